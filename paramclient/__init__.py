@@ -15,10 +15,9 @@ from paramclient.cache import (
     Snapshot,
     SnapshotSummary,
 )
-from paramclient.client.client import FetchedAll, ParamClient
+from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
 from paramclient.client.events import (
-    Changes,
     Contested,
     Event,
     Events,
@@ -29,9 +28,11 @@ from paramclient.client.events import (
     Resynced,
     Uncontested,
 )
+from paramclient.client.fetch_all import FetchedAll
 from paramclient.client.files import Ftp
 from paramclient.client.signing import Signing, key_from_environment, read_key
 from paramclient.client.stats import ClientStats
+from paramclient.client.subscription import Changes
 from paramclient.errors import (
     AmbiguousVehicle,
     AnotherVehicle,

@@ -16,6 +16,7 @@ import anyio
 
 from paramclient import Component, Param, ParamClient, ParamType
 from paramclient.client import cache_writer
+from paramclient.client.local import local
 from paramclient.client.worker_thread import Worker
 from paramclient.errors import LinkError
 from paramclient.links import Peer, SimLink
@@ -358,7 +359,7 @@ def bits(params: Mapping[str, Param]) -> dict[str, int]:
 
 def machine_of(component: Component) -> ComponentMachine:
     """What stands behind a component, wherever its link is."""
-    return component._machine
+    return local(component).machine
 
 
 def residue(component: Component) -> list[object]:

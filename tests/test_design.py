@@ -176,22 +176,72 @@ def test_imports_are_absolute_and_point_one_way(module: str) -> None:
             assert not is_command(target), where
 
 
-CHOICES = {("paramclient.client.client", "paramclient.remote")}
-"""Who makes one of its own kind that knows it, while it runs: a client whose link is a service."""
-
-
 def test_no_module_imports_itself_through_others() -> None:
-    """Modules that only name each other's types do not count."""
+    """Imports of types count, and those inside of functions."""
     graph = {
-        module: {
-            target
-            for target, each in own_imports_of(module)
-            if not each.for_types_only and target != module
-            if each.runs_at_import or (module, target) not in CHOICES
-        }
-        for module in MODULES
+        module: {target for target, _ in own_imports_of(module) if target != module} for module in MODULES
     }
     TopologicalSorter(graph).prepare()
+
+
+NAMEDTUPLE_METHODS = {"_replace", "_asdict", "_fields"}
+"""Names that begin with an underscore and are public nevertheless, so that no field can have them."""
+
+
+def own_names_of(source: ast.Module) -> set[str]:
+    """The names that a module gives to functions, classes, variables and attributes."""
+    names = set[str]()
+    for node in ast.walk(source):
+        match node:
+            case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
+                names.add(node.name)
+            case ast.Attribute(ctx=ast.Store()):
+                names.add(node.attr)
+            case ast.Name(ctx=ast.Store()):
+                names.add(node.id)
+    return names
+
+
+def private_names_in(source: ast.Module) -> Iterator[tuple[str, int]]:
+    """The names of other modules that begin with one underscore, and the lines on which they are used.
+
+    Those of a base class are its subclasses' too, for themselves: `self._x`.
+    """
+    own = own_names_of(source) | NAMEDTUPLE_METHODS
+    for node in ast.walk(source):
+        match node:
+            case ast.ImportFrom(names=aliases):
+                yield from ((alias.name, node.lineno) for alias in aliases if is_private(alias.name))
+            case ast.Attribute(value=ast.Name(id="self" | "cls")):
+                continue
+            case ast.Attribute(attr=name) if is_private(name) and name not in own:
+                yield name, node.lineno
+
+
+def is_private(name: str) -> bool:
+    return name.startswith("_") and not name.startswith("__")
+
+
+@EVERY_MODULE
+def test_no_module_uses_the_private_names_of_another(module: str) -> None:
+    """What the package needs of a component beyond its public calls is in `client.local`."""
+    assert list(private_names_in(source_of(module))) == []
+
+
+@pytest.mark.parametrize(
+    ("program", "found"),
+    [
+        ("def f(other): return other._x", ["_x"]),
+        ("def f(other): return other.part._x.y", ["_x"]),
+        ("from other import _x", ["_x"]),
+        ("class C:\n    def f(self): return self.other._x", ["_x"]),
+        ("class C:\n    def f(self): return self._x", []),
+        ("class C:\n    def f(self, other): self._x = other._x", []),
+        ("def f(other): return other.__class__, other._replace()", []),
+    ],
+)
+def test_private_names_are_found(program: str, found: list[str]) -> None:
+    assert [name for name, _ in private_names_in(ast.parse(program))] == found
 
 
 def test_the_simulators_load_only_when_a_link_asks_for_them() -> None:

@@ -6,19 +6,35 @@ open their clients with `a_client`: what users see must be the same.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import weakref
+from collections.abc import Callable, Collection
 from types import TracebackType
 from typing import Any, TypeVar
 
 import pytest
 
 from paramclient import Component, ParamClient
+from paramclient.client.client import implementation_of
+from paramclient.client.link_component import LinkComponent
+from paramclient.client.local import local
+from paramclient.client.subscription import Changes
 from paramclient.remote import RemoteClient, RemoteComponent
+from paramclient.remote.component import mirrored_of
+from paramclient.remote.service_client import ServiceClient
 from paramclient.service import Hub, create_app
 from tests import shell
 from tests.asgi import ASGITransport
 
-__all__ = ["DIRECT", "ServedClient", "direct_only", "looks", "pytest_generate_tests", "served", "way"]
+__all__ = [
+    "DIRECT",
+    "ServedClient",
+    "direct_only",
+    "listeners",
+    "looks",
+    "pytest_generate_tests",
+    "served",
+    "way",
+]
 
 DIRECT = "direct"
 SERVICE = "service"
@@ -49,7 +65,7 @@ def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     chosen: str = request.param
     if chosen == SERVICE:
         monkeypatch.setattr(shell, "client_of", ServedClient)
-        monkeypatch.setattr(shell, "machine_of", lambda component: served(component)._machine)
+        monkeypatch.setattr(shell, "machine_of", lambda component: local(served(component)).machine)
     return chosen
 
 
@@ -59,12 +75,13 @@ class ServedClient(RemoteClient):
     Attributes:
         hub: of the service.
         own: the client that the service has made for the link; None before.
+        roster: the components that it mirrors.
     """
 
     def __init__(self, link: Any, **options: Any) -> None:
-        super().__init__("http://127.0.0.1:8765")
         self.own: ParamClient | None = None
         self._is_served = False
+        OPENED.add(self)
         first = ParamClient(link, **options)
         unused = [first]
 
@@ -73,11 +90,14 @@ class ServedClient(RemoteClient):
             return self.own
 
         self.hub = Hub([(first.link.name, make)], cache=False, fetches=False)
-        self._requests._transport = ASGITransport(create_app(self.hub))
+        super().__init__("http://127.0.0.1:8765", transport=ASGITransport(create_app(self.hub)))
+        implementation = implementation_of(self)
+        assert isinstance(implementation, ServiceClient)
+        self.roster = implementation._roster
 
     async def __aenter__(self) -> ServedClient:
         if self._is_served:
-            return await super().__aenter__()  # type: ignore[return-value]  # it refuses
+            return await super().__aenter__()  # it refuses
         self._is_served = True
         await self.hub.__aenter__()
         try:
@@ -96,6 +116,18 @@ class ServedClient(RemoteClient):
             await self.hub.__aexit__(None, None, None)
 
 
+OPENED: weakref.WeakSet[ServedClient] = weakref.WeakSet()
+"""The clients over a service that were made here."""
+
+
+def listeners(component: Component) -> Collection[Changes]:
+    """Who listens to the changes of a component."""
+    if isinstance(component, RemoteComponent):
+        return mirrored_of(component)._subscriptions
+    assert isinstance(component, LinkComponent)
+    return component._subscriptions
+
+
 def looks(component: Component) -> str:
     """Its `repr`, without a word on where its link is."""
     return repr(component).replace("<Remote", "<")
@@ -105,7 +137,6 @@ def served(component: Component) -> Component:
     """The component as whoever has the link knows it."""
     if not isinstance(component, RemoteComponent):
         return component
-    client = component._client
-    assert isinstance(client, ServedClient)
+    (client,) = (each for each in OPENED if each.roster is component._service)
     assert client.own is not None
     return client.own.components[component.system, component.component]

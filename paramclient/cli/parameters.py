@@ -41,7 +41,6 @@ from paramclient.cli.output import (
 )
 from paramclient.client.arguments import SETTLE_MAX
 from paramclient.client.events import (
-    Changes,
     Contested,
     Event,
     Events,
@@ -52,6 +51,7 @@ from paramclient.client.events import (
     Resynced,
     Uncontested,
 )
+from paramclient.client.subscription import Changes
 from paramclient.errors import CacheError, NoReply, ParamClientError, UsageError, ValueNotApplied
 from paramclient.metadata import Metadata
 from paramclient.model.notation import hash_text, time_text

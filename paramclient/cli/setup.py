@@ -48,6 +48,7 @@ from paramclient.cli.targets import (
     targets,
 )
 from paramclient.client.component import Component
+from paramclient.client.local import local
 from paramclient.errors import NoReply, NotInCache, ParamClientError, UnknownVehicle, UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.paramset import ParamSet
@@ -295,7 +296,7 @@ async def _load_state(found: Targets, vehicle: Component, when: str | None, opti
             "backup file"
         )
     await wait_for_identity(vehicle)
-    await found.client._writer.write_all()
+    await local(vehicle).client.cache_writer.write_all()
     key, component = vehicle.identity.key, vehicle.component
     return await anyio.to_thread.run_sync(lambda: _state_at(cache, key, component, moment))
 

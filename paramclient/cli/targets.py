@@ -13,7 +13,7 @@ import anyio
 from paramclient.cli.connection import VEHICLE_TIMEOUT, Deadline, Session, connect
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.sources import choose, is_file, open_file, resolve
-from paramclient.client.client import ParamClient
+from paramclient.client.client import ParamClient, implementation_of
 from paramclient.client.component import Component
 from paramclient.errors import FileError, NoReply, UsageError
 from paramclient.files import ParamFile
@@ -210,7 +210,7 @@ async def _find_vehicles(
     timeout = deadline.left(FLEET_LISTENING_TIME if expect is None else VEHICLE_TIMEOUT)
     with anyio.move_on_after(timeout):
         while expect is None or len(_vehicles(client, component)) < expect:
-            client._check_open()
+            implementation_of(client).check_open()
             await anyio.sleep(POLL_INTERVAL)
     found = _vehicles(client, component)
     if expect is not None and len(found) < expect:

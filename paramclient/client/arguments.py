@@ -1,4 +1,4 @@
-"""What is asked of a component, looked at before anything is sent: directly or over a service."""
+"""Defaults and checks of the arguments of calls, the same over a link and over a service."""
 
 from __future__ import annotations
 
@@ -8,8 +8,21 @@ from paramclient.errors import UsageError
 from paramclient.model.values import check_name, is_portable_name
 from paramclient.protocol.wire import MOST_PARAMETERS
 
-__all__ = ["SETTLE_MAX", "check_accepted", "check_asked", "check_asked_name", "check_settle"]
+__all__ = [
+    "HEARING_PATIENCE",
+    "PROGRESS_INTERVAL",
+    "SETTLE_MAX",
+    "address_in_words",
+    "check_accepted",
+    "check_asked",
+    "check_asked_name",
+    "check_settle",
+]
 
+HEARING_PATIENCE: Final = 10.0
+"""Seconds to wait for a first component, unless the caller says otherwise."""
+PROGRESS_INTERVAL: Final = 0.1
+"""Seconds between two calls of a progress callback."""
 SETTLE_MAX: Final = 60.0
 """Seconds for which a written value can be watched, at the most: a write to the same name waits meanwhile."""
 
@@ -61,3 +74,11 @@ def check_settle(settle: float) -> float:
     if not 0.0 <= settle <= SETTLE_MAX:
         raise UsageError(f"settle is a number of seconds from 0 to {SETTLE_MAX:g}, not {settle}")
     return float(settle)
+
+
+def address_in_words(system: int | None, component: int | None, peer: str | None = None) -> str:
+    """Return what a call looks for on a link, in words."""
+    at = "" if peer is None else f" at {peer}"
+    if component is None:
+        return f"an autopilot{at}" if system is None else f"an autopilot with system id {system}{at}"
+    return f"component {'*' if system is None else system}/{component}{at}"

@@ -1,75 +1,48 @@
-"""The shell around the protocol: a link, a clock, and calls that can be awaited."""
+"""ParamClient: what users open to reach the components on a link, or on the links of a service.
+
+`ParamClient` is one concrete class that forwards its calls to an implementation: `LinkClient` where the
+link is opened in this process, `ServiceClient` (in `paramclient.remote`) where a service has the links.
+`__init__` chooses it by the name of the link. So `ParamClient(link)` and `isinstance(client, ParamClient)`
+hold for both, a subclass of `ParamClient` works over both, and type checkers see one signature with its
+docstring. The implementations offer the same calls with the same arguments. They are no subclasses, and do
+not import this module. Their components are subclasses of the abstract class `Component`, which users do not
+construct.
+"""
 
 from __future__ import annotations
 
-import logging
-import math
 import os
-import weakref
-from collections.abc import Awaitable, Callable, Mapping
-from types import MappingProxyType, TracebackType
-from typing import TYPE_CHECKING, Final
-
-import anyio
-import anyio.abc
+from collections.abc import Callable, Mapping
+from types import TracebackType
+from typing import TYPE_CHECKING, Self, TypeAlias
 
 from paramclient.cache import ParamCache
-from paramclient.client.cache_writer import WriteThrough, chosen_cache
-from paramclient.client.component import Component, address_in_words, patience_of
-from paramclient.client.events import Events, told
-from paramclient.client.fetch_all import FetchedAll, FetchTogether
+from paramclient.client.arguments import HEARING_PATIENCE
+from paramclient.client.component import Component
+from paramclient.client.events import Events
+from paramclient.client.fetch_all import FetchedAll
 from paramclient.client.files import Ftp
-from paramclient.client.link_task import Carrier
-from paramclient.client.signing import Signing, refused_in_words
-from paramclient.client.signing_timestamps import TimestampKeeper
+from paramclient.client.link_client import LinkClient, LinkOptions
+from paramclient.client.local import LocalClient, not_given
+from paramclient.client.signing import Signing
 from paramclient.client.stats import ClientStats
-from paramclient.client.taps import Beside
-from paramclient.errors import ClientClosed, LinkError, NoReply, UsageError
-from paramclient.links import Link, ReplayLink, SimLink, create_link
+from paramclient.errors import UsageError
+from paramclient.links import Link
 from paramclient.links.names import names_service
-from paramclient.model.identity import Identity
 from paramclient.model.values import Encoding
-from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.events import (
-    ComponentContested,
-    ComponentForgotten,
-    ComponentFound,
-    ComponentHeard,
-    ComponentIdentified,
-    ComponentLost,
-    ComponentReplaced,
-    ComponentUncontested,
-    Event,
-    Fetched,
-    ParamChanged,
-    ParamsMoved,
-    TableResynced,
-)
+from paramclient.protocol.addresses import Address
 from paramclient.protocol.params.fetch_result import Policy, Progress
-from paramclient.protocol.params.sync import Upkeep
-from paramclient.protocol.station import Address, Station
 from paramclient.protocol.stats.traffic import TrafficReport
-from paramclient.protocol.system_id_change import SEARCH_PACE, Succession
-from paramclient.protocol.vehicle_selection import LOOK_TIME, VehicleChoice
 from paramclient.protocol.wire import SigningKey, SigningReport
 
 if TYPE_CHECKING:
+    from paramclient.remote.service_client import ServiceClient
     from paramclient.sim import Endpoint
 
-__all__ = ["FetchedAll", "ParamClient"]
+__all__ = ["ParamClient", "implementation_of", "local_client"]
 
-HEARING_PATIENCE: Final = 10.0
-"""Seconds to wait for a first component, unless the caller says otherwise."""
-LISTENING_TIME: Final = 1.2
-"""Seconds from opening in which every component has been heard: each sends a heartbeat once a second."""
-CLOSING_PATIENCE: Final = 0.5
-"""Seconds that closing waits for the hash after a write, where the next session could not do without it."""
-SESSION_PATIENCE: Final = 2.0
-"""Seconds that a closing client waits at most for file sessions to be closed on board. The request is on its
-way by then: a burst that runs on a radio lets it wait, and it is obeyed after that."""
-
-logger = logging.getLogger(__name__)
-protocol_logger = logging.getLogger("paramclient.protocol")
+Implementation: TypeAlias = "LinkClient | ServiceClient"
+"""What a `ParamClient` forwards its calls to."""
 
 
 class ParamClient:
@@ -129,14 +102,6 @@ class ParamClient:
         LinkError: on entering: the link, or the one to the other program, cannot be opened.
     """
 
-    def __new__(cls, link: str | Link | Endpoint, **_: object) -> ParamClient:
-        """One of the kind that the link's name asks for."""
-        if cls is ParamClient and names_service(link):
-            from paramclient.remote import RemoteClient  # brings httpx along
-
-            return object.__new__(RemoteClient)
-        return object.__new__(cls)
-
     def __init__(
         self,
         link: str | Link | Endpoint,
@@ -155,55 +120,43 @@ class ParamClient:
         token: str | None = None,
         split_peers: bool = False,
     ) -> None:
-        if token is not None:
-            raise UsageError("a token is for a service, whose name is http://HOST:PORT; a link takes none")
-        for number in (system, component):
-            if not 1 <= number <= 255:
-                raise UsageError(f"our own system and component ids are 1 to 255, not {number}")
-        self._link = create_link(link)
-        is_log = isinstance(self._link, ReplayLink)
-        self.cache = chosen_cache(cache, is_log=is_log)
-        self._station = Station(
-            link=self._link.name,
-            is_stream=self._link.is_stream,
+        options = LinkOptions(
+            cache=cache,
             system=system,
             component=component,
             encoding=encoding,
-            upkeep=Upkeep.chosen(watch_interval, policy, listen_only=listen_only, is_log=is_log),
+            watch_interval=watch_interval,
+            policy=policy,
+            traffic=traffic,
+            listen_only=listen_only,
+            forward=forward,
+            tlog=tlog,
+            signing=signing,
             split_peers=split_peers,
-            counts_traffic=traffic,
-            trace=protocol_logger.debug,
         )
-        self._writer = WriteThrough(
-            self.cache,
-            owned=self.cache is not cache,
-            identity_of=self._station.identity_of,
-            is_doubted=self._station.is_doubted,
-            renewed=self._dispatch,
-            look=lambda: self._carrier.look_at_the_clock(),
-        )
-        self._subscriptions: weakref.WeakSet[Events] = weakref.WeakSet()
-        self._components: dict[Address, Component] = {}
-        self._tasks: anyio.abc.TaskGroup | None = None
-        self._outlasting: list[anyio.CancelScope] = []
-        self._beside = Beside(tlog, forward, is_stream=self._link.is_stream)
-        self._carrier = Carrier(
-            self._link,
-            self._station,
-            dispatch=self._dispatch,
-            end=self._end,
-            taps=self._beside.taps,
-            may_rest=self._beside.forwarder is None,
-        )
-        if not self.listens_only:
-            self._beside.share(self._carrier.send_for_another)
-        self._downloads = self._cache_hits = 0
-        if isinstance(signing, SigningKey):
-            signing = Signing(signing)
-        self._keeper = None if signing is None else TimestampKeeper(signing)
-        self._splits_peers = split_peers
-        self._is_entered = False
-        self._opened_at = -math.inf
+        self._implementation: Implementation
+        if names_service(link):
+            from paramclient.remote.service_client import ServiceClient  # only here: it loads httpx
+
+            options.check_unset()
+            self._implementation = ServiceClient(str(link), token=token)
+        elif token is not None:
+            raise UsageError("a token is for a service, whose name is http://HOST:PORT; a link takes none")
+        else:
+            self._implementation = LinkClient(link, options)
+        self.cache = self._implementation.cache
+
+    def __repr__(self) -> str:
+        return repr(self._implementation)
+
+    async def __aenter__(self) -> Self:
+        await self._implementation.open()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self._implementation.close(failed=kind is not None)
 
     @property
     def components(self) -> Mapping[Address, Component]:
@@ -212,113 +165,37 @@ class ParamClient:
         With `split_peers`, ids may be there several times, and a key stands for the ids at one peer: it is
         what `Component.address` gives, and the ids alone are none.
         """
-        return MappingProxyType(self._components)
+        return self._implementation.components
 
     @property
     def autopilots(self) -> list[Component]:
         """The autopilot of each system heard so far, by system id: vehicles, without what they carry."""
-        station = self._station
-        heard = dict.fromkeys(machine.vehicle for machine in station.components.values())
-        vehicles = sorted(heard, key=lambda vehicle: vehicle[0])
-        found = [station.autopilot_of(*vehicle) for vehicle in vehicles]
-        return [self._components[machine.address] for machine in found if machine is not None]
+        return self._implementation.autopilots
 
     @property
     def link(self) -> Link:
         """The link."""
-        return self._link
+        return self._implementation.link
 
     @property
     def listens_only(self) -> bool:
         """Whether nothing is ever sent: by choice, or as the link is a log."""
-        return self._station.listens_only
+        return self._implementation.listens_only
 
     @property
     def bytes_received(self) -> int:
         """Bytes that have come over the link."""
-        return self._station.bytes_received
+        return self._implementation.bytes_received
 
     @property
     def bytes_sent(self) -> int:
         """Bytes of the frames that were sent, our heartbeats among them."""
-        return self._station.bytes_sent
+        return self._implementation.bytes_sent
 
     @property
     def stats(self) -> ClientStats:
         """What it has done so far, in numbers; also when it is closed."""
-        return ClientStats.of(self._station, downloads=self._downloads, cache_hits=self._cache_hits)
-
-    def __repr__(self) -> str:
-        state = "away" if self._carrier.is_away else "open"
-        state = "closed" if self._tasks is None or self._carrier.ended is not None else state
-        heard = len(self._components)
-        return f"<ParamClient {self._link.name} {state}, {heard} component{'' if heard == 1 else 's'}>"
-
-    async def __aenter__(self) -> ParamClient:
-        if self._is_entered:
-            raise UsageError("a ParamClient is opened once; make a new one")
-        self._is_entered = True
-        try:
-            await self._link.open()
-            await self._writer.open()
-            await self._beside.open()
-            if self._keeper is not None:
-                self._station.begin_signing(*await self._keeper.open())
-        except BaseException:
-            await self._release()
-            raise
-        logger.debug("%s: open", self._link.name)
-        tasks = anyio.create_task_group()
-        await tasks.__aenter__()
-        self._tasks = tasks
-        self._opened_at = self._station.listening_since = anyio.current_time()
-        tasks.start_soon(self._outlast, self._carrier.read, name="paramclient reader")
-        tasks.start_soon(self._outlast, self._carrier.send, name="paramclient sender")
-        tasks.start_soon(self._writer.run, name="paramclient cache writer")
-        self._beside.start(tasks)
-        if self._keeper is not None:
-            tasks.start_soon(self._keeper.run, name="paramclient timestamp keeper")
-        return self
-
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        tasks = self._tasks
-        assert tasks is not None
-        try:
-            if kind is None and self._carrier.broken is None:
-                await self._let_hashes_settle()
-        finally:
-            closed = ClientClosed("the client was closed", link=self._link.name)
-            try:
-                await self._close_files(closed)
-            finally:
-                self._end(closed)
-                for scope in (*self._outlasting, tasks.cancel_scope):
-                    scope.cancel()
-            try:
-                # not told of the caller's exception: it would come out wrapped in a group
-                await tasks.__aexit__(None, None, None)
-            finally:
-                await self._release()
-
-    async def _release(self) -> None:
-        """Give back the link and the cache, also when cancelled."""
-        logger.debug("%s: closing", self._link.name)
-        with anyio.CancelScope(shield=True):
-            try:
-                await self._link.close()
-                for machine in self._station.components.values():
-                    await self._writer.keep_late(machine)
-            finally:
-                try:
-                    await self._writer.close()
-                finally:
-                    try:
-                        if self._keeper is not None:
-                            await self._keeper.close()
-                    finally:
-                        await self._beside.close()
+        return self._implementation.stats
 
     def events(self) -> Events:
         """What happens to components from now on: `async for event in client.events()`.
@@ -331,15 +208,11 @@ class ParamClient:
             LinkError: while waiting, when the link failed for good or the client was closed. What had come
                 before is given first.
         """
-        events = Events()
-        self._subscriptions.add(events)
-        if self._is_over:
-            events.end(self._carrier.ended)
-        return events
+        return self._implementation.events()
 
     def ftp(self, component: Component) -> Ftp:
         """The files of a component, over MAVFTP."""
-        return Ftp(component)
+        return self._implementation.ftp(component)
 
     async def component(
         self,
@@ -366,19 +239,7 @@ class ParamClient:
             NoReply: it was not heard in time.
             LinkError: the link failed, or the client was closed.
         """
-        self._check_open()
-        began = anyio.current_time()
-        with anyio.move_on_after(timeout):
-            while (found := self._find(system, component, peer)) is None and not self._station.is_over:
-                await self._carrier.news.wait()
-                self._check_open()
-            if found is not None:
-                await found._wait_for_cache()
-        if found is None:
-            waited = anyio.current_time() - began
-            wanted = address_in_words(system, component, peer) + refused_in_words(self.signing_report())
-            raise NoReply(wanted, attempts=0, waited=waited)
-        return found
+        return await self._implementation.component(system, component, peer=peer, timeout=timeout)
 
     async def only_component(
         self,
@@ -412,32 +273,7 @@ class ParamClient:
             NoReply: it was not heard in time, or not for long enough to see that it is the only one.
             LinkError: the link failed, or the client was closed.
         """
-        if self._has_one_vehicle:
-            return await self.component(system, component, peer=peer, timeout=timeout)
-        self._check_open()
-        began = anyio.current_time()
-        choice = VehicleChoice(system, component, splits_peers=self._splits_peers)
-        station = self._station
-        machine = None
-        with anyio.move_on_after(timeout), station.looking_for_others():
-            while True:
-                news, now = self._carrier.news, anyio.current_time()
-                since = station.listening_since
-                machine = choice.look(station.at_peer(peer), now, listening_since=since)
-                if machine is not None or station.is_over:
-                    break
-                with anyio.move_on_after(None if choice.due == math.inf else choice.due - now):
-                    await news.wait()
-                await self._carrier.read_up(choice.due)
-                self._check_open()
-            if machine is not None:
-                await self._components[machine.address]._wait_for_cache()
-        if machine is not None:
-            return self._components[machine.address]
-        wanted = address_in_words(system, component, peer) + refused_in_words(self.signing_report())
-        if choice.due < math.inf:
-            wanted += f", and {LOOK_TIME} s more to see that it is the only one"
-        raise NoReply(wanted, attempts=0, waited=anyio.current_time() - began)
+        return await self._implementation.only_component(system, component, peer=peer, timeout=timeout)
 
     async def successor(
         self, component: Component, system: int, *, timeout: float | None = HEARING_PATIENCE
@@ -459,19 +295,7 @@ class ParamClient:
             NoReply: it was not heard under this id in time, or did not say who it is.
             LinkError: the link failed, or the client was closed.
         """
-        self._check_open()
-        began = anyio.current_time()
-        search = Succession(component._machine, component._machine.address_in(system))
-        with anyio.move_on_after(timeout):
-            while not search.look(self._station.components, anyio.current_time()):
-                self._wake()
-                with anyio.move_on_after(SEARCH_PACE):
-                    await self._carrier.news.wait()
-                self._check_open()
-            found = self._components[search.address]
-            await found._wait_for_cache()
-            return found
-        raise NoReply(search.awaited, attempts=0, waited=anyio.current_time() - began)
+        return await self._implementation.successor(component, system, timeout=timeout)
 
     async def fetch_all(
         self,
@@ -499,18 +323,8 @@ class ParamClient:
             NoReply: nobody was heard, or nobody answered.
             LinkError: the link failed, or the client was closed.
         """
-        self._station.check_refresh(refresh)
-        timeout = patience_of(self._station, timeout)
-        began = anyio.current_time()
-        together = FetchTogether(self._station, self._components, system, refresh=refresh)
-        return await together.run(
-            self._check_open,
-            self._wake,
-            self._files_closed,
-            until=math.inf if timeout is None else began + timeout,
-            hear_until=began + (HEARING_PATIENCE if timeout is None else timeout),
-            listen_until=self._opened_at + LISTENING_TIME,
-            progress=progress,
+        return await self._implementation.fetch_all(
+            system, refresh=refresh, timeout=timeout, progress=progress
         )
 
     def traffic_report(self) -> TrafficReport:
@@ -520,195 +334,28 @@ class ParamClient:
             UsageError: the client was made without `traffic=True`.
             LinkError: the link failed, or the client was closed.
         """
-        if self._station.traffic is None:
-            raise UsageError("nothing is counted; use ParamClient(..., traffic=True)")
-        self._check_open()
-        return self._station.traffic.report(anyio.current_time())
+        return self._implementation.traffic_report()
 
     def signing_report(self) -> SigningReport | None:
         """How the signatures on the link stand: what came signed, what was refused and why.
 
         None where the client has no key.
         """
-        return None if self._station.verifier is None else self._station.verifier.report()
+        return self._implementation.signing_report()
 
-    # what has happened
 
-    async def _load(self, component: Component, identity: Identity) -> None:
-        if await self._writer.bring(component._machine, identity):
-            component._cache_is_read.set()
-            self._writer.wake()
-            self._dispatch()
+def implementation_of(client: ParamClient) -> Implementation:
+    """Return what a client forwards its calls to. For the modules of this package, as is `local_client`."""
+    return client._implementation
 
-    def _dispatch(self) -> None:
-        """Hand out what has happened."""
-        is_to_be_written = False
-        for event in self._station.events():
-            machine = event.machine
-            if isinstance(event, ParamChanged | ParamsMoved):
-                self._components[machine.address]._moved(event)
-                is_to_be_written = True
-                continue
-            logger.debug("%s", event)
-            if isinstance(event, Fetched):
-                self._cache_hits += event.result.source == "cache"
-                self._downloads += event.result.source != "cache" and event.result.complete
-            if isinstance(event, ComponentForgotten):
-                self._components.pop(machine.address)._part()
-                continue
-            if isinstance(event, ComponentHeard):
-                self._meet(machine)
-            elif isinstance(event, ComponentLost | ComponentFound) and self._splits_peers:
-                self._pass_place_on(machine, is_lost=isinstance(event, ComponentLost))
-            elif isinstance(event, ComponentContested):
-                self._writer.let_go(machine)
-                logger.warning("%s: %s", self._link.name, event.contest.error)
-            elif isinstance(event, ComponentUncontested | ComponentReplaced):
-                self._writer.let_go(machine)
-            elif isinstance(event, ComponentIdentified):
-                self._carrier.tell()
-                for component in self._components.values():
-                    if component._machine.vehicle == machine.vehicle:
-                        self._read_cache(component)
-            elif isinstance(event, Fetched) and event.result.complete and event.result.is_confirmed:
-                is_whole = event.result.source != "cache" and not event.result.resumed
-                self._writer.synced(machine, is_whole=is_whole)
-                is_to_be_written = True
-            elif isinstance(event, TableResynced):
-                self._writer.synced(machine, is_whole=False)
-                is_to_be_written = True
-            if self._subscriptions:
-                self._announce(event)
-        if is_to_be_written:
-            self._writer.wake()
-        if self._station.is_over:
-            self._end_feeds(None)
 
-    def _announce(self, event: Event) -> None:
-        """Tell those who listen, if it is for them."""
-        news = told(event, self._components[event.machine.address])
-        if news is not None:
-            for events in list(self._subscriptions):
-                events.push(news)
+def local_client(client: ParamClient) -> LocalClient:
+    """Return what the package needs of a client beyond its public calls.
 
-    def _meet(self, machine: ComponentMachine) -> None:
-        address = (machine.system, machine.component)
-        now = anyio.current_time()
-        component = self._components[machine.address] = Component(self, machine, now)
-        self._read_cache(component)
-        if self._writer.may_hit(*address):
-            machine.sync.ask(now)
-
-    def _read_cache(self, component: Component) -> None:
-        """Look for its cached table, once it is known whose it is."""
-        machine = component._machine
-        if (identity := self._station.identity_of(machine)) is None or self._writer.follow(machine, identity):
-            return
-        assert self._tasks is not None, "nothing is heard before"
-        self._tasks.start_soon(self._load, component, identity)
-
-    def _pass_place_on(self, machine: ComponentMachine, *, is_lost: bool) -> None:
-        """A vehicle may have come back at another peer: one of those with equal ids is kept in the cache."""
-        if is_lost:
-            self._writer.let_go(machine)
-        for component in self._components.values():
-            other = component._machine
-            if (other.system, other.component) == (machine.system, machine.component) and (
-                not other.presence.is_lost
-            ):
-                self._read_cache(component)
-
-    def _wake(self, machine: ComponentMachine | None = None) -> None:
-        self._carrier.wake(machine)
-
-    # ends
-
-    def _end(self, error: LinkError) -> None:
-        """No call can be answered any more."""
-        self._dispatch()
-        self._carrier.fail_for_good(error)
-        for component in self._components.values():
-            component._cache_is_read.set()
-        self._end_feeds(error)
-
-    def _end_feeds(self, error: LinkError | None) -> None:
-        for component in self._components.values():
-            component._end(error)
-        for events in list(self._subscriptions):
-            events.end(error)
-
-    @property
-    def _is_over(self) -> bool:
-        """Whether nothing more will happen."""
-        return self._station.is_over or self._carrier.ended is not None
-
-    def _check_open(self) -> None:
-        if self._carrier.broken is not None:
-            raise self._carrier.broken.with_traceback(None)
-        if self._tasks is None:
-            raise ClientClosed("the client is not open; use it as `async with`", link=self._link.name)
-
-    async def _let_hashes_settle(self) -> None:
-        """Wait for the hash after our writes, where it cannot be computed here."""
-        with anyio.move_on_after(CLOSING_PATIENCE):
-            while any(
-                machine.is_settling and machine.table.complete and not machine.table.volatile_known
-                for machine in self._station.components.values()
-            ):
-                await self._carrier.news.wait()
-
-    async def _outlast(self, work: Callable[[], Awaitable[None]]) -> None:
-        """Do this until the files are closed, also when a scope around the client is cancelled before."""
-        if self._carrier.ended is None:
-            with anyio.CancelScope(shield=True) as scope:
-                self._outlasting.append(scope)
-                await work()
-
-    async def _close_files(self, error: LinkError) -> None:
-        """End what still waits, and have the sessions of open files closed on board, also when cancelled.
-
-        ArduPilot has one session for all links: what stays open keeps everyone from its files for 3 s.
-        """
-        if self._carrier.broken is None:
-            self._carrier.fail_calls(error)
-            machines = [each for each in self._station.components.values() if each.files.is_closing]
-            if not machines:
-                return
-            with anyio.CancelScope(shield=True), anyio.move_on_after(SESSION_PATIENCE):
-                async with anyio.create_task_group() as tasks:
-                    # `asyncio.run` cancels each task for itself when its main one has ended: these go on then
-                    tasks.start_soon(self._carrier.read)
-                    tasks.start_soon(self._carrier.send)
-                    for machine in machines:
-                        await self._wait_until_closed(machine)
-                    tasks.cancel_scope.cancel()
-
-    async def _files_closed(self, machine: ComponentMachine) -> None:
-        """Wait until the session of a file that nobody wants any more is closed on board: for one round trip.
-
-        While a burst comes the vehicle does not look at the request.
-        """
-        if machine.files.is_closing and self._carrier.broken is None:
-            with anyio.move_on_after(machine.round_trip.prompt_timeout):
-                await self._wait_until_closed(machine)
-
-    async def _wait_until_closed(self, machine: ComponentMachine) -> None:
-        carrier, files = self._carrier, machine.files
-
-        def tell(now: float) -> None:
-            carrier.tell()
-
-        self._wake(machine)
-        while files.is_closing and not (carrier.is_away or carrier.ended or machine.presence.is_lost):
-            if tell not in files.on_closed:
-                files.on_closed.append(tell)
-            await carrier.news.wait()
-
-    @property
-    def _has_one_vehicle(self) -> bool:
-        """Whether no vehicle can be taken for another: there is one, or none is written to."""
-        return self.listens_only or (isinstance(self._link, SimLink) and self._link.has_one_vehicle)
-
-    def _find(self, system: int | None, component: int | None, peer: str | None) -> Component | None:
-        found = self._station.find(system, component, peer)
-        return None if found is None else self._components[found.address]
+    Raises:
+        UsageError: its links are those of a service.
+    """
+    implementation = client._implementation
+    if not isinstance(implementation, LinkClient):
+        raise not_given("what this needs")
+    return implementation

@@ -11,7 +11,9 @@ from typing import Final
 import anyio
 import anyio.lowlevel
 
-from paramclient.client.component import PROGRESS_INTERVAL, TIME_IS_OVER, Component
+from paramclient.client.arguments import PROGRESS_INTERVAL
+from paramclient.client.link_component import TIME_IS_OVER
+from paramclient.client.local import LocalComponent
 from paramclient.errors import CacheError, ContestedAddress, NoReply
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.params.fetch import Fetch
@@ -60,7 +62,12 @@ class FetchTogether:
     """
 
     def __init__(
-        self, station: Station, components: Mapping[Address, Component], system: int | None, *, refresh: bool
+        self,
+        station: Station,
+        components: Mapping[Address, LocalComponent],
+        system: int | None,
+        *,
+        refresh: bool,
     ) -> None:
         self._station = station
         self._components = components
@@ -126,14 +133,14 @@ class FetchTogether:
         self._is_cache_awaited = False
         ready: dict[tuple[int, Peer], list[ComponentMachine]] = {}
         for address, component in self._components.items():
-            machine = component._machine
+            machine = component.machine
             if address in self._fetches or not machine.who.has_parameters:
                 continue
             if self._system not in (None, machine.system) or (machine.presence.is_lost and not machine.fetch):
                 continue
             if machine.peers.contest is not None:
                 continue
-            if self._refresh or component._cache_is_due(now):
+            if self._refresh or component.is_cache_due(now):
                 ready.setdefault(machine.vehicle, []).append(machine)
             else:
                 self._is_cache_awaited = True
@@ -206,10 +213,10 @@ class FetchTogether:
                 silent[address] = error
         for address, component in self._components.items():
             is_wanted = self._system in (None, address[0])
-            contest = component._machine.peers.contest
+            contest = component.machine.peers.contest
             if is_wanted and address not in self._fetches and contest is not None:
                 silent[address] = contest.error
-            elif is_wanted and address not in self._fetches and component._machine.presence.is_lost:
+            elif is_wanted and address not in self._fetches and component.machine.presence.is_lost:
                 what = f"the parameters of {address[0]}/{address[1]} (lost)"
                 silent[address] = NoReply(what, attempts=0, waited=component.silence)
         if not results:

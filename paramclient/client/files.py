@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import builtins
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import anyio
 
+from paramclient.client.component import Component
+from paramclient.client.local import local
 from paramclient.protocol.ftp import LARGEST_FILE, DirectoryEntry, FileTransfers
 from paramclient.protocol.ftp.operations import Job
-
-if TYPE_CHECKING:
-    from paramclient.client.component import Component
 
 __all__ = ["Ftp"]
 
@@ -30,7 +29,7 @@ class Ftp:
     """
 
     def __init__(self, component: Component) -> None:
-        self._component = component
+        self._component = local(component)
 
     def __repr__(self) -> str:
         return f"<Ftp {self._component.system}/{self._component.component}>"
@@ -102,9 +101,9 @@ class Ftp:
     def _begin(self, what: str) -> builtins.tuple[FileTransfers, float]:
         """What to ask, and the time, if anything may be asked."""
         component, now = self._component, anyio.current_time()
-        component._client._check_open()
-        component._machine.check_present(f"{what} of {component.system}/{component.component}", now)
-        return component._machine.files, now
+        component.client.check_open()
+        component.machine.check_present(f"{what} of {component.system}/{component.component}", now)
+        return component.machine.files, now
 
     async def _wait(
         self,
@@ -117,8 +116,8 @@ class Ftp:
         job.is_of_caller = True
         awaited = f"{what} of {component.system}/{component.component}"
         try:
-            return await component._wait(job, timeout, lambda: (awaited, 0), tell)
+            return await component.wait(job, timeout, lambda: (awaited, 0), tell)
         finally:
-            component._machine.files.release(job, anyio.current_time())
-            component._client._wake(component._machine)
-            await component._client._files_closed(component._machine)
+            component.machine.files.release(job, anyio.current_time())
+            component.wake()
+            await component.wait_until_files_closed()

@@ -10,20 +10,19 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final, ParamSpec, TypeVar
+from typing import Final, ParamSpec, TypeVar
 
 import anyio
 import anyio.to_thread
 
+from paramclient.client.component import Component
 from paramclient.client.files import Ftp
+from paramclient.client.local import LocalComponent, local
 from paramclient.errors import MetadataError, UsageError
 from paramclient.metadata.formats import PACKED_SIZE_MAX, json_of, read_content, unpacked
 from paramclient.metadata.info import Metadata
 from paramclient.metadata.metadata_cache import MetadataStore, has_checksum
 from paramclient.protocol.wire import ComponentMetadata
-
-if TYPE_CHECKING:
-    from paramclient.client.component import Component
 
 __all__ = ["announced_metadata", "metadata_of"]
 
@@ -60,13 +59,14 @@ async def metadata_of(
         NoReply: no response in time.
         LinkError: the link failed, or the client was closed.
     """
+    vehicle = local(component)
     if isinstance(store, bool):
-        cache = component._client.cache
+        cache = vehicle.client.cache
         kept = MetadataStore.beside(cache.path) if store and cache is not None else None
     else:
         kept = store
     deadline = None if timeout is None else anyio.current_time() + timeout
-    files = _Files(component, kept, deadline, progress)
+    files = _Files(vehicle, kept, deadline, progress)
     before = component.identity
     announced = await announced_metadata(component, files.left())
     if announced is None:
@@ -95,7 +95,7 @@ class _Files:
         progress: called for each file.
     """
 
-    component: Component
+    component: LocalComponent
     kept: MetadataStore | None
     deadline: float | None
     progress: Callable[[int, int | None], None] | None
@@ -147,7 +147,7 @@ class _Files:
         number, path = found.groups()
         other: Component | None = self.component
         if number is not None and int(number) != self.component.component:
-            other = self.component._client.components.get((self.component.system, int(number)))
+            other = self.component.client.components.get((self.component.system, int(number)))
         if other is None:
             raise MetadataError(
                 f"{self.who} announces its metadata at {uri}, but component {number} has not been received",
@@ -167,13 +167,14 @@ async def announced_metadata(component: Component, timeout: float | None) -> Com
         NoReply: no response in time.
         LinkError: the link failed, or the client was closed.
     """
-    component._client._check_open()
+    asked = local(component)
+    asked.client.check_open()
     what = f"COMPONENT_METADATA of {component.system}/{component.component}"
-    machine, now = component._machine, anyio.current_time()
+    machine, now = asked.machine, anyio.current_time()
     machine.check_present(what, now)
     ask = machine.descriptions.ask(now)
     try:
-        return await component._wait(ask, timeout, lambda: (what, ask.attempts))
+        return await asked.wait(ask, timeout, lambda: (what, ask.attempts))
     finally:
         machine.descriptions.release(ask)
 

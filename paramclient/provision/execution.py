@@ -12,6 +12,7 @@ from typing import Final
 import anyio
 
 from paramclient.client.component import Component
+from paramclient.client.local import local
 from paramclient.errors import (
     AnotherVehicle,
     InvalidParameters,
@@ -156,7 +157,7 @@ class ApplyRun:
 
     async def prepare(self) -> None:
         """Inspect the vehicle, plan, and store its state. A failure is raised before the first write."""
-        if self._durable and self._component._client.cache is None:
+        if self._durable and local(self._component).client.cache is None:
             raise UsageError("durable needs a cache, and the client keeps none")
         check_component(self._wanted, self._component.component)
         plan({}, self._wanted, include=self._include, autopilot=self._component.autopilot)
@@ -179,7 +180,7 @@ class ApplyRun:
 
     async def write_and_verify(self) -> None:
         """Write and verify until no stage is pending. `result` reports a failure after the first write."""
-        sync = self._component._machine.sync
+        sync = local(self._component).machine.sync
         sync.holds += 1  # a changed count starts no download besides those of the run
         try:
             while True:
@@ -199,7 +200,8 @@ class ApplyRun:
                 else:
                     break
             if self._durable and self.sent:
-                await self._component._client._writer.write_durably(self._component._machine)
+                vehicle = local(self._component)
+                await vehicle.client.cache_writer.write_durably(vehicle.machine)
         except ParamClientError as error:
             if not self.sent:
                 raise
@@ -391,7 +393,7 @@ class ApplyRun:
     async def _write_system_id(self, step: Step) -> None:
         """Set the system id, and continue with the vehicle under its new one."""
         system = int(step.value) if not isinstance(step.value, bytes) else 0
-        client = self._component._client
+        client = local(self._component).client
         if any(self._is_other_vehicle_with(system, known) for known in client.components.values()):
             reason = f"another vehicle on this link has system id {system}"
             self._record(step, ApplyStatus.SKIPPED, step.before, reason, WRONG)
@@ -452,7 +454,7 @@ class ApplyRun:
         with suppress(ParamClientError):
             await component.set(step.name, step.value, asker=self._asker)
             acknowledged_at = anyio.current_time()
-            while component._machine.presence.beat_at < acknowledged_at + SYSTEM_CHANGE_DELAY:  # noqa: ASYNC110 - no event
+            while local(component).machine.presence.beat_at < acknowledged_at + SYSTEM_CHANGE_DELAY:  # noqa: ASYNC110 - no event
                 await anyio.sleep(POLL_INTERVAL)
             return
         await anyio.sleep_forever()
@@ -502,7 +504,8 @@ class ApplyRun:
         with anyio.move_on_after(ARMED_STATE_TIMEOUT):
             while component.is_armed is None and component.state != "lost":  # noqa: ASYNC110 - no event
                 await anyio.sleep(POLL_INTERVAL)
-        own = [each for each in component._client.components.values() if each.system == component.system]
+        heard = local(component).client.components.values()
+        own = [each for each in heard if each.system == component.system]
         if any(each.is_armed for each in own):
             message = f"{self._address} is armed; nothing is set then"
         elif component.is_armed is None and component.state != "lost":
@@ -529,15 +532,15 @@ class ApplyRun:
 
     async def _store_state(self) -> None:
         """Store the vehicle's state: in the backup file, and in the cache if the plan has steps."""
-        client, component, inspection = self._component._client, self._component, self.inspection
+        client, component, inspection = local(self._component).client, self._component, self.inspection
         if (path := self._backup) is not None:
             from paramclient.files import write_file
 
-            await client._writer.aside(lambda: write_file(path, inspection.table))
+            await client.cache_writer.aside(lambda: write_file(path, inspection.table))
         cache = client.cache
         if cache is not None and self.plan.steps:
-            await client._writer.write_all()  # the history then has the values from before the change
-            await client._writer.aside(
+            await client.cache_writer.write_all()  # the history then has the values from before the change
+            await client.cache_writer.aside(
                 lambda: cache.store_snapshot(
                     component.identity,
                     component.component,

@@ -11,6 +11,7 @@ from typing import Final, Self
 import anyio
 
 from paramclient.client.component import Component
+from paramclient.client.local import local
 from paramclient.errors import LinkError, NoReply, UsageError, VehicleError
 from paramclient.model.params import copy_params
 from paramclient.model.paramset import ParamSet, WrittenParam
@@ -105,7 +106,7 @@ async def inspect(
         NoReply: the vehicle did not answer.
         LinkError: the link failed, or the client was closed.
     """
-    component._machine.sync.expire_hash()  # the hash may have changed since its announcement
+    local(component).machine.sync.expire_hash()  # the hash may have changed since its announcement
     before = copy_params(component.params)
     with _Search(component, _probably_hidden(component, wanted).difference(absent)) as search:
         fetched = await component.fetch_all()
@@ -204,8 +205,8 @@ async def reread(component: Component, inspection: Inspection, names: Iterable[s
 async def wait_for_identity(component: Component) -> None:
     """Wait until the vehicle is identified, at most `SETUP_IDENTITY_TIMEOUT`, as the cache key requires."""
     with anyio.move_on_after(SETUP_IDENTITY_TIMEOUT):
-        station = component._client._station
-        while station.identity_of(component._machine) is None:  # noqa: ASYNC110 - no event
+        vehicle = local(component)
+        while vehicle.settled_identity is None:  # noqa: ASYNC110 - no event
             await anyio.sleep(POLL_INTERVAL)
 
 
@@ -293,7 +294,7 @@ def _not_covered(component: Component, fetched: FetchResult) -> Collection[str]:
         return ()
     if fetched.hash is None:  # the cache policy did not verify it, or the download was resumed
         return component.params.keys()
-    return component._machine.table.unhashed()
+    return local(component).machine.table.unhashed()
 
 
 async def _read_names(
@@ -343,19 +344,19 @@ class _Search:
     """
 
     def __init__(self, component: Component, names: Iterable[str]) -> None:
-        self._component = component
-        self._spelled = {name: component._machine.spelling(name) for name in names if _is_name(name)}
+        self._component = local(component)
+        self._spelled = {name: self._component.machine.spelling(name) for name in names if _is_name(name)}
         self._search: NameSearch | None = None
 
     def __enter__(self) -> Self:
         if self._spelled:
-            self._search = self._component._machine.search(self._spelled.values(), anyio.current_time())
-            self._component._client._wake(self._component._machine)
+            self._search = self._component.machine.search(self._spelled.values(), anyio.current_time())
+            self._component.wake()
         return self
 
     def __exit__(self, *exc: object) -> None:
         if self._search is not None:
-            self._component._machine.name_searches.cancel(self._search, anyio.current_time())
+            self._component.machine.name_searches.cancel(self._search, anyio.current_time())
 
     def leave_out(self, names: Iterable[str]) -> None:
         """Stop the search for these names, as the vehicle spells them."""
@@ -370,7 +371,7 @@ class _Search:
             LinkError: the link failed, or the client was closed.
         """
         if (search := self._search) is not None and search.open:
-            await self._component._wait(search, None, lambda: ("names", search.attempts))
+            await self._component.wait(search, None, lambda: ("names", search.attempts))
 
     def result(self) -> tuple[dict[str, Param], set[str]]:
         """Return the parameters found, and the names that the vehicle does not have.
@@ -395,7 +396,7 @@ def _probably_hidden(component: Component, wanted: ParamSet) -> frozenset[str]:
     wasted. The result is empty if there are more than `EARLY_READS_MAX`, and if the table is downloaded as a
     list, which reads slow down.
     """
-    if component.autopilot != "ardupilot" or not component._machine.fetches.may_use_file():
+    if component.autopilot != "ardupilot" or not local(component).machine.fetches.may_use_file():
         return frozenset()
     cautions = cautions_for("ardupilot")
     switches = {name for name, each in wanted.items() if cautions.reveals(name) and each.value != 0}

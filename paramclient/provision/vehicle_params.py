@@ -137,7 +137,7 @@ def incomplete_error(component: Component, missing: Sequence[str]) -> VehicleErr
     vehicle = f"{component.system}/{component.component} {component.autopilot}"
     rest = f" and {more} more" if more > 0 else ""
     return VehicleError(
-        f"{vehicle} on {component._client.link.name} is incomplete: {shown}{rest} did not come",
+        f"{vehicle} on {component.identity.link} is incomplete: {shown}{rest} did not come",
         system=component.system,
         component=component.component,
     )

@@ -10,7 +10,7 @@ from typing import Any, Final, Protocol, TypeVar
 import anyio
 
 from paramclient.client import link_task
-from paramclient.client.component import PROGRESS_INTERVAL
+from paramclient.client.arguments import PROGRESS_INTERVAL
 from paramclient.errors import ClientClosed, LinkError, NoReply, ParamClientError
 from paramclient.remote.decoding import understood
 from paramclient.remote.http import Answer, Place, Requests, Unreached

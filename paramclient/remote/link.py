@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import NoReturn
 
-from paramclient.errors import UsageError
+from paramclient.client.local import not_given
 
-__all__ = ["ServiceLink", "not_given"]
+__all__ = ["ServiceLink"]
 
 
 class ServiceLink:
@@ -42,8 +42,3 @@ class ServiceLink:
 
     def _refuse(self) -> NoReturn:
         raise not_given("the bytes of its links")
-
-
-def not_given(what: str) -> UsageError:
-    """What a service does not give."""
-    return UsageError(f"a service does not give {what}: use a program that has the link itself")

@@ -1,25 +1,29 @@
-"""Who is heard on the links of a service, and the mirrors of their tables, kept in step with its events."""
+"""The components on the links of a service, and the mirrors of their tables, kept in step with its events."""
 
 from __future__ import annotations
 
 import logging
 import weakref
-from typing import TYPE_CHECKING, Final
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, Final
 
 import anyio
 
+from paramclient.client.component import Component
 from paramclient.client.events import Contested, Event, Events, Found, Lost, Rebooted, Resynced, Uncontested
 from paramclient.errors import LinkError, NoReply, ParamClientError
-from paramclient.remote.component import Key, RemoteComponent
+from paramclient.remote.component import RemoteComponent
 from paramclient.remote.connection import Connection
 from paramclient.remote.decoding import Document, hash_of, params_of, understood
 from paramclient.remote.http import Answer, Place, Requests, Unreached
+from paramclient.remote.mirrored_component import Key, MirroredComponent, key_of
+from paramclient.remote.problems import NotHeard
 
-if TYPE_CHECKING:
-    from paramclient.remote.client import RemoteClient
+__all__ = ["Roster"]
 
-__all__ = ["Roster", "key_of"]
-
+HEARING_PATIENCE: Final = 2.5
+"""Seconds for a component to be heard by a service that has started again: it sends a heartbeat a second."""
 CATCHING_UP: Final = 2.0
 """Seconds for which an answer waits for the events of what it tells; they mostly came before it."""
 UNSURE: Final = ("cached", "contested", "lost")
@@ -43,30 +47,30 @@ class Roster:
     Who is heard and each table are loaded once events come, and again when some of them were lost.
 
     Args:
-        client: whose components these are.
         requests: how requests travel.
         link: the name of the link that is meant, or None for all.
 
     Attributes:
+        name: the address of the service.
         connection: where events come from.
-        components: everyone, by link and address, in the order of the service.
+        components: all components, by link and address, in the order of the service.
         subscriptions: who listens to what happens to them.
         asker: who we are for the service.
         are_links_stale: is set when something has happened to a link.
     """
 
-    def __init__(self, client: RemoteClient, requests: Requests, link: str | None) -> None:
+    def __init__(self, requests: Requests, link: str | None) -> None:
+        self.name = requests.name
         self.connection = Connection(requests, self)
-        self.components: dict[Key, RemoteComponent] = {}
+        self.components: dict[Key, MirroredComponent] = {}
         self.subscriptions: weakref.WeakSet[Events] = weakref.WeakSet()
         self.asker = ""
         self.are_links_stale = anyio.Event()
-        self._client = client
         self._requests = requests
         self._link = link
         self._is_list_stale = True
-        self._stale: dict[Key, RemoteComponent] = {}
-        self._gone: dict[Key, RemoteComponent] = {}
+        self._stale: dict[Key, MirroredComponent] = {}
+        self._gone: dict[Key, MirroredComponent] = {}
 
     def take(self, event: Document) -> None:
         """See `Follower`."""
@@ -75,111 +79,114 @@ class Roster:
             self.are_links_stale.set()
         if "component" not in event or self._link not in (None, event["link"]):
             return
-        component = self.components.get(key_of(event))
+        mirrored = self.components.get(key_of(event))
         match kind:
             case "component":
-                self._take_component(event, component)
-            case _ if component is None:
+                self._take_component(event, mirrored)
+            case _ if mirrored is None:
                 self._is_list_stale = True
             case "change":
-                component._take_change(event, self.asker)
+                mirrored.take_change(event, self.asker)
             case "params":
-                self._doubt(component)
+                self._doubt(mirrored)
             case "resynced":
                 told = tuple(event["changed"])
-                component._announce(Resynced(component, told, hash_of(event["hash"])))
+                mirrored.announce(Resynced(mirrored.component, told, hash_of(event["hash"])))
             case "progress":
-                component._take_progress(event)
+                mirrored.take_progress(event)
 
     def leave(self) -> None:
         """See `Follower`."""
-        for component in self.components.values():
-            component._mirror.leave()
+        for mirrored in self.components.values():
+            mirrored.mirror.leave()
 
     def resume(self) -> None:
         """See `Follower`."""
-        for component in self.components.values():
-            component._mirror.resume()
+        for mirrored in self.components.values():
+            mirrored.mirror.resume()
 
     def begin_anew(self) -> None:
         """See `Follower`."""
         self._is_list_stale = True
-        for component in self.components.values():
-            component._seq = -1  # another run of the service counts from the beginning
-            component._mirror.resume()
-            self._doubt(component)
+        for mirrored in self.components.values():
+            mirrored.seq = -1  # another run of the service counts from the beginning
+            mirrored.mirror.resume()
+            self._doubt(mirrored)
 
-    def _take_component(self, event: Document, known: RemoteComponent | None) -> None:
+    def _take_component(self, event: Document, known: MirroredComponent | None) -> None:
         why = event["why"]
         if why == "forgotten":
             if known is not None:
                 self._forget(known)
             return
-        component = known or self.meet(event["component_doc"], event["seq"])
-        state = component.state
-        component._take_document(event["component_doc"], event["seq"])
-        if component.state != state and component.state in UNSURE:
-            self._doubt(component)
+        mirrored = known or self.meet(event["component_doc"], event["seq"])
+        state = mirrored.component.state
+        mirrored.take_document(event["component_doc"], event["seq"])
+        if mirrored.component.state != state and mirrored.component.state in UNSURE:
+            self._doubt(mirrored)
         match why:
             case "heard":
-                component._announce_first()
+                mirrored.announce_first()
             case "lost":
-                self._doubt(component)
-                component._announce(Lost(component, event["silence_s"]))
+                self._doubt(mirrored)
+                mirrored.announce(Lost(mirrored.component, event["silence_s"]))
             case "found":
-                component._announce(Found(component, event["silence_s"]))
+                mirrored.announce(Found(mirrored.component, event["silence_s"]))
             case "contested":
-                self._doubt(component)
-                if component.contest is not None:
-                    component._announce(Contested(component, component.contest))
+                self._doubt(mirrored)
+                contest = mirrored.component.contest
+                if contest is not None:
+                    mirrored.announce(Contested(mirrored.component, contest))
             case "uncontested":
-                self._doubt(component)
-                component._announce(Uncontested(component))
+                self._doubt(mirrored)
+                mirrored.announce(Uncontested(mirrored.component))
             case "rebooted":
-                self._doubt(component)
-                component._announce(Rebooted(component))
+                self._doubt(mirrored)
+                mirrored.announce(Rebooted(mirrored.component))
 
     def publish(self, event: Event) -> None:
         """Tell those who listen."""
         for events in list(self.subscriptions):
             events.push(event)
 
-    def meet(self, document: Document, seq: int) -> RemoteComponent:
-        """The component of a document that tells how it stood after this event; it may be new here."""
+    def meet(self, document: Document, seq: int) -> MirroredComponent:
+        """Return the component of a document that tells how it stood after this event; it may be new here."""
         key = key_of(document)
-        component = self.components.get(key)
-        if component is None:
+        mirrored = self.components.get(key)
+        if mirrored is None:
             if len(self.components) >= MOST_COMPONENTS:
                 raise ValueError(f"more than {MOST_COMPONENTS} components")
-            component = self._gone.pop(key, None) or RemoteComponent(self._client, document, seq)
-            component._return(document, seq)
-            self.components[key] = component
-            self._stale[key] = component
+            mirrored = self._gone.pop(key, None) or MirroredComponent(
+                document, seq, partial(RemoteComponent, self), self.publish
+            )
+            mirrored.come_back(document, seq)
+            self.components[key] = mirrored
+            self._stale[key] = mirrored
             self.connection.tell()
-        return component
+        return mirrored
 
-    def _doubt(self, component: RemoteComponent) -> None:
-        component._mirror.doubt()
-        self._stale[component._key] = component
+    def _doubt(self, mirrored: MirroredComponent) -> None:
+        mirrored.mirror.doubt()
+        self._stale[mirrored.key] = mirrored
 
-    def _forget(self, component: RemoteComponent) -> None:
+    def _forget(self, mirrored: MirroredComponent) -> None:
         """The service does not know it any more, or not yet again: it may have started anew, or its link."""
-        key = component._key
+        key = mirrored.key
         self._stale.pop(key, None)
         if self.components.pop(key, None) is not None:
-            component._leave()
-            self._gone[key] = component
+            mirrored.leave()
+            self._gone[key] = mirrored
             if len(self._gone) > MOST_GONE:
-                self._gone.pop(next(iter(self._gone)))._part()
+                self._gone.pop(next(iter(self._gone))).forget()
 
-    def same_ids(self, component: RemoteComponent) -> list[RemoteComponent]:
+    def same_ids(self, mirrored: MirroredComponent) -> list[MirroredComponent]:
         """All with its ids, on whatever link."""
-        return [each for key, each in self.components.items() if key[1:] == component._key[1:]]
+        return [each for key, each in self.components.items() if key[1:] == mirrored.key[1:]]
 
     # what is loaded
 
     async def until_current(
-        self, component: RemoteComponent | None, place: Place | None, *, patience: float | None = CATCHING_UP
+        self, mirrored: MirroredComponent | None, place: Place | None, *, patience: float | None = CATCHING_UP
     ) -> None:
         """Wait until what had happened up to a place is in a table, but not for longer than this.
 
@@ -188,26 +195,77 @@ class Roster:
         """
         connection = self.connection
         with anyio.move_on_after(patience):
-            while component is not None:
+            while mirrored is not None:
                 has_come = (
                     place is None
                     or connection.place is None
                     or connection.place.run != place.run
                     or connection.place.seq >= place.seq
                 )
-                if has_come and component._mirror.is_loaded:
+                if has_come and mirrored.mirror.is_loaded:
                     return
-                if component._key in self._stale:  # it is the next to be loaded
-                    self._stale = {component._key: component, **self._stale}
+                if mirrored.key in self._stale:  # it is the next to be loaded
+                    self._stale = {mirrored.key: mirrored, **self._stale}
                 await connection.news.wait()
                 connection.check_open()
 
-    async def given(self, answer: Answer, patience: float | None = CATCHING_UP) -> RemoteComponent:
-        """The component that an answer is about, with its table."""
-        with understood(self._requests.name):
+    async def given(self, answer: Answer) -> Component:
+        """Return the component that an answer is about, with its table."""
+        return (await self.mirror_for(answer)).component
+
+    async def mirror_for(self, answer: Answer, patience: float | None = CATCHING_UP) -> MirroredComponent:
+        """Return what is known of the component that an answer is about, with its table.
+
+        Args:
+            answer: its document is that of a component.
+            patience: seconds to wait for the table; None waits until it has come.
+        """
+        with understood(self.name):
             found = self.meet(answer.document, -1 if answer.place is None else answer.place.seq)
         await self.until_current(found, answer.place, patience=patience)
         return found
+
+    async def ask(
+        self,
+        mirrored: MirroredComponent,
+        what: str,
+        body: Mapping[str, Any],
+        timeout: float | None,
+        awaited: str,
+        *,
+        method: str = "POST",
+        is_write: bool = False,
+        waits_for_ever: bool = False,
+    ) -> Answer:
+        """See `Service.ask` and `Connection.ask`."""
+        began = anyio.current_time()
+        request = partial(
+            self.connection.ask,
+            method,
+            f"{mirrored.path}/{what}",
+            body,
+            awaited=awaited,
+            waits_for_ever=waits_for_ever,
+            link=mirrored.link_name,
+            is_write=is_write,
+        )
+        try:
+            answer = await request(timeout=timeout)
+        except NotHeard:
+            left = None if timeout is None else began + timeout - anyio.current_time()
+            patience = min(HEARING_PATIENCE, HEARING_PATIENCE if left is None else left)
+            await self._until_heard(mirrored, patience)
+            left = None if timeout is None else began + timeout - anyio.current_time()
+            answer = await request(timeout=left)
+        await self.until_current(mirrored, answer.place)
+        return answer
+
+    async def _until_heard(self, mirrored: MirroredComponent, patience: float) -> None:
+        """Wait until the service knows a component again."""
+        link, system, component = mirrored.key
+        body = {"system": system, "component": component}
+        awaited = f"{system}/{component} (lost)"
+        await self.connection.ask("POST", "/find", body, awaited=awaited, timeout=patience, link=link)
 
     async def run(self) -> None:
         """Load what is not known to be the service's, for as long as the client is open."""
@@ -222,7 +280,7 @@ class Roster:
                 else:
                     await self._load(next(iter(self._stale.values())))
             except (Unreached, ParamClientError) as error:
-                logger.info("%s: a table could not be loaded: %s", self._requests.name, error)
+                logger.info("%s: a table could not be loaded: %s", self.name, error)
                 await anyio.sleep(RETRY_PAUSE)
 
     async def load_list(self) -> None:
@@ -230,7 +288,7 @@ class Roster:
         self._is_list_stale = False
         try:
             answer = await self._snapshot("/components", None)
-            with understood(self._requests.name):
+            with understood(self.name):
                 self._take_list(answer["components"], answer["seq"])
         except BaseException:
             self._is_list_stale = True
@@ -242,28 +300,28 @@ class Roster:
         listed = [document for document in documents if self._link in (None, document["link"])]
         self.components = {key: before[key] for document in listed if (key := key_of(document)) in before}
         for document in listed:
-            component = self.meet(document, seq)
-            component._take_document(document, seq)
-            component._announce_first()
-        for key, component in before.items():
+            mirrored = self.meet(document, seq)
+            mirrored.take_document(document, seq)
+            mirrored.announce_first()
+        for key, mirrored in before.items():
             if key not in self.components:
-                self.components[key] = component
-                if component._seq <= seq:  # else it was heard since
-                    self._forget(component)
+                self.components[key] = mirrored
+                if mirrored.seq <= seq:  # else it was heard since
+                    self._forget(mirrored)
 
-    async def _load(self, component: RemoteComponent) -> None:
+    async def _load(self, mirrored: MirroredComponent) -> None:
         """The table of one."""
-        component._mirror.begin()
+        mirrored.mirror.begin()
         try:
-            answer = await self._snapshot(f"{component._path}/params", component.link_name)
+            answer = await self._snapshot(f"{mirrored.path}/params", mirrored.link_name)
         except NoReply:
-            self._forget(component)
+            self._forget(mirrored)
             return
-        with understood(self._requests.name):
-            changes = component._mirror.load(answer["seq"], params_of(answer["params"]))
+        with understood(self.name):
+            changes = mirrored.mirror.load(answer["seq"], params_of(answer["params"]))
         if changes is not None:
-            self._stale.pop(component._key, None)
-            component._loaded(changes)
+            self._stale.pop(mirrored.key, None)
+            mirrored.table_was_loaded(changes)
             self.connection.tell()
 
     async def _snapshot(self, path: str, link: str | None) -> Document:
@@ -271,13 +329,8 @@ class Roster:
         asked = await self._requests.ask("GET", path, link=link, patience=ANSWER_PATIENCE)
         answer: Document = asked.document
         place = self.connection.place
-        with understood(self._requests.name):
+        with understood(self.name):
             is_of_run = place is not None and answer["run"] == place.run
         if not is_of_run:
-            raise LinkError(f"{self._requests.name}: it has started again", link=self._requests.name)
+            raise LinkError(f"{self.name}: it has started again", link=self.name)
         return answer
-
-
-def key_of(document: Document) -> Key:
-    """Which component a document is about."""
-    return str(document["link"]), int(document["system"]), int(document["component"])

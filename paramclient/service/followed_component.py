@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import anyio
 
 from paramclient.client.component import Component
-from paramclient.client.events import Changes
+from paramclient.client.local import local
+from paramclient.client.subscription import Changes
 from paramclient.documents.component import ComponentDoc, ProgressDoc
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.model.notation import bits_text, value_json
@@ -22,12 +23,28 @@ from paramclient.service.event_feed import COMPACT
 if TYPE_CHECKING:
     from paramclient.metadata import Metadata
     from paramclient.service.event_feed import Feed
-    from paramclient.service.link import Line
 
-__all__ = ["Followed", "param_text"]
+__all__ = ["Followed", "FollowedLink", "param_text"]
 
 MOST_TOLD_SINGLY: Final = 32
 """Parameters whose trust alone has moved, of which each is told; of more it is told that they have."""
+
+
+class FollowedLink(Protocol):
+    """What a component needs of the link that it is on.
+
+    Attributes:
+        name: the name of the link on the service.
+        state: the state of the link, in a word.
+        followed: the components on the link, by system and component id.
+    """
+
+    name: str
+    state: str
+    followed: dict[tuple[int, int], Followed]
+
+    def forget(self, followed: Followed) -> None:
+        """Follow a component no longer."""
 
 
 class Followed:
@@ -39,8 +56,8 @@ class Followed:
         metadata: what its firmware says of its parameters, as far as that is here.
     """
 
-    def __init__(self, component: Component, line: Line, feed: Feed) -> None:
-        self.component = component
+    def __init__(self, component: Component, line: FollowedLink, feed: Feed) -> None:
+        self.component = local(component)
         self.line = line
         self.metadata: Metadata | None = None
         self._feed = feed
@@ -51,7 +68,7 @@ class Followed:
         self._is_fetching = False
         self._last_fetch: object = None
         self._sink = _Sink(self)
-        component._listen(self._sink)
+        self.component.listen(self._sink)
 
     def __repr__(self) -> str:
         return f"<Followed {self.component!r} on {self.line.name}>"
@@ -64,13 +81,13 @@ class Followed:
     @property
     def key(self) -> str | None:
         """The key under which its table is kept; None while it is open who the vehicle is."""
-        identity = self.component._client._station.identity_of(self.component._machine)
+        identity = self.component.settled_identity
         return None if identity is None else identity.key
 
     @property
     def document(self) -> ComponentDoc:
         """How it stands now."""
-        machine = self.component._machine
+        machine = self.component.machine
         fetch = machine.fetch
         return ComponentDoc.of(
             self.component,
@@ -133,7 +150,7 @@ class Followed:
 
     def look_at_state(self) -> None:
         """The same of its state, and of a fetch under way."""
-        machine = self.component._machine
+        machine = self.component.machine
         fetch = machine.fetch
         if fetch is not None:
             self._is_fetching = True
@@ -151,7 +168,7 @@ class Followed:
 
     def close(self) -> None:
         """Hear no more of it."""
-        self.component._subscriptions.discard(self._sink)
+        self.component.ignore(self._sink)
 
     def changed(self, change: Change) -> None:
         """A value has changed."""
@@ -174,7 +191,7 @@ class Followed:
     def _look_at_values(self) -> None:
         """See which parameters are others than were told: their trust, default or index has moved."""
         params, shown = as_params(self.component.params), self._shown
-        last = self.component._machine.fetches.last
+        last = self.component.machine.fetches.last
         if last is not self._last_fetch:
             self._last_fetch = last
             self._was_fetched()
@@ -232,7 +249,7 @@ class Followed:
             component.state,
             component.sync_state,
             component.is_armed,
-            component._machine.fetches.last,
+            component.machine.fetches.last,
             self.line.state,
         )
 

@@ -17,9 +17,9 @@ import anyio.abc
 import anyio.lowlevel
 
 from paramclient.cache import SetupNotes
+from paramclient.client.arguments import address_in_words
 from paramclient.client.cache_writer import chosen_cache
-from paramclient.client.client import ParamClient
-from paramclient.client.component import address_in_words
+from paramclient.client.client import ParamClient, local_client
 from paramclient.client.worker_thread import Worker
 from paramclient.documents.component import ProgressDoc
 from paramclient.documents.job import progress_text
@@ -289,28 +289,28 @@ class Hub:
             while True:
                 self._check_open()
                 now = anyio.current_time()
-                clients = [(line, line.client) for line in chosen if line.client is not None]
-                news = [line.news for line in chosen] + [client._carrier.news for _, client in clients]
+                clients = [(line, local_client(line.client)) for line in chosen if line.client is not None]
+                news = [line.news for line in chosen] + [client.link_task.news for _, client in clients]
                 machines = {
                     machine: line
                     for line, client in clients
-                    for machine in client._station.components.values()
+                    for machine in client.station.components.values()
                 }
-                since = max((client._station.listening_since for _, client in clients), default=math.inf)
+                since = max((client.station.listening_since for _, client in clients), default=math.inf)
                 machine = choice.look(machines, now, listening_since=since)
                 followed = None
                 if machine is not None:
                     followed = machines[machine].followed.get((machine.system, machine.component))
                 if followed is not None:
-                    await followed.component._wait_for_cache()
+                    await followed.component.wait_for_cache()
                     return followed
                 with ExitStack() as looking:
                     for _, client in clients:
-                        looking.enter_context(client._station.looking_for_others())
+                        looking.enter_context(client.station.looking_for_others())
                     with anyio.move_on_after(None if choice.due == math.inf else choice.due - now):
                         await _any_of([*news, self._closing])
                 for _, client in clients:
-                    await client._carrier.read_up(choice.due)
+                    await client.link_task.read_up(choice.due)
         awaited = address_in_words(system, component)
         if choice.due < math.inf:
             awaited += f", and {LOOK_TIME} s more to see that it is the only one"
@@ -348,13 +348,13 @@ class Hub:
 
     async def _welcome(self, followed: Followed) -> None:
         """See what is known of a component already, and bring its table up to date."""
-        client = followed.component._client
+        client = followed.component.client
         with suppress(ParamClientError, ServiceError):
-            await followed.component._wait_for_cache()
+            await followed.component.wait_for_cache()
             await self._recall(followed)
-        machine = followed.component._machine
+        machine = followed.component.machine
         is_due = machine.who.has_parameters and machine.fetch is None and machine.sync_state == "unsynced"
-        if self._fetches and is_due and not client.listens_only:
+        if self._fetches and is_due and not client.station.listens_only:
             with suppress(ServiceError):  # as many are under way as may be
                 self.begin_fetch(followed, OURSELVES)
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import anyio
 import anyio.lowlevel
 
-from paramclient.client.client import ParamClient
+from paramclient.client.client import ParamClient, local_client
 from paramclient.client.events import (
     Contested,
     Event,
@@ -178,12 +178,10 @@ class Line:
         self._over = anyio.Event()
         self._ending = None
         self._sink = _Sink(self)
-        client._subscriptions.add(self._sink)
+        local_client(client).subscribe(self._sink)
         for component in client.components.values():
             self.happened(Heard(component))
         self._become("open")
-        if client._is_over:
-            self.over(client._carrier.ended)
 
     async def _watch(self) -> None:
         """Tell of what nobody tells of, until the link has failed for good."""
@@ -209,9 +207,9 @@ class Line:
         client = self.client
         if client is None:
             return
-        carrier = client._carrier
-        if carrier.is_away:
-            error = self.error if carrier.broken is None else str(carrier.broken)
+        task = local_client(client).link_task
+        if task.is_away:
+            error = self.error if task.broken is None else str(task.broken)
             self._become("away", error or f"{self.name} has dropped and is being opened again")
         elif self.state == "away":
             self._become("open")

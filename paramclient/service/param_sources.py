@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeVar
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
+from paramclient.client.client import local_client
 from paramclient.documents.document import Body, InParts
 from paramclient.errors import NotInCache, UnknownVehicle, UsageError
 from paramclient.files import FileForm, ParamFile, loads
@@ -283,7 +284,7 @@ async def written(hub: Hub) -> None:
         CacheError: it cannot be written, so that no answer from the cache would be the whole one.
     """
     for _, client in hub.clients():
-        await client._writer.write_all()
+        await local_client(client).cache_writer.write_all()
 
 
 async def past(hub: Hub, key: str, component: int, when: float | int | None) -> ParamSet:

@@ -32,7 +32,11 @@ from paramclient import (
 )
 from paramclient.cache import CachedComponent
 from paramclient.client import cache_writer
-from paramclient.client import component as component_module
+from paramclient.client import link_component as component_module
+from paramclient.client.client import implementation_of, local_client
+from paramclient.client.link_client import LinkClient
+from paramclient.client.link_component import LinkComponent
+from paramclient.client.local import local
 from paramclient.model.paramset import ParamSet
 from paramclient.protocol import wire
 from paramclient.provision import apply
@@ -113,6 +117,7 @@ async def test_an_unchanged_vehicle_is_not_downloaded_again(
         assert component.state == "cached"
         assert trusts(component, volatile) == {Trust.CACHED}
         result = await component.fetch_all()
+        assert isinstance(component, LinkComponent)
         assert anyio.current_time() - component._heard_at < 0.21, "one round trip after it was heard"
         assert (result.source, result.complete, result.hash) == ("cache", True, vehicle.announced_hash())
         assert bits(result.params) == bits(vehicle.params)
@@ -359,7 +364,7 @@ async def test_the_end_of_a_table_is_no_news_of_the_vehicle_that_has_gone(path: 
         second.reboot(anyio.current_time(), down=10.0)
         gone = await anext(component.changes())
         assert gone.new is None
-        await client._writer.flush()  # which the clock may bring about at any moment
+        await local_client(client).cache_writer.flush()  # which the clock may bring about at any moment
     with ParamCache(path) as cache:
         table = cache.load(f"uid:{0xA:016x}", 1)
         assert table is not None
@@ -381,8 +386,10 @@ async def test_another_vehicle_takes_the_place_while_the_cache_is_read(path: Pat
             return super().load(key, component)
 
     def hear_of_another() -> None:
-        client._station.receive(version, "sim", anyio.current_time())
-        client._dispatch()
+        implementation = implementation_of(client)
+        assert isinstance(implementation, LinkClient)
+        implementation.station.receive(version, "sim", anyio.current_time())
+        implementation._dispatch()
 
     with Interrupted(path) as cache:
         async with ParamClient(tap, cache=cache) as client:
@@ -660,7 +667,7 @@ async def test_what_goes_from_the_table_goes_from_the_cache(path: Path) -> None:
     await session(small_px4(), path)
     async with ParamClient(small_px4(), cache=path) as client:
         component = await client.component()
-        component._machine.table.remove(lambda param: param.name == "PARAM_01")
+        local(component).machine.table.remove(lambda param: param.name == "PARAM_01")
     assert "PARAM_01" not in kept(path)
 
 

@@ -35,9 +35,9 @@ from paramclient import (
     UsageError,
     ValueNotApplied,
 )
-from paramclient.client import client as client_module
-from paramclient.client import link_task
-from paramclient.client.component import IDENTITY_PATIENCE
+from paramclient.client import arguments, link_task
+from paramclient.client.client import local_client
+from paramclient.client.link_component import IDENTITY_PATIENCE
 from paramclient.links import Peer, create_link, serve_endpoint
 from paramclient.protocol import wire
 from paramclient.protocol.station import Station
@@ -60,7 +60,7 @@ from tests.shell import (
     tasks_beside,
     until,
 )
-from tests.ways import DIRECT, direct_only, looks, pytest_generate_tests, way
+from tests.ways import DIRECT, direct_only, listeners, looks, pytest_generate_tests, way
 
 __all__ = ["pytest_generate_tests", "way"]
 
@@ -494,7 +494,7 @@ async def test_a_component_that_is_not_there(wanted: dict[str, Any], words: str)
         began = anyio.current_time()
         with pytest.raises(NoReply):
             await client.component(**wanted)
-        assert round(anyio.current_time() - began, 3) == client_module.HEARING_PATIENCE
+        assert round(anyio.current_time() - began, 3) == arguments.HEARING_PATIENCE
 
 
 # Reading and writing
@@ -1105,9 +1105,9 @@ async def test_nobody_is_told_who_has_gone() -> None:
     async with a_client(small_px4()) as client:
         component = await client.component()
         changes = component.changes()
-        assert len(component._subscriptions) == 1
+        assert len(listeners(component)) == 1
         del changes
-        assert not component._subscriptions
+        assert not listeners(component)
 
 
 @swiftly
@@ -1372,7 +1372,7 @@ class Chatter(Tap):
 async def known_component(client: ParamClient) -> Component:
     """The component, after it has said who it is."""
     component = await client.component()
-    await until(lambda: not client._station.is_waiting)
+    await until(lambda: not local_client(client).station.is_waiting)
     return component
 
 

@@ -13,6 +13,7 @@ import pytest
 
 from paramclient import CacheError, NotDurable, ParamCache, ParamClient, UsageError
 from paramclient.cache.sqlite_file import Database
+from paramclient.client.client import local_client
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.provision import apply
 from tests.caches import CACHE_ALONE, start, whole_table
@@ -129,7 +130,7 @@ async def test_without_a_disk_nothing_is_sent_or_it_is_said_what_the_vehicle_has
             await component.set(NAME, 11.0, durable=True)
             assert cache.component().params[NAME].value == 11.0
             with (
-                mock.patch.object(client._writer, "_is_doubted", return_value=True),
+                mock.patch.object(local_client(client).cache_writer, "_is_doubted", return_value=True),
                 pytest.raises(CacheError, match="nothing was set: it is not known which vehicle 1/1 is"),
             ):
                 await component.set(NAME, 12.0, durable=True)

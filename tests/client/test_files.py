@@ -10,8 +10,9 @@ import anyio
 import pytest
 
 from paramclient import ClientClosed, NoReply, ParamClient, UsageError
-from paramclient.client.client import SESSION_PATIENCE
 from paramclient.client.files import Ftp
+from paramclient.client.link_client import SESSION_PATIENCE
+from paramclient.client.local import local
 from paramclient.errors import FileErrorCode, FileTransferError, LinkError
 from paramclient.links import SimLink
 from paramclient.model.values import ParamType, crc32_px4
@@ -129,7 +130,7 @@ async def test_cancellation_closes_the_file() -> None:
             await files.write("/APM/new", LOG)
         await anyio.sleep(1.0)
         assert not vehicle.open_files
-        assert client.components[1, 1]._machine.files.is_idle
+        assert local(client.components[1, 1]).machine.files.is_idle
 
 
 @pytest.mark.parametrize("how", ["timeout", "error", "cancelled", "scope"])
@@ -270,7 +271,7 @@ async def test_reads_are_done_in_order() -> None:
                 await asyncio.sleep(0)
             tasks.start_soon(client.components[1, 1].fetch_all)
         assert ended == ["/APM/LOGS/1.BIN", "/APM/a.txt", "/APM/empty"]
-        last = client.components[1, 1]._machine.fetches.last
+        last = local(client.components[1, 1]).machine.fetches.last
         assert last is not None
         assert last.source == "ftp"
 
@@ -302,7 +303,7 @@ async def test_nothing_is_asked_of_a_component_that_is_lost() -> None:
         await anyio.sleep(3.0)
         assert await files.read("/APM/a.txt") == b"hello"
         await anyio.sleep(1.0)
-        assert component._machine.files.is_idle
+        assert local(component).machine.files.is_idle
 
 
 @swiftly

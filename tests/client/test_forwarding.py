@@ -15,6 +15,8 @@ import pytest
 from paramclient import LinkError, ParamType
 from paramclient.cli import run
 from paramclient.client import forwarding, link_task
+from paramclient.client.client import implementation_of
+from paramclient.client.link_client import LinkClient
 from paramclient.links import Peer, create_link
 from paramclient.links.tlog import read_records
 from paramclient.model.values import Encoding, encode
@@ -168,14 +170,17 @@ async def test_a_program_that_reads_nothing_holds_nothing_up(monkeypatch: pytest
         assert bits((await component.fetch_all()).params) == bits(vehicle.params)
         assert (await component.set("PARAM_01", 8)).status == "accepted"
         assert anyio.current_time() - began < 3.0
-        assert client._beside.forwarder is not None
-        assert len(client._beside.forwarder._waiting) == 10
-        lost = client._beside.forwarder.lost
+        implementation = implementation_of(client)
+        assert isinstance(implementation, LinkClient)
+        forwarder = implementation._beside.forwarder
+        assert forwarder is not None
+        assert len(forwarder._waiting) == 10
+        lost = forwarder.lost
         assert lost > 10
         program.is_stuck = False
         await anyio.sleep(3.0)
-        assert not client._beside.forwarder._waiting
-        assert client._beside.forwarder.lost < lost + 20
+        assert not forwarder._waiting
+        assert forwarder.lost < lost + 20
     assert len(program.heard) >= 11
 
 

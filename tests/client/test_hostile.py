@@ -18,8 +18,10 @@ from paramclient import FileTransferError, NoReply, ParamCache, ParamClient
 from paramclient.cli import connection as session_room
 from paramclient.cli import run as run_command
 from paramclient.client import cache_writer
-from paramclient.client import events as events_room
-from paramclient.client.events import Changes
+from paramclient.client import subscription as subscription_room
+from paramclient.client.client import local_client
+from paramclient.client.local import local
+from paramclient.client.subscription import Changes
 from paramclient.links import SimLink
 from paramclient.protocol import component as component_room
 from paramclient.protocol import station as station_room
@@ -207,7 +209,7 @@ def test_a_flood_of_random_systems_from_random_peers_stays_within_the_page_of_th
 
 
 def test_changes_that_nobody_takes_are_so_many_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(events_room, "MOST_CHANGES", 3)
+    monkeypatch.setattr(subscription_room, "MOST_CHANGES", 3)
     changes = Changes()
     for name in "ABCDE":
         changes.push(Change(name, None, known(name)))
@@ -424,7 +426,7 @@ async def test_one_that_is_another_vehicle_each_time_fills_no_cache(
             liar.say(AutopilotVersion(16, uid=number + 1))
             liar.say(param_value(f"V{number}"))
             await anyio.sleep(LOST_AFTER + 2 * cache_writer.FLUSH_INTERVAL)  # till then it may be two
-            assert len(client._writer._bringing) <= 1
+            assert len(local_client(client).cache_writer._bringing) <= 1
     with ParamCache(path) as cache:
         systems = [each.identity.system for each in cache.vehicles()]
         assert systems.count(66) == kept
@@ -456,11 +458,11 @@ async def test_a_component_that_is_forgotten_ends_what_listens_to_it(monkeypatch
         other = await client.component(66, 1)
         changes = other.changes()
         await anyio.sleep(10)
-        other._machine.presence.is_lost = True
+        local(other).machine.presence.is_lost = True
         liar.say(Heartbeat(2, 12), 77)
         with pytest.raises(NoReply, match=r"66/1 \(lost\)"):
             await anext(changes)
-        assert [*client.components] == [*client._station.components] == [(1, 1), (77, 1)]
+        assert [*client.components] == [*local_client(client).station.components] == [(1, 1), (77, 1)]
         with pytest.raises(NoReply):
             await other.get("A")
 

@@ -20,6 +20,7 @@ from paramclient import (
     UsageError,
 )
 from paramclient.cli import run
+from paramclient.client.client import local_client
 from paramclient.model.values import Encoding, encode
 from paramclient.protocol import wire
 from paramclient.protocol.params.passive import LONGEST_PAUSE, OVERHEARING_PATIENCE
@@ -75,7 +76,7 @@ async def test_not_a_byte_is_sent() -> None:
         channel.is_mute = False
         await anyio.sleep(60.0)
         assert component.state == "new"
-        assert not client._station.is_waiting
+        assert not local_client(client).station.is_waiting
         assert residue(component) == []
         assert client.bytes_sent == 0
     assert channel.heard == []

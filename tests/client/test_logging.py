@@ -49,8 +49,8 @@ async def test_each_step_is_told_in_one_line(caplog: pytest.LogCaptureFixture, t
     ):
         assert sum(bool(re.fullmatch(step, each)) for each in steps) == 1, step
     assert len(steps) < 15, "values of a list are not told one by one"
-    assert told(caplog, "client.client")[0] == "sim:custom: open"
-    assert told(caplog, "client.client")[-1] == "sim:custom: closing"
+    assert told(caplog, "client.link_client")[0] == "sim:custom: open"
+    assert told(caplog, "client.link_client")[-1] == "sim:custom: closing"
     assert any("nothing" in each for each in told(caplog, "client.cache_writer"))
     caplog.clear()
     with caplog.at_level(logging.DEBUG, WATCHED):

@@ -6,9 +6,10 @@ import anyio
 import pytest
 
 from paramclient import AmbiguousVehicle, Component, LinkError, NoReply, UsageError
+from paramclient.client.client import local_client
 from paramclient.protocol import wire
 from paramclient.protocol.vehicle_selection import LOOK_TIME
-from paramclient.remote import RemoteClient
+from paramclient.remote import RemoteClient, RemoteComponent
 from paramclient.service import Hub, create_app
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from tests.asgi import ASGITransport
@@ -147,7 +148,7 @@ async def test_after_an_absence_of_the_link_a_second_one_is_looked_for_again() -
     async with a_client(link) as client:
         await client.only_component()
         await link.drop()
-        await until(lambda: client._carrier.is_away)
+        await until(lambda: local_client(client).link_task.is_away)
         began = swift_loop().now
         found = await client.only_component()
         assert swift_loop().now - began >= LOOK_TIME
@@ -199,6 +200,7 @@ async def test_one_address_on_two_links_of_a_service_is_chosen_by_the_link() -> 
         name = "http://127.0.0.1:8765?link=tcp:flaky:5760"
         async with RemoteClient(name, transport=ASGITransport(app)) as client:
             found = await client.only_component()
+            assert isinstance(found, RemoteComponent)
             assert found.link_name == "tcp:flaky:5760"
 
 

@@ -228,7 +228,7 @@ async def test_a_cached_table_that_is_being_read_is_waited_for(
     path = tmp_path / "cache.sqlite3"
     async with ParamClient(small(1), cache=path) as client:
         await (await client.component()).fetch_all()
-    monkeypatch.setattr("paramclient.client.component.IDENTITY_PATIENCE", 0.05)
+    monkeypatch.setattr("paramclient.client.link_component.IDENTITY_PATIENCE", 0.05)
     with SlowCache(path) as cache:
         async with ParamClient(small(1), cache=cache) as client:
             assert (await client.fetch_all()).results[1, 1].source == "cache"

@@ -30,7 +30,9 @@ from paramclient import (
     Trust,
     UsageError,
 )
-from paramclient.client.events import MOST_EVENTS, Changes
+from paramclient.client.client import implementation_of
+from paramclient.client.events import MOST_EVENTS
+from paramclient.client.subscription import Changes
 from paramclient.protocol import wire
 from paramclient.protocol.wire import HASH_CHECK, ParamRequestList, ParamRequestRead, ParamSet
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle
@@ -546,7 +548,7 @@ async def test_nobody_is_told_who_has_gone() -> None:
         gone: weakref.ref[Events] = weakref.ref(client.events())
         gc.collect()
         assert gone() is None
-        assert not client._subscriptions
+        assert not implementation_of(client)._subscriptions
 
 
 @swiftly

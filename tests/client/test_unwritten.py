@@ -19,6 +19,8 @@ import pytest
 from paramclient import CacheError, Component, ParamCache, ParamClient
 from paramclient.cache import sqlite_file
 from paramclient.client.cache_writer import FLUSH_INTERVAL, RETRY_INTERVAL
+from paramclient.client.client import local_client
+from paramclient.client.local import local
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.provision import apply
 from paramclient.sim import PX4Vehicle
@@ -65,8 +67,8 @@ def is_heard(component: Component, value: float) -> bool:
 
 async def written(client: ParamClient, component: Component) -> None:
     """Wait until all that was heard of a component is in the cache."""
-    await until(lambda: client._writer.obstacle(component._machine) is None)
-    await client._writer.write_all()
+    await until(lambda: local_client(client).cache_writer.obstacle(local(component).machine) is None)
+    await local_client(client).cache_writer.write_all()
 
 
 Holding = Callable[[Path], AbstractContextManager[None]]

@@ -16,6 +16,7 @@ import anyio
 
 from paramclient import Component, FetchResult, Ftp, ParamCache, ParamClient, Rebooted
 from paramclient.client.events import Events
+from paramclient.client.local import local
 from paramclient.errors import (
     FileTransferError,
     NoReply,
@@ -813,7 +814,7 @@ async def reboot(session: Session) -> Measured:
         value = another_value(await vehicle.get(name))
         await session.journal.set(vehicle, name, value)
         await anyio.sleep(SAVING_TIME)
-        events = vehicle._client.events()
+        local(vehicle).client.subscribe(events := Events())
         began = time.monotonic()
         vehicle = await vehicle.reboot()
         seconds = time.monotonic() - began
@@ -850,7 +851,7 @@ async def reboot_by_another(session: Session) -> Measured:
     async with session.client() as watching, second_client(session) as other:
         await watching.fetch_all()
         await check_disarmed(watching)
-        events = watching._client.events()
+        local(watching).client.subscribe(events := Events())
         await anyio.sleep(BASELINE_TIME)
         began = time.monotonic()
         await other.reboot()

@@ -16,6 +16,7 @@ import anyio.to_thread
 import pytest
 
 from paramclient import ClientClosed, FileTransferError, NoReply, ParamCache, UsageError
+from paramclient.client.local import local
 from paramclient.errors import MetadataError
 from paramclient.metadata import Metadata, MetadataStore, download, metadata_cache, metadata_of
 from paramclient.model.identity import Identity
@@ -204,7 +205,7 @@ async def test_vehicles_without_metadata(make: Any) -> None:
         began = anyio.current_time()
         assert await metadata_of(component) is None
         assert anyio.current_time() - began < 1.5
-        assert not component._machine.descriptions.is_asking
+        assert not local(component).machine.descriptions.is_asking
 
 
 @swiftly
@@ -294,7 +295,7 @@ async def test_a_vehicle_that_does_not_respond() -> None:
         result = await outcome(metadata_of(component, timeout=0.7))
         assert isinstance(result, NoReply)
         assert anyio.current_time() - began == pytest.approx(0.7, abs=0.01)
-        assert not component._machine.descriptions.is_asking
+        assert not local(component).machine.descriptions.is_asking
         tap.is_mute = True
         result = await outcome(metadata_of(component))
         assert isinstance(result, NoReply)
@@ -335,7 +336,7 @@ async def test_cancellation_closes_files_and_sessions(tmp_path: Path) -> None:
             component = await client.component()
             with anyio.move_on_after(moment):
                 await metadata_of(component, store=MetadataStore(tmp_path / str(moment)))
-            assert not component._machine.descriptions.is_asking
+            assert not local(component).machine.descriptions.is_asking
             await anyio.sleep(1.0)
             assert not vehicle.open_files
             assert await metadata_of(component) is not None
@@ -360,12 +361,12 @@ async def test_a_link_that_drops_during_a_download() -> None:
         component = await client.component()
         await component.get("PARAM_03")
         await anyio.sleep(2.0)
-        waited = [component._machine.is_waiting]
+        waited = [local(component).machine.is_waiting]
         tap.is_deaf = True
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(metadata_of, component)
             await anyio.sleep(0.01)
-            waited.append(component._machine.is_waiting)
+            waited.append(local(component).machine.is_waiting)
             await link.drop()
             asked = len(tap.messages(CommandLong))
             tap.is_deaf = False
@@ -395,7 +396,7 @@ async def test_nothing_is_stored_after_the_vehicle_was_replaced(
         await anyio.sleep(1.0)
 
         def read(content: bytes, source: str) -> Metadata:
-            who = component._machine.who
+            who = local(component).machine.who
             who.identity = replace(who.identity, uid="another")
             return read_parameters(content, source)
 

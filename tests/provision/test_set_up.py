@@ -16,6 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from paramclient import Component, ParamCache, ParamClient, read_file
+from paramclient.client.client import local_client
+from paramclient.client.link_client import LinkClient
+from paramclient.client.link_component import LinkComponent
 from paramclient.errors import (
     AnotherVehicle,
     CacheError,
@@ -857,7 +860,7 @@ async def test_a_vehicle_with_unknown_armed_state_is_refused() -> None:
     async with a_client(vehicle) as client:
         component = await client.component()
         with (
-            mock.patch.object(Component, "is_armed", None),
+            mock.patch.object(LinkComponent, "is_armed", None),
             pytest.raises(VehicleArmed, match="1/1 does not report whether it is armed"),
         ):
             await apply(component, written(another()))
@@ -1113,7 +1116,7 @@ async def test_a_link_that_fails_during_the_system_id_change_ends_the_run() -> N
     broken = mock.AsyncMock(side_effect=LinkError("gone", link="x"))
     async with a_client(ardupilot()) as client:
         component = await client.component()
-        with mock.patch.object(ParamClient, "successor", broken):
+        with mock.patch.object(LinkClient, "successor", broken):
             result = await apply(component, written({"SYSID_THISMAV": 7}), include="identity")
         assert isinstance(result.error, LinkError)
         assert statuses(result) == {"SYSID_THISMAV": "failed"}
@@ -1251,7 +1254,7 @@ async def run_interrupted(
         else:
             scope.cancel()
         if how == "kill":  # nothing more is written to the disk
-            client._writer._cache = None
+            local_client(client).cache_writer._cache = None
 
     tap = EndpointWithEvent(Air.symmetric([story.vehicle], **faults), frames, end)
     with scope:

@@ -36,10 +36,12 @@ from paramclient import (
     UsageError,
 )
 from paramclient.client import link_task
+from paramclient.client.client import implementation_of
 from paramclient.metadata import metadata_of
 from paramclient.protocol import wire
 from paramclient.remote import RemoteClient, RemoteComponent
 from paramclient.remote.http import SILENCE
+from paramclient.remote.service_client import ServiceClient
 from paramclient.service import Hub, Settings, create_app
 from paramclient.service.access import AccessSettings
 from paramclient.service.tokens import Holder, Tokens
@@ -744,5 +746,5 @@ async def follow(steps: list[str], draw: random.Random) -> None:
 def test_a_program_is_one_kind_of_client() -> None:
     client = ParamClient(URL)
     assert isinstance(client, ParamClient)
-    assert type(client) is RemoteClient
+    assert type(implementation_of(client)) is ServiceClient
     assert not isinstance(ArduPilotVehicle(), ParamClient)

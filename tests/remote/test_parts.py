@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import math
 import re
@@ -17,6 +18,7 @@ from paramclient import (
     CacheError,
     Change,
     CommandRefused,
+    Component,
     InvalidParameters,
     LinkError,
     NoReply,
@@ -32,14 +34,18 @@ from paramclient import (
     ValueNotApplied,
     VehicleArmed,
 )
+from paramclient.client.client import implementation_of, local_client
+from paramclient.client.link_client import LinkClient
+from paramclient.client.link_component import LinkComponent
 from paramclient.documents.param import ParamDoc
 from paramclient.model.values import Value, from_bits, type_name
-from paramclient.remote import RemoteClient, RemoteComponent
+from paramclient.remote import RemoteComponent
 from paramclient.remote.bounded import MOST_EVENT, EventReader
 from paramclient.remote.decoding import number_of, param_of, value_as_sent
 from paramclient.remote.mirror import MOST_WAITING, Mirror
 from paramclient.remote.problems import error_of
 from paramclient.remote.service_address import TOKEN_VARIABLE, ServiceAddress, chosen_token
+from paramclient.remote.service_client import ServiceClient
 
 WHOM: dict[str, Any] = {"system": 1, "component": 1}
 
@@ -63,7 +69,7 @@ def test_addresses_of_services(text: str, base: str, link: str | None) -> None:
     assert (address.base, address.link) == (base, link)
     assert address.name == (base if link is None else f"{base}?link={link}")
     client = ParamClient(text)
-    assert type(client) is RemoteClient
+    assert type(implementation_of(client)) is ServiceClient
     assert isinstance(client, ParamClient)
     assert repr(client) == f"<RemoteClient {address.name} closed, 0 components>"
 
@@ -127,10 +133,44 @@ def test_a_token_is_given_or_stands_in_the_environment(monkeypatch: pytest.Monke
 
 def test_everything_public_is_answered_for() -> None:
     """What a client or a component offers either goes over the service or is refused in words."""
-    for local, remote in ((ParamClient, RemoteClient), (RemoteComponent.__base__, RemoteComponent)):
+    for local, remote in ((ParamClient, ServiceClient), (RemoteComponent.__base__, RemoteComponent)):
         offered = {name for name in vars(local) if not name.startswith("_")}
         assert offered <= vars(remote).keys()
         assert {"__repr__", "__init__"} <= vars(remote).keys()
+
+
+@pytest.mark.parametrize(
+    ("interface", "implementation"),
+    [
+        *((ParamClient, LinkClient), (ParamClient, ServiceClient)),
+        *((Component, LinkComponent), (Component, RemoteComponent)),
+    ],
+    ids=lambda kind: kind.__name__,
+)
+def test_both_implementations_take_the_same_arguments(interface: type, implementation: type) -> None:
+    for name, call in vars(interface).items():
+        if not name.startswith("_") and inspect.isfunction(call):
+            parameters = inspect.signature(getattr(implementation, name)).parameters
+            assert parameters == inspect.signature(call).parameters, name
+
+
+@pytest.mark.parametrize("link", ["sim:px4", "http://h:1"])
+def test_a_subclass_is_a_client_over_both(link: str) -> None:
+    class Mine(ParamClient):
+        def __init__(self, link: str) -> None:
+            super().__init__(link)
+            self.is_mine = True
+
+    client = Mine(link)
+    assert client.is_mine
+    assert client.link.name == link
+    assert not client.components
+
+
+def test_what_only_a_client_with_a_link_has_is_refused_over_a_service() -> None:
+    assert local_client(ParamClient("sim:px4")).link.name == "sim:px4"
+    with pytest.raises(UsageError, match="a service does not give"):
+        local_client(ParamClient("http://h:1"))
 
 
 # Documents

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from paramclient import ParamCache, UsageError
+from paramclient.client.local import local
 from paramclient.documents.component import ComponentDoc
 from paramclient.documents.job import JobDoc
 from paramclient.documents.param import ParamDoc
@@ -463,7 +464,7 @@ async def test_a_call_whose_client_leaves_is_given_up() -> None:
         vehicle.is_deaf = True
         call = asyncio.create_task(browser.post(f"{C}/params/PARAM_01/read", json={}))
         await asyncio.sleep(0.05)
-        machine = hub.followed[0].component._machine
+        machine = local(hub.followed[0].component).machine
         assert len(machine.reads) == 1
         call.cancel()
         await settled()

@@ -8,7 +8,7 @@ import anyio.lowlevel
 from fastapi import APIRouter, Depends, Request, Response
 from pydantic import Field
 
-from paramclient.client.client import HEARING_PATIENCE
+from paramclient.client.arguments import HEARING_PATIENCE
 from paramclient.client.component import Component
 from paramclient.documents.component import ComponentDoc, ComponentsDoc
 from paramclient.documents.document import Body
@@ -99,7 +99,7 @@ async def successor(request: Request, target: Target, body: Moved) -> ComponentD
     """Wait for the same component of the same vehicle under another system id."""
 
     async def work() -> Component:
-        client = target.component._client
+        client = target.component.client
         return await client.successor(target.component, body.system, timeout=body.timeout_s)
 
     return _document(target, await answered(request, work, target))

@@ -21,7 +21,8 @@ from paramclient import (
     ParamClient,
     Rebooted,
 )
-from paramclient.client.component import REBOOT_PATIENCE
+from paramclient.client.link_component import REBOOT_PATIENCE
+from paramclient.client.local import local
 from paramclient.protocol import wire
 from paramclient.protocol.system_id_change import HUSH
 from paramclient.protocol.vehicle.reboot import MOST_TRIES, SAVING_TIME, UNNOTICED
@@ -136,7 +137,7 @@ async def test_it_comes_back(make: Make, uptime: float, down: float, ack: bool) 
         assert await component.reboot() is component
         assert len(starts) == 1
         assert starts[0] <= anyio.current_time() < starts[0] + 3.5
-        assert component._machine.who.known_at >= starts[0]  # it has said who it is since
+        assert local(component).machine.who.known_at >= starts[0]  # it has said who it is since
         assert (await component.get(next(iter(vehicle.params)))).value is not None
         assert residue(component) == []
         await asyncio.sleep(10.0)
@@ -401,8 +402,8 @@ async def test_cancelling_leaves_nothing(make: Make, after: float) -> None:
         await asyncio.wait([call])
         assert call.cancelled() or call.done()
         assert residue(component) == []
-        assert len(component._machine.commands) == 0
-        assert component._machine.restarts.current is None
+        assert len(local(component).machine.commands) == 0
+        assert local(component).machine.restarts.current is None
         assert tasks_beside() == tasks
         await asyncio.sleep(5.0)
         assert await component.reboot() is component

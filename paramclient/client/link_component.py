@@ -1,0 +1,468 @@
+"""LinkComponent: the implementation of `Component` over a link of this process."""
+
+from __future__ import annotations
+
+import random
+import weakref
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from typing import SupportsFloat, SupportsIndex, TypeVar
+
+import anyio
+
+from paramclient.client.arguments import (
+    PROGRESS_INTERVAL,
+    address_in_words,
+    check_accepted,
+    check_asked,
+    check_asked_name,
+    check_settle,
+)
+from paramclient.client.component import Component
+from paramclient.client.local import LocalClient, LocalComponent
+from paramclient.client.signing import timestamp_now
+from paramclient.client.subscription import Changes
+from paramclient.errors import CacheError, NoReply, NotDurable, ParamClientError, UsageError
+from paramclient.model.identity import Identity, autopilot_name
+from paramclient.model.params import ParamMap
+from paramclient.model.values import Encoding, Param, check_value, decode, known_type
+from paramclient.protocol.addresses import Address
+from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.events import ParamChanged, ParamsMoved
+from paramclient.protocol.params.change import Change
+from paramclient.protocol.params.change_origin import check_asker
+from paramclient.protocol.params.fetch import Fetch
+from paramclient.protocol.params.fetch_result import FetchResult, Progress, Sampled
+from paramclient.protocol.params.passive import OVERHEARING_PATIENCE
+from paramclient.protocol.params.sampling import SAMPLE_SIZE
+from paramclient.protocol.params.sync import SyncState
+from paramclient.protocol.params.writes import SetResult
+from paramclient.protocol.requests.operation import Operation
+from paramclient.protocol.station import Station
+from paramclient.protocol.vehicle.peers import Contest
+from paramclient.protocol.wire import (
+    HASH_CHECK,
+    MAV_MODE_FLAG_SAFETY_ARMED,
+    NO_INDEX,
+    ParamValue,
+    SigningKey,
+)
+
+__all__ = ["LinkComponent", "patience_of"]
+
+Result = TypeVar("Result")
+
+REBOOT_PATIENCE = 60.0
+"""Seconds for a vehicle to start again and say who it is, unless the caller says otherwise: autopilots on
+small boards take up to half a minute, and those that calibrate sensors first a little longer."""
+IDENTITY_PATIENCE = 1.5
+"""Seconds to wait for a component to say who it is before its cached table is done without."""
+CACHE_PATIENCE = 5.0
+"""The same while its cached table is being read: for milliseconds, but hundreds may be wanted at once."""
+SETUP_TRIES = 3
+SETUP_PAUSE = 0.1
+"""How often SETUP_SIGNING is sent, and the seconds after each: nothing answers it, and frames get lost."""
+TIME_IS_OVER = "The time given for the fetch was over."
+"""Why a result is partial that a time limit ended."""
+
+
+class LinkComponent(LocalComponent):
+    """A component on a link of this process. See `Component` for its calls.
+
+    Args:
+        client: the client that follows it.
+        machine: its protocol state.
+        heard_at: when it was heard first, by the clock of the event loop.
+    """
+
+    def __init__(self, client: LocalClient, machine: ComponentMachine, heard_at: float) -> None:
+        self.client = client
+        self.machine = machine
+        self._heard_at = heard_at
+        self._subscriptions: weakref.WeakSet[Changes] = weakref.WeakSet()
+        machine.tells_changes = False  # until somebody listens
+        self.system = machine.system
+        self.component = machine.component
+        self.params = ParamMap(machine.table.params)
+        self._cache_is_read = anyio.Event()
+
+    @property
+    def autopilot(self) -> str:
+        """See `Component.autopilot`."""
+        number = self.machine.who.autopilot
+        return "unknown" if number is None else autopilot_name(number)
+
+    @property
+    def identity(self) -> Identity:
+        """See `Component.identity`."""
+        return self.settled_identity or self.machine.identity
+
+    @property
+    def encoding(self) -> Encoding:
+        """See `Component.encoding`."""
+        return self.machine.table.encoding
+
+    @property
+    def encoding_reason(self) -> str:
+        """See `Component.encoding_reason`."""
+        return self.machine.who.encoding_reason
+
+    @property
+    def count(self) -> int | None:
+        """See `Component.count`."""
+        return self.machine.table.count
+
+    @property
+    def hash(self) -> int | None:
+        """See `Component.hash`."""
+        return self.machine.table.hash if self.machine.table.complete else None
+
+    @property
+    def state(self) -> str:
+        """See `Component.state`."""
+        return self.machine.state
+
+    @property
+    def sync_state(self) -> SyncState:
+        """See `Component.sync_state`."""
+        return self.machine.sync_state
+
+    @property
+    def address(self) -> Address:
+        """See `Component.address`."""
+        return self.machine.address
+
+    @property
+    def peer(self) -> str:
+        """See `Component.peer`."""
+        return self.machine.peer_in_words
+
+    @property
+    def contest(self) -> Contest | None:
+        """See `Component.contest`."""
+        return self.machine.peers.contest
+
+    @property
+    def is_armed(self) -> bool | None:
+        """See `Component.is_armed`."""
+        presence = self.machine.presence
+        if presence.base_mode is None or presence.is_lost:
+            return None
+        return bool(presence.base_mode & MAV_MODE_FLAG_SAFETY_ARMED)
+
+    @property
+    def silence(self) -> float:
+        """See `Component.silence`."""
+        return max(0.0, anyio.current_time() - self.machine.presence.heard_at)
+
+    @property
+    def round_trip(self) -> float | None:
+        """See `Component.round_trip`."""
+        return self.machine.round_trip.smoothed
+
+    def __repr__(self) -> str:
+        last = self.machine.fetches.last
+        origin = "" if last is None else f" from {last.source} in {last.elapsed:.2f} s"
+        of = f" of {self.count}" if self.count is not None and self.state in ("partial", "fetching") else ""
+        whose = f"{self.system}/{self.component} {self.autopilot}"
+        return f"<Component {whose} {self.state} {len(self.params)}{of} params{origin}>"
+
+    async def get(self, name: str | int, *, timeout: float | None = None) -> Param:
+        """See `Component.get`."""
+        check_asked(name)
+        machine = self.machine
+        self.client.check_open()
+        read = machine.read(name, anyio.current_time())
+        try:
+            message = await self.wait(read, timeout, lambda: (_read_of(machine, name), read.attempts))
+        finally:
+            machine.reads.release(read)
+        known = machine.table.params.get(message.param_id)
+        if known is None or (isinstance(name, int) and known.index != name):
+            return _param_of(message, machine.table.encoding)
+        return known
+
+    async def set(
+        self,
+        name: str,
+        value: SupportsIndex | SupportsFloat | bytes,
+        *,
+        timeout: float | None = None,
+        settle: float = 0.0,
+        force: bool = False,
+        durable: bool = False,
+        asker: str | None = None,
+    ) -> SetResult:
+        """See `Component.set`."""
+        if check_asked_name(name) == HASH_CHECK:
+            raise UsageError(f"{HASH_CHECK} is no parameter: it can be read, and not written")
+        machine = self.machine
+        self.client.check_open()
+        machine.check_uncontested()
+        if durable:
+            await self._wait_until_kept()
+        write = machine.write(
+            name,
+            check_value(value),
+            anyio.current_time(),
+            check_asker(asker),
+            settle=check_settle(settle),
+            force=force,
+        )
+        try:
+            what = f"PARAM_SET {name} to {self.system}/{self.component}"
+            result = await self.wait(write, timeout, lambda: (what, write.attempts))
+        finally:
+            machine.writes.cancel(write, anyio.current_time())
+        if durable:
+            try:
+                await self.client.cache_writer.write_durably(machine)
+            except CacheError as error:
+                what = f"{self.system}/{self.component} has taken {name}, but it is not on the disk: {error}"
+                raise NotDurable(what) from error
+        return result
+
+    async def fetch_all(
+        self,
+        *,
+        refresh: bool = False,
+        accept: str = "verified",
+        sample: int = SAMPLE_SIZE,
+        seed: int | None = None,
+        timeout: float | None = None,
+        progress: Callable[[Progress], None] | None = None,
+    ) -> FetchResult:
+        """See `Component.fetch_all`."""
+        self.client.check_open()
+        self.client.station.check_refresh(refresh)
+        check_accepted(accept, sample)
+        sampled = None
+        if accept == "sampled" and not refresh:
+            sampled = Sampled(sample, random.getrandbits(32) if seed is None else seed)
+        timeout = patience_of(self.client.station, timeout)
+        began = anyio.current_time()
+        if not refresh:
+            with anyio.move_on_after(timeout):
+                await self.wait_for_cache()
+        machine = self.machine
+        fetch = machine.begin_fetch(anyio.current_time(), refresh=refresh, sampled=sampled)
+        try:
+            result = await self.wait_for_fetch(fetch, None if timeout is None else began + timeout, progress)
+        finally:
+            machine.end_fetch(fetch, anyio.current_time())
+            self.wake()  # it may have been in the way of others
+            await self.wait_until_files_closed()
+        return replace(result, elapsed=anyio.current_time() - began)
+
+    async def refreshed(self, *, timeout: float | None = None) -> None:
+        """See `Component.refreshed`."""
+        self.client.check_open()
+        refresh = self.machine.refresh
+        if refresh is not None:
+            await self.wait(refresh, timeout, lambda: ("the values that no hash covers", 0))
+
+    async def setup_signing(self, key: SigningKey | None, *, link_is_safe: bool = False) -> None:
+        """See `Component.setup_signing`."""
+        if not link_is_safe:
+            raise UsageError(
+                "SETUP_SIGNING carries the key in clear: only over a link on which nobody else can listen, "
+                "and with link_is_safe=True"
+            )
+        if self.machine.version == 1:
+            raise UsageError(f"{self.system}/{self.component} speaks MAVLink 1, which knows no signatures")
+        for _ in range(SETUP_TRIES):
+            self.client.check_open()
+            timestamp = 0 if key is None else timestamp_now()
+            self.client.station.send_setup_signing(
+                self.system, self.component, key, timestamp, peer=self.machine.vehicle[1]
+            )
+            self.client.wake()
+            await anyio.sleep(SETUP_PAUSE)
+
+    async def reboot(self, *, system: int | None = None, timeout: float | None = None) -> Component:
+        """See `Component.reboot`."""
+        self.client.check_open()
+        moves = system is not None and system != self.system
+        deadline = anyio.current_time() + (REBOOT_PATIENCE if timeout is None else timeout)
+        machine = self.machine
+        restart = machine.begin_restart(anyio.current_time(), returns=not moves)
+        try:
+            left = deadline - anyio.current_time()
+            await self.wait(restart, left, lambda: (restart.stage, restart.attempts))
+        finally:
+            machine.end_restart(restart, anyio.current_time())
+        if system is None or not moves:
+            return self
+        return await self.client.successor(self, system, timeout=deadline - anyio.current_time())
+
+    def changes(self) -> Changes:
+        """See `Component.changes`."""
+        self.listen(changes := Changes())
+        return changes
+
+    @property
+    def settled_identity(self) -> Identity | None:
+        """See `LocalComponent.settled_identity`."""
+        return self.client.station.identity_of(self.machine)
+
+    def wake(self) -> None:
+        """See `LocalComponent.wake`."""
+        self.client.wake(self.machine)
+
+    def is_cache_due(self, now: float) -> bool:
+        """See `LocalComponent.is_cache_due`."""
+        writer = self.client.cache_writer
+        patience = CACHE_PATIENCE if writer.is_bringing(self.machine) else IDENTITY_PATIENCE
+        return (
+            self._cache_is_read.is_set()
+            or not writer.may_have(self.system, self.component)
+            or now >= self._heard_at + patience
+        )
+
+    async def wait_for_cache(self) -> None:
+        """See `LocalComponent.wait_for_cache`."""
+        for patience in (IDENTITY_PATIENCE, CACHE_PATIENCE):
+            now = anyio.current_time()
+            if not self.is_cache_due(now):
+                with anyio.move_on_after(self._heard_at + patience - now):
+                    await self._cache_is_read.wait()
+                self.client.check_open()
+
+    async def _wait_until_kept(self) -> None:
+        """Wait until what is heard of it goes to the cache, as long as that may take.
+
+        Raises:
+            UsageError: the client keeps no cache.
+            CacheError: that is not so in time.
+        """
+        writer = self.client.cache_writer
+        if self.client.cache is None:
+            raise UsageError("durable needs a cache, and the client keeps none")
+        with anyio.move_on_after(IDENTITY_PATIENCE + CACHE_PATIENCE):
+            await self._cache_is_read.wait()
+        self.client.check_open()
+        if (why := writer.obstacle(self.machine)) is not None:
+            raise CacheError(f"nothing was set: {why}, so it could not be written to the disk")
+
+    async def wait_until_files_closed(self) -> None:
+        """See `LocalComponent.wait_until_files_closed`."""
+        await self.client.wait_until_files_closed(self.machine)
+
+    def listen(self, changes: Changes) -> None:
+        """See `LocalComponent.listen`."""
+        self._subscriptions.add(changes)
+        self.machine.tells_changes = True
+        if self.client.is_over:
+            changes.end(self.client.link_task.ended)
+
+    def ignore(self, changes: Changes) -> None:
+        """See `LocalComponent.ignore`."""
+        self._subscriptions.discard(changes)
+
+    # what the client tells
+
+    def cache_was_read(self) -> None:
+        """Take note that the cached table is in `params`, or that there is none."""
+        self._cache_is_read.set()
+
+    def take_change(self, event: ParamChanged | ParamsMoved) -> None:
+        """Take note that a parameter has changed, or several."""
+        if isinstance(event, ParamChanged):
+            self._publish(event.change)
+        self.machine.tells_changes, self.machine.has_moved = len(self._subscriptions) > 0, False
+
+    def _publish(self, change: Change) -> None:
+        """Hand a change to everyone who listens."""
+        for changes in list(self._subscriptions):
+            changes.push(change)
+
+    def forget(self) -> None:
+        """End everything that waits: it is lost, and not followed any more."""
+        self.client.cache_writer.part_with(self.machine)
+        silence = anyio.current_time() - self.machine.presence.heard_at
+        awaited = f"{address_in_words(self.system, self.component)} (lost)"
+        self.end(NoReply(awaited, attempts=0, waited=silence))
+
+    def end(self, error: ParamClientError | None) -> None:
+        """End all streams of changes: with this error, or as the log is over."""
+        for changes in list(self._subscriptions):
+            changes.end(error)
+
+    # waiting
+
+    async def wait(
+        self,
+        operation: Operation[Result],
+        timeout: float | None,
+        describe: Callable[[], tuple[str, int]],
+        progress: Callable[[], None] | None = None,
+    ) -> Result:
+        """See `LocalComponent.wait`."""
+        began = anyio.current_time()
+        ended = anyio.Event()
+        operation.on_done.append(ended.set)
+        self.wake()
+        try:
+            with anyio.move_on_after(timeout):
+                while not operation.done:
+                    with anyio.move_on_after(None if progress is None else PROGRESS_INTERVAL):
+                        await ended.wait()
+                    if progress is not None:
+                        progress()
+        finally:
+            with suppress(ValueError):
+                operation.on_done.remove(ended.set)
+        if not operation.done:
+            awaited, attempts = describe()
+            raise NoReply(awaited, attempts=attempts, waited=anyio.current_time() - began)
+        return _outcome(operation)
+
+    async def wait_for_fetch(
+        self, fetch: Fetch, deadline: float | None, progress: Callable[[Progress], None] | None
+    ) -> FetchResult:
+        """See `LocalComponent.wait_for_fetch`."""
+        ended = anyio.Event()
+        fetch.on_done.append(ended.set)
+        self.wake()
+        try:
+            while not fetch.done:
+                now = anyio.current_time()
+                if deadline is not None and now >= deadline:
+                    return fetch.partial(now, TIME_IS_OVER)
+                until = now + PROGRESS_INTERVAL if progress is not None else None
+                if deadline is not None:
+                    until = deadline if until is None else min(until, deadline)
+                with anyio.move_on_after(None if until is None else until - now):
+                    await ended.wait()
+                if progress is not None:
+                    progress(fetch.progress(anyio.current_time()))
+        finally:
+            with suppress(ValueError):
+                fetch.on_done.remove(ended.set)
+        return _outcome(fetch)
+
+
+def patience_of(station: Station, timeout: float | None) -> float | None:
+    """For how long a fetch waits: nothing tells whether others will ever ask, unless there is an end."""
+    is_open = timeout is None and station.listens_only and not station.is_log
+    return OVERHEARING_PATIENCE if is_open else timeout
+
+
+def _outcome(operation: Operation[Result]) -> Result:
+    if operation.error is not None:
+        raise operation.error
+    assert operation.done
+    return operation.result  # type: ignore[return-value]  # an Operation[None] ends with None
+
+
+def _param_of(message: ParamValue, encoding: Encoding) -> Param:
+    """What a message says of what is not in the table: a hash, what has left it, what shares its name."""
+    value, bits = decode(message.raw, message.param_type, encoding)
+    index = None if message.param_index == NO_INDEX else message.param_index
+    return Param(message.param_id, value, known_type(message.param_type), index, bits)
+
+
+def _read_of(machine: ComponentMachine, name: str | int) -> str:
+    what = name if isinstance(name, str) else f"parameter {name}"
+    return f"{what} of {machine.system}/{machine.component}"

@@ -1,0 +1,386 @@
+"""ServiceClient: the implementation of `ParamClient` over a service."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from types import MappingProxyType
+from typing import Final, NoReturn
+
+import anyio
+import anyio.abc
+import httpx
+
+from paramclient.cache import ParamCache
+from paramclient.client.arguments import HEARING_PATIENCE, address_in_words
+from paramclient.client.component import Component
+from paramclient.client.events import Events
+from paramclient.client.fetch_all import FetchedAll
+from paramclient.client.files import Ftp
+from paramclient.client.local import not_given
+from paramclient.client.stats import ClientStats
+from paramclient.errors import (
+    CacheError,
+    ClientClosed,
+    ContestedAddress,
+    LinkError,
+    NoReply,
+    ParamClientError,
+    UsageError,
+)
+from paramclient.links import Link
+from paramclient.protocol.addresses import Address
+from paramclient.protocol.params.fetch_result import Progress
+from paramclient.protocol.wire import AUTOPILOT_COMPONENT
+from paramclient.remote.component import mirrored_of
+from paramclient.remote.connection import telling
+from paramclient.remote.decoding import Document, fetch_result_of, stats_of, understood
+from paramclient.remote.http import Answer, Requests, Unreached
+from paramclient.remote.link import ServiceLink
+from paramclient.remote.mirrored_component import Key, MirroredComponent, key_of
+from paramclient.remote.problems import error_of
+from paramclient.remote.roster import Roster
+from paramclient.remote.service_address import ServiceAddress, chosen_token
+
+__all__ = ["ServiceClient"]
+
+OPENING_PATIENCE: Final = 10.0
+"""Seconds for a service to say what it has."""
+STATS_PAUSE: Final = 0.5
+"""Seconds between two questions for the numbers of the links, however often they are looked at."""
+
+
+class ServiceClient:
+    """A client whose links and cache are those of a service. See `RemoteClient` for what is different.
+
+    Args:
+        link: as in `RemoteClient`.
+        token: as in `RemoteClient`.
+        transport: as in `RemoteClient`.
+
+    Attributes:
+        cache: None; the service has it.
+
+    Raises:
+        UsageError: no such address or token.
+    """
+
+    def __init__(
+        self, link: str, *, token: str | None = None, transport: httpx.AsyncBaseTransport | None = None
+    ) -> None:
+        address = ServiceAddress.read(link)
+        self.cache: ParamCache | None = None
+        self._service = ServiceLink(address.name)
+        self._chosen = address.link
+        self._requests = Requests(address, chosen_token(token), transport)
+        self._roster = Roster(self._requests, address.link)
+        self._connection = self._roster.connection
+        self._subscriptions = self._roster.subscriptions
+        self._tasks: anyio.abc.TaskGroup | None = None
+        self._is_entered = False
+        self._links: list[Document] = []
+
+    # what is known
+
+    @property
+    def components(self) -> Mapping[Address, Component]:
+        """See `ParamClient.components`; without those whose ids are on several links."""
+        return MappingProxyType({at: each.component for at, each in self._unambiguous().items()})
+
+    @property
+    def autopilots(self) -> list[Component]:
+        """See `ParamClient.autopilots`."""
+        found: dict[int, MirroredComponent] = {}
+        for (system, number), mirrored in self._unambiguous().items():
+            if mirrored.is_autopilot and (number == AUTOPILOT_COMPONENT or system not in found):
+                found[system] = mirrored
+        return [found[system].component for system in sorted(found)]
+
+    def _unambiguous(self) -> dict[Address, MirroredComponent]:
+        """Return the components whose ids are on one link only."""
+        keys: dict[Address, list[Key]] = {}
+        for key in self._roster.components:
+            keys.setdefault(key[1:], []).append(key)
+        return {at: self._roster.components[several[0]] for at, several in keys.items() if len(several) == 1}
+
+    @property
+    def link(self) -> Link:
+        """The address of the service, in the place of a link."""
+        return self._service
+
+    @property
+    def listens_only(self) -> bool:
+        """Whether nothing is ever sent on any of the links."""
+        return bool(self._links) and all(each["listens_only"] for each in self._links)
+
+    @property
+    def bytes_received(self) -> int:
+        """As in `stats`."""
+        return self.stats.bytes_received
+
+    @property
+    def bytes_sent(self) -> int:
+        """As in `stats`."""
+        return self.stats.bytes_sent
+
+    @property
+    def stats(self) -> ClientStats:
+        """What the links of the service have done, as it was when that was asked for last."""
+        self._roster.are_links_stale.set()
+        return stats_of([each["stats"] for each in self._links if each["stats"] is not None])
+
+    def __repr__(self) -> str:
+        connection = self._connection
+        state = "closed" if self._tasks is None or connection.ended is not None else "open"
+        if state == "open" and connection.is_away:
+            state = "away"
+        heard = len(self._roster.components)
+        return f"<RemoteClient {self._service.name} {state}, {heard} component{'' if heard == 1 else 's'}>"
+
+    # its life
+
+    async def open(self) -> None:
+        """Connect to the service, and load what it has.
+
+        Raises:
+            UsageError, LinkError: as from entering a `RemoteClient`.
+        """
+        if self._is_entered:
+            raise UsageError("a ParamClient is opened once; make a new one")
+        self._is_entered = True
+        await self._requests.open()
+        tasks = anyio.create_task_group()
+        await tasks.__aenter__()
+        try:
+            tasks.start_soon(self._connection.follow, name="paramclient follower of a service")
+            with anyio.fail_after(OPENING_PATIENCE):
+                await self._connection.reached()
+                await self._load_links()
+                await self._learn_who_we_are()
+                await self._roster.load_list()
+            tasks.start_soon(self._roster.run, name="paramclient loader")
+            tasks.start_soon(self._load_stats_when_wanted, name="paramclient statistics")
+        except BaseException as error:
+            await self._leave(tasks)
+            if isinstance(error, Unreached):
+                raise error.error from error.error.__cause__
+            if isinstance(error, TimeoutError) and not isinstance(error, ParamClientError):
+                name = self._service.name
+                raise LinkError(f"{name}: it does not answer", link=name) from None
+            raise
+        self._tasks = tasks
+
+    async def close(self, *, failed: bool) -> None:
+        """End every call that waits, and the connections.
+
+        Args:
+            failed: whether the body of the `async with` has raised; it makes no difference.
+        """
+        tasks = self._tasks
+        assert tasks is not None
+        closed = ClientClosed("the client was closed", link=self._service.name)
+        self._connection.end(closed)
+        for mirrored in self._roster.components.values():
+            mirrored.end(closed)
+        for events in list(self._subscriptions):
+            events.end(closed)
+        await self._leave(tasks)
+
+    async def _leave(self, tasks: anyio.abc.TaskGroup) -> None:
+        """End the tasks and the connections, also when cancelled."""
+        tasks.cancel_scope.cancel()
+        try:
+            # not told of the caller's exception: it would come out wrapped in a group
+            await tasks.__aexit__(None, None, None)
+        finally:
+            with anyio.CancelScope(shield=True):
+                await self._requests.close()
+
+    # calls
+
+    def events(self) -> Events:
+        """See `ParamClient.events`. What an event tells of a table is in `params` by then."""
+        events = Events()
+        self._subscriptions.add(events)
+        if self._connection.ended is not None:
+            events.end(self._connection.ended)
+        return events
+
+    def ftp(self, component: Component) -> Ftp:
+        """Refused: files go over the link itself."""
+        raise not_given("files over MAVFTP")
+
+    async def component(
+        self,
+        system: int | None = None,
+        component: int | None = None,
+        *,
+        peer: str | None = None,
+        timeout: float | None = HEARING_PATIENCE,
+    ) -> Component:
+        """See `ParamClient.component`. It is waited for also on links that the service cannot open yet.
+
+        Raises:
+            UsageError: it is on several links, and the address of the service names none of them.
+            NoReply, LinkError: as there.
+        """
+        _check_peer(peer)
+        return await self._found({"system": system, "component": component}, timeout)
+
+    async def only_component(
+        self,
+        system: int | None = None,
+        component: int | None = None,
+        *,
+        peer: str | None = None,
+        timeout: float | None = HEARING_PATIENCE,
+    ) -> Component:
+        """See `ParamClient.only_component`. The vehicles on all links of the service count, or on the one
+        that the address names.
+
+        Raises:
+            AmbiguousVehicle, UsageError, NoReply, LinkError: as there, and as `component`.
+        """
+        _check_peer(peer)
+        return await self._found({"system": system, "component": component, "only": True}, timeout)
+
+    async def _found(self, sought: Document, timeout: float | None) -> Component:
+        """Return the component that the service finds."""
+        began = anyio.current_time()
+        answer = await self._connection.ask(
+            "POST",
+            "/find",
+            sought,
+            awaited=address_in_words(sought["system"], sought["component"]),
+            timeout=timeout,
+            waits_for_ever=True,
+            link=self._chosen,
+        )
+        left = None if timeout is None else began + timeout - anyio.current_time()
+        found = await self._roster.mirror_for(answer, left)
+        if len(same := self._roster.same_ids(found)) > 1:
+            links = " and ".join(each.link_name for each in same)
+            ids = f"{found.key[1]}/{found.key[2]}"
+            raise UsageError(f"{ids} is on {links} of the service; name one: http://…?link=NAME")
+        return found.component
+
+    async def successor(
+        self, component: Component, system: int, *, timeout: float | None = HEARING_PATIENCE
+    ) -> Component:
+        """See `ParamClient.successor`."""
+        mirrored = mirrored_of(component)
+        awaited = f"{component.system}/{component.component} as system {system}"
+        answer = await self._roster.ask(
+            mirrored, "successor", {"system": system}, timeout, awaited, waits_for_ever=True
+        )
+        return await self._roster.given(answer)
+
+    async def fetch_all(
+        self,
+        system: int | None = None,
+        *,
+        refresh: bool = False,
+        timeout: float | None = None,
+        progress: Callable[[Mapping[Address, Progress]], None] | None = None,
+    ) -> FetchedAll:
+        """See `ParamClient.fetch_all`. Where two links have the same ids, one of them is told."""
+        began = anyio.current_time()
+        before = {key: each.progress_count for key, each in self._roster.components.items()}
+
+        def tell() -> None:
+            told = self._roster.components.items()
+            assert progress is not None
+            progress({key[1:]: each.progress_since(before.get(key, 0)) for key, each in told})
+
+        async def fetch() -> Answer:
+            whose = "any component" if system is None else f"any component of system {system}"
+            answer = await self._connection.ask(
+                "POST",
+                "/fetch",
+                {"refresh": refresh} | ({} if system is None else {"system": system}),
+                awaited=f"the parameters of {whose}",
+                timeout=timeout,
+                link=self._chosen,
+            )
+            with understood(self._service.name):
+                ended = [
+                    (key_of(each), each["received"], each["count"]) for each in answer.document["results"]
+                ]
+            for key, received, count in ended:
+                mirrored = self._roster.components.get(key)
+                await self._roster.until_current(mirrored, answer.place)
+                if mirrored is not None:
+                    mirrored.end_progress(received, count)
+            await self._look_at_links()
+            return answer
+
+        answer = await telling(fetch, None if progress is None else tell)
+        elapsed = anyio.current_time() - began
+        with understood(self._service.name):
+            known = self._roster.components
+            results = {
+                key[1:]: fetch_result_of(each, known[key].component.params, elapsed)
+                for each in answer.document["results"]
+                if (key := key_of(each)) in known
+            }
+            silent: dict[Address, NoReply | CacheError | ContestedAddress] = {}
+            for each in answer.document["silent"]:
+                problem = each["problem"]
+                error = error_of(problem, status=problem["status"], link=self._service.name)
+                if isinstance(error, NoReply | CacheError | ContestedAddress):
+                    silent[each["system"], each["component"]] = error
+        return FetchedAll(results, silent)
+
+    def traffic_report(self) -> NoReturn:
+        """Refused: the links are the service's."""
+        raise not_given("a report of the traffic")
+
+    def signing_report(self) -> NoReturn:
+        """Refused: keys and signatures are the service's."""
+        raise not_given("a report of signatures")
+
+    async def _learn_who_we_are(self) -> None:
+        with suppress(LinkError):  # a service that keeps that to itself
+            answer = await self._requests.ask("GET", "/me")
+            with understood(self._service.name):
+                self._roster.asker = str(answer.document.get("asker", ""))
+
+    async def _load_links(self) -> None:
+        """The links and their numbers.
+
+        Raises:
+            UsageError: the one that is meant is not among them.
+        """
+        answer = await self._requests.ask("GET", "/links")
+        with understood(self._service.name):
+            links = [each for each in answer.document["links"] if self._chosen in (None, each["name"])]
+            stats_of([each["stats"] for each in links if each["stats"] is not None])
+            names = ", ".join(str(each["name"]) for each in answer.document["links"])
+        if not links and self._chosen is not None:
+            raise UsageError(f"the service has no link {self._chosen}; it has {names or 'none'}")
+        self._links = links
+
+    async def _look_at_links(self) -> None:
+        """The same as far as it goes: these numbers are worth no error."""
+        with suppress(Unreached, ParamClientError):
+            await self._load_links()
+
+    async def _load_stats_when_wanted(self) -> None:
+        while True:
+            await self._roster.are_links_stale.wait()
+            self._roster.are_links_stale = anyio.Event()
+            await self._look_at_links()
+            await anyio.sleep(STATS_PAUSE)
+
+    def check_open(self) -> None:
+        """Check that the service can be asked.
+
+        Raises:
+            LinkError: the service cannot be reached, or the client is not open.
+        """
+        self._connection.check_open()
+
+
+def _check_peer(peer: str | None) -> None:
+    if peer is not None:
+        raise UsageError("peer is for a client with a link of its own; a service keeps no peers apart")
