@@ -12,7 +12,8 @@ import anyio.to_thread
 import pytest
 
 from paramclient import ParamClient
-from paramclient.cli import connection, run
+from paramclient.cli import run
+from paramclient.cli import session as cli_session
 from paramclient.client.worker_thread import Worker
 from paramclient.links import SimLink
 from paramclient.sim import Endpoint
@@ -80,7 +81,7 @@ def behind(monkeypatch: pytest.MonkeyPatch, url: str) -> Put:
             link = far_end if isinstance(far_end, SimLink | PeersLink) else SimLink(far_end, url)
             return ParamClient(link, **options)
 
-        monkeypatch.setattr(connection, "ParamClient", client)
+        monkeypatch.setattr(cli_session, "ParamClient", client)
         return url
 
     return place

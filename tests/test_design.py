@@ -184,6 +184,43 @@ def test_no_module_imports_itself_through_others() -> None:
     TopologicalSorter(graph).prepare()
 
 
+COUNTERPARTS = {
+    "app": "the application: of the command line, of the service",
+    "ardupilot": "what is ArduPilot's: its metadata, its simulated vehicle",
+    "check": "the check of a vehicle: the command and its document",
+    "client": "the client: over a link, over a service",
+    "component": "a component: for users, over a service, on the wire, as a document",
+    "diff": "the comparison: the command and its document",
+    "events": "events: on the wire, for users, over HTTP",
+    "fleet": "several vehicles: in the cache, as a command, as a document, in a set-up",
+    "formats": "the format of a file, told by its content: parameters, metadata",
+    "history": "the history: the command, its document, its route",
+    "link": "a link: bytes, the command, its document, over a service, in the service",
+    "metadata": "metadata: the command, the route, of simulated vehicles",
+    "param_pck": "the packed parameter file: its bytes, as a format of parameter files",
+    "params": "parameters: plain data, the route",
+    "paramset": "a set of parameters: plain data, its document",
+    "passive": "what others request: files over MAVFTP, tables",
+    "ports": "serial ports: the list, the command",
+    "problems": "errors of the service: told by it, understood by its client",
+    "px4": "what is PX4's: its metadata, its simulated vehicle",
+    "results": "results: of a set-up, as documents, printed",
+    "setup": "the set-up of a vehicle: the command, its document, its route",
+    "signing": "MAVLink signing: frames, keys of a client, the command",
+    "traffic": "traffic on a link: counted, as a document",
+}
+"""Names of modules that stand in several rooms, and of what each is the room's part."""
+
+
+def test_no_two_modules_share_a_name_but_counterparts() -> None:
+    rooms: dict[str, list[str]] = {}
+    for module, path in MODULES.items():
+        if path.stem != "__init__":
+            rooms.setdefault(path.stem, []).append(module.rpartition(".")[0])
+    assert {name for name, places in rooms.items() if len(places) > 1} == COUNTERPARTS.keys()
+    assert all(len(places) == len(set(places)) for places in rooms.values())
+
+
 NAMEDTUPLE_METHODS = {"_replace", "_asdict", "_fields"}
 """Names that begin with an underscore and are public nevertheless, so that no field can have them."""
 

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 from cyclopts import Parameter
 
-from paramclient.cli.connection import VEHICLE_TIMEOUT, Deadline, listen
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import Id, Seconds, SigningOptions
 from paramclient.cli.output import (
@@ -25,6 +24,7 @@ from paramclient.cli.output import (
     printable,
     say,
 )
+from paramclient.cli.session import VEHICLE_TIMEOUT, Deadline, listen
 from paramclient.diagnosis import Finding, Severity, VehicleReport, check_vehicle, findings_of
 from paramclient.errors import UsageError
 from paramclient.version import __version__

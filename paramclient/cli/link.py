@@ -11,10 +11,10 @@ from typing import Annotated, Final
 import anyio
 from cyclopts import Parameter
 
-from paramclient.cli.connection import Deadline, listen
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import Seconds, SigningOptions
 from paramclient.cli.output import live_view, milliseconds, print_document, print_line, print_table
+from paramclient.cli.session import Deadline, listen
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
 from paramclient.errors import NoReply, ParamClientError

@@ -12,9 +12,9 @@ import anyio.to_thread
 from cyclopts import Parameter
 
 from paramclient.cache import CachedComponent, ParamCache
-from paramclient.cli.connection import Session
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import print_line, printable, say
+from paramclient.cli.session import Session
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata, MetadataStore, ParamInfo, metadata_of, read_metadata
 from paramclient.metadata.info import number_of

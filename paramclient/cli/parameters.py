@@ -12,7 +12,6 @@ import anyio
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from paramclient.cli.connection import Session, connect
 from paramclient.cli.exit_codes import ExitCode, code_of, status_of
 from paramclient.cli.metadata import (
     DESCRIBED_COLUMNS,
@@ -39,6 +38,7 @@ from paramclient.cli.output import (
     report,
     say,
 )
+from paramclient.cli.session import Session, connect
 from paramclient.client.arguments import SETTLE_MAX
 from paramclient.client.events import (
     Contested,

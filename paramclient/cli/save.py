@@ -10,11 +10,11 @@ import anyio
 import anyio.to_thread
 from cyclopts import Parameter
 
-from paramclient.cli.connection import Session, connect
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.offline import tables_of
 from paramclient.cli.options import CacheOptions, LinkOptions
 from paramclient.cli.output import print_document, printable, progress_bar, report, say
+from paramclient.cli.session import Session, connect
 from paramclient.cli.sources import check_link, collect_confirmed, names_vehicle
 from paramclient.client.component import Component
 from paramclient.errors import UsageError

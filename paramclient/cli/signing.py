@@ -11,10 +11,10 @@ from typing import Annotated, Final
 
 from cyclopts import Parameter
 
-from paramclient.cli.connection import VEHICLE_TIMEOUT, Deadline
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import Id, KeyOptions, Seconds
 from paramclient.cli.output import print_document, print_line, printable
+from paramclient.cli.session import VEHICLE_TIMEOUT, Deadline
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
 from paramclient.client.signing import Signing, read_key

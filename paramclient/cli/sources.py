@@ -21,9 +21,9 @@ import anyio
 
 from paramclient.cache import CachedSummary, ParamCache
 from paramclient.cache.lookup import is_vehicle_name
-from paramclient.cli.connection import Deadline, connect
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import progress_bar, report
+from paramclient.cli.session import Deadline, connect
 from paramclient.client.component import Component
 from paramclient.errors import UnknownVehicle, UsageError
 from paramclient.files import ParamFile, read_file

@@ -10,8 +10,8 @@ from typing import Final, TypeAlias
 
 import anyio
 
-from paramclient.cli.connection import VEHICLE_TIMEOUT, Deadline, Session, connect
 from paramclient.cli.options import LinkOptions
+from paramclient.cli.session import VEHICLE_TIMEOUT, Deadline, Session, connect
 from paramclient.cli.sources import choose, is_file, open_file, resolve
 from paramclient.client.client import ParamClient, implementation_of
 from paramclient.client.component import Component

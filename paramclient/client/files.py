@@ -11,7 +11,7 @@ import anyio
 from paramclient.client.component import Component
 from paramclient.client.local import local
 from paramclient.protocol.ftp import LARGEST_FILE, DirectoryEntry, FileTransfers
-from paramclient.protocol.ftp.operations import Job
+from paramclient.protocol.ftp.transfer_job import Job
 
 __all__ = ["Ftp"]
 

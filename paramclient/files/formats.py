@@ -7,7 +7,7 @@ from pathlib import PurePath
 from typing import Final, TypeAlias
 
 from paramclient.errors import FileError, UsageError
-from paramclient.files import document, line_formats, param_pck, script
+from paramclient.files import document_format, line_formats, param_pck, script
 from paramclient.files.includes import Includes
 from paramclient.files.param_file import AUTOPILOT, ENDINGS, FileForm, ParamFile, address, as_form
 from paramclient.files.text import decode_text, lines_of, time_of
@@ -66,9 +66,9 @@ def loads(
         case FileForm.PX4_SCRIPT:
             return script.read_script(text, source, params_max)
         case FileForm.JSON:
-            return document.read_json(text, source, params_max)
+            return document_format.read_json(text, source, params_max)
         case FileForm.YAML:
-            return document.read_yaml(text, source, params_max)
+            return document_format.read_yaml(text, source, params_max)
         case _:
             return line_formats.read_pairs(text, form, source, includes, params_max)
 
@@ -115,9 +115,9 @@ def _bytes(sets: list[ParamSet], form: FileForm, around: ParamFile) -> bytes:
         case FileForm.QGC:
             lines = line_formats.write_qgc(sets, around)
         case FileForm.JSON:
-            lines = document.write_json(sets, around)
+            lines = document_format.write_json(sets, around)
         case FileForm.YAML:
-            lines = document.write_yaml(sets, around)
+            lines = document_format.write_yaml(sets, around)
         case _:
             lines = line_formats.write_pairs(sets, form, around)
     return "".join(f"{line}\n" for line in lines).encode("utf-8", "backslashreplace")
@@ -140,7 +140,7 @@ def _form_of(text: str, source: str) -> FileForm:
         return FileForm.QGC
     if any(script.is_script_line(line.text) for line in lines_of(text)):
         return FileForm.PX4_SCRIPT
-    if document.is_document(first.text):
+    if document_format.is_document(first.text):
         return FileForm.YAML
     named = ENDINGS.get(PurePath(source).suffix.lower())
     if named in (FileForm.PARM, FileForm.MISSION_PLANNER):

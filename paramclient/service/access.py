@@ -20,7 +20,7 @@ import anyio
 
 from paramclient.errors import UsageError
 from paramclient.protocol.params.change_origin import LONGEST_ASKER
-from paramclient.service.addresses import is_in, is_loopback, network
+from paramclient.service.client_address import is_in, is_loopback, network
 from paramclient.service.held_bodies import HeldBodies, HeldBody
 from paramclient.service.log_limit import LogLimit
 from paramclient.service.request import (

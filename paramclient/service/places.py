@@ -7,7 +7,7 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import Final
 
-from paramclient.service.addresses import is_loopback, network_of
+from paramclient.service.client_address import is_loopback, network_of
 
 if sys.platform != "win32":
     import resource

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final, TypeAlias
 from urllib.parse import unquote
 
-from paramclient.service.addresses import Network, first_beyond, forwarded_for, is_in, network_of, parsed
+from paramclient.service.client_address import Network, first_beyond, forwarded_for, is_in, network_of, parsed
 
 __all__ = [
     "ASK",

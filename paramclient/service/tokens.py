@@ -15,7 +15,7 @@ from typing import Final, Literal, TypeAlias
 
 from paramclient.client.signing import read_private
 from paramclient.errors import UsageError
-from paramclient.service.addresses import network_of
+from paramclient.service.client_address import network_of
 
 __all__ = [
     "Guesses",

@@ -19,7 +19,8 @@ import pytest
 
 from paramclient import ParamCache, ParamClient, ParamType
 from paramclient.cache import StoredParam, TableState
-from paramclient.cli import connection, run
+from paramclient.cli import run
+from paramclient.cli import session as cli_session
 from paramclient.links import SimLink
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param, Value, bits_of, from_bits
@@ -477,7 +478,7 @@ def vehicles(monkeypatch: pytest.MonkeyPatch) -> dict[str, Vehicle]:
     def client(url: str, **options: Any) -> ParamClient:
         return ParamClient(SimLink(known.pop(url), url), **options)  # each link is opened once
 
-    monkeypatch.setattr(connection, "ParamClient", client)
+    monkeypatch.setattr(cli_session, "ParamClient", client)
     return known
 
 

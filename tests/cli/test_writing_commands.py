@@ -11,7 +11,7 @@ import pytest
 
 from paramclient import ParamCache, ParamClient, ParamType
 from paramclient.cache import StoredParam, TableState
-from paramclient.cli import connection
+from paramclient.cli import session as cli_session
 from paramclient.cli import signing as signing_commands
 from paramclient.links import SimLink
 from paramclient.model.identity import Identity
@@ -280,7 +280,7 @@ def test_values_of_an_ambiguous_source_are_not_used(
 ) -> None:
     target, (one, two) = px4(5), (px4(), copter())
     links = {URL: SimLink(target, URL), SOURCE: SimLink(Air([one, Late(two, 0.9)]), SOURCE)}
-    monkeypatch.setattr(connection, "ParamClient", lambda url, **options: ParamClient(links[url], **options))
+    monkeypatch.setattr(cli_session, "ParamClient", lambda url, **options: ParamClient(links[url], **options))
     done = command("apply", URL, SOURCE, "--yes", *dry)
     assert (done.code, done.out, done.err) == (2, "", LISTED)
     assert untouched(target, one, two)
@@ -379,7 +379,7 @@ def served(monkeypatch: pytest.MonkeyPatch) -> Callable[[Endpoint], None]:
         def client(url: str, **options: Any) -> ServedClient:
             return ServedClient(SimLink(far_end, "sim:custom"))
 
-        monkeypatch.setattr(connection, "ParamClient", client)
+        monkeypatch.setattr(cli_session, "ParamClient", client)
 
     return place
 

@@ -15,8 +15,8 @@ import anyio
 import pytest
 
 from paramclient import FileTransferError, NoReply, ParamCache, ParamClient
-from paramclient.cli import connection as session_room
 from paramclient.cli import run as run_command
+from paramclient.cli import session as session_room
 from paramclient.client import cache_writer
 from paramclient.client import subscription as subscription_room
 from paramclient.client.client import local_client

@@ -35,7 +35,8 @@ from paramclient import (
     key_from_environment,
     read_key,
 )
-from paramclient.cli import connection, run
+from paramclient.cli import run
+from paramclient.cli import session as cli_session
 from paramclient.cli import signing as signing_commands
 from paramclient.client import signing, signing_timestamps
 from paramclient.client.signing_timestamps import LOOK_INTERVAL, RESERVED, TimestampFile, TimestampKeeper
@@ -526,7 +527,7 @@ def put(monkeypatch: pytest.MonkeyPatch) -> Callable[[Vehicle], str]:
         def client(_: object, **options: Any) -> ParamClient:
             return ParamClient(link, **options)
 
-        monkeypatch.setattr(connection, "ParamClient", client)
+        monkeypatch.setattr(cli_session, "ParamClient", client)
         monkeypatch.setattr(signing_commands, "create_link", lambda _: link)
         return "sim:custom"
 

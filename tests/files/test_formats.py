@@ -866,7 +866,7 @@ def test_yaml_reads_numbers_as_json_does() -> None:
 
 
 def test_yaml_without_pyyaml_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("paramclient.files.document.find_spec", lambda _: None)
+    monkeypatch.setattr("paramclient.files.document_format.find_spec", lambda _: None)
     data = dumps(params_of(WrittenParam("A", 1)), form="yaml")
     with pytest.raises(FileError, match=r"pip install 'paramclient\[yaml\]'"):
         loads(data)

@@ -12,7 +12,7 @@ import anyio
 import pytest
 
 from paramclient.service import Listening, gate, places
-from paramclient.service.addresses import is_loopback, network_of
+from paramclient.service.client_address import is_loopback, network_of
 from paramclient.service.log_limit import MINUTE, MOST_KINDS, LogLimit
 from paramclient.service.places import KEPT_FOR_LOOPBACK, MOST_FROM_ONE, Place, Places, Stage
 from tests.service.test_attacks import Answer, Served, over_tls, served, taken, trusting

@@ -26,7 +26,7 @@ from paramclient.protocol import wire
 from paramclient.service import AccessSettings, Hub, Settings, Tokens, create_app
 from paramclient.service.param_sources import LARGEST_UPLOAD
 from paramclient.service.quota import LONG_REQUESTS_OF_ONE
-from paramclient.service.routes.files import attachment
+from paramclient.service.routes.param_files import attachment
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
 from paramclient.sim.vehicle import Vehicle
 from tests.asgi import a_browser

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from paramclient.protocol.ftp.file_read import LARGEST_FILE, FileRead
-from paramclient.protocol.ftp.operations import BUSY
 from paramclient.protocol.ftp.passive import ObservedRead, ObservedReads
+from paramclient.protocol.ftp.transfer_job import BUSY
 from paramclient.protocol.ftp.transfers import (
     DirectoryEntry,
     FileChecksum,

@@ -8,8 +8,8 @@ from typing import Final, NamedTuple
 
 from paramclient.errors import FileErrorCode, FileTransferError, UsageError
 from paramclient.protocol.ftp.blocks import Blocks
-from paramclient.protocol.ftp.operations import Job, Line
 from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
+from paramclient.protocol.ftp.transfer_job import Job, Line
 from paramclient.protocol.requests.round_trip import LONGEST_SILENCE, MOST_TRIES
 
 __all__ = ["LARGEST_FILE", "FileRead"]

@@ -8,8 +8,8 @@ from typing import Final
 
 from paramclient.errors import FileErrorCode
 from paramclient.protocol.ftp.blocks import Blocks
-from paramclient.protocol.ftp.operations import SESSION_LOST
 from paramclient.protocol.ftp.packets import Opcode, Packet
+from paramclient.protocol.ftp.transfer_job import SESSION_LOST
 
 __all__ = ["ObservedRead", "ObservedReads", "path_of"]
 

@@ -13,8 +13,8 @@ from typing import Any, Final, NamedTuple, TypeVar
 
 from paramclient.errors import FileErrorCode, NoReply, UsageError
 from paramclient.protocol.ftp.file_read import LARGEST_FILE, FileRead
-from paramclient.protocol.ftp.operations import Job, Line
 from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
+from paramclient.protocol.ftp.transfer_job import Job, Line
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.wire import FileTransfer

@@ -39,7 +39,7 @@ from paramclient.service.param_sources import (
 from paramclient.service.problems import ServiceError
 from paramclient.service.reading import BodyRoute, long_request
 from paramclient.service.route_context import Target, TheHub, answered, may_write
-from paramclient.service.routes.files import Form, From, attachment, moment
+from paramclient.service.routes.param_files import Form, From, attachment, moment
 
 __all__ = ["router"]
 

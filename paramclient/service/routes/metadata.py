@@ -17,7 +17,7 @@ from paramclient.service.problems import ServiceError
 from paramclient.service.reading import BodyRoute, long_request
 from paramclient.service.request import LARGEST_DESCRIPTION
 from paramclient.service.route_context import Seconds, Target, TheHub, answered, may_write
-from paramclient.service.routes.files import RAW_BODY, body_of
+from paramclient.service.routes.param_files import RAW_BODY, body_of
 
 __all__ = ["router"]
 

@@ -15,9 +15,9 @@ from paramclient.model.values import ParamType, crc32_px4
 from paramclient.protocol import wire
 from paramclient.protocol.ftp import DirectoryEntry, FileRead, FileTransfers, param_pck
 from paramclient.protocol.ftp.file_read import MOST_RESTARTS, SMALLEST_WINDOW
-from paramclient.protocol.ftp.operations import BUSY_PATIENCE, MOST_FAILURES, MOST_OPENINGS, QUIET_TIME
 from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
 from paramclient.protocol.ftp.param_pck import PackedParam
+from paramclient.protocol.ftp.transfer_job import BUSY_PATIENCE, MOST_FAILURES, MOST_OPENINGS, QUIET_TIME
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.requests.round_trip import FEWEST_TRIES, MOST_TRIES, RoundTrip

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import pytest
 
 from paramclient.protocol import wire
-from paramclient.protocol.ftp.operations import QUIET_TIME
 from paramclient.protocol.ftp.packets import Opcode, Packet
+from paramclient.protocol.ftp.transfer_job import QUIET_TIME
 from paramclient.protocol.params.fetch import BLIND_PATIENCE, FILE_PATIENCE, Fetch
 from paramclient.protocol.params.fetch_notes import FILE_IN_USE
 from paramclient.protocol.requests.round_trip import FIRST_TIMEOUT
