@@ -1,15 +1,14 @@
-"""What hostile hands can do to the service and to its clients: attack, limit, measured, held.
+"""Attacks on the service and its clients: each attack with its limit and the measured value.
 
     python bench/attack.py [--quick] [--only TEXT] [--slack N] [--json]
 
-Each group of attacks has a service of its own (`paramclient serve`, with and without TLS, on loopback), and
-each attack says what it measures and what the limit is. 127.0.0.1 is this computer there; other addresses of
-the loopback network play clients beyond it, as the process begins with a notion of its own of what this
-computer is. Nothing else in it is changed, but that the event loop notes how much processor time its longest
-callback has taken.
+Each group of attacks has its own service (`paramclient serve`, with and without TLS, on loopback), and each
+attack prints what it measures and the limit. 127.0.0.1 counts as this computer; other addresses of the
+loopback network act as remote clients, because the process is started with a changed test for loopback
+addresses. The only other change is that the event loop records the processor time of its longest callback.
 
-`--quick` runs those that take about a second each. The exit code is 1 where a limit was not held. Linux only:
-memory is read from /proc.
+`--quick` runs the attacks that take about a second each. The exit code is 1 if a limit was exceeded. Linux
+only: memory is read from /proc.
 """
 
 from __future__ import annotations
@@ -46,25 +45,25 @@ ROOT: Final = Path(__file__).parent.parent
 CERT: Final = ROOT / "tests" / "data" / "tls_station.pem"
 KEY: Final = ROOT / "tests" / "data" / "tls_station.key"
 HERE, ELSEWHERE, FAR = "127.0.0.1", "127.0.0.2", "127.0.0.3"
-"""This computer, the attacker beyond it, and somebody else beyond it."""
+"""Addresses of this computer, of a remote attacker, and of another remote client."""
 WRITER, READER = "writer-0123456789abcdef", "reader-0123456789abcdef"
 C: Final = "/api/v1/components/1/1"
 MEGABYTE: Final = 1_000_000
 PATIENCE: Final = 60.0
-"""Seconds for a process to start, and for an answer to come."""
+"""Seconds to wait for the start of a process, and for a response."""
 
 REACHED: Final = 1.0
-"""Seconds within which `/health` is answered."""
+"""Limit in seconds for a response to `/health`."""
 BLOCKED: Final = 50.0
-"""Milliseconds of processor time of the longest callback of the event loop."""
+"""Limit in milliseconds for the processor time of the longest callback of the event loop."""
 MEMORY: Final = 64.0
-"""Megabytes by which the memory of the service grows at most."""
+"""Limit in megabytes for the growth of the service's memory."""
 MEMORY_OF_COMPONENTS: Final = 80.0
-"""The same where it follows as many components as it may, by docs/internals/bounds.md."""
+"""Limit in megabytes with the maximum number of components, by docs/internals/bounds.md."""
 LOG: Final = 10.0
-"""Kilobytes in the log."""
+"""Limit in kilobytes for the log."""
 ENDED: Final = 3.0
-"""Seconds from SIGTERM to the end."""
+"""Limit in seconds from SIGTERM to the end of the process."""
 
 LAUNCH: Final = """
 import asyncio.events, json, os, signal, sys, time
@@ -102,13 +101,13 @@ class Row:
 
     @property
     def is_held(self) -> bool:
-        """Whether it stayed within the limit."""
+        """Whether the measured value is within the limit."""
         return self.measured <= self.limit
 
 
 @dataclass
 class Service:
-    """A service that runs."""
+    """A running service."""
 
     process: subprocess.Popen[bytes]
     port: int
@@ -124,23 +123,23 @@ class Service:
 
     @property
     def log(self) -> str:
-        """All that it has written on stderr."""
+        """Everything that the service has written on stderr."""
         return (self.folder / "log").read_text(errors="replace")
 
     def memory(self, name: str = "VmHWM") -> float:
-        """Megabytes: the most since `forget`, or VmRSS for now."""
+        """Return the memory in megabytes: the maximum since `forget`, or with VmRSS the present one."""
         text = Path(f"/proc/{self.process.pid}/status").read_text()
         found = re.search(rf"{name}:\s+(\d+) kB", text)
         assert found is not None
         return int(found[1]) / 1024
 
     def forget(self) -> None:
-        """Begin to measure memory and the event loop anew."""
+        """Start new measurements of memory and event loop."""
         Path(f"/proc/{self.process.pid}/clear_refs").write_text("5")
         self.blocked()
 
     def blocked(self) -> float:
-        """Milliseconds that the longest callback of the event loop has taken since this was asked last."""
+        """Return the milliseconds of the longest callback of the event loop since the last call."""
         told = self.folder / "loop"
         told.unlink(missing_ok=True)
         self.process.send_signal(signal.SIGUSR1)
@@ -151,7 +150,7 @@ class Service:
 
     @contextmanager
     def watched(self, *, memory: float | None = MEMORY, blocked: float | None = BLOCKED) -> Iterator[None]:
-        """Measure what happens in here."""
+        """Measure memory and event loop during the block, and add the lines to the table."""
         self.forget()
         before, log = self.memory("VmRSS"), len(self.log)
         yield
@@ -170,7 +169,7 @@ class Service:
         source: str = HERE,
         kind: str = "application/json",
     ) -> tuple[int, bytes]:
-        """One request on a connection of its own: the status, 0 where there was no answer, and the body."""
+        """Send one request on a new connection; return the status, or 0 without a response, and the body."""
         lines = [f"{method} {path} HTTP/1.1", f"Host: 127.0.0.1:{self.port}", "Connection: close", *headers]
         lines += [f"Content-Type: {kind}", f"Content-Length: {len(body)}"] if body else []
         data = b""
@@ -187,7 +186,7 @@ class Service:
         return (int(head.split()[1]) if head else 0), content
 
     async def reached(self, what: str, source: str = HERE, times: int = 3) -> None:
-        """Note the longest that `/health` takes."""
+        """Add the longest response time of `/health` to the table."""
         longest = 0.0
         for _ in range(times):
             began = time.monotonic()
@@ -196,7 +195,7 @@ class Service:
         self.note(what, REACHED, longest, "s")
 
     def is_busy(self) -> bool:
-        """Whether it has taken processor time since this was asked last."""
+        """Return whether the service has used processor time since the last call."""
         before, self.cpu = (
             self.cpu,
             sum(map(int, Path(f"/proc/{self.process.pid}/stat").read_text().split()[13:15])),
@@ -204,7 +203,7 @@ class Service:
         return self.cpu > before + 2
 
     def end(self) -> float:
-        """SIGTERM; give the seconds until it ended."""
+        """Send SIGTERM; return the seconds until the process ended."""
         began = time.monotonic()
         self.process.send_signal(signal.SIGTERM)
         try:
@@ -218,7 +217,7 @@ class Service:
 async def serving(
     rows: list[Row], *words: str, tls: bool = False, tokens: bool = True, folder: Path | None = None
 ) -> AsyncIterator[Service]:
-    """A fresh service."""
+    """Run a new service."""
     own = Path(tempfile.mkdtemp()) if folder is None else folder
     words = (*words, "--listen", "127.0.0.1:0")
     if tls:
@@ -255,7 +254,7 @@ async def serving(
 def connections(
     service: Service, count: int, source: str, data: bytes = b""
 ) -> Iterator[list[socket.socket]]:
-    """Plain TCP connections that send these bytes and nothing else."""
+    """Open plain TCP connections that send these bytes and nothing else."""
     held = []
     try:
         for _ in range(count):
@@ -274,7 +273,7 @@ def connections(
 
 
 def token(text: str) -> str:
-    """The header that shows a token."""
+    """Return the header with a token."""
     return f"Authorization: Bearer {text}"
 
 
@@ -308,7 +307,7 @@ async def handshakes(service: Service, quick: bool) -> None:
 
 
 async def requests(service: Service, quick: bool) -> None:
-    """Clause 7, with a token that may only read."""
+    """Clause 7, with a read-only token."""
     for path in ("/api/v1/find", f"{C}/fetch"):
         status, answer = await service.ask("POST", path, b'{"timeout_s": 60}', token(READER))
         assert status == 200, answer
@@ -376,7 +375,7 @@ async def requests(service: Service, quick: bool) -> None:
 
 
 async def large_table(rows: list[Row], quick: bool) -> None:
-    """Clause 7: what a reader asks of a vehicle that has as many parameters as one request may name."""
+    """Clause 7: requests of a reader for a vehicle with as many parameters as one request may name."""
     table = {f"A{number % 97}_P{number:05}": float(number) for number in range(300 if quick else 10_000)}
     values = {"wanted": {"values": {name: value + 1 for name, value in table.items()}}, "timeout_s": 60}
     asked: list[tuple[str, str, bytes]] = [
@@ -409,7 +408,7 @@ async def large_table(rows: list[Row], quick: bool) -> None:
 
 
 async def guesses(service: Service, quick: bool) -> None:
-    """Clause 8, with 127.0.0.2 for a proxy that is trusted."""
+    """Clause 8, with 127.0.0.2 as a trusted proxy."""
     service.attack = "30 wrong tokens, then a right one"
     for sources, shown, limit in (
         ([HERE, HERE], ["", ""], 2.5),
@@ -466,7 +465,7 @@ async def stuck_readers(service: Service, quick: bool) -> None:
 
 
 async def killed_apply(rows: list[Row], quick: bool) -> None:
-    """Clause 8: `kill -9` in an apply, and what the next start says."""
+    """Clause 8: `kill -9` during an apply, and the report of the next start."""
     folder = Path(tempfile.mkdtemp())
     link = ["sim:px4", "--cache", str(folder / "cache.sqlite3")]
     try:
@@ -511,7 +510,7 @@ import httpx, paramclient.remote.client
 before = peak()
 print(asyncio.run(main()), peak() - before, time.monotonic() - began)
 """
-"""A client that opens a service; it prints the error, the memory that it took, and the seconds."""
+"""A client program that opens a service; it prints the error, the megabytes used, and the seconds."""
 
 
 async def hostile_service(rows: list[Row], quick: bool) -> None:
@@ -600,7 +599,7 @@ async def udp(rows: list[Row], quick: bool) -> None:
 
 
 def as_json(document: dict[str, Any], **more: Any) -> bytes:
-    """A document as it is sent."""
+    """Return a document as JSON bytes."""
     return json.dumps({**document, **more}).encode()
 
 
@@ -608,7 +607,7 @@ def as_json(document: dict[str, Any], **more: Any) -> bytes:
 
 
 async def attack(quick: bool, only: str) -> list[Row]:
-    """Run the groups whose name holds a text."""
+    """Run the groups of attacks whose name contains a text."""
     rows: list[Row] = []
 
     async def on_service(
@@ -639,7 +638,7 @@ async def attack(quick: bool, only: str) -> list[Row]:
 
 
 def table(rows: Iterable[Row]) -> str:
-    """The rows as text."""
+    """Return the rows as text."""
     cells = [("attack", "what", "limit", "measured", "", "held")]
     cells += [
         (

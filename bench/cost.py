@@ -1,18 +1,18 @@
-"""What the library costs: bytes to table, a client that only listens, and the memory of a table.
+"""Cost of the library: processor time from bytes to table, idle listening, and memory of a table.
 
     python bench/cost.py [--rounds N] [--seconds S] [--check]
 
-Prints each figure beside its target; with `--check` it fails when one is missed. Times are those of the CPU,
-which other work on the machine disturbs less than those of the clock on the wall.
+Prints each figure with its target; with `--check`, fails if a target is missed. Times are CPU times, which
+other work on the machine disturbs less than wall-clock times.
 
-- Bytes to table: the list of a simulated PX4 vehicle goes through `Station.receive`: framing, checksum,
-  decoding, table, events. pymavlink's `parse_buffer` takes the same bytes in the same run and only parses
-  them. Both are given one frame at a time, as in datagrams, and all at once, as from a stream. The last
-  value is left out: with it a fetch ends and proves the hash, which is timed on its own.
-- Listening: a client on a real UDP socket hears telemetry that it has no use for, and a heartbeat a second.
-  The frames come one by one, evenly, which is the worst case; and in bursts every 10 ms, as from the loop
-  of a vehicle. Nothing is awaited of the vehicle meanwhile, so the client rests between the frames.
-- Memory: what a component holds after a download.
+- Bytes to table: `Station.receive` processes the list of a simulated PX4 vehicle: framing, checksum,
+  decoding, table, events. pymavlink's `parse_buffer` only parses the same bytes in the same run. Both get
+  one frame at a time, as in datagrams, and all frames in one call, as from a stream. The last value is left
+  out: it ends a fetch and verifies the hash, which is timed separately.
+- Listening: a client on a real UDP socket receives telemetry that it does not use, and a heartbeat a second.
+  The frames arrive one by one at a constant rate, which is the worst case; and in bursts every 10 ms, as from
+  the main loop of a vehicle. No request is pending, so that the client sleeps between the frames.
+- Memory: the memory of a component after a download.
 """
 
 from __future__ import annotations
@@ -41,19 +41,21 @@ from paramclient.protocol.station import Station
 from paramclient.sim import PX4Vehicle
 
 FRAMES_PER_SECOND = 150_000
+"""The target for the rate of PARAM_VALUEs from bytes to table, per second."""
 MOST_LOAD = 0.05
+"""The target for listening, as a share of a core."""
 MOST_MEMORY = 300
-"""The targets: PARAM_VALUEs to the table, the share of a core, KiB for 1,000 parameters."""
+"""The target for the memory of 1,000 parameters, in KiB."""
 
 TELEMETRY = 2_000
-"""Frames a second for the client that listens."""
+"""Frames per second for the listening client."""
 WARM_UP = 9.0
-"""Seconds before its CPU time is read first: until then it asks the component, in vain, who it is."""
+"""Seconds before the first reading of the CPU time: until then the client requests the identity in vain."""
 
 
 @dataclass(frozen=True)
 class Download:
-    """What a vehicle sends.
+    """The frames that a vehicle sends for a download.
 
     Attributes:
         heartbeat: one frame.
@@ -83,7 +85,7 @@ def main() -> int:
 
 
 def print_rates(download: Download, rounds: int) -> bool:
-    """Frames a second in each way of taking them, in the median; whether the targets are met."""
+    """Print the median frames per second of each way of parsing; return whether the targets are met."""
     count = len(download.values) - 1
     ways: dict[str, Callable[[list[bytes]], float]] = {
         "pymavlink, parsing only": parse_with_pymavlink,
@@ -117,7 +119,7 @@ def print_rates(download: Download, rounds: int) -> bool:
 
 
 def parse_with_pymavlink(chunks: list[bytes]) -> float:
-    """Seconds of the CPU that pymavlink's parser takes, as a program without a signing key sets it up."""
+    """Return the CPU seconds of pymavlink's parser, set up as in a program without a signing key."""
     parser = common.MAVLink(None)
     parsed = 0
     start = time.process_time()
@@ -129,7 +131,7 @@ def parse_with_pymavlink(chunks: list[bytes]) -> float:
 
 
 def receive(download: Download, chunks: list[bytes], *, fetching: bool = False, known: bool = False) -> float:
-    """Seconds of the CPU from bytes to table."""
+    """Return the CPU seconds from bytes to table."""
     station = meet(download)
     if fetching:
         station.components[1, 1].begin_fetch(1.0)
@@ -143,7 +145,7 @@ def receive(download: Download, chunks: list[bytes], *, fetching: bool = False, 
 
 
 def prove(download: Download) -> float:
-    """Seconds of the CPU for the last value of a fetch, with which the hash is computed and compared."""
+    """Return the CPU seconds for the last value of a fetch, after which the hash is computed and compared."""
     station = meet(download)
     fetch = station.components[1, 1].begin_fetch(1.0)
     station.receive(download.announcement, None, 1.0)
@@ -162,14 +164,14 @@ def deliver(station: Station, chunks: list[bytes], now: float) -> float:
 
 
 def meet(download: Download) -> Station:
-    """A station that has heard the vehicle's heartbeat."""
+    """Return a station that has received the vehicle's heartbeat."""
     station = Station(link="bench", is_stream=False)
     station.receive(download.heartbeat, None, 0.0)
     return station
 
 
 def print_load(seconds: float, burst: int) -> bool:
-    """The share of a core that a client needs to hear telemetry; whether the target is met."""
+    """Print the share of a core that a listening client needs; return whether the target is met."""
     spawn = multiprocessing.get_context("spawn")
     stop = spawn.Event()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
@@ -190,7 +192,7 @@ def print_load(seconds: float, burst: int) -> bool:
 
 
 async def listen(port: int, seconds: float) -> tuple[float, float]:
-    """The share of a core that a client takes, and the frames a second that it hears."""
+    """Return the share of a core that a client uses, and the frames per second that it receives."""
     async with ParamClient(f"udpin:127.0.0.1:{port}", cache=False) as client:
         await client.component()
         await anyio.sleep(WARM_UP)
@@ -203,7 +205,7 @@ async def listen(port: int, seconds: float) -> tuple[float, float]:
 
 
 def send_telemetry(port: int, burst: int, stop: Event) -> None:
-    """Send a vehicle's telemetry to a port until told to stop; runs in a process of its own."""
+    """Send a vehicle's telemetry to a port until `stop` is set; runs in another process."""
     frames = telemetry()
     heartbeat = record_download().heartbeat
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
@@ -217,13 +219,13 @@ def send_telemetry(port: int, burst: int, stop: Event) -> None:
                         out.send(heartbeat)
                     out.send(frames[number % len(frames)])
                 except ConnectionRefusedError:
-                    pass  # the client is not there yet, or not any more
+                    pass  # the client has not opened the port yet, or has closed it
             sent += burst
             time.sleep(max(0.0, began + sent / TELEMETRY - time.perf_counter()))
 
 
 def telemetry() -> list[bytes]:
-    """Frames of which a client makes nothing: without PARAM_VALUE, and without heartbeats of nobody."""
+    """Return frames that a client does not use: no PARAM_VALUE, and no heartbeat."""
     stream = build_stream(3_000, random.Random(1))
     frames = []
     while stream:
@@ -235,11 +237,11 @@ def telemetry() -> list[bytes]:
 
 
 MEAN_SIZE = statistics.mean(map(len, telemetry()))
-"""Bytes of a frame."""
+"""Mean bytes of a frame."""
 
 
 def print_memory(download: Download) -> bool:
-    """KiB for 1,000 parameters; whether the target is met."""
+    """Print the KiB for 1,000 parameters; return whether the target is met."""
     station = meet(download)
     machine = station.components[1, 1]
     gc.collect()
@@ -273,7 +275,7 @@ def print_memory(download: Download) -> bool:
 
 
 def record_download() -> Download:
-    """What a simulated PX4 vehicle sends when it is asked for its list."""
+    """Return the frames that a simulated PX4 vehicle sends for a list request."""
     vehicle = PX4Vehicle()
     vehicle.tick(0.0)
     heartbeat, _system_time = vehicle.data_to_send()

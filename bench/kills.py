@@ -1,21 +1,21 @@
-"""Kill programs that write the cache at random moments, and look for what is lost.
+"""Kill programs that write the cache at random times, and check which values are lost.
 
     python bench/kills.py [--kills 1000] [--seed 1] [--only station,service,database] [--slack 0.5]
 
 In each round a victim runs for up to a second and sets parameters of a simulated vehicle, in every second
-round some of them with `durable`, and gets SIGKILL at a random moment, also while it starts:
+round some of them with `durable`, and receives SIGKILL at a random time, also during its start:
 
 station   a program with a ParamClient, and a SQLite file
-service   what `paramclient serve` does, with a SQLite file; the parameters are set over HTTP
-database  the PostgreSQL of a station, with all of its processes; the station goes on, and ends in good order
+service   the code of `paramclient serve`, with a SQLite file; the parameters are set over HTTP
+database  the PostgreSQL of a station, with all of its processes; the station continues, and ends normally
 
 Then the cache is opened. It must not be damaged, and table and history must have every set that was
-acknowledged as durable, and every other one that was acknowledged more than 0.25 s and the slack before the
-kill. By then a change should be on the disk. The slack is for a batch under way at that time, for the commit,
-and for two waits for a core where other programs take them. The table has the age of the oldest set
-that was lost. Of a database, nothing that was acknowledged may be missing, as its station lives on.
+acknowledged as durable, and every other set that was acknowledged more than 0.25 s plus the slack before the
+kill: by then a change should be on the disk. The slack covers a batch in progress at that time, the commit,
+and two waits for a core on a busy machine. The table has the age of the oldest lost set. With a killed
+database, no acknowledged set may be missing, because its station continues.
 
-Exit code 1 says that something was lost.
+Exit code 1: a set was lost.
 """
 
 from __future__ import annotations
@@ -47,20 +47,20 @@ from paramclient.sim import PX4Vehicle
 from tests.postgres import PROGRAMS, Server, database_on, server
 
 LONGEST_LIFE = 1.0
-"""Seconds from the first set until the kill."""
+"""Maximum seconds from the first set to the kill."""
 EARLY = 0.1
-"""The share of the rounds in which the victim is killed before it has set anything."""
+"""Share of the rounds in which the victim is killed before its first set."""
 DURABLE = 0.3
-"""The share of the sets that are durable, in every second round."""
+"""Share of durable sets in every second round."""
 NAMES = [f"PARAM_{number:02}" for number in range(30)]
 FRESH_EVERY = 25
-"""Rounds after which a fresh cache begins: histories are bounded."""
+"""Rounds after which a new cache is used, because the history has a maximum length."""
 PATIENCE = 60.0
 
 
 @dataclass(frozen=True)
 class Acknowledged:
-    """A set that the vehicle has acknowledged, by the clock of all processes."""
+    """A set that the vehicle has acknowledged, with its time on the clock that all processes share."""
 
     name: str
     value: int
@@ -70,14 +70,14 @@ class Acknowledged:
 
 @dataclass
 class Figures:
-    """What came of the rounds of one kind of victim."""
+    """The results of the rounds with one kind of victim."""
 
     kills: int = 0
     sets: int = 0
     durable: int = 0
     lost: list[str] = field(default_factory=list)
     oldest: float = 0.0
-    """Seconds before the kill at which the oldest set was acknowledged that was lost and may be."""
+    """Seconds between the acknowledgement of the oldest lost set and the kill, of sets that may be lost."""
 
 
 def main() -> int:
@@ -91,7 +91,7 @@ def main() -> int:
     if len(kinds) < len(options.only.split(",")):
         print("no PostgreSQL is here: no database is killed", file=sys.stderr)
     print(f"{options.kills} kills, seed {options.seed}", flush=True)
-    logging.disable()  # that a database is gone is what is wanted
+    logging.disable()  # the loss of the database is intended
     dice = random.Random(options.seed)
     figures = {kind: Figures() for kind in kinds}
     with ExitStack() as stack:
@@ -116,7 +116,7 @@ def main() -> int:
 
 
 class Rounds:
-    """One kill after the other.
+    """Runs the rounds one after another.
 
     Attributes:
         server, url: the PostgreSQL, and a database in it.
@@ -131,15 +131,15 @@ class Rounds:
         self._slack = slack
         self._figures = figures
         self._durable = 0.0
-        self._values = iter(range(1, 1 << 24))  # what a float32 tells apart, too
+        self._values = iter(range(1, 1 << 24))  # a float32 holds these exactly
 
     def play(self, kind: str, number: int) -> None:
-        """Let a victim run, kill it, and look at what is kept."""
+        """Run a victim, kill it, and check the cache."""
         place = (
             self.url if kind == "database" else str(self._folder / f"{kind}-{number // FRESH_EVERY}.sqlite3")
         )
         first = next(self._values)
-        for _ in range(2_000):  # those that the victim may use
+        for _ in range(2_000):  # values for the victim
             last = next(self._values)
         found = self._figures[kind]
         found.kills += 1
@@ -168,7 +168,7 @@ class Rounds:
                 time.sleep(life / 2)
                 said = b""
             else:
-                said = told.readline()  # it has set something
+                said = told.readline()  # waits for the first set
                 time.sleep(life)
             killed_at = time.monotonic()
             if is_database:
@@ -231,7 +231,7 @@ class Rounds:
     def _check(
         self, kind: str, number: int, place: str, acknowledged: list[Acknowledged], killed_at: float
     ) -> None:
-        """Look for every set in table and history."""
+        """Check table and history for every set."""
         found = self._figures[kind]
         with ParamCache(place) as cache:
             tables = cache.components()
@@ -262,7 +262,7 @@ class Rounds:
 
 
 def forked(work: Callable[[], object]) -> int:
-    """Do something in a process of its own; the process id."""
+    """Run `work` in a forked process; return the process id."""
     child = os.fork()
     if child:
         return child
@@ -276,7 +276,7 @@ def forked(work: Callable[[], object]) -> int:
 
 
 def station(place: str, told: int, values: Iterable[int], share: float, seed: float) -> None:
-    """Set parameters, and tell of each that was acknowledged."""
+    """Set parameters, and write each acknowledged set to the pipe."""
     anyio.run(_station, place, told, values, share, seed)
 
 
@@ -304,7 +304,7 @@ async def _station(place: str, told: int, values: Iterable[int], share: float, s
 
 
 def serve(place: str, told: int) -> None:
-    """What `paramclient serve` does, with its address on the pipe."""
+    """Run the code of `paramclient serve`, and write its address to the pipe."""
 
     async def work() -> None:
         hub = service.Hub([PX4Vehicle(table=dict.fromkeys(NAMES, 0))], cache=place)
@@ -319,10 +319,10 @@ def tell(told: int, text: str) -> None:
 
 
 def ask(connection: http.client.HTTPConnection, method: str, path: str, body: object) -> None:
-    """One request, which succeeds.
+    """Send one request, which must succeed.
 
     Raises:
-        OSError, HTTPException: the service is not there any more.
+        OSError, HTTPException: the service has ended.
     """
     connection.request(method, path, json.dumps(body), {"content-type": "application/json"})
     answer = connection.getresponse()

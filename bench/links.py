@@ -1,13 +1,13 @@
-"""How long a download takes on good and bad links, against an oracle, in simulated time.
+"""Duration of downloads on good and bad links, compared with an oracle, in simulated time.
 
-A run is the session of a program without a cache: nothing is known of the vehicle until its first heartbeat
-arrives, and the fetch begins then. The time from there on counts, identification included.
+A run is the session of a program without a cache: it knows nothing of the vehicle until the first heartbeat,
+and then begins the fetch. The time from the heartbeat on is measured, identification included.
 
 Run `python bench/links.py` for the table, `--seeds N` for more seeds, `--only TEXT` for the rows whose name
-holds a text, `--row NAME` for the one with this name, `--check` to fail when a row is beyond its bound. The
-protocol core runs against the simulated vehicles through the faulty link with no socket and no clock: the
-same seeds give the same figures anywhere. Where several vehicles share a link, the oracle's column holds the
-time of as many single downloads.
+contains a text, `--row NAME` for the row with this name, `--check` to fail if a row exceeds its bound. The
+protocol core runs against simulated vehicles over a faulty link without socket and clock: equal seeds give
+equal figures on every machine. If several vehicles share a link, the oracle's column has the time of as many
+single downloads.
 """
 
 from __future__ import annotations
@@ -30,10 +30,11 @@ from paramclient.protocol.station import Station
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, Vehicle
 
 LIMIT = 600.0
-"""Simulated seconds after which a run counts as endless."""
+"""Maximum simulated seconds of a run, after which it counts as endless."""
 UDP_FILE_RATE = 48_500.0
+"""Bytes per second of a MAVFTP burst of an ArduPilot on UDP (measured)."""
 UDP_READ_RATE = 3 * UDP_FILE_RATE
-"""Bytes per second of a burst of ArduPilot on UDP, as measured, and of what is asked for singly."""
+"""Bytes per second of single MAVFTP reads from an ArduPilot on UDP."""
 
 
 @dataclass(frozen=True)
@@ -41,14 +42,14 @@ class Row:
     """One kind of vehicle on one kind of link.
 
     Attributes:
-        name: what the row is called.
-        make: makes the vehicle.
-        reads_per_second: what the oracle may count on: the vehicle's own pace, or the link's.
+        name: the name of the row.
+        make: creates the vehicle.
+        reads_per_second: the read rate of the oracle: that of the vehicle, or of the link.
         faults: keywords of `FaultyLink`, for each direction.
-        bound: the largest ratio to the oracle that is good enough.
-        limit: the seconds that are good enough.
-        vehicles: how many share the link. Several are measured against as many single downloads.
-        file_rate: bytes per second of a burst of the vehicle's file, where it serves one.
+        bound: the highest acceptable ratio to the oracle.
+        limit: the highest acceptable time in seconds.
+        vehicles: number of vehicles on the link. Several are compared with as many single downloads.
+        file_rate: bytes per second of a burst of the vehicle's file, if it serves one.
     """
 
     name: str
@@ -63,7 +64,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Run:
-    """One download, or several at once: when it ended, whether all was whole and right, and what it cost."""
+    """One download, or several concurrent ones: duration, correctness, bytes and requests."""
 
     seconds: float
     is_right: bool
@@ -78,7 +79,7 @@ class Run:
 
 
 def rows() -> Iterator[Row]:
-    """Every row, in the order in which they are printed."""
+    """Yield all rows in the order of the output."""
     kinds: tuple[tuple[str, Callable[..., Vehicle], float], ...] = (
         ("PX4", PX4Vehicle, 5000.0),
         ("ArduPilot", partial(ArduPilotVehicle, ftp=False), 50.0),
@@ -94,7 +95,7 @@ def rows() -> Iterator[Row]:
             for loss in (0.05, 0.20):
                 name = f"{kind} UDP 100 ms {loss:.0%} in bursts of 8{beside}"
                 yield Row(name, plain, served, {"loss": loss, "delay": 0.05, "loss_burst": 8.0})
-            # on a serial port both pace themselves by the room in its buffer, and send less telemetry
+            # on a serial port both limit their rate by the free space of its buffer, and send less telemetry
             burst = 3 if kind == "PX4" else 1
             radio = partial(make, burst=burst, period=0.025, telemetry=telemetry / 5)
             for loss in (0.0, 0.05, 0.15):
@@ -112,11 +113,11 @@ def rows() -> Iterator[Row]:
 
 
 def file_rows() -> Iterator[Row]:
-    """The rows of downloads as one file."""
+    """Yield the rows of file downloads."""
     limits = {(0.1, 0.0): 0.6, (0.1, 0.05): 0.9, (0.1, 0.2): 1.5}
     for loss, bound in ((0.0, 1.25), (0.01, 1.25), (0.05, 1.25), (0.20, 1.4), (0.40, 1.5)):
         for trip in (0.02, 0.1, 0.6, 2.5):
-            # who is not told cannot know within 20 ms that an answer got lost
+            # unlike the oracle, a client cannot detect a lost response within 20 ms
             is_untold = trip == 0.02 and loss == 0.4
             yield Row(
                 f"ArduPilot by FTP UDP {trip * 1000:g} ms {loss:.0%}",
@@ -136,7 +137,7 @@ def file_rows() -> Iterator[Row]:
 
 
 def download(row: Row, seed: int) -> Run:
-    """What this library makes of a row, and what it is measured against."""
+    """Run a row with this library; return the run with the oracle's time."""
     if row.vehicles == 1:
         return fetch(row, seed, oracle(row, seed))
     alone = replace(row, vehicles=1)
@@ -144,7 +145,7 @@ def download(row: Row, seed: int) -> Run:
 
 
 def fetch(row: Row, seed: int, measure: float) -> Run:
-    """The downloads of a row's vehicles, begun at once; `measure` is what their time is held against."""
+    """Download from all vehicles of a row concurrently; `measure` is the oracle's time."""
     vehicles = [row.make(system=system) for system in range(1, row.vehicles + 1)]
     uplink = FaultyLink(**row.faults, seed=2 * seed)
     downlink = FaultyLink(**row.faults, seed=2 * seed + 1)
@@ -186,16 +187,16 @@ def fetch(row: Row, seed: int, measure: float) -> Run:
 
 
 def is_right(result: FetchResult, vehicle: Vehicle) -> bool:
-    """Whether a result is whole, and every value is the vehicle's."""
+    """Return whether a result is complete and every value is that of the vehicle."""
     return result.complete and all(
         result.params[name].same_value(param)
         for name, param in vehicle.params.items()
-        if name not in ("STAT_RUNTIME", "BARO1_GND_PRESS")  # they move by themselves
+        if name not in ("STAT_RUNTIME", "BARO1_GND_PRESS")  # the vehicle changes them
     )
 
 
 def oracle(row: Row, seed: int) -> float:
-    """The oracle's time: by file, or by list the quickest of single reads and of two or three passes."""
+    """Return the oracle's time in seconds: by file, or the fastest list download with 1 to 3 passes."""
     if row.file_rate is not None:
         return file_oracle_time(
             row.make,

@@ -1,16 +1,16 @@
-"""Time the main jobs on real autopilots, through a link that loses datagrams.
+"""Duration of the main operations on real autopilots, over a link with packet loss.
 
     python bench/live.py LINK --kind ardupilot|px4 [--seeds N] [--row TEXT ...] [--check] [--json]
 
 LINK is the link to one vehicle, real or in the firmware's own simulation, such as `udpin:127.0.0.1:14550`. It
 must be disarmed. Everything goes through the relay of `tests/live/relay.py`, which has one port towards the
-vehicle for the whole run. Each run of a row is a new client with a new cache, which knows nothing of the
-vehicle. Every table that comes is compared with one that was fetched at the beginning.
+vehicle for the whole run. Each run of a row is a new client with a new, empty cache. Every downloaded table
+is compared with one that was fetched at the beginning.
 
-The row with `apply` changes parameters, and puts them back after each run: it turns on four groups that are
+The row with `apply` changes parameters, and restores them after each run: it turns on four groups that are
 off, and changes members of them.
 
-Prints a Markdown table, and below it the date, the machine, its load and the firmware, to be pasted as it is.
+Prints a Markdown table, and below it the date, the machine, its load and the firmware, ready to be pasted.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ from tests.live.relay import CLEAN, Conditions, Relay
 
 SEEDS: Final = 10
 ROUND_TRIP: Final = 0.1
-"""Seconds, where datagrams are lost."""
+"""Round-trip time in seconds of the rows with packet loss."""
 FETCH_TIMEOUT: Final = 120.0
-"""Seconds after which one run is given up."""
+"""Timeout of one run in seconds."""
 HEARING_TIMEOUT: Final = 20.0
 """Seconds to wait for the vehicle's heartbeat."""
 SESSION_PAUSE: Final = 3.5
-"""Seconds before each run but those of the row without a pause: ArduPilot keeps a MAVFTP session that was not
-closed for 3 s, and a run must not pay for the one before it."""
+"""Seconds before each run, except in the row without a pause: ArduPilot keeps a MAVFTP session that was not
+closed for 3 s, which must not delay the next run."""
 SWITCHES: Final = (
     *(
         "FENCE_ENABLE",
@@ -67,10 +67,10 @@ SWITCHES: Final = (
     ),
     *("DID_ENABLE", "VTX_ENABLE", "CHUTE_ENABLED", "CUST_ROT_ENABLE", "SOAR_ENABLE", "RALLY_ENABLE"),
 )
-"""Switches of ArduPilot that show a group; the first `GROUPS` that are off and show enough are taken."""
+"""Switches of ArduPilot that reveal a group; the first `GROUPS` that are off and reveal enough are used."""
 GROUPS: Final = 4
 VALUES: Final = 30
-"""Values that are applied, the switches among them."""
+"""Number of values that are applied, switches included."""
 NO_LIMITS: Final = (
     "_TYPE",
     "_ACTION",
@@ -84,9 +84,9 @@ NO_LIMITS: Final = (
     "_RETRACT",
     "_PIN",
 )
-"""Ends of names of members that choose something, instead of limiting it."""
+"""Suffixes of names of members that are a choice, not a limit."""
 GETS: Final = 100
-"""Values that are read one after the other."""
+"""Number of sequential reads."""
 COMMAND_TIMEOUT: Final = 30.0
 """Seconds for one call of the command."""
 ATTITUDE_ID: Final = 30
@@ -94,11 +94,11 @@ TELEMETRY_INTERVAL: Final = 0.1
 """Seconds between two ATTITUDE while the command is timed."""
 MAV_CMD_SET_MESSAGE_INTERVAL: Final = 511
 ENVIRONMENT: Final = {name: text for name, text in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
-"""Of the command: where bytecode is not kept, Python compiles every module at each start."""
+"""Environment of the command, with bytecode caching: else Python compiles modules at each start."""
 
 
 class WrongResult(Exception):
-    """A run did not bring what the vehicle has."""
+    """The result of a run differs from the vehicle's values."""
 
 
 @dataclass(frozen=True)
@@ -106,10 +106,10 @@ class Row:
     """One line of the table.
 
     Attributes:
-        name: what is timed.
-        kind: the autopilot that it is about.
-        measure: does one run, with this seed, and returns its seconds.
-        median, worst: the seconds that are good enough.
+        name: the operation that is measured.
+        kind: the autopilot of the row.
+        measure: executes one run with a seed, and returns its seconds.
+        median, worst: the highest acceptable seconds.
         pause: seconds before each run.
     """
 
@@ -123,14 +123,14 @@ class Row:
 
 @dataclass(frozen=True)
 class Timing:
-    """What came of a row.
+    """The result of a row.
 
     Attributes:
         row: its name.
-        seconds: of each run.
-        problems: of runs that did not bring what the vehicle has, in words.
-        median, worst: of the runs.
-        promised_median, promised_worst: the seconds that are good enough.
+        seconds: the seconds of each run.
+        problems: sentences on runs with wrong results.
+        median, worst: median and maximum seconds of the runs.
+        promised_median, promised_worst: the highest acceptable seconds.
     """
 
     row: str
@@ -143,7 +143,7 @@ class Timing:
 
     @property
     def is_met(self) -> bool:
-        """Whether every run was right, and median and worst are good enough."""
+        """Whether every run was right, and median and maximum are acceptable."""
         return not self.problems and self.median <= self.promised_median and self.worst <= self.promised_worst
 
 
@@ -152,13 +152,13 @@ class Vehicle:
     """The vehicle of the run.
 
     Attributes:
-        relay: the way to it.
+        relay: the relay to it.
         system: its system id.
-        journal: its state before, and what was changed.
-        folder: for caches.
+        journal: its state before, and the changes.
+        folder: the folder for caches.
         wanted: the values to apply, switches first; None until they are chosen.
-        members: what the switches and their members are before, for putting back.
-        caches: how many were made.
+        members: the values of the switches and their members before, to restore them.
+        caches: number of caches that were created.
     """
 
     relay: Relay
@@ -170,7 +170,7 @@ class Vehicle:
     caches: int = 0
 
     def new_cache(self) -> Path:
-        """Return a path where no cache is."""
+        """Return the path of a new cache."""
         self.caches += 1
         return self.folder / f"{self.caches}.sqlite3"
 
@@ -185,7 +185,7 @@ class Vehicle:
 
 
 def rows() -> Iterator[Row]:
-    """Give every row, in the order in which they are printed."""
+    """Yield all rows in the order of the output."""
     clean = partial(time_fetch, conditions=CLEAN)
     yield Row("ArduPilot, clean, one right after the other", "ardupilot", clean, 0.45, 0.6, pause=0.0)
     for refuses, way, bounds in (
@@ -209,7 +209,7 @@ def rows() -> Iterator[Row]:
 
 
 async def time_fetch(vehicle: Vehicle, seed: int, *, conditions: Conditions) -> float:
-    """Fetch everything once; the seconds from the call to the result, with the vehicle heard before."""
+    """Fetch all parameters once; return the seconds of the call, after the first heartbeat."""
     vehicle.relay.change(replace(conditions, seed=seed))
     async with ParamClient(vehicle.relay.link, cache=vehicle.new_cache()) as client:
         component = await client.component(vehicle.system, timeout=HEARING_TIMEOUT)
@@ -221,7 +221,7 @@ async def time_fetch(vehicle: Vehicle, seed: int, *, conditions: Conditions) -> 
 
 
 async def time_gets(vehicle: Vehicle, seed: int) -> float:
-    """Read values one after the other in a new session, each when the one before has come."""
+    """Read values sequentially in a new session; return the seconds."""
     vehicle.relay.change(replace(CLEAN, seed=seed))
     names = sorted(name for name, param in vehicle.journal.before.items() if isinstance(param.value, int))
     async with ParamClient(vehicle.relay.link, cache=vehicle.new_cache()) as client:
@@ -236,9 +236,9 @@ async def time_gets(vehicle: Vehicle, seed: int) -> float:
 
 
 async def time_command(vehicle: Vehicle, seed: int) -> float:
-    """Call `paramclient get` once; the seconds from the start of its process to the printed value.
+    """Run `paramclient get` once; return the seconds from the start of its process to the printed value.
 
-    The vehicle sends telemetry meanwhile, as it does to a ground station. One that sends only heartbeats is
+    The vehicle sends telemetry meanwhile, as to a ground station. A vehicle that sends only heartbeats is
     heard up to a second later.
     """
     vehicle.relay.change(CLEAN)
@@ -250,7 +250,7 @@ async def time_command(vehicle: Vehicle, seed: int) -> float:
 
 
 def set_attitude_interval(vehicle: Vehicle, seconds: float) -> None:
-    """Have the vehicle send ATTITUDE so often, by MAV_CMD_SET_MESSAGE_INTERVAL; 0 is its own choice again."""
+    """Set the interval of ATTITUDE in seconds by MAV_CMD_SET_MESSAGE_INTERVAL; 0 restores the default."""
     host, port = vehicle.relay.link.removeprefix("udpout:").split(":")
     params = (float(ATTITUDE_ID), seconds * 1e6, *[0.0] * 5)
     command = CommandLong(vehicle.system, AUTOPILOT_COMPONENT, MAV_CMD_SET_MESSAGE_INTERVAL, params)
@@ -283,7 +283,7 @@ async def time_one_get(vehicle: Vehicle, seed: int) -> float:
 
 
 async def time_apply(vehicle: Vehicle, seed: int) -> float:
-    """Apply the chosen values once, and put the vehicle back; the seconds of the call of `apply`."""
+    """Apply the chosen values once, and restore the vehicle; return the seconds of the call of `apply`."""
     vehicle.relay.change(CLEAN)
     if vehicle.wanted is None:
         async with ParamClient(vehicle.relay.link, cache=False) as client:
@@ -303,7 +303,7 @@ async def time_apply(vehicle: Vehicle, seed: int) -> float:
 
 
 async def choose_values(vehicle: Vehicle, component: Component) -> ParamSet:
-    """Look into the groups that are off, one after another, and choose what to apply.
+    """Inspect the groups that are off, one after another, and choose the values to apply.
 
     Raises:
         UsageError: the vehicle has too few groups that are off, or they have too few members.
@@ -339,17 +339,17 @@ def is_plain(param: Param) -> bool:
 
 
 async def put_back(vehicle: Vehicle, component: Component) -> None:
-    """Put back what was changed.
+    """Restore the changed values.
 
     Raises:
-        WrongResult: something could not be put back.
+        WrongResult: a value could not be restored.
     """
     if problems := await vehicle.journal.put_back(component):
         raise WrongResult(f"NOT AS BEFORE: {'; '.join(problems)}")
 
 
 async def time_row(row: Row, vehicle: Vehicle, seeds: int) -> Timing:
-    """Do every run of a row."""
+    """Execute all runs of a row."""
     seconds: list[float] = []
     problems: list[str] = []
     for seed in range(seeds):
@@ -377,7 +377,7 @@ async def time_row(row: Row, vehicle: Vehicle, seeds: int) -> Timing:
 async def time_rows(
     chosen: Sequence[Row], relay: Relay, folder: Path, options: argparse.Namespace
 ) -> tuple[str, list[Timing]]:
-    """Look at the vehicle, do every row, and see that the vehicle is as before; its name and the timings."""
+    """Run all rows and check that the vehicle is unchanged; return its name and the timings."""
     async with ParamClient(relay.link, cache=False) as client:
         component = await client.only_component(options.system, timeout=HEARING_TIMEOUT)
         if component.autopilot != options.kind:
@@ -400,7 +400,7 @@ async def time_rows(
 
 
 def table(timings: Sequence[Timing]) -> Iterator[str]:
-    """Give the lines of the Markdown table, and of what did not go right."""
+    """Yield the lines of the Markdown table, and of the problems."""
     yield "| real autopilot | median | worst | promised |"
     yield "|---|---|---|---|"
     for each in timings:
@@ -412,7 +412,7 @@ def table(timings: Sequence[Timing]) -> Iterator[str]:
 
 
 def main() -> int:
-    """Print the table; the exit code is 1 with `--check` when a promise is missed."""
+    """Print the table; return exit code 1 with `--check` if a promise is missed."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("link", help="the link to the vehicle")
     parser.add_argument("--kind", choices=list(TITLES), required=True)

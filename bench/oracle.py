@@ -1,16 +1,17 @@
-"""The client that a download is measured against: it is told of each loss, so it never waits in vain.
+"""The oracle: an ideal client that is informed of each lost packet, as the reference for downloads.
 
-It begins as a program does, with the first heartbeat of the vehicle. That tells it all that it has to know,
-except whether an ArduPilot serves its parameters as a file: there it waits for AUTOPILOT_VERSION before it
-requests the list, since no file would come beside a list. It sees what no client can see: a frame that the
-simulated link loses is reported to it at the moment when that frame, or the answer to it, would have arrived.
-So it never waits longer than one round trip for anything. It knows the rules by which the vehicle serves, and
-keeps as many requests in flight as the vehicle answers. It cannot make the vehicle or the link faster.
+The oracle begins like a program, with the first heartbeat of the vehicle. The heartbeat has all information
+except whether an ArduPilot serves its parameters as a file: there the oracle waits for AUTOPILOT_VERSION
+before it requests the list, because the vehicle would not serve a file during a list. Unlike a client, the
+oracle is informed of a frame that the simulated link loses, at the time at which that frame, or the response
+to it, would have arrived. It therefore never waits longer than one round trip. It knows the service rates of
+the vehicle, and keeps as many requests in flight as the vehicle answers. It cannot make the vehicle or the
+link faster.
 
-`oracle_time` runs it by list: after as many passes of the list as it is told, it fills the gaps with reads,
-either as soon as it learns of them or once the list is over, since an ArduPilot pauses a list for reads.
-`file_oracle_time` runs it by file: one burst, reads for the gaps, and the end of the session, without which
-the next program would have to wait.
+`oracle_time` is for list downloads: after a given number of passes of the list, the oracle fills the gaps
+with reads, either immediately or after the list, because an ArduPilot pauses a list for reads.
+`file_oracle_time` is for file downloads: one burst, reads for the gaps, and the end of the session, without
+which the next program would have to wait.
 """
 
 from __future__ import annotations
@@ -56,24 +57,24 @@ class TellingLink(FaultyLink):
 
     @property
     def is_free_at(self) -> float:
-        """When the next datagram would leave without waiting."""
+        """The time at which the next datagram would leave without queueing."""
         return self._free_at
 
     @property
     def travel(self) -> float:
-        """Seconds on the way."""
+        """The transit time in seconds."""
         return self._delay
 
 
 class _Oracle(ABC):
-    """One run: it asks at the first heartbeat, and again for each loss that is reported.
+    """One run: requests at the first heartbeat, and again for each reported loss.
 
     Attributes:
-        next_send: when the next request of `ask` may leave.
+        next_send: the time at which the next request of `ask` may leave.
     """
 
     understood: frozenset[int]
-    """The ids of the messages that it reads, sends, and is told the loss of."""
+    """The ids of the messages that the oracle receives and sends, and whose losses are reported to it."""
 
     def __init__(self, air: Air) -> None:
         assert isinstance(air.uplink, TellingLink)
@@ -81,11 +82,11 @@ class _Oracle(ABC):
         self.air = air
         self.uplink, self.downlink = air.uplink, air.downlink
         self.next_send = 0.0
-        self._known: list[tuple[float, int, wire.Message]] = []  # reports that are still to come, in order
+        self._known: list[tuple[float, int, wire.Message]] = []  # future reports, in order
         self._sequence = 0
 
     def run(self) -> float:
-        """Seconds from the first heartbeat until everything has come."""
+        """Return the seconds from the first heartbeat to the last parameter."""
         now = 0.0
         began = math.inf
         self.air.tick(now)
@@ -105,27 +106,27 @@ class _Oracle(ABC):
 
     @abstractmethod
     def begin(self, now: float) -> None:
-        """Ask for the parameters."""
+        """Request the parameters."""
 
     @abstractmethod
     def take(self, message: wire.Message, now: float) -> None:
-        """A message of the vehicle has come."""
+        """Process a message of the vehicle."""
 
     @abstractmethod
     def reported(self, message: wire.Message, now: float) -> None:
-        """This message, or the answer to it, would have come by now."""
+        """Process the loss of a message that, or whose response, would have arrived now."""
 
     @abstractmethod
     def ask(self, now: float) -> None:
-        """Ask for what is known to be missing, at the rate at which it is served."""
+        """Request missing parameters at the rate at which the vehicle serves them."""
 
     @abstractmethod
     def wants(self) -> bool:
-        """Whether `ask` has something to ask for."""
+        """Whether `ask` has a request to send."""
 
     @abstractmethod
     def is_done(self) -> bool:
-        """Whether all the parameters have come."""
+        """Whether all parameters were received."""
 
     def send(self, message: wire.Message, now: float) -> None:
         self._sequence += 1
@@ -145,7 +146,7 @@ class _Oracle(ABC):
         return max(min(times), now + 1e-7)
 
     def _learn_of_losses(self, now: float) -> None:
-        """Turn what the links lost into reports at their time, and take those that are due."""
+        """Convert the losses of the links to reports, and process those that are due."""
         for losses, later in ((self.downlink.losses, 0.0), (self.uplink.losses, self.downlink.travel)):
             for at, data in losses:
                 for message in self._read(data):
@@ -159,7 +160,7 @@ class _Oracle(ABC):
 
 
 class _ListOracle(_Oracle):
-    """By list: reads for the gaps, as soon as they are known or once the last pass is over."""
+    """The oracle for list downloads: reads for the gaps immediately, or after the last pass."""
 
     understood = frozenset({20, 21, 22, 76, wire.AUTOPILOT_VERSION_ID})
 
@@ -206,7 +207,7 @@ class _ListOracle(_Oracle):
                 self._end_pass(now)
 
     def _end_pass(self, now: float) -> None:
-        """The last value of a pass has come, or would have."""
+        """Process the end of a pass: its last value was received, or reported lost."""
         if self.is_over:
             return
         if self.passes > 1 and len(self.missing) > 1:
@@ -232,13 +233,13 @@ class _ListOracle(_Oracle):
 
 
 class _FileOracle(_Oracle):
-    """By file: it asks for the burst together with the open, and for each lost block singly.
+    """The oracle for file downloads: requests the burst together with the open, and each lost block singly.
 
-    The requests for lost blocks arrive once the burst is over, and then no quicker than they are served. At
-    the end it closes the session.
+    The requests for lost blocks arrive after the burst, at most at the rate at which they are served. At the
+    end the oracle closes the session.
 
     Attributes:
-        end: where the file ends, once the end of the burst has come or was reported lost.
+        end: the size of the file in bytes, once the end of the burst was received or reported lost.
     """
 
     understood = frozenset({110})
@@ -288,7 +289,7 @@ class _FileOracle(_Oracle):
                 self.to_ask.append(packet.offset)
             case Opcode.ACK if packet.requested == Opcode.TERMINATE_SESSION:
                 self._close(now)
-            case _:  # the answer to the open says nothing that it needs, the end of the burst does
+            case _:  # the response to the open is not needed: the end of the burst has the size
                 self.take(message, now)
 
     def wants(self) -> bool:
@@ -329,15 +330,15 @@ def oracle_time(
     reads_beside: bool,
     asks_version: bool,
 ) -> float:
-    """Seconds that one run of the oracle takes, by list.
+    """Return the seconds of one list download by the oracle.
 
     Args:
-        air: with a fresh simulated vehicle, and a `TellingLink` in each direction.
-        count: the vehicle's parameters.
-        passes: times that the list is asked for; reads fill the gaps after the last one.
-        reads_per_second: what the vehicle or the link serves.
-        reads_beside: read while the list runs, too.
-        asks_version: wait for AUTOPILOT_VERSION before the list is requested.
+        air: a channel with a new simulated vehicle, and a `TellingLink` in each direction.
+        count: the number of the vehicle's parameters.
+        passes: number of list requests; reads fill the gaps after the last one.
+        reads_per_second: the read rate of the vehicle or the link.
+        reads_beside: whether to read also during the list.
+        asks_version: whether to wait for AUTOPILOT_VERSION before the list request.
     """
     return _ListOracle(
         air,
@@ -357,13 +358,13 @@ def file_oracle_time(
     burst_rate: float,
     reads_per_second: float,
 ) -> float:
-    """Seconds that one run of the oracle by file takes.
+    """Return the seconds of one file download by the oracle.
 
     Args:
-        make: makes a fresh simulated vehicle, which serves param.pck.
-        uplink, downlink: what lies between.
+        make: creates a simulated vehicle that serves param.pck.
+        uplink, downlink: the links to and from the vehicle.
         burst_rate: bytes per second of the vehicle's burst.
-        reads_per_second: what the vehicle or the link serves.
+        reads_per_second: the read rate of the vehicle or the link.
     """
     alone = _FileOracle(
         Air([make()], uplink=TellingLink(), downlink=TellingLink()),

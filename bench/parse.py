@@ -1,12 +1,12 @@
-"""Frames per second, from bytes to messages: this library beside pymavlink's `parse_buffer`.
+"""Frames per second from bytes to messages: this library compared with pymavlink's `parse_buffer`.
 
     python bench/parse.py [FRAMES [SECONDS]]
 
-One stream, the same for both and in every run: 10 % PARAM_VALUE, the rest in the proportions in which a
-PX4 vehicle sends its telemetry. Both parsers take it whole. pymavlink is set up as in a program that has
-no signing key: `MAVLink(None)` of its `common` dialect, with nothing changed. Ours is given the ids that
-the client listens for, and every frame that comes out is decoded. The rounds alternate, so that a machine
-that slows down slows both. Both must find the same PARAM_VALUEs.
+Both parsers get the same stream in every run: 10 % PARAM_VALUE, and other messages in the proportions of a
+PX4 vehicle's telemetry. Both get it in one call. pymavlink is set up as in a program without a signing key:
+`MAVLink(None)` of its `common` dialect, unchanged. This library gets the ids that the client uses, and
+decodes every frame. The rounds alternate, so that a machine that slows down slows both. Both must find the
+same PARAM_VALUEs.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ TELEMETRY = {
     "STATUSTEXT": 1,
     "VIBRATION": 1,
 }
-"""About how many of each a PX4 vehicle sent in 6.5 s: `tests/data/px4_full_download.tlog`."""
+"""Approximate number of messages of a PX4 vehicle in 6.5 s: `tests/data/px4_full_download.tlog`."""
 
 Messages = list[Any]
 
@@ -98,7 +98,7 @@ def parse_with_paramclient(stream: bytes) -> Messages:
 
 
 def passes_per_second(parse: Callable[[bytes], Messages], stream: bytes, seconds: float) -> float:
-    """Both are timed for equally long, so that what else the machine does weighs the same on both."""
+    """Return the passes per second. Both parsers run for the same time, so that other load affects both."""
     gc.collect()
     passes = 0
     start = time.perf_counter()
@@ -109,7 +109,7 @@ def passes_per_second(parse: Callable[[bytes], Messages], stream: bytes, seconds
 
 
 def build_stream(frames: int, rng: random.Random) -> bytes:
-    """Unsigned MAVLink 2: every tenth frame a PARAM_VALUE, the others with random bytes in their fields."""
+    """Return unsigned MAVLink 2: every tenth frame is a PARAM_VALUE, all others have random field values."""
     kinds = {message.msgname: message for message in common.mavlink_map.values()}
     names = rng.choices(list(TELEMETRY), list(TELEMETRY.values()), k=frames)
     mav = common.MAVLink(None, 1, 1)
@@ -123,7 +123,9 @@ def build_stream(frames: int, rng: random.Random) -> bytes:
             parts.append(value.pack(mav))
         else:
             kind = kinds[name]
-            payload = rng.randbytes(kind.unpacker.size - 1) + b"\1"  # no zero at the end to cut off
+            payload = (
+                rng.randbytes(kind.unpacker.size - 1) + b"\1"
+            )  # not ending with zero bytes, which MAVLink 2 truncates
             body = (
                 struct.pack("<6B", len(payload), 0, 0, mav.seq, 1, 1)
                 + kind.id.to_bytes(3, "little")

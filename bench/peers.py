@@ -1,21 +1,21 @@
-"""Download every parameter with this library and with the programs that people use today, side by side.
+"""Comparison of full downloads by this library, pymavlink, MAVSDK and MAVProxy.
 
     python bench/peers.py [--repeat N] [--limit SECONDS] [--only TEXT ...] [--live LINK]
 
-Simulated PX4 and ArduPilot vehicles speak over real UDP on loopback, each in a process of its own, behind a
-link that loses datagrams in both directions. Every client starts with nothing known and hears the vehicle
-first; then its time runs from asking until it has every value. What it got is compared with what the vehicle
-holds. An ArduPilot "by file" serves its table over MAVFTP too, and whoever can fetch it as one file does.
+Simulated PX4 and ArduPilot vehicles communicate over real UDP on loopback, each in its own process, over a
+link with packet loss in both directions. Every client starts without a cache and first receives a heartbeat;
+its time is measured from the request to the last value. The values are compared with those of the vehicle. An
+ArduPilot "by file" also serves its table over MAVFTP, and clients that support it download the file.
 
 With `--live`, the vehicle is the one on this link, real or in its firmware's own simulation; the relay of
-`tests/live/relay.py` loses the datagrams and, but for the rows "by file", refuses MAVFTP. Nothing is changed
-on the vehicle.
+`tests/live/relay.py` drops the datagrams and, except in the rows "by file", refuses MAVFTP. Nothing is
+changed on the vehicle.
 
 Prints a Markdown table of the median seconds, each with its ratio to this library, and below it the date, the
-machine and its load, to be pasted as it is; what goes on meanwhile goes to the standard error. A whole run
-takes about 25 minutes.
+machine and its load, ready to be pasted; the progress is printed on stderr. A whole run takes about 25
+minutes.
 
-MAVSDK and MAVProxy are in the dependency group `peers`; one that is not installed is named as such.
+MAVSDK and MAVProxy are in the dependency group `peers`; the table names programs that are not installed.
 """
 
 from __future__ import annotations
@@ -55,19 +55,21 @@ from tests.live.relay import Conditions, Relay
 
 REPEAT = 3
 LIMIT = 120.0
-"""Seconds that one download may take."""
+"""Timeout of one download in seconds."""
 SET_BY_STATIONS = re.compile(r"SR\d_\w+")
 """Parameters in which ArduPilot keeps the streams that a station requests, as MAVProxy does at its start."""
 START_PATIENCE = 30.0
-"""Further seconds for a client to start and to hear the vehicle."""
+"""Further seconds for the start of a client and its first heartbeat."""
 ROUND_TRIP = 0.1
+"""Round-trip time in seconds of the cases with packet loss."""
 LOSSES = (0.0, 0.05, 0.20)
-"""The share of datagrams lost in each direction. Where some are, the round trip is `ROUND_TRIP` seconds."""
+"""Shares of lost datagrams in each direction. With packet loss, the round trip is `ROUND_TRIP` seconds."""
 SILENCE = 1.0
+"""Seconds of silence after which the usual loop over pymavlink requests missing indices."""
 MISSING_AT_ONCE = 10
-"""How the usual loop over pymavlink goes on: so many missing indices after so long a silence."""
+"""Missing indices that the usual loop over pymavlink requests after each silence."""
 TOLERANCE = 1e-6
-"""Within which values count as equal: the file that MAVProxy writes has six decimals."""
+"""Difference up to which values count as equal: the file that MAVProxy writes has six decimals."""
 
 SESSION_PAUSE = 3.5
 """Seconds before each download of a real vehicle: ArduPilot keeps a file that was not closed open for 3 s."""
@@ -79,12 +81,12 @@ spawn = multiprocessing.get_context("spawn")
 
 @dataclass(frozen=True)
 class Outcome:
-    """How one download went.
+    """The outcome of one download.
 
     Attributes:
-        seconds: it took; infinite when it did not bring everything.
-        problem: what went wrong, or nothing.
-        wrong: values that are not the vehicle's.
+        seconds: its duration; infinite if it is incomplete.
+        problem: the error, or "".
+        wrong: number of values that differ from the vehicle's.
     """
 
     seconds: float
@@ -94,12 +96,12 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Case:
-    """One vehicle behind one link.
+    """One simulated vehicle on one link.
 
     Attributes:
-        kind: of vehicle.
-        loss: the share of datagrams lost in each direction.
-        by_file: it serves its table as a file too.
+        kind: the kind of vehicle.
+        loss: the share of lost datagrams in each direction.
+        by_file: whether the vehicle also serves its table as a file.
     """
 
     kind: str
@@ -116,11 +118,11 @@ class Case:
 
     @property
     def truth(self) -> Mapping[str, float]:
-        """What the vehicle holds, by name."""
+        """The vehicle's values by name."""
         return {name: float(v) for name, v in self.vehicle().values.items() if not isinstance(v, bytes)}
 
     def is_settled(self, name: str) -> bool:
-        """Whether the value stays the same as long as nobody sets it."""
+        """Return whether the value stays the same unless it is set."""
         return True
 
     def vehicle(self) -> Vehicle:
@@ -133,9 +135,9 @@ class Case:
 
     @contextmanager
     def flying(self, seed: int) -> Iterator[tuple[int, Any]]:
-        """Run the vehicle in a process of its own.
+        """Run the vehicle in a new process.
 
-        Gives the port that it speaks to, and a shared number: when it was first asked for its list or file.
+        Yields the port that it sends to, and a shared number: the time of the first request for list or file.
         """
         port = free_port()
         asked_at = spawn.Value("d", math.inf)
@@ -150,10 +152,10 @@ class Case:
 
 @dataclass(frozen=True)
 class LiveCase(Case):
-    """A real vehicle behind one link.
+    """A real vehicle on one link.
 
     Attributes:
-        field: the relay to it, and what it holds.
+        field: the relay to it, and its values.
     """
 
     field: LiveField | None = None
@@ -169,7 +171,7 @@ class LiveCase(Case):
 
     @contextmanager
     def flying(self, seed: int) -> Iterator[tuple[int, Any]]:
-        """See `Case.flying`; the vehicle is there already, and hears a new partner behind another link."""
+        """See `Case.flying`; the vehicle runs already, and hears a new client over another link."""
         time.sleep(SESSION_PAUSE)
         conditions = Conditions(
             loss=self.loss,
@@ -190,12 +192,12 @@ class LiveField:
     """A real vehicle and the relay to it.
 
     Attributes:
-        relay: loses what is to be lost.
-        port: where every client listens.
-        journal: what the vehicle held at the beginning, and which of it moves by itself.
-        values: the numbers of that.
-        kind: of autopilot, as the table names it.
-        vehicle: what it is, in words.
+        relay: the relay, which drops datagrams.
+        port: the port on which every client listens.
+        journal: the vehicle's state at the beginning, and the parameters that it changes itself.
+        values: the values of that state.
+        kind: the kind of autopilot, as the table names it.
+        vehicle: the vehicle in words.
     """
 
     def __init__(self, relay: Relay, port: int, folder: Path) -> None:
@@ -209,12 +211,12 @@ class LiveField:
 
     @property
     def value(self) -> float:
-        """When the vehicle was first asked for its list or file; infinite before."""
+        """The time of the first request for list or file; infinite before."""
         asked_at = self.relay.counts().first_request_at
         return math.inf if asked_at is None else asked_at
 
     def cases(self) -> list[Case]:
-        """Give the rows for this vehicle."""
+        """Return the rows for this vehicle."""
         ways = (False, True) if self.kind == "real ArduPilot" else (False,)
         return [LiveCase(self.kind, loss, by_file, self) for by_file in ways for loss in LOSSES]
 
@@ -261,7 +263,7 @@ def main() -> None:
 
 
 def compare(cases: list[Case], arguments: argparse.Namespace, vehicle: str) -> None:
-    """Let every client download every case, and print the table; `vehicle` stands at its end."""
+    """Run every client on every case, and print the table, which ends with `vehicle`."""
     clients = choose(list(CLIENTS), arguments.only)
     chosen = [case for case in cases if case.name in choose([case.name for case in cases], arguments.only)]
     results: dict[tuple[str, Case], list[Outcome]] = {}
@@ -287,11 +289,11 @@ def compare(cases: list[Case], arguments: argparse.Namespace, vehicle: str) -> N
 
 
 def choose(names: list[str], texts: list[str]) -> list[str]:
-    """The names that hold one of the texts; all of them when none does."""
+    """Return the names that contain one of the texts; all names if none does."""
     return [name for name in names if any(text in name for text in texts)] or names
 
 
-# what is printed
+# Output
 
 
 def print_table(
@@ -333,7 +335,7 @@ def middle(outcomes: list[Outcome]) -> float:
 
 
 def remarks(outcomes: list[Outcome]) -> Iterator[str]:
-    """What must be known besides the median."""
+    """Yield the remarks that accompany the median."""
     if middle(outcomes) < math.inf:
         for problem in sorted({outcome.problem for outcome in outcomes if outcome.problem}):
             times = sum(outcome.problem == problem for outcome in outcomes)
@@ -360,7 +362,7 @@ def versions() -> str:
 
 
 def firmware(identity: Identity) -> str:
-    """Return what a vehicle's heartbeat and AUTOPILOT_VERSION say of it, in words."""
+    """Return the firmware in words, from a vehicle's heartbeat and AUTOPILOT_VERSION."""
     major, minor, patch, stage = identity.firmware.to_bytes(4, "big")
     release = {0: "-dev", 64: "-alpha", 128: "-beta", 192: "-rc", 255: ""}.get(stage, f"-{stage}")
     commit = f" ({identity.git_hash[:8]})" if identity.git_hash else ""
@@ -372,18 +374,18 @@ def firmware(identity: Identity) -> str:
 
 def installed(package: str) -> str:
     if package == "paramclient":
-        return __version__  # also where it is run without being installed
+        return __version__  # also without an installation
     try:
         return version(package)
     except PackageNotFoundError:
         return "not installed"
 
 
-# the vehicle's side
+# Vehicles
 
 
 def free_port() -> int:
-    """Return a port on loopback that nobody has."""
+    """Return a free port on loopback."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
@@ -391,12 +393,12 @@ def free_port() -> int:
 
 
 def fly(case: Case, seed: int, port: int, asked_at: Any) -> None:
-    """Speak to a port until the process is ended."""
+    """Run the vehicle, sending to a port, until the process is ended."""
     anyio.run(serve_endpoint, Watched(case.air(seed), asked_at), create_link(f"udpout:127.0.0.1:{port}"))
 
 
 class Watched:
-    """An endpoint that notes when its list or file was first asked for, before anything can be lost."""
+    """An endpoint that records the time of the first request for list or file, before any packet loss."""
 
     def __init__(self, air: Air, asked_at: Any) -> None:
         self._air = air
@@ -412,16 +414,16 @@ class Watched:
         self._air.receive(data, now)
 
 
-# the clients
+# Clients
 
 
 class PythonClient:
     """A client that is called from Python, each time in a new process.
 
     Args:
-        package: what must be installed.
-        fetch: takes the port and the seconds that it may take; gives those that it took, and the values.
-        fetches_files: whether it takes the table as one file where there is one.
+        package: the package that must be installed.
+        fetch: takes the port and the timeout in seconds; returns the seconds used, and the values.
+        fetches_files: whether the client downloads the file if there is one.
     """
 
     def __init__(
@@ -467,7 +469,7 @@ def call(
 
 
 def judge(case: Case, seconds: float, values: Values, limit: float) -> Outcome:
-    """Compare what was got with what the vehicle holds."""
+    """Compare the downloaded values with those of the vehicle."""
     truth = case.truth
     got = truth.keys() & values.keys()
     if len(got) < len(truth):
@@ -495,7 +497,7 @@ def fetch_with_paramclient(port: int, limit: float) -> tuple[float, Values]:
 
 
 def fetch_with_pymavlink(port: int, limit: float) -> tuple[float, Values]:
-    """The loop that is found everywhere: the list, then after each silence some of what is missing."""
+    """Download with the usual loop: the list, then after each silence reads of some missing indices."""
     from pymavlink import mavutil
 
     master = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}")
@@ -527,7 +529,7 @@ def fetch_with_pymavlink(port: int, limit: float) -> tuple[float, Values]:
 
 
 def number_in(message: Any, *, is_cast: bool) -> float:
-    """The number that a float of pymavlink stands for."""
+    """Return the number that a float of pymavlink encodes."""
     layout = {1: "B", 2: "b", 3: "H", 4: "h", 5: "I", 6: "i"}.get(message.param_type)
     if is_cast or layout is None:
         return float(message.param_value)
@@ -538,7 +540,7 @@ def fetch_with_mavsdk(port: int, limit: float) -> tuple[float, Values]:
     from mavsdk import ComponentType, Configuration, Mavsdk, log_subscribe
     from mavsdk.plugins.param import Param
 
-    log_subscribe(lambda *_: True)  # it would tell on the standard output what it does
+    log_subscribe(lambda *_: True)  # MAVSDK would log on stdout
     with Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION)) as mavsdk:
         mavsdk.add_any_connection(f"udpin://127.0.0.1:{port}")
         system = mavsdk.first_autopilot(timeout_s=START_PATIENCE)
@@ -552,7 +554,7 @@ def fetch_with_mavsdk(port: int, limit: float) -> tuple[float, Values]:
 
 
 class MavProxy:
-    """MAVProxy, as a program of its own. It asks by itself once it has heard the vehicle."""
+    """MAVProxy as a program. It requests the parameters itself after the first heartbeat."""
 
     fetches_files = True
 

@@ -1,24 +1,23 @@
-"""Many vehicles in one process: how time and memory grow from one system on a link to 250.
+"""Scaling to many vehicles in one process: time and memory from one system on a link to 250.
 
     python bench/scale.py [--systems N ...] [--links N] [--parameters N] [--check]
 
-The vehicles are simulated PX4 autopilots in another process, each with a UDP socket of its own. A client
-fetches all of them at once, with an empty cache; then another client does so again with what the first one
-has kept: a warm start, one question for the hash each. Last, so many links are open in one process.
+The vehicles are simulated PX4 autopilots in another process, each with its own UDP socket. A client fetches
+all of them concurrently, with an empty cache; then another client fetches them again with the cache of the
+first one: a warm start, one hash request for each. Finally, several links are opened in one process.
 
-Every size is measured in a process of its own, which does as the command `paramclient` does: when all is
-loaded it calls `gc.freeze()`, so that full collections do not go through modules and classes. With
-`--no-freeze` it does not. For each it prints, beside the targets at 250:
+Every size is measured in a new process, which works like the command `paramclient`: after loading all modules
+it calls `gc.freeze()`, so that full collections skip modules and classes. With `--no-freeze` it does not. For
+each size it prints, with the targets at 250:
 
-- seconds by the clock on the wall, and of the CPU: of the whole process with the kernel's share for it, from
-  the call of `fetch_all` until it has returned, without what it takes to set down the bytes that come;
-- the ratio of that CPU time to the bare framing of the same bytes: every datagram that came in that time goes
-  once more, one at a time, through a `Framer` that makes the same frames of them and nothing else;
-- the share of it that the cache's thread took, and what it took afterwards until all is written;
-- the longest time for which the event loop did not come round, by a task that is due every 5 ms: the first
-  figure is the clock's, which other programs of the machine push up as well; the second is how much of that
-  the process spent computing;
-- by how much the process has grown, in resident memory.
+- wall-clock seconds, and CPU seconds of the whole process including the kernel, from the call of `fetch_all`
+  to its return, without the time that recording the received bytes takes;
+- the ratio of that CPU time to the bare framing of the same bytes: every received datagram is passed again,
+  one at a time, through a `Framer` that only builds the same frames;
+- the share of it that the cache thread used, and the CPU time that it used afterwards until all is written;
+- the highest event-loop latency, measured by a task that is due every 5 ms: the first figure is by the clock,
+  which other programs on the machine increase too; the second is the part that the process spent computing;
+- the growth of the process in resident memory.
 """
 
 from __future__ import annotations
@@ -58,23 +57,25 @@ SYSTEMS = (1, 10, 50, 250)
 LINKS = 20
 PARAMETERS = 1_000
 MOST_FRAMINGS = 4.0
+"""The target at the largest size for the ratio to the bare framing."""
 MOST_MEMORY = 200
+"""The target at the largest size for the memory, in MiB."""
 MOST_IN_CACHE = 0.1
+"""The target at the largest size for the share of the CPU time that the cache uses."""
 LONGEST_BLOCK = 0.020
-"""The targets, at the largest size: times the bare framing, MiB, the share of the time that goes into the
-cache, and seconds for which the event loop does not come round."""
+"""The target at the largest size for the event-loop latency, in seconds."""
 
 WATCH_INTERVAL = 0.005
-"""Seconds from one look at the event loop to the next."""
+"""Seconds between two measurements of the event-loop latency."""
 SETTLING_TIME = 1.0
-"""Seconds in which what is left of the time before or after a fetch comes to its end."""
+"""Seconds in which remaining work from before or after a fetch ends."""
 ROOM = 96 * 1024 * 1024
-"""Bytes of what comes that are kept, to be framed once more. They are there before memory is measured."""
+"""Bytes of received data that are recorded for the framing. The memory is allocated before it is measured."""
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """What is measured: links, systems in all, parameters of each; and whether `gc.freeze` is called."""
+    """Sizes of a measurement: links, systems in total, parameters of each; and `gc.freeze` or not."""
 
     links: int
     systems: int
@@ -84,20 +85,20 @@ class Sizes:
 
 @dataclass(frozen=True)
 class Phase:
-    """What one fetch of everything took; times in seconds.
+    """The cost of one fetch of all vehicles; times in seconds.
 
     Attributes:
-        elapsed: by the clock on the wall.
-        cpu: of the CPU, in the whole process.
-        cache: of that, in the cache's thread.
-        later: what that took after the fetch, until all was written.
-        framing: for the bare framing of what came.
-        block: the longest time in which the event loop did not come round.
-        computed: the longest that the process computed in one of those times.
-        grown: resident memory at the end, beyond that before the clients were opened, in MiB.
-        right: systems whose table is whole and as the vehicle has it.
-        source: where the tables are from.
-        requests: messages that the vehicles have received, other than heartbeats.
+        elapsed: wall-clock time.
+        cpu: CPU time of the whole process.
+        cache: the part of it in the cache thread.
+        later: CPU time of the cache thread after the fetch, until all was written.
+        framing: CPU time of the bare framing of the received bytes.
+        block: the highest event-loop latency.
+        computed: the highest CPU time of the process within one such latency.
+        grown: growth of the resident memory since before the clients were opened, in MiB.
+        right: number of systems whose table is complete and correct.
+        source: the source of the tables.
+        requests: number of messages that the vehicles have received, without heartbeats.
     """
 
     elapsed: float
@@ -149,7 +150,7 @@ def main() -> int:
 
 
 def print_verdicts(cold: Phase, warm: Phase) -> bool:
-    """Each target, and whether it is met."""
+    """Print whether each target is met; return whether all are."""
     verdicts = {
         f"at most {MOST_FRAMINGS:g} times the bare framing": cold.cpu <= MOST_FRAMINGS * cold.framing,
         f"at most {MOST_IN_CACHE:.0%} of the time in the cache": cold.cache <= MOST_IN_CACHE * cold.cpu,
@@ -164,7 +165,7 @@ def print_verdicts(cold: Phase, warm: Phase) -> bool:
 
 
 def measured(sizes: Sizes) -> tuple[Phase, Phase]:
-    """A cold fetch and a warm one, in a process of their own."""
+    """Measure a cold fetch and a warm one in a new process."""
     spawn = multiprocessing.get_context("spawn")
     here, there = spawn.Pipe()
     process = spawn.Process(target=measure, args=(sizes, there))
@@ -180,14 +181,14 @@ def measured(sizes: Sizes) -> tuple[Phase, Phase]:
 
 
 def measure(sizes: Sizes, out: Connection) -> None:
-    """Start the vehicles, fetch all of them twice, and say what that took; in a process of its own."""
+    """Start the vehicles, fetch all of them twice, and send the costs; runs in a new process."""
     spawn = multiprocessing.get_context("spawn")
     stop = spawn.Event()
     here, there = spawn.Pipe()
     vehicles = spawn.Process(target=fly, args=(sizes, stop, there))
     vehicles.start()
     try:
-        here.recv()  # they are there
+        here.recv()  # the vehicles are ready
         record = Record()
         gc.collect()
         if sizes.freeze:
@@ -203,10 +204,10 @@ def measure(sizes: Sizes, out: Connection) -> None:
 
 
 class Record:
-    """The datagrams that came, in order, in memory that is there from the beginning.
+    """The received datagrams in order, in memory that is allocated in advance.
 
     Attributes:
-        seconds: of the CPU, that it took to set them down.
+        seconds: CPU seconds that recording them took.
     """
 
     def __init__(self) -> None:
@@ -215,13 +216,13 @@ class Record:
         self.begin()
 
     def begin(self) -> None:
-        """Begin anew."""
+        """Start a new recording."""
         self._bytes.seek(0)
         self.count = 0
         self.seconds = 0.0
 
     def add(self, batch: list[tuple[Peer, bytes]]) -> None:
-        """Set down what has come at once."""
+        """Record the datagrams of one read."""
         start = time.thread_time()
         datagrams = [data for _, data in batch]
         self._bytes.write(b"".join(datagrams))
@@ -231,7 +232,7 @@ class Record:
         self.seconds += time.thread_time() - start
 
     def framing(self, count: int) -> float:
-        """Seconds of the CPU to frame so many of them once more."""
+        """Return the CPU seconds for framing `count` of the datagrams."""
         self._bytes.seek(0)
         datagrams = [self._bytes.read(size) for size in self._sizes[:count]]
         framer = Framer(HEARD, stream=False)
@@ -242,7 +243,7 @@ class Record:
 
 
 class Watch:
-    """Notes for how long the event loop does not come round."""
+    """Measures the event-loop latency."""
 
     def __init__(self) -> None:
         self.block = 0.0
@@ -259,7 +260,7 @@ class Watch:
 
 
 class RecordedLink(UdpIn):
-    """A link that sets down what comes."""
+    """A link that records the received datagrams."""
 
     def __init__(self, record: Record) -> None:
         super().__init__(parse_link("udpin:127.0.0.1:0"))
@@ -272,7 +273,7 @@ class RecordedLink(UdpIn):
 
 
 class TimedCache(ParamCache):
-    """A cache that adds up what it takes of the CPU, in whatever thread."""
+    """A cache that sums up its CPU time in all threads."""
 
     seconds = 0.0
 
@@ -292,7 +293,7 @@ class TimedCache(ParamCache):
 
 
 async def fetch(sizes: Sizes, path: Path, record: Record, before: float, vehicles: Connection) -> Phase:
-    """Fetch everything, with what the cache has."""
+    """Fetch all vehicles with this cache; return the cost."""
     per_link = sizes.systems // sizes.links
     results: list[FetchedAll] = []
     watch = Watch()
@@ -345,7 +346,7 @@ async def fetch(sizes: Sizes, path: Path, record: Record, before: float, vehicle
 
 
 def is_right(result: FetchResult, parameters: int) -> bool:
-    """Whether a result is whole, and every value is the vehicle's."""
+    """Return whether a result is complete and every value is that of the vehicle."""
     rows = table_of(result.system, parameters)
     return result.complete and all(
         result.params[row.name].bits == (result.system if row.name == "MAV_SYS_ID" else row.bits)
@@ -354,20 +355,20 @@ def is_right(result: FetchResult, parameters: int) -> bool:
 
 
 def resident() -> float:
-    """MiB of memory that this process holds now."""
+    """Return the present resident memory of this process in MiB."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1024 / 1024
 
 
 def requests_of(vehicles: Connection) -> int:
-    """What the vehicles have received so far, but for heartbeats."""
+    """Return the number of messages that the vehicles have received, without heartbeats."""
     vehicles.send(None)
     number: int = vehicles.recv()
     return number
 
 
 def table_of(system: int, parameters: int) -> list[SimParam]:
-    """The parameters of one vehicle: those of a real quad, and more, with values of its own."""
+    """Return the parameters of one vehicle: those of a real quadrotor, and further ones with own values."""
     table = px4_table()
     dice = random.Random(system)
     more = range(parameters - len(table))
@@ -375,7 +376,7 @@ def table_of(system: int, parameters: int) -> list[SimParam]:
 
 
 def fly(sizes: Sizes, stop: Event, out: Connection) -> None:
-    """The vehicles, until told to stop; runs in a process of its own. They speak when they are told where."""
+    """Run the vehicles until `stop` is set, in a new process. They send once they receive an address."""
     selector = selectors.DefaultSelector()
     due: list[tuple[float, int]] = []
     wake_at: list[float] = []
@@ -389,7 +390,9 @@ def fly(sizes: Sizes, stop: Event, out: Connection) -> None:
         sock.setblocking(False)
         fleet.append((vehicle, sock))
         selector.register(sock, selectors.EVENT_READ, number)
-        wake_at.append(time.monotonic() + number / sizes.systems)  # they were not switched on together
+        wake_at.append(
+            time.monotonic() + number / sizes.systems
+        )  # the vehicles do not start at the same time
         due.append((wake_at[number], number))
     selector.register(out, selectors.EVENT_READ, None)
     out.send(None)

@@ -1,16 +1,16 @@
-"""What the service costs: a core's share with many listeners, many reads and a download at once.
+"""Cost of the service: its share of a core with many listeners, many reads and a download concurrently.
 
     python bench/service.py [--listeners N] [--reads N] [--seconds S] [--check]
 
-Three processes on loopback: a simulated vehicle (`paramclient sim`), the service (`paramclient serve`, its
-uvicorn and nothing else, held to one core where the system allows it), and this one, which is its clients.
-First all listeners open their streams of events, then the table is downloaded, over and over, while single
-cached values are read evenly at the rate that is asked for, whether or not the answers come.
+Uses three processes on loopback: a simulated vehicle (`paramclient sim`), the service (`paramclient serve`,
+limited to one core if the system allows it), and this one, which has the clients. First all listeners open
+their event streams, then the table is downloaded repeatedly, while single cached values are read at a
+constant rate, independent of the responses.
 
-Prints the share of a core that the service took (its CPU time by the seconds in which the reads were due),
-how long a read took from the moment at which it was due, and whether every listener was told of every event,
-in order. With `--check` it fails when a target is missed. What else the machine does shows in how long a read
-takes, and hardly in the share.
+Prints the share of a core that the service used (its CPU time divided by the duration of the reads), the
+latency of a read from the time at which it was due, and whether every listener received every event in order.
+With `--check`, fails if a target is missed. Other load on the machine increases the latency, and hardly the
+share.
 """
 
 from __future__ import annotations
@@ -30,23 +30,27 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 LISTENERS = 200
+"""The target for the number of listeners."""
 READS = 500
+"""The target for the rate of reads, per second."""
 MOST_LOAD = 1.0
+"""The target for the CPU time, as a share of a core."""
 MOST_LATENCY = 0.25
-"""The targets: listeners, reads a second, the share of a core, seconds for 99 of 100 reads."""
+"""The target for the latency of 99 of 100 reads, in seconds."""
 
 NAMES = ("MC_ROLL_P", "BAT1_N_CELLS", "COM_ARM_WO_GPS")
+"""The parameters that are read."""
 CONNECTIONS = 20
-"""What is read, and the connections over which: each one request at a time, as by so many programs."""
+"""Connections for the reads: each sends one request at a time, like one program."""
 PATIENCE = 30.0
-"""Seconds for a process to start, and for the last event to come."""
+"""Seconds to wait for the start of a process, and for the last event."""
 
 _EVENT = re.compile(rb"^id: [0-9a-f]+-(\d+)\ndata: ", re.MULTILINE)
 
 
 @dataclass
 class Figures:
-    """What was measured."""
+    """The measured figures."""
 
     reads: int = 0
     downloads: int = 0
@@ -57,7 +61,7 @@ class Figures:
 
 @dataclass
 class Listener:
-    """One stream of events: the numbers that came, and the last bytes, which may be half an event."""
+    """One event stream: numbers of the received events, and the last bytes, which may be half an event."""
 
     first: int | None = None
     last: int = 0
@@ -66,7 +70,7 @@ class Listener:
     rest: bytes = b""
 
     def take(self, chunk: bytes) -> None:
-        """Look at what has come. Each chunk of the transfer holds whole events, so its frame is left in."""
+        """Process received bytes. Chunks of the transfer have whole events, so they are not decoded."""
         text = self.rest + chunk
         end = text.rfind(b"\n\n") + 2
         self.rest = text[end:] if end > 1 else text
@@ -99,7 +103,7 @@ def main() -> int:
 
 
 def show(figures: Figures, listeners: list[Listener], rate: int) -> bool:
-    """Print the figures; whether every target is met."""
+    """Print the figures; return whether every target is met."""
     told = min((each.events for each in listeners), default=0)
     whole = sum(each.is_whole for each in listeners)  # each has come to the last one, from where it began
     share = figures.cpu / figures.elapsed
@@ -127,7 +131,7 @@ def verdict(is_met: bool) -> str:
 async def measure(
     url: str, process: int, count: int, rate: int, seconds: float
 ) -> tuple[Figures, list[Listener]]:
-    """Listen, download and read, and see what that takes."""
+    """Listen, download and read; return the figures."""
     host, port = url.removeprefix("http://").rsplit(":", 1)
     where = (host, int(port))
     listeners = [Listener() for _ in range(count)]
@@ -143,7 +147,7 @@ async def measure(
         await read_evenly(where, rate, seconds, figures)
         figures.elapsed, figures.cpu = seconds, cpu_time(process) - cpu
         downloading.cancel()
-        await asyncio.sleep(1.0)  # what ends a download is told too
+        await asyncio.sleep(1.0)  # the end of a download is an event too
         last = await call(calls, "GET", "/api/v1/components")
         await until(lambda: all(each.last >= last["seq"] for each in listeners))
         for each in following:
@@ -152,14 +156,14 @@ async def measure(
 
 
 async def until(condition: Callable[[], bool]) -> None:
-    """Wait for what nobody tells of."""
+    """Poll until a condition is true."""
     async with asyncio.timeout(PATIENCE):
-        while not condition():  # noqa: ASYNC110 - nobody tells
+        while not condition():  # noqa: ASYNC110 - no event
             await asyncio.sleep(0.02)
 
 
 async def listen(where: tuple[str, int], listener: Listener) -> None:
-    """Follow the events until cancelled."""
+    """Receive events until cancelled."""
     async with connection(where) as (reader, writer):
         writer.write(head("GET", "/api/v1/events", b""))
         while chunk := await reader.read(1 << 16):
@@ -167,7 +171,7 @@ async def listen(where: tuple[str, int], listener: Listener) -> None:
 
 
 async def download(where: tuple[str, int], figures: Figures) -> None:
-    """Download the table again and again, until cancelled."""
+    """Download the table repeatedly until cancelled."""
     async with connection(where) as calls:
         while True:
             await call(calls, "POST", "/api/v1/components/1/1/fetch", {"refresh": True})
@@ -175,7 +179,7 @@ async def download(where: tuple[str, int], figures: Figures) -> None:
 
 
 async def read_evenly(where: tuple[str, int], rate: int, seconds: float, figures: Figures) -> None:
-    """Read cached values at a rate; a read that is due while all connections are busy counts from then."""
+    """Read cached values at a rate; the latency of a read includes its wait for a free connection."""
     due: asyncio.Queue[float | None] = asyncio.Queue()
 
     async def read() -> None:
@@ -212,7 +216,7 @@ async def connection(where: tuple[str, int]) -> AsyncIterator[Calls]:
 
 
 async def call(calls: Calls, method: str, path: str, body: object = None) -> dict[str, int]:
-    """One request and its answer, in as little HTTP as it takes: the clients are not what is measured."""
+    """Send one request and return its response, with minimal HTTP: the clients are not measured."""
     reader, writer = calls
     content = b"" if body is None else json.dumps(body).encode()
     writer.write(head(method, path, content) + content)
@@ -233,7 +237,7 @@ def head(method: str, path: str, content: bytes) -> bytes:
 
 @contextmanager
 def started(*words: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """The command in a process of its own, and the address that it prints first."""
+    """Run the command in a new process; yield it with the address that it prints first."""
     process = subprocess.Popen(
         [sys.executable, "-m", "paramclient", *words], stdout=subprocess.PIPE, text=True
     )
@@ -249,13 +253,13 @@ def started(*words: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
 
 
 def hold_to_one_core(process: subprocess.Popen[str]) -> None:
-    """Give the service one core, where the system lets us."""
+    """Limit the service to one core, if the system allows it."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(process.pid, {max(os.sched_getaffinity(0))})
 
 
 def cpu_time(process: int) -> float:
-    """Seconds of CPU that a process has taken (Linux, proc(5): utime and stime)."""
+    """Return the CPU seconds of a process (Linux, proc(5): utime and stime)."""
     fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 

@@ -1,8 +1,8 @@
-"""How long the command takes from the start of its process to the first byte on the link.
+"""Time from the start of the command's process to its first byte on the link.
 
     python bench/startup.py [ROUNDS]
 
-Prints the fastest and the median of several rounds, in seconds. The promise is 0.4 s.
+Prints the minimum and the median of several rounds in seconds. The target is 0.4 s.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 
 PATIENCE = 30.0
-"""Seconds for one round; longer means that nothing was sent at all."""
+"""Timeout of one round in seconds, after which nothing was sent."""
 
 
 def main() -> None:
@@ -30,7 +30,7 @@ def main() -> None:
 
 
 def first_byte_after(cache: Path) -> float:
-    """Run `fetch` against a socket that only listens; give the seconds until something arrives there."""
+    """Run `fetch` against a socket that only listens; return the seconds until the first datagram."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
         listener.bind(("127.0.0.1", 0))
         listener.settimeout(PATIENCE)

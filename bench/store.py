@@ -1,12 +1,11 @@
-"""How quick the cache is with many vehicles in it: in a file, and in PostgreSQL.
+"""Speed of the cache with many vehicles: in a SQLite file and in PostgreSQL.
 
     python bench/store.py [--vehicles 1000] [--params 1000] [--only sqlite] [--postgres URL] [--check]
 
-Fills a fresh cache with a table for each vehicle, then measures: to write a full table, to load one, to write
-one change, to compare all vehicles with a file of 200 parameters, and what a line of history takes on the
-disk. PostgreSQL is a server of its own, started from pgserver's or Debian's programs, or the one at the URL.
-What it is measured with includes the local copy. With --check it fails where the comparison of the fleet
-takes a second or more.
+Fills a new cache with a table for each vehicle, then measures the time to write a full table, to load one, to
+write one change, to compare all vehicles with a file of 200 parameters, and the bytes of a line of history on
+the disk. PostgreSQL is a new server, started from pgserver's or Debian's programs, or the one at the URL; its
+figures include the local copy. With --check, fails if the comparison of the fleet takes a second or more.
 """
 
 from __future__ import annotations
@@ -32,14 +31,14 @@ from tests.postgres import PROGRAMS, database_on, server
 
 NOW = 1_795_000_000.0
 WANTED = 200
-"""Parameters of the file with which all vehicles are compared."""
+"""Number of parameters in the file with which all vehicles are compared."""
 STRAY_EVERY = 50
-"""Of the compared values, every so many is another one than in the file."""
+"""Every 50th compared value differs from the file."""
 TARGET = 1.0
-"""Seconds that the comparison may take."""
+"""The target for the comparison, in seconds."""
 CHANGES = 2_000
 Size = Callable[[tuple[str, ...]], int]
-"""Gives the bytes that these tables take."""
+"""Returns the bytes that these database tables use."""
 ROUNDS = 5
 
 
@@ -65,7 +64,7 @@ def main() -> int:
 
 
 def caches(only: str | None, url: str | None) -> Iterator[tuple[str, ParamCache, Size]]:
-    """The caches, each with its name and what tells its size in bytes."""
+    """Yield the caches, each with its name and a function that returns its size in bytes."""
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         if only != "postgres":
             path = Path(folder) / "cache.sqlite3"
@@ -90,7 +89,7 @@ def caches(only: str | None, url: str | None) -> Iterator[tuple[str, ParamCache,
 
 
 def pages(path: Path) -> int:
-    """The bytes in use of a file of SQLite."""
+    """Return the used bytes of a SQLite file."""
     with closing(sqlite3.connect(path)) as connection:
         figures = [
             connection.execute(f"PRAGMA {name}").fetchone()[0]
@@ -100,7 +99,7 @@ def pages(path: Path) -> int:
 
 
 def measure(cache: ParamCache, size: Size, vehicles: int, params: int) -> Iterator[tuple[str, float, str]]:
-    """Fill the cache, and give name, value and unit of each figure."""
+    """Fill the cache, and yield name, value and unit of each figure."""
     cache.vehicles()
     everything = ("vehicle", "component", "param", "history", "birth")
     empty = size(everything)
@@ -144,7 +143,7 @@ def param(number: int, value: float) -> Param:
 
 
 def table(vehicle: int, params: int) -> TableUpdate:
-    """A whole table; every so many of its values is another one than in most vehicles."""
+    """Return a whole table; some of its values differ from those of most vehicles, see `STRAY_EVERY`."""
     items = [
         StoredParam(param(n, n + 1 if not (n * 7 + vehicle) % STRAY_EVERY else n), NOW, volatile=False)
         for n in range(params)
@@ -165,7 +164,7 @@ def param_at(number: int, value: int, at: float) -> TableUpdate:
 
 
 def chunks(updates: list[TableUpdate], params: int) -> Iterator[list[TableUpdate]]:
-    """As a client gathers them: a hundred in one call, each of another parameter."""
+    """Yield updates in batches, like a client: a hundred in one call, each of another parameter."""
     for start in range(0, len(updates), 100):
         some = updates[start : start + 100]
         items = [

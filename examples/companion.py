@@ -1,9 +1,9 @@
-"""A companion computer, whole: `paramclient serve` on a serial port, used by a program and a script at once.
+"""A companion computer: `paramclient serve` on a serial port, used by a program and a script concurrently.
 
     python examples/companion.py
 
-The serial port is a pseudo-terminal of this computer with a simulated PX4 at its other end, at the pace of a
-port with 115200 baud. What uses it is what would run on board: the two programs in `examples/companion/`.
+The serial port is a pseudo-terminal of this computer with a simulated PX4 at the other end, at the rate of a
+port with 115200 baud. The two programs in `examples/companion/` use it, as they would on board.
 """
 
 import os
@@ -29,7 +29,7 @@ BYTES_A_SECOND = 11520
 
 @contextmanager
 def flight_controller() -> Iterator[str]:
-    """A PX4 behind a serial port; the port's name."""
+    """Run a simulated PX4 on a serial port; yield the name of the port."""
     board, port = pty.openpty()
     tty.setraw(port)
     os.set_blocking(board, False)
@@ -60,7 +60,7 @@ def flight_controller() -> Iterator[str]:
 
 @contextmanager
 def service(port: str, folder: Path) -> Iterator[tuple[str, str]]:
-    """`paramclient serve` on that port, for whoever has a token; its address and a token that may write."""
+    """Run `paramclient serve` on that port; yield its URL and a token that allows writes."""
     tokens = folder / "tokens"
     token = subprocess.run(
         [*COMMAND, "token", "companion", "--file", tokens], check=True, capture_output=True, text=True
@@ -71,7 +71,7 @@ def service(port: str, folder: Path) -> Iterator[tuple[str, str]]:
         try:
             assert serving.stdout is not None
             found = re.search("http://[^ \n]+", serving.stdout.readline())
-            assert found is not None, "it does not serve"
+            assert found is not None, "the service did not start"
             yield found[0], token
         finally:
             serving.terminate()
@@ -94,7 +94,7 @@ def main() -> None:
         ]
         failed = sum(program.wait() != 0 for program in both)
         if failed:
-            raise SystemExit(f"{failed} of them failed")
+            raise SystemExit(f"{failed} of the two programs failed")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""The main job on a simulated PX4 vehicle, over real UDP on loopback: `make demo`.
+"""Fetch, cache and set parameters of a simulated PX4 vehicle, over real UDP on loopback: `make demo`.
 
-A cold fetch of every parameter, a second run that starts from the cache, and one set that is confirmed; at
-the end what each took. The cache is a temporary one, and the system chooses the port.
+Fetches every parameter, fetches again from the cache, and sets one parameter; prints the time and bytes of
+each step. The cache is temporary, and the system chooses the port.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ console = Console(highlight=False, soft_wrap=True)
 
 
 async def main(cache: Path) -> bool:
-    """Put a vehicle on UDP, run against it, take it down again."""
+    """Serve a simulated vehicle on UDP and run the demo against it; return whether every step succeeded."""
     px4 = PX4Vehicle()
     far_end = UdpIn(parse_link("udpin:127.0.0.1:0"))
     async with anyio.create_task_group() as tasks:
@@ -42,7 +42,7 @@ async def main(cache: Path) -> bool:
 
 
 async def run(px4: PX4Vehicle, url: str, cache: Path) -> bool:
-    """All of it; true when everything was as it should be."""
+    """Run the three steps of the demo; return whether every step succeeded."""
     costs = Table("", "seconds", "bytes received", "bytes sent", box=None, pad_edge=False)
     for column in costs.columns[1:]:
         column.justify = "right"
@@ -96,7 +96,7 @@ async def fetch_with_bar(vehicle: Component) -> FetchResult:
 
 
 class Meter:
-    """Counts seconds and bytes from one line of the table to the next."""
+    """Measures seconds and bytes between two lines of the table."""
 
     def __init__(self, client: ParamClient, costs: Table) -> None:
         self._client = client
@@ -104,18 +104,18 @@ class Meter:
         self.reset()
 
     def reset(self) -> None:
-        """Count from here."""
+        """Start a new measurement."""
         self._began = time.perf_counter()
         self._received, self._sent = self._client.bytes_received, self._client.bytes_sent
 
     async def wait_for_heartbeat(self) -> None:
-        """Do not count these seconds, up to one; do count the bytes."""
+        """Wait for the first heartbeat; its wait of up to 1 s is not counted, its bytes are."""
         while not self._client.components:  # noqa: ASYNC110 - component() waits for more than that
             await anyio.sleep(0.001)
         self._began = time.perf_counter()
 
     def lap(self, step: str) -> None:
-        """Add a line."""
+        """Add a line to the table."""
         seconds = time.perf_counter() - self._began
         received, sent = self._client.bytes_received - self._received, self._client.bytes_sent - self._sent
         self._costs.add_row(step, f"{seconds:.4f}", f"{received:,}", f"{sent:,}")

@@ -1,8 +1,8 @@
-"""Look at a vehicle's parameters when there is no vehicle: the cache has what was heard last.
+"""Read a vehicle's parameters from the cache, without a link.
 
 python examples/offline.py [LINK]
 
-First a visit to the vehicle, which fills the cache; then everything from the disk alone.
+First fetches the parameters from the vehicle, which fills the cache; then reads everything from the disk.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from paramclient import ParamCache, ParamClient
 
 
 async def visit(link: str) -> str:
-    """Fetch everything; give the name under which the cache keeps the vehicle."""
+    """Fetch all parameters; return the key of the vehicle in the cache."""
     async with ParamClient(link) as client:
         vehicle = await client.only_component()
         print("visit:", await vehicle.fetch_all())
-        if link == "sim:px4":  # leave a trace in the history; a real vehicle is only looked at
+        if link == "sim:px4":  # adds a change to the history; a real vehicle is only read
             await vehicle.set("MC_ROLL_P", 7.0)
         return vehicle.identity.key
 
 
 def look(key: str) -> None:
-    """Everything below works with no link."""
+    """Print the cached table and its history. Needs no link."""
     with ParamCache() as cache:
         for known in cache.vehicles():
             print("known:", known)

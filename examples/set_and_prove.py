@@ -1,4 +1,4 @@
-"""Write parameters, and handle everything that can become of it.
+"""Write parameters, and handle every possible outcome.
 
 python examples/set_and_prove.py [LINK [NAME VALUE ...]]
 """
@@ -19,11 +19,11 @@ async def main(link: str, pairs: list[str]) -> None:
         for name, text in zip(pairs[::2], pairs[1::2], strict=True):
             try:
                 done = await vehicle.set(name, int(text) if text.lstrip("-").isdecimal() else float(text))
-            except UsageError as error:  # it cannot be right; nothing was sent
+            except UsageError as error:  # the value is invalid; nothing was sent
                 print("wrong:  ", error)
-            except VehicleError as error:  # the vehicle answered, and the answer is no
+            except VehicleError as error:  # the vehicle refused the value
                 print("refused:", error)
-            except NoReply as error:  # whether it has taken the value is not known
+            except NoReply as error:  # the vehicle may have accepted the value or not
                 print("silent: ", error)
             else:
                 print("done:   ", done)

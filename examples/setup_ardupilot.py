@@ -1,4 +1,4 @@
-"""Set ArduPilot vehicles up: from a file what all share, over it what is each one's own; back if that fails.
+"""Set up ArduPilot vehicles from a shared file and own values of each; restore a vehicle on failure.
 
 python examples/setup_ardupilot.py [LINK [FILE]]
 """
@@ -20,7 +20,7 @@ OWN: dict[int, dict[str, int | float]] = {
     1: {"BATT_CAPACITY": 5200},
     2: {"BATT_CAPACITY": 3300, "WPNAV_SPEED": 500.0},
 }
-"""By system id, what is not the same for all."""
+"""Values of single vehicles, by system id."""
 
 
 async def main(link: str, file: Path) -> bool:
@@ -36,7 +36,7 @@ async def main(link: str, file: Path) -> bool:
     started = time.strftime("%Y%m%dT%H%M%S")
     async with ParamClient(link) as client:
         await client.component()
-        await asyncio.sleep(1.5)  # each of them is heard once a second
+        await asyncio.sleep(1.5)  # each vehicle sends a heartbeat once a second
         vehicles = [each for each in client.autopilots if each.autopilot == "ardupilot"]
         if not vehicles:
             raise NoReply("an ArduPilot", attempts=0, waited=1.5)
@@ -53,13 +53,13 @@ async def main(link: str, file: Path) -> bool:
             vehicle = await client.component(result.system, component)
             back = await restore(vehicle, result.before, reboot=True)
             print(
-                f"{system}: as it was before"
+                f"{system}: restored to its state before"
                 if back.complete
-                else f"{system}: NEITHER ONE NOR THE OTHER: {back}"
+                else f"{system}: NEITHER SET UP NOR RESTORED: {back}"
             )
         verified = await verify_all(vehicles, wanted)
         for (system, _), plan in verified.results.items():
-            print(f"{system}: {'as it shall be' if plan.is_met else 'NOT as it shall be'}")
+            print(f"{system}: {'set up' if plan.is_met else 'NOT set up'}")
         return applied.complete and verified.is_met
 
 

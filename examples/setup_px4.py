@@ -1,8 +1,8 @@
-"""Set a PX4 vehicle up from a parameter file: show, keep what was before, apply, start again, verify.
+"""Set up a PX4 vehicle from a parameter file: show the plan, back up, apply, reboot, verify.
 
 python examples/setup_px4.py [LINK [FILE]]
 
-Ended in the middle, it goes on from what the vehicle has when it is run again.
+After an interruption, run it again to continue.
 """
 
 from __future__ import annotations
@@ -33,39 +33,41 @@ async def main(link: str, file: Path) -> bool:
     async with ParamClient(link) as client:
         vehicle = await client.only_component()
         if vehicle.autopilot != "px4":
-            raise UsageError(f"this is for px4, and the vehicle is {vehicle.autopilot}")
+            raise UsageError(f"this program needs a px4 vehicle, and the vehicle is {vehicle.autopilot}")
         if not await show(vehicle, wanted):
             return False
         backup = Path(tempfile.gettempdir()) / f"before-{time.strftime('%Y%m%dT%H%M%S')}.yaml"
-        result = await apply(vehicle, wanted, reboot=True, backup=backup, progress=tell)
-        print(f"{result}; what was before is in {backup.name}")
+        result = await apply(vehicle, wanted, reboot=True, backup=backup, progress=show_progress)
+        print(f"{result}; the state before is in {backup.name}")
         if result.error is not None:
-            print("ended before its time:", result.error)
+            print("ended early:", result.error)
             return False
-        vehicle = await client.component(result.system, result.component)  # another id, if the file sets one
+        vehicle = await client.component(
+            result.system, result.component
+        )  # the file may set another system id
         state = await verify(vehicle, wanted)
-        print("as the file says" if state.is_met else "NOT as the file says")
+        print("the vehicle matches the file" if state.is_met else "the vehicle does NOT match the file")
         return state.is_met
 
 
 async def show(vehicle: Component, wanted: ParamSet) -> bool:
-    """Print what is going to be done; whether it can be."""
+    """Print the plan; return whether all values are valid."""
     plan = await prepare(vehicle, wanted)
     for stage in plan.stages:
         print(f"{stage.purpose}:")
         for step in stage.steps:
-            print(f"  {step}{' (from the next start on)' if step.needs_reboot else ''}")
+            print(f"  {step}{' (takes effect after a reboot)' if step.needs_reboot else ''}")
     for row in plan.rows.values():
         if row.reason:
             print(row)
     return not plan.of(PlanStatus.INVALID)
 
 
-def tell(how_far: ApplyProgress) -> None:
-    if how_far.row is not None:
-        print(f"{how_far.done}/{how_far.total} {how_far.row}")
-    elif how_far.phase == "rebooting":
-        print("the vehicle starts again")
+def show_progress(progress: ApplyProgress) -> None:
+    if progress.row is not None:
+        print(f"{progress.done}/{progress.total} {progress.row}")
+    elif progress.phase == "rebooting":
+        print("the vehicle reboots")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A small program for vehicles, and its tests against simulated ones, by the fixtures of the pytest plugin.
+"""A small program for vehicles, and its tests on simulated vehicles with the fixtures of the pytest plugin.
 
 pytest examples/test_your_program.py           run the tests
 python examples/test_your_program.py [LINK]    run the program
@@ -19,15 +19,15 @@ from paramclient.testing import MakeArduPilot, MakePX4
 INDOOR = {"MPC_XY_VEL_MAX": 2.0, "MPC_Z_VEL_MAX_UP": 1.0, "COM_RC_IN_MODE": 1}
 
 
-# the program
+# The program
 
 
 async def prepare_for_indoors(link: str | Link | Endpoint) -> list[str]:
-    """Limit a PX4 vehicle's speed; give the names of the parameters that had to be changed."""
+    """Limit a PX4 vehicle's speed; return the names of the parameters that were changed."""
     async with ParamClient(link) as client:
         vehicle = await client.only_component()
         if vehicle.autopilot != "px4":
-            raise ValueError(f"this is for px4, and the vehicle is {vehicle.autopilot}")
+            raise ValueError(f"this program needs a px4 vehicle, and the vehicle is {vehicle.autopilot}")
         changed = []
         for name, wanted in INDOOR.items():
             if (await vehicle.get(name)).value != wanted:
@@ -36,7 +36,7 @@ async def prepare_for_indoors(link: str | Link | Endpoint) -> list[str]:
         return changed
 
 
-# its tests: sim_px4 and sim_ardupilot make vehicles, and what is on board can be looked at
+# Its tests: sim_px4 and sim_ardupilot create vehicles, whose values the tests can read
 
 
 def test_sets_the_limits(sim_px4: MakePX4) -> None:
@@ -45,13 +45,13 @@ def test_sets_the_limits(sim_px4: MakePX4) -> None:
     assert {name: px4.vehicle.values[name] for name in INDOOR} == INDOOR
 
 
-def test_leaves_alone_what_is_right(sim_px4: MakePX4) -> None:
+def test_does_not_write_values_that_are_right(sim_px4: MakePX4) -> None:
     px4 = sim_px4(table=INDOOR)
     assert asyncio.run(prepare_for_indoors(px4)) == []
     assert px4.vehicle.requests["PARAM_SET"] == 0
 
 
-def test_works_on_a_bad_radio(sim_px4: MakePX4) -> None:
+def test_works_on_a_lossy_radio(sim_px4: MakePX4) -> None:
     px4 = sim_px4(loss=0.2, delay=0.02, jitter=0.02, seed=7)
     asyncio.run(prepare_for_indoors(px4))
     assert {name: px4.vehicle.values[name] for name in INDOOR} == INDOOR

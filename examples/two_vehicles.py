@@ -1,8 +1,8 @@
-"""Fetch the tables of two vehicles on one link side by side, and show where they differ.
+"""Fetch the tables of two vehicles on one link concurrently, and print the differences.
 
 python examples/two_vehicles.py [LINK [SYSTEM SYSTEM]]
 
-Without a link: two simulated PX4 vehicles behind one radio, of which one is tuned differently.
+Without a link: two simulated PX4 vehicles on one radio, with different tuning.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Print every change of a vehicle's parameters, whoever causes it, until Ctrl-C.
+"""Print every change of a vehicle's parameters, by any source, until Ctrl-C.
 
 python examples/watch.py [LINK]
 
-Without a link, a simulated vehicle changes two values by itself, and the example ends after them.
+Without a link, a simulated vehicle changes two values, and the example ends after them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ async def main(link: str | None = None) -> None:
         vehicle = await client.component()
         await vehicle.fetch_all()
         print(vehicle)
-        changes = vehicle.changes()  # all from here on, also those that come while nobody waits
+        changes = vehicle.changes()  # all changes from here on are queued
         awaited = set(ON_BOARD)
         for name in awaited:
             simulated.set_param(name, ON_BOARD[name])

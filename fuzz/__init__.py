@@ -1,5 +1,5 @@
-"""Bytes at random, led by what they reach: each target is a function that takes bytes and finds fault.
+"""Coverage-guided fuzz targets: each target is a function that takes bytes and fails on a fault.
 
-A target knows nothing of the fuzzer: the tests run the same functions on the bytes that are kept in
-`fuzz/corpus` and `fuzz/findings`. `python -m fuzz` lets atheris look for more.
+The targets are independent of the fuzzer: the tests run the same functions on the inputs stored in
+`fuzz/corpus` and `fuzz/findings`. `python -m fuzz` runs atheris to find further inputs.
 """

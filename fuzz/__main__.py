@@ -1,8 +1,8 @@
-"""Let atheris look for inputs that break a target: `python -m fuzz component --seconds 1800`.
+"""Run atheris on a fuzz target: `python -m fuzz component --seconds 1800`.
 
-What it finds to reach new code is kept in `fuzz/corpus/<target>`, and what breaks something in
-`fuzz/findings/<target>`. Further arguments go to libFuzzer. Before a corpus is committed, `python -m
-fuzz.keep` leaves of it what is needed.
+Inputs that reach new code are stored in `fuzz/corpus/<target>`, inputs that fail in
+`fuzz/findings/<target>`. Further arguments are passed to libFuzzer. Before a corpus is committed, `python -m
+fuzz.keep` reduces it to the inputs that are needed.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ TARGETS: Final = sorted(
 def main() -> None:
     parser = argparse.ArgumentParser(prog="fuzz", description="Look for inputs that break a target.")
     parser.add_argument("target", choices=TARGETS)
-    parser.add_argument("--seconds", type=int, default=1800, help="how long; 1800 unless it is said")
-    parser.add_argument("--corpus", type=Path, help="where inputs are kept; fuzz/corpus/<target>")
+    parser.add_argument("--seconds", type=int, default=1800, help="duration in seconds; default 1800")
+    parser.add_argument("--corpus", type=Path, help="folder for inputs; default fuzz/corpus/<target>")
     asked, options = parser.parse_known_args()
     corpus = asked.corpus or HERE / "corpus" / asked.target
     findings = HERE / "findings" / asked.target

@@ -1,10 +1,9 @@
-"""The cache file, damaged in any way: nothing is lost, and nothing wrong is believed.
+"""Fuzz target: damaged cache files. No data is lost, and no wrong value is accepted.
 
-Only CacheError comes, or UnknownVehicle where a file that was set aside had the vehicle.
+Only CacheError is raised, or UnknownVehicle if a file that was set aside had the vehicle.
 
-The input says what is changed in a file that was written before; a whole file would leave the fuzzer with
-nothing but bytes that SQLite refuses at once. What is left of the input changes the bytes of a table, under a
-checksum that is right: so they come from one who wants them believed.
+The input describes changes of a valid file: SQLite refuses nearly all random bytes immediately. The rest of
+the input changes the bytes of a table under a valid checksum, as an attacker would.
 """
 
 from __future__ import annotations
@@ -31,20 +30,20 @@ from paramclient.model.values import Param, ParamType, Trust
 __all__ = ["LONGEST", "run"]
 
 LONGEST: Final = 256
-"""Bytes of an input: longer ones take their time and say nothing new."""
+"""Maximum bytes of an input: longer ones are slow and find nothing new."""
 
 NAMES: Final = tuple(f"PARAM_{number}" for number in range(12))
 VEHICLE: Final = Identity(1, "fuzz", uid="a1b2c3", autopilot=12)
 OTHER: Final = Identity(2, "fuzz", uid="d4e5f6", autopilot=3)
 AT: Final = 1_700_000_000.0
 LATER: Final = 20_000_000_000.0
-"""Seconds after that at which more is saved: later than whatever a damaged file holds, or long before it."""
+"""Seconds after `AT` of later values: after most times in a damaged file, or long before some of them."""
 
 logger = logging.getLogger("paramclient.cache")
 
 
 def run(data: bytes) -> None:
-    """Damage a file, then read and write it as a client would; then a blob, alone and in a file."""
+    """Damage a file, then read and write it as a client does; then damage a table, alone and in a file."""
     draw = Draw(data)
     _run_file(_damaged(_good_file(), draw))
     if not draw.is_over:
@@ -55,13 +54,13 @@ def _run_file(content: bytes) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cache.sqlite3"
         path.write_bytes(content)
-        # each damaged file is worth a warning
+        # each damaged file causes a warning
         with suppress(CacheError, UnknownVehicle), mock.patch.object(logger, "disabled", True):
             _use(path)
         files = [
             each for each in Path(folder).iterdir() if not each.name.endswith(("-wal", "-shm", "-journal"))
         ]
-        # the damaged file is set aside under another name, or stands where it was; nothing of it is cut off
+        # the damaged file is set aside under another name or still in its place, and never truncated
         assert any(each.stat().st_size >= len(content) for each in files), [each.name for each in files]
 
 
@@ -161,7 +160,7 @@ def _damaged(content: bytes, draw: Draw) -> bytes:
                 size = draw.number() % 32
                 damaged[at : at + size] = draw.take(size)
             case 3:
-                at %= 200  # the header, and the first page behind it
+                at %= 200  # the header and the first page
                 damaged[at : at + 1] = draw.take(1)
             case _:
                 del damaged[at : at + draw.number(2)]

@@ -1,7 +1,7 @@
-"""A whole station against frames that may say anything, and all that can be asked of it, in any order.
+"""Fuzz target: a station that receives arbitrary frames and requests in any order.
 
-Frames are built from the input with a checksum that holds, so that they reach the protocol; small choices of
-names and addresses let them meet what is awaited. Bounds are made small enough to be reached.
+The frames are built from the input with a valid checksum, so that they reach the protocol; small sets of
+names and addresses make them match pending requests. Limits are reduced so that inputs can reach them.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from paramclient.protocol.wire import HASH_CHECK, NO_INDEX, Framer, Message
 __all__ = ["LONGEST", "run"]
 
 LONGEST: Final = 400
-"""Bytes of an input: longer ones take their time and say nothing new."""
+"""Maximum bytes of an input: longer ones are slow and find nothing new."""
 
 BOUNDS: Final = (
     (station, "MOST_COMPONENTS", 5),
@@ -48,7 +48,7 @@ BOUNDS: Final = (
     (change_origin, "MOST_FOREIGN_SETS", 4),
 )
 LISTENS: Final = 0xE0
-"""First bytes of an input from here on mean a station that sends nothing."""
+"""Lowest first byte of an input that stands for a listen-only station."""
 OWN: Final = (255, 190)
 SYSTEMS: Final = (1, 1, 1, 2, 3, 4, 255, 0)
 COMPONENTS: Final = (1, 1, 100, 190)
@@ -59,16 +59,17 @@ VALUES: Final[tuple[Value, ...]] = (0.0, 1, -1.5, 300, 1e39, math.nan, b"\1\2\3\
 PAUSES: Final = (0.0, 0.001, 0.02, 0.1, 0.3, 1.0, 2.5, 5.1, 20.0, 70.0, 3600.0)
 MOST_OPERATIONS: Final = 12
 MOST_STEPS: Final = 60
-"""Ticks at one moment that look like an endless loop."""
+"""Ticks at one time that count as an endless loop."""
 MOST_SENT: Final = 400
-"""Frames that one step may make: a burst of reads, an answer to each of what a moment brings, and repeats."""
+"""Frames that one step may send: a burst of reads, responses to the received frames, and repeats."""
 PATIENCE: Final = 900.0
+"""Seconds of final silence within which every request has ended."""
 MOST_TICKS: Final = 6000
-"""Seconds of silence, and deadlines in them, within which everything that was asked for has ended."""
+"""Deadlines within the final silence by which every request has ended."""
 
 
 def run(data: bytes) -> None:
-    """Play a session. Nothing is raised, nothing hangs, and no table holds what is not its component's."""
+    """Run a session. No error is raised, no request hangs, no table has another component's parameters."""
     with ExitStack() as stack:
         for room, name, bound in BOUNDS:
             stack.enter_context(mock.patch.object(room, name, bound))
@@ -112,12 +113,12 @@ class _Session:
 
     def play(self) -> None:
         while not self.draw.is_over:
-            with suppress(ContestedAddress):  # several peers speak for the component that is asked
+            with suppress(ContestedAddress):  # several peers use the address of the component
                 self.draw.one_of(self.steps)()
             self.settle()
 
     def end(self) -> None:
-        """Nothing comes any more: all that was begun ends, but for what only a caller's time limit ends."""
+        """Receive nothing more: all requests end, except those that only a caller's timeout ends."""
         if self.is_paused:
             self.interrupt()
             self.settle()
@@ -141,7 +142,7 @@ class _Session:
             self.station.traffic.report(self.now)
 
     def settle(self) -> None:
-        """Do what is due, take what is sent, and see that all is as it must be."""
+        """Run due deadlines, collect sent frames, and check all invariants."""
         for _ in range(MOST_STEPS):
             deadline = self.station.next_deadline()
             assert not math.isnan(deadline)
@@ -185,7 +186,7 @@ class _Session:
         assert held._wire.keys() <= held.params.keys()
         assert held._filed <= held.params.keys()
 
-    # what comes
+    # Received frames
 
     def hear(self, message: Message, system: int | None = None, component: int | None = None) -> None:
         draw = self.draw
@@ -218,7 +219,7 @@ class _Session:
         self.hear(message, system, component)
 
     def values(self) -> None:
-        """A part of a list, as a vehicle sends it."""
+        """Receive a part of a list, as a vehicle sends it."""
         draw = self.draw
         system, component = draw.one_of(SYSTEMS), draw.one_of(COMPONENTS)
         count, first, number = draw.one_of(COUNTS), draw.number() % 9, draw.number() % 10
@@ -234,7 +235,7 @@ class _Session:
         self.hear(message, system, component)
 
     def answer(self) -> None:
-        """What an honest vehicle would say to one of the last requests."""
+        """Receive the response of a correct vehicle to one of the latest requests."""
         if not self.requests:
             return
         request = self.requests[-1 - self.draw.number() % len(self.requests)]
@@ -258,7 +259,7 @@ class _Session:
                 self.answer_file(request, system, component)
 
     def file_answer(self) -> None:
-        """Something of a file, whoever asked for it."""
+        """Receive a MAVFTP response, requested or not."""
         for request in reversed(self.requests):
             if isinstance(request, wire.FileTransfer):
                 self.answer_file(request, request.target_system, self.draw.one_of(COMPONENTS))
@@ -319,13 +320,13 @@ class _Session:
         if not self.is_paused:
             self.station.receive(data, self.draw.number() % 4, self.now)
 
-    # time
+    # Time
 
     def wait(self) -> None:
         self.now += self.draw.one_of(PAUSES)
 
     def due(self) -> None:
-        """On to what is due next, several times."""
+        """Advance the time to the next deadline, several times."""
         for _ in range(self.draw.number() % 16):
             deadline = self.station.next_deadline()
             if deadline < math.inf:
@@ -333,14 +334,14 @@ class _Session:
             self.settle()
 
     def interrupt(self) -> None:
-        """The link goes away, or comes back."""
+        """Interrupt the link, or restore it."""
         self.is_paused = not self.is_paused
         if self.is_paused:
             self.station.pause()
         else:
             self.station.resume(self.now)
 
-    # what is asked
+    # Requests
 
     def machine(self) -> ComponentMachine | None:
         known = list(self.station.components.values())
@@ -365,7 +366,7 @@ class _Session:
             case Restart():
                 machine.end_restart(operation, self.now)
             case _:
-                machine.files.release(operation, self.now)  # type: ignore[arg-type]  # nothing else is left
+                machine.files.release(operation, self.now)  # type: ignore[arg-type]  # all other kinds are handled above
 
     def fetch(self) -> None:
         machine, how = self.machine(), self.draw.number()
@@ -433,7 +434,7 @@ class _Session:
         self.keep(machine, job)
 
     def cached(self) -> None:
-        """The cache brings what it knows: a whole table, or a part of one."""
+        """Load a cached table, complete or in part."""
         machine, how = self.machine(), self.draw.number()
         if machine is None:
             return
@@ -456,7 +457,7 @@ class _Session:
             volatile_known=bool(how & 4),
         )
 
-    # what it is made of
+    # Building blocks
 
     def name(self, system: int) -> str:
         kind = self.draw.number()
@@ -465,11 +466,11 @@ class _Session:
         return f"{_prefix(system)}{'ABCDEFGHIJKLMNOPQR'[kind % 18]}"
 
     def entry(self, system: int, index: int, count: int) -> wire.ParamValue:
-        """The value that a vehicle has under an index; its last byte is the input's."""
+        """Return the value of a vehicle at an index; its last byte comes from the input."""
         raw = b"\0\0" + bytes((0x80, self.draw.number() & 0x3F))
         return wire.ParamValue(f"{_prefix(system)}{'ABCDEFGHIJKLMNOPQR'[index % 18]}", raw, 9, count, index)
 
 
 def _prefix(system: int) -> str:
-    """How the name of each of a system's parameters begins; a capital, which ArduPilot leaves as it is."""
+    """Return the prefix of a system's parameter names: a capital letter, which ArduPilot does not change."""
     return chr(ord("A") + system % 26)

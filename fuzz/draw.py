@@ -1,4 +1,4 @@
-"""Bytes as a source of decisions: what a target makes of its input, in the order in which it asks."""
+"""A source of decisions that reads values from the bytes of an input."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Item = TypeVar("Item")
 
 
 class Draw:
-    """Takes bytes from the front of an input; behind its end everything is zero."""
+    """Reads values from the start of an input; after its end, all bytes are zero."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
@@ -19,23 +19,23 @@ class Draw:
 
     @property
     def is_over(self) -> bool:
-        """Whether every byte has been taken."""
+        """Whether all bytes have been read."""
         return self._at >= len(self._data)
 
     def take(self, size: int) -> bytes:
-        """So many bytes, padded with zeros."""
+        """Return `size` bytes, padded with zeros."""
         self._at += size
         return self._data[self._at - size : self._at].ljust(size, b"\0")
 
     def number(self, size: int = 1) -> int:
-        """An unsigned number of so many bytes."""
+        """Return an unsigned number of `size` bytes."""
         return int.from_bytes(self.take(size), "little")
 
     def one_of(self, items: Sequence[Item]) -> Item:
-        """One of the items."""
+        """Return one of the items."""
         return items[self.number() % len(items)]
 
     def rest(self) -> bytes:
-        """All that is left."""
+        """Return all remaining bytes."""
         rest, self._at = self._data[self._at :], len(self._data)
         return rest

@@ -1,4 +1,4 @@
-"""Parameter files: only FileError comes, and what is read says the same when it is written again."""
+"""Fuzz target: parameter files. Only FileError is raised; a file that is read can be written unchanged."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from paramclient.files import FileForm, ParamFile, dumps, loads
 __all__ = ["LONGEST", "run"]
 
 LONGEST: Final = 1024
-"""Bytes of an input: longer ones take their time and say nothing new."""
+"""Maximum bytes of an input: longer ones are slow and find nothing new."""
 
 NAMES: Final = ("", "a.params", "a.parm", "a.param", "a.pck", "a.json", "a.yaml", "a.txt")
 WRITABLE: Final = tuple(form for form in FileForm if form is not FileForm.PX4_SCRIPT)
 
 
 def run(data: bytes) -> None:
-    """The first byte chooses the name and the form that it is read as; the others are the file."""
+    """Read a file: the first byte chooses its name and file format, all other bytes are the content."""
     draw = Draw(data)
     how = draw.number()
     form = None if how & 8 else list(FileForm)[how % 7]
@@ -33,7 +33,7 @@ def run(data: bytes) -> None:
         try:
             written = dumps(held, form=form)
         except FileError:
-            continue  # not every form can say everything
+            continue  # not every file format can hold every value
         again = loads(written, source=NAMES[how >> 4 & 7], form=form)
         assert _names(again) == _names(held), f"{form} has other parameters"
         if is_exact:
@@ -45,7 +45,7 @@ def _names(file: ParamFile) -> list[str]:
 
 
 def _told(file: ParamFile) -> list[tuple[object, ...]]:
-    """What a file says of values; NaN equals itself here. Comments may be written otherwise."""
+    """Return the values of a file, in which NaN equals itself. Comments may be written differently."""
     return [
         (params.system, params.component, each.name, each.type, repr(each.value), repr(each.default))
         for params in file.sets

@@ -1,4 +1,4 @@
-"""The framers, held against a third one that takes no short cut."""
+"""Fuzz target: both framers, compared with a simple reference framer."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from paramclient.protocol.wire import Frame, Framer, Signer, SigningKey, Signing
 __all__ = ["LONGEST", "run"]
 
 LONGEST: Final = 1024
-"""Bytes of an input: longer ones take their time and say nothing new."""
+"""Maximum bytes of an input: longer ones are slow and find nothing new."""
 
 LONGEST_FRAME = 280
 IDS = (0, 2, 20, 21, 22, 23, 76, 77, 110, 148, 235, 253, 256, 345, 397, 1, 33, 12915)
-"""What whole frames are made of: the messages that are understood, and a few others."""
+"""Message ids of whole frames: those that the library decodes, and some others."""
 
 EXTRAS = {number: message.crc_extra for number, message in dialect.mavlink_map.items()} | {397: 182}
 KEY = SigningKey(bytes(range(32)))
 
 
 def run(data: bytes) -> None:
-    """Frames, parts of frames and noise, cut anywhere: each framer finds what stands there, and no more."""
+    """Feed frames, parts of frames and noise in arbitrary chunks: each framer finds exactly the frames."""
     draw = Draw(data)
     chunks: list[bytes] = [b""]
     while not draw.is_over:
@@ -75,7 +75,7 @@ def _check_sniffer(chunks: list[bytes]) -> None:
         assert len(sniffer._tail) <= MOST_KEPT + LONGEST_FRAME
     seen += sniffer.flush()
     data = b"".join(chunks)
-    # what nothing proves may count as a frame, but never in the place of one that is proven
+    # bytes that cannot be checked may count as a frame, but must not displace a verified frame
     proven = [Frame(*each[:6]) for each in seen if each.is_known]
     assert proven == [frame for frame, _ in _frames_of(data)]
     assert sum(each.size for each in seen) + sniffer.other_bytes <= len(data)
@@ -93,7 +93,7 @@ def _check_codec(frame: Frame) -> None:
 
 
 def _frames_of(data: bytes) -> list[tuple[Frame, int]]:
-    """The frames in bytes that are all there, each with its size: byte by byte, with pymavlink's CRC."""
+    """Return the frames in complete data, each with its size: byte by byte, with pymavlink's CRC."""
     found = []
     at = 0
     while at < len(data):
@@ -127,7 +127,7 @@ def _frame_at(data: bytes, at: int) -> tuple[Frame, int] | None:
 
 
 def _piece(draw: Draw) -> tuple[bytes, bool]:
-    """What comes next, and whether a chunk ends behind it."""
+    """Return the next piece of data, and whether a chunk ends after it."""
     kind = draw.number()
     is_cut = bool(kind & 0x80)
     match kind % 8:
@@ -152,7 +152,7 @@ def _frame(draw: Draw) -> bytes:
 
 
 def _damaged(frame: bytes, much: int, draw: Draw) -> bytes:
-    """A frame as it is; signed; cut off; or with a byte that was another one."""
+    """Return a frame unchanged, signed, truncated, or with one byte changed."""
     match much:
         case 5 if frame[0] == 0xFD:
             body = frame[1:2] + b"\x01" + frame[3:-2]

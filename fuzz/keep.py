@@ -1,7 +1,7 @@
-"""Keep of many inputs the few that reach everything: `python -m fuzz.keep component FOUND`.
+"""Reduce a corpus to the inputs that are needed for its coverage: `python -m fuzz.keep component FOUND`.
 
-Of the inputs in the corpus of a target and in a folder, the smallest ones stay in the corpus that together
-take every step from one line of the package to another that any of them takes.
+From the corpus of a target and the inputs in a folder, the smallest inputs are kept that together cover every
+step from line to line of the package that any of them covers.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ HERE: Final = Path(__file__).parent
 def main() -> None:
     parser = argparse.ArgumentParser(prog="fuzz.keep", description="Keep the inputs that reach everything.")
     parser.add_argument("target")
-    parser.add_argument("found", type=Path, nargs="?", help="a folder with more inputs")
+    parser.add_argument("found", type=Path, nargs="?", help="a folder with further inputs")
     asked = parser.parse_args()
     corpus = HERE / "corpus" / asked.target
     target = importlib.import_module(f"fuzz.{asked.target}")
@@ -41,7 +41,7 @@ def main() -> None:
 
 
 def steps_of(target: Any, data: bytes) -> set[tuple[str, int, int]]:
-    """The steps from line to line that an input takes."""
+    """Return the steps from line to line that an input covers."""
     steps: set[tuple[str, int, int]] = set()
     lines: dict[int, int] = {}
 

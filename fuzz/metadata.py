@@ -1,4 +1,4 @@
-"""Descriptions of parameters, of a file or a vehicle: only MetadataError comes, and all of it can be used."""
+"""Fuzz target: metadata of a file or a vehicle. Only MetadataError is raised, and all descriptions work."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from paramclient.metadata import read_content
 __all__ = ["LONGEST", "run"]
 
 LONGEST: Final = 3000
-"""Bytes of an input: longer ones take their time and say nothing new."""
+"""Maximum bytes of an input: longer ones are slow and find nothing new."""
 
 VALUES = (0, 1, -1, 255, 1 << 31, 0.0, 1.5, -0.0, math.nan, math.inf, 1e39, b"\1\2\3\4")
 WORDS = ("", "0", "1.5", "0x10", "Enabled", "a,b", "1+2", "nan")
 
 
 def run(data: bytes) -> None:
-    """The bytes of a file."""
+    """Read a metadata file with this content."""
     try:
         known = read_content(data, source="fuzz")
     except MetadataError as error:

@@ -1,9 +1,9 @@
-"""Requests at random to a service, made from its OpenAPI document: `python -m fuzz.over_http --seconds 1200`.
+"""Random requests to a service, built from its OpenAPI document: `python -m fuzz.over_http --seconds 1200`.
 
-A service with a simulated PX4 and a cache of its own runs on loopback. Schemathesis sends it requests that
-fit its document, and some that do not, and holds every answer against that document: no 500, no state, kind
-of content or shape that is not in it. Answers of 503 and 504 are in it: a vehicle need not answer within a
-nanosecond. The exit code is that of schemathesis: 0 where nothing was found.
+Starts a service with a simulated PX4 and a new cache on loopback. Schemathesis sends valid and invalid
+requests, and checks every response against the document: no 500, and no status, content type or schema that
+is not in it. The document has 503 and 504: a vehicle need not answer within a nanosecond. The exit code is
+that of schemathesis: 0 if nothing was found.
 """
 
 from __future__ import annotations
@@ -34,14 +34,15 @@ CONFIG: Final = """
 [checks]
 not_a_server_error.expected-statuses = ["2xx", "3xx", "4xx", 503, 504]
 """
-"""That of schemathesis: requests go to the vehicle that is there, or most would end with 404."""
+"""The configuration of schemathesis: requests use the simulated vehicle, because most others end with 404."""
 LEFT_OUT: Final = (
     "/api/v1/events",
     "/api/v1/find",
     "/api/v1/components/{system}/{component}/successor",
     "/api/v1/components/{system}/{component}/reboot",
 )
-"""A stream has no end, who is not there is waited for as long as was asked, and a restart takes seconds."""
+"""Operations that are left out: a stream does not end, a wait takes its whole timeout, a reboot takes
+seconds."""
 WORKERS: Final = 4
 
 
@@ -49,7 +50,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         prog="fuzz.over_http", description="Send requests at random to a service."
     )
-    parser.add_argument("--seconds", type=int, default=1200, help="how long; 1200 unless it is said")
+    parser.add_argument("--seconds", type=int, default=1200, help="duration in seconds; default 1200")
     asked, options = parser.parse_known_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -81,7 +82,7 @@ def main() -> int:
 
 
 def find(url: str) -> None:
-    """See that the vehicle is heard, with all its parameters."""
+    """Wait until the service has all parameters of the vehicle."""
     for path in ("/api/v1/find", "/api/v1/components/1/1/fetch"):
         body = json.dumps({"timeout_s": 60}).encode()
         request = urllib.request.Request(url + path, body, {"Content-Type": "application/json"})

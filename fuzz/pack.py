@@ -1,4 +1,4 @@
-"""param.pck: what can be read says the same when it is written again, and only PackError comes."""
+"""Fuzz target: param.pck. Only PackError is raised, and a file that is read can be written unchanged."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from paramclient.protocol.ftp import param_pck
 __all__ = ["LONGEST", "run"]
 
 LONGEST: Final = 1024
-"""Bytes of an input: longer ones take their time and say nothing new."""
+"""Maximum bytes of an input: longer ones are slow and find nothing new."""
 
 MOST_READ = 239
 
 
 def run(data: bytes) -> None:
-    """The bytes of a file, as a vehicle gives it and as it is written to one."""
+    """Read and write a file in the format for downloads, and in the format for uploads."""
     assert param_pck.total_of(data) in (None, int.from_bytes(data[4:6], "little"))
     _check_table(data)
     _check_upload(data)

@@ -1,7 +1,7 @@
-"""A service that a client must not believe: its events and answers changed at random, in a whole session.
+"""Fuzz target: a client of a hostile service, whose events and responses are changed at random.
 
-Whatever comes, the client raises nothing but errors of the library, and ends. Time is passed by a loop whose
-clock leaps, so that back-offs take none.
+The client raises only errors of the library, and ends. The event loop has simulated time, so that backoffs
+take no time.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from paramclient.remote import RemoteClient
 __all__ = ["LONGEST", "run"]
 
 LONGEST: Final = 256
-"""Bytes of an input: a few dozen changes."""
+"""Maximum bytes of an input: a few dozen changes."""
 
 RUN: Final = "0123456789abcdef"
 IDENTITY: Final = {
@@ -164,7 +164,7 @@ KINDS: Final = ("application/json", "application/json", "application/problem+jso
 
 
 def run(data: bytes) -> None:
-    """The first byte says how many events there are; an odd one, that the stream is the rest as it is."""
+    """Run a session: the first byte is the number of events; if odd, the stream is the rest of the input."""
     draw = Draw(data)
     how = draw.number()
     logging.disable()
@@ -208,12 +208,12 @@ async def _use(client: RemoteClient) -> None:
 
 
 class _Hostile(httpx.AsyncBaseTransport):
-    """Answers with documents in which something is changed."""
+    """A transport that answers with changed documents."""
 
     def __init__(self, draw: Draw, how: int) -> None:
         self._draw = draw
         self._how = how
-        self._left = 40  # answers, so that a session has an end whatever it comes to
+        self._left = 40  # number of responses, so that every session ends
 
     async def handle_async_request(self, request: httpx.Request) -> httpx.Response:
         path = request.url.path.removeprefix("/api/v1")
@@ -242,7 +242,7 @@ class _Hostile(httpx.AsyncBaseTransport):
 
 
 class _Stream(httpx.AsyncByteStream):
-    """Pieces, and then nothing more, without an end."""
+    """A stream that yields pieces and then never ends."""
 
     def __init__(self, pieces: list[bytes]) -> None:
         self._pieces = pieces
@@ -255,7 +255,7 @@ class _Stream(httpx.AsyncByteStream):
 
 
 def _changed(document: Any, draw: Draw) -> Any:
-    """A copy in which up to two members are others, or gone; in most cases none."""
+    """Return a copy with up to two members changed or removed; in most cases with none."""
     document = deepcopy(document)
     for _ in range(max(0, draw.number() // 32 - 5)):
         holder: Any = {"": document}
@@ -274,7 +274,7 @@ def _changed(document: Any, draw: Draw) -> Any:
 
 
 class _LeapingLoop(asyncio.SelectorEventLoop):
-    """An event loop whose clock leaps to the next thing to do."""
+    """An event loop whose simulated clock advances to the next callback."""
 
     def __init__(self) -> None:
         super().__init__(_LeapingSelector(self))

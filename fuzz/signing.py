@@ -1,4 +1,4 @@
-"""Signed frames: what is taken and what is refused, held against the rules of the guide once more."""
+"""Fuzz target: signed frames. Accepted and refused frames follow the rules of the MAVLink guide."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from paramclient.protocol.wire.signing import LAST_TIMESTAMP, MOST_AHEAD
 __all__ = ["LONGEST", "run"]
 
 LONGEST: Final = 600
-"""Bytes of an input: longer ones take their time and say nothing new."""
+"""Maximum bytes of an input: longer ones are slow and find nothing new."""
 
 SECRET: Final = bytes(range(32))
 OTHER_SECRET: Final = bytes(range(1, 33))
@@ -28,7 +28,7 @@ STARTS: Final = (36_000_000_000_000, 36_000_000_000_000, 0, MOST_AHEAD)
 
 
 def run(data: bytes) -> None:
-    """Frames of several senders: signed, unsigned, forged, cut off and sent again; ours between them."""
+    """Receive frames of several senders: signed, unsigned, forged, truncated, repeated; send own frames."""
     with suppress(UsageError):
         key = SigningKey.from_text(data.decode("latin-1"))
         assert SigningKey.from_text(key.secret.hex()) == key
@@ -95,7 +95,7 @@ class _Session:
         assert len(told) <= MOST_STREAMS
 
     def _flaw(self, frame: bytes) -> Refusal | None:
-        """What the rules say of a frame; what a right one changes is noted."""
+        """Return why the rules refuse a frame, or None; record the timestamp of an accepted one."""
         if frame[0] == 0xFE or not frame[2]:
             number = frame[5] if frame[0] == 0xFE else int.from_bytes(frame[7:10], "little")
             if self.policy is SigningPolicy.SIGNED_ONLY or (
@@ -132,7 +132,7 @@ class _Session:
         )
 
     def _frame(self) -> bytes:
-        """A frame that holds its checksum."""
+        """Return a frame with a valid checksum."""
         draw = self.draw
         way = draw.number() % 8
         if way == 0 and self.heard:

@@ -1,4 +1,4 @@
-"""Telemetry logs: read as a simpler reader reads them, replayed whole, and imported with nothing made up."""
+"""Fuzz target: telemetry logs. Read like a simple reference reader does, replayed, and imported correctly."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from paramclient.protocol.wire import NO_INDEX, Framer, Message
 __all__ = ["LONGEST", "run"]
 
 LONGEST: Final = 1024
-"""Bytes of an input: longer ones take their time and say nothing new."""
+"""Maximum bytes of an input: longer ones are slow and find nothing new."""
 
 YEAR = 366 * 86400 * 1_000_000
 END = 7_258_118_400 * 1_000_000
 BLOCKS = (1, 13, 64, 300, 65536)
-"""Sizes in which a log is read."""
+"""Block sizes in bytes in which a log is read."""
 BEGINNINGS = (1_700_000_000_000_000, 1_700_000_000_000_000, 315_964_800_000_000, 20_000_000)
 PASSES = (1000, 1000, 20_000, 300_000, 7_000_000, -5_000_000, YEAR - 1, YEAR + 1, -40 * YEAR, 50 * YEAR)
-"""Microseconds between two frames."""
+"""Microseconds between two frames of a log."""
 NAMES = ("A", "B", "C", "D", "_HASH_CHECK", "\x1b[2J")
 KINDS = (9, 6, 1, 5, 10)
 VALUES = (0, 1, 2, 0x3F800000, 0x7FC00000, 0xFFFFFFFF)
@@ -47,7 +47,7 @@ logger = logging.getLogger("paramclient")
 
 
 def run(data: bytes) -> None:
-    """The first byte chooses between the bytes of a log, and pieces of which one is made."""
+    """Read a log: the first byte chooses between the bytes of a log and pieces from which one is built."""
     draw = Draw(data)
     how = draw.number()
     content = draw.rest() if how & 1 else _log(draw)
@@ -90,9 +90,10 @@ async def _check_uses(path: Path, records: Sequence[Record]) -> None:
 
 
 def _check_import(kept: ParamCache, tables: Sequence[ImportedTable], records: Sequence[Record]) -> list[str]:
-    """All that is kept was said in the log by such a component, at a time of the log; told in full.
+    """Check that all cached values are in the log, from the same component and with a time of the log.
 
-    By which system it was said is left open: a vehicle that says the same id under two addresses is one.
+    The system id is not checked: one hardware id under two addresses is one vehicle. Return the content of
+    the cache as sorted texts.
     """
     said = _said(records)
     times = {each.at for each in records}
@@ -106,7 +107,7 @@ def _check_import(kept: ParamCache, tables: Sequence[ImportedTable], records: Se
             for (_, component), each in said.items()
             if component == summary.component
             for name, kind, raw in each
-            for spelt in (name, name.translate(_CAPITALS))  # as ArduPilot's are taken
+            for spelt in (name, name.translate(_CAPITALS))  # names of ArduPilot are stored in capitals
             for encoding in Encoding
         }
         for name, param in table.params.items():
@@ -118,7 +119,7 @@ def _check_import(kept: ParamCache, tables: Sequence[ImportedTable], records: Se
 
 
 def _said(records: Sequence[Record]) -> dict[tuple[int, int], set[tuple[str, int, bytes]]]:
-    """What parameters a log tells of, by who told it; from the bytes of each record alone."""
+    """Return the parameters of a log by their sender, from the bytes of each record alone."""
     framer = Framer({22}, stream=False)
     said: dict[tuple[int, int], set[tuple[str, int, bytes]]] = {}
     for record in records:
@@ -131,7 +132,7 @@ def _said(records: Sequence[Record]) -> dict[tuple[int, int], set[tuple[str, int
 
 
 def _records_of(content: bytes) -> list[Record]:
-    """The records of a log: from one whole to the next, at each place by what stands there and behind it."""
+    """Return the records of a log: at each offset, decided by the record there and the one after it."""
     found: list[Record] = []
     at = 0
     last: int | None = None
@@ -152,7 +153,7 @@ def _records_of(content: bytes) -> list[Record]:
 
 
 def _record_at(content: bytes, at: int) -> tuple[int, int] | None:
-    """Time and end of what may stand there, no further than `at` if nothing does; None where the log ends."""
+    """Return time and end of a record at an offset; the end is `at` without a record; None after the log."""
     head = content[at : at + 11]
     if len(head) < 11:
         return None

@@ -1,8 +1,8 @@
-"""A program on the companion computer. It has the vehicle through the service as over a link of its own.
+"""A program on the companion computer. It uses the vehicle over the service like over its own link.
 
     python tune.py http://127.0.0.1:8765 MC_ROLL_P 6.5
 
-The token, where the service wants one, stands in the environment variable PARAMCLIENT_TOKEN.
+If the service requires a token, it is in the environment variable PARAMCLIENT_TOKEN.
 """
 
 import asyncio
@@ -21,7 +21,7 @@ async def main(service: str, name: str, value: float) -> None:
         print(f"{done.status}: {name} = {done.actual!r}")
         async for change in changes:
             if change.name == name and change.new is not None:
-                print(f"everybody is told: {name} = {change.new.value!r}, by {change.by}")
+                print(f"all clients receive: {name} = {change.new.value!r}, by {change.by}")
                 break
 
 

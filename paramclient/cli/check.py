@@ -40,6 +40,7 @@ ENTRIES_SHOWN_MAX: Final = 8
 """Files and directories that a row names, so that it stays one line; it gives the number of further ones."""
 _UNSIGNED: Final = SigningOptions()
 _COLOURS: Final = {Severity.PROBLEM: "red", Severity.SLOW: "yellow", Severity.NOTE: ""}
+"""Styles of rich for each severity."""
 
 
 async def check(

@@ -25,14 +25,18 @@ _UNITS: Final = {
 }
 """Seconds of each unit of time."""
 _LENGTH: Final = rf"([0-9]{{1,9}}(?:\.[0-9]{{1,9}})?) ?({'|'.join(_UNITS)})(?![a-z])"
+"""A number with a unit, such as `30min`."""
 _AGO: Final = re.compile(rf"{_LENGTH}(?: ?{_LENGTH})*(?: ago)?", re.ASCII)
+"""A time before now, such as `2h 30min ago`."""
 _MOMENT: Final = re.compile(
     r"(?:(?P<day>today|yesterday|[0-9]{4}-[0-9]{2}-[0-9]{2})(?:[t ](?=.)|$))?"
     r"(?:(?P<hour>[0-9]{1,2})(?P<minutes>:[0-9]{2}(?::[0-9]{2}(?:\.[0-9]{1,6})?)?)"
     r"(?P<zone> ?(?:z|utc|[+-][0-9]{2}:?[0-9]{2}))?)?",
     re.ASCII,
 )
+"""A day, a time of day, or both, with or without a time zone."""
 _SNAPSHOT: Final = re.compile(r"[0-9]{1,18}", re.ASCII)
+"""The id of a snapshot."""
 
 
 def parse_when(text: str, now: float, zone: tzinfo | None = None) -> float | int:

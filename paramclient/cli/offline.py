@@ -236,11 +236,13 @@ class _View:
         *,
         changed: bool,
     ) -> _View:
+        """Return the view of a table; without `metadata`, with the stored metadata of its firmware."""
         known = known_of_table(cache.path, table) if metadata is None else metadata
         return cls(table, tuple(name for name in names if name in table.params), known, changed)
 
     @property
     def params(self) -> Iterable[Param]:
+        """The parameters to show."""
         params = self.table.params.changed() if self.changed else self.table.params
         return [params[name] for name in self.names if name in params] if self.names else params.values()
 

@@ -72,7 +72,8 @@ INDICES_SHOWN_MAX: Final = 20
 """Missing indices that a message names, so that it stays readable; it gives the number of further ones."""
 
 _DEFAULTS: Final = LinkOptions()
-_News: TypeAlias = Lost | Found | Rebooted | Resynced | Contested | Uncontested
+_ComponentEvent: TypeAlias = Lost | Found | Rebooted | Resynced | Contested | Uncontested
+"""Events that watch prints."""
 
 
 async def fetch(
@@ -274,7 +275,7 @@ async def watch(
         watched = ", ".join(wanted) if wanted else f"{len(session.component.params)} parameters"
         say(printable(f"watching {watched} of {session.label}"))
         with anyio.move_on_after(session.deadline.left()):
-            await _print_news(
+            await _print_changes_and_events(
                 session, changes, events, known, frozenset(wanted), as_lines_of_json=options.json
             )
     return ExitCode.DONE
@@ -301,6 +302,7 @@ class _Fetched:
 
     @classmethod
     def of(cls, session: Session, result: FetchResult, policy: Policy) -> _Fetched:
+        """Select the parameters of a fetch under a policy."""
         params = by_index(session.component.params.values())
         cached = [param for param in params if param.trust is Trust.CACHED]
         missing = set(result.missing)
@@ -321,10 +323,12 @@ class _Fetched:
 
     @property
     def received(self) -> int:
+        """The number of parameters that were received or confirmed."""
         return self.result.count - len(self.missing)
 
     @property
     def summary(self) -> str:
+        """The line about the fetch: parameters, source, seconds, losses, bytes, hash."""
         result = self.result
         of = f" of {result.count}" if self.missing else ""
         crc = "" if result.hash is None else f"; hash {hash_text(result.hash)}"
@@ -466,6 +470,7 @@ class _Written:
         )
 
     def cells(self) -> tuple[object, ...]:
+        """Return the row of the table."""
         actual = None if self.actual is None else format_value(self.actual, self.type)
         return self.name, format_value(self.requested, ParamType.REAL64), actual, self.status
 
@@ -513,7 +518,7 @@ async def _read_again(session: Session, written: _Written) -> _Written:
 # watch
 
 
-async def _print_news(
+async def _print_changes_and_events(
     session: Session,
     changes: Changes,
     events: Events,
@@ -576,7 +581,7 @@ async def _merged(changes: Changes, events: Events) -> AsyncGenerator[Change | E
                 each.exception()  # both end with the link; one error is reported
 
 
-def _line(news: Change | _News, at: float) -> Document:
+def _line(news: Change | _ComponentEvent, at: float) -> Document:
     """Return the JSON document of a change or an event."""
     from paramclient.documents.command import ChangeLineDoc, EventLineDoc  # only here: loads pydantic
 
@@ -591,7 +596,7 @@ def _change_text(change: Change) -> str:
     return f"{change.name}  {old} -> {new}  ({change.by})"
 
 
-def _event_text(event: _News) -> str:
+def _event_text(event: _ComponentEvent) -> str:
     match event:
         case Lost():
             text = f"lost: not heard for {event.silence:.1f} s"

@@ -66,8 +66,11 @@ if TYPE_CHECKING:
 __all__ = ["apply", "restore", "verify"]
 
 Include: TypeAlias = Annotated[tuple[str, ...], Parameter(show_default=False)]
+"""Categories and globs of --include."""
 AllVehicles: TypeAlias = Annotated[bool, Parameter(name="--all")]
+"""The option --all."""
 Count: TypeAlias = Annotated[int | None, Parameter(validator=Number(gte=1, lte=255))]
+"""A number of vehicles, at most as many as there are system ids."""
 Result = TypeVar("Result")
 Found = TypeVar("Found")
 

@@ -127,6 +127,7 @@ class VehicleFaults:
 _NO_FAULTS: Final = Faults()
 _NO_VEHICLE_FAULTS: Final = VehicleFaults()
 _Id = Annotated[int, Parameter(validator=Number(gte=1, lte=255))]
+"""A system or component id."""
 
 
 async def sim(

@@ -90,7 +90,7 @@ async def collect_set(
     table = copy_params(component.params)
     system, number, identity, at = component.system, component.component, component.identity, time.time()
 
-    def take() -> FetchedSet:
+    def make_set() -> FetchedSet:
         params = list(table.values())
         known = [param for param in params if param.trust is not Trust.CACHED]
         stale = {
@@ -102,7 +102,7 @@ async def collect_set(
         found = ParamSet.of(known, component=number, system=system, identity=identity, at=at, source=source)
         return FetchedSet(found, known, missing)
 
-    return await run(take)
+    return await run(make_set)
 
 
 async def fetch_set(

@@ -1490,14 +1490,14 @@ def test_sim_serves_other_processes_through_a_faulty_link(live_command: Command)
         assert live_command("get", url, "MC_ROLL_P", "--timeout", 1, "--no-cache").code == 3
 
 
-def test_sim_answers_with_param_error_where_asked(live_command: Command) -> None:
+def test_sim_answers_with_param_error_if_requested(live_command: Command) -> None:
     with simulated("ardupilot", "--param-error") as url:
         got = live_command("get", url, "NOPE", "--json", "--no-cache")
     assert got.code == 1
     assert "silent" not in got.json["errors"]["NOPE"]
 
 
-def test_sim_speaks_first_on_udpout() -> None:
+def test_sim_sends_first_on_udpout() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         free.settimeout(PATIENCE)
@@ -1508,7 +1508,7 @@ def test_sim_speaks_first_on_udpout() -> None:
     assert (heartbeat.message_id, heartbeat.system) == (0, 1)
 
 
-def test_sim_on_a_byte_stream_joins_what_was_cut() -> None:
+def test_sim_on_a_byte_stream_joins_split_frames() -> None:
     request = wire.encode(wire.ParamRequestRead(1, 1, "MC_ROLL_P"), system=255, component=190, sequence=0)
     framer = wire.Framer()
     messages: list[wire.Message | None] = []
@@ -1522,14 +1522,14 @@ def test_sim_on_a_byte_stream_joins_what_was_cut() -> None:
                     messages.extend(map(wire.decode, framer.receive(connection.recv(4096))))
 
             connection.sendall(request[:9])
-            receive(2)  # by then the first half has been read
+            receive(2)  # the first half has been read by then
             connection.sendall(request[9:])
             receive(4)
     values = [each.param_id for each in messages if isinstance(each, wire.ParamValue)]
     assert values == ["MC_ROLL_P"]
 
 
-def test_the_garbage_collector_leaves_out_what_is_loaded_when_a_command_begins() -> None:
+def test_the_garbage_collector_skips_the_modules_of_a_command() -> None:
     program = (
         "import gc, paramclient.cli as cli\n"
         "cli.run = lambda arguments: print(gc.get_freeze_count(), len(gc.get_objects())) or 0\n"
@@ -1541,7 +1541,7 @@ def test_the_garbage_collector_leaves_out_what_is_loaded_when_a_command_begins()
 
 
 def test_a_command_loads_its_own_modules_only() -> None:
-    """To start is a part of the time that each call takes."""
+    """The start is part of the duration of each call."""
     program = (
         "import sys; from paramclient.cli import run; run(['ports', '--json']); "
         "print([name for name in sys.modules if name.startswith('paramclient.cli.')])"
@@ -1555,7 +1555,7 @@ def test_a_command_loads_its_own_modules_only() -> None:
 
 
 @pytest.mark.parametrize("words", [(), ("--help",), ("cache",), ("fleet", "--help")])
-def test_a_page_of_help_says_what_each_command_does(words: tuple[str, ...], command: Command) -> None:
+def test_the_help_describes_each_subcommand(words: tuple[str, ...], command: Command) -> None:
     out = command(*words).out
     rows = re.findall(r"^│ ([a-z]+) +(\S.*)│$", out, re.MULTILINE)
     assert rows

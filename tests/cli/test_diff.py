@@ -30,7 +30,7 @@ from tests.caches import NOW, PX4, update
 from tests.commands import Command, in_process
 
 ROOT = Path(__file__).parents[2]
-PATIENCE = 60.0  # seconds after which a test gives up; nothing waits that long when all is well
+PATIENCE = 60.0  # seconds after which a test fails; a passing test never waits that long
 
 INT32, REAL32 = ParamType.INT32, ParamType.REAL32
 AT = "2026-11-18T11:06:40.000Z"
@@ -56,7 +56,7 @@ def command(capsys: pytest.CaptureFixture[str], cache: Path) -> Command:
 def keep(
     cache: Path, content: Content, identity: Identity = FIRST, *, component: int = 1, complete: bool = True
 ) -> None:
-    """Put a table into the cache."""
+    """Store a table in the cache."""
     params = [
         StoredParam(
             Param(
@@ -91,13 +91,13 @@ AFTER: Content = {
 
 @pytest.fixture
 def two(cache: Path) -> None:
-    """Two vehicles in the cache."""
+    """Store two vehicles in the cache."""
     keep(cache, BEFORE)
     keep(cache, AFTER, SECOND)
 
 
 @pytest.mark.usefixtures("two")
-def test_people_see_what_differs(command: Command) -> None:
+def test_diff_prints_a_table_of_differences(command: Command) -> None:
     outcome = command("diff", 1, 2)
     assert outcome.code == 1
     assert outcome.rows == [
@@ -116,12 +116,12 @@ def test_people_see_what_differs(command: Command) -> None:
 
 
 @pytest.mark.usefixtures("two")
-def test_all_names_what_is_the_same_too(command: Command) -> None:
+def test_all_also_prints_equal_parameters(command: Command) -> None:
     assert ["A_SAME", "1", "1", "same"] in command("diff", 1, 2, "--all").rows
 
 
 @pytest.mark.usefixtures("two")
-def test_a_base_tells_who_has_moved(command: Command, cache: Path) -> None:
+def test_a_base_shows_the_side_that_has_changed(command: Command, cache: Path) -> None:
     keep(cache, {"B_FLOAT": (0.1, REAL32), "F_CONFLICT": (0.5, REAL32)}, THIRD)
     outcome = command("diff", 1, 2, "--base", 3)
     assert outcome.rows[0] == ["name", "left", "right", "base", "is", "moved"]
@@ -152,14 +152,14 @@ def test_the_defaults_are_a_base(command: Command) -> None:
     }
 
 
-def test_defaults_that_nobody_knows_are_no_base(command: Command, cache: Path) -> None:
+def test_unknown_defaults_are_no_base(command: Command, cache: Path) -> None:
     keep(cache, {"A": (1, INT32)})
     outcome = command("diff", 1, 1, "--base", "defaults")
     assert (outcome.code, outcome.out) == (2, "")
     assert "defaults are not known" in outcome.err
 
 
-def test_the_same_is_code_0_and_prints_no_table(command: Command, cache: Path) -> None:
+def test_equal_sets_are_exit_code_0_without_a_table(command: Command, cache: Path) -> None:
     keep(cache, {"A": (0.0, REAL32), "B": (1, INT32)})
     keep(cache, {"B": (1, INT32), "A": (-0.0, REAL32)}, SECOND)
     outcome = command("diff", 1, 2)
@@ -169,7 +169,7 @@ def test_the_same_is_code_0_and_prints_no_table(command: Command, cache: Path) -
     assert (told.code, told.err, told.json["same"], told.json["params"]) == (0, "", True, {})
 
 
-def test_another_type_alone_is_told_and_no_difference(command: Command, cache: Path) -> None:
+def test_another_type_alone_is_reported_and_no_difference(command: Command, cache: Path) -> None:
     keep(cache, {"A": (1, INT32)})
     keep(cache, {"A": (1.0, REAL32)}, SECOND)
     outcome = command("diff", 1, 2)
@@ -177,7 +177,7 @@ def test_another_type_alone_is_told_and_no_difference(command: Command, cache: P
     assert outcome.err.splitlines()[-1] == "1 same; 1 of another type"
 
 
-def test_programs_get_exact_values(command: Command, cache: Path) -> None:
+def test_json_has_exact_values(command: Command, cache: Path) -> None:
     keep(cache, {"A": (float("nan"), REAL32), "B": (16777217, INT32), "C": (b"\1\0\0\0", ParamType.UINT64)})
     keep(cache, {"A": (from_bits(0x7FC00001, REAL32), REAL32), "B": (16777216, INT32)}, SECOND)
     outcome = command("diff", 1, 2, "--json")
@@ -216,13 +216,13 @@ def test_programs_get_exact_values(command: Command, cache: Path) -> None:
 
 
 @pytest.mark.usefixtures("two")
-def test_what_only_the_other_has_may_be_left_out_and_what_only_this_one_has_may_not(command: Command) -> None:
+def test_partial_leaves_out_only_parameters_of_the_right_side(command: Command) -> None:
     names = set(command("diff", 1, 2, "--partial", "--json").json["params"])
     assert names == set(command("diff", 1, 2, "--json").json["params"]) - {"D_RIGHT"}
     assert "C_LEFT" in names
 
 
-def test_a_file_of_a_few_values_may_be_the_same_as_a_whole_vehicle(
+def test_partial_compares_a_few_values_with_a_whole_vehicle(
     command: Command, cache: Path, tmp_path: Path
 ) -> None:
     keep(cache, BEFORE)
@@ -235,7 +235,7 @@ def test_a_file_of_a_few_values_may_be_the_same_as_a_whole_vehicle(
 
 
 @pytest.mark.usefixtures("two")
-def test_only_what_is_asked_for_counts(command: Command) -> None:
+def test_only_compares_the_named_parameters(command: Command) -> None:
     assert command("diff", 1, 2, "--only", "A_*", "--only", "E_BOTH").code == 0
     narrowed = command("diff", 1, 2, "--only", "?_FLOAT", "--json")
     assert (narrowed.code, list(narrowed.json["params"])) == (1, ["B_FLOAT"])
@@ -244,7 +244,7 @@ def test_only_what_is_asked_for_counts(command: Command) -> None:
     assert misspelt.err == "paramclient: no parameter of either side is called B_FLAOT\n"
 
 
-# where the parameters come from
+# Sources
 
 
 @pytest.mark.usefixtures("two")
@@ -300,19 +300,19 @@ def test_an_unknown_source_is_an_error(command: Command, words: list[str], code:
 
 
 @pytest.mark.usefixtures("two")
-def test_without_a_cache_there_is_no_vehicle_in_it(capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_cache_excludes_cached_vehicles(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["diff", "1", "2", "--no-cache"]) == 2
     assert "--no-cache excludes" in capsys.readouterr().err
 
 
-def test_a_table_that_is_not_whole_is_not_compared(command: Command, cache: Path) -> None:
+def test_an_incomplete_table_is_not_compared(command: Command, cache: Path) -> None:
     keep(cache, {"A": (1, INT32)}, complete=False)
     outcome = command("diff", 1, 1)
     assert (outcome.code, outcome.out) == (5, "")
     assert "the cache has 1 of 2 parameters of 1/1 (uid:aa00000000000001), not all" in outcome.err
 
 
-def test_of_several_components_the_autopilot_is_meant(command: Command, cache: Path) -> None:
+def test_the_autopilot_is_the_default_component(command: Command, cache: Path) -> None:
     keep(cache, {"CAM": (1, INT32)}, component=100)
     only = command("diff", 1, 1, "--all", "--json").json
     assert (only["left"]["component"], list(only["params"])) == (100, ["CAM"])
@@ -321,15 +321,15 @@ def test_of_several_components_the_autopilot_is_meant(command: Command, cache: P
     assert command("diff", 1, 1, "--component", 100, "--json").json["left"]["component"] == 100
 
 
-def test_an_empty_name_is_no_vehicle(command: Command, cache: Path) -> None:
-    """Not even the only one that there is: a script may have an empty variable there."""
+def test_an_empty_name_is_refused(command: Command, cache: Path) -> None:
+    """An empty name, as of an unset variable in a script, does not mean the only vehicle."""
     keep(cache, BEFORE)
     for words in (["show", ""], ["cache", "history", ""], ["cache", "remove", ""]):
         assert command(*words).code == 2
     assert len(ParamCache(cache).vehicles()) == 1
 
 
-# files
+# Files
 
 ROWS = ("A_SAME\t1\t6", "B_FLOAT\t0.100000001490116119\t9", "C_LEFT\t5\t6")
 
@@ -459,7 +459,7 @@ def test_show_finds_a_cached_vehicle_despite_a_file(command: Command, write: Cal
     assert component["uid"] == "aa00000000000001"
 
 
-# links
+# Links
 
 
 class Gappy(GenericVehicle):
@@ -542,7 +542,7 @@ def test_links_are_opened_after_all_other_checks(command: Command, vehicles: dic
     assert command("diff", "tcp:one:1", "quad.params").code == 2
 
 
-# terminals and pipes
+# Terminals and pipes
 
 PLAIN = {
     name: value

@@ -255,7 +255,7 @@ def test_a_user_at_a_terminal_must_confirm(
         assert "go on?" not in command("apply", put(vehicle), file()).err, "there is nothing to ask about"
 
 
-def test_dry_run_prints_what_would_be_sent_in_its_order(
+def test_dry_run_prints_the_stages_in_order(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path], tmp_path: Path
 ) -> None:
     vehicle = copter()

@@ -1124,7 +1124,7 @@ async def test_a_link_that_fails_during_the_system_id_change_ends_the_run() -> N
 
 
 @swiftly
-async def test_cached_values_are_not_taken_for_values_of_the_vehicle(tmp_path: Path) -> None:
+async def test_cached_values_do_not_count_as_values_of_the_vehicle(tmp_path: Path) -> None:
     wanted = written({"EK2_ALT_M_NSE": 3.0, "TUNE_01": 0.25})
     for vehicle in (ardupilot(), px4(uid=77)):
         with ParamCache(tmp_path / f"{type(vehicle).__name__}.sqlite3") as cache:
