@@ -42,6 +42,7 @@ from paramclient.service import (
     jobs,
     quota,
 )
+from paramclient.service import hub as hub_room
 from paramclient.service.answering import written_out
 from paramclient.service.event_feed import MOST_AT_ONCE
 from paramclient.service.link import LOOKED_AT_ONCE
@@ -684,3 +685,31 @@ def test_a_file_with_too_many_parameters_is_not_read_to_its_end(
     assert made <= 1_001
     with pytest.raises(ServiceError, match="10,000"):
         read_upload(data, "", None)
+
+
+@pytest.mark.asyncio
+async def test_the_end_of_the_service_waits_for_nothing_that_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hub_room, "READING_PATIENCE", 0.1)
+    begun: list[int] = []
+    may_end = threading.Event()
+    problems: list[str] = []
+
+    def work() -> None:
+        begun.append(1)
+        may_end.wait(20)
+
+    async def ask(hub: Hub) -> None:
+        with pytest.raises(ServiceError) as caught:
+            await hub.read_aside(work)
+        problems.append(caught.value.kind)
+
+    async with anyio.create_task_group() as tasks:
+        async with service() as (hub, _):
+            for _ in range(5):
+                tasks.start_soon(ask, hub)
+            await until(lambda: bool(begun))
+            ending = anyio.current_time()
+        assert anyio.current_time() - ending < 2
+    assert problems == ["closing"] * 5
+    assert len(begun) == 1
+    may_end.set()
