@@ -481,6 +481,19 @@ async def test_a_list_of_jobs_has_their_results() -> None:
         assert (await browser.get(f"/api/v1/jobs/{last['id']}")).json() == last
 
 
+@swiftly
+async def test_a_list_of_jobs_has_no_long_results() -> None:
+    async with service(GenericVehicle(table=LARGE)) as (_, browser):
+        await fetched(browser)
+        answer = await browser.post(f"{C}/apply", json={"wanted": {"values": LARGE}, "full": True})
+        assert len(answer.json()["params"]) == len(LARGE) > jobs.LISTED_MAX
+        [_, last] = (await browser.get("/api/v1/jobs")).json()["jobs"]
+        whole = (await browser.get(f"/api/v1/jobs/{last['id']}")).json()
+        assert whole["result"] == answer.json()
+        del whole["result"]["params"]
+        assert last == whole
+
+
 class Turns:
     """Counts what happens in one turn of the event loop."""
 
