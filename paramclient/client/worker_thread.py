@@ -6,8 +6,8 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
-from queue import SimpleQueue
-from typing import TypeVar
+from queue import Empty, SimpleQueue
+from typing import Any, Final, Generic, TypeVar
 
 import anyio
 import anyio.from_thread
@@ -16,6 +16,9 @@ import anyio.lowlevel
 __all__ = ["Worker"]
 
 Result = TypeVar("Result")
+
+ENDING_INTERVAL: Final = 0.01
+"""Seconds between two looks whether a thread has ended."""
 
 
 class Worker:
@@ -30,38 +33,51 @@ class Worker:
 
     def __init__(self, name: str) -> None:
         self._name = name
-        self._calls: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self._calls: SimpleQueue[_Call[Any] | None] = SimpleQueue()
         self._thread: threading.Thread | None = None
-        self._under_way = 0
+        self._waiting: dict[_Call[Any], None] = {}
         self._is_closed = False
+        self._ended_with: Callable[[], Exception] | None = None
 
     async def run(self, work: Callable[[], Result]) -> Result:
-        """Do it in the thread. Cancelled, it is done all the same."""
+        """Do it in the thread. Cancelled, it is done all the same.
+
+        Raises:
+            Exception: that of `abandon`, where it had not ended by then.
+        """
+        if self._ended_with is not None:
+            raise self._ended_with()
         if self._thread is None:
             self._thread = threading.Thread(target=self._main, name=self._name, daemon=True)
             self._thread.start()
-        future: Future[Result] = Future()
-        ended = anyio.Event()
-        token = anyio.lowlevel.current_token()
-
-        def call() -> None:
-            try:
-                future.set_result(work())
-            except BaseException as error:
-                future.set_exception(error)
-            with suppress(anyio.RunFinishedError):
-                anyio.from_thread.run_sync(done, token=token)
-
-        def done() -> None:
-            self._under_way -= 1
-            ended.set()
-
-        self._under_way += 1
+        call = _Call(work, self._waiting)
         self._calls.put(call)
         if self._is_closed:
             self._end()
-        await ended.wait()
-        return future.result()
+        await call.ended.wait()
+        return call.future.result()
+
+    def drop(self, error: Callable[[], Exception]) -> None:
+        """Do nothing that has not begun. Who waits for it, or asks for more, gets this error."""
+        self._ended_with = error
+        with suppress(Empty):
+            while True:
+                call = self._calls.get_nowait()
+                if call is not None:
+                    call.give_up(error())
+
+    async def abandon(self, error: Callable[[], Exception], within: float) -> None:
+        """End the thread: as `drop`, and what has begun is waited for no longer than these seconds."""
+        self.drop(error)
+        thread = self._thread
+        if thread is None:
+            return
+        self._end()
+        with anyio.move_on_after(within, shield=True):
+            while thread.is_alive():  # noqa: ASYNC110 - a thread tells nobody
+                await anyio.sleep(ENDING_INTERVAL)
+        for call in list(self._waiting):
+            call.give_up(error())
 
     async def close(self, work: Callable[[], None]) -> None:
         """Do a last piece of work, and end the thread."""
@@ -73,7 +89,7 @@ class Worker:
             await self.run(work)
         finally:
             with anyio.CancelScope(shield=True):
-                while self._under_way:  # others may have asked for more, and the thread tells them here
+                while self._waiting:  # others may have asked for more, and the thread tells them here
                     await self.run(_nothing)
             self._is_closed = True
             self._end()
@@ -86,7 +102,41 @@ class Worker:
 
     def _main(self) -> None:
         while (call := self._calls.get()) is not None:
-            call()
+            call.work_it_out()
+
+
+class _Call(Generic[Result]):
+    """One call: done in the thread, and told in the event loop."""
+
+    def __init__(self, work: Callable[[], Result], waiting: dict[_Call[Any], None]) -> None:
+        self.future: Future[Result] = Future()
+        self.ended = anyio.Event()
+        self._work = work
+        self._waiting = waiting
+        self._token = anyio.lowlevel.current_token()
+        waiting[self] = None
+
+    def work_it_out(self) -> None:
+        """Do it, in the thread."""
+        done: Future[Result] = Future()
+        try:
+            done.set_result(self._work())
+        except BaseException as error:
+            done.set_exception(error)
+        with suppress(anyio.RunFinishedError):
+            anyio.from_thread.run_sync(self._tell, done, token=self._token)
+
+    def give_up(self, error: Exception) -> None:
+        """Wait for it no longer."""
+        done: Future[Result] = Future()
+        done.set_exception(error)
+        self._tell(done)
+
+    def _tell(self, done: Future[Result]) -> None:
+        if not self.ended.is_set():
+            self.future = done
+            del self._waiting[self]
+            self.ended.set()
 
 
 def _nothing() -> None:

@@ -20,6 +20,13 @@ import anyio
 
 from paramclient.errors import UsageError
 from paramclient.protocol.params.change_origin import LONGEST_ASKER
+from paramclient.service.answer_places import (
+    POSTED_MAX,
+    POSTED_OF_ONE,
+    READ_MAX,
+    READ_OF_ONE,
+    AnswerPlaces,
+)
 from paramclient.service.client_address import is_in, is_loopback, network
 from paramclient.service.held_bodies import HeldBodies, HeldBody
 from paramclient.service.log_limit import LogLimit
@@ -47,6 +54,8 @@ LONGEST_SESSION: Final = 1_024
 """Bytes of the body that begins a session: all that those without a token may send."""
 BODY_PATIENCE: Final = 60.0
 """Seconds for a body to come."""
+SENT_AT_ONCE: Final = 65_536
+"""Bytes of an answer that are handed to the connection at once: it keeps what the client has not taken."""
 LONGEST_CLIENT: Final = 64
 """Characters in which a client says what it is, in X-Asker."""
 
@@ -130,6 +139,8 @@ class AccessMiddleware:
         self._proxies = tuple(map(network, settings.proxies))
         self._limit = LogLimit(clock)
         self._bodies = HeldBodies()
+        self._answers_to_get = AnswerPlaces(READ_MAX, READ_OF_ONE)
+        self._answers_to_post = AnswerPlaces(POSTED_MAX, POSTED_OF_ONE)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket"):
@@ -168,7 +179,12 @@ class AccessMiddleware:
                 request.check_content()
                 most = min(request.longest_body, self._settings.max_body)
                 receive = _after(await self._body(request, receive, most, held), receive)
-            await self._app(scope, receive, answer.send)
+            if not request.has_large_answer:
+                await self._app(scope, receive, answer.send)
+                return
+            places = self._answers_to_post if request.method == "POST" else self._answers_to_get
+            async with places.take(state["quota"]):  # until all of it is sent
+                await self._app(scope, receive, answer.send)
 
     # Where it comes from
 
@@ -342,9 +358,15 @@ class _Answer:
     varies: bool = False
 
     async def send(self, message: Message) -> None:
-        """Send a message of the application."""
+        """Send a message of the application. A large body goes in parts, as far as the client takes them."""
         if message["type"] in ("http.response.start", "websocket.http.response.start"):
             message = {**message, "headers": self._headers(message.get("headers", ()))}
+        elif message["type"] == "http.response.body" and not message.get("more_body", False):
+            whole = memoryview(message.get("body", b""))
+            while len(whole) > SENT_AT_ONCE:
+                part, whole = bytes(whole[:SENT_AT_ONCE]), whole[SENT_AT_ONCE:]
+                await self.original({**message, "body": part, "more_body": True})
+            message = {**message, "body": bytes(whole)}
         await self.original(message)
 
     async def respond(self, status: int, body: bytes, headers: Iterable[tuple[bytes, bytes]]) -> None:

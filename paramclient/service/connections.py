@@ -21,6 +21,8 @@ STALL_PATIENCE: Final = 60.0
 has missed."""
 BYTES_AT_ONCE: Final = 4_096
 """Bytes of one connection that are parsed in one turn of the event loop. As chunks of 1 byte: 5 ms."""
+UNSENT_MAX: Final = 65_536
+"""Bytes that wait for a client before an answer waits too; with TLS asyncio would keep 512 kB."""
 FRAGMENTS_MAX: Final = 64
 """Frames of one WebSocket message. Empty ones count for nothing in its size."""
 
@@ -99,6 +101,7 @@ class Connection(H11Protocol, _InSlices):
         limit_tls = getattr(transport, "set_read_buffer_limits", None)
         if limit_tls is not None:  # else each read of the socket would add a turn that decrypts
             limit_tls(high=BYTES_AT_ONCE, low=0)
+        transport.set_write_buffer_limits(high=UNSENT_MAX)
         self._stall = _StallWatch(transport, self.loop)
         self._place.leave = transport.abort
         self._await_head()

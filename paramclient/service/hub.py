@@ -44,6 +44,8 @@ __all__ = ["Hub"]
 
 OURSELVES: Final = "service"
 """Who has asked for what the service does by itself."""
+READING_PATIENCE: Final = 1.0
+"""Seconds for what is being parsed or compared when the service ends; what has not begun is dropped."""
 
 Result = TypeVar("Result")
 
@@ -140,6 +142,7 @@ class Hub:
         assert lines is not None
         self.feed.end()
         self._closing.set()
+        self._reader.drop(_closing)
         try:
             lines.cancel_scope.cancel()
             await lines.__aexit__(None, None, None)
@@ -150,7 +153,7 @@ class Hub:
             close = self.cache.close if self._owns_cache and self.cache is not None else _nothing
             with anyio.CancelScope(shield=True):
                 await self._worker.close(close)
-                await self._reader.close(_nothing)
+                await self._reader.abandon(_closing, READING_PATIENCE)
 
     async def aside(self, work: Callable[[], Result]) -> Result:
         """Do what blocks, such as a look into the cache, in a thread. Cancelled, it is done all the same.
@@ -318,7 +321,7 @@ class Hub:
 
     def _check_open(self) -> None:
         if self._closing.is_set():
-            raise ServiceError(503, "closing", "The service is ending.")
+            raise _closing()
 
     def _add(self, link: str | Link | Endpoint | tuple[str, Callable[[], ParamClient]]) -> None:
         if isinstance(link, tuple):
@@ -408,6 +411,10 @@ async def _fetch(options: dict[str, Any], job: Job) -> FetchResultDoc:
 
 def _is_log(link: object) -> bool:
     return isinstance(link, str) and link.lower().startswith("replay:")
+
+
+def _closing() -> ServiceError:
+    return ServiceError(503, "closing", "The service is ending.")
 
 
 def _nothing() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import secrets
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -33,6 +33,9 @@ MOST_OF_ONE: Final = 64
 """Those of one holder of a token or, without tokens, of one address; the service's own are not counted."""
 MOST_ENDED: Final = 64
 """Jobs that are kept when they have ended, for those who ask late."""
+
+LISTED_MAX: Final = 64
+"""Entries of a member of a result that stands in the list of jobs; `GET /jobs/{id}` has the longer ones."""
 
 logger = logging.getLogger(__name__)
 
@@ -86,12 +89,17 @@ class Job:
             problem=None if self.error is None else problem_of(self.error),
         )
 
-    def later_document(self) -> Callable[[], JobDoc]:
-        """What makes the same document, as it stands now, in any thread: a result may have many rows."""
+    def later_document(self, *, in_list: bool = False) -> Callable[[], JobDoc]:
+        """What makes the same document, as it stands now, in any thread: a result may have many rows.
+
+        Args:
+            in_list: leaves out the members of the result that have more than `LISTED_MAX` entries.
+        """
         document, result = self.document(with_result=False), self.result
         if result is None:
             return lambda: document
-        return lambda: document.model_copy(update={"result": result.as_json()})
+        long = {name for name, each in result if in_list and _is_long(each)}
+        return lambda: document.model_copy(update={"result": result.model_dump(mode="json", exclude=long)})
 
     def cancel(self) -> None:
         """End it; what it shares with others goes on for them."""
@@ -141,9 +149,9 @@ class Jobs:
 
     @property
     def later_documents(self) -> list[Callable[[], JobDoc]]:
-        """What makes the documents of all of them, the oldest first; see `Job.later_document`."""
+        """What makes the documents of all of them for a list, the oldest first; see `Job.later_document`."""
         cut_off = [partial(JobDoc.of_cut_off, note) for note in self.cut_off]
-        return [*cut_off, *(job.later_document() for job in self._jobs.values())]
+        return [*cut_off, *(job.later_document(in_list=True) for job in self._jobs.values())]
 
     def later_document(self, name: str) -> Callable[[], JobDoc]:
         """What makes the document of the one of this name.
@@ -221,3 +229,9 @@ class Jobs:
             job.followed.look()
             self.tell(job)
             job._over.set()
+
+
+def _is_long(content: object) -> bool:
+    return (
+        not isinstance(content, str) and isinstance(content, Sequence | Mapping) and len(content) > LISTED_MAX
+    )

@@ -61,6 +61,18 @@ LONG_BODIES: Final = {
     ("PUT", "metadata"): LARGEST_DESCRIPTION,
 }
 """Bytes of the bodies with values and files, by method and the last part of the path."""
+_LARGE_READS: Final = frozenset(
+    {
+        *("components", "file", "history", "jobs", "metadata", "metrics", "openapi.json", "params"),
+        *("snapshots", "state", "vehicles"),
+    }
+)
+LARGE_ANSWERS: Final = {
+    "GET": _LARGE_READS,
+    "HEAD": _LARGE_READS,
+    "POST": frozenset({"diff", "files", "metadata", "plan", "verify"}),
+}
+"""What may be answered with megabytes, by method and the last part of the path or the one before a name."""
 ASK: Final = [(b"www-authenticate", b'Bearer realm="paramclient"')]
 """What goes with 401."""
 
@@ -222,6 +234,13 @@ class Request:
         if self.method == "DELETE" and self.path.startswith("/api/v1/jobs/"):
             return False  # whoever may begin a download may end it; of other jobs the route asks
         return self.method != "POST" or self.path.rpartition("/")[2] not in READ_BY_POST
+
+    @property
+    def has_large_answer(self) -> bool:
+        """Whether its answer may have megabytes."""
+        *_, before, last = ("", "", *self.path.split("/"))
+        names = LARGE_ANSWERS.get(self.method, frozenset())
+        return self.scope["type"] == "http" and (last in names or before in {"jobs", "snapshots"} & names)
 
     @property
     def token(self) -> bytes | None:

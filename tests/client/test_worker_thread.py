@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 
 import anyio
 
@@ -61,3 +62,43 @@ def with_patience(main: object) -> None:
     ended.start()
     ended.join(20)
     assert not ended.is_alive()
+
+
+def test_abandoned_it_does_nothing_more_and_does_not_wait() -> None:
+    begun: list[str] = []
+    errors: list[str] = []
+    blocked, may_end = threading.Event(), threading.Event()
+
+    def block() -> None:
+        begun.append("first")
+        blocked.set()
+        may_end.wait(20)
+
+    async def ask(worker: Worker, work: Callable[[], None]) -> None:
+        try:
+            await worker.run(work)
+        except EOFError as error:
+            errors.append(str(error))
+
+    async def main() -> None:
+        worker = Worker(NAME)
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(ask, worker, block)
+            for _ in range(3):
+                tasks.start_soon(ask, worker, lambda: begun.append("more"))
+            while not blocked.is_set():  # noqa: ASYNC110 - nobody tells
+                await anyio.sleep(0.001)
+            worker.drop(lambda: EOFError("over"))
+            await anyio.lowlevel.checkpoint()
+            assert errors == ["over"] * 3
+            began = anyio.current_time()
+            await worker.abandon(lambda: EOFError("over"), 0.1)
+            assert anyio.current_time() - began < 5
+            tasks.start_soon(ask, worker, lambda: begun.append("late"))
+        assert errors == ["over"] * 5
+        may_end.set()
+        while threads():  # noqa: ASYNC110 - nobody tells
+            await anyio.sleep(0.001)
+
+    with_patience(main)
+    assert begun == ["first"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import contextlib
 import json
 import math
 import threading
@@ -42,6 +43,9 @@ from paramclient.service import (
     jobs,
     quota,
 )
+from paramclient.service import hub as hub_room
+from paramclient.service.access import AccessMiddleware
+from paramclient.service.answer_places import READ_OF_ONE, AnswerPlaces
 from paramclient.service.answering import written_out
 from paramclient.service.event_feed import MOST_AT_ONCE
 from paramclient.service.link import LOOKED_AT_ONCE
@@ -477,6 +481,19 @@ async def test_a_list_of_jobs_has_their_results() -> None:
         assert (await browser.get(f"/api/v1/jobs/{last['id']}")).json() == last
 
 
+@swiftly
+async def test_a_list_of_jobs_has_no_long_results() -> None:
+    async with service(GenericVehicle(table=LARGE)) as (_, browser):
+        await fetched(browser)
+        answer = await browser.post(f"{C}/apply", json={"wanted": {"values": LARGE}, "full": True})
+        assert len(answer.json()["params"]) == len(LARGE) > jobs.LISTED_MAX
+        [_, last] = (await browser.get("/api/v1/jobs")).json()["jobs"]
+        whole = (await browser.get(f"/api/v1/jobs/{last['id']}")).json()
+        assert whole["result"] == answer.json()
+        del whole["result"]["params"]
+        assert last == whole
+
+
 class Turns:
     """Counts what happens in one turn of the event loop."""
 
@@ -684,3 +701,102 @@ def test_a_file_with_too_many_parameters_is_not_read_to_its_end(
     assert made <= 1_001
     with pytest.raises(ServiceError, match="10,000"):
         read_upload(data, "", None)
+
+
+@pytest.mark.asyncio
+async def test_the_end_of_the_service_waits_for_nothing_that_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hub_room, "READING_PATIENCE", 0.1)
+    begun: list[int] = []
+    may_end = threading.Event()
+    problems: list[str] = []
+
+    def work() -> None:
+        begun.append(1)
+        may_end.wait(20)
+
+    async def ask(hub: Hub) -> None:
+        with pytest.raises(ServiceError) as caught:
+            await hub.read_aside(work)
+        problems.append(caught.value.kind)
+
+    async with anyio.create_task_group() as tasks:
+        async with service() as (hub, _):
+            for _ in range(5):
+                tasks.start_soon(ask, hub)
+            await until(lambda: bool(begun))
+            ending = anyio.current_time()
+        assert anyio.current_time() - ending < 2
+    assert problems == ["closing"] * 5
+    assert len(begun) == 1
+    may_end.set()
+
+
+@swiftly
+async def test_large_answers_wait_for_each_other_until_they_are_sent() -> None:
+    async with service(GenericVehicle(table=LARGE)) as (_, browser):
+        await fetched(browser)
+        async with contextlib.AsyncExitStack() as stack:
+            for _ in range(READ_OF_ONE):
+                request = browser.stream("GET", f"{C}/params")
+                assert (await stack.enter_async_context(request)).status_code == 200  # and takes nothing
+            answers: list[httpx.Response] = []
+
+            async def ask(path: str) -> None:
+                answers.append(await browser.get(path))
+
+            async with anyio.create_task_group() as tasks:
+                for path in (f"{C}/params", f"{C}/file?from=known", "/metrics", f"{C}/snapshots/1"):
+                    tasks.start_soon(ask, path)
+                await anyio.sleep(1)
+                assert not answers
+                assert (await browser.get(f"{C}/params/ABC_0_P0000")).status_code == 200
+                assert (
+                    await browser.post(f"{C}/diff", json={"wanted": {"values": VALUES}})
+                ).status_code == 200
+                await stack.aclose()
+            assert sorted(each.status_code for each in answers) == [200, 200, 200, 409]
+
+
+@swiftly
+async def test_places_for_answers_are_of_a_holder_and_of_all() -> None:
+    places = AnswerPlaces(3, 2)
+    held: list[str] = []
+    may_leave = anyio.Event()
+
+    async def answer(holder: str) -> None:
+        async with places.take(holder):
+            held.append(holder)
+            await may_leave.wait()
+
+    async with anyio.create_task_group() as tasks:
+        for holder in ("a", "a", "a", "b", "b"):
+            tasks.start_soon(answer, holder)
+        await anyio.sleep(1)
+        assert held == ["a", "a", "b"]
+        may_leave.set()
+    assert sorted(held) == ["a", "a", "a", "b", "b"]
+    assert not places._of_holders
+
+
+@pytest.mark.asyncio
+async def test_an_answer_is_sent_as_it_is_taken() -> None:
+    sent: list[tuple[int, bool]] = []
+    body = bytes(range(256)) * 1_000
+
+    async def app(scope: Any, receive: Any, send: Any) -> None:
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+        await send({"type": "http.response.body", "body": body})
+
+    async def send(message: Any) -> None:
+        if message["type"] == "http.response.body":
+            sent.append((len(message["body"]), message.get("more_body", False)))
+            parts.append(message["body"])
+
+    async def receive() -> Any:
+        raise AssertionError("it has no body")
+
+    parts: list[bytes] = []
+    scope = {"type": "http", "method": "GET", "path": "/health", "headers": [(b"host", b"127.0.0.1")]}
+    await AccessMiddleware(app, AccessSettings())(scope, receive, send)
+    assert sent == [(65_536, True)] * 3 + [(256_000 - 3 * 65_536, False)]
+    assert b"".join(parts) == body

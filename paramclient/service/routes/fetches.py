@@ -90,7 +90,7 @@ async def fetch_everybody(
 
 @router.get("/jobs", response_model=JobsDoc)
 async def jobs(hub: TheHub) -> Response:
-    """What is under way, and what was lately."""
+    """What is under way, and what was lately. Members of a result with more than 64 entries are left out."""
     documents = hub.jobs.later_documents
 
     def write() -> bytes:
