@@ -66,7 +66,7 @@ def run(data: bytes) -> None:
 
 
 def _check_reader(content: bytes, block: int) -> list[Record]:
-    with mock.patch.object(tlog, "BLOCK", block):
+    with mock.patch.object(tlog, "BLOCK_SIZE", block):
         records = list(read_records(io.BytesIO(content)))
     assert records == _records_of(content)
     return records

@@ -35,6 +35,7 @@ from paramclient.protocol.params import change_origin as authors_room
 from paramclient.protocol.params import list_download as download_room
 from paramclient.protocol.params import sync as sync_room
 from paramclient.protocol.params import table as table_room
+from paramclient.protocol.params import value_check
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.change_origin import Authors
 from paramclient.protocol.params.sync import Upkeep
@@ -241,7 +242,7 @@ def test_names_that_go_are_told_to_the_cache_up_to_a_bound(monkeypatch: pytest.M
 
 
 def test_a_value_that_flips_is_asked_for_only_so_often(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(component_room, "MOST_DOUBTED", 2)
+    monkeypatch.setattr(value_check, "READS_MAX", 2)
     session = Simulation()
     beat(session)
     for value in (1.0, 2.0):

@@ -133,7 +133,7 @@ def test_the_command_prints_json(
 
 def test_no_ports_at_all(plugged: list[serialx.SerialPortInfo], capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["ports"]) == 0
-    assert tuple(capsys.readouterr()) == ("", "there are no serial ports\n")
+    assert tuple(capsys.readouterr()) == ("", "this computer has no serial ports\n")
     assert run(["ports", "--json"]) == 0
     assert capsys.readouterr().out == '{"ports": []}\n'
 

@@ -570,7 +570,7 @@ async def test_fetches_of_many_are_begun_few_at_a_time() -> None:
             vehicle=(system, None),
             address=(system, 1),
         )
-        return SimpleNamespace(_machine=machine, _cache_is_due=lambda now: True)
+        return SimpleNamespace(machine=machine, is_cache_due=lambda now: True)
 
     components = {(system, 1): component(system) for system in range(1, 251)}
     station: Any = Station()
