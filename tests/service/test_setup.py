@@ -26,6 +26,7 @@ from paramclient.protocol import wire
 from paramclient.service import AccessSettings, Hub, Settings, Tokens, create_app
 from paramclient.service.param_sources import LARGEST_UPLOAD
 from paramclient.service.quota import LONG_REQUESTS_OF_ONE
+from paramclient.service.reading import LONGEST_LINE
 from paramclient.service.routes.files import attachment
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
 from paramclient.sim.vehicle import Vehicle
@@ -514,7 +515,8 @@ async def test_a_file_is_read_and_its_faults_are_told_by_line() -> None:
         assert "bad.param:3" in bad["detail"]
         assert (await upload(b"", 422))["error"] == "FileError"
         assert (await upload(b"{" * 50_000, 422, form="json"))["error"] == "FileError"
-        assert (await upload(b"- " * 50_000, 422, form="yaml"))["error"] == "FileError"
+        assert (await upload(b"- " * 8_000, 422, form="yaml"))["error"] == "FileError"
+        assert (await upload(b"- " * 50_000, 413, form="yaml"))["most"] == LONGEST_LINE
         assert (await upload(b"A,1\n" * (LARGEST_UPLOAD // 4 + 1), 413))[
             "type"
         ] == "urn:paramclient:too-large"
