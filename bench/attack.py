@@ -5,7 +5,8 @@
 Each group of attacks has its own service (`paramclient serve`, with and without TLS, on loopback), and each
 attack prints what it measures and the limit. 127.0.0.1 counts as this computer; other addresses of the
 loopback network act as remote clients, because the process is started with a changed test for loopback
-addresses. The only other change is that the event loop records the processor time of its longest callback.
+addresses. The only other change is that the event loop records the processor time of its longest callback,
+and the latency of a timer of 5 ms.
 
 `--quick` runs the attacks that take about a second each. The exit code is 1 if a limit was exceeded. Linux
 only: memory is read from /proc.
@@ -48,6 +49,10 @@ HERE, ELSEWHERE, FAR = "127.0.0.1", "127.0.0.2", "127.0.0.3"
 """Addresses of this computer, of a remote attacker, and of another remote client."""
 WRITER, READER = "writer-0123456789abcdef", "reader-0123456789abcdef"
 C: Final = "/api/v1/components/1/1"
+UPGRADE: Final = (
+    "Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
+    "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="
+)
 MEGABYTE: Final = 1_000_000
 PATIENCE: Final = 60.0
 """Seconds to wait for the start of a process, and for a response."""
@@ -56,6 +61,9 @@ REACHED: Final = 1.0
 """Limit in seconds for a response to `/health`."""
 BLOCKED: Final = 50.0
 """Limit in milliseconds for the processor time of the longest callback of the event loop."""
+LATE: Final = 50.0
+"""Limit in milliseconds for the event-loop latency by wall clock, which includes the time in which another
+thread holds the interpreter. Other processes of the machine, such as the attacker, add to it."""
 MEMORY: Final = 64.0
 """Limit in megabytes for the growth of the service's memory."""
 MEMORY_OF_COMPONENTS: Final = 80.0
@@ -66,22 +74,31 @@ ENDED: Final = 3.0
 """Limit in seconds from SIGTERM to the end of the process."""
 
 LAUNCH: Final = """
-import asyncio.events, json, os, signal, sys, time
+import asyncio.base_events, asyncio.events, json, os, signal, sys, time
 from paramclient.service import places
 places.is_loopback = lambda address: address == "127.0.0.1"
-longest, run = 0.0, asyncio.events.Handle._run
+longest, late, run = 0.0, 0.0, asyncio.events.Handle._run
 def timed(handle):
     global longest
     began = time.thread_time()
     run(handle)
     longest = max(longest, time.thread_time() - began)
 asyncio.events.Handle._run = timed
+run_forever = asyncio.base_events.BaseEventLoop.run_forever
+def beating(loop):
+    def beat(due):
+        global late
+        late = max(late, time.monotonic() - due)
+        loop.call_later(0.005, beat, time.monotonic() + 0.005)
+    loop.call_later(0.005, beat, time.monotonic() + 0.005)
+    return run_forever(loop)
+asyncio.base_events.BaseEventLoop.run_forever = beating
 def tell(*_):
-    global longest
+    global longest, late
     with open(told + ".new", "w") as file:
-        json.dump(longest, file)
+        json.dump([longest, late], file)
     os.replace(told + ".new", told)
-    longest = 0.0
+    longest = late = 0.0
 signal.signal(signal.SIGUSR1, tell)
 told = sys.argv.pop(1)
 from paramclient.__main__ import main
@@ -138,26 +155,38 @@ class Service:
         Path(f"/proc/{self.process.pid}/clear_refs").write_text("5")
         self.blocked()
 
-    def blocked(self) -> float:
-        """Return the milliseconds of the longest callback of the event loop since the last call."""
+    def blocked(self) -> tuple[float, float]:
+        """Return the milliseconds of the longest callback of the event loop since the last call, and the
+        event-loop latency.
+        """
         told = self.folder / "loop"
         told.unlink(missing_ok=True)
         self.process.send_signal(signal.SIGUSR1)
         deadline = time.monotonic() + PATIENCE
         while not told.exists() and time.monotonic() < deadline:
             time.sleep(0.01)
-        return float(json.loads(told.read_text())) * 1_000
+        longest, late = json.loads(told.read_text())
+        return float(longest) * 1_000, float(late) * 1_000
 
     @contextmanager
-    def watched(self, *, memory: float | None = MEMORY, blocked: float | None = BLOCKED) -> Iterator[None]:
+    def watched(
+        self,
+        *,
+        memory: float | None = MEMORY,
+        blocked: float | None = BLOCKED,
+        late: float | None = None,
+    ) -> Iterator[None]:
         """Measure memory and event loop during the block, and add the lines to the table."""
         self.forget()
         before, log = self.memory("VmRSS"), len(self.log)
         yield
         if memory is not None:
             self.note("memory grows", memory, self.memory() - before, "MB")
+        held, came_late = self.blocked()
         if blocked is not None:
-            self.note("event loop held", blocked, self.blocked(), "ms")
+            self.note("event loop held", blocked, held, "ms")
+        if late is not None:
+            self.note("event loop late", late, came_late, "ms")
         self.note("log grows", LOG, (len(self.log) - log) / 1_000, "kB")
 
     async def ask(
@@ -403,8 +432,114 @@ async def large_table(rows: list[Row], quick: bool) -> None:
                 with service.watched():
                     status, answer = await service.ask(method, path, body, token(READER))
                     assert status == 200, answer
+            await many_answers(service, len(table))
     finally:
         far_end.cancel()
+
+
+async def many_answers(service: Service, size: int) -> None:
+    """Clause 7: large answers at once, taken and not taken, and all events again."""
+    for count, path in ((16, f"{C}/params"), (120, f"{C}/file?from=known")):
+        service.attack = f"{size:,} parameters: {count} GET {path.removeprefix(C)} at once"
+        with service.watched():
+            asked = [service.ask("GET", path, b"", token(READER), source=ELSEWHERE) for _ in range(count)]
+            statuses = [status for status, _ in await asyncio.gather(*asked)]
+            service.note("not answered", 0, sum(status != 200 for status in statuses), "times")
+    run = json.loads((await service.ask("GET", "/api/v1/components", b"", token(READER)))[1])["run"]
+    lines = [f"Host: 127.0.0.1:{service.port}", token(READER), "", ""]
+    for count, path in ((1, "/api/v1/events"), (1, f"/api/v1/events?after={run}-0"), (128, f"{C}/params")):
+        service.attack = f"{size:,} parameters: {count} GET {path.removeprefix(C)[:20]}, and nobody reads"
+        data = "\r\n".join([f"GET {path} HTTP/1.1", *lines]).encode()
+        with service.watched(), connections(service, 0, ELSEWHERE) as held:
+            for _ in range(count):
+                one = socket.socket()
+                held.append(one)
+                one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4_096 if count > 1 else 4_000_000)
+                one.bind((ELSEWHERE, 0))
+                one.connect((HERE, service.port))
+                one.sendall(data)
+            await asyncio.sleep(1.5 if count == 1 else 4)
+
+
+async def slices(service: Service, quick: bool) -> None:
+    """Clause 7: many small things in what one connection sends, and answers that nobody takes."""
+    for method, path in (("POST", "/api/v1/find"), ("POST", f"{C}/fetch"), ("GET", "/api/v1/ws")):
+        await service.ask(method, path, b'{"timeout_s": 60}' if method == "POST" else b"", token(READER))
+    chunked = ["Content-Type: application/json", "Transfer-Encoding: chunked"]
+    pongs = 1 if quick else 300
+    sent = [
+        ("2 MB of empty pings", f"GET /api/v1/ws?{UPGRADE}", b"\x89\x80\0\0\0\0" * 350_000, 2),
+        ("chunks of 1 byte, a reader", f"POST {C}/diff", b"1\r\n \r\n" * 500_000, 3),
+        ("chunks of 1 byte, no token", "POST /api/v1/session", b"1\r\n \r\n" * 500_000, 3),
+        (f"{pongs} MB of pings, no pong is read", f"GET /api/v1/ws?{UPGRADE}",
+         (b"\x89\xfd\0\0\0\0" + b"p" * 125) * (pongs * MEGABYTE // 131), 25),
+    ]  # fmt: skip
+    for attack, asked, data, seconds in sent:
+        service.attack = attack
+        request, _, more = asked.partition("?")
+        lines = [f"{request} HTTP/1.1", f"Host: 127.0.0.1:{service.port}"]
+        lines += [more] if more else chunked
+        lines += [] if "session" in request else [token(READER)]
+        with socket.socket() as one:
+            one.connect((HERE, service.port))
+            one.sendall("\r\n".join([*lines, "", ""]).encode())
+            await asyncio.sleep(0.3)
+            with service.watched(late=LATE):
+                await asyncio.to_thread(
+                    push, one, data[: MEGABYTE if quick else None], 1 if quick else seconds
+                )
+                await asyncio.sleep(0.1 if quick else 0.5)
+                await service.reached("/health meanwhile", times=1)
+
+
+def push(one: socket.socket, data: bytes, seconds: float) -> None:
+    """Send as much as is taken in this time."""
+    deadline = time.monotonic() + seconds
+    rest = memoryview(data)
+    one.setblocking(False)
+    while rest and time.monotonic() < deadline:
+        try:
+            rest = rest[one.send(rest[:MEGABYTE]) :]
+        except BlockingIOError:
+            time.sleep(0.005)
+        except OSError:
+            return
+
+
+async def parsing(service: Service, quick: bool) -> None:
+    """Clause 7: calls that hold the interpreter, in whichever thread they run; and the end meanwhile."""
+    for path in ("/api/v1/find", f"{C}/fetch", f"{C}/diff"):
+        await service.ask("POST", path, b'{"timeout_s": 60}', token(READER))
+    numbers = b'{"x":[' + b",".join([b"9" * 4_300] * 730) + b"]}"
+    values = b",".join(b'"A%05d":%s' % (number, b"9" * 1_000) for number in range(3_000))
+    strings = b",".join(b'"a%05d":"%s"' % (number, b"y" * 20) for number in range(58_000))
+    flow = b",".join(b"a%d: 'x%s'" % (number, b"y" * 20) for number in range(58_000))
+    posts = [
+        ("730 numbers of 4,300 digits", f"{C}/diff", numbers),
+        ("3,000 numbers of 1,000 digits", f"{C}/diff", b'{"wanted":{"values":{' + values + b"}}}"),
+        ("a line of 1.9 million digits", "/api/v1/files?name=a.parm", b"P1 " + b"1" * 1_900_000),
+        ("480,000 escapes in YAML", "/api/v1/files?name=a.yaml", b'a: "' + b"\\x41" * 480_000 + b'"\n'),
+        ("YAML on one line", "/api/v1/files?name=a.yaml", b"a: {" + flow + b"}\n"),
+        ("58,000 strings in JSON", "/api/v1/files?name=a.json", b"{" + strings + b"}"),
+    ]
+    for attack, path, body in posts:
+        service.attack = attack
+        kind = "application/octet-stream" if "/files" in path else "application/json"
+        with service.watched(late=LATE):
+            status, _ = await service.ask("POST", path, body, token(READER), kind=kind)
+            service.note("answered with 5xx or not", 0, status >= 500 or not status, "times")
+    service.attack = "SIGTERM with 7 uploads of 58,000 lines"
+    rows = b"".join(b"1\t1\tP%05d\t1.5\t9\n" % number for number in range(58_000))
+    upload = "/api/v1/files?name=c.params"
+    uploads = [
+        asyncio.create_task(service.ask("POST", upload, rows, token(READER), kind="application/octet-stream"))
+        for _ in range(7)
+    ]
+    await asyncio.sleep(0.6)
+    service.note("it ends", ENDED, await asyncio.to_thread(service.end), "s")
+    service.note("exit code", 0, abs(service.process.returncode or 0), "")
+    service.note("tracebacks", 0, service.log.count("Traceback"), "")
+    await asyncio.gather(*uploads)
 
 
 async def guesses(service: Service, quick: bool) -> None:
@@ -622,6 +757,8 @@ async def attack(quick: bool, only: str) -> list[Row]:
         "handshakes without TLS": lambda: on_service(handshakes, *bare),
         "requests": lambda: on_service(requests, *sim),
         "large table": lambda: large_table(rows, quick),
+        "slices": lambda: on_service(slices, *sim),
+        "parsing": lambda: on_service(parsing, *sim),
         "guesses": lambda: on_service(guesses, *bare, "--trusted-proxy", ELSEWHERE),
         "origins": lambda: on_service(
             origins, *bare, "--allow-origin", "https://station.example", tokens=False

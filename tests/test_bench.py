@@ -32,7 +32,9 @@ def bench(name: str, *arguments: str, code: int = 0) -> str:
     return run.stdout
 
 
-@pytest.mark.parametrize("group", ["handshakes over", "requests", "guesses", "origins", "stuck", "hostile"])
+@pytest.mark.parametrize(
+    "group", ["handshakes over", "requests", "slices", "parsing", "guesses", "origins", "stuck", "hostile"]
+)
 def test_attacks_are_held(group: str) -> None:
     """The quick ones, with time for a machine that does other things besides."""
     text = bench("attack", "--quick", "--slack", "10", "--only", group)
