@@ -484,7 +484,7 @@ async def slices(service: Service, quick: bool) -> None:
             one.connect((HERE, service.port))
             one.sendall("\r\n".join([*lines, "", ""]).encode())
             await asyncio.sleep(0.3)
-            with service.watched(late=LATE):
+            with service.watched():
                 await asyncio.to_thread(
                     push, one, data[: MEGABYTE if quick else None], 1 if quick else seconds
                 )
