@@ -205,8 +205,13 @@ async def listen(port: int, seconds: float) -> tuple[float, float]:
 
 
 def send_telemetry(port: int, burst: int, stop: Event) -> None:
-    """Send a vehicle's telemetry to a port until `stop` is set; runs in another process."""
+    """Send a vehicle's telemetry to a port until `stop` is set; runs in another process.
+
+    The time since boot goes on in it, as a vehicle's does: else the client would see several vehicles.
+    """
+    mav = common.MAVLink(None, 1, 1)
     frames = telemetry()
+    messages = [mav.parse_buffer(frame)[0] for frame in frames]
     heartbeat = record_download().heartbeat
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
         out.connect(("127.0.0.1", port))
@@ -217,7 +222,12 @@ def send_telemetry(port: int, burst: int, stop: Event) -> None:
                 try:
                     if number % TELEMETRY == 0:
                         out.send(heartbeat)
-                    out.send(frames[number % len(frames)])
+                    message = messages[number % len(frames)]
+                    if hasattr(message, "time_boot_ms"):
+                        message.time_boot_ms = int((time.perf_counter() - began) * 1_000) + 60_000
+                        out.send(message.pack(mav))
+                    else:
+                        out.send(frames[number % len(frames)])
                 except ConnectionRefusedError:
                     pass  # the client has not opened the port yet, or has closed it
             sent += burst
