@@ -1,1 +1,23 @@
-"""The client over one link: client, component, link task, cache writer, events, files, signing."""
+"""The client over one link.
+
+- `arguments`: argument defaults and checks.
+- `cache_writer`: writes parameter tables to the cache.
+- `client`: `ParamClient`, the public class.
+- `component`: `Component`, the public interface of one component.
+- `event_loop_share`: CPU time and list downloads shared among the links of one event loop.
+- `events`: public events and their stream.
+- `fetch_all`: fetches of several components in parallel.
+- `files`: MAVFTP calls.
+- `forwarding`: frames to and from one other program.
+- `link_client`, `link_component`: the implementation over a link of this process.
+- `link_task`: link reader, sender and reconnection.
+- `local`: internal interface of a client and a component on a link of this process.
+- `recording`: telemetry log of a link.
+- `signing`: signing keys and options.
+- `signing_timestamps`: persistent signature timestamps.
+- `stats`: counters of a client.
+- `subscription`: streams of items, and of parameter changes.
+- `suspend_detection`: detection of suspend and of a stopped process.
+- `taps`: the telemetry log and the forwarder of a client.
+- `worker_thread`: a thread for blocking calls.
+"""

@@ -1,4 +1,4 @@
-"""Defaults and checks of the arguments of calls, the same over a link and over a service."""
+"""Argument defaults and checks, shared by clients over a link and over a service."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from paramclient.model.values import check_name, is_portable_name
 from paramclient.protocol.wire import MOST_PARAMETERS
 
 __all__ = [
-    "HEARING_PATIENCE",
+    "COMPONENT_TIMEOUT",
     "PROGRESS_INTERVAL",
     "SETTLE_MAX",
     "address_in_words",
@@ -19,19 +19,19 @@ __all__ = [
     "check_settle",
 ]
 
-HEARING_PATIENCE: Final = 10.0
-"""Seconds to wait for a first component, unless the caller says otherwise."""
+COMPONENT_TIMEOUT: Final = 10.0
+"""Default timeout in seconds for the first component on a link."""
 PROGRESS_INTERVAL: Final = 0.1
 """Seconds between two calls of a progress callback."""
 SETTLE_MAX: Final = 60.0
-"""Seconds for which a written value can be watched, at the most: a write to the same name waits meanwhile."""
+"""Maximum `settle` in seconds: further writes to the same name wait for it."""
 
 
 def check_asked(name: str | int) -> None:
-    """See that a parameter can have this name or this index.
+    """Check that a parameter can have this name or index.
 
     Raises:
-        UsageError: it cannot.
+        UsageError: the name is not portable, or the index is out of range.
     """
     if isinstance(name, str):
         check_asked_name(name)
@@ -40,44 +40,45 @@ def check_asked(name: str | int) -> None:
 
 
 def check_asked_name(name: str) -> str:
-    """Give a name back under which a vehicle can have a parameter.
+    """Check and return a parameter name.
 
     Raises:
-        UsageError: it is no param_id, or one that no parameter file can hold: of a vehicle it is not taken.
+        UsageError: the name is not a valid param_id, or no parameter file can hold it. The client ignores
+            such names when a vehicle sends them.
     """
     if not is_portable_name(check_name(name)):
         raise UsageError(
-            f"parameter name {name!r}: no parameter file can hold it, so a vehicle's is not taken; a name has"
+            f"parameter name {name!r}: no parameter file can hold it, so the client ignores it; a name has"
             " a letter, no space and none of # , ; = ; it begins with neither @ nor / and does not end with :"
         )
     return name
 
 
 def check_accepted(accept: str, sample: int) -> None:
-    """See that a fetch can accept this.
+    """Check the arguments `accept` and `sample` of a fetch.
 
     Raises:
-        UsageError: it cannot.
+        UsageError: `accept` is neither "verified" nor "sampled", or `sample` is less than 1.
     """
     if accept not in ("verified", "sampled"):
-        raise UsageError(f'accept is "verified" or "sampled", not {accept!r}')
+        raise UsageError(f'accept must be "verified" or "sampled", not {accept!r}')
     if sample < 1:
-        raise UsageError(f"a sample has at least one parameter, not {sample}")
+        raise UsageError(f"sample must be at least 1 parameter, not {sample}")
 
 
 def check_settle(settle: float) -> float:
-    """See that a value can be watched for so many seconds after it was written.
+    """Check and return `settle`, the seconds for which a value is watched after a write.
 
     Raises:
-        UsageError: it cannot.
+        UsageError: the number is outside 0 to `SETTLE_MAX`.
     """
     if not 0.0 <= settle <= SETTLE_MAX:
-        raise UsageError(f"settle is a number of seconds from 0 to {SETTLE_MAX:g}, not {settle}")
+        raise UsageError(f"settle must be 0 to {SETTLE_MAX:g} seconds, not {settle}")
     return float(settle)
 
 
 def address_in_words(system: int | None, component: int | None, peer: str | None = None) -> str:
-    """Return what a call looks for on a link, in words."""
+    """Return the component that a call waits for, for messages."""
     at = "" if peer is None else f" at {peer}"
     if component is None:
         return f"an autopilot{at}" if system is None else f"an autopilot with system id {system}{at}"

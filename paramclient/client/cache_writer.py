@@ -1,4 +1,4 @@
-"""What the tables learn goes to the cache: in batches, in a thread of its own, never in anybody's way."""
+"""WriteThrough: loads cached tables, and writes new values to the cache in batches, in a thread."""
 
 from __future__ import annotations
 
@@ -36,50 +36,52 @@ from paramclient.model.values import Param
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.params.table import Observation
 
-__all__ = ["WriteThrough", "chosen_cache"]
+__all__ = ["WriteThrough", "choose_cache"]
 
 FLUSH_INTERVAL: Final = 0.25
-"""Seconds after which a change is on the disk, as long as the machine keeps up: changes are gathered for so
-long, less what the last commit took. A download fills several batches."""
-FLUSH_RESERVE: Final = 0.04
-"""Seconds of that for a commit that takes longer than the last one."""
+"""Seconds from a change to its commit, unless the computer is overloaded: changes are collected for this
+time, less the duration of the last commit. A download takes several batches."""
+COMMIT_RESERVE: Final = 0.04
+"""Seconds of `FLUSH_INTERVAL` reserved for a commit that takes longer than the last one."""
 DOWNLOAD_INTERVAL: Final = 10.0
-FEW_FETCHES: Final = 8
-"""Seconds for which what a fetch under way brings is gathered, and the number of fetches above which that is
-done: most are over by then, and each table is written once, where parts of it would take several times as
-long. So much of a download is lost where the process is killed in its course."""
-LEAST_NEW: Final = 0.5
-"""The share of a table that must be new for a part of it to be written: that costs as much as all of it."""
-PORTION: Final = 2_000
-"""Parameters after which a transaction ends, of those that are written together: to gather so many takes a
-few milliseconds, in which nothing else is done."""
+"""Seconds for which the values of a running fetch are collected, if more than `UNBATCHED_FETCHES_MAX` run.
+Most fetches end sooner, so that each table is written once; writing it in parts takes several times as long.
+A killed process loses at most these values of a download."""
+UNBATCHED_FETCHES_MAX: Final = 8
+"""Number of running fetches up to which their values are written every `FLUSH_INTERVAL`."""
+NEW_SHARE_MIN: Final = 0.5
+"""Minimum share of new values in a table of a running fetch before a part of it is written: a part takes as
+long as the whole table."""
+TRANSACTION_PARAMS: Final = 2_000
+"""Number of parameters after which a transaction ends: collecting 2,000 blocks the event loop for a few
+milliseconds."""
 RETRY_INTERVAL: Final = 5.0
-"""Seconds until a cache that could not be written is tried again."""
-MOST_VEHICLES: Final = 16
-"""Vehicles under one address whose tables are kept in one session: more than are changed in a day. One that
-says each time that it is another vehicle fills no disk."""
-MOST_TABLES: Final = 4_000
-"""Tables that are kept in one session: four for each component that can be followed."""
+"""Seconds until the next attempt after a failed write."""
+VEHICLES_MAX: Final = 16
+"""Maximum number of vehicles under one address that are cached in a session: more than are swapped in a day.
+A vehicle that changes its identity each time cannot fill the disk."""
+TABLES_MAX: Final = 4_000
+"""Maximum number of tables cached in a session: four for each component that can be followed."""
 
 logger = logging.getLogger(__name__)
 Result = TypeVar("Result")
 
 
 class WriteThrough:
-    """The way from the tables of one client to its cache, and back at the beginning.
+    """Writes the tables of one client to its cache, and loads cached tables of new components.
 
-    A cache that fails costs a warning in the log, once until it can be written again, and nothing else: what
-    could not be written is written when it can be.
+    A cache error causes one warning in the log until the next successful write. Values that could not be
+    written stay queued and are written later.
 
     Args:
-        cache: where to, or None for nowhere.
-        owned: whether `close` closes it.
-        identity_of: says who the vehicle is that a component belongs to; None while that is open.
-        is_doubted: says whether another vehicle may have taken its place by now.
-        renewed: is called when another station has brought tables up to date.
-        look: is called before moments become unix times: to notice that the computer has slept.
-        clock: the time in unix seconds; None for that of this computer.
-        now: the time of the components.
+        cache: the cache, or None.
+        owned: whether `close` closes the cache.
+        identity_of: returns the identity of a component's vehicle; None while it is not settled.
+        is_doubted: returns whether another vehicle may use the address of a component by now.
+        renewed: called when a write of another station has updated tables.
+        look: called before times are converted to unix times, to detect suspend of the computer.
+        clock: returns unix seconds; None for the clock of this computer.
+        now: returns the time of the components.
     """
 
     def __init__(
@@ -105,15 +107,15 @@ class WriteThrough:
         self._worker = Worker("paramclient cache")
         self._kept: dict[ComponentMachine, _Kept] = {}
         self._flushing = anyio.Lock()
-        self._failure: CacheError | UsageError | None = None  # None once it could be written again
+        self._failure: CacheError | UsageError | None = None  # None after a successful write
         self._failures = 0
-        self._syncs_begun = self._synced = 0  # the number of the last one that has succeeded
+        self._syncs_begun = self._synced = 0  # numbers of the last sync begun, and the last that succeeded
         self._tables: dict[tuple[int, int], bool] = {}
         self._something_to_write = anyio.Event()
-        self._waiting_since = -math.inf  # as long as that is set
+        self._waiting_since = -math.inf  # time at which that was set
         self._commit_time = 0.0
         self._bringing: set[ComponentMachine] = set()
-        self._vehicles: dict[tuple[int, int], set[str]] = {}  # that were kept in this session
+        self._vehicles: dict[tuple[int, int], set[str]] = {}  # keys of identities cached in this session
         self._has_refused = self._has_refused_twin = False
         self._replacements = 0 if cache is None else cache.replacements
         self._has_written = False
@@ -123,7 +125,7 @@ class WriteThrough:
         self._flushed_at = (math.inf, -math.inf)  # by the components' clock, and in unix seconds
 
     async def open(self) -> None:
-        """Find out which components the cache knows."""
+        """Load the list of cached components, and subscribe to writes of other stations."""
         if self._cache is not None:
             for each in await self._run(self._cache.components) or ():
                 address = (each.system, each.component)
@@ -132,11 +134,11 @@ class WriteThrough:
             self._end_news = await self._run(partial(self._cache.subscribe, told)) or _nothing
 
     async def close(self) -> None:
-        """Write what is left, or warn of what is lost, and end the thread."""
+        """Write all new values, log a warning for lost ones, and end the thread."""
         self._end_news()
         is_written = False
         try:
-            is_written = await self.flush() and await self.flush()  # all of it, where the file had gone
+            is_written = await self.flush() and await self.flush()  # the second rewrites a replaced file
         finally:
             if not is_written:
                 self._tell_of_loss()
@@ -144,21 +146,21 @@ class WriteThrough:
             await self._worker.close(_nothing if cache is None else cache.close)
 
     async def aside(self, work: Callable[[], Result]) -> Result:
-        """Do what blocks in the cache's thread, behind what is under way there. Cancelled, it is done."""
+        """Run a blocking call in the cache's thread after queued calls. Cancellation does not stop it."""
         return await self._worker.run(work)
 
     def may_have(self, system: int, component: int) -> bool:
-        """Whether the cache had a table for such an address when the client was opened."""
+        """Return whether the cache had a table for this address when the client was opened."""
         return (system, component) in self._tables
 
     def may_hit(self, system: int, component: int) -> bool:
-        """Whether it had one that the vehicle's hash may confirm."""
+        """Return whether the cache had a table with a hash for this address when the client was opened."""
         return self._tables.get((system, component), False)
 
     def follow(self, machine: ComponentMachine, identity: Identity) -> bool:
-        """Go on under an identity; false where `bring` must come first, as for another vehicle.
+        """Update the identity of a cached component. Return False if `bring` must load its table first.
 
-        What becomes of the table when another vehicle takes the address is no news of the one before.
+        If the identity is that of another vehicle, the values queued for the previous vehicle are discarded.
         """
         kept = self._kept.get(machine)
         if kept is not None and kept.identity.key == identity.key:
@@ -169,12 +171,13 @@ class WriteThrough:
         return False
 
     async def bring(self, machine: ComponentMachine, identity: Identity) -> bool:
-        """Give a component the table that is cached under an identity, and keep what it learns under that.
+        """Load the table that is cached under an identity, and write new values under it from now on.
 
-        False where it was overtaken meanwhile: by another vehicle, or by the same call for another reason.
+        Return False if the call has no effect: another call for the component is running, or the identity is
+        no longer settled.
         """
         if machine in self._bringing:
-            return False  # that sees to it
+            return False
         self._bringing.add(machine)
         try:
             while self._has_room(machine, identity):
@@ -184,22 +187,22 @@ class WriteThrough:
                 if current is None or (current.key == identity.key and self.follow(machine, current)):
                     return False
                 if current.key == identity.key:
-                    if self._has_room(machine, current):  # another one may have come first meanwhile
+                    if self._has_room(machine, current):  # another component may have used the room meanwhile
                         self._keep(machine, current, cached)
                     break
-                identity = current  # another vehicle has taken its place meanwhile
+                identity = current  # another vehicle has replaced it meanwhile
             return True
         finally:
             self._bringing.discard(machine)
 
     def is_bringing(self, machine: ComponentMachine) -> bool:
-        """Whether `bring` is under way for it."""
+        """Return whether `bring` is running for a component."""
         return machine in self._bringing
 
     async def keep_late(self, machine: ComponentMachine) -> None:
-        """Keep a table that there was no time to bring the cached one for.
+        """Write the table of a component that closes before its identity was settled or its cache loaded.
 
-        A component that has not said who it is by now may be one that never does: what is whole is kept.
+        A component may never report its identity. Its table is written if it is complete.
         """
         known = self._identity_of(machine)
         if not (machine.table.complete or (known is not None and machine.table.params)):
@@ -211,7 +214,7 @@ class WriteThrough:
                 self._keep(machine, identity, cached)
 
     def synced(self, machine: ComponentMachine, *, is_whole: bool) -> None:
-        """The table was proven to be the vehicle's just now; `is_whole` by a download of all of it."""
+        """Record that the table was verified now; `is_whole`: by a full download."""
         kept = self._kept.get(machine)
         if kept is not None:
             kept.proven_at = self._now() + machine.table.slept
@@ -219,32 +222,32 @@ class WriteThrough:
                 kept.whole_at = kept.proven_at
 
     def let_go(self, machine: ComponentMachine) -> None:
-        """Several vehicles have its address, or had it until now: what it has learnt is kept under none."""
+        """Discard the queued values of a component: several vehicles use its address, or did until now."""
         self._kept.pop(machine, None)
         machine.table.take_dirty()
         machine.table.take_overwritten()
         machine.table.take_gone()
 
     def part_with(self, machine: ComponentMachine) -> None:
-        """It is not followed any more."""
+        """Remove a component that is no longer followed."""
         self._kept.pop(machine, None)
 
     @property
     def is_held_back(self) -> bool:
-        """Whether there is news of a component of which it is open who it is: it may be another vehicle."""
+        """Whether a component with queued values may be another vehicle by now, so that writing must wait."""
         return any(machine.table.dirty and self._is_doubted(machine) for machine in self._kept)
 
     def wake(self) -> None:
-        """There may be something to write."""
+        """Run the writer: there may be new values."""
         if not self._something_to_write.is_set():
             self._waiting_since = anyio.current_time()
             self._something_to_write.set()
 
     async def run(self) -> None:
-        """Write whatever is new, in batches, until cancelled."""
+        """Write new values in batches, until cancelled."""
         while True:
             await self._something_to_write.wait()
-            pause = FLUSH_INTERVAL - FLUSH_RESERVE - min(self._commit_time, FLUSH_INTERVAL / 2)
+            pause = FLUSH_INTERVAL - COMMIT_RESERVE - min(self._commit_time, FLUSH_INTERVAL / 2)
             await anyio.sleep_until(self._waiting_since + pause)
             self._something_to_write = anyio.Event()
             begun_at = anyio.current_time()
@@ -257,45 +260,45 @@ class WriteThrough:
             await self._take_news()
 
     async def flush(self, *, is_last: bool = True) -> bool:
-        """Write what is new; false when the cache could not take it. Cancelled, it loses nothing.
+        """Write new values. Return False if the write failed. Cancellation loses no value.
 
         Args:
-            is_last: whether what a fetch under way has brought must not be left for later.
+            is_last: whether to write values of running fetches too, which are otherwise collected.
         """
         async with self._flushing:
             return await self._flush(is_last=is_last)
 
     async def write_all(self) -> None:
-        """Write all that has been heard, so that the cache can be asked about it.
+        """Write all received values, before a query of the cache.
 
         Raises:
-            CacheError: the cache could not take it. It is kept, and written when that is possible.
+            CacheError: the write failed. The values stay queued and are written later.
         """
         failures = self._failures
         async with self._flushing:
             if failures == self._failures and await self._flush(is_last=True):
                 return
-        raise CacheError(f"what was heard last could not be written: {self._failure}") from self._failure
+        raise CacheError(f"the last received values could not be written: {self._failure}") from self._failure
 
     def obstacle(self, machine: ComponentMachine) -> str | None:
-        """Why nothing of a component can be written at present, in words; None where it can."""
+        """Return why values of a component cannot be written at present; None if they can."""
         if self._cache is None:
-            return "the client keeps no cache"
+            return "the client has no cache"
         if machine not in self._kept or self._is_doubted(machine):
             return f"it is not known which vehicle {machine.system}/{machine.component} is"
         return None
 
     async def write_durably(self, machine: ComponentMachine) -> None:
-        """Have all that was heard of a component on the disk, past a loss of power.
+        """Write all received values of a component and sync them to the disk, safe from power loss.
 
-        Calls at the same time share the work.
+        Concurrent calls share a sync.
 
         Raises:
-            CacheError: it cannot be written. It is kept, and written when that is possible.
+            CacheError: the write or the sync failed. The values stay queued and are written later.
         """
         cache, begun = self._cache, self._syncs_begun
         async with self._flushing:
-            if self._synced <= begun:  # else one that was begun after this call has succeeded
+            if self._synced <= begun:  # otherwise a sync that started after this call has succeeded
                 self._syncs_begun += 1
                 number = self._syncs_begun
                 is_done = cache is not None and await self._flush(is_last=True)
@@ -310,7 +313,9 @@ class WriteThrough:
         size = 0
         times = self._present_times()
         fetches = sum(machine.fetch is not None for machine in self._kept)
-        self._are_many = fetches > (0 if self._are_many else FEW_FETCHES)  # the last ones of many count too
+        self._are_many = fetches > (
+            0 if self._are_many else UNBATCHED_FETCHES_MAX
+        )  # until the last has ended
         for kept in list(self._kept.values()) if self._cache is not None else ():
             if self._are_many and not is_last and self._is_for_later(kept):
                 self.wake()
@@ -318,24 +323,24 @@ class WriteThrough:
                 for new in self._news_of(kept, times):
                     portion.append(new)
                     size += len(new.update.params)
-            if size >= PORTION:
+            if size >= TRANSACTION_PARAMS:
                 if not await self._write(portion):
                     return False
                 portion, size = [], 0
         return await self._write(portion)
 
     def _is_for_later(self, kept: _Kept) -> bool:
-        """Whether a fetch brings more of it that is better written together."""
+        """Return whether a running fetch delivers more values that are written together later."""
         fetch, table = kept.machine.fetch, kept.machine.table
         if fetch is None:
             return False
-        if len(table.dirty) < LEAST_NEW * len(table.params):
+        if len(table.dirty) < NEW_SHARE_MIN * len(table.params):
             return True
         began_at = fetch.first_value_at if fetch.first_value_at < math.inf else fetch.begun_at
         return anyio.current_time() < max(kept.written_at, began_at) + DOWNLOAD_INTERVAL
 
     async def _write(self, news: list[_News]) -> bool:
-        """Write what was gathered; false when the cache could not take it."""
+        """Write the collected updates. Return False if the write failed."""
         cache = self._cache
         if cache is None or not news:
             return True
@@ -357,12 +362,12 @@ class WriteThrough:
         return is_written
 
     def _hear_of(self, change: CacheChange) -> None:
-        """Another station has written to a table."""
+        """Record that another station has written to a table."""
         self._news.add(change)
         self.wake()
 
     async def _take_news(self) -> None:
-        """Bring up to date what is only cached here, where another station has heard it since."""
+        """Update cached values from the newer writes of other stations."""
         news, self._news = self._news, set()
         for kept in list(self._kept.values()):
             machine, identity = kept.machine, kept.identity
@@ -373,7 +378,7 @@ class WriteThrough:
                     self._renewed()
 
     def _begin_anew(self, replacements: int) -> None:
-        """Where the file is another one than before: nothing that was written earlier is in it."""
+        """Queue all values again if the cache file was replaced: the new file lacks earlier writes."""
         is_another = replacements != self._replacements and (self._has_written or bool(self._tables))
         self._replacements = replacements
         self._has_written = True
@@ -392,13 +397,13 @@ class WriteThrough:
         return await self._run(partial(_save, cache, updates, self._clock)) is not None
 
     def _has_room(self, machine: ComponentMachine, identity: Identity) -> bool:
-        """Whether a vehicle's table may be kept, beside those of this session that are."""
+        """Return whether the table of a vehicle may be cached, within the limits of the session."""
         address = (machine.system, machine.component)
         twins = [each for each in self._kept.values() if _is_twin(each, machine, identity)]
         if twins:
             if not self._has_refused_twin:
                 logger.warning(
-                    "%d/%d at %s has the identity of the one at %s (%s), so it is not cached",
+                    "%d/%d at %s has the same identity as the vehicle at %s (%s): its table is not cached",
                     *address,
                     machine.peer_in_words,
                     twins[0].machine.peer_in_words,
@@ -409,10 +414,10 @@ class WriteThrough:
         vehicles = self._vehicles.get(address, set())
         if identity.key in vehicles:
             return True
-        is_full = sum(map(len, self._vehicles.values())) >= MOST_TABLES
-        if len(vehicles) >= MOST_VEHICLES or is_full:
+        is_full = sum(map(len, self._vehicles.values())) >= TABLES_MAX
+        if len(vehicles) >= VEHICLES_MAX or is_full:
             if not self._has_refused:
-                logger.warning("%d/%d: too many vehicles on this link, so it is not cached", *address)
+                logger.warning("%d/%d: too many vehicles on this link: its table is not cached", *address)
             self._has_refused = True
             return False
         self._vehicles[address] = vehicles | {identity.key}
@@ -431,7 +436,7 @@ class WriteThrough:
         for name in table.params:
             table.dirty.setdefault(name, "vehicle")
         if cached is not None:
-            # the indices of an unfinished table are gone on with: they must be this firmware's on this board
+            # a partial table is resumed by index: its indices must be of the same firmware on the same board
             is_same = identity.uid is not None and _firmware(cached.identity) == _firmware(identity)
             machine.use_cached(
                 _of_firmware(cached, identity),
@@ -453,24 +458,24 @@ class WriteThrough:
             kept.proven_at = self._now() + table.slept
 
     def _present_times(self) -> UnixTimes:
-        """Return what turns moments of the components into unix times, as the computer's clock is now.
+        """Return the conversion of component times to unix times, by the current clock of the computer.
 
-        Where that was set back by less than `CLOCK_SLACK` since the last flush, what has come since counts as
-        later than what was written then.
+        If the clock was set back by less than `CLOCK_SLACK` since the last flush, values received since then
+        get later times than the values written then.
         """
         self._look()
         since, last = self._flushed_at
         ahead = seconds_ahead(self._clock, self._now)
         now = self._now()
         at = now + ahead
-        if at < last - CLOCK_SLACK:  # the cache sees to that
+        if at < last - CLOCK_SLACK:  # the cache handles such a clock jump
             since, last = math.inf, -math.inf
         times = UnixTimes(max(at, last), ahead, since, last)
         self._flushed_at = (now, times.at)
         return times
 
     def _moments(self, cached: CachedComponent) -> dict[str, float]:
-        """Return when the values of a cached table were observed, as moments of the components."""
+        """Return the observation times of the values of a cached table, in component time."""
         self._look()
         now = self._now()
         ahead = seconds_ahead(self._clock, self._now)
@@ -479,7 +484,7 @@ class WriteThrough:
         return {name: min(at - ahead, now) for name, at in cached.heard_at.items()}
 
     def _news_of(self, kept: _Kept, times: UnixTimes) -> list[_News]:
-        """What the cache does not know of a table yet; it counts as written from now on."""
+        """Return the updates of a table since the last write, and mark them as written."""
         machine, table = kept.machine, kept.machine.table
         if self._is_doubted(machine):
             return []
@@ -529,7 +534,7 @@ class WriteThrough:
         table = machine.table
         return TableState(
             hash=table.hash if table.complete else None,
-            count=None if table.is_displaced else table.count,  # the cache keeps the indices of before
+            count=None if table.is_displaced else table.count,  # the cache keeps the previous indices
             complete=table.complete,
             volatile_known=table.volatile_known,
             synced_at=kept.synced_at,
@@ -537,18 +542,18 @@ class WriteThrough:
         )
 
     async def _run(self, work: Callable[[], Result]) -> Result | None:
-        """Run a call of the cache in the thread; None when it failed, which is worth a warning once."""
+        """Run a cache call in the thread. Return None if it failed, and log the first failure."""
         try:
             return await self._worker.run(work)
-        except (CacheError, UsageError) as error:  # a UsageError comes of a clock that is far off
+        except (CacheError, UsageError) as error:  # a clock that is far off causes a UsageError
             if self._failure is None:
-                logger.warning("going on without the cache: %s", error)
+                logger.warning("continuing without the cache: %s", error)
             self._failure = error
             self._failures += 1
             return None
 
     def _tell_of_loss(self) -> None:
-        """Warn of what can no longer be written."""
+        """Log a warning for each component with values that were not written."""
         for machine, kept in self._kept.items():
             values, earlier = len(machine.table.dirty), len(machine.table.overwritten)
             if values or earlier:
@@ -567,20 +572,30 @@ class WriteThrough:
 
 @dataclass(slots=True)
 class _Kept:
-    """What is known of a component's place in the cache."""
+    """State of a cached component.
+
+    Attributes:
+        machine: the component.
+        identity: the identity under which its table is written.
+        state: the table state written last, or None.
+        synced_at: time of the last verification, in unix seconds, or None.
+        proven_at: time of a verification since the last write, in component time with `Table.slept`, or None.
+        whole_at: time of a full download since the last write, likewise.
+        written_at: time of the last write, by the clock of the event loop.
+    """
 
     machine: ComponentMachine
     identity: Identity
     state: TableState | None = None
     synced_at: float | None = None
-    proven_at: float | None = None  # since it was written last: by the components' clock, with `Table.slept`
-    whole_at: float | None = None  # when all of it was downloaded, likewise
-    written_at: float = 0.0  # by the event loop's clock
+    proven_at: float | None = None
+    whole_at: float | None = None
+    written_at: float = 0.0
 
 
 @dataclass(slots=True)
 class _News:
-    """What is on its way to the cache for one component."""
+    """Updates of one component in a write, kept to queue them again after a failure."""
 
     kept: _Kept
     dirty: dict[str, str]
@@ -593,7 +608,7 @@ class _News:
     whole_at: float | None
 
     def take_back(self) -> None:
-        """It has not arrived: it is news again."""
+        """Queue the updates again after a failed write."""
         kept = self.kept
         if kept.proven_at is None:
             kept.proven_at = self.proven_at
@@ -603,16 +618,16 @@ class _News:
         kept.state = None
 
 
-def chosen_cache(
+def choose_cache(
     cache: ParamCache | str | os.PathLike[str] | bool | None, *, is_log: bool
 ) -> ParamCache | None:
-    """The cache that a user's choice means, see `ParamClient`.
+    """Return the cache for the `cache` argument of `ParamClient`, or None.
 
     Raises:
-        UsageError: a cache is named for a log.
+        UsageError: the argument names a cache, and the link is a log.
     """
     if is_log and cache not in (None, True, False):
-        raise UsageError("what a log holds is of the past: `paramclient import` brings it into a cache")
+        raise UsageError("a replayed log uses no cache: `paramclient import` writes its values into one")
     if isinstance(cache, ParamCache):
         return cache
     if cache is False or is_log:
@@ -621,7 +636,7 @@ def chosen_cache(
 
 
 def _is_twin(kept: _Kept, machine: ComponentMachine, identity: Identity) -> bool:
-    """Whether the cache would take a component for one that is kept, with equal ids at another peer."""
+    """Return whether a cached component has equal ids and identity at another peer."""
     other = kept.machine
     has_equal_ids = (other.system, other.component) == (machine.system, machine.component)
     return has_equal_ids and other is not machine and kept.identity.key == identity.key
@@ -646,7 +661,7 @@ def _sync(cache: ParamCache) -> bool:
 
 
 def _of_firmware(cached: CachedComponent, identity: Identity) -> Mapping[str, Param]:
-    """The cached parameters, without the defaults of another firmware than the present one."""
+    """Return the cached parameters, without defaults if they are of another firmware."""
     if _firmware(cached.identity) == _firmware(identity):
         return cached.params
     return {name: replace(param, default=None) for name, param in cached.params.items()}
@@ -655,7 +670,7 @@ def _of_firmware(cached: CachedComponent, identity: Identity) -> Mapping[str, Pa
 def _pass_on(
     token: anyio.lowlevel.EventLoopToken, told: Callable[[CacheChange], None], change: CacheChange
 ) -> None:
-    """Tell something to the event loop, from another thread; to nobody where that has ended."""
+    """Call a function in the event loop from another thread; do nothing if the event loop has ended."""
     with suppress(anyio.RunFinishedError):
         anyio.from_thread.run_sync(told, change, token=token)
 

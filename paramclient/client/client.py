@@ -1,12 +1,11 @@
-"""ParamClient: what users open to reach the components on a link, or on the links of a service.
+"""ParamClient: the public client for the components on a link, or on the links of a service.
 
-`ParamClient` is one concrete class that forwards its calls to an implementation: `LinkClient` where the
-link is opened in this process, `ServiceClient` (in `paramclient.remote`) where a service has the links.
-`__init__` chooses it by the name of the link. So `ParamClient(link)` and `isinstance(client, ParamClient)`
-hold for both, a subclass of `ParamClient` works over both, and type checkers see one signature with its
-docstring. The implementations offer the same calls with the same arguments. They are no subclasses, and do
-not import this module. Their components are subclasses of the abstract class `Component`, which users do not
-construct.
+`ParamClient` is a concrete class that forwards its calls to an implementation: `LinkClient` for a link of
+this process, `ServiceClient` (in `paramclient.remote`) for a service. `__init__` chooses it by the name of
+the link. `ParamClient(link)` and `isinstance(client, ParamClient)` therefore work for both, a subclass of
+`ParamClient` works over both, and type checkers see one signature with its docstring. The implementations
+have the same calls with the same arguments. They are not subclasses of `ParamClient`, and do not import this
+module. Their components are subclasses of the abstract class `Component`, which users do not construct.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Self, TypeAlias
 
 from paramclient.cache import ParamCache
-from paramclient.client.arguments import HEARING_PATIENCE
+from paramclient.client.arguments import COMPONENT_TIMEOUT
 from paramclient.client.component import Component
 from paramclient.client.events import Events
 from paramclient.client.fetch_all import FetchedAll
@@ -42,64 +41,63 @@ if TYPE_CHECKING:
 __all__ = ["ParamClient", "implementation_of", "local_client"]
 
 Implementation: TypeAlias = "LinkClient | ServiceClient"
-"""What a `ParamClient` forwards its calls to."""
+"""The class to which a `ParamClient` forwards its calls."""
 
 
 class ParamClient:
-    """The ground station's side of the parameter protocol on one link, as an async context manager.
+    """A ground station for the MAVLink parameter protocol on one link, as an async context manager.
 
-    Inside the `async with`, it sends its heartbeat once a second, follows every component that it hears, and
-    keeps their tables in the cache. At its end every call that still waits, in other tasks, raises
-    ClientClosed, what is new is written, and neither task nor socket nor thread remains. What the body
-    raises comes out as it is. File sessions are closed on board first, also when the body is cancelled: a
-    vehicle that does not acknowledge that takes at most `SESSION_PATIENCE` (2 s).
+    Inside the `async with`, the client sends a heartbeat once a second, follows every component on the link,
+    and keeps their tables in the cache. On exit, waiting calls in other tasks raise ClientClosed, new values
+    are written to the cache, and no task, socket or thread remains. Exceptions of the body propagate
+    unchanged. Before that, open file sessions are closed on board, also if the body is cancelled. If a
+    vehicle does not acknowledge, this takes at most `SESSION_CLOSE_TIMEOUT` (2 s).
 
-    A TCP connection that drops, a serial port that is unplugged or a UDP socket that fails is opened again
-    with back-off for as long as the client lives. Calls that wait meanwhile go on when it is back: what had
-    not been answered is asked for again. After `LINK_PATIENCE` seconds without a link they raise LinkError,
-    and new ones do so at once. A link that cannot come back (`tcpin`, when nobody can be let in) ends every
-    call with its LinkError.
+    A dropped TCP connection, an unplugged serial port or a failed UDP socket is reopened with backoff while
+    the client is open. Waiting calls continue after the reconnection, and unacknowledged requests are sent
+    again. After `LINK_TIMEOUT` seconds (10) without a link, waiting calls and new ones raise LinkError. If a
+    link cannot reconnect (`tcpin` when it can no longer accept connections), every call raises its LinkError.
 
     Args:
-        link: a link's name, such as `udpin:0.0.0.0:14550` (`paramclient.links.FORMS` says which there are), a
-            link object, or a simulated vehicle. With `http://HOST:8765` a service of `paramclient serve` has
-            the links (see `paramclient.remote`); of the other arguments only `token` goes with that.
-        cache: where tables are kept: None for the user's cache, a path, a `ParamCache` (which stays open), or
-            False for none. A log that is replayed neither reads nor writes one.
-        system, component: who we are on the link.
-        encoding: how all components lay out values, for those who know better than the evidence.
-        watch_interval: seconds after which it is looked again whether a table that was fetched still is the
-            vehicle's, while the link is idle. An update is sent once, and lost with its frame: so it is found
-            within one interval. None: every 30 seconds where the vehicle has a hash, which costs two small
-            messages and what the hash leaves out, or gives its table as a file, less often where that takes
-            more than 1.5 s, and never elsewhere. A number goes for every vehicle, the whole table of those
-            without a hash. 0 for never. See `Component.sync_state`.
-        policy: what may be asked of vehicles to bring tables up to date, see `Policy`: "auto", "hash-only"
-            or "cache-only". Anything but "auto" also ends the watch. Single reads and writes go out all the
-            same.
-        traffic: whether to count everything that is heard, for `traffic_report`. That takes time for each
-            frame, also of those that a client otherwise steps over.
-        listen_only: never send a byte, not even a heartbeat. Tables fill by what others on the link ask for;
-            `fetch_all` waits for their list, and `get`, `set` and the like raise UsageError.
-        forward: the link to one other program, by its name or as an object, such as
-            `udpout:127.0.0.1:14551`: it gets every frame that comes, and what it sends goes to the vehicles;
-            with `listen_only` it is not. A program that is slow or absent holds nothing up.
-        tlog: a telemetry log to be made, of every frame on the link, both ways. One that exists is not
-            written over; a full disk ends it with a warning, and nothing else.
-        signing: the key with which what is sent is signed and what comes is checked, or a `Signing`, which
-            says more. None: nothing is signed, and signatures count for nothing.
-        token: what a service wants to see; None for PARAMCLIENT_TOKEN of the environment.
-        split_peers: whether components with equal ids are different ones where they come from different UDP
-            addresses or TCP connections: for vehicles that share a system id. A vehicle with two ways to this
-            computer is then two, and so is one that was restarted with another port.
+        link: name of a link, such as `udpin:0.0.0.0:14550` (all forms are in `paramclient.links.FORMS`), a
+            link object, or a simulated vehicle. `http://HOST:8765` connects to a service of `paramclient
+            serve` (see `paramclient.remote`); then `token` is the only other argument allowed.
+        cache: cache of the tables: None for the user's cache, a path, a `ParamCache` (the client does not
+            close it), or False for none. A replayed log neither reads nor writes a cache.
+        system, component: MAVLink ids of this client, 1 to 255.
+        encoding: parameter encoding of all components; None detects it for each component.
+        watch_interval: seconds between two checks of each fetched table against the vehicle, while the link
+            is idle. A vehicle sends PARAM_VALUE once after a change, without acknowledgement; a check finds a
+            lost one within an interval. None: every 30 s for a vehicle with a hash (two small messages, and
+            the values outside the hash) or with a parameter file over MAVFTP, less often if that takes more
+            than 1.5 s, and never for other vehicles. A number applies to every vehicle, with a full download
+            from those without a hash. 0 disables the checks. See `Component.sync_state`.
+        policy: which requests may update tables, see `Policy`: "auto", "hash-only" or "cache-only". Any value
+            but "auto" also disables the checks of `watch_interval`. Single reads and writes are not affected.
+        traffic: whether to count all frames for `traffic_report`. This takes time for each frame, also for
+            frames that the client otherwise skips.
+        listen_only: send nothing, not even a heartbeat. Tables fill from responses to other stations;
+            `fetch_all` waits for a list that another station requests; `get`, `set` and other requests
+            raise UsageError.
+        forward: link to one other program, by name or as an object, such as `udpout:127.0.0.1:14551`. The
+            program receives every received frame, and its frames are sent to the vehicles, except with
+            `listen_only`. A slow or absent program does not delay the client.
+        tlog: path of a telemetry log to create, with every frame of both directions. An existing file is not
+            overwritten. A full disk ends the log with a warning and has no other effect.
+        signing: key to sign sent frames and to check received ones, or a `Signing` with more options. None:
+            frames are not signed, and signatures are not checked.
+        token: access token of the service; None for PARAMCLIENT_TOKEN of the environment.
+        split_peers: whether equal ids at different UDP addresses or TCP connections are different components,
+            for vehicles that share a system id. A vehicle with two connections to this computer then appears
+            twice, and so does a vehicle that was restarted with another port.
 
     Attributes:
-        cache: where tables are kept, or None.
+        cache: cache of the tables, or None.
 
     Raises:
-        UsageError: no such link, ids outside 1 to 255, or an interval or policy that cannot be; on entering:
-            for the second time, or the telemetry log exists or cannot be made.
-        LinkError: on entering: the link, or the one to the other program, cannot be opened.
+        UsageError: the link name, an id, the interval or the policy is not valid. On entering: the client was
+            entered before, or the telemetry log exists or cannot be created.
+        LinkError: on entering: the link, or the link to the other program, cannot be opened.
     """
 
     def __init__(
@@ -141,7 +139,7 @@ class ParamClient:
             options.check_unset()
             self._implementation = ServiceClient(str(link), token=token)
         elif token is not None:
-            raise UsageError("a token is for a service, whose name is http://HOST:PORT; a link takes none")
+            raise UsageError("a token is only for a service, named http://HOST:PORT; a link has none")
         else:
             self._implementation = LinkClient(link, options)
         self.cache = self._implementation.cache
@@ -160,58 +158,63 @@ class ParamClient:
 
     @property
     def components(self) -> Mapping[Address, Component]:
-        """Every component heard so far, by (system, component).
+        """All components from which messages have arrived, by (system, component). Read-only and live.
 
-        With `split_peers`, ids may be there several times, and a key stands for the ids at one peer: it is
-        what `Component.address` gives, and the ids alone are none.
+        With `split_peers`, ids may occur several times. The keys are then the values of `Component.address`,
+        which include the peer; the ids alone are not keys.
         """
         return self._implementation.components
 
     @property
     def autopilots(self) -> list[Component]:
-        """The autopilot of each system heard so far, by system id: vehicles, without what they carry."""
+        """The autopilot of each system, sorted by system id, without cameras, gimbals and the like."""
         return self._implementation.autopilots
 
     @property
     def link(self) -> Link:
-        """The link."""
+        """The link object of the client."""
         return self._implementation.link
 
     @property
     def listens_only(self) -> bool:
-        """Whether nothing is ever sent: by choice, or as the link is a log."""
+        """Whether the client sends nothing: because of `listen_only`, or because the link is a log."""
         return self._implementation.listens_only
 
     @property
     def bytes_received(self) -> int:
-        """Bytes that have come over the link."""
+        """Bytes received over the link."""
         return self._implementation.bytes_received
 
     @property
     def bytes_sent(self) -> int:
-        """Bytes of the frames that were sent, our heartbeats among them."""
+        """Bytes of all sent frames, including heartbeats."""
         return self._implementation.bytes_sent
 
     @property
     def stats(self) -> ClientStats:
-        """What it has done so far, in numbers; also when it is closed."""
+        """Counters of the client since its creation, also after it is closed."""
         return self._implementation.stats
 
     def events(self) -> Events:
-        """What happens to components from now on: `async for event in client.events()`.
+        """Return a stream of component events from now on: `async for event in client.events()`.
 
-        They are Heard, Lost, Found, Rebooted, Resynced, Contested and Uncontested. An absence of the link
-        does not end it; it ends when nobody holds it any more. Whoever is very slow to ask misses the oldest
-        ones. In a log it ends with that.
+        The events are Heard, Lost, Found, Rebooted, Resynced, Contested and Uncontested. The stream continues
+        across a reconnection of the link. It is released with its last reference, and ends with a replayed
+        log. It queues at most 1,000 events for a slow consumer and then drops the oldest. Cancelling the
+        iteration loses no event.
 
         Raises:
-            LinkError: while waiting, when the link failed for good or the client was closed. What had come
-                before is given first.
+            LinkError: while iterating, after the queued events: the link failed permanently, or the client
+                was closed.
         """
         return self._implementation.events()
 
     def ftp(self, component: Component) -> Ftp:
-        """The files of a component, over MAVFTP."""
+        """Return the MAVFTP file calls of a component.
+
+        Raises:
+            UsageError: the component belongs to a client over a service.
+        """
         return self._implementation.ftp(component)
 
     async def component(
@@ -220,23 +223,23 @@ class ParamClient:
         component: int | None = None,
         *,
         peer: str | None = None,
-        timeout: float | None = HEARING_PATIENCE,
+        timeout: float | None = COMPONENT_TIMEOUT,
     ) -> Component:
-        """The component with this address, as soon as it has been heard.
+        """Return the component with this address, after its first message.
 
-        Without arguments the first autopilot; with a system alone, that system's autopilot; with a component
-        alone, the first of that id. Which one is the first is a matter of chance where there are several:
-        programs that write use `only_component`. If the cache may have its table, it is in `params` on
-        return, unless the vehicle does not say who it is.
+        Without arguments, this is the first autopilot; with only a system, the autopilot of that system; with
+        only a component, the first component with that id. With several vehicles, the first one is arbitrary:
+        programs that write use `only_component`. On return, a cached table is in `params`, unless the vehicle
+        does not report its identity.
 
         Args:
             system: system id.
             component: component id.
-            peer: the peer that its messages come from, as `Component.peer` says it, or its host alone.
-            timeout: seconds; None waits for ever.
+            peer: source address of its messages, as in `Component.peer`, or only the host.
+            timeout: seconds; None waits without limit.
 
         Raises:
-            NoReply: it was not heard in time.
+            NoReply: no message of the component arrived in time.
             LinkError: the link failed, or the client was closed.
         """
         return await self._implementation.component(system, component, peer=peer, timeout=timeout)
@@ -247,52 +250,52 @@ class ParamClient:
         component: int | None = None,
         *,
         peer: str | None = None,
-        timeout: float | None = HEARING_PATIENCE,
+        timeout: float | None = COMPONENT_TIMEOUT,
     ) -> Component:
-        """Return the component with this address if no other vehicle can be meant; for programs that write.
+        """Return the component with this address if the choice is unambiguous; for programs that write.
 
-        Without arguments it is the only autopilot on the link; with a component alone, the component of that
-        id of the only vehicle. For `LOOK_TIME` (1.2 s) from the first autopilot heard on, a second one is
-        looked for: every autopilot sends a heartbeat once a second. With a system alone it is that system's
-        autopilot: component 1 as soon as it is heard, or another one when it is the only one for as long.
-        With both ids it is that component, as soon as it is heard. A vehicle that is lost is not there.
-        Nothing is sent but what identifies vehicles.
+        Without arguments, this is the only autopilot on the link; with only a component, the component with
+        that id of the only vehicle. The call waits `LOOK_TIME` (1.2 s) after the first autopilot for a second
+        one, as every autopilot sends a heartbeat once a second. With only a system, it is the autopilot of
+        that system: component 1 after its first message, or another one if it is the only one for 1.2 s. With
+        both ids, it is that component after its first message. Lost vehicles are ignored. The call sends only
+        identity requests.
 
-        The call takes no time where a second autopilot would have been heard already. So a program that did
-        something else since can make sure by another call, directly before it writes.
+        The call returns immediately if the client has already listened long enough. A program can therefore
+        repeat it directly before it writes.
 
         Args:
             system: system id.
             component: component id.
             peer: as in `component`.
-            timeout: seconds for everything; None waits for ever.
+            timeout: seconds for the whole call; None waits without limit.
 
         Raises:
             AmbiguousVehicle: several vehicles are on the link, or the only one has several autopilots.
-                `vehicles` and the text list them.
-            NoReply: it was not heard in time, or not for long enough to see that it is the only one.
+                `vehicles` and the message list them.
+            NoReply: no message of the component arrived in time, or too late to exclude a second vehicle.
             LinkError: the link failed, or the client was closed.
         """
         return await self._implementation.only_component(system, component, peer=peer, timeout=timeout)
 
     async def successor(
-        self, component: Component, system: int, *, timeout: float | None = HEARING_PATIENCE
+        self, component: Component, system: int, *, timeout: float | None = COMPONENT_TIMEOUT
     ) -> Component:
-        """The same component of the same vehicle under another system id, as soon as it speaks under that.
+        """Return the component of the same vehicle under its new system id, after its first message there.
 
-        For a vehicle whose system id was set: ArduPlane and Rover take it at once (SYSID_THISMAV), ArduCopter
-        and PX4 (MAV_SYS_ID) when they start again (see `Component.reboot`). That it is the same one is shown
-        by its hardware id; where there is none, by its autopilot and type, and by its silence under the id of
-        before.
+        For a vehicle whose system id was changed. On ArduPlane and Rover, the new id (SYSID_THISMAV) takes
+        effect immediately; on ArduCopter and PX4 (MAV_SYS_ID) after a reboot (see `Component.reboot`). The
+        vehicle is recognized by its hardware id, or without one, by its autopilot and type and by its silence
+        under the old id.
 
         Args:
-            component: what it was before.
+            component: the component under the old system id.
             system: its new system id.
-            timeout: seconds; None waits for ever.
+            timeout: seconds; None waits without limit.
 
         Raises:
             AnotherVehicle: another vehicle has this system id.
-            NoReply: it was not heard under this id in time, or did not say who it is.
+            NoReply: no message with this id arrived in time, or the vehicle did not report its identity.
             LinkError: the link failed, or the client was closed.
         """
         return await self._implementation.successor(component, system, timeout=timeout)
@@ -305,22 +308,30 @@ class ParamClient:
         timeout: float | None = None,
         progress: Callable[[Mapping[Address, Progress]], None] | None = None,
     ) -> FetchedAll:
-        """Bring the tables of all components of one system, or of every system heard, up to date.
+        """Update the tables of all components of one system, or of every system on the link.
 
-        They are fetched side by side; those that begin to speak meanwhile join in, and so does everyone who
-        is heard within `LISTENING_TIME` of opening. A component that stays silent is given up soon after
-        another one is done.
+        The fetches run in parallel. Components that appear during the call are included, and the call waits
+        for components until `LISTENING_TIME` (1.2 s) after the client was opened. A component that does not
+        respond is given up when another fetch has ended: after 1 s, or 4 times the longest response time of
+        another component.
+
+        Cancellation keeps the received values in the tables.
 
         Args:
-            system: this system's components only, asked for with one list request to all of them.
+            system: fetch only this system, with one list request for all of its components; None for all.
             refresh: as in `Component.fetch_all`.
-            timeout: seconds, after which what has come is given.
-            progress: called about ten times a second with the progress of each, from this task.
+            timeout: seconds after which partial results are returned; None: no limit, except 20 s if the
+                client only listens.
+            progress: called about ten times a second with the progress by (system, component), from this
+                task.
+
+        Returns:
+            The results by (system, component), and the errors of the components that did not respond.
 
         Raises:
-            UsageError: `refresh`, and the policy allows no download.
-            CacheError: nothing is cached of anybody, and the policy allows no download.
-            NoReply: nobody was heard, or nobody answered.
+            UsageError: `refresh` is given, and the policy allows no download.
+            CacheError: nothing is cached for any component, and the policy allows no download.
+            NoReply: no component was found, or none responded.
             LinkError: the link failed, or the client was closed.
         """
         return await self._implementation.fetch_all(
@@ -328,7 +339,7 @@ class ParamClient:
         )
 
     def traffic_report(self) -> TrafficReport:
-        """What has gone over the link so far: who was heard, how fast, and what was lost on the way.
+        """Return the traffic statistics of the link: components, message rates, packet loss.
 
         Raises:
             UsageError: the client was made without `traffic=True`.
@@ -337,23 +348,23 @@ class ParamClient:
         return self._implementation.traffic_report()
 
     def signing_report(self) -> SigningReport | None:
-        """How the signatures on the link stand: what came signed, what was refused and why.
+        """Return the signing statistics of the link: signed frames, and refused frames with the reasons.
 
-        None where the client has no key.
+        None if the client has no key.
         """
         return self._implementation.signing_report()
 
 
 def implementation_of(client: ParamClient) -> Implementation:
-    """Return what a client forwards its calls to. For the modules of this package, as is `local_client`."""
+    """Return the implementation of a client. For the modules of this package only, as is `local_client`."""
     return client._implementation
 
 
 def local_client(client: ParamClient) -> LocalClient:
-    """Return what the package needs of a client beyond its public calls.
+    """Return the internal interface of a client.
 
     Raises:
-        UsageError: its links are those of a service.
+        UsageError: the client is connected to a service.
     """
     implementation = client._implementation
     if not isinstance(implementation, LinkClient):

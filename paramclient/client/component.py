@@ -1,4 +1,4 @@
-"""Component: the parameters of one component of a vehicle, and the calls on it, wherever its link is."""
+"""Component: parameters of one component of a vehicle, and its calls, over a link or a service."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ __all__ = ["Component"]
 
 
 class Component(ABC):
-    """One component of a vehicle, as `ParamClient.component` gives it.
+    """One component of a vehicle; see `ParamClient.component`.
 
-    All of its calls may be cancelled at any point, and the next call works. All of them wait on while a link
-    that comes back by itself is away, up to `LINK_PATIENCE` (in `client.link_task`); then, and when the
-    client is closed, they raise LinkError. A component that is lost (see `Lost`) is not asked: calls that
-    wait for an answer and new ones raise NoReply at once, but for a `fetch_all` under way, which goes on for
-    a while, as the vehicle may only be starting again. A component whose address several vehicles have (see
-    `Contested`) is not asked either: calls raise ContestedAddress. The table stays, and what is in it is
-    *cached* until the vehicle is back and has confirmed it.
+    All calls may be cancelled at any point; later calls are not affected. While a link reconnects, calls wait
+    for up to `LINK_TIMEOUT` (10 s, in `client.link_task`). After that, and when the client is closed, they
+    raise LinkError. A lost component (see `Lost`) receives no requests: waiting calls and new ones raise
+    NoReply immediately, except a running `fetch_all`, which continues for a while, as the vehicle may be
+    rebooting. A component whose address several vehicles use (see `Contested`) receives no requests either:
+    calls raise ContestedAddress. In both cases the table stays, and its values are *cached* until the vehicle
+    has confirmed them.
 
     Attributes:
-        system, component: its address.
-        params: all that is known of its parameters now, by name: live, verified or cached, see `Trust`. The
-            mapping is read-only and follows what is heard.
+        system, component: MAVLink ids of the component.
+        params: the known parameters by name: live, verified or cached, see `Trust`. The mapping is read-only
+            and follows the received messages.
     """
 
     system: int
@@ -45,96 +45,102 @@ class Component(ABC):
     @property
     @abstractmethod
     def autopilot(self) -> str:
-        """What its heartbeat says it runs: px4, ardupilot, generic, …; "unknown" before a heartbeat came."""
+        """Autopilot of its heartbeat: px4, ardupilot, generic, …; "unknown" before the first heartbeat."""
 
     @property
     @abstractmethod
     def identity(self) -> Identity:
-        """Who the vehicle is: hardware id, firmware, capabilities, as far as known."""
+        """Identity of the vehicle from AUTOPILOT_VERSION: hardware id, firmware, capabilities, if known."""
 
     @property
     @abstractmethod
     def encoding(self) -> Encoding:
-        """How it lays values into messages."""
+        """Encoding of its parameter values in messages: bytewise or C cast."""
 
     @property
     @abstractmethod
     def encoding_reason(self) -> str:
-        """Why that is believed, in words."""
+        """The reason for `encoding`, as text."""
 
     @property
     @abstractmethod
     def count(self) -> int | None:
-        """The number of parameters that it says it has, or None before it said so."""
+        """The `param_count` of the component; None before its first PARAM_VALUE."""
 
     @property
     @abstractmethod
     def hash(self) -> int | None:
-        """The PX4 hash under which the vehicle would confirm the table as it stands here, or None."""
+        """The PX4 hash (`_HASH_CHECK`) of the complete table; None if it is not known."""
 
     @property
     @abstractmethod
     def state(self) -> str:
-        """The table's state in a word: new, cached, fetching, synced, partial, contested, lost."""
+        """State of the table: new, cached, fetching, synced, partial, contested or lost."""
 
     @property
     @abstractmethod
     def sync_state(self) -> SyncState:
-        """How the table stands to the vehicle's: up to date, or what is done about it."""
+        """Whether the table matches the vehicle, and the running check or update."""
 
     @property
     @abstractmethod
     def address(self) -> Address:
-        """System and component: its key in `ParamClient.components`; with `split_peers` of this peer."""
+        """Its key in `ParamClient.components`: (system, component), with `split_peers` also the peer."""
 
     @property
     @abstractmethod
     def peer(self) -> str:
-        """The address and port that its messages come from and requests go to; empty while not known."""
+        """Address and port from which its messages arrive, and to which requests go; empty if unknown."""
 
     @property
     @abstractmethod
     def contest(self) -> Contest | None:
-        """Why it is open which vehicle this is, where several have its address; else None.
+        """The vehicles that share its address, and their differences; None if there is only one vehicle.
 
-        Meanwhile every call raises ContestedAddress, `params` stays as it was, and nothing goes to the cache.
+        During a contest, every call raises ContestedAddress, `params` does not change, and the cache receives
+        nothing.
         """
 
     @property
     @abstractmethod
     def is_armed(self) -> bool | None:
-        """Whether its motors may turn, by its last heartbeat.
+        """Whether the vehicle is armed, from `base_mode` of its last heartbeat.
 
-        None where that is not known: before a heartbeat, while it is lost, and in high-latency mode, in which
-        it sends none.
+        None if unknown: before the first heartbeat, while the component is lost, and in high-latency mode, in
+        which a vehicle sends no heartbeats.
         """
 
     @property
     @abstractmethod
     def silence(self) -> float:
-        """Seconds since it was heard last. After five without a word it is lost, see `Lost`."""
+        """Seconds since its last message. After 5 s the component is lost, see `Lost`."""
 
     @property
     @abstractmethod
     def round_trip(self) -> float | None:
-        """The measured round trip in seconds, smoothed, or None before anything was answered."""
+        """Smoothed round-trip time in seconds; None before the first response."""
 
     @abstractmethod
     async def get(self, name: str | int, *, timeout: float | None = None) -> Param:
-        """Ask the vehicle for one parameter.
+        """Read one parameter from the vehicle with PARAM_REQUEST_READ.
 
-        Equal calls at the same time share one request. Different ones run side by side.
+        Concurrent calls for one parameter share a request. Calls for different parameters run in parallel.
+        Cancellation ends the request unless another call waits for it.
 
         Args:
             name: param_id, or an index from 0.
-            timeout: seconds until giving up; None leaves it to the number of tries, which follows the
-                measured round trip and loss.
+            timeout: seconds; None: the number of attempts, which follows the measured round-trip time and
+                packet loss, limits the time.
+
+        Returns:
+            The parameter as the vehicle has reported it.
 
         Raises:
-            UsageError: no such name or index can exist, or the client only listens.
-            UnknownParameter: the vehicle does not have it.
-            Refused: it gave a reason not to tell.
-            NoReply: it did not answer.
+            UsageError: the name or index is not valid, or the client only listens.
+            UnknownParameter: the vehicle has no such parameter.
+            Refused: the vehicle refused with a reason (PARAM_ERROR).
+            NoReply: the vehicle did not respond in time, or it is lost.
+            ContestedAddress: several vehicles use its address.
             LinkError: the link failed, or the client was closed.
         """
 
@@ -150,40 +156,40 @@ class Component(ABC):
         durable: bool = False,
         asker: str | None = None,
     ) -> SetResult:
-        """Write one parameter and prove by its value that the vehicle has taken it.
+        """Write one parameter with PARAM_SET and verify the value that the vehicle acknowledges.
 
-        The type is learnt first when it is not known. Writes to one name are done in the order of the calls,
-        those to different names side by side.
+        An unknown type is read from the vehicle first. Writes to one name run in the order of the calls,
+        writes to different names in parallel. After cancellation it is unknown whether the vehicle has the
+        value.
 
         Args:
             name: param_id.
-            value: a number; or the 4 bytes of the message for what cannot be said as a number.
+            value: a number; or the 4 bytes of the message for a value that is not expressible as a number.
             timeout: as in `get`.
-            settle: seconds, up to 60, for which the value is watched after its acknowledgement; then it is
-                read once more, and the result tells what has become of it. 1.2 is enough for PX4, whose
-                modules clamp values within a second. Without it such a change only comes as one of
-                `changes`.
+            settle: seconds, 0 to 60, for which the value is watched after its acknowledgement; then it is
+                read again, and the result has the final value. 1.2 is enough for PX4, whose modules clamp
+                values within a second. Without it, such a change only appears in `changes`.
             force: send NaN and infinity also to PX4, which cannot save them and may stop, and to ArduPilot,
                 which ignores them.
-            durable: return only when the value and its line of history are on the disk, past a loss of power.
-                Without it they are written within 0.25 s, and a loss of power may cost them later too.
-            asker: for whom it is done, in printable ASCII: the change, and its line of history, are then by
-                "us for ASKER".
+            durable: return only after the value and its history entry are synced to the disk, safe from power
+                loss. Otherwise they are written within 0.25 s, and a later power loss may still lose them.
+            asker: the user of the change, in printable ASCII: the change, and its history entry, then have
+                the author "us for ASKER".
 
         Returns:
-            Accepted, or adjusted: the vehicle made another value of it.
+            Accepted, or adjusted: the vehicle stored another value.
 
         Raises:
-            UsageError: the name, the value or another argument cannot be right, the value is NaN or infinite
+            UsageError: the name, the value or another argument is not valid, the value is NaN or infinite
                 and the autopilot cannot store that, or the client only listens. Nothing was written.
-            UnknownParameter: the vehicle does not have it.
-            Refused: it gave a reason.
-            TypeMismatch: it holds the parameter in another type.
-            ValueNotApplied: it keeps the value it had and gives no reason.
-            NoReply: it did not answer. Whether it has taken the value is not known, as after cancellation.
-            ContestedAddress: several vehicles have its address.
-            NotDurable: the vehicle has taken the value, and it could not be written to the disk.
-            CacheError: with `durable`, nothing can be written to the disk; nothing was sent.
+            UnknownParameter: the vehicle has no such parameter.
+            Refused: the vehicle refused with a reason (PARAM_ERROR).
+            TypeMismatch: the parameter has another type on the vehicle.
+            ValueNotApplied: the vehicle keeps its previous value and reports no reason.
+            NoReply: the vehicle did not respond. It is unknown whether it has the value.
+            ContestedAddress: several vehicles use its address.
+            NotDurable: the vehicle has accepted the value, but it could not be written to the disk.
+            CacheError: with `durable`, the disk cannot be written; nothing was sent.
             LinkError: the link failed, or the client was closed.
         """
 
@@ -198,108 +204,118 @@ class Component(ABC):
         timeout: float | None = None,
         progress: Callable[[Progress], None] | None = None,
     ) -> FetchResult:
-        """Bring the whole table up to date.
+        """Fetch all parameters. Uses the cache if the vehicle's hash matches, otherwise downloads.
 
-        Where the cache has a table and the vehicle a hash, the hash is asked for first; when it confirms the
-        table, nothing is downloaded. Then the values that the hash does not cover are read afresh in the
-        background: they stay *cached* until they have come, and `refreshed` waits for them.
+        If the cache has a table and the vehicle a hash, the client requests the hash first. If it matches,
+        nothing is downloaded, and the values outside the hash are read in the background: they stay *cached*
+        until then, and `refreshed` waits for them.
 
-        Otherwise the table comes as one packed file over MAVFTP where the component serves that: quicker than
-        the list, exact, and with the firmware's defaults. Else it comes by list. `source` and `notes` of the
-        result say what was done, and why.
+        Otherwise the client downloads the packed file `param.pck` over MAVFTP if the component serves it: it
+        is faster than the list, exact, and has the firmware's defaults. Else it downloads the list. `source`
+        and `notes` of the result give the source and the reason.
 
-        Where the client only listens, nothing is asked for: it waits for a list that others ask for, and then
-        ends when the table is whole, or 5 seconds after the last new value.
+        A client that only listens sends no request: it waits for a list that another station requests. The
+        fetch ends when the table is complete, or 5 s after the last new value.
 
-        It ends by itself in every case: indices that never answer are given up and named in `missing`.
-        Calls at the same time share one fetch. Cancelling it leaves what has come in the table.
+        The fetch always ends: indices without a response after all attempts are in `missing`. Concurrent
+        calls share one fetch. Cancellation keeps the received values in the table.
 
         Args:
-            refresh: download even when the hash would confirm the cached table.
-            accept: "sampled" where a vehicle without a hash may be believed to have the cached table when a
-                sample of it agrees (name, value, index and count), of the same hardware id, firmware version
-                and git hash. `sample` of the result then says how far that can be trusted, and nothing counts
-                as verified. Else "verified".
-            sample: how many parameters are read for that.
-            seed: of their draw; None for another one each time.
-            timeout: seconds, after which what has come is given with `missing`; None is 20 where the client
-                only listens.
+            refresh: download even if the hash would confirm the cached table.
+            accept: "verified", or "sampled": for a vehicle without a hash, accept the cached table if a
+                sample of it matches (name, value, index and count), and the hardware id, firmware version and
+                git hash are equal. `sample` of the result then quantifies the remaining risk, and no value
+                counts as verified.
+            sample: number of parameters to read for "sampled".
+            seed: seed of the random sample; None for a different sample each time.
+            timeout: seconds after which the partial table is returned with `missing`; None: no limit, except
+                20 s if the client only listens.
             progress: called about ten times a second, from this task.
 
+        Returns:
+            The parameters with their source, the missing indices and notes.
+
         Raises:
-            UsageError: there is no such `accept`, the sample is empty, or `refresh` is given where the policy
-                of the client allows no download, or it only listens.
+            UsageError: `accept` is unknown, the sample is empty, or `refresh` is given and the policy of the
+                client allows no download, or the client only listens.
             CacheError: nothing is cached, and the policy allows no download.
-            NoReply: nothing came at all, or it is lost.
+            NoReply: no response arrived, or the component is lost.
+            ContestedAddress: several vehicles use its address.
             LinkError: the link failed, or the client was closed.
         """
 
     @abstractmethod
     async def refreshed(self, *, timeout: float | None = None) -> None:
-        """Wait until the values that a hash does not cover have been read afresh after `fetch_all`.
+        """Wait until the values outside the hash have been read after `fetch_all`.
 
-        Returns at once where there are none. A value that cannot be read stays *cached*.
+        Returns immediately if there are none. A value that cannot be read stays *cached*. Cancellation does
+        not stop the reads.
+
+        Args:
+            timeout: seconds; None waits without limit.
 
         Raises:
-            NoReply: that took longer than `timeout`.
+            NoReply: the reads took longer than `timeout`.
             LinkError: the link failed, or the client was closed.
         """
 
     @abstractmethod
     async def setup_signing(self, key: SigningKey | None, *, link_is_safe: bool = False) -> None:
-        """Give a vehicle its signing key, or with None take it away, by SETUP_SIGNING.
+        """Send a new signing key to the vehicle with SETUP_SIGNING, or with None remove its key.
 
-        The key goes over the link in clear, so only where nobody listens: over a USB cable, a wire. Nothing
-        answers it; whether the vehicle has obeyed shows in a session with the new key. This one goes on with
-        its own, which must be the vehicle's until then, unless that trusts the link (ArduPilot trusts USB).
+        The key is sent unencrypted: use a link that no other party can read, such as a USB cable. MAVLink has
+        no acknowledgement for SETUP_SIGNING; a session with the new key shows whether the vehicle uses it.
+        This session keeps its own key, which must be the vehicle's current key unless the vehicle trusts the
+        link (ArduPilot trusts USB). After cancellation the vehicle may have the new key.
 
         Args:
-            key: its new key.
-            link_is_safe: that the user has said so.
+            key: the new key, or None.
+            link_is_safe: confirmation by the user that no other party can read the link.
 
         Raises:
-            UsageError: nobody has said that the link is safe, or the component speaks MAVLink 1.
+            UsageError: `link_is_safe` is False, or the component uses MAVLink 1.
             LinkError: the link failed, or the client was closed.
         """
 
     @abstractmethod
     async def reboot(self, *, system: int | None = None, timeout: float | None = None) -> Component:
-        """Let the vehicle start again, and wait until the same one is back.
+        """Reboot the vehicle, and wait until the same vehicle is back.
 
-        It is told to when what was written through this client has had the time to be saved (2.5 s after the
-        last write). That it has started again is seen by its clock, its heartbeat, the sequence numbers of
-        its frames or its silence, so an acknowledgement may be lost. Then its hardware id is asked for, or
-        where it has none, its heartbeat must name the same autopilot and type. Its table is *cached*
-        afterwards until it is confirmed, as after any start; parameters may be others now.
+        The command is sent 2.5 s after the last write of this client, so that the vehicle has saved it. The
+        client detects the reboot from the vehicle's clock, its heartbeat, its frame sequence numbers or its
+        silence, so the acknowledgement may be lost. Then it verifies the hardware id, or without one, the
+        autopilot and type of the heartbeat. As after every boot, the table is *cached* until it is confirmed;
+        parameters may have changed.
 
-        Calls at the same time share one restart. When the call is cancelled, the vehicle may start again all
-        the same.
+        Concurrent calls share one reboot. After cancellation the vehicle may reboot nevertheless.
 
         Args:
-            system: the system id that it takes with the start, where another one was set (MAV_SYS_ID of PX4,
-                SYSID_THISMAV of ArduCopter); then `ParamClient.successor` finds it there.
-            timeout: seconds until giving up; None for `REBOOT_PATIENCE`.
+            system: the new system id, if a changed one takes effect with the reboot (MAV_SYS_ID of PX4,
+                SYSID_THISMAV of ArduCopter); the client then finds the vehicle as `ParamClient.successor`
+                does.
+            timeout: seconds; None for `REBOOT_TIMEOUT` (60 s).
 
         Returns:
-            The component that it is now: this one, or the one with the other system id.
+            This component, or the component with the new system id.
 
         Raises:
-            CommandRefused: it does not want to, most likely because it is armed.
-            AnotherVehicle: another vehicle answers under its system id.
-            NoReply: it does not answer, or did not come back in time.
+            CommandRefused: the vehicle refused, most likely because it is armed.
+            AnotherVehicle: another vehicle responds under its system id.
+            NoReply: the vehicle did not respond, or was not back in time.
             LinkError: the link failed, or the client was closed.
         """
 
     @abstractmethod
     def changes(self) -> Changes:
-        """What changes from now on: `async for change in component.changes()`.
+        """Return a stream of parameter changes from now on: `async for change in component.changes()`.
 
-        Each change names the parameter, what was known before and what is known now. A value that is heard
-        for the first time is one too. Whoever is slow to ask gets several changes of one parameter as one,
-        so what waits is never more than one change for each parameter. An absence of the link does not end
-        it; it ends when nobody holds it any more. In a log it ends with that.
+        Each change has the name, the old and the new value. The first value of a parameter is a change too. A
+        slow consumer receives several changes of one parameter as one, so the queue has at most one change
+        for each parameter. The stream continues across a reconnection of the link. It is released with its
+        last reference, and ends with a replayed log. Cancelling the iteration loses no change.
 
         Raises:
-            LinkError: while waiting, when the link failed for good or the client was closed. What had come
-                before is given first.
+            LinkError: while iterating, after the queued changes: the link failed permanently, or the client
+                was closed.
+            NoReply: while iterating: the component was lost and is no longer followed.
         """

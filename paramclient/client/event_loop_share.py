@@ -1,4 +1,4 @@
-"""The links that are read in one event loop: they share its time."""
+"""Fair sharing of one event loop among the links that are read in it."""
 
 from __future__ import annotations
 
@@ -8,94 +8,96 @@ from typing import Final
 import anyio
 from anyio.lowlevel import RunVar
 
-__all__ = ["Crowd"]
+__all__ = ["EventLoopShare"]
 
-LONGEST_TURN: Final = 0.003
-"""Seconds of what came at once after which other tasks get their turn. With the last value of a list its hash
-is proven, which takes a millisecond more, and many lists may end at once."""
-SOME: Final = 16
-MANY: Final = 64
-"""Datagrams read at once for which a link waits for its turn, and that show that there are more: a link gives
-up to 128."""
-LASTING: Final = 0.02
-"""Seconds for which that says something of a link when it has done with them: who has more, reads again."""
-ENOUGH_LISTS: Final = 24
-"""Lists in bursts on all links together beside which no link begins a second one: so many take all the time
-that the program has."""
-LOOK_AGAIN: Final = 0.01
-"""Seconds after which a link that waits for the others looks at them again."""
+TURN_MAX: Final = 0.003
+"""Seconds of processing received datagrams after which a reader yields to other tasks. The last value of a
+list triggers the hash check, which takes 1 ms more, and many lists may end at the same time."""
+TURN_DATAGRAMS_MIN: Final = 16
+"""Datagrams of one read from which the reader waits for its turn before it processes them."""
+BACKLOG_DATAGRAMS_MIN: Final = 64
+"""Datagrams of one read that indicate a backlog, as a link returns at most 128."""
+BACKLOG_VALIDITY: Final = 0.02
+"""Seconds for which a backlog counts after its processing: a reader with more datagrams reads sooner."""
+BURST_LISTS_MAX: Final = 24
+"""Lists arriving in bursts on all links together, above which no link starts a second one: 24 lists use all
+CPU time of the program."""
+RECHECK_INTERVAL: Final = 0.01
+"""Seconds until a link that waits for other links checks them again."""
 
 
-class Crowd:
-    """What the readers of one event loop know of each other; see `of_this_loop`.
+class EventLoopShare:
+    """State shared by the link readers of one event loop; see `of_this_loop`.
 
     Attributes:
-        turn: who takes many datagrams holds it, and lets the event loop come round before the next one does.
+        turn: held by a reader that processes many datagrams. The reader yields to the event loop before it
+            releases the lock.
     """
 
     def __init__(self) -> None:
         self.turn = anyio.Lock(fast_acquire=True)
         self._readers: set[object] = set()
-        self._behind: dict[object, float] = {}  # by reader: until when there is more to be read
-        self._bursts: dict[object, int] = {}  # by reader: its lists that come in bursts
-        self._awaited: dict[object, int] = {}  # by reader: its lists that may do so soon
+        self._behind: dict[object, float] = {}  # by reader: time until which its backlog counts
+        self._bursts: dict[object, int] = {}  # by reader: number of lists that arrive in bursts
+        self._awaited: dict[object, int] = {}  # by reader: number of requested lists without a burst yet
 
     @staticmethod
-    def of_this_loop() -> Crowd:
-        """That of the event loop that runs."""
+    def of_this_loop() -> EventLoopShare:
+        """Return the instance of the running event loop."""
         try:
-            return _crowd.get()
+            return _share.get()
         except LookupError:
-            _crowd.set(crowd := Crowd())
-            return crowd
+            _share.set(share := EventLoopShare())
+            return share
 
     def joined(self, reader: object) -> None:
-        """A reader has begun."""
+        """Register a reader."""
         self._readers.add(reader)
 
     @property
     def has_others(self) -> bool:
-        """Whether there is more than one."""
+        """Whether more than one reader is registered."""
         return len(self._readers) > 1
 
     def came(self, reader: object, datagrams: int) -> None:
-        """A reader has read so many at once, and will say when it has taken them."""
+        """Record the number of datagrams of one read. The reader calls `taken` after processing them."""
         self._behind.pop(reader, None)
-        if datagrams >= MANY:
+        if datagrams >= BACKLOG_DATAGRAMS_MIN:
             self._behind[reader] = math.inf
 
     def taken(self, reader: object, now: float) -> None:
-        """It has."""
+        """Record that the reader has processed its datagrams."""
         if reader in self._behind:
-            self._behind[reader] = now + LASTING
+            self._behind[reader] = now + BACKLOG_VALIDITY
 
     def left(self, reader: object) -> None:
-        """A reader has ended."""
+        """Remove a reader."""
         self._readers.discard(reader)
         self._behind.pop(reader, None)
         self._bursts.pop(reader, None)
         self._awaited.pop(reader, None)
 
     def most_lists(self, reader: object, bursts: int, now: float, *, awaited: int = 0) -> float:
-        """How many lists a link may have running beside each other: one in any case.
+        """Return the number of lists that a link may download in parallel, at least 1.
 
-        No more, where more has come on any link than was read. A link that is alone has its own measure.
+        The result is 1 while any link has a backlog, and infinity while no other link downloads lists.
 
         Args:
-            reader: of the link.
-            bursts: how many of its lists come in bursts now.
-            awaited: how many may do so soon.
+            reader: the reader of the link.
+            bursts: number of its lists that arrive in bursts now.
+            awaited: number of its requested lists without a burst yet.
+            now: time of the event loop.
         """
         self._bursts[reader] = bursts
         self._awaited[reader] = awaited
         others = sum(self._bursts.values()) + sum(self._awaited.values()) - bursts - awaited
         if any(now < until for until in self._behind.values()):
             return 1
-        return max(ENOUGH_LISTS - others, 1) if others else math.inf
+        return max(BURST_LISTS_MAX - others, 1) if others else math.inf
 
     def is_busy_without(self, reader: object) -> bool:
-        """Whether lists come in bursts on other links: one that is only awaited takes no time of anybody."""
+        """Whether lists arrive in bursts on other links. Requested lists without a burst use no CPU time."""
         return any(bursts for each, bursts in self._bursts.items() if each is not reader)
 
 
-_crowd: RunVar[Crowd] = RunVar("paramclient crowd")
+_share: RunVar[EventLoopShare] = RunVar("paramclient event loop share")

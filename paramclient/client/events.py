@@ -1,4 +1,4 @@
-"""Events of components as users receive them, and their stream."""
+"""Public component events, and the stream that delivers them."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ __all__ = [
     "Rebooted",
     "Resynced",
     "Uncontested",
-    "told",
+    "public_event",
 ]
 
-MOST_EVENTS: Final = 1_000
-"""Events that wait for a slow listener; beyond that the oldest ones go."""
+EVENTS_MAX: Final = 1_000
+"""Maximum number of events queued for a consumer. Above it, the oldest are dropped."""
 
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """A component was heard for the first time.
+    """The first message of a component has arrived.
 
     Attributes:
-        component: which one.
+        component: the new component.
     """
 
     component: Component
@@ -41,11 +41,11 @@ class Heard:
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """A component is not heard any more: five seconds without a word from one that sent heartbeats.
+    """A component is lost: it has sent heartbeats before, and no message for 5 seconds.
 
     Attributes:
-        component: which one.
-        silence: seconds since it was heard last.
+        component: the lost component.
+        silence: seconds since its last message.
     """
 
     component: Component
@@ -54,11 +54,11 @@ class Lost:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A component that was lost is heard again. Who it is and its hash are being asked for.
+    """A lost component sends again. The client requests its identity and its hash.
 
     Attributes:
-        component: which one.
-        silence: seconds for which it was not heard.
+        component: the component.
+        silence: seconds without a message.
     """
 
     component: Component
@@ -67,12 +67,12 @@ class Found:
 
 @dataclass(frozen=True, slots=True)
 class Rebooted:
-    """A vehicle has started again: its clock went back, or its heartbeat says that it is booting.
+    """A vehicle has rebooted: its clock has jumped back, or its heartbeat reports MAV_STATE_BOOT.
 
-    For one that was told to (see `Component.reboot`), its silence may have shown it too.
+    During `Component.reboot`, silence may indicate the reboot too.
 
     Attributes:
-        component: which one.
+        component: the component that has rebooted.
     """
 
     component: Component
@@ -80,12 +80,12 @@ class Rebooted:
 
 @dataclass(frozen=True, slots=True)
 class Resynced:
-    """A table that had fallen behind the vehicle's, or might have, agrees with it again.
+    """A table that was stale, or possibly stale, matches the vehicle again.
 
     Attributes:
-        component: whose table.
-        changed: names of what had moved; empty where the hash showed that nothing had.
-        hash: the vehicle's hash that confirms the table, or None for one without.
+        component: the component of the table.
+        changed: names of the parameters that had changed; empty if the hash showed that none had.
+        hash: the vehicle's hash that confirms the table; None for a vehicle without a hash.
     """
 
     component: Component
@@ -95,12 +95,13 @@ class Resynced:
 
 @dataclass(frozen=True, slots=True)
 class Contested:
-    """Several vehicles have the address of a component. Its calls raise ContestedAddress until `Uncontested`,
-    and nothing of it goes to the cache.
+    """Several vehicles use the address of a component.
+
+    Until `Uncontested`, its calls raise ContestedAddress, and the cache receives nothing from it.
 
     Attributes:
-        component: which one.
-        contest: which vehicles, and what tells them apart.
+        component: the component with the shared address.
+        contest: the vehicles, and the differences between them.
     """
 
     component: Component
@@ -109,10 +110,10 @@ class Contested:
 
 @dataclass(frozen=True, slots=True)
 class Uncontested:
-    """One vehicle alone has the address of a component again. Who it is and its hash are being asked for.
+    """Only one vehicle uses the address of a component again. The client requests its identity and its hash.
 
     Attributes:
-        component: which one.
+        component: the component.
     """
 
     component: Component
@@ -121,8 +122,8 @@ class Uncontested:
 Event: TypeAlias = Heard | Lost | Found | Rebooted | Resynced | Contested | Uncontested
 
 
-def told(event: protocol.Event, component: Component) -> Event | None:
-    """An event of the protocol as listeners get it; None for those that are not for them."""
+def public_event(event: protocol.Event, component: Component) -> Event | None:
+    """Return the public event for a protocol event; None for internal events."""
     match event:
         case protocol.ComponentHeard():
             return Heard(component)
@@ -143,11 +144,14 @@ def told(event: protocol.Event, component: Component) -> Event | None:
 
 
 class Events(Subscription[Event]):
-    """What happens to components since this object was made; see `ParamClient.events`."""
+    """Stream of the component events since its creation; see `ParamClient.events`.
+
+    It queues at most `EVENTS_MAX` events and then drops the oldest.
+    """
 
     def __init__(self) -> None:
         super().__init__()
-        self._waiting: deque[Event] = deque(maxlen=MOST_EVENTS)
+        self._waiting: deque[Event] = deque(maxlen=EVENTS_MAX)
 
     def push(self, item: Event) -> None:
         """Add an event."""

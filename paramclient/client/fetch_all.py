@@ -1,4 +1,4 @@
-"""Fetch several components side by side: who takes part, how long to wait, what came of it."""
+"""Parallel fetches of several components: participants, timeouts, results."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import anyio
 import anyio.lowlevel
 
 from paramclient.client.arguments import PROGRESS_INTERVAL
-from paramclient.client.link_component import TIME_IS_OVER
+from paramclient.client.link_component import TIMEOUT_NOTE
 from paramclient.client.local import LocalComponent
 from paramclient.errors import CacheError, ContestedAddress, NoReply
 from paramclient.protocol.component import ComponentMachine
@@ -22,24 +22,26 @@ from paramclient.protocol.station import Address, Peer, Station
 
 __all__ = ["FetchTogether", "FetchedAll"]
 
-SILENT_PATIENCE: Final = 1.0
-"""Seconds for which a component that does not answer at all is asked, once another one is done."""
-PATIENCE_PER_ANSWER: Final = 4.0
-"""The same by the longest time in which another one has answered: where one process is all vehicles, or this
-one serves many links, an answer may come seconds later than it would from one alone."""
+SILENT_TIMEOUT: Final = 1.0
+"""Minimum timeout in seconds for a component without any response, once another fetch has ended."""
+SILENT_TIMEOUT_FACTOR: Final = 4.0
+"""The same timeout as a multiple of the longest response time of another component. If one process simulates
+all vehicles, or this process serves many links, responses may arrive seconds later than from a single
+vehicle."""
 
-BEGUN_AT_ONCE: Final = 32
-"""Fetches that are begun before the event loop comes round: 2 ms."""
+STARTED_FETCHES_MAX: Final = 32
+"""Fetches started in one iteration of the event loop: 32 take 2 ms."""
 
 
 @dataclass(frozen=True, slots=True)
 class FetchedAll:
-    """What a fetch of several components brought.
+    """Result of a fetch of several components.
 
     Attributes:
-        results: by (system, component), for those that answered.
-        silent: those that have not, each with its error: a CacheError where the policy allows no download and
-            nothing is cached.
+        results: results of the components that responded, by (system, component).
+        silent: errors of the other components, by (system, component). NoReply if the component did not
+            respond or is lost, CacheError if the policy allows no download and nothing is cached,
+            ContestedAddress if several vehicles use its address.
     """
 
     results: Mapping[Address, FetchResult]
@@ -47,7 +49,7 @@ class FetchedAll:
 
     @property
     def complete(self) -> bool:
-        """Whether everyone who answered gave every parameter."""
+        """Whether `results` has every parameter of every component that responded."""
         return all(result.complete for result in self.results.values())
 
 
@@ -55,9 +57,9 @@ class FetchTogether:
     """The fetches of all components of one system, or of every system.
 
     Args:
-        station: the protocol.
-        components: everyone heard; it may grow meanwhile.
-        system: of this system only.
+        station: the protocol core.
+        components: all components of the link, a live mapping.
+        system: id of the system to fetch, or None for every system.
         refresh: as in `Component.fetch_all`.
     """
 
@@ -77,7 +79,7 @@ class FetchTogether:
         self._is_cache_awaited = False
         self._unanswered: dict[Address, Fetch] = {}
         self._longest_answer = 0.0
-        self._unheard_at: dict[Address, float] = {}  # when those who have not answered were not heard either
+        self._unheard_at: dict[Address, float] = {}  # last time at which heartbeats were overdue
 
     async def run(
         self,
@@ -90,13 +92,15 @@ class FetchTogether:
         listen_until: float,
         progress: Callable[[Mapping[Address, Progress]], None] | None,
     ) -> FetchedAll:
-        """Fetch until nothing more may come.
+        """Fetch until `is_worth_waiting` returns False, or until the deadline.
+
+        Cancellation ends the fetches and keeps the received values in the tables.
 
         Args:
-            check: raises what ends it; called at each turn.
-            wake: is told that there may be something to send.
-            closed: waits until no file of a component is open on board that nobody wants any more.
-            until: ends it, with what has come.
+            check: raises an error if the link failed or the client was closed; called in each iteration.
+            wake: runs the sender.
+            closed: waits until the unused file session of a component is closed on board.
+            until: deadline; at this time the partial results are returned.
             hear_until, listen_until: as in `is_worth_waiting`.
             progress: called about ten times a second.
 
@@ -121,14 +125,14 @@ class FetchTogether:
                     progress(self.progress(anyio.current_time()))
         finally:
             self._end(anyio.current_time())
-            wake()  # they may have been in the way of others
+            wake()  # requests of other operations may have waited for these fetches
             for address in self._fetches:
                 await closed(self._station.components[address])
 
     def join(self, now: float) -> bool:
-        """Begin the fetches of components that have none yet, as soon as their cached table is there.
+        """Start the fetches of components whose cached table is loaded. Return whether any was due.
 
-        At most `BEGUN_AT_ONCE`, and those of one vehicle together. Gives whether any has begun.
+        It starts at most `STARTED_FETCHES_MAX` fetches, but all components of one vehicle together.
         """
         self._is_cache_awaited = False
         ready: dict[tuple[int, Peer], list[ComponentMachine]] = {}
@@ -146,7 +150,7 @@ class FetchTogether:
                 self._is_cache_awaited = True
         count = 0
         for machines in ready.values():
-            if count >= BEGUN_AT_ONCE:
+            if count >= STARTED_FETCHES_MAX:
                 break
             count += len(machines)
             begun = self._station.begin_fetches(machines, now, refresh=self._refresh)
@@ -156,12 +160,12 @@ class FetchTogether:
         return bool(ready)
 
     def is_worth_waiting(self, now: float, *, listen_until: float, hear_until: float) -> bool:
-        """Whether more may come.
+        """Return whether further results may arrive.
 
         Args:
-            now: the time.
-            listen_until: until then somebody else may be heard.
-            hear_until: until then it is waited for anybody at all.
+            now: time of the event loop.
+            listen_until: time until which further components may appear.
+            hear_until: time until which to wait for the first component.
         """
         if now < listen_until or self._is_cache_awaited:
             return True
@@ -169,16 +173,16 @@ class FetchTogether:
             return now < hear_until
         for address, fetch in list(self._unanswered.items()):
             self._look(address, fetch, now)
-        patience = math.inf
+        timeout = math.inf
         if any(fetch.result is not None for fetch in self._fetches.values()):
-            patience = max(SILENT_PATIENCE, PATIENCE_PER_ANSWER * self._longest_answer)
+            timeout = max(SILENT_TIMEOUT, SILENT_TIMEOUT_FACTOR * self._longest_answer)
         return any(
-            not fetch.done and (not fetch.is_silent or not self._is_mute(address, fetch, now, patience))
+            not fetch.done and (not fetch.is_silent or not self._is_mute(address, fetch, now, timeout))
             for address, fetch in self._fetches.items()
         )
 
     async def news(self, seconds: float) -> None:
-        """Wait until a fetch ends, but not longer than this."""
+        """Wait until a fetch ends, for at most this many seconds."""
         ended = anyio.Event()
         under_way = [fetch for fetch in self._fetches.values() if not fetch.done]
         for fetch in under_way:
@@ -192,14 +196,19 @@ class FetchTogether:
                     fetch.on_done.remove(ended.set)
 
     def progress(self, now: float) -> dict[Address, Progress]:
-        """How far each is."""
+        """Return the progress of each fetch, by (system, component)."""
         return {address: fetch.progress(now) for address, fetch in self._fetches.items()}
 
     def outcome(self, now: float, *, waited: float) -> FetchedAll:
-        """What came in so many seconds, also of those that are not over.
+        """Return the results so far, partial ones for fetches that have not ended.
+
+        Args:
+            now: time of the event loop.
+            waited: seconds since the start, for NoReply.
 
         Raises:
-            NoReply, CacheError, ContestedAddress: nothing came.
+            NoReply: no component responded.
+            CacheError, ContestedAddress: there is no result, and a component ended with this error.
             LinkError: the link failed, or the client was closed.
         """
         results: dict[Address, FetchResult] = {}
@@ -208,7 +217,7 @@ class FetchTogether:
             try:
                 if fetch.error is not None:
                     raise fetch.error
-                results[address] = fetch.result or fetch.partial(now, TIME_IS_OVER)
+                results[address] = fetch.result or fetch.partial(now, TIMEOUT_NOTE)
             except (NoReply, CacheError, ContestedAddress) as error:
                 silent[address] = error
         for address, component in self._components.items():
@@ -230,12 +239,12 @@ class FetchTogether:
         return FetchedAll(results, silent)
 
     def _end(self, now: float) -> None:
-        """Nobody waits for them any longer."""
+        """Release all fetches."""
         for address, fetch in self._fetches.items():
             self._station.components[address].end_fetch(fetch, now)
 
     def _look(self, address: Address, fetch: Fetch, now: float) -> None:
-        """See whether one has answered by now, and how long that took; or whether it was heard at all."""
+        """Record the response time of a component, or the time at which its heartbeats were overdue."""
         presence = self._station.components[address].presence
         answered_at = fetch.first_value_at
         if fetch.result is not None and fetch.result.source == "cache":
@@ -248,9 +257,9 @@ class FetchTogether:
         elif presence.is_overdue(now):
             self._unheard_at[address] = now
 
-    def _is_mute(self, address: Address, fetch: Fetch, now: float, patience: float) -> bool:
-        """Whether one could have answered for so long, was heard meanwhile, and has not answered."""
+    def _is_mute(self, address: Address, fetch: Fetch, now: float, timeout: float) -> bool:
+        """Return whether a component sends messages, but no response to its fetch for this many seconds."""
         presence = self._station.components[address].presence
         since = max(fetch.begun_at + fetch.held_up(now), self._unheard_at.get(address, -math.inf))
         is_heard = presence.heard_at >= since or presence.is_lost or not presence.has_beaten
-        return is_heard and now - since >= patience
+        return is_heard and now - since >= timeout

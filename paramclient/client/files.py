@@ -1,4 +1,4 @@
-"""The files of a component over MAVFTP, as users see them."""
+"""Ftp: MAVFTP file calls of one component."""
 
 from __future__ import annotations
 
@@ -19,13 +19,15 @@ Result = TypeVar("Result")
 
 
 class Ftp:
-    """Reads and writes the files of one component; `ParamClient.ftp` gives it.
+    """Reads and writes files of one component over MAVFTP; see `ParamClient.ftp`.
 
-    A vehicle serves one file at a time, so calls are done in order, a `fetch_all` that reads the parameter
-    file among them. However one ends, also cancelled, the file is closed on board.
+    A vehicle serves one file at a time, so calls run in order, including the file download of `fetch_all`.
+    After each call, also after an error or cancellation, the client closes the file session on board.
 
-    Every call raises FileTransferError when the vehicle says no, NoReply when it does not answer in time or
-    is lost, and LinkError when the link failed or the client was closed.
+    Raises:
+        FileTransferError: the vehicle reports an error.
+        NoReply: the vehicle does not respond in time, or it is lost.
+        LinkError: the link failed, or the client was closed.
     """
 
     def __init__(self, component: Component) -> None:
@@ -42,18 +44,19 @@ class Ftp:
         progress: Callable[[int, int | None], None] | None = None,
         limit: int = LARGEST_FILE,
     ) -> bytes:
-        """Read a whole file.
+        """Read a file and return its content.
 
         Args:
-            path: as the vehicle names it, such as `@PARAM/param.pck` or `/fs/microsd/log.txt`.
-            timeout: seconds; None leaves it to the number of tries, which follows the link.
-            progress: called about ten times a second, from this task, with the bytes that have come and the
-                size that the vehicle gives (None before it did; ArduPilot's is an estimate for files that
-                it makes up).
-            limit: bytes above which the file is not taken.
+            path: path on the vehicle, such as `@PARAM/param.pck` or `/fs/microsd/log.txt`.
+            timeout: seconds; None: the number of attempts, which follows the link quality, limits the time.
+            progress: called about ten times a second, from this task, with the received bytes and the file
+                size that the vehicle reports (None before the report; an estimate for files that ArduPilot
+                generates).
+            limit: maximum file size in bytes; a larger file is not read.
 
         Raises:
-            UsageError: the path cannot be.
+            UsageError: the path is not valid.
+            FileTransferError, NoReply, LinkError: as for every call, see `Ftp`.
         """
         what = f"the file {path}"
         files, now = self._begin(what)
@@ -62,12 +65,18 @@ class Ftp:
         return await self._wait(job, what, timeout, tell)
 
     async def write(self, path: str, data: bytes, *, timeout: float | None = None) -> None:
-        """Write a whole file in the place of one that may be there.
+        """Write a file, replacing an existing one.
 
-        When it fails or is cancelled half-way, what was written until then stays on board.
+        After an error or cancellation, the data written so far stays on board.
+
+        Args:
+            path: path on the vehicle.
+            data: content of the file.
+            timeout: as in `read`.
 
         Raises:
-            UsageError: the path cannot be.
+            UsageError: the path is not valid.
+            FileTransferError, NoReply, LinkError: as for every call, see `Ftp`.
         """
         what = f"the writing of {path}"
         files, now = self._begin(what)
@@ -77,10 +86,15 @@ class Ftp:
     async def list(
         self, path: str = "/", *, timeout: float | None = None
     ) -> builtins.tuple[DirectoryEntry, ...]:
-        """The entries of a directory.
+        """Return the entries of a directory.
+
+        Args:
+            path: path on the vehicle.
+            timeout: as in `read`.
 
         Raises:
-            UsageError: the path cannot be.
+            UsageError: the path is not valid.
+            FileTransferError, NoReply, LinkError: as for every call, see `Ftp`.
         """
         what = f"the directory {path}"
         files, now = self._begin(what)
@@ -88,10 +102,15 @@ class Ftp:
         return await self._wait(job, what, timeout)
 
     async def checksum(self, path: str, *, timeout: float | None = None) -> int:
-        """The CRC-32 of a file, computed on board: start value 0 and no final xor, as in PX4's hash.
+        """Return the CRC-32 of a file, computed on board: initial value 0, no final xor, as in PX4's hash.
+
+        Args:
+            path: path on the vehicle.
+            timeout: as in `read`.
 
         Raises:
-            UsageError: the path cannot be.
+            UsageError: the path is not valid.
+            FileTransferError, NoReply, LinkError: as for every call, see `Ftp`.
         """
         what = f"the checksum of {path}"
         files, now = self._begin(what)
@@ -99,7 +118,12 @@ class Ftp:
         return await self._wait(job, what, timeout)
 
     def _begin(self, what: str) -> builtins.tuple[FileTransfers, float]:
-        """What to ask, and the time, if anything may be asked."""
+        """Return the file transfers of the component and the time.
+
+        Raises:
+            NoReply: the component is lost.
+            LinkError: the link failed, or the client is not open.
+        """
         component, now = self._component, anyio.current_time()
         component.client.check_open()
         component.machine.check_present(f"{what} of {component.system}/{component.component}", now)

@@ -1,4 +1,4 @@
-"""One other program beside this one on the same link: every frame is passed on, both ways."""
+"""Forwarder: frames between the vehicle link and one other program, in both directions."""
 
 from __future__ import annotations
 
@@ -16,29 +16,30 @@ from paramclient.protocol.stats.sniffer import FrameCutter
 
 __all__ = ["Forwarder"]
 
-MOST_WAITING: Final = 1_000
-"""Frames that wait for a program that reads slowly; further ones are lost to it. A list of parameters, which
-PX4 sends in bursts, finds room."""
-FIRST_BACKOFF: Final = 0.5
-LONGEST_BACKOFF: Final = 5.0
-"""Seconds between two attempts to reach the program again: doubled from the first to the longest."""
+QUEUED_FRAMES_MAX: Final = 1_000
+"""Maximum number of frames queued for a slow program; further frames are dropped. A parameter list, which PX4
+sends in bursts, fits."""
+BACKOFF_MIN: Final = 0.5
+"""Seconds before the first attempt to reopen the link to the program; doubled after each attempt."""
+BACKOFF_MAX: Final = 5.0
+"""Maximum seconds between two attempts to reopen the link to the program."""
 
 logger = logging.getLogger(__name__)
 
 
 class Forwarder:
-    """Passes what a vehicle link delivers to another program, and what that sends to the vehicle link.
+    """Forwards received frames to another program, and frames of the program to the vehicle link.
 
-    Frames go whole and as they were; what this client itself sends is not passed on. A program that is slow,
-    or not there, is no reason to wait: what it has no room for is lost to it.
+    Frames are complete and unchanged. Frames that this client sends are not forwarded. A slow or absent
+    program does not block the client: frames above the queue limit are dropped.
 
     Args:
-        link: to the program.
-        is_stream: whether the vehicle link delivers a stream.
+        link: link to the program.
+        is_stream: whether the vehicle link delivers a byte stream.
 
     Attributes:
-        to_vehicle: takes each frame of the program; None for nobody, where nothing may be sent.
-        lost: frames that the program had no room for.
+        to_vehicle: called with each frame of the program; None if nothing may be sent to vehicles.
+        lost: number of dropped frames.
     """
 
     def __init__(self, link: Link, *, is_stream: bool) -> None:
@@ -52,36 +53,36 @@ class Forwarder:
         self._is_there = False
 
     async def open(self) -> None:
-        """Open the link to the program; one that may come later is waited for.
+        """Open the link to the program. A stream link that can reconnect may also open later, in `read`.
 
         Raises:
-            LinkError: it cannot be opened, and not later either.
+            LinkError: the link cannot be opened, and cannot be opened later.
         """
         try:
             await self._link.open()
             self._is_there = True
         except LinkError as error:
             if not (self._link.reconnects and self._link.is_stream):
-                raise  # a datagram reaches whoever comes later: there is nobody to wait for
-            logger.warning("%s; trying again until somebody is there", error)
+                raise  # a datagram link needs no listener to open: retries would not help
+            logger.warning("%s; retrying until the program listens", error)
 
     async def close(self) -> None:
         """Close the link to the program."""
         await self._link.close()
 
     def received(self, data: bytes, peer: Peer) -> None:
-        """Take what the vehicle link has delivered."""
+        """Queue received data for the program."""
         self._pass_on(self._from_vehicle.cut(data, peer))
 
     def sent(self, data: bytes) -> None:
-        """What went out is not for the program."""
+        """Ignore a sent frame: it is not forwarded."""
 
     def pause(self) -> None:
-        """The vehicle link is away."""
+        """Discard an incomplete frame: the vehicle link is disconnected."""
         self._pass_on(self._from_vehicle.flush())
 
     async def read(self) -> None:
-        """Take what the program sends, and reach it again when it was lost, until its link fails for good."""
+        """Receive frames of the program and reconnect to it, until its link fails permanently."""
         while True:
             try:
                 if not self._is_there:
@@ -94,33 +95,33 @@ class Forwarder:
                 self._is_there = False
                 self._from_program.flush()
                 if not self._link.reconnects:
-                    logger.warning("nothing is forwarded any more: %s", error)
+                    logger.warning("forwarding has stopped: %s", error)
                     return
-                logger.warning("%s; trying again", error)
+                logger.warning("%s; reconnecting", error)
 
     async def send(self) -> None:
-        """Give the program what waits for it, until cancelled."""
+        """Send the queued frames to the program, until cancelled."""
         while True:
             self._something_waits = anyio.Event()
             while self._waiting:
                 frame = self._waiting.popleft()
-                with suppress(LinkError):  # the reader's business
+                with suppress(LinkError):  # the reader reconnects
                     await self._link.send(frame, None)
             await self._something_waits.wait()
 
     async def _reach(self) -> None:
-        """Open the link again, for as long as it takes."""
-        backoff = FIRST_BACKOFF
+        """Reopen the link with backoff, without a time limit."""
+        backoff = BACKOFF_MIN
         while not self._is_there:
             await anyio.sleep(backoff)
-            backoff = min(2 * backoff, LONGEST_BACKOFF)
+            backoff = min(2 * backoff, BACKOFF_MAX)
             with suppress(LinkError):
                 await self._link.open()
                 self._is_there = True
-        logger.info("%s: open again", self._link.name)
+        logger.info("%s: reconnected", self._link.name)
 
     def _pass_on(self, frames: list[bytes]) -> None:
-        room = MOST_WAITING - len(self._waiting) if self._is_there else 0
+        room = QUEUED_FRAMES_MAX - len(self._waiting) if self._is_there else 0
         self.lost += max(0, len(frames) - room)
         if frames[:room]:
             self._waiting.extend(frames[:room])

@@ -15,19 +15,19 @@ import anyio
 import anyio.abc
 
 from paramclient.cache import ParamCache
-from paramclient.client.arguments import HEARING_PATIENCE, address_in_words
-from paramclient.client.cache_writer import WriteThrough, chosen_cache
+from paramclient.client.arguments import COMPONENT_TIMEOUT, address_in_words
+from paramclient.client.cache_writer import WriteThrough, choose_cache
 from paramclient.client.component import Component
-from paramclient.client.events import Events, told
+from paramclient.client.events import Events, public_event
 from paramclient.client.fetch_all import FetchedAll, FetchTogether
 from paramclient.client.files import Ftp
-from paramclient.client.link_component import LinkComponent, patience_of
-from paramclient.client.link_task import Carrier
+from paramclient.client.link_component import LinkComponent, fetch_timeout
+from paramclient.client.link_task import LinkTask
 from paramclient.client.local import LocalClient, local
 from paramclient.client.signing import Signing, refused_in_words
 from paramclient.client.signing_timestamps import TimestampKeeper
 from paramclient.client.stats import ClientStats
-from paramclient.client.taps import Beside
+from paramclient.client.taps import LinkTaps
 from paramclient.errors import ClientClosed, LinkError, NoReply, UsageError
 from paramclient.links import Link, ReplayLink, SimLink, create_link
 from paramclient.model.identity import Identity
@@ -63,12 +63,12 @@ if TYPE_CHECKING:
 __all__ = ["LinkClient", "LinkOptions"]
 
 LISTENING_TIME: Final = 1.2
-"""Seconds from opening in which every component has been heard: each sends a heartbeat once a second."""
-CLOSING_PATIENCE: Final = 0.5
-"""Seconds that closing waits for the hash after a write, where the next session could not do without it."""
-SESSION_PATIENCE: Final = 2.0
-"""Seconds that a closing client waits at most for file sessions to be closed on board. The request is on its
-way by then: a burst that runs on a radio lets it wait, and it is obeyed after that."""
+"""Seconds after opening in which every component has sent a message: each sends a heartbeat once a second."""
+CLOSING_HASH_TIMEOUT: Final = 0.5
+"""Seconds for which closing waits for the hash after a write, if the next session needs it for the cache."""
+SESSION_CLOSE_TIMEOUT: Final = 2.0
+"""Seconds for which closing waits for the end of file sessions on board. The request has been sent by then; a
+running burst on a radio delays it, and the vehicle executes it after the burst."""
 
 logger = logging.getLogger(__name__)
 protocol_logger = logging.getLogger("paramclient.protocol")
@@ -101,12 +101,12 @@ class LinkOptions:
             value = getattr(self, field.name)
             if value is not field.default and value != field.default:
                 raise UsageError(
-                    f"{field.name} is for a client with a link of its own; over a service, that decides"
+                    f"{field.name} is only for a client with its own link; a service has its own setting"
                 )
 
 
 class LinkClient(LocalClient):
-    """A client over a link of this process: the link, the protocol core, the cache and the tasks between.
+    """A client over a link of this process: the link, the protocol core, the cache and their tasks.
 
     Args:
         link: as in `ParamClient`, but for the address of a service.
@@ -119,10 +119,10 @@ class LinkClient(LocalClient):
     def __init__(self, link: str | Link | Endpoint, options: LinkOptions) -> None:
         for number in (options.system, options.component):
             if not 1 <= number <= 255:
-                raise UsageError(f"our own system and component ids are 1 to 255, not {number}")
+                raise UsageError(f"the client's system and component ids must be 1 to 255, not {number}")
         self._link = create_link(link)
         is_log = isinstance(self._link, ReplayLink)
-        self.cache = chosen_cache(options.cache, is_log=is_log)
+        self.cache = choose_cache(options.cache, is_log=is_log)
         self.station = Station(
             link=self._link.name,
             is_stream=self._link.is_stream,
@@ -148,8 +148,8 @@ class LinkClient(LocalClient):
         self._components: dict[Address, LinkComponent] = {}
         self._tasks: anyio.abc.TaskGroup | None = None
         self._outlasting: list[anyio.CancelScope] = []
-        self._beside = Beside(options.tlog, options.forward, is_stream=self._link.is_stream)
-        self.link_task = Carrier(
+        self._beside = LinkTaps(options.tlog, options.forward, is_stream=self._link.is_stream)
+        self.link_task = LinkTask(
             self._link,
             self.station,
             dispatch=self._dispatch,
@@ -220,7 +220,7 @@ class LinkClient(LocalClient):
             UsageError, LinkError: as from entering a `ParamClient`.
         """
         if self._is_entered:
-            raise UsageError("a ParamClient is opened once; make a new one")
+            raise UsageError("a ParamClient can be opened only once; create a new one")
         self._is_entered = True
         try:
             await self._link.open()
@@ -244,10 +244,12 @@ class LinkClient(LocalClient):
             tasks.start_soon(self._keeper.run, name="paramclient timestamp keeper")
 
     async def close(self, *, failed: bool) -> None:
-        """End every call that waits, write what is new, and release the link and the cache.
+        """End waiting calls, write new values, and release the link and the cache.
+
+        Cancellation does not skip these steps.
 
         Args:
-            failed: whether the body of the `async with` has raised: then no hash is waited for.
+            failed: whether the body of the `async with` has raised; then closing does not wait for a hash.
         """
         tasks = self._tasks
         assert tasks is not None
@@ -263,13 +265,13 @@ class LinkClient(LocalClient):
                 for scope in (*self._outlasting, tasks.cancel_scope):
                     scope.cancel()
             try:
-                # not told of the caller's exception: it would come out wrapped in a group
+                # not public_event of the caller's exception: it would come out wrapped in a group
                 await tasks.__aexit__(None, None, None)
             finally:
                 await self._release()
 
     async def _release(self) -> None:
-        """Give back the link and the cache, also when cancelled."""
+        """Close the link, the cache and the taps, also when cancelled."""
         logger.debug("%s: closing", self._link.name)
         with anyio.CancelScope(shield=True):
             try:
@@ -308,7 +310,7 @@ class LinkClient(LocalClient):
         component: int | None = None,
         *,
         peer: str | None = None,
-        timeout: float | None = HEARING_PATIENCE,
+        timeout: float | None = COMPONENT_TIMEOUT,
     ) -> Component:
         """See `ParamClient.component`."""
         self.check_open()
@@ -331,7 +333,7 @@ class LinkClient(LocalClient):
         component: int | None = None,
         *,
         peer: str | None = None,
-        timeout: float | None = HEARING_PATIENCE,
+        timeout: float | None = COMPONENT_TIMEOUT,
     ) -> Component:
         """See `ParamClient.only_component`."""
         if self._has_one_vehicle:
@@ -359,10 +361,11 @@ class LinkClient(LocalClient):
         wanted = address_in_words(system, component, peer) + refused_in_words(self.signing_report())
         if choice.due < math.inf:
             wanted += f", and {LOOK_TIME} s more to see that it is the only one"
+
         raise NoReply(wanted, attempts=0, waited=anyio.current_time() - began)
 
     async def successor(
-        self, component: Component, system: int, *, timeout: float | None = HEARING_PATIENCE
+        self, component: Component, system: int, *, timeout: float | None = COMPONENT_TIMEOUT
     ) -> Component:
         """See `ParamClient.successor`."""
         self.check_open()
@@ -390,7 +393,7 @@ class LinkClient(LocalClient):
     ) -> FetchedAll:
         """See `ParamClient.fetch_all`."""
         self.station.check_refresh(refresh)
-        timeout = patience_of(self.station, timeout)
+        timeout = fetch_timeout(self.station, timeout)
         began = anyio.current_time()
         together = FetchTogether(self.station, self._components, system, refresh=refresh)
         return await together.run(
@@ -398,7 +401,7 @@ class LinkClient(LocalClient):
             self.wake,
             self.wait_until_files_closed,
             until=math.inf if timeout is None else began + timeout,
-            hear_until=began + (HEARING_PATIENCE if timeout is None else timeout),
+            hear_until=began + (COMPONENT_TIMEOUT if timeout is None else timeout),
             listen_until=self.opened_at + LISTENING_TIME,
             progress=progress,
         )
@@ -406,7 +409,7 @@ class LinkClient(LocalClient):
     def traffic_report(self) -> TrafficReport:
         """See `ParamClient.traffic_report`."""
         if self.station.traffic is None:
-            raise UsageError("nothing is counted; use ParamClient(..., traffic=True)")
+            raise UsageError("this client does not count traffic; use ParamClient(..., traffic=True)")
         self.check_open()
         return self.station.traffic.report(anyio.current_time())
 
@@ -414,8 +417,7 @@ class LinkClient(LocalClient):
         """See `ParamClient.signing_report`."""
         return None if self.station.verifier is None else self.station.verifier.report()
 
-    # what has happened
-
+    # events of the protocol core
     async def _load(self, component: LinkComponent, identity: Identity) -> None:
         if await self.cache_writer.bring(component.machine, identity):
             component.cache_was_read()
@@ -423,7 +425,7 @@ class LinkClient(LocalClient):
             self._dispatch()
 
     def _dispatch(self) -> None:
-        """Hand out what has happened."""
+        """Process the events of the protocol core: components, streams and cache."""
         is_to_be_written = False
         for event in self.station.events():
             machine = event.machine
@@ -467,13 +469,14 @@ class LinkClient(LocalClient):
             self._end_feeds(None)
 
     def _announce(self, event: Event) -> None:
-        """Tell those who listen, if it is for them."""
-        news = told(event, self._components[event.machine.address])
+        """Push an event to all streams, if it has a public form."""
+        news = public_event(event, self._components[event.machine.address])
         if news is not None:
             for events in list(self._subscriptions):
                 events.push(news)
 
     def _meet(self, machine: ComponentMachine) -> None:
+        """Add a new component, load its cached table, and request its hash if that may confirm the table."""
         address = (machine.system, machine.component)
         now = anyio.current_time()
         component = self._components[machine.address] = LinkComponent(self, machine, now)
@@ -482,16 +485,19 @@ class LinkClient(LocalClient):
             machine.sync.ask(now)
 
     def _read_cache(self, component: LinkComponent) -> None:
-        """Look for its cached table, once it is known whose it is."""
+        """Load the cached table of a component, if its identity is known."""
         machine = component.machine
         identity = component.settled_identity
         if identity is None or self.cache_writer.follow(machine, identity):
             return
-        assert self._tasks is not None, "nothing is heard before"
+        assert self._tasks is not None, "no message arrives before"
         self._tasks.start_soon(self._load, component, identity)
 
     def _pass_place_on(self, machine: ComponentMachine, *, is_lost: bool) -> None:
-        """A vehicle may have come back at another peer: one of those with equal ids is kept in the cache."""
+        """Pass the cache entry of a lost component to one with equal ids at another peer.
+
+        The vehicle may have returned at another peer. The cache has one table for equal ids.
+        """
         if is_lost:
             self.cache_writer.let_go(machine)
         for component in self._components.values():
@@ -505,10 +511,10 @@ class LinkClient(LocalClient):
         """See `LocalClient.wake`."""
         self.link_task.wake(machine)
 
-    # ends
+    # end of the link
 
     def _end(self, error: LinkError) -> None:
-        """No call can be answered any more."""
+        """End all calls and streams permanently with this error."""
         self._dispatch()
         self.link_task.fail_for_good(error)
         for component in self._components.values():
@@ -534,8 +540,8 @@ class LinkClient(LocalClient):
             raise ClientClosed("the client is not open; use it as `async with`", link=self._link.name)
 
     async def _let_hashes_settle(self) -> None:
-        """Wait for the hash after our writes, where it cannot be computed here."""
-        with anyio.move_on_after(CLOSING_PATIENCE):
+        """Wait for the hash after writes of this client, if it cannot be computed locally."""
+        with anyio.move_on_after(CLOSING_HASH_TIMEOUT):
             while any(
                 machine.is_settling and machine.table.complete and not machine.table.volatile_known
                 for machine in self.station.components.values()
@@ -543,25 +549,26 @@ class LinkClient(LocalClient):
                 await self.link_task.news.wait()
 
     async def _outlast(self, work: Callable[[], Awaitable[None]]) -> None:
-        """Do this until the files are closed, also when a scope around the client is cancelled before."""
+        """Run a task until file sessions are closed, also if a scope around the client is cancelled."""
         if self.link_task.ended is None:
             with anyio.CancelScope(shield=True) as scope:
                 self._outlasting.append(scope)
                 await work()
 
     async def _close_files(self, error: LinkError) -> None:
-        """End what still waits, and have the sessions of open files closed on board, also when cancelled.
+        """End waiting calls, and close open file sessions on board, also when cancelled.
 
-        ArduPilot has one session for all links: what stays open keeps everyone from its files for 3 s.
+        ArduPilot has one session for all links: an open session blocks file access of all stations for 3 s.
         """
         if self.link_task.broken is None:
             self.link_task.fail_calls(error)
             machines = [each for each in self.station.components.values() if each.files.is_closing]
             if not machines:
                 return
-            with anyio.CancelScope(shield=True), anyio.move_on_after(SESSION_PATIENCE):
+            with anyio.CancelScope(shield=True), anyio.move_on_after(SESSION_CLOSE_TIMEOUT):
                 async with anyio.create_task_group() as tasks:
-                    # `asyncio.run` cancels each task for itself when its main one has ended: these go on then
+                    # `asyncio.run` cancels the other tasks one by one when its main task has ended: these
+                    # replace the reader and the sender
                     tasks.start_soon(self.link_task.read)
                     tasks.start_soon(self.link_task.send)
                     for machine in machines:
@@ -569,7 +576,7 @@ class LinkClient(LocalClient):
                     tasks.cancel_scope.cancel()
 
     async def wait_until_files_closed(self, machine: ComponentMachine) -> None:
-        """See `LocalClient.wait_until_files_closed`. During a burst the vehicle ignores the request."""
+        """See `LocalClient.wait_until_files_closed`. During a burst, vehicles ignore the request."""
         if machine.files.is_closing and self.link_task.broken is None:
             with anyio.move_on_after(machine.round_trip.prompt_timeout):
                 await self._wait_until_closed(machine)
@@ -588,7 +595,7 @@ class LinkClient(LocalClient):
 
     @property
     def _has_one_vehicle(self) -> bool:
-        """Whether no vehicle can be taken for another: there is one, or none is written to."""
+        """Whether the choice of a vehicle cannot be wrong: there is only one, or nothing is sent."""
         return self.listens_only or (isinstance(self._link, SimLink) and self._link.has_one_vehicle)
 
     def _find(self, system: int | None, component: int | None, peer: str | None) -> LinkComponent | None:

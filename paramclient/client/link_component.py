@@ -49,22 +49,23 @@ from paramclient.protocol.wire import (
     SigningKey,
 )
 
-__all__ = ["LinkComponent", "patience_of"]
+__all__ = ["LinkComponent", "fetch_timeout"]
 
 Result = TypeVar("Result")
 
-REBOOT_PATIENCE = 60.0
-"""Seconds for a vehicle to start again and say who it is, unless the caller says otherwise: autopilots on
-small boards take up to half a minute, and those that calibrate sensors first a little longer."""
-IDENTITY_PATIENCE = 1.5
-"""Seconds to wait for a component to say who it is before its cached table is done without."""
-CACHE_PATIENCE = 5.0
-"""The same while its cached table is being read: for milliseconds, but hundreds may be wanted at once."""
-SETUP_TRIES = 3
-SETUP_PAUSE = 0.1
-"""How often SETUP_SIGNING is sent, and the seconds after each: nothing answers it, and frames get lost."""
-TIME_IS_OVER = "The time given for the fetch was over."
-"""Why a result is partial that a time limit ended."""
+REBOOT_TIMEOUT = 60.0
+"""Default timeout in seconds for a vehicle to reboot and report its identity: small autopilot boards take up
+to 30 s, and boards that calibrate sensors first a little longer."""
+IDENTITY_TIMEOUT = 1.5
+"""Timeout in seconds for the identity of a component, without which its cached table cannot be loaded."""
+CACHE_TIMEOUT = 5.0
+"""Timeout in seconds for loading a cached table: one takes milliseconds, but hundreds may be queued."""
+SETUP_SIGNING_COUNT = 3
+"""Number of SETUP_SIGNING messages sent: they have no acknowledgement, and a frame may be lost."""
+SETUP_SIGNING_INTERVAL = 0.1
+"""Seconds after each SETUP_SIGNING message."""
+TIMEOUT_NOTE = "The fetch ended at its timeout."
+"""Note of a partial result that a timeout ended."""
 
 
 class LinkComponent(LocalComponent):
@@ -81,7 +82,7 @@ class LinkComponent(LocalComponent):
         self.machine = machine
         self._heard_at = heard_at
         self._subscriptions: weakref.WeakSet[Changes] = weakref.WeakSet()
-        machine.tells_changes = False  # until somebody listens
+        machine.tells_changes = False  # until the first subscription
         self.system = machine.system
         self.component = machine.component
         self.params = ParamMap(machine.table.params)
@@ -196,7 +197,7 @@ class LinkComponent(LocalComponent):
     ) -> SetResult:
         """See `Component.set`."""
         if check_asked_name(name) == HASH_CHECK:
-            raise UsageError(f"{HASH_CHECK} is no parameter: it can be read, and not written")
+            raise UsageError(f"{HASH_CHECK} is read-only: it is the hash of the parameters, not a parameter")
         machine = self.machine
         self.client.check_open()
         machine.check_uncontested()
@@ -219,7 +220,9 @@ class LinkComponent(LocalComponent):
             try:
                 await self.client.cache_writer.write_durably(machine)
             except CacheError as error:
-                what = f"{self.system}/{self.component} has taken {name}, but it is not on the disk: {error}"
+                what = (
+                    f"{self.system}/{self.component} has accepted {name}, but it is not on the disk: {error}"
+                )
                 raise NotDurable(what) from error
         return result
 
@@ -240,7 +243,7 @@ class LinkComponent(LocalComponent):
         sampled = None
         if accept == "sampled" and not refresh:
             sampled = Sampled(sample, random.getrandbits(32) if seed is None else seed)
-        timeout = patience_of(self.client.station, timeout)
+        timeout = fetch_timeout(self.client.station, timeout)
         began = anyio.current_time()
         if not refresh:
             with anyio.move_on_after(timeout):
@@ -251,7 +254,7 @@ class LinkComponent(LocalComponent):
             result = await self.wait_for_fetch(fetch, None if timeout is None else began + timeout, progress)
         finally:
             machine.end_fetch(fetch, anyio.current_time())
-            self.wake()  # it may have been in the way of others
+            self.wake()  # requests of other operations may have waited for this fetch
             await self.wait_until_files_closed()
         return replace(result, elapsed=anyio.current_time() - began)
 
@@ -260,31 +263,31 @@ class LinkComponent(LocalComponent):
         self.client.check_open()
         refresh = self.machine.refresh
         if refresh is not None:
-            await self.wait(refresh, timeout, lambda: ("the values that no hash covers", 0))
+            await self.wait(refresh, timeout, lambda: ("the values outside the hash", 0))
 
     async def setup_signing(self, key: SigningKey | None, *, link_is_safe: bool = False) -> None:
         """See `Component.setup_signing`."""
         if not link_is_safe:
             raise UsageError(
-                "SETUP_SIGNING carries the key in clear: only over a link on which nobody else can listen, "
-                "and with link_is_safe=True"
+                "SETUP_SIGNING sends the key unencrypted. Use a link that no other party can read, such as"
+                " USB, and pass link_is_safe=True"
             )
         if self.machine.version == 1:
-            raise UsageError(f"{self.system}/{self.component} speaks MAVLink 1, which knows no signatures")
-        for _ in range(SETUP_TRIES):
+            raise UsageError(f"{self.system}/{self.component} uses MAVLink 1, which has no signing")
+        for _ in range(SETUP_SIGNING_COUNT):
             self.client.check_open()
             timestamp = 0 if key is None else timestamp_now()
             self.client.station.send_setup_signing(
                 self.system, self.component, key, timestamp, peer=self.machine.vehicle[1]
             )
             self.client.wake()
-            await anyio.sleep(SETUP_PAUSE)
+            await anyio.sleep(SETUP_SIGNING_INTERVAL)
 
     async def reboot(self, *, system: int | None = None, timeout: float | None = None) -> Component:
         """See `Component.reboot`."""
         self.client.check_open()
         moves = system is not None and system != self.system
-        deadline = anyio.current_time() + (REBOOT_PATIENCE if timeout is None else timeout)
+        deadline = anyio.current_time() + (REBOOT_TIMEOUT if timeout is None else timeout)
         machine = self.machine
         restart = machine.begin_restart(anyio.current_time(), returns=not moves)
         try:
@@ -313,33 +316,33 @@ class LinkComponent(LocalComponent):
     def is_cache_due(self, now: float) -> bool:
         """See `LocalComponent.is_cache_due`."""
         writer = self.client.cache_writer
-        patience = CACHE_PATIENCE if writer.is_bringing(self.machine) else IDENTITY_PATIENCE
+        timeout = CACHE_TIMEOUT if writer.is_bringing(self.machine) else IDENTITY_TIMEOUT
         return (
             self._cache_is_read.is_set()
             or not writer.may_have(self.system, self.component)
-            or now >= self._heard_at + patience
+            or now >= self._heard_at + timeout
         )
 
     async def wait_for_cache(self) -> None:
         """See `LocalComponent.wait_for_cache`."""
-        for patience in (IDENTITY_PATIENCE, CACHE_PATIENCE):
+        for timeout in (IDENTITY_TIMEOUT, CACHE_TIMEOUT):
             now = anyio.current_time()
             if not self.is_cache_due(now):
-                with anyio.move_on_after(self._heard_at + patience - now):
+                with anyio.move_on_after(self._heard_at + timeout - now):
                     await self._cache_is_read.wait()
                 self.client.check_open()
 
     async def _wait_until_kept(self) -> None:
-        """Wait until what is heard of it goes to the cache, as long as that may take.
+        """Wait until the values of the component are written to the cache, for at most 6.5 s.
 
         Raises:
-            UsageError: the client keeps no cache.
-            CacheError: that is not so in time.
+            UsageError: the client has no cache.
+            CacheError: the values cannot be written, or the timeout is over.
         """
         writer = self.client.cache_writer
         if self.client.cache is None:
-            raise UsageError("durable needs a cache, and the client keeps none")
-        with anyio.move_on_after(IDENTITY_PATIENCE + CACHE_PATIENCE):
+            raise UsageError("durable needs a cache, and the client has none; open it with a cache")
+        with anyio.move_on_after(IDENTITY_TIMEOUT + CACHE_TIMEOUT):
             await self._cache_is_read.wait()
         self.client.check_open()
         if (why := writer.obstacle(self.machine)) is not None:
@@ -360,32 +363,32 @@ class LinkComponent(LocalComponent):
         """See `LocalComponent.ignore`."""
         self._subscriptions.discard(changes)
 
-    # what the client tells
+    # called by the client
 
     def cache_was_read(self) -> None:
-        """Take note that the cached table is in `params`, or that there is none."""
+        """Record that the cached table is in `params`, or that there is none."""
         self._cache_is_read.set()
 
     def take_change(self, event: ParamChanged | ParamsMoved) -> None:
-        """Take note that a parameter has changed, or several."""
+        """Publish a change of a parameter, or reset the state after a change of several."""
         if isinstance(event, ParamChanged):
             self._publish(event.change)
         self.machine.tells_changes, self.machine.has_moved = len(self._subscriptions) > 0, False
 
     def _publish(self, change: Change) -> None:
-        """Hand a change to everyone who listens."""
+        """Push a change to all streams."""
         for changes in list(self._subscriptions):
             changes.push(change)
 
     def forget(self) -> None:
-        """End everything that waits: it is lost, and not followed any more."""
+        """End all streams with NoReply: the component is lost and no longer followed."""
         self.client.cache_writer.part_with(self.machine)
         silence = anyio.current_time() - self.machine.presence.heard_at
         awaited = f"{address_in_words(self.system, self.component)} (lost)"
         self.end(NoReply(awaited, attempts=0, waited=silence))
 
     def end(self, error: ParamClientError | None) -> None:
-        """End all streams of changes: with this error, or as the log is over."""
+        """End all streams of changes: with this error, or with None at the end of a log."""
         for changes in list(self._subscriptions):
             changes.end(error)
 
@@ -429,7 +432,7 @@ class LinkComponent(LocalComponent):
             while not fetch.done:
                 now = anyio.current_time()
                 if deadline is not None and now >= deadline:
-                    return fetch.partial(now, TIME_IS_OVER)
+                    return fetch.partial(now, TIMEOUT_NOTE)
                 until = now + PROGRESS_INTERVAL if progress is not None else None
                 if deadline is not None:
                     until = deadline if until is None else min(until, deadline)
@@ -443,13 +446,18 @@ class LinkComponent(LocalComponent):
         return _outcome(fetch)
 
 
-def patience_of(station: Station, timeout: float | None) -> float | None:
-    """For how long a fetch waits: nothing tells whether others will ever ask, unless there is an end."""
+def fetch_timeout(station: Station, timeout: float | None) -> float | None:
+    """Return the timeout of a fetch in seconds, with a default if the client only listens.
+
+    Such a client cannot know whether another station will request a list. A log has an end, so it needs no
+    default.
+    """
     is_open = timeout is None and station.listens_only and not station.is_log
     return PASSIVE_TIMEOUT if is_open else timeout
 
 
 def _outcome(operation: Operation[Result]) -> Result:
+    """Return the result of an ended operation, or raise its error."""
     if operation.error is not None:
         raise operation.error
     assert operation.done
@@ -457,12 +465,13 @@ def _outcome(operation: Operation[Result]) -> Result:
 
 
 def _param_of(message: ParamValue, encoding: Encoding) -> Param:
-    """What a message says of what is not in the table: a hash, what has left it, what shares its name."""
+    """Return the parameter of a PARAM_VALUE outside the table: a hash, or a removed or duplicate name."""
     value, bits = decode(message.raw, message.param_type, encoding)
     index = None if message.param_index == NO_INDEX else message.param_index
     return Param(message.param_id, value, known_type(message.param_type), index, bits)
 
 
 def _read_of(machine: ComponentMachine, name: str | int) -> str:
+    """Return the description of a read, for NoReply."""
     what = name if isinstance(name, str) else f"parameter {name}"
     return f"{what} of {machine.system}/{machine.component}"

@@ -1,8 +1,8 @@
-"""What the package needs of a component and a client on a link of this process, beyond their public calls.
+"""LocalClient and LocalComponent: internal interface of a client and a component on a link of this process.
 
-`local` gives it for a component, `paramclient.client.client.local_client` for a client. The service,
-provision, metadata, diagnosis, MAVFTP and the fetch of several components use these names and no others. They
-are not part of `Component` and `ParamClient`. A component over a service has none of them.
+`local` returns it for a component, `paramclient.client.client.local_client` for a client. The service,
+provision, metadata, diagnosis, MAVFTP and the fetch of several components use only these names. They are not
+part of `Component` and `ParamClient`. A component over a service has none of them.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from paramclient.cache import ParamCache
 from paramclient.client.cache_writer import WriteThrough
 from paramclient.client.component import Component
 from paramclient.client.events import Events
-from paramclient.client.link_task import Carrier
+from paramclient.client.link_task import LinkTask
 from paramclient.client.subscription import Changes
 from paramclient.errors import UsageError
 from paramclient.links import Link
@@ -45,7 +45,7 @@ class LocalClient(Protocol):
 
     cache: ParamCache | None
     station: Station
-    link_task: Carrier
+    link_task: LinkTask
     cache_writer: WriteThrough
     opened_at: float
 
@@ -103,7 +103,7 @@ class LocalComponent(Component):
 
     @abstractmethod
     def is_cache_due(self, now: float) -> bool:
-        """Return whether the cached table is in `params`, or not to be waited for any longer."""
+        """Return whether the cached table is in `params`, or the timeout for it is over."""
 
     @abstractmethod
     async def wait_for_cache(self) -> None:
@@ -125,8 +125,8 @@ class LocalComponent(Component):
 
         Args:
             operation: begun by a call of `machine`.
-            timeout: seconds; None waits until the operation ends by itself.
-            describe: gives what is awaited, in words, and the number of attempts, for NoReply.
+            timeout: seconds; None waits until the operation ends.
+            describe: returns a description of the operation and the number of attempts, for NoReply.
             progress: called about ten times a second, from this task.
 
         Raises:
@@ -160,10 +160,10 @@ class LocalComponent(Component):
 
 
 def local(component: Component) -> LocalComponent:
-    """Return what the package needs of a component beyond its public calls.
+    """Return a component with its internal interface.
 
     Raises:
-        UsageError: its link is that of a service.
+        UsageError: the component belongs to a client over a service.
     """
     if not isinstance(component, LocalComponent):
         raise not_given("what this needs")
@@ -171,5 +171,5 @@ def local(component: Component) -> LocalComponent:
 
 
 def not_given(what: str) -> UsageError:
-    """Return the error for what a client over a service cannot do."""
+    """Return the UsageError for a feature that a client over a service does not have."""
     return UsageError(f"a service does not give {what}: use a program that has the link itself")

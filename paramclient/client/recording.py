@@ -1,4 +1,4 @@
-"""Everything that goes over a link into a telemetry log, in a thread, never in anybody's way."""
+"""Capture: a telemetry log (`.tlog`) of all frames of a link, written in a thread."""
 
 from __future__ import annotations
 
@@ -22,19 +22,22 @@ from paramclient.protocol.wire import bears_key, unsign_frame
 __all__ = ["Capture"]
 
 FLUSH_INTERVAL: Final = 0.25
-"""Seconds that frames are gathered for before they are written: what a killed process may lose."""
-MOST_UNWRITTEN: Final = 16 * 1024 * 1024
-"""Bytes that may wait for the disk: ten seconds of a link with 100 Mbit/s, an hour of a radio. A disk that
-falls further behind does not come back, and memory is not to follow it."""
+"""Seconds between two writes to the file: a killed process loses the frames of at most this time."""
+UNWRITTEN_BYTES_MAX: Final = 16 * 1024 * 1024
+"""Maximum number of bytes queued for the disk: 10 seconds of a link with 100 Mbit/s, an hour of a radio. A
+disk that falls further behind does not catch up, and the limit bounds memory."""
 
 _OURS: Final = None
-"""Who sent a frame of the station itself, in the place of a peer."""
+"""Value of `peer` for frames that this client sends."""
 
 logger = logging.getLogger(__name__)
 
 
 class _Chunk(NamedTuple):
-    """What came or went at a time; our own without a peer, and the end of what came before without data."""
+    """Data received or sent, with its time in `.tlog` encoding.
+
+    Sent data has no peer. Empty data marks the end of a stream.
+    """
 
     at: bytes
     peer: Peer | None
@@ -42,18 +45,18 @@ class _Chunk(NamedTuple):
 
 
 class Capture:
-    """Writes a `.tlog`: before each frame the time, eight bytes, big-endian, in unix microseconds.
+    """Writes a `.tlog`: each frame follows its time, eight bytes, big-endian, in unix microseconds.
 
-    Frames of both directions are written whole, without their signatures, in the order in which the client
-    read and sent them; the time is that of the reading, which may be up to 20 ms after the arrival. Damaged
-    frames, other bytes, and messages with a key for signing are left out.
+    The file has complete frames of both directions, without signatures, in the order in which the client read
+    and sent them. The time is that of the read, up to 20 ms after the arrival. Damaged frames, other bytes,
+    and messages with a signing key are omitted.
 
-    A file that cannot be written any more ends the capture with a warning in the log, and nothing else: what
-    stands in it up to there is whole.
+    A write error ends the capture with a warning in the log and has no other effect. The file then ends with
+    a complete frame.
 
     Args:
-        path: of a file that is made here.
-        is_stream: whether the link delivers a stream.
+        path: file to create.
+        is_stream: whether the link delivers a byte stream.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, is_stream: bool) -> None:
@@ -67,27 +70,27 @@ class Capture:
         self._something_to_write = anyio.Event()
 
     async def open(self) -> None:
-        """Make the file.
+        """Create the file.
 
         Raises:
-            UsageError: it exists, or cannot be made.
+            UsageError: the file exists, or cannot be created.
         """
         await self._worker.run(self._create)
 
     def received(self, data: bytes, peer: Peer) -> None:
-        """Take what the link has delivered; an empty chunk says that the peer's stream has ended."""
+        """Queue received data; empty data marks the end of the peer's stream."""
         self._take(peer, data)
 
     def sent(self, data: bytes) -> None:
-        """Take a frame that went out."""
+        """Queue a sent frame."""
         self._take(_OURS, data)
 
     def pause(self) -> None:
-        """The link is away: what was cut off by that is not continued."""
+        """Discard an incomplete frame: the link is disconnected."""
         self._unwritten.append(_Chunk(packed_time(time.time()), _OURS, b""))
 
     async def run(self) -> None:
-        """Write in batches, until cancelled."""
+        """Write the queued frames in batches, until cancelled or a write error."""
         while not self._has_failed:
             await self._something_to_write.wait()
             self._something_to_write = anyio.Event()
@@ -95,7 +98,7 @@ class Capture:
             await self._flush()
 
     async def close(self) -> None:
-        """Write what is left, and end the thread."""
+        """Write the queued frames, close the file and end the thread."""
         try:
             self.pause()
             await self._flush()
@@ -106,8 +109,8 @@ class Capture:
         if self._has_failed:
             return
         self._size += len(data)
-        if self._size > MOST_UNWRITTEN:
-            self._fail("the disk does not keep up")
+        if self._size > UNWRITTEN_BYTES_MAX:
+            self._fail("the disk is slower than the link")
             return
         self._unwritten.append(_Chunk(packed_time(time.time()), peer, data))
         self._something_to_write.set()
@@ -124,20 +127,26 @@ class Capture:
     def _fail(self, why: str) -> None:
         self._has_failed = True
         self._unwritten.clear()
-        logger.warning("nothing more is written to %s: %s", self._path, why)
+        logger.warning("the telemetry log %s ends here: %s", self._path, why)
 
-    # in the thread
+    # called in the thread
 
     def _create(self) -> None:
         try:
             self._file = os.open(self._path, os.O_CREAT | os.O_EXCL | os.O_WRONLY | _BINARY, 0o666)
         except FileExistsError:
-            raise UsageError(f"the log {self._path} exists, and is not written over; name another") from None
+            raise UsageError(
+                f"the log {self._path} exists and is not overwritten; name another file"
+            ) from None
         except OSError as error:
-            raise UsageError(f"the log {self._path} cannot be made: {error.strerror}") from error
+            raise UsageError(f"the log {self._path} cannot be created: {error.strerror}") from error
 
     def _write(self, batch: Sequence[_Chunk]) -> None:
-        """Write a batch; where that fails, the file ends with a whole frame all the same."""
+        """Write a batch. After an error, truncate the file to its last complete batch.
+
+        Raises:
+            OSError: the batch cannot be written.
+        """
         assert self._file is not None
         data = b"".join(part for chunk in batch for frame in self._cut(chunk) for part in (chunk.at, frame))
         whole = os.fstat(self._file).st_size
@@ -163,4 +172,5 @@ class Capture:
             self._file = None
 
 
-_BINARY: Final = getattr(os, "O_BINARY", 0)  # of Windows
+_BINARY: Final = getattr(os, "O_BINARY", 0)
+"""Flag of `os.open` on Windows for binary mode; 0 elsewhere."""

@@ -1,4 +1,4 @@
-"""Signing keys as users have them, and what a client is told of signing."""
+"""Signing: keys from files and the environment, and the signing options of a client."""
 
 from __future__ import annotations
 
@@ -16,28 +16,31 @@ from paramclient.protocol.wire import SigningKey, SigningPolicy, SigningReport, 
 __all__ = ["Signing", "key_from_environment", "read_key", "read_private", "refused_in_words", "timestamp_now"]
 
 KEY_VARIABLE: Final = "PARAMCLIENT_SIGNING_KEY"
+"""Environment variable with the key in 64 hexadecimal digits or base64."""
 FILE_VARIABLE: Final = "PARAMCLIENT_SIGNING_KEY_FILE"
+"""Environment variable with the path of a key file."""
 PASSPHRASE_VARIABLE: Final = "PARAMCLIENT_SIGNING_PASSPHRASE"
-LONGEST_FILE: Final = 1_000
-"""Bytes of a key file that are looked at: a key, in text or not, with some blank lines."""
+"""Environment variable with a passphrase from which the key is derived."""
+KEY_FILE_BYTES_MAX: Final = 1_000
+"""Maximum size of a key file in bytes: a binary or text key with some blank lines."""
 CREDENTIALS_VARIABLE: Final = "CREDENTIALS_DIRECTORY"
-"""The folder of the credentials of a unit, which nobody else can enter (systemd.exec, "Credentials")."""
+"""Environment variable with the credentials folder of a systemd unit, which only the unit can access
+(systemd.exec, "Credentials")."""
 
 
 @dataclass(frozen=True, slots=True)
 class Signing:
-    """How a client signs what it sends, and what it takes of what comes.
+    """MAVLink 2 signing of a client: signatures of sent frames, and checks of received frames.
 
     Attributes:
-        key: the key, which the vehicle has too.
-        policy: what is accepted, see `SigningPolicy`; also its value, such as `"signed-only"`.
-        link_id: the id of this link in our signatures, 0 to 255. None: the lowest that no other session on
-            this machine uses with this key, so that the timestamps of two sessions never get into each
-            other's way.
-        state: the folder in which the timestamps are kept; None for the user's own.
+        key: the secret key, the same as on the vehicle.
+        policy: which frames are accepted, see `SigningPolicy`; or its value, such as `"signed-only"`.
+        link_id: link id in the signatures of this client, 0 to 255. None: the lowest that no other session on
+            this machine uses with this key, so that the timestamps of two sessions do not conflict.
+        state: folder for the signature timestamps; None for the user's state folder.
 
     Raises:
-        UsageError: there is no such policy or link id.
+        UsageError: the policy is unknown, or the link id is out of range.
     """
 
     key: SigningKey
@@ -48,41 +51,41 @@ class Signing:
     def __post_init__(self) -> None:
         if self.policy not in list(SigningPolicy):
             known = ", ".join(SigningPolicy)
-            raise UsageError(f"there is no signing policy {self.policy!r}, only {known}")
+            raise UsageError(f"unknown signing policy {self.policy!r}; choose one of {known}")
         if self.link_id is not None and not 0 <= self.link_id <= 255:
-            raise UsageError(f"a link id is a number from 0 to 255, not {self.link_id}")
+            raise UsageError(f"a signing link id must be 0 to 255, not {self.link_id}")
 
 
 def read_key(path: str | os.PathLike[str]) -> SigningKey:
-    """The key in a file: its 32 bytes as they are, 64 hexadecimal digits, or base64.
+    """Read a signing key from a file with 32 raw bytes, 64 hexadecimal digits, or base64.
 
     Raises:
-        UsageError: the file cannot be read, is open to others than its owner (where there are such modes),
-            or holds no key. The text never tells what it holds.
+        UsageError: the file cannot be read, has no valid key, belongs to another user, or is accessible to
+            other users than its owner (on systems with file modes). The message never includes its content.
     """
-    data = read_private(path, "signing key", LONGEST_FILE + 1)
+    data = read_private(path, "signing key", KEY_FILE_BYTES_MAX + 1)
     try:
         if len(data) == 32:
             return SigningKey(data)
-        if len(data) > LONGEST_FILE:
-            raise UsageError(f"a signing key is no file of more than {LONGEST_FILE} bytes")
+        if len(data) > KEY_FILE_BYTES_MAX:
+            raise UsageError(f"a signing key file has at most {KEY_FILE_BYTES_MAX} bytes; this one is larger")
         return SigningKey.from_text(data.decode("ascii", "replace"))
     except UsageError as error:
         raise UsageError(f"{os.fspath(path)}: {error}") from None
 
 
 def read_private(path: str | os.PathLike[str], what: str, most: int) -> bytes:
-    """The first so many bytes of a file that is its owner's alone.
+    """Read the start of a file that only its owner can access.
 
     Args:
         path: the file.
-        what: what it holds, for errors.
-        most: bytes that are read.
+        what: kind of its content, for errors.
+        most: maximum number of bytes to read.
 
     Raises:
-        UsageError: it cannot be read, belongs to another user than that of this process or root, or is open
-            to others than its owner (where there are such modes). Also root does not take another user's: who
-            owns a file can change it.
+        UsageError: the file cannot be read, its owner is neither the user of this process nor root, or it is
+            accessible to other users than its owner (on systems with file modes). A process of root also
+            rejects a file of another user, as the owner of a file can change it.
     """
     try:
         with Path(path).open("rb") as file:
@@ -96,25 +99,26 @@ def read_private(path: str | os.PathLike[str], what: str, most: int) -> bytes:
             " `chown` it to the user of this program"
         )
     mode = mode_of(status)
-    # a credential of systemd has it since version 254 in the place of an entry of the access list, which lets
-    # the user of the unit read it, and for no group (systemd's issue 29435)
+    # since version 254, a systemd credential shows the group-read bit for the access-list entry of the unit's
+    # user, although no group can read it (systemd issue 29435)
     of_others = OF_OTHERS & ~GROUP_READS if _is_credential(path) else OF_OTHERS
     if mode & of_others:
         raise UsageError(
-            f"{os.fspath(path)}: others than its owner can get at this {what} (mode {mode:o}); "
-            "`chmod 600` ends that, and what others may have read is better replaced"
+            f"{os.fspath(path)}: other users than its owner can access this {what} (mode {mode:o}); "
+            "run `chmod 600` on it, and replace it if another user may have read it"
         )
     return data
 
 
 def key_from_environment(environment: Mapping[str, str] = os.environ) -> SigningKey | None:
-    """The key that the environment names, or None.
+    """Return the signing key of the environment, or None.
 
-    `PARAMCLIENT_SIGNING_KEY` has it in 64 hexadecimal digits or base64, `PARAMCLIENT_SIGNING_KEY_FILE` names
-    a file for `read_key`, `PARAMCLIENT_SIGNING_PASSPHRASE` has the passphrase of which it is made.
+    `PARAMCLIENT_SIGNING_KEY` has the key in 64 hexadecimal digits or base64, `PARAMCLIENT_SIGNING_KEY_FILE`
+    the path of a file for `read_key`, `PARAMCLIENT_SIGNING_PASSPHRASE` a passphrase from which the key is
+    derived.
 
     Raises:
-        UsageError: there are several of them, or what one of them has is no key.
+        UsageError: several of these variables are set, or the value of one is not valid.
     """
     makers = {
         KEY_VARIABLE: SigningKey.from_text,
@@ -125,7 +129,7 @@ def key_from_environment(environment: Mapping[str, str] = os.environ) -> Signing
     if not given:
         return None
     if len(given) > 1:
-        raise UsageError(f"one signing key is enough; the environment has {' and '.join(given)}")
+        raise UsageError(f"several signing keys in the environment: {' and '.join(given)}; set only one")
     try:
         return makers[given[0]](environment[given[0]])
     except UsageError as error:
@@ -133,18 +137,18 @@ def key_from_environment(environment: Mapping[str, str] = os.environ) -> Signing
 
 
 def timestamp_now() -> int:
-    """The timestamp of this moment, by the system's clock."""
+    """Return the current time of the system clock as a signature timestamp."""
     return timestamp_of(time.time())
 
 
 def refused_in_words(report: SigningReport | None) -> str:
-    """Why somebody may be there and not be heard, for the end of a sentence."""
+    """Return the numbers of refused frames with reasons, as the end of a message; "" if there are none."""
     refused = {} if report is None else report.refused
     reasons = ", ".join(f"{count} for: {reason}" for reason, count in refused.items())
     return f" (frames were refused, {reasons})" if reasons else ""
 
 
 def _is_credential(path: str | os.PathLike[str]) -> bool:
-    """Whether systemd has given this file to the unit that we are."""
+    """Return whether a file is in the credentials folder of the systemd unit of this process."""
     folder = os.environ.get(CREDENTIALS_VARIABLE, "")
     return folder != "" and Path(path).resolve().parent == Path(folder).resolve()

@@ -1,8 +1,8 @@
-"""The timestamps of signatures, from one session to the next: none is ever used twice.
+"""Persistent signature timestamps: no timestamp is used twice, also across sessions.
 
-Each session has a link id to itself, by a lock on a file, and for each key and link id stands on disk how
-far the timestamps may go. That is written ahead, so that neither every frame writes, nor a crash or a clock
-that went back leads to one that was used before.
+Each session locks a file for exclusive use of a link id. A file for each key and link id has an upper limit
+of the used timestamps. The limit is written ahead of use, so that not every frame causes a write, and neither
+a crash nor a clock that was set back leads to a reused timestamp.
 """
 
 from __future__ import annotations
@@ -25,31 +25,33 @@ from paramclient.protocol.wire.signing import MOST_AHEAD, UNITS
 
 __all__ = ["TimestampFile", "TimestampKeeper"]
 
-RESERVED: Final = 60 * UNITS
-"""How far ahead of use a timestamp is written down: at most so much is skipped after a crash."""
-LEAST_RESERVED: Final = RESERVED // 2
-"""When so little of that is left, it is written again."""
-LOOK_INTERVAL: Final = 5.0
-"""Seconds between two looks at how much is left."""
+TIMESTAMP_RESERVE: Final = 60 * UNITS
+"""Timestamp units (60 s) by which the written limit is ahead of the used timestamps. A crash skips at most
+this many."""
+TIMESTAMP_RESERVE_MIN: Final = TIMESTAMP_RESERVE // 2
+"""Remaining timestamp units at which a new limit is written."""
+CHECK_INTERVAL: Final = 5.0
+"""Seconds between two checks of the remaining timestamps."""
 LINK_IDS: Final = 256
+"""Number of link ids: a signature has 8 bits for it."""
 
 logger = logging.getLogger(__name__)
 
 
 class TimestampFile:
-    """How far the timestamps of one key on one link id have gone. Its methods block.
+    """The file with the timestamp limit of one key and link id. Its methods block.
 
     Args:
-        folder: where it is kept.
-        fingerprint: of the key.
-        link_id: the link id; None for the lowest that is free.
+        folder: folder of the files.
+        fingerprint: fingerprint of the key.
+        link_id: the link id; None for the lowest free one.
 
     Attributes:
-        link_id: the link id, once there is one.
+        link_id: the link id; None until `claim` if it was not given.
 
     Raises:
-        UsageError: on `claim`: another session has this link id, or others have all of them.
-        OSError: the folder cannot be used.
+        UsageError: on `claim`: other sessions use this link id, or all link ids.
+        OSError: the folder cannot be read or written.
     """
 
     def __init__(self, folder: Path, fingerprint: str, link_id: int | None) -> None:
@@ -59,7 +61,12 @@ class TimestampFile:
         self._lock: int | None = None
 
     def claim(self) -> int:
-        """Take a link id for this session alone; gives the last timestamp that may have been used, or 0."""
+        """Lock a link id for this session and return the last timestamp that may have been used, or 0.
+
+        Raises:
+            UsageError: other sessions use this link id, or all link ids.
+            OSError: the folder cannot be read or written.
+        """
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         for link_id in range(LINK_IDS) if self.link_id is None else (self.link_id,):
             self._lock = _locked(self._path(link_id, "lock"))
@@ -70,7 +77,11 @@ class TimestampFile:
         raise UsageError(f"{which} of this signing key is in use by other sessions on this machine")
 
     def write(self, timestamp: int) -> None:
-        """Let timestamps up to this one be used."""
+        """Write the limit up to which timestamps may be used, and flush it to the disk.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
         path = self._path(self.link_id, "timestamp")
         fresh = path.with_suffix(".new")
         with open(fresh, "w", encoding="ascii", opener=_private) as file:
@@ -80,7 +91,7 @@ class TimestampFile:
         fresh.replace(path)
 
     def release(self) -> None:
-        """Leave the link id to others."""
+        """Unlock the link id for other sessions."""
         lock, self._lock = self._lock, None
         if lock is not None:
             os.close(lock)
@@ -91,9 +102,9 @@ class TimestampFile:
             text = path.read_text(encoding="ascii", errors="replace")
         except FileNotFoundError:
             return 0
-        if text.strip().isdecimal() and (timestamp := int(text)) <= MOST_AHEAD + RESERVED:
+        if text.strip().isdecimal() and (timestamp := int(text)) <= MOST_AHEAD + TIMESTAMP_RESERVE:
             return timestamp
-        logger.warning("%s: holds no timestamp; the time of day counts", path)
+        logger.warning("%s: no valid signature timestamp; using the system clock", path)
         return 0
 
     def _path(self, link_id: int | None, kind: str) -> Path:
@@ -101,12 +112,12 @@ class TimestampFile:
 
 
 class TimestampKeeper:
-    """Sees to the timestamps of one client: `open`, then `run` for as long as it lives, then `close`.
+    """Stores the signature timestamps of one client: `open`, then `run` while it is open, then `close`.
 
-    A folder that cannot be used costs a warning; the time of day alone counts then.
+    If the folder cannot be used, it logs a warning, and timestamps start at the system clock.
 
     Args:
-        signing: what the user has said.
+        signing: the signing options of the client.
     """
 
     def __init__(self, signing: Signing) -> None:
@@ -120,10 +131,10 @@ class TimestampKeeper:
         self._is_kept = False
 
     async def open(self) -> tuple[Signer, Verifier]:
-        """What signs from here on, and what looks at signatures.
+        """Claim a link id, and return the signer and the verifier of the session.
 
         Raises:
-            UsageError: the link id is in use by another session.
+            UsageError: other sessions use the link id, or all link ids.
         """
         last = 0
         try:
@@ -139,13 +150,13 @@ class TimestampKeeper:
         return signer, Verifier(signer, SigningPolicy(self._signing.policy))
 
     async def run(self) -> None:
-        """Write ahead, for ever."""
+        """Write new limits ahead of use, until cancelled."""
         while True:
-            await anyio.sleep(LOOK_INTERVAL)
+            await anyio.sleep(CHECK_INTERVAL)
             await self._keep()
 
     async def close(self) -> None:
-        """Write down where it has ended, and leave the link id to others."""
+        """Write the last used timestamp and unlock the link id."""
         signer = self._signer
         if signer is not None and self._is_kept:
             await self._write(signer.timestamp)
@@ -154,8 +165,8 @@ class TimestampKeeper:
     async def _keep(self) -> None:
         signer = self._signer
         assert signer is not None, "open comes first"
-        if self._is_kept and self._written - signer.timestamp < LEAST_RESERVED:
-            await self._write(signer.timestamp + RESERVED)
+        if self._is_kept and self._written - signer.timestamp < TIMESTAMP_RESERVE_MIN:
+            await self._write(signer.timestamp + TIMESTAMP_RESERVE)
 
     async def _write(self, timestamp: int) -> None:
         try:
@@ -168,8 +179,9 @@ class TimestampKeeper:
 
     def _warn(self, error: OSError) -> None:
         logger.warning(
-            "%s: the timestamps of signatures cannot be kept (%s); if the clock goes back, vehicles refuse "
-            "what is signed until they have brought us up to theirs",
+            "%s: cannot store signature timestamps (%s). If the system clock is set back, vehicles refuse "
+            "signed frames until one of their signed frames has advanced the timestamp. Check the access "
+            "rights of the folder",
             self._folder,
             error.strerror,
         )
@@ -180,7 +192,11 @@ def _private(path: str, flags: int) -> int:
 
 
 def _locked(path: Path) -> int | None:
-    """A file's descriptor with the lock on it, or None where somebody else has that."""
+    """Open a file and lock it. Return its descriptor, or None if another session holds the lock.
+
+    Raises:
+        OSError: the file cannot be opened or locked.
+    """
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
     try:
         if try_to_lock(descriptor):

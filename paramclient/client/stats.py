@@ -1,4 +1,4 @@
-"""What a client has done so far, in numbers."""
+"""Counters of a client."""
 
 from __future__ import annotations
 
@@ -12,25 +12,24 @@ __all__ = ["ClientStats"]
 
 @dataclass(frozen=True, slots=True)
 class ClientStats:
-    """What a client has done since it was made; see `ParamClient.stats`.
+    """Counters of a client since its creation; see `ParamClient.stats`.
 
     Attributes:
-        bytes_received, bytes_sent: over the link, those of another program that shares it not among the sent.
-        frames_received, frames_sent: whole ones.
-        skipped: bytes that came and belong to no whole frame of a known id.
-        damaged: what looked like a frame of a known id and had a wrong checksum.
-        unusable_names: messages that were left out as no parameter file can hold the name in them, and values
-            of packed files likewise.
-        lost: frames that were lost on the way, by the gaps in their sequence numbers; None where the client
-            was made without `traffic=True`.
-        repeated: frames that came twice; None as before.
-        reads, writes: parameters that were asked for one by one, and written.
-        retries: requests of these that were sent for another time.
-        downloads: fetches that brought a whole table.
-        cache_hits: fetches that the cache settled, because the vehicle's hash confirmed it or a sample
-            agreed.
-        round_trips: the measured round trip in seconds, smoothed, by (system, component), of those that have
-            answered something.
+        bytes_received, bytes_sent: bytes on the link. `bytes_sent` excludes the frames of the forwarded
+            program.
+        frames_received, frames_sent: complete frames.
+        skipped: received bytes outside of complete frames with a known message id.
+        damaged: frames with a known message id and a wrong checksum.
+        unusable_names: ignored messages, and values of packed files, whose parameter name no parameter file
+            can hold.
+        lost: lost frames, by the gaps in their sequence numbers; None without `traffic=True`.
+        repeated: frames received twice; None without `traffic=True`.
+        reads, writes: parameters read one by one, and written.
+        retries: retransmitted requests of these reads and writes.
+        downloads: fetches that downloaded a complete table.
+        cache_hits: fetches served from the cache, because the vehicle's hash or a sample matched.
+        round_trips: smoothed round-trip time in seconds, by (system, component), of each component that has
+            responded to a request.
     """
 
     bytes_received: int
@@ -51,7 +50,13 @@ class ClientStats:
 
     @classmethod
     def of(cls, station: Station, *, downloads: int, cache_hits: int) -> ClientStats:
-        """Of the core of a client."""
+        """Return the counters of a client.
+
+        Args:
+            station: its protocol core.
+            downloads: number of complete downloads.
+            cache_hits: number of fetches served from the cache.
+        """
         frames, skipped, damaged = station.framing
         machines = station.components.values()
         return cls(

@@ -1,4 +1,4 @@
-"""Streams that a caller iterates over: the base of all, and the changes of one component's parameters."""
+"""Asynchronous streams: their base class, and the parameter changes of one component."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from paramclient.protocol.params.change import Change
 
 __all__ = ["Changes", "Subscription"]
 
-MOST_CHANGES: Final = 100_000
-"""Changes that wait for a slow listener, one for each name: more than a table can hold, as names may go and
-others come. Beyond that the oldest ones go."""
+QUEUED_CHANGES_MAX: Final = 100_000
+"""Maximum number of changes queued for a consumer, one for each name: more than a table holds, as names may
+be removed and others added. Above it, the oldest are dropped."""
 
 Item = TypeVar("Item")
 
 
 class Subscription(AsyncIterator[Item], Generic[Item]):
-    """What has come since it was made, one item for each `await`. Cancelled, it loses nothing."""
+    """Stream of the items since its creation, one for each `await`. Cancellation loses no item."""
 
     def __init__(self) -> None:
         self._error: ParamClientError | StopAsyncIteration | None = None
@@ -33,10 +33,10 @@ class Subscription(AsyncIterator[Item], Generic[Item]):
 
     @abstractmethod
     def _take(self) -> Item | None:
-        """The next item, or None while there is none."""
+        """Remove and return the next item; None while the queue is empty."""
 
     def end(self, error: ParamClientError | None) -> None:
-        """What waits is still given, then the error is raised; with None it is over, as a log is."""
+        """End the stream after the queued items: with this error, or with None as at the end of a log."""
         self._error = StopAsyncIteration() if error is None else error
         self._arrived.set()
 
@@ -54,14 +54,18 @@ class Subscription(AsyncIterator[Item], Generic[Item]):
 
 
 class Changes(Subscription[Change]):
-    """The changes of one component's parameters since this object was made; see `Component.changes`."""
+    """Stream of the parameter changes of one component since its creation; see `Component.changes`.
+
+    A slow consumer receives several changes of one parameter as one. The queue holds at most
+    `QUEUED_CHANGES_MAX` changes and then drops the oldest.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self._waiting: dict[str, Change] = {}
 
     def push(self, item: Change) -> None:
-        """Add a change, or join it with one of the same parameter that waits."""
+        """Add a change, or merge it with the queued change of the same parameter."""
         earlier = self._waiting.pop(item.name, None)
         if earlier is not None:
             item = Change(item.name, earlier.old, item.new, item.by)
@@ -69,7 +73,7 @@ class Changes(Subscription[Change]):
             if (old is None and new is None) or (old is not None and new is not None and old.same_value(new)):
                 return
         self._waiting[item.name] = item
-        if len(self._waiting) > MOST_CHANGES:
+        if len(self._waiting) > QUEUED_CHANGES_MAX:
             del self._waiting[next(iter(self._waiting))]
         self._arrived.set()
 

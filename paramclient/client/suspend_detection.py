@@ -1,4 +1,4 @@
-"""Whether time has passed in which nothing was done here: the computer slept, or the process was stopped."""
+"""Detection of suspend/resume of the computer, and of a stopped process."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ import sys
 import time
 from typing import Final
 
-__all__ = ["Standstill", "time_asleep"]
+__all__ = ["SuspendDetector", "time_asleep"]
 
-STANDSTILL: Final = 2.0
-"""Seconds from which an absence of ours counts. Below, no more than a heartbeat or two was missed, and what
-is late by so little is asked for once more at most."""
+SUSPEND_MIN: Final = 2.0
+"""Seconds of suspension from which it is reported. A shorter one misses at most two heartbeats, and causes at
+most one retry of a request."""
 
 
-class Standstill:
-    """Notices that nobody was at work here.
+class SuspendDetector:
+    """Detects that the event loop did not run.
 
-    A suspended computer shows it in one of two ways. Where the loop's clock goes on meanwhile (Windows), who
-    wanted to be woken is late by all of it, as in a process that was stopped or held up. Where it stands
-    still (Linux, macOS), another clock tells for how long that was.
+    There are two indications. If the clock of the event loop runs during suspend (Windows), a timer fires
+    late by the whole duration, as it does in a stopped process. If that clock stops during suspend (Linux,
+    macOS), the difference to a second clock gives the duration.
     """
 
     def __init__(self) -> None:
@@ -27,26 +27,33 @@ class Standstill:
         self._asleep = time_asleep()
 
     def expect(self, due: float) -> None:
-        """Work is to go on at this time at the latest; infinity while that is open."""
+        """Set the time at which the event loop is due to continue; infinity if there is no deadline."""
         self._due = due
 
     def unseen(self, now: float) -> float | None:
-        """Seconds that the clock has left out since it was asked last; None when nobody was away for long."""
+        """Return the seconds that the clock of the event loop left out since the last call.
+
+        None if there was no suspension of `SUSPEND_MIN` or longer. 0.0 for a suspension during which the
+        clock went on.
+
+        Args:
+            now: time of the event loop.
+        """
         late = now - self._due
         asleep = time_asleep()
         unseen = asleep - self._asleep
         self._asleep = asleep
-        if unseen < STANDSTILL and late < STANDSTILL:
+        if unseen < SUSPEND_MIN and late < SUSPEND_MIN:
             return None
         self._due = math.inf
         return max(unseen, 0.0)
 
 
 def time_asleep() -> float:
-    """Seconds for which this computer has slept, as far as the event loop's clock leaves them out."""
+    """Return the seconds of suspend since boot that the clock of the event loop leaves out."""
     if sys.platform == "linux":
         asleep = time.clock_gettime(time.CLOCK_BOOTTIME) - time.clock_gettime(time.CLOCK_MONOTONIC)
-    elif sys.platform == "darwin":  # its CLOCK_MONOTONIC goes on in sleep, see clock_gettime(3)
+    elif sys.platform == "darwin":  # its CLOCK_MONOTONIC runs during suspend, see clock_gettime(3)
         asleep = time.clock_gettime(time.CLOCK_MONOTONIC) - time.clock_gettime(time.CLOCK_UPTIME_RAW)
     else:
         asleep = 0.0

@@ -1,4 +1,4 @@
-"""What a client does with everything on the link beside its own work: a log, and another program's share."""
+"""The telemetry log and the forwarder of a client: both receive all frames of the link."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from paramclient.client.link_task import Tap
 from paramclient.client.recording import Capture
 from paramclient.links import Link, create_link
 
-__all__ = ["Beside"]
+__all__ = ["LinkTaps"]
 
 
-class Beside:
-    """The telemetry log and the other program of a client, as far as there are any.
+class LinkTaps:
+    """The optional telemetry log and the optional forwarder of a client.
 
     Args:
-        tlog: the log to be made, or None.
-        forward: the link to the other program, or None.
-        is_stream: whether the vehicle link delivers a stream.
+        tlog: path of the log to create, or None.
+        forward: link to the other program, or None.
+        is_stream: whether the vehicle link delivers a byte stream.
 
     Attributes:
-        forwarder: what passes frames on, or None.
-        taps: what is to be told of everything on the link.
+        forwarder: the forwarder, or None.
+        taps: the receivers of all data on the link.
     """
 
     def __init__(
@@ -46,15 +46,16 @@ class Beside:
             self.taps.append(self.forwarder)
 
     def share(self, to_vehicle: Callable[[bytes], None]) -> None:
-        """Let the program send to the vehicles too, by what takes each of its frames."""
+        """Pass the frames of the program to this function, which sends them to the vehicles."""
         if self.forwarder is not None:
             self.forwarder.to_vehicle = to_vehicle
 
     async def open(self) -> None:
-        """Make the log and open the link to the program.
+        """Open the link to the program and create the log.
 
         Raises:
-            UsageError, LinkError: as they say.
+            UsageError: the log exists or cannot be created.
+            LinkError: the link to the program cannot be opened.
         """
         if self.forwarder is not None:
             await self.forwarder.open()
@@ -62,7 +63,7 @@ class Beside:
             await self._capture.open()
 
     def start(self, tasks: anyio.abc.TaskGroup) -> None:
-        """Begin what is done until the tasks are cancelled."""
+        """Start the tasks of the forwarder and of the log in this task group."""
         if self.forwarder is not None:
             tasks.start_soon(self.forwarder.read, name="paramclient forward reader")
             tasks.start_soon(self.forwarder.send, name="paramclient forward sender")
@@ -70,7 +71,7 @@ class Beside:
             tasks.start_soon(self._capture.run, name="paramclient tlog writer")
 
     async def close(self) -> None:
-        """Write what is left of the log, and leave nothing behind."""
+        """Close the link to the program, write the remaining frames and close the log."""
         try:
             if self.forwarder is not None:
                 await self.forwarder.close()

@@ -1,4 +1,4 @@
-"""A thread for what blocks."""
+"""Worker: a thread for blocking calls."""
 
 from __future__ import annotations
 
@@ -22,13 +22,12 @@ ENDING_INTERVAL: Final = 0.01
 
 
 class Worker:
-    """One thread for calls that block. They are done in order; `close` ends it. What is asked for later is
-    done in a thread for that alone.
+    """One thread that runs blocking calls in order, until `close`. A call after `close` runs in a new thread.
 
-    Not a thread of anyio's pool: that would be left behind, idle, until the event loop ends.
+    A thread of anyio's pool would stay idle until the event loop ends.
 
     Args:
-        name: of the thread.
+        name: name of the thread.
     """
 
     def __init__(self, name: str) -> None:
@@ -40,10 +39,10 @@ class Worker:
         self._ended_with: Callable[[], Exception] | None = None
 
     async def run(self, work: Callable[[], Result]) -> Result:
-        """Do it in the thread. Cancelled, it is done all the same.
+        """Run a call in the thread and return its result. Cancellation does not stop a queued call.
 
         Raises:
-            Exception: that of `abandon`, where it had not ended by then.
+            Exception: that of `abandon`, if the call had not ended by then.
         """
         if self._ended_with is not None:
             raise self._ended_with()
@@ -80,7 +79,7 @@ class Worker:
             call.give_up(error())
 
     async def close(self, work: Callable[[], None]) -> None:
-        """Do a last piece of work, and end the thread."""
+        """Run a last call and end the thread."""
         if self._thread is None:
             work()
             return
@@ -89,14 +88,14 @@ class Worker:
             await self.run(work)
         finally:
             with anyio.CancelScope(shield=True):
-                while self._waiting:  # others may have asked for more, and the thread tells them here
+                while self._waiting:  # other tasks may have queued calls, and await their results here
                     await self.run(_nothing)
             self._is_closed = True
             self._end()
-        thread.join()  # at once: it has nothing more to do
+        thread.join()  # returns immediately: its queue is empty
 
     def _end(self) -> None:
-        """Let the thread end when it has done what it was given."""
+        """End the thread after its queued calls."""
         self._calls.put(None)
         self._thread = None
 

@@ -278,7 +278,7 @@ class RemoteComponent(Component):
 
     async def refreshed(self, *, timeout: float | None = None) -> None:
         """See `Component.refreshed`."""
-        await self._service.ask(self._mirrored, "refreshed", {}, timeout, "the values that no hash covers")
+        await self._service.ask(self._mirrored, "refreshed", {}, timeout, "the values outside the hash")
 
     async def setup_signing(self, key: SigningKey | None, *, link_is_safe: bool = False) -> None:
         """Refused: a key goes over a link on which nobody else can listen."""

@@ -48,7 +48,7 @@ class Follower(Protocol):
 class Connection:
     """Follows the events of a service, and carries calls to it.
 
-    Like a link that drops, it is made again with back-off; calls wait for that up to `LINK_PATIENCE` seconds
+    Like a link that drops, it is made again with back-off; calls wait for that up to `LINK_TIMEOUT` seconds
     (in `client.link_task`), then they and new ones raise LinkError until it is back.
 
     Args:
@@ -141,12 +141,12 @@ class Connection:
                         if is_write and failure.may_be_done:
                             raise self._unknown(awaited, failure) from failure.error.__cause__
                         now = anyio.current_time()
-                        if now - asked_at > link_task.LINK_PATIENCE:  # it had been reached
+                        if now - asked_at > link_task.LINK_TIMEOUT:  # it had been reached
                             failing_since = now
                         failing_since = min(failing_since, now)
-                        if now - failing_since >= link_task.LINK_PATIENCE:
+                        if now - failing_since >= link_task.LINK_TIMEOUT:
                             raise failure.error from failure.error.__cause__
-                        await anyio.sleep(link_task.FIRST_BACKOFF)
+                        await anyio.sleep(link_task.BACKOFF_MIN)
             finally:
                 self._scopes.discard(scope)
         self.check_open()
@@ -225,8 +225,8 @@ class Connection:
         if not self.is_away:
             logger.warning("%s; trying to reach it again", error)
             self.is_away = True
-            self._patience_ends = now + link_task.LINK_PATIENCE
-            self._backoff = link_task.FIRST_BACKOFF
+            self._patience_ends = now + link_task.LINK_TIMEOUT
+            self._backoff = link_task.BACKOFF_MIN
             self._follower.leave()
             self.tell()
         elif now >= self._patience_ends:
@@ -235,7 +235,7 @@ class Connection:
             self._fail_calls()
         patience = self._patience_ends - now
         await anyio.sleep(min(self._backoff, patience) if patience > 0 else self._backoff)
-        self._backoff = min(self._backoff * 2, link_task.LONGEST_BACKOFF)
+        self._backoff = min(self._backoff * 2, link_task.BACKOFF_MAX)
 
     async def _is_reached(self, deadline: float) -> bool:
         """Wait until it is; false when the time is over."""

@@ -22,7 +22,7 @@ from paramclient.remote.problems import NotHeard
 
 __all__ = ["Roster"]
 
-HEARING_PATIENCE: Final = 2.5
+COMPONENT_TIMEOUT: Final = 2.5
 """Seconds for a component to be heard by a service that has started again: it sends a heartbeat a second."""
 CATCHING_UP: Final = 2.0
 """Seconds for which an answer waits for the events of what it tells; they mostly came before it."""
@@ -253,7 +253,7 @@ class Roster:
             answer = await request(timeout=timeout)
         except NotHeard:
             left = None if timeout is None else began + timeout - anyio.current_time()
-            patience = min(HEARING_PATIENCE, HEARING_PATIENCE if left is None else left)
+            patience = min(COMPONENT_TIMEOUT, COMPONENT_TIMEOUT if left is None else left)
             await self._until_heard(mirrored, patience)
             left = None if timeout is None else began + timeout - anyio.current_time()
             answer = await request(timeout=left)

@@ -12,7 +12,7 @@ import anyio.abc
 import httpx
 
 from paramclient.cache import ParamCache
-from paramclient.client.arguments import HEARING_PATIENCE, address_in_words
+from paramclient.client.arguments import COMPONENT_TIMEOUT, address_in_words
 from paramclient.client.component import Component
 from paramclient.client.events import Events
 from paramclient.client.fetch_all import FetchedAll
@@ -146,7 +146,7 @@ class ServiceClient:
             UsageError, LinkError: as from entering a `RemoteClient`.
         """
         if self._is_entered:
-            raise UsageError("a ParamClient is opened once; make a new one")
+            raise UsageError("a ParamClient can be opened only once; create a new one")
         self._is_entered = True
         await self._requests.open()
         tasks = anyio.create_task_group()
@@ -216,7 +216,7 @@ class ServiceClient:
         component: int | None = None,
         *,
         peer: str | None = None,
-        timeout: float | None = HEARING_PATIENCE,
+        timeout: float | None = COMPONENT_TIMEOUT,
     ) -> Component:
         """See `ParamClient.component`. It is waited for also on links that the service cannot open yet.
 
@@ -233,7 +233,7 @@ class ServiceClient:
         component: int | None = None,
         *,
         peer: str | None = None,
-        timeout: float | None = HEARING_PATIENCE,
+        timeout: float | None = COMPONENT_TIMEOUT,
     ) -> Component:
         """See `ParamClient.only_component`. The vehicles on all links of the service count, or on the one
         that the address names.
@@ -265,7 +265,7 @@ class ServiceClient:
         return found.component
 
     async def successor(
-        self, component: Component, system: int, *, timeout: float | None = HEARING_PATIENCE
+        self, component: Component, system: int, *, timeout: float | None = COMPONENT_TIMEOUT
     ) -> Component:
         """See `ParamClient.successor`."""
         mirrored = mirrored_of(component)

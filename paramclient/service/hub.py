@@ -18,7 +18,7 @@ import anyio.lowlevel
 
 from paramclient.cache import SetupNotes
 from paramclient.client.arguments import address_in_words
-from paramclient.client.cache_writer import chosen_cache
+from paramclient.client.cache_writer import choose_cache
 from paramclient.client.client import ParamClient, local_client
 from paramclient.client.worker_thread import Worker
 from paramclient.documents.component import ProgressDoc
@@ -84,7 +84,7 @@ class Hub:
         fetches: bool = True,
         **options: Any,
     ) -> None:
-        self.cache = chosen_cache(cache, is_log=False)
+        self.cache = choose_cache(cache, is_log=False)
         self.feed = Feed()
         self.jobs = Jobs(self.feed)
         self.lines: dict[str, Line] = {}

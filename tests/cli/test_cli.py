@@ -1123,7 +1123,7 @@ def test_a_failed_cache_is_exit_code_5_and_only_a_warning_for_fetch(
     fetched = command("fetch", put(GenericVehicle({"A": 1})), "--json", "--cache", tmp_path)
     assert (fetched.code, fetched.json["received"]) == (0, 1)
     warned, told = fetched.err.splitlines()
-    assert warned.startswith("paramclient: warning: going on without the cache: ")
+    assert warned.startswith("paramclient: warning: continuing without the cache: ")
     assert "not written to the cache, and lost: 1 value" in told
 
 

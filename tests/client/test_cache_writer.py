@@ -176,7 +176,7 @@ async def test_waiting_for_volatile_values_has_an_end(path: Path) -> None:
         component = await client.component()
         await component.fetch_all()
         tap.is_mute = True
-        with pytest.raises(NoReply, match="no hash covers") as caught:
+        with pytest.raises(NoReply, match="values outside the hash") as caught:
             await component.refreshed(timeout=0.5)
         assert math.isclose(caught.value.waited, 0.5, abs_tol=0.01)
         cancelled = asyncio.create_task(component.refreshed())
@@ -418,7 +418,7 @@ async def test_a_vehicle_that_does_not_say_who_it_is(path: Path) -> None:
         assert not component.params, "not yet"
         assert math.isclose(anyio.current_time() - began, 0.5, abs_tol=0.01)
         assert await client.component() is component
-        assert 0.5 < anyio.current_time() - began < component_module.IDENTITY_PATIENCE + 0.01
+        assert 0.5 < anyio.current_time() - began < component_module.IDENTITY_TIMEOUT + 0.01
         assert bits(component.params) == bits(vehicle.params)
         assert (await component.fetch_all()).complete
     vehicle.reboot(anyio.current_time())
@@ -768,7 +768,7 @@ async def goes_on_without(path: Path | ParamCache, caplog: pytest.LogCaptureFixt
             assert (await component.get("PARAM_01")).value == 5
     assert [record.name for record in caplog.records] == ["paramclient.client.cache_writer"] * 2, caplog.text
     why, lost = [record.getMessage() for record in caplog.records]
-    assert "going on without the cache" in why
+    assert "continuing without the cache" in why
     assert f"not written to the cache, and lost: {len(vehicle.params)} values and 2 earlier values" in lost
 
 
@@ -847,7 +847,7 @@ async def test_what_could_not_be_written_is_written_later(
             await asyncio.sleep(1.0)
             cache.is_broken = False
         told = [record.getMessage() for record in caplog.records]
-        assert told == ["going on without the cache: no room"] * 2, "once for each time that it began"
+        assert told == ["continuing without the cache: no room"] * 2, "once for each time that it began"
     assert kept(path) == bits(vehicle.params)
     assert (await session(vehicle, path)).source == "cache"
 

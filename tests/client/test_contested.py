@@ -330,7 +330,7 @@ async def test_of_split_vehicles_that_say_to_be_one_the_first_is_cached(
         assert table["SHARED_A"] == 1.0
         assert lines(path) == []
         [warning] = [each.getMessage() for each in caplog.records if each.levelno >= logging.WARNING]
-        assert "10.0.0.2:14550 has the identity of the one at 10.0.0.1:14550" in warning
+        assert "10.0.0.2:14550 has the same identity as the vehicle at 10.0.0.1:14550" in warning
         await until(lambda: client.components[next(iter(client.components))].state == "lost")
         await anyio.sleep(2.0)
         [table] = cached(path).values()

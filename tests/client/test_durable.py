@@ -123,7 +123,7 @@ async def test_without_a_disk_nothing_is_sent_or_it_is_said_what_the_vehicle_has
             await component.fetch_all()
             for broken in ("save", "sync"):
                 with mock.patch.object(cache, broken, side_effect=CacheError("no room")):
-                    told = f"1/1 has taken {NAME}, but it is not on the disk: it could not be written: no"
+                    told = f"1/1 has accepted {NAME}, but it is not on the disk: it could not be written: no"
                     with pytest.raises(NotDurable, match=told):
                         await component.set(NAME, 6.0 + len(broken), durable=True)
                     assert vehicle.values[NAME] == component.params[NAME].value == 10.0
@@ -164,7 +164,7 @@ async def test_the_service_answers_when_it_is_on_the_disk(tmp_path: Path) -> Non
                 assert sync.call_count == 1
             with mock.patch.object(cache, "sync", side_effect=CacheError("no room")):
                 told = problem(await browser.put(f"{C}/params/{NAME}", json=body), 503, "not-durable")
-                assert "has taken PARAM_01, but it is not on the disk" in told["detail"]
+                assert "has accepted PARAM_01, but it is not on the disk" in told["detail"]
                 assert told["error"] == "NotDurable"
 
 
@@ -180,7 +180,7 @@ def test_the_command_says_what_is_not_on_the_disk(
     with mock.patch.object(ParamCache, "sync", side_effect=CacheError("no room")):
         ended = command("set", put(vehicle), NAME, "6", "--durable", "--cache", tmp_path / "cache")
     assert (ended.code, ended.rows[1]) == (5, [NAME, "6", "not-durable"])
-    assert "1/1 has taken PARAM_01, but it is not on the disk" in ended.err
+    assert "1/1 has accepted PARAM_01, but it is not on the disk" in ended.err
     file = tmp_path / "quad.parm"
     file.write_text(f"{NAME} 7\n")
     applied = command("apply", put(vehicle), file, "--durable", "--yes", "--cache", tmp_path / "cache")

@@ -11,7 +11,7 @@ import pytest
 
 from paramclient import ClientClosed, NoReply, ParamClient, UsageError
 from paramclient.client.files import Ftp
-from paramclient.client.link_client import SESSION_PATIENCE
+from paramclient.client.link_client import SESSION_CLOSE_TIMEOUT
 from paramclient.client.local import local
 from paramclient.errors import FileErrorCode, FileTransferError, LinkError
 from paramclient.links import SimLink
@@ -174,7 +174,7 @@ async def test_a_client_leaves_no_file_open_at_whatever_moment_it_ends(how: str)
     ("fault", "longest"),
     [
         ("none", 1.1),
-        ("deaf", SESSION_PATIENCE),
+        ("deaf", SESSION_CLOSE_TIMEOUT),
         ("dropped", 0),
         ("failed", 0),
         ("drops", 0.1),

@@ -161,7 +161,7 @@ async def test_what_the_program_sets_is_its_change() -> None:
 
 @swiftly
 async def test_a_program_that_reads_nothing_holds_nothing_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(forwarding, "MOST_WAITING", 10)
+    monkeypatch.setattr(forwarding, "QUEUED_FRAMES_MAX", 10)
     vehicle, program = small_px4(), Program()
     program.is_stuck = True
     async with a_client(vehicle, forward=program) as client:
@@ -186,7 +186,7 @@ async def test_a_program_that_reads_nothing_holds_nothing_up(monkeypatch: pytest
 
 @swiftly
 async def test_a_program_that_floods_takes_turns_with_us(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(link_task, "MOST_OF_OTHERS", 100)
+    monkeypatch.setattr(link_task, "FORWARDED_QUEUE_MAX", 100)
     vehicle, program = Tap(generic()), Program()
     async with a_client(vehicle, forward=program) as client:
         component = await client.component()
@@ -263,7 +263,7 @@ async def test_a_link_to_the_program_that_fails_for_good(caplog: pytest.LogCaptu
         await program.close()
         with caplog.at_level(logging.WARNING):
             assert (await component.fetch_all()).complete
-    assert "nothing is forwarded any more: program: closed" in caplog.text
+    assert "forwarding has stopped: program: closed" in caplog.text
 
 
 @pytest.mark.asyncio

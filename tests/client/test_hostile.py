@@ -210,7 +210,7 @@ def test_a_flood_of_random_systems_from_random_peers_stays_within_the_page_of_th
 
 
 def test_changes_that_nobody_takes_are_so_many_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(subscription_room, "MOST_CHANGES", 3)
+    monkeypatch.setattr(subscription_room, "QUEUED_CHANGES_MAX", 3)
     changes = Changes()
     for name in "ABCDE":
         changes.push(Change(name, None, known(name)))
@@ -416,7 +416,7 @@ async def test_one_that_is_another_vehicle_each_time_fills_no_cache(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    monkeypatch.setattr(cache_writer, "MOST_VEHICLES", 3)
+    monkeypatch.setattr(cache_writer, "VEHICLES_MAX", 3)
     liar = LiarVehicle(*lies, rate=1)
     path = tmp_path / "cache" / "parameters.sqlite3"
     async with ParamClient(Air([liar, small_px4()]), cache=path) as client:
@@ -435,13 +435,13 @@ async def test_one_that_is_another_vehicle_each_time_fills_no_cache(
     assert os.listdir(tmp_path) == ["cache"]  # noqa: PTH208 - nothing stands outside of its folder
     assert os.listdir(path.parent) == ["parameters.sqlite3"]  # noqa: PTH208 - as above
     assert [record.message for record in caplog.records] == [
-        "66/1: too many vehicles on this link, so it is not cached"
+        "66/1: too many vehicles on this link: its table is not cached"
     ]
 
 
 @swiftly
 async def test_so_many_tables_are_kept_and_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cache_writer, "MOST_TABLES", 2)
+    monkeypatch.setattr(cache_writer, "TABLES_MAX", 2)
     vehicles = [small_px4(system=system) for system in (1, 2, 3)]
     async with ParamClient(Air(vehicles), cache=tmp_path / "cache.sqlite3") as client:
         await client.component(3, 1)

@@ -197,7 +197,7 @@ async def test_time_that_is_over_gives_what_has_come() -> None:
         channel.ask(LIST)
         result = await component.fetch_all(timeout=2.0)
         assert result.missing == (24,)
-        assert "time given" in result.notes[0]
+        assert "ended at its timeout" in result.notes[0]
 
 
 @swiftly

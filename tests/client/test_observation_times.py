@@ -20,7 +20,7 @@ from paramclient import Param, ParamCache, ParamType
 from paramclient.cache import HistoryEntry, UnixTimes
 from paramclient.client import suspend_detection
 from paramclient.client.cache_writer import WriteThrough
-from paramclient.client.link_task import Carrier
+from paramclient.client.link_task import LinkTask
 from paramclient.links import Peer, create_link
 from paramclient.links.clock_offset import seconds_ahead
 from paramclient.protocol import wire
@@ -489,7 +489,7 @@ class Asking(Station):
 async def carried(link: Scripted) -> AsyncIterator[dict[bytes, float]]:
     """What came over a link, and when, as its station was told."""
     station = Asking()
-    mover = Carrier(link, station, dispatch=lambda: None, end=lambda error: None, may_rest=False)
+    mover = LinkTask(link, station, dispatch=lambda: None, end=lambda error: None, may_rest=False)
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(mover.read)
         tasks.start_soon(mover.send)

@@ -246,7 +246,7 @@ async def test_a_log_that_exists_is_not_written_over(tmp_path: Path) -> None:
         async with a_client(vehicle, tlog=path):
             raise AssertionError("it was opened")
     assert path.read_bytes() == b"precious"
-    with pytest.raises(UsageError, match="cannot be made: No such file or directory"):
+    with pytest.raises(UsageError, match="cannot be created: No such file or directory"):
         async with a_client(vehicle, tlog=tmp_path / "nowhere" / "flight.tlog"):
             raise AssertionError("it was opened")
 
@@ -275,7 +275,7 @@ async def test_a_full_disk_ends_the_log_and_nothing_else(
             await anyio.sleep(5.0)
             assert (await component.get("PARAM_01")).value == 1
     assert [record.name for record in caplog.records] == ["paramclient.client.recording"], caplog.text
-    assert f"nothing more is written to {path}: No space left on device" in caplog.text
+    assert f"the telemetry log {path} ends here: No space left on device" in caplog.text
     assert messages(path)  # whole frames, and nothing behind them
 
 
@@ -283,14 +283,14 @@ async def test_a_full_disk_ends_the_log_and_nothing_else(
 async def test_memory_does_not_follow_a_disk_that_falls_behind(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(recording, "MOST_UNWRITTEN", 1000)
+    monkeypatch.setattr(recording, "UNWRITTEN_BYTES_MAX", 1000)
     log = Capture(tmp_path / "flight.tlog", is_stream=False)
     await log.open()
     for number in range(100):
         log.received(frame(number), "vehicle")
         assert log._size <= 1000 + len(frame(number))
     assert not log._unwritten
-    assert "the disk does not keep up" in caplog.text
+    assert "the disk is slower than the link" in caplog.text
     await log.close()
     assert (tmp_path / "flight.tlog").read_bytes() == b""
 

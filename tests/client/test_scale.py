@@ -17,9 +17,9 @@ import pytest
 from paramclient import ParamCache, ParamClient
 from paramclient.cache import CachedComponent, TableUpdate
 from paramclient.client import cache_writer, event_loop_share, link_task
-from paramclient.client.cache_writer import DOWNLOAD_INTERVAL, LEAST_NEW
-from paramclient.client.event_loop_share import LONGEST_TURN
-from paramclient.client.link_task import HELD_UP, MOST_BEHIND, Carrier
+from paramclient.client.cache_writer import DOWNLOAD_INTERVAL, NEW_SHARE_MIN
+from paramclient.client.event_loop_share import TURN_MAX
+from paramclient.client.link_task import HELD_UP_MIN, TIMEOUT_DELAY_MAX, LinkTask
 from paramclient.links import Peer
 from paramclient.model.values import ParamType
 from paramclient.protocol import station as station_room
@@ -228,7 +228,7 @@ async def test_a_cached_table_that_is_being_read_is_waited_for(
     path = tmp_path / "cache.sqlite3"
     async with ParamClient(small(1), cache=path) as client:
         await (await client.component()).fetch_all()
-    monkeypatch.setattr("paramclient.client.link_component.IDENTITY_PATIENCE", 0.05)
+    monkeypatch.setattr("paramclient.client.link_component.IDENTITY_TIMEOUT", 0.05)
     with SlowCache(path) as cache:
         async with ParamClient(small(1), cache=cache) as client:
             assert (await client.fetch_all()).results[1, 1].source == "cache"
@@ -283,7 +283,7 @@ class Watched(Station):
 
 
 async def carry(link: Flood, station: Watched, seconds: float, dispatch: Callable[[], None]) -> None:
-    whole = Carrier(link, station, dispatch=dispatch, end=lambda error: None)
+    whole = LinkTask(link, station, dispatch=dispatch, end=lambda error: None)
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(whole.read)
         tasks.start_soon(whole.send)
@@ -294,14 +294,14 @@ async def carry(link: Flood, station: Watched, seconds: float, dispatch: Callabl
 @swiftly
 async def test_time_outs_wait_until_what_has_come_is_read() -> None:
     link, station = Flood(), Watched()
-    link.size = event_loop_share.MANY
+    link.size = event_loop_share.BACKLOG_DATAGRAMS_MIN
     began = anyio.current_time()
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(carry, link, station, 2.0, lambda: None)
         await anyio.sleep(1.0)
         meanwhile = [at for at in station.ticks if at > began + link.interval]
         assert not meanwhile, "more was there after each reading"
-        link.size = event_loop_share.MANY - 1
+        link.size = event_loop_share.BACKLOG_DATAGRAMS_MIN - 1
         await anyio.sleep(0.1)
         assert station.ticks[-1] > began + 1.0
         assert len(station.ticks) > 5
@@ -311,12 +311,12 @@ async def test_time_outs_wait_until_what_has_come_is_read() -> None:
 @swiftly
 async def test_time_outs_do_not_wait_for_ever() -> None:
     link, station = Flood(), Watched()
-    link.size = event_loop_share.MANY
+    link.size = event_loop_share.BACKLOG_DATAGRAMS_MIN
     began = anyio.current_time()
-    await carry(link, station, MOST_BEHIND + 1.0, lambda: None)
+    await carry(link, station, TIMEOUT_DELAY_MAX + 1.0, lambda: None)
     meanwhile = [at - began for at in station.ticks if at > began + link.interval]
-    assert MOST_BEHIND <= meanwhile[0] < MOST_BEHIND + 0.1
-    assert 50 < len(meanwhile) < 1.0 / LONGEST_TURN
+    assert TIMEOUT_DELAY_MAX <= meanwhile[0] < TIMEOUT_DELAY_MAX + 0.1
+    assert 50 < len(meanwhile) < 1.0 / TURN_MAX
     assert station.most_lists == 1, "and no further list begins"
 
 
@@ -328,44 +328,44 @@ class Starved(Watched):
         return super().next_deadline(everyone=everyone)
 
     def _starve(self) -> None:
-        swift_loop().now += HELD_UP + 0.002
+        swift_loop().now += HELD_UP_MIN + 0.002
 
 
 @swiftly
 async def test_time_outs_wait_while_other_programs_have_the_processor() -> None:
     """What has come is there, but the reader had no turn meanwhile."""
     link, station = Flood(), Starved()
-    link.size = event_loop_share.MANY
-    link.interval = LONGEST_TURN + 0.003  # the sender wakes before it
+    link.size = event_loop_share.BACKLOG_DATAGRAMS_MIN
+    link.interval = TURN_MAX + 0.003  # the sender wakes before it
     began = anyio.current_time()
     await carry(link, station, 1.0, lambda: None)
-    assert not [at for at in station.ticks if at > began + link.interval + HELD_UP]
+    assert not [at for at in station.ticks if at > began + link.interval + HELD_UP_MIN]
 
 
 @swiftly
 async def test_time_outs_wait_for_nothing_that_does_not_come() -> None:
     """The last reading brought many, and then the link falls silent."""
     link, station = Flood(), Watched()
-    link.size = event_loop_share.MANY
+    link.size = event_loop_share.BACKLOG_DATAGRAMS_MIN
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(carry, link, station, 1.0, lambda: None)
         await anyio.sleep(0.5)
         link.size = 0
         silent_at = anyio.current_time()
         await anyio.sleep(0.2)
-    assert next(at for at in station.ticks if at > silent_at) < silent_at + HELD_UP + 2 * LONGEST_TURN
+    assert next(at for at in station.ticks if at > silent_at) < silent_at + HELD_UP_MIN + 2 * TURN_MAX
 
 
 @swiftly
 async def test_time_outs_wait_for_what_waits_for_its_turn() -> None:
     """Few datagrams were read, among them perhaps the answers, and another link has the turn."""
     link, station = Flood(), Watched()
-    link.size = event_loop_share.SOME
+    link.size = event_loop_share.TURN_DATAGRAMS_MIN
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(carry, link, station, 3.0, lambda: None)
         await anyio.sleep(0.5)
         assert len(station.ticks) > 5
-        async with event_loop_share.Crowd.of_this_loop().turn:
+        async with event_loop_share.EventLoopShare.of_this_loop().turn:
             await anyio.sleep(2 * link.interval)
             before = len(station.ticks)
             await anyio.sleep(0.5)
@@ -405,7 +405,7 @@ async def test_what_comes_at_once_gives_way_to_other_tasks(monkeypatch: pytest.M
         await carry(link, station, 0.008, lambda: happened.append("told"))
         tasks.cancel_scope.cancel()
     assert happened.count("read") == 100
-    most = round(LONGEST_TURN / 0.001)
+    most = round(TURN_MAX / 0.001)
     rounds = "".join(each[0] for each in happened).split("a")
     longest = max(part.count("r") for part in rounds)
     assert longest == most
@@ -413,8 +413,8 @@ async def test_what_comes_at_once_gives_way_to_other_tasks(monkeypatch: pytest.M
 
 
 def test_a_link_has_no_more_lists_than_the_others_leave_it() -> None:
-    readers = event_loop_share.Crowd()
-    most = event_loop_share.ENOUGH_LISTS
+    readers = event_loop_share.EventLoopShare()
+    most = event_loop_share.BURST_LISTS_MAX
     assert readers.most_lists("a", 10 * most, 1.0) == math.inf, "it has its own measure"
     assert readers.most_lists("a", 0, 1.0) == math.inf
     assert readers.most_lists("b", most - 3, 2.0) == math.inf
@@ -429,7 +429,7 @@ def test_a_link_has_no_more_lists_than_the_others_leave_it() -> None:
 
 
 def test_a_list_that_is_only_awaited_takes_no_time_of_others() -> None:
-    readers = event_loop_share.Crowd()
+    readers = event_loop_share.EventLoopShare()
     readers.most_lists("a", 0, 1.0, awaited=5)
     assert not readers.is_busy_without("b")
     readers.most_lists("a", 1, 1.0)
@@ -440,23 +440,25 @@ def test_a_list_that_is_only_awaited_takes_no_time_of_others() -> None:
 
 
 def test_no_link_has_lists_beside_each_other_while_more_has_come_on_one_than_was_read() -> None:
-    readers = event_loop_share.Crowd()
-    readers.came("b", event_loop_share.MANY - 1)
+    readers = event_loop_share.EventLoopShare()
+    readers.came("b", event_loop_share.BACKLOG_DATAGRAMS_MIN - 1)
     assert readers.most_lists("a", 0, 1.0) == math.inf
-    readers.came("b", event_loop_share.MANY)
+    readers.came("b", event_loop_share.BACKLOG_DATAGRAMS_MIN)
     assert readers.most_lists("a", 0, 1e6) == 1, "it is not done with them"
     readers.taken("b", 2.0)
     assert readers.most_lists("a", 0, 2.0) == 1
-    assert readers.most_lists("a", 0, 2.0 + event_loop_share.LASTING) == math.inf
-    readers.came("b", event_loop_share.MANY - 1)
+    assert readers.most_lists("a", 0, 2.0 + event_loop_share.BACKLOG_VALIDITY) == math.inf
+    readers.came("b", event_loop_share.BACKLOG_DATAGRAMS_MIN - 1)
     readers.taken("b", 2.0)
     assert readers.most_lists("a", 0, 2.0) == math.inf
 
 
 def test_links_of_two_event_loops_share_nothing() -> None:
-    async def find() -> event_loop_share.Crowd:
-        assert event_loop_share.Crowd.of_this_loop() is event_loop_share.Crowd.of_this_loop()
-        return event_loop_share.Crowd.of_this_loop()
+    async def find() -> event_loop_share.EventLoopShare:
+        assert (
+            event_loop_share.EventLoopShare.of_this_loop() is event_loop_share.EventLoopShare.of_this_loop()
+        )
+        return event_loop_share.EventLoopShare.of_this_loop()
 
     assert anyio.run(find) is not anyio.run(find)
 
@@ -464,13 +466,13 @@ def test_links_of_two_event_loops_share_nothing() -> None:
 @swiftly
 async def test_no_list_begins_while_another_link_brings_more_than_is_read() -> None:
     busy, quiet, station = Flood(), Flood(), Watched()
-    busy.size, quiet.size = event_loop_share.MANY, 1
+    busy.size, quiet.size = event_loop_share.BACKLOG_DATAGRAMS_MIN, 1
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(carry, quiet, station, 3.0, lambda: None)
         await anyio.sleep(0.5)
         seen = [station.most_lists]
         tasks.start_soon(carry, busy, Watched(), 2.0, lambda: None)
-        for size in (event_loop_share.MANY, 0, event_loop_share.MANY):
+        for size in (event_loop_share.BACKLOG_DATAGRAMS_MIN, 0, event_loop_share.BACKLOG_DATAGRAMS_MIN):
             busy.size = size
             busy.is_stuck.set()
             await anyio.sleep(0.5)
@@ -486,14 +488,14 @@ async def test_no_list_begins_while_another_link_brings_more_than_is_read() -> N
 @swiftly
 async def test_a_link_that_was_closed_leaves_nothing_behind_whichever_of_its_tasks_ends_last() -> None:
     station = Watched()
-    station.bursts = lambda now: (event_loop_share.ENOUGH_LISTS, 0)  # type: ignore[method-assign]
+    station.bursts = lambda now: (event_loop_share.BURST_LISTS_MAX, 0)  # type: ignore[method-assign]
     for first in ("read", "send"):
         tasks = {}
-        link = Carrier(Flood(), station, dispatch=lambda: None, end=lambda error: None)
+        link = LinkTask(Flood(), station, dispatch=lambda: None, end=lambda error: None)
         for name in ("read", "send"):
             tasks[name] = asyncio.create_task(getattr(link, name)())
         await anyio.sleep(0.1)
-        readers = event_loop_share.Crowd.of_this_loop()
+        readers = event_loop_share.EventLoopShare.of_this_loop()
         assert readers.most_lists("another", 0, anyio.current_time()) == 1
         for name in (first, *({*tasks} - {first})):
             tasks[name].cancel()
@@ -518,7 +520,7 @@ class Portions(ParamCache):
 @swiftly
 async def test_what_is_new_is_written_in_portions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No transaction begins another table when it has enough: to gather one takes the loop's time."""
-    monkeypatch.setattr(cache_writer, "PORTION", 200)
+    monkeypatch.setattr(cache_writer, "TRANSACTION_PARAMS", 200)
     monkeypatch.setattr(cache_writer, "FLUSH_INTERVAL", 1000.0)  # everything on closing
     vehicles = [small(system) for system in range(1, 8)]
     cache = Portions(tmp_path / "cache.sqlite3")
@@ -599,7 +601,7 @@ async def test_tables_that_are_fetched_in_numbers_are_written_once_or_in_growing
     tmp_path: Path, seconds: int, few: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each part costs as much as all of the table: so half of it must be new."""
-    monkeypatch.setattr(cache_writer, "FEW_FETCHES", few)
+    monkeypatch.setattr(cache_writer, "UNBATCHED_FETCHES_MAX", few)
     vehicles: list[Vehicle] = []
     for system in range(1, 13):
         table = [SimParam(f"P_{index:03}", ParamType.INT32, index) for index in range(200)]
@@ -614,4 +616,4 @@ async def test_tables_that_are_fetched_in_numbers_are_written_once_or_in_growing
         parts = sizes[:-1]
         assert bool(parts) == (seconds > DOWNLOAD_INTERVAL)
         for number, part in enumerate(parts):
-            assert part >= LEAST_NEW * sum(parts[: number + 1])
+            assert part >= NEW_SHARE_MIN * sum(parts[: number + 1])

@@ -39,7 +39,12 @@ from paramclient.cli import run
 from paramclient.cli import session as cli_session
 from paramclient.cli import signing as signing_commands
 from paramclient.client import signing, signing_timestamps
-from paramclient.client.signing_timestamps import LOOK_INTERVAL, RESERVED, TimestampFile, TimestampKeeper
+from paramclient.client.signing_timestamps import (
+    CHECK_INTERVAL,
+    TIMESTAMP_RESERVE,
+    TimestampFile,
+    TimestampKeeper,
+)
 from paramclient.links import SimLink
 from paramclient.sim import ArduPilotVehicle, Vehicle
 from tests.shell import VALUES, Tap, small_px4, swift_loop, swiftly
@@ -98,7 +103,9 @@ def test_a_file_holds_a_key_as_it_is_or_as_text(tmp_path: Path, data: bytes) -> 
 @pytest.mark.parametrize("mode", [0o644, 0o640, 0o604, 0o620, 0o601])
 def test_a_key_that_others_can_get_at_is_refused(tmp_path: Path, mode: int) -> None:
     path = a_file(tmp_path / "key", SECRET, mode)
-    with pytest.raises(UsageError, match=rf"key: others than its owner .* \(mode {mode:o}\); `chmod 600`"):
+    with pytest.raises(
+        UsageError, match=rf"key: other users than its owner .* \(mode {mode:o}\); run `chmod 600`"
+    ):
         read_key(path)
 
 
@@ -152,7 +159,7 @@ def test_the_environment_names_a_key_in_one_of_three_ways(key_file: Path) -> Non
 def test_what_cannot_be_is_refused_when_it_is_said() -> None:
     assert Signing(KEY, "signed-only").policy == SigningPolicy.SIGNED_ONLY
     with pytest.raises(
-        UsageError, match="no signing policy 'none', only signed-only, unsigned-radios, accept"
+        UsageError, match="unknown signing policy 'none'; choose one of signed-only, unsigned-radios, accept"
     ):
         Signing(KEY, "none")
     for link_id in (-1, 256):
@@ -238,7 +245,7 @@ def test_a_damaged_file_is_told_and_the_time_of_day_counts(
     (state / f"{KEY.fingerprint}-0.timestamp").write_text(text, encoding="latin-1")
     file.release()
     assert file.claim() == 0
-    assert "holds no timestamp" in caplog.text
+    assert "no valid signature timestamp" in caplog.text
     file.release()
 
 
@@ -310,7 +317,7 @@ def test_after_a_crash_at_most_a_minute_is_skipped(clock: Clock) -> None:
     in_session(lambda signer: signer.catch_up(NOW + 5), crashes=True)
     last = []
     in_session(lambda signer: last.append(signer.timestamp))
-    assert NOW + 5 < last[0] <= NOW + 5 + RESERVED
+    assert NOW + 5 < last[0] <= NOW + 5 + TIMESTAMP_RESERVE
 
 
 @swiftly
@@ -342,7 +349,7 @@ async def test_timestamps_are_written_ahead_and_seldom(
         await vehicle.fetch_all()
         await anyio.sleep(600.0)
         assert wire.frames > 600
-        assert len(written) <= 600 * 100_000 / (RESERVED // 2) + 2
+        assert len(written) <= 600 * 100_000 / (TIMESTAMP_RESERVE // 2) + 2
         assert client.signing_report() is not None
     assert written[-1] - NOW == pytest.approx(600 * 100_000, rel=0.05)
     assert (state / f"{KEY.fingerprint}-0.timestamp").read_text() == f"{written[-1]}\n"
@@ -356,9 +363,9 @@ async def test_a_folder_that_cannot_be_used_is_told_and_costs_no_session(
     async with a_client(signed_vehicle(), signing=Signing(KEY, state=file)) as client:
         vehicle = await client.component()
         assert (await vehicle.fetch_all()).complete
-        await anyio.sleep(3 * LOOK_INTERVAL)
+        await anyio.sleep(3 * CHECK_INTERVAL)
     assert len(caplog.records) == 1
-    assert "the timestamps of signatures cannot be kept (Not a directory)" in caplog.text
+    assert "cannot store signature timestamps (Not a directory)" in caplog.text
 
 
 @swiftly
@@ -433,7 +440,7 @@ async def test_a_key_is_given_only_where_somebody_says_that_the_link_is_safe() -
     vehicle = ArduPilotVehicle(table=VALUES)
     async with a_client(vehicle, signing=None) as client:
         component = await client.component()
-        with pytest.raises(UsageError, match="carries the key in clear"):
+        with pytest.raises(UsageError, match="sends the key unencrypted"):
             await component.setup_signing(KEY)
         assert vehicle.requests["SETUP_SIGNING"] == 0
         await component.setup_signing(KEY, link_is_safe=True)
@@ -449,7 +456,7 @@ async def test_a_key_is_given_only_where_somebody_says_that_the_link_is_safe() -
 async def test_a_vehicle_of_mavlink_1_is_given_no_key() -> None:
     vehicle = small_px4(mavlink_version=1)
     async with a_client(vehicle, signing=None) as client:
-        with pytest.raises(UsageError, match="1/1 speaks MAVLink 1"):
+        with pytest.raises(UsageError, match="1/1 uses MAVLink 1"):
             await (await client.component()).setup_signing(KEY, link_is_safe=True)
 
 
@@ -581,7 +588,7 @@ def test_commands_sign_with_the_key_of_a_file_or_the_environment(
     code, out, err = command(*get, "--signing-key", key_file)
     assert (code, out) == (2, "")
     assert err.count("\n") == 1
-    assert "others than its owner" in err
+    assert "other users than its owner" in err
     code, _, err = command(*get, "--signing-passphrase", "--signing-key", key_file)
     assert (code, "exclude each other" in err) == (2, True)
     code, _, err = command(*get, "--signing-passphrase")

@@ -11,7 +11,7 @@ import pytest
 
 from paramclient import Component, Event, Events, Lost, NoReply, Rebooted, Resynced, SyncState, Trust
 from paramclient.client import suspend_detection
-from paramclient.client.suspend_detection import STANDSTILL, Standstill, time_asleep
+from paramclient.client.suspend_detection import SUSPEND_MIN, SuspendDetector, time_asleep
 from paramclient.protocol.vehicle.presence import Presence
 from paramclient.protocol.wire import ParamSet, SystemTime
 from paramclient.sim import Air, Endpoint
@@ -223,7 +223,7 @@ async def test_a_short_nap_is_none(sleep: Sleep) -> None:
         component = await client.component()
         await component.fetch_all()
         tap.heard.clear()
-        sleep(STANDSTILL - 0.1)
+        sleep(SUSPEND_MIN - 0.1)
         await anyio.sleep(3.0)
         assert trusts(component) == {Trust.LIVE}
         assert len(tap.heard) < 6, "heartbeats alone"
@@ -241,17 +241,17 @@ async def _error_of(component: Component, name: str, value: float | None = None)
 
 
 def test_who_is_late_by_much_was_away() -> None:
-    clock = Standstill()
+    clock = SuspendDetector()
     assert clock.unseen(100.0) is None, "nothing was expected"
     clock.expect(101.0)
-    assert clock.unseen(101.0 + STANDSTILL - 0.01) is None
-    assert clock.unseen(101.0 + STANDSTILL) == pytest.approx(0.0, abs=0.5)
+    assert clock.unseen(101.0 + SUSPEND_MIN - 0.01) is None
+    assert clock.unseen(101.0 + SUSPEND_MIN) == pytest.approx(0.0, abs=0.5)
     assert clock.unseen(1000.0) is None, "that is known by now"
 
 
 def test_sleep_that_the_clock_leaves_out_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(suspend_detection, "time_asleep", lambda: 50.0)
-    clock = Standstill()
+    clock = SuspendDetector()
     clock.expect(math.inf)
     monkeypatch.setattr(suspend_detection, "time_asleep", lambda: 50.0 + HOURS)
     assert clock.unseen(1.0) == HOURS

@@ -31,7 +31,7 @@ from paramclient import (
     UsageError,
 )
 from paramclient.client.client import implementation_of
-from paramclient.client.events import MOST_EVENTS
+from paramclient.client.events import EVENTS_MAX
 from paramclient.client.subscription import Changes
 from paramclient.protocol import wire
 from paramclient.protocol.wire import HASH_CHECK, ParamRequestList, ParamRequestRead, ParamSet
@@ -534,10 +534,10 @@ async def test_a_slow_listener_misses_the_oldest_and_holds_no_more() -> None:
     async with a_client(small_px4()) as client:
         component = await client.component()
         events = client.events()
-        for number in range(MOST_EVENTS + 10):
+        for number in range(EVENTS_MAX + 10):
             events.push(Lost(component, float(number)))
         waiting = drained(events)
-        assert len(waiting) == MOST_EVENTS
+        assert len(waiting) == EVENTS_MAX
         assert waiting[0] == Lost(component, 10.0)
 
 

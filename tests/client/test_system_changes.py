@@ -120,7 +120,7 @@ async def test_a_clock_that_cannot_be_costs_a_warning_and_nothing_is_lost(
         wall.now = right
         await anyio.sleep(cache_writer.RETRY_INTERVAL + 1.0)
     [warning] = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
-    assert warning.startswith("going on without the cache: ")
+    assert warning.startswith("continuing without the cache: ")
     with ParamCache(path) as cache:
         assert bits(cache.component(system=1).params) == bits(vehicle.params)
 
@@ -226,7 +226,7 @@ async def test_a_disk_that_is_full_for_a_while(path: Path, caplog: pytest.LogCap
             await anyio.sleep(2.0)
         await anyio.sleep(cache_writer.RETRY_INTERVAL + 2.0)
     [warning] = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
-    assert warning.startswith("going on without the cache: ")
+    assert warning.startswith("continuing without the cache: ")
     with ParamCache(path) as cache:
         assert bits(cache.component(system=1).params) == bits(vehicle.params)
         assert cache.component(system=1).complete

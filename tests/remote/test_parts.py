@@ -108,7 +108,7 @@ def test_a_password_in_an_address_is_refused_and_not_repeated() -> None:
     ids=lambda option: next(iter(option)),
 )
 def test_arguments_for_a_link_of_ones_own_are_refused(option: dict[str, Any]) -> None:
-    with pytest.raises(UsageError, match=f"{next(iter(option))} is for a client with a link of its own"):
+    with pytest.raises(UsageError, match=f"{next(iter(option))} is only for a client with its own link"):
         ParamClient("http://h:1", **option)
 
 
@@ -127,7 +127,7 @@ def test_a_token_is_given_or_stands_in_the_environment(monkeypatch: pytest.Monke
     for bad in ("two words", "line\nbreak", "grün"):
         with pytest.raises(UsageError, match="token"):
             ParamClient("http://h:1", token=bad)
-    with pytest.raises(UsageError, match="a token is for a service"):
+    with pytest.raises(UsageError, match="a token is only for a service"):
         ParamClient("sim:px4", token="given")
 
 

@@ -56,9 +56,9 @@ def running(vehicle: Any, port: int = 0, **tls: Path) -> Iterator[str]:
 
 @pytest.mark.asyncio
 async def test_the_library_over_sockets_and_through_a_restart(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(link_task, "LINK_PATIENCE", 0.5)
-    monkeypatch.setattr(link_task, "FIRST_BACKOFF", 0.05)
-    monkeypatch.setattr(link_task, "LONGEST_BACKOFF", 0.1)
+    monkeypatch.setattr(link_task, "LINK_TIMEOUT", 0.5)
+    monkeypatch.setattr(link_task, "BACKOFF_MIN", 0.05)
+    monkeypatch.setattr(link_task, "BACKOFF_MAX", 0.1)
     vehicle = small_px4()
     with anyio.fail_after(PATIENCE):
         with running(vehicle) as url:
@@ -103,7 +103,7 @@ def test_the_command_over_a_service(
         assert "does not report the traffic" in refused.err
         refused = command("get", url, "PARAM_01", "--no-cache")
         assert refused.code != 0
-        assert "cache is for a client with a link of its own" in refused.err
+        assert "cache is only for a client with its own link" in refused.err
     assert not list(tmp_path.glob("**/*.sqlite3")), "nothing is cached here"
 
 

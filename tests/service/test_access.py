@@ -275,7 +275,7 @@ def test_a_file_of_tokens_is_its_owners_alone(tmp_path: Path) -> None:
     path.write_text(f"anna write {ANNA}")
     path.chmod(0o640)
     with pytest.raises(
-        UsageError, match=r"others than its owner can get at this file of tokens \(mode 640\)"
+        UsageError, match=r"other users than its owner can access this file of tokens \(mode 640\)"
     ):
         Tokens.read(path)
 
@@ -309,13 +309,13 @@ def test_a_credential_of_systemd_may_look_as_if_a_group_could_read_it(
     path.chmod(0o440)
     assert tokens_from(path, {}) is not None
     path.chmod(0o444)
-    with pytest.raises(UsageError, match="others than its owner"):
+    with pytest.raises(UsageError, match="other users than its owner"):
         tokens_from(path, {})
     (tmp_path / "further").mkdir()
     elsewhere = tmp_path / "further" / "tokens"
     elsewhere.write_text(f"anna write {ANNA}")
     elsewhere.chmod(0o440)
-    with pytest.raises(UsageError, match="others than its owner"):
+    with pytest.raises(UsageError, match="other users than its owner"):
         tokens_from(elsewhere, {})
 
 

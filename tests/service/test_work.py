@@ -19,7 +19,7 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
-from paramclient.client.fetch_all import BEGUN_AT_ONCE, FetchTogether
+from paramclient.client.fetch_all import STARTED_FETCHES_MAX, FetchTogether
 from paramclient.documents.component import ComponentsDoc
 from paramclient.documents.diff import DiffDoc
 from paramclient.documents.job import JobsDoc
@@ -589,8 +589,8 @@ async def test_fetches_of_many_are_begun_few_at_a_time() -> None:
     bounds = {"until": 9e9, "hear_until": 0.0, "listen_until": 0.0}
     with pytest.raises(EOFError):
         await together.run(check, lambda: None, closed, **bounds, progress=None)
-    assert turns.most == BEGUN_AT_ONCE
-    assert checks == 1 + math.ceil(250 / BEGUN_AT_ONCE)
+    assert turns.most == STARTED_FETCHES_MAX
+    assert checks == 1 + math.ceil(250 / STARTED_FETCHES_MAX)
 
 
 @swiftly

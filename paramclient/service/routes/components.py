@@ -8,7 +8,7 @@ import anyio.lowlevel
 from fastapi import APIRouter, Depends, Request, Response
 from pydantic import Field
 
-from paramclient.client.arguments import HEARING_PATIENCE
+from paramclient.client.arguments import COMPONENT_TIMEOUT
 from paramclient.client.component import Component
 from paramclient.documents.component import ComponentDoc, ComponentsDoc
 from paramclient.documents.document import Body
@@ -39,14 +39,14 @@ class Sought(Body):
     system: Id = None
     component: Id = None
     only: bool = False
-    timeout_s: Seconds = HEARING_PATIENCE
+    timeout_s: Seconds = COMPONENT_TIMEOUT
 
 
 class Moved(Body):
     """Under which system id a vehicle is looked for."""
 
     system: Annotated[int, Field(ge=1, le=255)]
-    timeout_s: Seconds = HEARING_PATIENCE
+    timeout_s: Seconds = COMPONENT_TIMEOUT
 
 
 class Restarted(Body):

@@ -21,7 +21,7 @@ from paramclient import (
     ParamClient,
     Rebooted,
 )
-from paramclient.client.link_component import REBOOT_PATIENCE
+from paramclient.client.link_component import REBOOT_TIMEOUT
 from paramclient.client.local import local
 from paramclient.protocol import wire
 from paramclient.protocol.system_id_change import HUSH
@@ -302,7 +302,7 @@ async def test_an_armed_vehicle_refuses(make: Make, code: int) -> None:
         assert len(starts) == 1
 
 
-@pytest.mark.parametrize(("timeout", "patience"), [(None, REBOOT_PATIENCE), (10.0, 10.0), (1.0, 1.0)])
+@pytest.mark.parametrize(("timeout", "patience"), [(None, REBOOT_TIMEOUT), (10.0, 10.0), (1.0, 1.0)])
 @pytest.mark.parametrize("ack", [True, False])
 @swiftly
 async def test_one_that_stays_away(ack: bool, timeout: float | None, patience: float) -> None:
