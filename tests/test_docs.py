@@ -57,7 +57,8 @@ COMMANDS = [
 ]
 COMMANDS += ["apply", "verify", "restore", "import", "serve", "token"]
 
-LINK = re.compile(r"\]\(([^)#\s]+)(#[^)\s]*)?\)")
+LINK = re.compile(r"\]\(([^)#\s]*)(?:#([^)\s]*))?\)")
+HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
 
 
 def blocks(page: Path, language: str) -> list[str]:
@@ -122,11 +123,23 @@ def test_the_first_example_runs(tmp_path: Path) -> None:
     assert printed == "903, MC_ROLL_P = 4.0, MC_ROLL_P = 6.0\n"
 
 
+@cache
+def anchors(page: Path) -> frozenset[str]:
+    """The anchors of a page's headings, as GitHub and the pages' builder make them."""
+    headings = HEADING.findall(FENCE.sub("", page.read_text(encoding="utf-8")))
+    return frozenset(re.sub(r"[^\w -]", "", each.lower()).replace(" ", "-") for each in headings)
+
+
 @EVERY_PAGE
 def test_links_lead_somewhere(page: Path) -> None:
-    for target, _ in LINK.findall(page.read_text(encoding="utf-8")):
-        if not target.startswith("https://"):
-            assert (page.parent / target).exists(), f"{page.name}: {target}"
+    """Sphinx follows the links of the pages in `docs` only, and the README is not among them."""
+    for target, anchor in LINK.findall(page.read_text(encoding="utf-8")):
+        if target.startswith("https://"):
+            continue
+        place = page.parent / target if target else page
+        assert place.exists(), f"{page.name}: {target}"
+        if anchor:
+            assert anchor in anchors(place), f"{page.name}: {target}#{anchor}"
 
 
 def test_every_page_is_in_the_table_of_contents() -> None:
