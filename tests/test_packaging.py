@@ -55,7 +55,7 @@ def metadata(wheel: dict[str, bytes]) -> Message:
 
 def test_the_wheel_has_the_package_and_nothing_else(wheel: dict[str, bytes]) -> None:
     shipped = {name for name in wheel if ".dist-info/" not in name}
-    data = {"paramclient/py.typed", "paramclient/provision/cautions.toml"}
+    data = {"paramclient/py.typed", "paramclient/provision/apply_rules.toml"}
     assert shipped == SOURCES | TABLES | SERVED | data | {PLUGIN}
     assert len(TABLES) >= 3
     assert "paramclient/service/page/index.html" in SERVED

@@ -52,7 +52,7 @@ async def import_(file: Path, /, *files: Path, options: CacheOptions = _DEFAULTS
             if not tables:
                 report(f"{each} has no parameters")
     if options.json:
-        from paramclient.documents.command import ImportDoc, ImportedDoc  # only here: loads pydantic
+        from paramclient.documents.command_output import ImportDoc, ImportedDoc  # only here: loads pydantic
 
         print_document(ImportDoc(tables=[ImportedDoc.of(str(log), table) for log, table in found]))
     elif found:

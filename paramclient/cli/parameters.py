@@ -61,7 +61,7 @@ from paramclient.protocol.params.fetch_result import FetchResult, Policy
 from paramclient.protocol.params.sampling import SAMPLE_SIZE, Sample
 
 if TYPE_CHECKING:
-    from paramclient.documents.command import FetchedDoc, SetDoneDoc
+    from paramclient.documents.command_output import FetchOutputDoc, SetDoneDoc
     from paramclient.documents.document import Document
 
 __all__ = ["fetch", "get", "set_", "watch"]
@@ -225,7 +225,7 @@ async def set_(
             f"{client.bytes_received:,} bytes received, {client.bytes_sent:,} sent"
         )
     if options.json:
-        from paramclient.documents.command import SetsDoneDoc  # only here: loads pydantic
+        from paramclient.documents.command_output import SetsDoneDoc  # only here: loads pydantic
 
         print_document(SetsDoneDoc(results=[outcome.document(described) for outcome in outcomes]))
     else:
@@ -340,11 +340,11 @@ class _Fetched:
             f"{self.bytes_sent:,} sent{crc}"
         )
 
-    def document(self) -> FetchedDoc:
+    def document(self) -> FetchOutputDoc:
         """Return the JSON document."""
-        from paramclient.documents.command import FetchedDoc  # only here: loads pydantic
+        from paramclient.documents.command_output import FetchOutputDoc  # only here: loads pydantic
 
-        return FetchedDoc.of(
+        return FetchOutputDoc.of(
             self.session.component,
             self.result,
             self.params,
@@ -456,7 +456,7 @@ class _Written:
 
     def document(self, metadata: Metadata | None) -> SetDoneDoc:
         """Return the JSON document."""
-        from paramclient.documents.command import SetDoneDoc  # only here: loads pydantic
+        from paramclient.documents.command_output import SetDoneDoc  # only here: loads pydantic
 
         return SetDoneDoc.of(
             self.name,
@@ -583,7 +583,7 @@ async def _merged(changes: Changes, events: Events) -> AsyncGenerator[Change | E
 
 def _line(news: Change | _ComponentEvent, at: float) -> Document:
     """Return the JSON document of a change or an event."""
-    from paramclient.documents.command import ChangeLineDoc, EventLineDoc  # only here: loads pydantic
+    from paramclient.documents.command_output import ChangeLineDoc, EventLineDoc  # only here: loads pydantic
 
     return ChangeLineDoc.of(news, at) if isinstance(news, Change) else EventLineDoc.of(news, at)
 

@@ -19,7 +19,7 @@ def ports(*, json: bool = False) -> ExitCode:
     """
     found = list_ports()
     if json:
-        from paramclient.documents.command import PortDoc, PortsDoc  # only here: loads pydantic
+        from paramclient.documents.command_output import PortDoc, PortsDoc  # only here: loads pydantic
 
         print_document(PortsDoc(ports=[PortDoc.of(port) for port in found]))
     elif found:

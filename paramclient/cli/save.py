@@ -160,7 +160,7 @@ def _add(sets: list[ParamSet], whole: ParamSet, params: Iterable[Param], *, chan
 
 def _show(file: Path, form: FileForm, sets: Sequence[ParamSet], *, as_json: bool) -> None:
     if as_json:
-        from paramclient.documents.command import SavedDoc  # only here: loads pydantic
+        from paramclient.documents.command_output import SavedDoc  # only here: loads pydantic
 
         print_document(SavedDoc.of(str(file), form, sets))
         return

@@ -182,7 +182,7 @@ def _refused(address: tuple[int, int], failure: str) -> VehicleError:
 
 def _show(options: VehicleOptions, vehicle: Component, key: SigningKey | None) -> None:
     if options.json:
-        from paramclient.documents.command import SignsDoc  # only here: loads pydantic
+        from paramclient.documents.command_output import SignsDoc  # only here: loads pydantic
 
         print_document(
             SignsDoc(

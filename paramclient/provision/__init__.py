@@ -5,12 +5,12 @@
 - `set_up`: `apply` and `restore`; `execution` runs them, `results` holds their results.
 - `fleet`: `apply_all` and `verify_all` for several vehicles.
 - `vehicle_params`: parameters of a vehicle or of the cache as a set.
-- `cautions`, `similar_names`, `runner`: special parameters, mistyped names, long computations.
+- `apply_rules`, `similar_names`, `runner`: special parameters, mistyped names, long computations.
 """
 
 from __future__ import annotations
 
-from paramclient.provision.cautions import CATEGORIES
+from paramclient.provision.apply_rules import CATEGORIES
 from paramclient.provision.fleet import apply_all, verify_all
 from paramclient.provision.inspection import prepare, verify
 from paramclient.provision.planning import (

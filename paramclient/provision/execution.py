@@ -29,7 +29,7 @@ from paramclient.model.identity import SHARED_UIDS, Identity
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Value
 from paramclient.protocol.params.change_origin import check_asker
-from paramclient.provision.cautions import READ_ONLY, cautions_for
+from paramclient.provision.apply_rules import READ_ONLY, rules_for
 from paramclient.provision.inspection import (
     POLL_INTERVAL,
     Inspection,
@@ -137,7 +137,7 @@ class ApplyRun:
         self._before_writing = before_writing
         self._reason = reason
         self._skips_read_only = skips_read_only
-        self._cautions = cautions_for("")
+        self._rules = rules_for("")
         self._began = anyio.current_time()
         self.rows: dict[str, ApplyRow] = {}
         self.sent: set[str] = set()
@@ -162,7 +162,7 @@ class ApplyRun:
         check_component(self._wanted, self._component.component)
         plan({}, self._wanted, include=self._include, autopilot=self._component.autopilot)
         await wait_for_identity(self._component)
-        self._cautions = cautions_for(self._component.autopilot)
+        self._rules = rules_for(self._component.autopilot)
         planned, own = self._plan_identity, self._component.identity
         if planned is not None and not planned.is_same_vehicle(own):
             raise UsageError(f"the plan is for another vehicle: {planned}; this vehicle is {own}")
@@ -269,7 +269,7 @@ class ApplyRun:
     def _pending_system_id(self) -> int | None:
         """Return the system id that is set and takes effect after a reboot, or None."""
         for name, row in self.plan.rows.items():
-            is_set = row.status is PlanStatus.UNCHANGED and self._cautions.is_system_id(name)
+            is_set = row.status is PlanStatus.UNCHANGED and self._rules.is_system_id(name)
             if is_set and isinstance(row.before, int) and row.before != self._component.system:
                 return row.before
         return None
@@ -282,8 +282,8 @@ class ApplyRun:
         return self.written.get(name, 0) < attempts_max
 
     def _is_action(self, name: str) -> bool:
-        caution = self._cautions.left_out(name)
-        return caution is not None and caution.category == "action"
+        rule = self._rules.left_out(name)
+        return rule is not None and rule.category == "action"
 
     # Reads, writes and reboots of the vehicle
 
@@ -348,7 +348,7 @@ class ApplyRun:
             if self._error is not None:
                 return
             try:
-                if self._cautions.is_system_id(step.name):
+                if self._rules.is_system_id(step.name):
                     await self._write_system_id(step)
                 else:
                     await self._write(step)
@@ -383,7 +383,7 @@ class ApplyRun:
         self._unanswered = 0
         self._count_write(step)
         self._notes[step.name] = done.note
-        if self._is_action(step.name) and self._cautions.resets(step.name):
+        if self._is_action(step.name) and self._rules.resets(step.name):
             self._next_system_id = DEFAULT_SYSTEM_ID
         if done.adjusted:
             self._record(step, ApplyStatus.ADJUSTED, done.actual, "the vehicle changed the value")
@@ -398,7 +398,7 @@ class ApplyRun:
             reason = f"another vehicle on this link has system id {system}"
             self._record(step, ApplyStatus.SKIPPED, step.before, reason, WRONG)
             return
-        if self._cautions.needs_reboot(step.name):
+        if self._rules.needs_reboot(step.name):
             await self._write(step)
             if step.name in self.written:
                 self._next_system_id = system
@@ -468,7 +468,7 @@ class ApplyRun:
         self._next_system_id = None
         self._reboots += 1
         # values that a resetting parameter has reverted are written again
-        is_reset = any(self._cautions.resets(name) for name in self._reboot_for)
+        is_reset = any(self._rules.resets(name) for name in self._reboot_for)
         self._written_before_reboot = set() if is_reset else set(self.written)
         self._notes.clear()  # they warn of effects of this reboot
         self._reboot_for.clear()
@@ -524,7 +524,7 @@ class ApplyRun:
             UsageError: one of them is to be set without `reboot`.
         """
         for step in self.plan.steps:
-            if self._is_action(step.name) and self._cautions.resets(step.name) and not self._reboot:
+            if self._is_action(step.name) and self._rules.resets(step.name) and not self._reboot:
                 raise UsageError(
                     f"{step.name} resets other parameters to their defaults at the next start of the "
                     "vehicle; it can only be set with reboot=True"

@@ -19,7 +19,7 @@ from paramclient.model.values import Param, ParamType, Trust, check_name
 from paramclient.protocol.params.fetch_result import FetchResult
 from paramclient.protocol.params.name_search import NameSearch
 from paramclient.protocol.wire import HASH_CHECK
-from paramclient.provision.cautions import cautions_for
+from paramclient.provision.apply_rules import rules_for
 from paramclient.provision.planning import ParamInfo, Plan, check_component, plan
 from paramclient.provision.runner import Runner, run_here
 
@@ -398,8 +398,8 @@ def _probably_hidden(component: Component, wanted: ParamSet) -> frozenset[str]:
     """
     if component.autopilot != "ardupilot" or not local(component).machine.fetches.may_use_file():
         return frozenset()
-    cautions = cautions_for("ardupilot")
-    switches = {name for name, each in wanted.items() if cautions.reveals(name) and each.value != 0}
+    rules = rules_for("ardupilot")
+    switches = {name for name, each in wanted.items() if rules.reveals(name) and each.value != 0}
     groups = tuple(f"{name.rpartition('_')[0]}_" for name in switches)
     names = [name for name in wanted if name.startswith(groups) and name not in switches]
     unheard = frozenset(name for name in names if name not in component.params)

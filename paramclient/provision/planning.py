@@ -24,7 +24,7 @@ from paramclient.model.values import (
     same_bits,
     type_name,
 )
-from paramclient.provision.cautions import OUT_OF_RANGE, READ_ONLY, Cautions, Choice, cautions_for
+from paramclient.provision.apply_rules import OUT_OF_RANGE, READ_ONLY, ApplyRules, Choice, rules_for
 from paramclient.provision.similar_names import nearest_names
 
 __all__ = [
@@ -302,11 +302,11 @@ def plan(
     given = (include,) if isinstance(include, str) else tuple(include)
     if encoding is None:
         encoding = Encoding.C_CAST if autopilot == "ardupilot" else Encoding.BYTEWISE
-    cautions = cautions_for(autopilot or "")
+    rules = rules_for(autopilot or "")
     planner = _Planner(
         current,
         wanted,
-        cautions,
+        rules,
         Choice(given),
         info or {},
         encoding,
@@ -378,7 +378,7 @@ class _Planner:
         self,
         current: ParamSet | Mapping[str, Param],
         wanted: ParamSet,
-        cautions: Cautions,
+        rules: ApplyRules,
         choice: Choice,
         info: Mapping[str, ParamInfo],
         encoding: Encoding,
@@ -390,7 +390,7 @@ class _Planner:
         self._current = current
         self._wanted = wanted
         self._vehicle_type = vehicle_type
-        self._cautions = cautions
+        self._rules = rules
         self._choice = choice
         self._info = info
         self._encoding = encoding
@@ -409,9 +409,9 @@ class _Planner:
         def verdict(status: PlanStatus, category: str = "", reason: str = "") -> PlanRow:
             return PlanRow(wanted, status, before, kind, category, reason)
 
-        caution = self._cautions.left_out(name, self._value_to_be)
-        if caution is not None and not self._choice.has(name, caution.category):
-            return verdict(PlanStatus.SKIPPED, caution.category, f"left out: it {caution.reason}")
+        rule = self._rules.left_out(name, self._value_to_be)
+        if rule is not None and not self._choice.has(name, rule.category):
+            return verdict(PlanStatus.SKIPPED, rule.category, f"left out: it {rule.reason}")
         if before is None:
             return verdict(PlanStatus.LATER, MISSING, "not on this vehicle")
         if _is_same(wanted.value, before, kind):
@@ -430,13 +430,13 @@ class _Planner:
         """Return the stages, in order."""
         steps = [self._step(row) for row in rows.values() if row.status is PlanStatus.SET]
         is_any_missing = any(row.status is PlanStatus.LATER for row in rows.values())
-        last = _pop_matching(steps, lambda step: self._cautions.is_last(step.name))
-        frame = _pop_matching(steps, lambda step: self._cautions.chooses_frame(step.name))
-        switches = _pop_matching(steps, lambda step: self._cautions.reveals(step.name))
+        last = _pop_matching(steps, lambda step: self._rules.is_last(step.name))
+        frame = _pop_matching(steps, lambda step: self._rules.chooses_frame(step.name))
+        switches = _pop_matching(steps, lambda step: self._rules.reveals(step.name))
         turned_off = _pop_matching(switches, lambda step: step.value == 0)
         stages = []
         if frame:
-            resets = any(self._cautions.resets(step.name) for step in frame)
+            resets = any(self._rules.resets(step.name) for step in frame)
             waits = is_any_missing and any(step.needs_reboot for step in frame)
             stages.append(Stage("frame parameters", tuple(frame), True, resets or waits))
         if switches:
@@ -447,7 +447,7 @@ class _Planner:
         if turned_off:
             stages.append(Stage("switches that are turned off", tuple(turned_off)))
         if last:
-            last.sort(key=lambda step: self._cautions.is_system_id(step.name))
+            last.sort(key=lambda step: self._rules.is_system_id(step.name))
             stages.append(Stage("parameters that may end the connection", tuple(last), is_last=True))
         return tuple(stages)
 
@@ -459,7 +459,7 @@ class _Planner:
             for name, row in rows.items()
             if row.status is PlanStatus.UNCHANGED
             and row.before != 0
-            and (self._cautions.reveals(name) or self._cautions.chooses_frame(name))
+            and (self._rules.reveals(name) or self._rules.chooses_frame(name))
             and self._needs_reboot(name)
             and any(each.startswith(name.rpartition("_")[0] + "_") for each in missing)
         )
@@ -491,7 +491,7 @@ class _Planner:
         self, name: str, value: Value, kind: ParamType | int | None, info: ParamInfo | None
     ) -> tuple[str, str] | None:
         """Return why a value is invalid, as category and sentence, or None."""
-        if self._cautions.is_system_id(name) and (isinstance(value, bytes) or not 1 <= value <= 255):
+        if self._rules.is_system_id(name) and (isinstance(value, bytes) or not 1 <= value <= 255):
             return WRONG, "a system id is a number from 1 to 255"
         if kind is not None:
             try:
@@ -530,7 +530,7 @@ class _Planner:
         info = self._info.get(name)
         if info is not None and info.reboot_required:
             return True
-        return self._cautions.needs_reboot(name, self._vehicle_type)
+        return self._rules.needs_reboot(name, self._vehicle_type)
 
 
 def _pop_matching(steps: list[Step], fits: Callable[[Step], bool]) -> list[Step]:

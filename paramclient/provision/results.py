@@ -10,7 +10,7 @@ from enum import StrEnum
 from paramclient.errors import ParamClientError
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, Value, format_value
-from paramclient.provision.cautions import CATEGORIES, OUT_OF_RANGE
+from paramclient.provision.apply_rules import CATEGORIES, OUT_OF_RANGE
 from paramclient.provision.planning import Plan
 
 __all__ = ["ApplyProgress", "ApplyResult", "ApplyRow", "ApplyStatus", "FleetApplied", "FleetVerified"]

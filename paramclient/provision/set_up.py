@@ -11,7 +11,7 @@ import anyio
 from paramclient.client.component import Component
 from paramclient.errors import UsageError
 from paramclient.model.paramset import ParamSet
-from paramclient.provision.cautions import OUT_OF_RANGE
+from paramclient.provision.apply_rules import OUT_OF_RANGE
 from paramclient.provision.execution import ApplyRun
 from paramclient.provision.inspection import wait_for_identity
 from paramclient.provision.planning import ParamInfo, Plan

@@ -16,7 +16,7 @@ from paramclient import Component, ParamSet, write_file
 from paramclient.errors import ParamClientError, VehicleArmed
 from paramclient.model.values import Param, Value, format_value
 from paramclient.protocol.params.writes import SetResult
-from paramclient.provision.cautions import cautions_for
+from paramclient.provision.apply_rules import rules_for
 
 __all__ = ["Journal", "check_disarmed"]
 
@@ -149,8 +149,8 @@ class Journal:
         return self.kind == "px4" and self._category(name) in (*_MOVING, "hardware")
 
     def _category(self, name: str) -> str:
-        caution = cautions_for(self.kind).left_out(name)
-        return "" if caution is None else caution.category
+        rule = rules_for(self.kind).left_out(name)
+        return "" if rule is None else rule.category
 
     async def _set_back(self, vehicle: Component, param: Param, problems: list[str]) -> None:
         """Set one parameter until a read proves it."""

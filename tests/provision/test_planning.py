@@ -14,7 +14,7 @@ from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import Encoding, Param, ParamType, Value, bits_of, from_bits
 from paramclient.provision import CATEGORIES, MISSING, WRONG, Plan, PlanStatus, overlay, plan
-from paramclient.provision.cautions import OUT_OF_RANGE, READ_ONLY, Caution, cautions_for
+from paramclient.provision.apply_rules import OUT_OF_RANGE, READ_ONLY, ApplyRule, rules_for
 from paramclient.provision.planning import SUGGESTIONS_MAX
 from paramclient.sim.param_table import SimParam, ardupilot_table, ek2_group, px4_table
 
@@ -464,13 +464,13 @@ def test_overlay_replaces_and_extends_the_base() -> None:
 def test_every_glob_of_the_list_matches_or_is_listed_in_elsewhere(section: str, autopilot: str) -> None:
     table = px4_table() if autopilot == "px4" else (*ardupilot_table(), *ek2_group())
     names = [row.name for row in table]
-    entries: tuple[Caution, ...] = tuple(cautions_for(autopilot).entries[section])
-    for caution in entries:
-        assert caution.reason
-        assert caution.autopilot == autopilot
-        assert (caution.category in CATEGORIES) is (section == "left_out")
-        assert set(caution.elsewhere) <= set(caution.names)
-        for glob in caution.names:
+    entries: tuple[ApplyRule, ...] = tuple(rules_for(autopilot).entries[section])
+    for rule in entries:
+        assert rule.reason
+        assert rule.autopilot == autopilot
+        assert (rule.category in CATEGORIES) is (section == "left_out")
+        assert set(rule.elsewhere) <= set(rule.names)
+        for glob in rule.names:
             hits = fnmatch.filter(names, glob)
-            assert bool(hits) is (glob not in caution.elsewhere), f"{section}: {glob} hits {hits}"
-    assert set(cautions_for(autopilot).entries) == set(SECTIONS)
+            assert bool(hits) is (glob not in rule.elsewhere), f"{section}: {glob} hits {hits}"
+    assert set(rules_for(autopilot).entries) == set(SECTIONS)

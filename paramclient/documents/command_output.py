@@ -29,7 +29,7 @@ __all__ = [
     "ChangeLineDoc",
     "ContestedLineDoc",
     "EventLineDoc",
-    "FetchedDoc",
+    "FetchOutputDoc",
     "ImportDoc",
     "ImportedDoc",
     "PortDoc",
@@ -66,7 +66,7 @@ class TrustedSampleDoc(Document):
         return cls(size=sample.size, count=sample.count, confidence=confidence)
 
 
-class FetchedDoc(Document):
+class FetchOutputDoc(Document):
     """A fetched table, and the details of the fetch.
 
     `missing` are indices that were not received, `cached` names whose values are cached and not confirmed.
@@ -102,7 +102,7 @@ class FetchedDoc(Document):
         cached: list[str],
         bytes_received: int,
         bytes_sent: int,
-    ) -> FetchedDoc:
+    ) -> FetchOutputDoc:
         """Return the document of a fetch of a component.
 
         Args:

@@ -1,4 +1,4 @@
-"""Parameters that `apply` leaves out, orders specially or reboots for, read from `cautions.toml`."""
+"""Parameters that `apply` leaves out, orders specially or reboots for, read from `apply_rules.toml`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any, Final
 from paramclient.errors import UsageError
 from paramclient.model.patterns import NameChoice
 
-__all__ = ["CATEGORIES", "OUT_OF_RANGE", "READ_ONLY", "Caution", "Cautions", "Choice", "cautions_for"]
+__all__ = ["CATEGORIES", "OUT_OF_RANGE", "READ_ONLY", "ApplyRule", "ApplyRules", "Choice", "rules_for"]
 
 READ_ONLY: Final = "read-only"
 """The category of parameters that the vehicle lets no client write."""
@@ -28,8 +28,8 @@ CATEGORIES: Final = (
 
 
 @dataclass(frozen=True, slots=True)
-class Caution:
-    """One entry of `cautions.toml`.
+class ApplyRule:
+    """One entry of `apply_rules.toml`.
 
     Attributes:
         names: globs, in the case of param_id.
@@ -52,21 +52,20 @@ class Caution:
     vehicle_types: tuple[int, ...] = ()
 
 
-class Cautions:
-    """The entries of `cautions.toml` for one autopilot.
+class ApplyRules:
+    """The entries of `apply_rules.toml` for one autopilot.
 
     Attributes:
         entries: the entries by section of the file.
     """
 
-    def __init__(self, entries: Mapping[str, Sequence[Caution]]) -> None:
+    def __init__(self, entries: Mapping[str, Sequence[ApplyRule]]) -> None:
         self.entries = entries
         self._patterns = {
-            section: [(_pattern(caution.names), caution) for caution in cautions]
-            for section, cautions in entries.items()
+            section: [(_pattern(rule.names), rule) for rule in rules] for section, rules in entries.items()
         }
 
-    def left_out(self, name: str, value_of: Callable[[str], object] | None = None) -> Caution | None:
+    def left_out(self, name: str, value_of: Callable[[str], object] | None = None) -> ApplyRule | None:
         """Return the entry that leaves a parameter out by default, or None.
 
         Args:
@@ -74,11 +73,11 @@ class Cautions:
             value_of: returns the value of another parameter, or the value it is to get; by default no other
                 parameter has a value.
         """
-        for pattern, caution in self._patterns["left_out"]:
+        for pattern, rule in self._patterns["left_out"]:
             if pattern.match(name) and (
-                value_of is None or all(value_of(other) != value for other, value in caution.unless.items())
+                value_of is None or all(value_of(other) != value for other, value in rule.unless.items())
             ):
-                return caution
+                return rule
         return None
 
     def chooses_frame(self, name: str) -> bool:
@@ -111,19 +110,19 @@ class Cautions:
             vehicle_type: MAV_TYPE of the vehicle; None if unknown.
         """
         return any(
-            pattern.match(name) and (not caution.vehicle_types or vehicle_type in caution.vehicle_types)
-            for pattern, caution in self._patterns["reboot"]
+            pattern.match(name) and (not rule.vehicle_types or vehicle_type in rule.vehicle_types)
+            for pattern, rule in self._patterns["reboot"]
         )
 
-    def _first(self, section: str, name: str) -> Caution | None:
-        for pattern, caution in self._patterns[section]:
+    def _first(self, section: str, name: str) -> ApplyRule | None:
+        for pattern, rule in self._patterns[section]:
             if pattern.match(name):
-                return caution
+                return rule
         return None
 
 
 class Choice:
-    """The parameters that are included although `cautions.toml` leaves them out.
+    """The parameters that are included although `apply_rules.toml` leaves them out.
 
     Args:
         include: names of `CATEGORIES`, and globs of parameter names; a single one may be a string.
@@ -150,16 +149,16 @@ class Choice:
 
 
 @cache
-def cautions_for(autopilot: str) -> Cautions:
+def rules_for(autopilot: str) -> ApplyRules:
     """Return the entries for "px4" or "ardupilot"; for any other autopilot, the entries of both.
 
     If several entries match a parameter, the first one applies.
     """
-    found: dict[str, list[Caution]] = {}
+    found: dict[str, list[ApplyRule]] = {}
     known = autopilot in ("px4", "ardupilot")
     for section, entries in _read().items():
         found[section] = [
-            Caution(
+            ApplyRule(
                 names=tuple(entry["names"]),
                 reason=entry["reason"],
                 category=entry.get("category", ""),
@@ -171,11 +170,11 @@ def cautions_for(autopilot: str) -> Cautions:
             for entry in entries
             if not known or entry["autopilot"] == autopilot
         ]
-    return Cautions(found)
+    return ApplyRules(found)
 
 
 def _read() -> dict[str, list[dict[str, Any]]]:
-    text = resources.files(__package__).joinpath("cautions.toml").read_text(encoding="utf-8")
+    text = resources.files(__package__).joinpath("apply_rules.toml").read_text(encoding="utf-8")
     return tomllib.loads(text)
 
 
