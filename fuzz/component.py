@@ -39,13 +39,13 @@ LONGEST: Final = 400
 BOUNDS: Final = (
     (station, "MOST_COMPONENTS", 5),
     (station, "MOST_PEERS", 3),
-    (table, "MOST_NAMES", 12),
-    (table, "ENOUGH_NAMES", 6),
-    (table, "MOST_NAMES_OF_LINK", 25),
-    (change_origin, "MOST_CHANGES", 5),
+    (table, "NAMES_MAX", 12),
+    (table, "NAMES_GUARANTEED", 6),
+    (table, "LINK_NAMES_MAX", 25),
+    (change_origin, "RECENT_CHANGES_MAX", 5),
     (traffic, "MOST_COMPONENTS", 4),
     (traffic, "MOST_PEERS", 3),
-    (change_origin, "MOST_FOREIGN_SETS", 4),
+    (change_origin, "FOREIGN_SETS_MAX", 4),
 )
 LISTENS: Final = 0xE0
 """First bytes of an input from here on mean a station that sends nothing."""

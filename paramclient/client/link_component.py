@@ -34,7 +34,7 @@ from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.change_origin import check_asker
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_result import FetchResult, Progress, Sampled
-from paramclient.protocol.params.passive import OVERHEARING_PATIENCE
+from paramclient.protocol.params.passive import PASSIVE_TIMEOUT
 from paramclient.protocol.params.sampling import SAMPLE_SIZE
 from paramclient.protocol.params.sync import SyncState
 from paramclient.protocol.params.writes import SetResult
@@ -446,7 +446,7 @@ class LinkComponent(LocalComponent):
 def patience_of(station: Station, timeout: float | None) -> float | None:
     """For how long a fetch waits: nothing tells whether others will ever ask, unless there is an end."""
     is_open = timeout is None and station.listens_only and not station.is_log
-    return OVERHEARING_PATIENCE if is_open else timeout
+    return PASSIVE_TIMEOUT if is_open else timeout
 
 
 def _outcome(operation: Operation[Result]) -> Result:

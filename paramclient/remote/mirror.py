@@ -7,7 +7,7 @@ from typing import Final
 
 from paramclient.model.values import Param, Trust
 from paramclient.protocol.params.change import Change
-from paramclient.protocol.params.table import MOST_NAMES
+from paramclient.protocol.params.table import NAMES_MAX
 
 __all__ = ["MOST_WAITING", "Mirror"]
 
@@ -52,8 +52,8 @@ class Mirror:
         waiting, self._waiting = self._waiting, None
         if waiting is None:
             return None
-        if len(params) > MOST_NAMES:
-            raise ValueError(f"a table of more than {MOST_NAMES} names")
+        if len(params) > NAMES_MAX:
+            raise ValueError(f"a table of more than {NAMES_MAX} names")
         before, self._told = self._told, dict(params)
         self.is_loaded, self._seq = True, seq
         self.params.clear()
@@ -80,8 +80,8 @@ class Mirror:
             return None
         name, new, by = change.name, change.new, change.by
         old = self._told.get(name)
-        if old is None and new is not None and len(self._told) >= MOST_NAMES:
-            raise ValueError(f"a table of more than {MOST_NAMES} names")
+        if old is None and new is not None and len(self._told) >= NAMES_MAX:
+            raise ValueError(f"a table of more than {NAMES_MAX} names")
         self._seq = seq
         if new is None:
             self._told.pop(name, None)

@@ -19,7 +19,7 @@ from typing import Any, Final, TypeAlias
 import anyio
 
 from paramclient.errors import UsageError
-from paramclient.protocol.params.change_origin import LONGEST_ASKER
+from paramclient.protocol.params.change_origin import ASKER_LENGTH_MAX
 from paramclient.service.client_address import is_in, is_loopback, network
 from paramclient.service.held_bodies import HeldBodies, HeldBody
 from paramclient.service.log_limit import LogLimit
@@ -408,7 +408,7 @@ def _asker(request: Request, holder: Holder | None) -> str:
     client = given.decode("latin-1")
     if not 1 <= len(client) <= LONGEST_CLIENT or not (client.isascii() and client.isprintable()):
         raise Denied(400, "bad-request", f"X-Asker has 1 to {LONGEST_CLIENT} printable ASCII characters.")
-    return f"{who} ({client})"[:LONGEST_ASKER]
+    return f"{who} ({client})"[:ASKER_LENGTH_MAX]
 
 
 def _quota(request: Request, holder: Holder | None) -> str:

@@ -128,7 +128,7 @@ def heard(table: Table, name: str) -> None:
 
 
 def test_a_table_holds_so_many_names_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(table_room, "MOST_NAMES", 3)
+    monkeypatch.setattr(table_room, "NAMES_MAX", 3)
     table = Table()
     for name in "ABCD":
         heard(table, name)
@@ -144,8 +144,8 @@ def test_a_table_holds_so_many_names_and_no_more(monkeypatch: pytest.MonkeyPatch
 
 def test_the_tables_of_a_link_share_a_room(monkeypatch: pytest.MonkeyPatch) -> None:
     """When it is full, each may still hold as many as an autopilot has."""
-    monkeypatch.setattr(table_room, "MOST_NAMES_OF_LINK", 6)
-    monkeypatch.setattr(table_room, "ENOUGH_NAMES", 2)
+    monkeypatch.setattr(table_room, "LINK_NAMES_MAX", 6)
+    monkeypatch.setattr(table_room, "NAMES_GUARANTEED", 2)
     room = Room()
     liar, honest = Table(room=room), Table(room=room)
     for name in "ABCDEFGH":
@@ -217,7 +217,7 @@ def test_changes_that_nobody_takes_are_so_many_and_no_more(monkeypatch: pytest.M
 
 
 def test_what_is_remembered_of_changes_is_so_much_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(authors_room, "MOST_CHANGES", 3)
+    monkeypatch.setattr(authors_room, "RECENT_CHANGES_MAX", 3)
     authors = Authors()
     for at, name in enumerate("ABCDABCD"):
         authors.changed(name, at / 100, False)
@@ -229,7 +229,7 @@ def test_what_is_remembered_of_changes_is_so_much_and_no_more(monkeypatch: pytes
 
 
 def test_names_that_go_are_told_to_the_cache_up_to_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(table_room, "MOST_GONE", 4)
+    monkeypatch.setattr(table_room, "REMOVED_NAMES_MAX", 4)
     table = Table()
     for name in "ABCDE":
         heard(table, name)
@@ -305,7 +305,7 @@ def test_what_is_remembered_of_the_reads_of_a_file_is_so_much_and_no_more() -> N
 
 
 def test_a_resync_tells_of_so_many_names_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sync_room, "MOST_NAMES", 3)
+    monkeypatch.setattr(sync_room, "NAMES_MAX", 3)
     session = Simulation(listing_ardupilot())
     session.fetch()
     say(session, param_value("ONE_MORE", 1.0, count=9))  # another count: it has fallen behind
@@ -367,9 +367,9 @@ def test_all_lies_at_once_cost_no_more_than_so_much_memory() -> None:
     """When all that has a bound has reached it, nothing grows any more."""
     names, components = 100, 10
     with (
-        mock.patch.object(table_room, "MOST_NAMES", names),
+        mock.patch.object(table_room, "NAMES_MAX", names),
         mock.patch.object(station_room, "MOST_COMPONENTS", components),
-        mock.patch.object(authors_room, "MOST_CHANGES", 100),
+        mock.patch.object(authors_room, "RECENT_CHANGES_MAX", 100),
         mock.patch.object(traffic_room, "MOST_COMPONENTS", components),
         mock.patch.object(component_room, "MOST_PARAMETERS", 1_000),
         mock.patch.object(table_room, "MOST_PARAMETERS", 1_000),

@@ -23,7 +23,7 @@ from paramclient.cli import run
 from paramclient.client.client import local_client
 from paramclient.model.values import Encoding, encode
 from paramclient.protocol import wire
-from paramclient.protocol.params.passive import LONGEST_PAUSE, OVERHEARING_PATIENCE
+from paramclient.protocol.params.passive import LIST_PAUSE_MAX, PASSIVE_TIMEOUT
 from paramclient.protocol.params.sync import Upkeep
 from paramclient.protocol.station import Station
 from paramclient.sim import Endpoint
@@ -162,7 +162,7 @@ async def test_nobody_asks(timeout: float | None) -> None:
             with pytest.raises(NoReply) as error:
                 await fetch_all(timeout=timeout)
             waited = anyio.current_time() - began
-            assert waited == pytest.approx(timeout or OVERHEARING_PATIENCE, abs=0.1)
+            assert waited == pytest.approx(timeout or PASSIVE_TIMEOUT, abs=0.1)
             assert error.value.attempts == 0
         assert residue(component) == []
 
@@ -179,7 +179,7 @@ async def test_a_list_with_gaps_ends_when_it_pauses_and_goes_on_with_what_others
         result = await component.fetch_all()
         assert result.missing == (3, 9)
         assert result.received == 23
-        assert LONGEST_PAUSE <= anyio.current_time() - began < LONGEST_PAUSE + 3.0
+        assert LIST_PAUSE_MAX <= anyio.current_time() - began < LIST_PAUSE_MAX + 3.0
         assert (component.state, component.sync_state) == ("partial", SyncState.UNSYNCED)
         assert (await client.fetch_all()).results[1, 1].missing == (3, 9)
         channel.loses = lambda each: False

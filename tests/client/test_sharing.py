@@ -18,7 +18,7 @@ from paramclient import ParamCache
 from paramclient.model.values import ParamType
 from paramclient.protocol import wire
 from paramclient.protocol.params.fetch import Fetch
-from paramclient.protocol.params.foreign_list import ENOUGH_TO_FOLLOW, Following
+from paramclient.protocol.params.foreign_list import LIST_VALUES_MIN, Following
 from paramclient.protocol.params.reads import Reads
 from paramclient.protocol.params.table import Table
 from paramclient.protocol.requests.context import Context
@@ -139,7 +139,7 @@ def test_where_theirs_stops_in_the_middle_we_ask_for_the_rest() -> None:
 @pytest.mark.parametrize("ahead", [1, 2])
 def test_single_answers_to_others_are_no_list(ahead: int) -> None:
     following = Following()
-    for index in range(0, ahead * (ENOUGH_TO_FOLLOW - 1), ahead):
+    for index in range(0, ahead * (LIST_VALUES_MIN - 1), ahead):
         following.heard(param_value(f"P{index}", index=index, count=500), index * 0.01)
         assert not following.is_running(index * 0.01)
 

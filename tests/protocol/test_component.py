@@ -29,7 +29,7 @@ from paramclient.protocol.events import (
 )
 from paramclient.protocol.params import table as table_room
 from paramclient.protocol.params.change import Change
-from paramclient.protocol.params.change_origin import DOUBT, FOREIGN_SET_MEMORY, MOST_FOREIGN_SETS
+from paramclient.protocol.params.change_origin import DOUBT_TIME, FOREIGN_SET_MEMORY, FOREIGN_SETS_MAX
 from paramclient.protocol.params.sync import Upkeep
 from paramclient.protocol.params.value_check import DISTRUST_TIME
 from paramclient.protocol.station import Station
@@ -186,7 +186,7 @@ def test_a_value_without_a_name_is_none() -> None:
 
 
 def test_a_table_that_is_full_takes_no_more_names(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(table_room, "MOST_NAMES", 1)
+    monkeypatch.setattr(table_room, "NAMES_MAX", 1)
     desk = Desk()
     desk.hear("A")
     write = desk.machine.write("B", 1.0, desk.now)
@@ -312,19 +312,19 @@ def test_a_count_that_moves_takes_the_table_out_of_step() -> None:
 def test_what_changes_twice_in_a_short_while_is_asked_for_once_more() -> None:
     desk = Desk(ARDUPILOT)
     desk.hear("A", 1.0)
-    desk.now += 2 * DOUBT
+    desk.now += 2 * DOUBT_TIME
     desk.hear("A", 2.0)
     desk.now += DISTRUST_TIME
     desk.hear("A", 1.0)  # an answer from before the change, it may be
     desk.hear("B", 1.0)
     assert desk.reads() == []
-    desk.pass_time(DOUBT / 2 + 0.05)
+    desk.pass_time(DOUBT_TIME / 2 + 0.05)
     assert desk.reads() == ["A"]
     desk.hear("A", 2.0)
-    desk.pass_time(DOUBT / 2 + 0.05)
+    desk.pass_time(DOUBT_TIME / 2 + 0.05)
     assert desk.reads() == ["A"]
     desk.hear("A", 2.0)
-    desk.pass_time(3 * DOUBT)
+    desk.pass_time(3 * DOUBT_TIME)
     assert desk.reads() == []
     assert len(desk.machine.reads) == 0
 
@@ -332,9 +332,9 @@ def test_what_changes_twice_in_a_short_while_is_asked_for_once_more() -> None:
 def test_what_changes_slowly_is_believed() -> None:
     desk = Desk()
     for number in range(5):
-        desk.now += DOUBT + 0.1
+        desk.now += DOUBT_TIME + 0.1
         desk.hear("A", float(number))
-    desk.pass_time(3 * DOUBT)
+    desk.pass_time(3 * DOUBT_TIME)
     assert desk.reads() == []
 
 
@@ -344,7 +344,7 @@ def test_what_we_change_twice_ourselves_is_believed() -> None:
     for value in (1.0, 2.0, 3.0):
         desk.machine.write("A", value, desk.now)
         desk.hear("A", value)
-    desk.pass_time(3 * DOUBT)
+    desk.pass_time(3 * DOUBT_TIME)
     assert desk.reads() == []
 
 
@@ -355,7 +355,7 @@ def test_memory_of_changes_is_short() -> None:
         desk.hear(f"N{number}")
         if number % 10 == 0:
             desk.receive(PX4)
-    assert len(desk.machine._authors._changed_at) <= (DOUBT + 1.0) / 0.1 + 2
+    assert len(desk.machine._authors._changed_at) <= (DOUBT_TIME + 1.0) / 0.1 + 2
 
 
 # who did it
@@ -410,11 +410,11 @@ def test_an_old_set_of_another_station_is_not_the_author_of_what_comes_of_our_wr
 
 def test_the_memory_of_other_stations_is_bounded() -> None:
     desk = Desk()
-    for number in range(3 * MOST_FOREIGN_SETS):
+    for number in range(3 * FOREIGN_SETS_MAX):
         desk.machine.foreign_set(f"N{number}", bytes(4), "station 2/2", desk.now)
-    assert len(desk.machine._authors.foreign_sets) == MOST_FOREIGN_SETS
+    assert len(desk.machine._authors.foreign_sets) == FOREIGN_SETS_MAX
     desk.hear("N0")
-    desk.hear(f"N{3 * MOST_FOREIGN_SETS - 1}")
+    desk.hear(f"N{3 * FOREIGN_SETS_MAX - 1}")
     assert [change.by for change in desk.changes] == ["vehicle", "station 2/2"]
 
 

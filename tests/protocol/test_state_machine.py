@@ -17,7 +17,7 @@ from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_result import FetchResult, Policy
-from paramclient.protocol.params.list_download import MOST_ASKED
+from paramclient.protocol.params.list_download import REQUESTED_INDICES_MAX
 from paramclient.protocol.params.reads import Read
 from paramclient.protocol.params.sync import Upkeep
 from paramclient.protocol.params.writes import Write
@@ -478,7 +478,7 @@ class Sessions(RuleBasedStateMachine):
         mine = len(self.open)
         most = len(self.names) + 10
         for machine in self.world.station.components.values():
-            assert len(machine.reads) <= MOST_ASKED + mine + 3 * most
+            assert len(machine.reads) <= REQUESTED_INDICES_MAX + mine + 3 * most
             assert len(machine.writes) <= mine
             assert len(machine.table.params) <= most
             assert len(machine.table.dirty) <= most

@@ -1,1 +1,30 @@
-"""The parameter protocol of one component: table, reads, writes, downloads, hash check, sync."""
+"""The parameter protocol of one component: table, reads, writes, downloads, hash check, sync.
+
+`boot_values`: reads again what a vehicle without a hash measures at boot.
+`change`: a change of one parameter.
+`change_origin`: the author of a change.
+`duplicate_names`: parameters that share a name.
+`fetch`: one fetch: cache, file, list or sample.
+`fetch_notes`: the sentences of `FetchResult.notes`.
+`fetch_queue`: the fetches of a component, one at a time.
+`fetch_result`: policy, progress and result of a fetch.
+`file_download`: the packed parameter file over MAVFTP.
+`foreign_list`: a list that another station has requested.
+`hash_check`: what an announced hash proves about a downloaded table.
+`hash_exclusions`: the parameters that PX4 excludes from its hash.
+`list_download`: PARAM_REQUEST_LIST and the repair of its gaps.
+`list_estimate`: the expected duration of a list.
+`list_stream`: progress, pace, losses and end of a running list.
+`name_search`: reads of many names that may not exist.
+`passive`: tables from the traffic of other stations, and from logs.
+`passive_file`: the packed file as other stations read it.
+`reads`: PARAM_REQUEST_READ.
+`sampling`: check of a cached table by a random sample.
+`sync`: detection of changes that were missed.
+`sync_interval`: the interval of checks without a hash.
+`table`: the parameters, their trust and their hash.
+`value_check`: values that may be older than a change.
+`volatile_values`: reads of the values that a hash does not cover.
+`write_resolution`: changes too small for PX4 to save.
+`writes`: PARAM_SET.
+"""

@@ -1,4 +1,4 @@
-"""Values that a vehicle measures at each start: read again when it has measured them."""
+"""Values that a vehicle measures at each boot: read again after its measurements."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ from paramclient.protocol.requests.machine import Machine
 __all__ = ["StartValues"]
 
 MEASURING_TIME: Final = 3.0
-"""Seconds after a start is noticed, and after the vehicle's main loop runs, until its measurements are done.
-ArduPilot 4.6-dev (SITL) is done with gyroscopes and barometers 2.7 s after it went off, at about the time at
-which it first sends its clock; Rover shows the group GPS1_* and loads the defaults of RC*_DZ only then
+"""Seconds after a boot is detected, and after the vehicle's main loop runs, until its measurements are done.
+ArduPilot 4.6-dev (SITL) has measured gyroscopes and barometers 2.7 s after it went off, at about the time of
+its first clock message; Rover shows the group GPS1_* and loads the defaults of RC*_DZ only then
 (measured)."""
-YOUNG: Final = 5.0
-"""Seconds of its own clock up to which a vehicle that is met may still be measuring."""
-MOST_AT_ONCE: Final = 5
-"""Reads in flight: what one batch of ArduPilot serves."""
-RETRY_PAUSE: Final = 0.1
-"""Seconds until it is looked again whether a fetch has ended."""
+MEASURING_UPTIME_MAX: Final = 5.0
+"""Seconds of uptime up to which a newly found vehicle may still be measuring."""
+BOOT_READS_MAX: Final = 5
+"""Reads in flight: one batch of ArduPilot."""
+FETCH_CHECK_INTERVAL: Final = 0.1
+"""Seconds until the next look at whether a fetch has ended."""
 
 _MEASURED = re.compile(
     r"INS\d?_(ACC\d?_ID|GYR\d?_ID|ACC\d?_CALTEMP|GYR\d?_CALTEMP|GYR\d?OFFS_[XYZ]|GYROFFS_[XYZ])"
     r"|BARO\d?_(GND_PRESS|DEVID)|GND_ABS_PRESS\d?|ARSPD\d?_(OFFSET|DEVID)"
     r"|COMPASS_DEV_ID\d?|COMPASS_DEC|STAT_BOOTCNT|GPS\d?_TYPE|RC\d+_DZ"
 )
-"""ArduPilot's parameters that differed between 1.3 s and 9 s after a start (measured on three vehicles, first
-start and later ones), and their kin of other sensors."""
+"""ArduPilot's parameters that differed between 1.3 s and 9 s after a boot (measured on three vehicles, first
+and later boots), and the corresponding ones of other sensors."""
 
 
 class StartValues(Machine):
-    """Reads again what a vehicle without a hash measures at each start; see `MEASURING_TIME`.
+    """Reads again what a vehicle without a hash measures at each boot; see `MEASURING_TIME`.
 
-    Where the whole table comes as a file in no time, that is fetched instead. A vehicle with a hash needs
-    neither: its hash shows what has moved.
+    If the file of the whole table is fast, it is fetched instead. A vehicle with a hash needs neither: its
+    hash shows the changes.
 
     Args:
         context, reads, table, sync: the component's.
@@ -59,17 +59,17 @@ class StartValues(Machine):
         self._table = table
         self._sync = sync
         self._read_at = math.inf
-        self._has_clock = False  # whether its clock has been told since its start, or since it is heard
+        self._has_clock = False  # whether its clock was received since its boot, or since it was found
         self._waiting: deque[str] = deque()
         self._in_flight = 0
 
     def restarted(self, now: float, *, by_clock: bool) -> None:
-        """The vehicle has started again; `by_clock` says that its clock has shown that."""
+        """Process a reboot of the vehicle; `by_clock` says that its clock has shown it."""
         self._read_at = now + MEASURING_TIME
         self._has_clock = by_clock
 
     def clock_told(self, uptime: float, now: float) -> None:
-        """It has told its clock, which it does when its main loop runs.
+        """Process a clock message, which the vehicle sends once its main loop runs.
 
         Args:
             uptime: seconds since boot.
@@ -77,15 +77,15 @@ class StartValues(Machine):
         """
         is_first = not self._has_clock
         self._has_clock = True
-        if is_first and (self._read_at < math.inf or uptime <= YOUNG):
+        if is_first and (self._read_at < math.inf or uptime <= MEASURING_UPTIME_MAX):
             self._read_at = now + MEASURING_TIME
 
     def tick(self, now: float) -> None:
-        """Read what is due."""
+        """Read the values that are due."""
         if self._read_at > now:
             return
         if self._context.is_fetching:
-            self._read_at = now + RETRY_PAUSE
+            self._read_at = now + FETCH_CHECK_INTERVAL
             return
         self._read_at = math.inf
         if self._sync.wants_start_values and not self._sync.fetch_quick_file(now):
@@ -93,7 +93,7 @@ class StartValues(Machine):
             self._ask(now)
 
     def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity."""
+        """Return when `tick` is due, or infinity."""
         return self._read_at
 
     def lose(self, now: float) -> None:
@@ -110,7 +110,7 @@ class StartValues(Machine):
         self._waiting.clear()
 
     def _ask(self, now: float) -> None:
-        while self._waiting and self._in_flight < MOST_AT_ONCE:
+        while self._waiting and self._in_flight < BOOT_READS_MAX:
             self._in_flight += 1
             read = self._reads.ask(self._waiting.popleft(), now, urgent=False)
             read.on_done.append(partial(self._read_ended, read))
@@ -118,5 +118,5 @@ class StartValues(Machine):
     def _read_ended(self, read: Read) -> None:
         self._in_flight -= 1
         if read.result is None:
-            self._waiting.clear()  # lost, or the link is: the next start or check brings them
+            self._waiting.clear()  # the read, or the link, is lost: the next boot or check brings the values
         self._ask(read.ended_at)

@@ -1,4 +1,4 @@
-"""What happens to one parameter of a table."""
+"""A change of one parameter in a table."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from paramclient.model.values import Param, Value
 
 __all__ = ["Change"]
 
-_new = tuple.__new__  # what the constructor of a tuple ends in, after several times the time
+_new = tuple.__new__  # the constructor of a tuple ends in this call and takes several times as long
 
 
 class Change(tuple[str, Held | None, Held | None, str, Value | None, Value | None]):
-    """One parameter that appeared, changed its value or went away.
+    """One parameter that appeared, changed its value or was removed.
 
-    Each first value makes one, so the parameters in it are made when they are asked for.
+    Each first value makes a change; the parameters in it are therefore built only on access.
 
     Args:
         name: param_id.
-        old: what was known before, or None when the parameter is new.
-        new: what is known now, or None when the vehicle no longer has it.
-        by: "us" (our own `set`), "us for NAME" (one for which it was told who asked), "vehicle", or "station
-            S/C" when another station was heard setting it.
+        old: the parameter before, or None for a new one.
+        new: the parameter now, or None when the vehicle no longer has it.
+        by: the author: "us" (our own `set`), "us for NAME" (a `set` on behalf of NAME), "vehicle", or
+            "station S/C" for a PARAM_SET of another station.
     """
 
     __slots__ = ()
@@ -40,17 +40,17 @@ class Change(tuple[str, Held | None, Held | None, str, Value | None, Value | Non
 
     @property
     def old(self) -> Param | None:
-        """What was known before, or None when the parameter is new."""
+        """The parameter before, or None for a new one."""
         return None if self[1] is None else param_of(self[0], self[1], self[5])
 
     @property
     def new(self) -> Param | None:
-        """What is known now, or None when the vehicle no longer has it."""
+        """The parameter now, or None when the vehicle no longer has it."""
         return None if self[2] is None else param_of(self[0], self[2], self[4])
 
     @property
     def by(self) -> str:
-        """Who did it."""
+        """The author of the change."""
         return self[3]
 
     def __eq__(self, other: object) -> bool:

@@ -1,4 +1,4 @@
-"""Parameters that share a name: which of them the name means."""
+"""Parameters that share a name: which of them the component means by it."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from paramclient.protocol.requests.round_trip import RoundTrip
 
 __all__ = ["Repeated", "repeated_names"]
 
-MOST_TOLD: Final = 5
-"""Names that a note gives one by one."""
-SHORTEST_WAIT: Final = 0.3
-"""Seconds until the names are asked for, at the least: late answers to reads by index carry them too."""
-ANSWERS_PAUSE: Final = 0.15
-"""Seconds from an answer until the name is asked for again. Several late values of the name may come in one
-moment, and each would count as an answer to the next read otherwise."""
-ENOUGH_ANSWERS: Final = 3
-"""Answers in a row that must say the same: a list that another station has asked for brings every value of
+NAMES_LISTED_MAX: Final = 5
+"""Names that a note lists one by one."""
+READ_DELAY_MIN: Final = 0.3
+"""Seconds until the names are read, at least: late responses to reads by index carry them too."""
+RESPONSE_PAUSE: Final = 0.15
+"""Seconds from a response until the name is read again. Several late values of the name may arrive at one
+moment, and each would otherwise count as a response to the next read."""
+EQUAL_RESPONSES_MIN: Final = 3
+"""Equal responses in a row that are required: a list that another station has requested brings every value of
 the name."""
-MOST_ANSWERS: Final = 12
-"""Answers after which it is left open."""
+RESPONSES_MAX: Final = 12
+"""Responses after which the question is left open."""
 
 
 def repeated_names(names: Mapping[int, str]) -> dict[str, tuple[int, ...]]:
-    """The names that stand at more than one index, each with its indices, rising."""
+    """Return the names with more than one index, each with its indices, rising."""
     if len(set(names.values())) == len(names):
         return {}
     indices: dict[str, list[int]] = defaultdict(list)
@@ -40,13 +40,14 @@ def repeated_names(names: Mapping[int, str]) -> dict[str, tuple[int, ...]]:
 
 
 class Repeated(Operation[None]):
-    """Asks for each repeated name, so that the table holds what the component itself means by it.
+    """Reads each repeated name, so that the table holds the value that the component means by it.
 
-    What stands at the other indices then counts no more: it would replace that value each time it passes by.
-    A component that does not tell an index with a name (ArduPilot) means none of them by it; one that does
-    not answer leaves the value that was heard last.
+    Values at the other indices are then ignored: each would replace that value on arrival. A component whose
+    response by name has no index (ArduPilot) means none of them; one that does not answer leaves the last
+    received value.
 
-    What was passed over before and is repeated no longer is asked for too: its value may have been missed.
+    Names whose values were ignored before and that are no longer repeated are read too: their value may have
+    been missed.
 
     Args:
         names: as of `repeated_names`.
@@ -68,28 +69,28 @@ class Repeated(Operation[None]):
         self._table = table
         self._open: dict[str, Read] = {}
         self._answers: dict[str, list[int]] = {}
-        first_at = now + max(round_trip.timeout, SHORTEST_WAIT)
+        first_at = now + max(round_trip.timeout, READ_DELAY_MIN)
         self._ask_at = dict.fromkeys(sorted(names.keys() | table.passed_over.keys()), first_at)
         table.passed_over.clear()
 
     def tick(self, now: float) -> None:
-        """Ask, once what was under way before is over."""
+        """Read, once earlier reads are over."""
         for name in [name for name, at in self._ask_at.items() if at <= now]:
             del self._ask_at[name]
             self._ask(name, now)
 
     def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity. The reads have deadlines of their own."""
+        """Return when `tick` is due, or infinity. The reads have deadlines of their own."""
         return min(self._ask_at.values(), default=math.inf)
 
     @property
     def note(self) -> str:
-        """What a user should know of it."""
+        """A note for the user."""
         told = [
             f"{name} (indices {', '.join(map(str, places))})"
-            for name, places in list(self.names.items())[:MOST_TOLD]
+            for name, places in list(self.names.items())[:NAMES_LISTED_MAX]
         ]
-        more = f" and {len(self.names) - MOST_TOLD} more" if len(self.names) > MOST_TOLD else ""
+        more = f" and {len(self.names) - NAMES_LISTED_MAX} more" if len(self.names) > NAMES_LISTED_MAX else ""
         return (
             f"Several parameters share a name, as where names are cut at 16 bytes: {', '.join(told)}{more}. "
             "The table holds the one that the vehicle answers with when it is asked by name; "
@@ -97,7 +98,7 @@ class Repeated(Operation[None]):
         )
 
     def cancel(self) -> None:
-        """Nobody waits any more."""
+        """Cancel the reads."""
         self._ask_at.clear()
         reads, self._open = self._open, {}
         for read in reads.values():
@@ -113,9 +114,9 @@ class Repeated(Operation[None]):
         if read.result is not None and name in self.names:
             answers = self._answers.setdefault(name, [])
             answers.append(read.result.param_index)
-            if answers[-ENOUGH_ANSWERS:] == [read.result.param_index] * ENOUGH_ANSWERS:
+            if answers[-EQUAL_RESPONSES_MIN:] == [read.result.param_index] * EQUAL_RESPONSES_MIN:
                 self._table.passed_over[name] = frozenset(self.names[name]) - {read.result.param_index}
-            elif len(answers) < MOST_ANSWERS:
-                self._ask_at[name] = read.ended_at + ANSWERS_PAUSE
+            elif len(answers) < RESPONSES_MAX:
+                self._ask_at[name] = read.ended_at + RESPONSE_PAUSE
         if not self._open and not self._ask_at:
             self.finish(None, read.ended_at)

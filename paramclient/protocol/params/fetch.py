@@ -1,4 +1,4 @@
-"""Bring a component's table up to date the cheapest sure way: by the vehicle's hash, or by its list."""
+"""One fetch of a component's table: from the cache if the hash matches, otherwise as a file or by list."""
 
 from __future__ import annotations
 
@@ -43,64 +43,66 @@ from paramclient.protocol.wire import HASH_CHECK, ParamRequestRead, ParamValue
 
 __all__ = ["Check", "Fetch"]
 
-FILE_PATIENCE: Final = 1.0
-FILE_TIMEOUTS: Final = 4.0
-"""Seconds, and timeouts, for which the opening of the file may stay unanswered before the list is asked for
-beside it."""
-BLIND_PATIENCE: Final = 2.0
-"""The same where nothing at all was answered: until then four requests of each kind have gone out."""
-ENOUGH_SILENCE: Final = 5
-"""Unanswered requests to open the file after which the component counts as one that serves none."""
-FILE_SHARE: Final = 0.1
-"""The time in which the file comes, as a share of the list's: 3.07 s of 34.6 s at 57600 baud (measured)."""
-QUICK_FILE: Final = 0.4
-"""Seconds in which the file comes on a link that is no limit (measured)."""
-MOST_TO_REPEAT: Final = 1.5
-"""Seconds of a download that are repeated where the component seems to have started again: ArduPilot's clock
-shows that 1.4 s later (measured)."""
-MOST_RESTARTS: Final = 8
-"""Times that a vehicle may start again, or turn out to be another one, before a fetch is given up."""
+FILE_OPEN_TIMEOUT: Final = 1.0
+"""Seconds, at least, for which the opening of the file may stay unanswered before the list is requested as
+well."""
+FILE_OPEN_TIMEOUT_FACTOR: Final = 4.0
+"""The same in timeouts of a request: on a slow link it is longer."""
+FILE_OPEN_TIMEOUT_SILENT: Final = 2.0
+"""The same in seconds where no request at all has been answered: until then four requests of each kind have
+been sent."""
+UNANSWERED_OPENS_MAX: Final = 5
+"""Unanswered requests to open the file after which the component counts as one that serves no files."""
+FILE_TIME_RATIO: Final = 0.1
+"""The duration of the file as a share of the list's: 3.07 s of 34.6 s at 57600 baud (measured)."""
+FILE_TIME_MIN: Final = 0.4
+"""Seconds that the file takes on a link that is no bottleneck (measured)."""
+REPEATED_TIME_MAX: Final = 1.5
+"""Seconds of a download that may be repeated when the component seems to have restarted: ArduPilot's clock
+shows a restart 1.4 s later (measured)."""
+FETCH_RESTARTS_MAX: Final = 8
+"""Restarts of the vehicle, or changes of its identity, after which a fetch is given up."""
 
 
 class Check(NamedTuple):
-    """How the table of a vehicle without a hash is fetched only to see whether it has moved.
+    """A fetch that only checks whether the table of a vehicle without a hash has changed.
 
     While another station has a file open, such a fetch ends with the server's refusal.
 
     Attributes:
-        may_list: whether the list is downloaded where the file does not come for another reason.
+        may_list: whether the list is downloaded if the file is not available for another reason.
     """
 
     may_list: bool
 
 
 class Fetch(Operation[FetchResult]):
-    """One fetch: hash first where a cached table has one, else or on a difference the file, or the list.
+    """One fetch: by the hash if the cached table has one; otherwise, or on a mismatch, by file or list.
 
-    The file is asked for where the component serves it: it is exact, has the firmware's defaults, and comes
-    quicker. When that fails, the list follows, and `notes` says why. Where there is no hash, a sample of a
-    cached table may settle it, if that was asked for.
+    The file is preferred where the component serves it: it is exact, has the firmware's defaults, and is
+    faster. When it fails, the list follows, and `notes` says why. Without a hash, a sample may confirm a
+    cached table, if the caller requested one.
 
-    The list is asked for beside the file when the opening of the file stays unanswered, and when another
-    station has a file open and the list is quicker than waiting for the end of its session. As soon as the
-    file is opened after all, the list's gaps are left to it. What is complete first ends the fetch.
+    The list is requested in parallel to the file when the opening of the file stays unanswered, and when
+    another station has a file open and the list is faster than waiting for the end of its session. As soon as
+    the file is opened after all, the list's gaps are left to it. The first complete one ends the fetch.
 
-    Of a vehicle with a hash, `Proof` says whether what came is confirmed.
+    For a vehicle with a hash, `Proof` decides whether the downloaded table is confirmed.
 
-    What an earlier download has left unfinished is gone on with, when the count is still the same. With a
-    hash it must be proven in the end, or all is downloaded after all; without one what the cache knows stays
-    *cached*.
+    An unfinished download is resumed if the count is still the same. With a hash the result must be proven in
+    the end, otherwise everything is downloaded again; without a hash the cached values stay *cached*.
 
     Attributes:
-        holders: how many wait for it; with none left it is cancelled.
-        download: the download by list, once it is needed.
-        file: the download as a file, while that is tried and when it has come.
-        file_failed: whether the component has no such file, once that is known: None before, and where it may
-            be bad luck.
-        check: how it is done where only the watch wants it; None where somebody waits for the table.
-        first_value_at: when the first value came of a download by list; infinity before.
-        begun_anew_at: when it was begun anew because the component seemed to have started again; minus
-            infinity where it was not.
+        holders: callers that wait for it; at 0 the fetch is cancelled.
+        download: the list download, once it is needed.
+        file: the file download, in progress or finished.
+        file_failed: whether the component is known to have no such file; None before, and where packet loss
+            may be the cause.
+        check: the options of a fetch that only the watch has requested; None where a caller waits for the
+            table.
+        first_value_at: when a list download received its first value; infinity before.
+        begun_anew_at: when the fetch restarted because the component seemed to have restarted; minus infinity
+            where it did not.
     """
 
     def __init__(
@@ -125,10 +127,10 @@ class Fetch(Operation[FetchResult]):
         self._reads = means.reads
         table = self._table = means.table
         self._may_use_file = may_use_file
-        self._present: Mapping[int, str] | None = None  # with what a list would go on
+        self._present: Mapping[int, str] | None = None  # the values with which a list would resume
         self._list_pace: ListPace | None = None  # while another station has a file open
-        self._list_error: Exception | None = None  # why the list beside the file came to nothing
-        self._was_in_use = False  # the server's session, when the list was asked for
+        self._list_error: Exception | None = None  # why the list in parallel to the file failed
+        self._was_in_use = False  # the server's session was in use when the list was requested
         self._is_cancelled = False
         self._has_begun = self._had_no_file = self._file_was_silent = False
         self._sampling: Sampling | None = None
@@ -136,9 +138,9 @@ class Fetch(Operation[FetchResult]):
         self._proof = Proof(table)
         self._repeated: Repeated | None = None
         self._was_asked_meanwhile = False
-        self._is_hash_unknown = False  # the vehicle answers, but not to that
+        self._is_hash_unknown = False  # the vehicle answers other reads, but not that of the hash
         self.first_value_at = math.inf
-        self._held_before = 0.0  # by a download that was begun anew
+        self._held_before = 0.0  # seconds waited for the turn before the download was restarted
         self._listed = listed
         self._by_list = by_list
         self.check = check
@@ -164,7 +166,7 @@ class Fetch(Operation[FetchResult]):
             self._ask_hash(self._hash_came_first, now)
 
     def announced(self, announcement: Announcement) -> None:
-        """A `_HASH_CHECK` passed by: PX4 sends one at the head of its list."""
+        """Process a `_HASH_CHECK`: PX4 sends one at the head of its list."""
         if self.file is not None and self.file.is_awaited:
             self._proof.before = announcement
         if self.download is not None and not self.download.names:
@@ -173,12 +175,12 @@ class Fetch(Operation[FetchResult]):
                 self._proof.before = announcement
 
     def heard(self, message: ParamValue, now: float) -> None:
-        """Every PARAM_VALUE of the component passes here, before the reads take their answers."""
+        """Process a PARAM_VALUE of the component, before the reads do."""
         if self.file is not None:
             self.file.heard(message)
         download = self.download
         if download is None:
-            if not self._reads.awaits(message):  # else it comes because we have asked
+            if not self._reads.awaits(message):  # otherwise it is the response to our request
                 self._means.following.heard(message, now)
         elif not download.done:
             if self.first_value_at > now:
@@ -186,7 +188,7 @@ class Fetch(Operation[FetchResult]):
             download.heard(message, now)
             is_unheard = self._proof.before is None and not self._was_asked_meanwhile
             if is_unheard and self._context.expects_hash and not self.done:
-                # the one at the head of the list was lost; asked for now, it need not be waited for later
+                # the one at the head of the list was lost; requested now, it causes no delay later
                 self._was_asked_meanwhile = True
                 self._ask_hash(self._hash_came_meanwhile, now)
 
@@ -206,7 +208,7 @@ class Fetch(Operation[FetchResult]):
         return deadline if self._list_pace is None else min(deadline, self._list_pace.next_deadline())
 
     def look(self, now: float) -> None:
-        """See how the file stands: it may be known by now that there is none, or that the list is quicker."""
+        """Check the state of the file: the component may have none, or the list may be faster."""
         if self.file is not None:
             self.file.look(now)
         file = self.file
@@ -230,31 +232,31 @@ class Fetch(Operation[FetchResult]):
                 self._begin_list_beside(now)
 
     def doubt(self) -> None:
-        """What has come may be of the past."""
+        """Record that what was announced before proves nothing: changes may have been missed."""
         self._proof.doubt()
 
     def resume(self, now: float) -> None:
-        """The link is back."""
+        """Resume: the link is back."""
         if self.download is not None:
             self.download.resume(now)
 
     @property
     def is_about_the_cache(self) -> bool:
-        """Whether it is still to be seen if what is known already will do."""
+        """Whether it is still open if the cached table is enough."""
         return not self._has_begun or (self.download is not None and self.download.resumed > 0)
 
     @property
     def is_sampling(self) -> bool:
-        """Whether a sample is being read that may settle it."""
+        """Whether a sample is being read that may confirm the table."""
         return self._sampling is not None
 
     @property
     def is_under_way(self) -> bool:
-        """Whether parameters have come, which are of the past if the vehicle starts again."""
+        """Whether parameters were received, which are stale if the vehicle restarts."""
         return self._has_begun or self.is_sampling
 
     def restart(self, now: float) -> None:
-        """The vehicle is another one, or has started again: what came is not about it. Fetch it anew."""
+        """Start again: the vehicle has restarted or is another one, so the received values are invalid."""
         held_up = self.held_up(now)
         self._drop(now)
         self.download = None
@@ -263,7 +265,7 @@ class Fetch(Operation[FetchResult]):
         self._had_no_file = self._file_was_silent = self._was_in_use = False
         self._list_error = None
         self._restarts += 1
-        if self._restarts > MOST_RESTARTS:
+        if self._restarts > FETCH_RESTARTS_MAX:
             whose = "/".join(map(str, self._target))
             what = f"the parameters of {whose}, which has started again {self._restarts} times"
             self.fail(NoReply(what, attempts=self._restarts, waited=now - self.begun_at), now)
@@ -275,27 +277,27 @@ class Fetch(Operation[FetchResult]):
         self._begin_download(now)
 
     def seems_restarted(self, silent_since: float, now: float) -> bool:
-        """Begin anew where the component may have started again; gives whether that was done.
+        """Start again if the component may have restarted, and return whether that was done.
 
-        It is not where that would repeat more than the component's clock takes to show a restart.
+        Nothing is done if it would repeat more than the component's clock needs to show a restart.
 
         Args:
             silent_since: when the component was heard last.
             now: the time.
         """
-        if self.done or not self._has_begun or silent_since - self._download_begun_at > MOST_TO_REPEAT:
+        if self.done or not self._has_begun or silent_since - self._download_begun_at > REPEATED_TIME_MAX:
             return False
         self.begun_anew_at = now
         self.restart(now)
         return True
 
     def finish(self, result: FetchResult, now: float) -> None:
-        """End with a result as soon as no session of a file is open on board that nobody wants."""
+        """End with a result, as soon as no unused file session is open on board."""
         files = self._means.files
         if not files.has_idle_session:
             super().finish(result, now)
         else:
-            restarts = self._restarts  # a result of the run before a restart is none
+            restarts = self._restarts  # a result from before a restart is invalid
 
             def closed(at: float) -> None:
                 if not self._is_cancelled and self._restarts == restarts:
@@ -304,15 +306,15 @@ class Fetch(Operation[FetchResult]):
             files.on_closed.append(closed)
 
     def cancel(self, now: float) -> None:
-        """Nobody waits any more. What is on its way still goes into the table."""
+        """Cancel the fetch. Values in flight still go into the table."""
         self._is_cancelled = True
         self._drop(now)
 
     def partial(self, now: float, note: str) -> FetchResult:
-        """What has come so far, for someone whose time is up while it goes on.
+        """Return the result so far, for a caller whose timeout ends before the fetch.
 
         Raises:
-            NoReply: nothing has come.
+            NoReply: nothing was received.
         """
         download = self.download
         file = self.file
@@ -327,7 +329,7 @@ class Fetch(Operation[FetchResult]):
 
     @property
     def is_silent(self) -> bool:
-        """Whether nothing has come although it was asked for more than once."""
+        """Whether nothing was received although it was requested more than once."""
         if self.file is not None and not self.file.is_silent:
             return False
         if self.download is not None:
@@ -338,12 +340,12 @@ class Fetch(Operation[FetchResult]):
         return read is not None and read.attempts > 1 and not read.controls
 
     def held_up(self, now: float) -> float:
-        """Seconds for which its list has waited for its turn: other lists of the same link ran."""
+        """Return the seconds for which the list has waited for its turn: other lists of the link ran."""
         stream = self.download if self.file is None else self.file
         return self._held_before + (0.0 if stream is None else stream.held_for(now))
 
     def progress(self, now: float) -> Progress:
-        """How far it is."""
+        """Return the progress."""
         if self.file is not None and (self.download is None or not self.file.is_awaited):
             return self.file.progress(now)
         received, total = (0, self._table.count) if self.download is None else self.download.progress
@@ -351,7 +353,7 @@ class Fetch(Operation[FetchResult]):
         return Progress.after(received, total, came, now - self.first_value_at)
 
     def _sample(self, sampled: Sampled, count: int, now: float) -> None:
-        """Judge the cached table by some of its parameters."""
+        """Check the cached table by a sample of its parameters."""
         table = self._table
         sampling = self._sampling = Sampling(
             self._reads, table.params, table.encoding, count, now, size=sampled.size, seed=sampled.seed
@@ -408,7 +410,7 @@ class Fetch(Operation[FetchResult]):
         self.finish(self._result("cache", announcement.count, (), announcement.hash, now, notes), now)
 
     def _begin_or_resume(self, announced: Announcement | None, now: float) -> None:
-        """Go on with what is there, if that is enough and the vehicle's count is still the same."""
+        """Resume with the present values if they are enough and the vehicle's count is unchanged."""
         if not present_of(self._table, self._reads):
             self._begin_download(now)
         elif not self._context.expects_hash:
@@ -452,7 +454,7 @@ class Fetch(Operation[FetchResult]):
             return
         self._context.trace("%s/%s: the file is wanted, %s there", *self._target, len(present or ()))
         if self._context.expects_hash:
-            # once, and before the file: so the answer is of the time before it
+            # once and before the file, so that the response belongs to the time before it
             self._context.send(ParamRequestRead(*self._target, HASH_CHECK, -1))
         file = self.file = PackFetch(
             means.files,
@@ -467,23 +469,24 @@ class Fetch(Operation[FetchResult]):
 
     @property
     def _is_file_check(self) -> bool:
-        """Whether it ends without a list when the file does not come."""
+        """Whether the fetch ends without a list when the file is not available."""
         return self.check is not None and not self.check.may_list
 
     @property
     def _list_due_at(self) -> float:
-        """When the list is asked for beside a file whose opening nothing answers; infinity where it comes."""
+        """When the list is requested in parallel to an unanswered file; infinity while the file is
+        received."""
         file, trip = self.file, self._round_trip
         if file is None or file.done or file.is_served or not file.is_awaited or self._list_error is not None:
             return math.inf
         if file.blocked_until is not None or self.download is not None or self._is_file_check:
             return math.inf
         if trip.smoothed is None:
-            return file.asked_at + BLIND_PATIENCE
-        return file.asked_at + max(FILE_PATIENCE, FILE_TIMEOUTS * trip.prompt_timeout)
+            return file.asked_at + FILE_OPEN_TIMEOUT_SILENT
+        return file.asked_at + max(FILE_OPEN_TIMEOUT, FILE_OPEN_TIMEOUT_FACTOR * trip.prompt_timeout)
 
     def _measure_list(self, now: float) -> None:
-        """Another station has a file open: see whether the list is quicker than the end of its session."""
+        """Measure whether the list is faster than waiting for the end of another station's session."""
         gap, count = self._reads.pace.gap, self._table.count
         if gap and count:
             self._choose(count * gap, now)
@@ -497,11 +500,11 @@ class Fetch(Operation[FetchResult]):
         pace.on_done.append(ended)
 
     def _choose(self, list_takes: float, now: float) -> None:
-        """Ask for the list if it comes quicker than the file will."""
+        """Request the list if it is faster than the file will be."""
         file = self.file
         if file is None or file.blocked_until is None or self.download is not None:
             return
-        file_takes = file.blocked_until - now + max(QUICK_FILE, FILE_SHARE * list_takes)
+        file_takes = file.blocked_until - now + max(FILE_TIME_MIN, FILE_TIME_RATIO * list_takes)
         self._context.trace(
             "%s/%s: another station has a file open; the list takes %.1f s and the file %.1f s",
             *self._target,
@@ -513,7 +516,7 @@ class Fetch(Operation[FetchResult]):
             self._begin_list_beside(now)
 
     def _begin_list_beside(self, now: float) -> None:
-        """Ask for the list while the file is not served."""
+        """Request the list while the file is not served."""
         assert self.file is not None
         self.file.give_way()
         self._begin_list(now)
@@ -523,7 +526,7 @@ class Fetch(Operation[FetchResult]):
         self._context.trace("%s/%s: the list is wanted, %s there", *self._target, len(present or ()))
         count, following = self._table.count, means.following
         if not self._listed and following.is_running(now):
-            # another station has asked for it: to ask again would begin it anew for both
+            # another station has requested it: another request would restart it for both
             followed, of = following.hand_over(means.reads)
             present, count = {**(present or {}), **followed} if of == count else followed, of
         download = self.download = Download(
@@ -541,7 +544,7 @@ class Fetch(Operation[FetchResult]):
             return
         download.on_done.append(partial(self._download_ended, download))
         if self._proof.before is None and self._context.expects_hash and not self._was_asked_meanwhile:
-            # beside the list, so that a lost request of either kind shows at once
+            # in parallel to the list, so that a lost request of either kind shows at once
             self._was_asked_meanwhile = True
             self._ask_hash(self._hash_came_meanwhile, now)
 
@@ -588,7 +591,8 @@ class Fetch(Operation[FetchResult]):
             self._begin_download(now)
 
     def _hash_came_after_file(self, file: PackFetch, read: Read) -> None:
-        """The file is the vehicle's table at one moment; its hash may be of a later one."""
+        """Settle the hash: the file is the vehicle's table at one moment, the hash may belong to a later
+        one."""
         after = Announcement.answering(read)
         self._table.unconfirm()
         count = file.count or 0
@@ -597,7 +601,7 @@ class Fetch(Operation[FetchResult]):
         self.finish(result, read.ended_at)
 
     def _stay_with_cache(self, now: float) -> None:
-        """The policy allows no download: give what is known, and say so."""
+        """End with the cached values and a note: the policy allows no download."""
         table = self._table
         if not table.params:
             whose = "/".join(map(str, self._target))
@@ -613,19 +617,19 @@ class Fetch(Operation[FetchResult]):
         file = self.file
         if download.error is not None:
             if file is not None and not file.done:
-                self.download, self._list_error = None, download.error  # the file may still come
+                self.download, self._list_error = None, download.error  # the file may still be received
             else:
                 self.fail(download.error, download.ended_at)
             return
         if file is not None and not file.done:
-            self._file_was_silent = file.is_silent and file.attempts >= ENOUGH_SILENCE
+            self._file_was_silent = file.is_silent and file.attempts >= UNANSWERED_OPENS_MAX
             if self._file_was_silent and not self._was_in_use:
                 self._notes += (NO_FILE.format(file.silence(download.ended_at)),)
             self._drop_file(download.ended_at)
         if download.missing:
-            self._drop_hash_read()  # it can prove nothing
+            self._drop_hash_read()  # proves nothing
         if self._hash_read is not None or self._asks_for_repeated(download):
-            return  # it is on its way
+            return  # in flight
         now = download.ended_at if self._repeated is None else self._repeated.ended_at
         if self._is_proven(download):
             self._finish_download(download, now, ())
@@ -635,7 +639,7 @@ class Fetch(Operation[FetchResult]):
             self._settle(download, None, now)
 
     def _asks_for_repeated(self, download: Download) -> bool:
-        """Whether it is still being asked what the vehicle means by names that came more than once."""
+        """Return whether reads of repeated names are still open."""
         if self._repeated is None:
             names = repeated_names(download.names)
             if not (names or self._table.passed_over):
@@ -645,7 +649,7 @@ class Fetch(Operation[FetchResult]):
         return not self._repeated.done
 
     def _is_proven(self, download: Download) -> bool:
-        """Whether what was announced in its course proves the table that it brought."""
+        """Return whether a hash announced during the download proves the table."""
         if download.missing or not download.is_settled:
             return False
         self._remove_what_is_gone(download)
@@ -655,7 +659,7 @@ class Fetch(Operation[FetchResult]):
         self._means.changed(self._table.settle(download.names))
 
     def _settle(self, download: Download, read: Read | None, now: float) -> None:
-        """The download is over and the hash is known, if there is one."""
+        """End the fetch: the download is over and the hash, if there is one, is known."""
         after = None if read is None else Announcement.answering(read)
         notes: tuple[str, ...] = ()
         if not download.missing:
@@ -666,7 +670,7 @@ class Fetch(Operation[FetchResult]):
         if after is not None and not download.missing:
             judged = self._proof.settle(after, download.count or 0, needs_proof=download.resumed > 0)
             if judged is None:
-                # what was heard earlier is not what the vehicle has now, or cannot be told from it
+                # values received earlier are not the vehicle's present ones, or cannot be told from them
                 self._notes = (NOT_RESUMED,)
                 self._proof.forget()
                 self._was_asked_meanwhile = False
@@ -687,7 +691,7 @@ class Fetch(Operation[FetchResult]):
         else:
             table.place(download.names)
         table.count = count
-        if self._file_was_silent and not missing:  # while the list has come
+        if self._file_was_silent and not missing:  # while the list was received
             self.file_failed = True
         if self._was_in_use:
             notes += (FILE_IN_USE,)

@@ -1,4 +1,4 @@
-"""What else a result may have to say, in sentences for people."""
+"""The sentences of `FetchResult.notes`."""
 
 from __future__ import annotations
 

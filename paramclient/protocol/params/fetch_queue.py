@@ -1,4 +1,4 @@
-"""The fetches of one component: one at a time, which everyone who wants one shares, and what follows each."""
+"""The fetches of one component: one at a time, shared by all callers, and the handling of each result."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from paramclient.protocol.requests.machine import Machine
 
 __all__ = ["Fetches"]
 
-EARLY: Final = 0.25
-"""Seconds by which a start may seem to be later than the first frame that shows it: messages are not equally
-long on their way."""
+BOOT_TIME_TOLERANCE: Final = 0.25
+"""Seconds by which a boot may seem later than the first frame after it: the latency of messages differs."""
 
 
 class Fetches(Machine):
-    """What was fetched, is being fetched, and can be.
+    """The last fetch, the one in progress, and what may be fetched.
 
     Args:
-        means: what each of them works with.
+        means: the objects that each fetch uses.
         sync: the component's.
-        upkeep: what may be asked.
-        check_pace: is told how long fetches take.
-        ended: is told of each result in which the vehicle has said something of its table.
+        upkeep: what may be requested.
+        check_pace: receives the duration of fetches.
+        ended: called with each result for which the vehicle has sent something of its table.
 
     Attributes:
-        last: the result of the last one that ended, or None.
-        file_works: whether this vehicle, with this firmware, gives its table as a file: None while unknown.
-        is_same_firmware: whether what the cache knows is of this very vehicle with this very firmware.
-        overheard: what comes because others ask for it, where nothing may be asked here; else None.
+        last: the result of the last fetch, or None.
+        file_works: whether this vehicle, with this firmware, serves its table as a file: None while unknown.
+        is_same_firmware: whether the cache belongs to this very vehicle with this very firmware.
+        overheard: the table from the traffic of other stations, where nothing may be requested; otherwise
+            None.
     """
 
     def __init__(
@@ -56,10 +56,10 @@ class Fetches(Machine):
         self._policy = upkeep.policy
         self.overheard: Overheard | None = None
         if upkeep.listens_only:
-            self.overheard = Overheard(means, sync, whole=self._overheard_whole, is_log=upkeep.is_log)
+            self.overheard = Overheard(means, sync, whole=self._passive_ended, is_log=upkeep.is_log)
         self._ended = ended
         self._check_pace = check_pace
-        self._begun_anew_at = -math.inf  # of the last one
+        self._begun_anew_at = -math.inf  # of the last fetch
 
     @property
     def current(self) -> Fetch | None:
@@ -73,11 +73,12 @@ class Fetches(Machine):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was not taken from files that others read, in sentences."""
+        """Notes on what was not taken from files that other stations read."""
         return () if self.overheard is None else tuple(self.overheard.file.notes)
 
     def may_use_file(self) -> bool:
-        """Whether the table is worth asking for as a file: it has come as one, or the component says so."""
+        """Return whether to request the file: the table has come as one, or the component says that it serves
+        it."""
         return self._means.context.serves_file if self.file_works is None else self.file_works
 
     def begin(
@@ -90,15 +91,16 @@ class Fetches(Machine):
         check: Check | None = None,
         sampled: Sampled | None = None,
     ) -> Fetch:
-        """Begin one, or join the one under way; give it back with `end`.
+        """Begin a fetch, or join the one in progress; give it back with `end`.
 
         Args:
             now: the time.
             refresh: fetch even if the vehicle's hash would confirm the cached table.
-            listed: the list has been asked for already, of all components at once.
-            by_list: download by list also where the vehicle serves the file.
-            check: how, where nobody waits for it but the watch; joined by a caller it is no check any more.
-            sampled: the sample that may settle it where there is no hash, or None.
+            listed: the list was requested already, of all components at once.
+            by_list: download by list even if the vehicle serves the file.
+            check: the options of a fetch that only the watch has requested; a caller that joins ends the
+                check.
+            sampled: the sample that may confirm a table without a hash, or None.
         """
         fetch = self.current
         if fetch is not None and check is None:
@@ -135,7 +137,7 @@ class Fetches(Machine):
         return fetch
 
     def end(self, fetch: Fetch, now: float) -> None:
-        """Wait for it no longer. The last one who waited cancels it."""
+        """Give a fetch back. The last holder cancels it."""
         fetch.holders -= 1
         if fetch.holders <= 0 and not fetch.done:
             fetch.cancel(now)
@@ -143,7 +145,7 @@ class Fetches(Machine):
                 self.current = None
 
     def tick(self, now: float) -> None:
-        """Do what is due of the fetch in progress, and of the files that others read."""
+        """Do what is due of the fetch in progress, and of the files that other stations read."""
         if self.overheard is not None:
             self.overheard.file.tick(now)
         if self.current is not None:
@@ -160,7 +162,7 @@ class Fetches(Machine):
             self.current.resume(now)
 
     def lose(self, now: float) -> None:
-        """End the files that others read. A fetch goes on: the component may only be rebooting."""
+        """End the files that other stations read. A fetch goes on: the component may only be rebooting."""
         self.interrupt(now)
 
     def fail_all(self, error: Exception, now: float) -> None:
@@ -171,24 +173,23 @@ class Fetches(Machine):
             fetch.fail(error, now)
 
     def interrupt(self, now: float) -> None:
-        """The component is lost, or starts again: nothing more comes of the files that others read."""
+        """End the files that other stations read: the component is lost or restarts."""
         if self.overheard is not None:
             self.overheard.file.close(now)
 
     def seems_restarted(self, silent_since: float, now: float) -> bool:
-        """The component may have started again, which its clock shows later; see `Fetch.seems_restarted`."""
+        """Restart the fetch where the component may have restarted, before its clock shows that; see
+        `Fetch.seems_restarted`."""
         return self.current is not None and self.current.seems_restarted(silent_since, now)
 
     def are_since(self, started_at: float) -> bool:
-        """Whether the table is of the run of the component that began then: wholly fetched since, or about to
-        be.
-        """
+        """Return whether the whole table was fetched since the component's boot then, or is about to be."""
         fetch = self.current
         begun_anew_at = self._begun_anew_at if fetch is None else fetch.begun_anew_at
-        return begun_anew_at >= started_at - EARLY
+        return begun_anew_at >= started_at - BOOT_TIME_TOLERANCE
 
     def forget(self) -> None:
-        """Another vehicle has taken the address."""
+        """Forget everything: another vehicle uses the address."""
         if self.overheard is not None:
             self.overheard.file.forget()
             self.overheard.forget()
@@ -197,22 +198,22 @@ class Fetches(Machine):
         self.is_same_firmware = False
 
     def updated(self, now: float) -> None:
-        """The vehicle has another firmware now, of which no sample says anything."""
+        """Forget what depends on the firmware, as samples of the old one do: it has changed."""
         self._means.table.forget_defaults()
         self.forget()
         if self.current is not None and self.current.is_sampling:
             self.current.restart(now)
 
     def over(self, now: float) -> None:
-        """Nothing more will come."""
+        """End the passive fetch: nothing more is received."""
         self.interrupt(now)
         if self.overheard is not None:
             self.overheard.is_over = True
         if isinstance(self.current, Overhearing):
             self.current.over(now)
 
-    def _overheard_whole(self, result: FetchResult, now: float) -> None:
-        """What others have asked for has made the table whole, or confirmed it."""
+    def _passive_ended(self, result: FetchResult, now: float) -> None:
+        """Take the result of a table that the traffic of other stations has completed or confirmed."""
         self.last = result
         if self._sync.fetched(result, now):
             self._ended(result)

@@ -1,4 +1,4 @@
-"""What a fetch works with, what it is told, what it tells meanwhile, and what comes of it."""
+"""Policy, inputs, progress and result of a fetch."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from paramclient.protocol.wire import ParamValue
 __all__ = ["Announcement", "FetchResult", "Means", "Policy", "Progress", "Sampled"]
 
 FRESH_HASH: Final = 1.0
-"""Seconds for which an announced hash answers the question what the hash is. It is asked for when a component
-is found, so that a fetch right after that need not wait for another round trip."""
+"""Seconds for which an announced hash is used without a new request. The hash is requested when a component
+is found, so that a fetch right after that saves a round trip."""
 
 
 class Policy(StrEnum):
-    """What may be asked of a vehicle to bring a table up to date.
+    """The requests that a fetch may send.
 
     Attributes:
-        AUTO: whatever is the cheapest sure way.
-        HASH_ONLY: its hash and nothing more, for a vehicle in flight or a link that costs: a table that the
-            hash does not confirm stays as it was cached.
-        CACHE_ONLY: nothing.
+        AUTO: whatever is cheapest and certain.
+        HASH_ONLY: the hash only, for a vehicle in flight or a metered link: a table that the hash does not
+            confirm stays as cached.
+        CACHE_ONLY: none.
     """
 
     AUTO = "auto"
@@ -43,13 +43,13 @@ class Policy(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Means:
-    """What a fetch works with; all of it is the component's.
+    """The objects of the component that a fetch uses.
 
     Attributes:
         context, reads, table, turns, files: as their names say.
-        changed: is told of changes that no PARAM_VALUE brought.
-        doubt: is told that a table has turned out not to be what it was.
-        following: the list that another station may be having sent.
+        changed: called with changes that no PARAM_VALUE brought.
+        doubt: called when a table turns out to have changed.
+        following: the list that another station may have requested.
     """
 
     context: Context
@@ -64,10 +64,10 @@ class Means:
 
 @dataclass(frozen=True, slots=True)
 class Sampled:
-    """What sample of a cached table may settle a fetch of a vehicle without a hash.
+    """The sample of a cached table that may end a fetch of a vehicle without a hash.
 
     Attributes:
-        size: how many parameters.
+        size: parameters to read.
         seed: of the draw.
     """
 
@@ -77,7 +77,7 @@ class Sampled:
 
 @dataclass(frozen=True, slots=True)
 class Announcement:
-    """A `_HASH_CHECK` that the vehicle has sent: its hash, the count with it, and when it came."""
+    """A received `_HASH_CHECK`: hash, count, and time of reception."""
 
     hash: int
     count: int
@@ -85,28 +85,28 @@ class Announcement:
 
     @classmethod
     def of(cls, message: ParamValue, at: float) -> Announcement:
-        """What such a message says."""
+        """Return the announcement in a message."""
         return cls(int.from_bytes(message.raw, "little"), message.param_count, at)
 
     @classmethod
     def answering(cls, read: Read) -> Announcement | None:
-        """What the answer to a read of `_HASH_CHECK` says, or None without one."""
+        """Return the announcement in the response to a read of `_HASH_CHECK`, or None without one."""
         return None if read.result is None else cls.of(read.result, read.ended_at)
 
     def is_fresh(self, now: float) -> bool:
-        """Whether it need not be asked for again."""
+        """Return whether the hash need not be requested again."""
         return now - self.at <= FRESH_HASH
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far a fetch is.
+    """The progress of a fetch.
 
     Attributes:
-        received: parameters that have come.
-        total: parameters that the component has, or None before it said so.
-        rate: parameters a second since the first one came.
-        seconds_left: at that rate, or None while it cannot be told.
+        received: parameters received.
+        total: parameters of the component, or None while unknown.
+        rate: parameters per second since the first one was received.
+        seconds_left: at that rate, or None while unknown.
     """
 
     received: int
@@ -116,7 +116,7 @@ class Progress:
 
     @classmethod
     def after(cls, received: int, total: int | None, came: int, running: float) -> Progress:
-        """What it is when so many of those received came in so many seconds."""
+        """Return the progress when `came` of the received ones took `running` seconds."""
         rate = came / running if came > 0 and running > 0 else 0.0
         left = (total - received) / rate if rate and total is not None else None
         return cls(received, total, rate, left)
@@ -124,28 +124,27 @@ class Progress:
 
 @dataclass(frozen=True, slots=True)
 class FetchResult:
-    """What `fetch_all` brought.
+    """The result of `fetch_all`.
 
     Attributes:
-        system, component: whose parameters.
-        params: all that are known, by name, as they were at the end of the fetch.
-        source: "cache" when the vehicle's hash confirmed the cached table, when the policy allows no more
-            than the cache, or when a sample agreed with it; "ftp" when it came as one packed file, "stream"
-            when it came by list.
+        system, component: the component's address.
+        params: all known parameters by name, as they were at the end of the fetch.
+        source: "cache" when the vehicle's hash confirmed the cached table, when the policy allows only the
+            cache, or when a sample matched; "ftp" for the packed file, "stream" for the list.
         count: parameters that the component says it has.
         received: how many of them are known.
-        missing: indices that did not come, rising. Empty when the fetch is complete.
-        hash: the PX4 hash under which the vehicle confirmed the table; None for a vehicle without one, when
-            the table moved during the download, and when the policy kept it from being asked.
+        missing: indices that were not received, rising. Empty when the fetch is complete.
+        hash: the PX4 hash by which the vehicle confirmed the table; None for a vehicle without one, when the
+            table changed during the download, and when the policy permits no request for it.
         elapsed: seconds from the call to the end.
-        resumed: how many were known already from an earlier download that did not come to its end.
-        notes: what else is worth knowing, in sentences.
-        lost: values that the list should have brought and did not, so that they had to be asked for one by
-            one or by listing again; 0 from the cache.
-        repeated: values that came although they had come before; 0 from the cache.
+        resumed: parameters that were known from an earlier, unfinished download.
+        notes: further sentences for the user.
+        lost: values of the list that were lost, so that they had to be read one by one or by another list; 0
+            from the cache.
+        repeated: values received more than once; 0 from the cache.
         round_trip: the component's measured round trip in seconds, smoothed, or None.
-        sample: what a sample of the cached table has shown, where that settled the fetch: then nothing is
-            *verified*, and `sample.confidence` says how far it can be trusted. Else None.
+        sample: the sample that confirmed the cached table, where one ended the fetch: then nothing is
+            *verified*, and `sample.confidence` says how far it can be trusted. Otherwise None.
     """
 
     system: int
@@ -170,17 +169,18 @@ class FetchResult:
 
     @property
     def sampled(self) -> bool:
-        """Whether a sample of the cached table settled it, so that nothing of it is *verified*."""
+        """Whether a sample of the cached table ended the fetch, so that nothing is *verified*."""
         return self.sample is not None
 
     @property
     def has_moved(self) -> bool:
-        """Whether the vehicle's hash has told that the table moved while it came: it may be a mixture."""
+        """Whether the vehicle's hash shows that the table changed during the download: it may be a
+        mixture."""
         return MOVED in self.notes
 
     @property
     def is_confirmed(self) -> bool:
-        """Whether every value was heard in this session, or the vehicle's hash stands for it."""
+        """Whether every value was received in this session, or is covered by the vehicle's hash."""
         if not self.resumed or self.hash is not None:
             return True
         return all(param.trust is not Trust.CACHED or param.index is None for param in self.params.values())

@@ -1,4 +1,4 @@
-"""Fetch every parameter of a component as one packed file over MAVFTP."""
+"""File download: all parameters of a component as one packed file over MAVFTP."""
 
 from __future__ import annotations
 
@@ -23,40 +23,40 @@ from paramclient.protocol.wire import MOST_PARAMETERS, ParamValue
 __all__ = ["PARAMETER_FILE", "PackFetch"]
 
 PARAMETER_FILE: Final = "@PARAM/param.pck"
-"""The table of ArduPilot 4.1 and later, and of PX4 after 1.17."""
+"""The parameter file of ArduPilot 4.1 and later, and of PX4 after 1.17."""
 WITH_DEFAULTS: Final = "?withdefaults=1"
-"""Understood since ArduPilot 4.3; what does not know it may say that there is no such file."""
-SILENCE: Final = 2.0
-"""Seconds without anything after which the file no longer keeps the lists of others waiting."""
-MOST_TRIES: Final = 2
-"""Times that a file is read which turns out to be none, or of the past: it is made anew for each reader, and
-a gap that is filled later may hold newer values of another length."""
+"""The query for defaults, supported since ArduPilot 4.3; older servers may report that there is no such
+file."""
+FILE_SILENCE_TIMEOUT: Final = 2.0
+"""Seconds of silence after which the file no longer delays the lists of other components."""
+FILE_READS_MAX: Final = 2
+"""Reads of a file that turns out to be invalid or stale: it is generated for each reader, and a gap that is
+filled later may contain newer values of another length."""
 
 
 class PackFetch(Operation[None]):
-    """One fetch of the packed file into the table. It ends with the table filled, or with the reason why not.
+    """One download of the packed file into the table. Ends with the table filled, or with an error.
 
-    While the file comes, PARAM_VALUEs go on: what was heard since it was asked for is newer than what stands
-    in it. A param_count that differs from the file's makes the file one of the past. It waits for its turn on
-    the link, as a list does.
+    PARAM_VALUEs may arrive meanwhile: values received since the file was requested are newer than those in
+    the file. A param_count that differs from the file's makes the file stale. The download waits for its turn
+    on the link, as a list does.
 
     Args:
         files: the component's.
         turns: those of the link.
-        table: where the parameters go.
-        changed: is told of the changes.
+        table: the table to fill.
+        changed: called with the changes.
         now: the time.
-        context: the component's.
-            Else it is asked for without them where there is none with them.
-        yields: whether to give up at once when another station has a file open.
+        context: the component's. Without support for defaults, the file is requested without them.
+        yields: whether to end at once when another station has a file open.
 
     Attributes:
-        held_up: seconds for which it waited for its turn.
-        is_in_use: whether it ended as another station has a file open.
-        is_useless: whether the component does not have the file, or one that cannot be read: with this
-            firmware that will not change.
-        left_out: the indices of entries whose names no parameter file can hold: they did not come.
-        is_unheard: whether it ended as nothing at all came of it, though the component was there.
+        held_up: seconds for which it has waited for its turn.
+        is_in_use: whether it ended because another station has a file open.
+        is_useless: whether the component does not have the file, or an unreadable one, which does not change
+            with this firmware.
+        left_out: the indices of entries whose names no parameter file can hold: they were not stored.
+        is_unheard: whether it ended without any response, though the component was not lost.
     """
 
     def __init__(
@@ -97,65 +97,65 @@ class PackFetch(Operation[None]):
 
     @property
     def is_silent(self) -> bool:
-        """Whether nothing of the file has come although it was asked for more than once."""
+        """Whether nothing of the file was received although it was requested more than once."""
         return self.is_awaited and self._job is not None and self._job.attempts > 1
 
     @property
     def is_awaited(self) -> bool:
-        """Whether nothing of the file has come."""
+        """Whether nothing of the file was received."""
         return self._job is None or not self._job.received
 
     @property
     def asked_at(self) -> float:
-        """When the opening of the file was asked for; infinity while that waits for its turn."""
+        """When the opening of the file was requested; infinity while that waits for its turn."""
         return math.inf if self._job is None else self._job.asked_at
 
     @property
     def attempts(self) -> int:
-        """How often the present request was sent."""
+        """The number of times the present request was sent."""
         return 0 if self._job is None else self._job.attempts
 
     def silence(self, now: float) -> NoReply:
-        """The error of a file of which nothing comes."""
+        """Return the error for a file without a response."""
         return NoReply(PARAMETER_FILE, attempts=self.attempts, waited=now - self.asked_at)
 
     @property
     def is_served(self) -> bool:
-        """Whether the component has opened the file, so that it will come."""
+        """Whether the component has opened the file."""
         return self._job is not None and self._job.session is not None
 
     @property
     def blocked_until(self) -> float | None:
-        """When the file is opened again, while another station has a file open; None where none has."""
+        """When the file is opened again, while another station has a file open; None without one."""
         return None if self._job is None else self._job.blocked_until
 
     @property
     def silent_at(self) -> float:
-        """While nothing has come: when that has lasted too long for others to wait."""
+        """When the file counts as silent for other lists, while nothing was received."""
         return self._silent_at if self.is_awaited else math.inf
 
     def give_way(self) -> None:
-        """Let a list of the same component run beside, as long as nothing comes of the file."""
+        """Let a list of the same component run in parallel, as long as nothing of the file is received."""
         self._turns.give_back(self)
 
     def seen(self) -> Seen:
-        """What has come, in messages: a burst that is repaired on its own goes over nothing."""
+        """Return the statistics in messages: a burst that is repaired separately skips nothing."""
         came = 0 if self._job is None else self._job.received // MOST_DATA
         return Seen(came, came, 0.0, False)
 
     def begin(self, now: float) -> None:
-        """It is this file's turn."""
+        """Begin: it is this file's turn."""
         if self._waits_since is not None:
             self.held_up += now - self._waits_since
             self._waits_since = None
         self._read(now)
 
     def held_for(self, now: float) -> float:
-        """Seconds for which it has waited for its turn so far."""
+        """Return the seconds for which it has waited for its turn."""
         return self.held_up + (0.0 if self._waits_since is None else now - self._waits_since)
 
     def progress(self, now: float) -> Progress:
-        """How far it is: by the share of the file, whose size the vehicle gives."""
+        """Return the progress by the share of the file, whose size the vehicle reports."""
         job, total = self._job, self.count or self._table.count
         share = min(job.received / job.size, 1.0) if job is not None and job.size else float(self.done)
         received, running = int(share * (total or 0)), now - self.begun_at - self.held_for(now)
@@ -164,17 +164,17 @@ class PackFetch(Operation[None]):
 
     @property
     def count(self) -> int | None:
-        """Parameters that the component has, as soon as the file's beginning has said so."""
+        """Parameters of the component, as soon as the file's header was received."""
         return self._count if self._job is None else total_of(self._job.beginning)
 
     def heard(self, message: ParamValue) -> None:
-        """Every PARAM_VALUE of the component passes here, after it went into the table."""
+        """Process a PARAM_VALUE of the component, after the table has stored it."""
         self._heard.add(message.param_id)
         if message.param_count <= MOST_PARAMETERS:
             self._heard_count = message.param_count
 
     def look(self, now: float) -> None:
-        """See whether the component has said meanwhile that it has no file without the defaults either."""
+        """Check whether the component is known by now to have no file without defaults either."""
         error, job = self._not_found, self._job
         if error is not None and job is not None and not self.is_served and self._context.adds_defaults:
             self._job = None
@@ -182,7 +182,7 @@ class PackFetch(Operation[None]):
             self._fails(error, now)
 
     def cancel(self, now: float, *, is_served: bool = True) -> None:
-        """Nobody wants it any more; the file is closed on board, where the component serves files."""
+        """Cancel the download; the file is closed on board, where the component serves files."""
         job, self._job = self._job, None
         self._turns.give_back(self)
         if job is not None:
@@ -191,7 +191,7 @@ class PackFetch(Operation[None]):
     def _read(self, now: float) -> None:
         self._attempts += 1
         self._asked_at = now
-        self._silent_at = now + SILENCE
+        self._silent_at = now + FILE_SILENCE_TIMEOUT
         self._doubts = self._table.doubts
         self._heard.clear()
         self._heard_count = None
@@ -246,8 +246,8 @@ class PackFetch(Operation[None]):
         self.fail(error, now)
 
     def _is_none(self, error: PackError, now: float, *, is_useless: bool = False) -> None:
-        """What came is not the vehicle's table: read it again, or give up."""
-        if self._attempts < MOST_TRIES:
+        """Read the file again, or give up: the received one is not the vehicle's table."""
+        if self._attempts < FILE_READS_MAX:
             self._read(now)
             return
         self.is_useless = is_useless

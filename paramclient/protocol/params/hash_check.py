@@ -1,4 +1,4 @@
-"""Whether a hash that the vehicle announced belongs to the table that has come."""
+"""Whether a hash that the vehicle announced matches the downloaded table."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ __all__ = ["Proof"]
 
 
 class Proof:
-    """The hashes that were announced in the course of one fetch, and what they prove.
+    """The hashes announced during one fetch, and what they prove.
 
-    A table is the vehicle's when the hash computed from it is an announced one; or when the vehicle announced
-    the same before and after, as then nothing moved between. A hash counts only with the count that was
-    announced with it: what came into use since would be taken for what the hash leaves out.
+    A table is the vehicle's when the hash recomputed from it equals an announced one; or when the vehicle
+    announced the same hash before and after, as then nothing changed between. A hash counts only with the
+    count that was announced with it: parameters that came into use since would be taken for excluded ones.
 
     Attributes:
-        before: announced before any value counted, or None.
-        meanwhile: announced in the course of the download, or None.
+        before: announced before the first value that counts, or None.
+        meanwhile: announced during the download, or None.
     """
 
     def __init__(self, table: Table) -> None:
@@ -29,20 +29,20 @@ class Proof:
         self._is_old = False
 
     def forget(self) -> None:
-        """What was announced is about another table."""
+        """Forget the announcements: they belong to another table."""
         self.before = self.meanwhile = None
         self._is_old = False
 
     def doubt(self) -> None:
-        """The vehicle was away for a while: what it announced before proves nothing by itself."""
+        """Doubt the announcements: the vehicle was away, so they prove nothing on their own."""
         self.before = self.before if self.meanwhile is None else self.meanwhile
         self.meanwhile = None
         self._is_old = True
 
     def is_given(self, count: int) -> bool:
-        """Whether what was announced so far proves the table, which has so many parameters.
+        """Return whether the announcements so far prove the table with this many parameters.
 
-        Then it is what the vehicle had at that moment, and the hash need not be waited for again.
+        Then it is the vehicle's table of that moment, and no further hash is needed.
         """
         announced = self.before if self.meanwhile is None else self.meanwhile
         if announced is None or announced.count != count or (self._is_old and self.meanwhile is None):
@@ -54,10 +54,10 @@ class Proof:
         return is_proven
 
     def settle(self, after: Announcement, count: int, *, needs_proof: bool = False) -> tuple[str, ...] | None:
-        """Judge by what was announced after the download; give what is to be noted of it.
+        """Decide with the hash announced after the download, and return the notes.
 
-        With `needs_proof`, that the vehicle announced the same before and after does not do: None is given
-        where nothing else speaks for the table.
+        With `needs_proof`, equal hashes before and after are not enough: None is returned without another
+        proof.
         """
         table = self._table
         volatile, is_proven = find_volatile(table.listed_bits(), after.hash, believed=table.volatile)

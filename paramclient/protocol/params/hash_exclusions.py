@@ -1,8 +1,8 @@
-"""Which parameters a PX4 vehicle leaves out of its hash: found by recomputing the hash, not believed.
+"""The parameters that a PX4 vehicle excludes from its hash, found by recomputing the hash.
 
-PX4 does not count volatile parameters into `_HASH_CHECK`, and which ones are volatile depends on its version.
-The names below are only where the search begins; the set is *known* when the hash that is computed without
-it equals the one the vehicle announced.
+PX4 does not include volatile parameters in `_HASH_CHECK`, and which ones are volatile depends on its version.
+The names below are only where the search begins; the set is *known* when the hash recomputed without it
+equals the one that the vehicle announced.
 """
 
 from __future__ import annotations
@@ -17,15 +17,14 @@ from paramclient.model.values import crc32_px4
 
 __all__ = ["find_volatile", "hash_of"]
 
-MOST_HASHED: Final = 1_000_000
-"""Parameters that go into hashes while single names are tried, about a tenth of a second: trying one costs a
-hash of the whole table."""
-MOST_NAMES_REMEMBERED: Final = 4_096
-"""Names of which it is remembered whether they are of a group: those of a few firmwares. To look takes ten
-times as long, and all vehicles of a fleet have the same."""
+HASHED_PARAMETERS_MAX: Final = 1_000_000
+"""Parameters hashed while single names are tried, about 0.1 s: each attempt hashes the whole table."""
+GROUP_NAMES_MAX: Final = 4_096
+"""Names whose group is remembered: those of a few firmwares. A lookup of the group takes ten times as long,
+and all vehicles of a fleet have the same names."""
 
-# Groups of PX4 parameters marked @volatile in one firmware or another: calibration that is learnt in flight,
-# flight counters, and what follows the place on earth.
+# Groups of PX4 parameters marked @volatile in one firmware or another: calibration learnt in flight, flight
+# counters, and values that depend on the location on earth.
 _GROUPS = tuple(
     re.compile(pattern)
     for pattern in (
@@ -46,10 +45,10 @@ _GROUPS = tuple(
 def find_volatile(
     bits: Mapping[str, int], announced: int, *, believed: Iterable[str] = ()
 ) -> tuple[frozenset[str], bool]:
-    """The names that a vehicle left out when it computed its hash.
+    """Return the names that a vehicle excluded when it computed its hash.
 
-    Tries what is believed (from an earlier session), the usual groups, none, the usual groups but for one or
-    two of them, and then the first guess with each single name taken out or in.
+    Tries `believed` (from an earlier session), the usual groups, none, the usual groups except one or two of
+    them, and then the first guess with each single name removed or added.
 
     Args:
         bits: the bits of the parameters that have an index (see `Param.bits`), by name.
@@ -57,7 +56,7 @@ def find_volatile(
         believed: names that an earlier download proved, or that changed under an unchanged hash.
 
     Returns:
-        The names, and True when the hash agrees. Without agreement: the best guess, and False.
+        The names, and True when the hash matches. Without a match: the best guess, and False.
     """
     chunks = _chunks(bits)
     guess: frozenset[str] | None = None
@@ -70,19 +69,19 @@ def find_volatile(
 
 
 def hash_of(bits: Mapping[str, int], *, leave_out: frozenset[str]) -> int:
-    """The value of PX4's `_HASH_CHECK` for parameters given by their bits, see `px4_hash`."""
+    """Return the value of PX4's `_HASH_CHECK` for parameters given by their bits, see `px4_hash`."""
     return crc32_px4(b"".join(chunk for name, chunk in _chunks(bits) if name not in leave_out))
 
 
 def _chunks(bits: Mapping[str, int]) -> list[tuple[str, bytes]]:
-    """What the hash takes in of each parameter, in its order; see `hash_chunk`."""
+    """Return the bytes that the hash covers of each parameter, in its order; see `hash_chunk`."""
     return [
         (name, name.encode("latin-1") + (each & 0xFFFFFFFF).to_bytes(4, "little"))
         for name, each in sorted(bits.items())
     ]
 
 
-@lru_cache(maxsize=MOST_NAMES_REMEMBERED)
+@lru_cache(maxsize=GROUP_NAMES_MAX)
 def _group_of(name: str) -> re.Pattern[str] | None:
     return next((group for group in _GROUPS if group.fullmatch(name)), None)
 
@@ -104,5 +103,5 @@ def _candidates(names: Sequence[str], believed: frozenset[str]) -> Iterator[froz
     for left_out in (1, 2):
         for some in combinations(groups, left_out):
             yield usual.difference(*some)
-    for name in names[: MOST_HASHED // max(len(names), 1)]:
+    for name in names[: HASHED_PARAMETERS_MAX // max(len(names), 1)]:
         yield first ^ {name}

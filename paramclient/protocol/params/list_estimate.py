@@ -1,4 +1,4 @@
-"""How long a component's list would take, by what a few single reads show of the link."""
+"""The expected duration of a component's list, estimated from a few single reads."""
 
 from __future__ import annotations
 
@@ -11,24 +11,26 @@ from paramclient.protocol.requests.operation import Operation
 
 __all__ = ["ListPace"]
 
-READS: Final = 5
-"""Reads that ArduPilot answers at once: the gaps between the answers are the link's doing."""
-ENOUGH_ANSWERS: Final = 3
-"""Answers that tell enough when the rest is lost."""
-BATCH: Final = 0.05
-"""Seconds by which two answers of one batch are apart at most, on links of 740 bytes/s and more."""
-LONGEST: Final = 0.6
-"""Seconds after which the pace is judged by what has come: two batches, and a round trip of 0.4 s."""
+ESTIMATE_READS: Final = 5
+"""Reads that ArduPilot answers at once: the gaps between the responses are due to the link."""
+RESPONSES_MIN: Final = 3
+"""Responses that are enough when the others are lost."""
+BATCH_SPREAD: Final = 0.05
+"""Seconds between two responses of one batch, at most, on links of 740 bytes/s and more."""
+ESTIMATE_TIMEOUT: Final = 0.6
+"""Seconds after which the pace is estimated from the responses so far: two batches, and a round trip of 0.4
+s."""
 LIST_SHARE: Final = 0.3
-"""The share of the link that ArduPilot's list takes (measured: 34.6 s for 1382 values at 57600 baud)."""
-QUICKEST_GAP: Final = 1 / 1680
-"""Seconds from one value of the list to the next on a link that is no limit (measured)."""
+"""The share of the link's bandwidth that ArduPilot's list uses (measured: 34.6 s for 1382 values at 57600
+baud)."""
+LIST_GAP_MIN: Final = 1 / 1680
+"""Seconds between two values of the list on a link that is no bottleneck (measured)."""
 
 
 class ListPace(Operation[float]):
-    """Seconds that the whole list would take; infinity where too little has come to tell.
+    """The expected seconds of the whole list; infinity after too few responses.
 
-    The reads are those of the first indices, which any download needs.
+    It reads the first indices, which any download needs.
 
     Args:
         reads: the component's.
@@ -40,22 +42,22 @@ class ListPace(Operation[float]):
         self._reads = reads
         self._count = 0
         self._came: list[float] = []
-        self._judged_at = now + LONGEST
-        self._open = [reads.ask(index, now) for index in range(READS)]
+        self._judged_at = now + ESTIMATE_TIMEOUT
+        self._open = [reads.ask(index, now) for index in range(ESTIMATE_READS)]
         for read in list(self._open):
             read.on_done.append(partial(self._ended, read))
 
     def tick(self, now: float) -> None:
-        """Judge when it is time."""
+        """Estimate when it is due."""
         if not self.done and self._judged_at <= now:
             self._judge(now)
 
     def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity."""
+        """Return when `tick` is due, or infinity."""
         return math.inf if self.done else self._judged_at
 
     def cancel(self) -> None:
-        """Nobody wants to know any more."""
+        """Cancel the reads."""
         open_reads, self._open = self._open, []
         for read in open_reads:
             self._reads.release(read)
@@ -69,14 +71,14 @@ class ListPace(Operation[float]):
             self._came.append(read.ended_at)
         if not self._open:
             self._judge(read.ended_at)
-        elif len(self._came) >= ENOUGH_ANSWERS:
-            self._judged_at = min(self._judged_at, read.ended_at + BATCH)
+        elif len(self._came) >= RESPONSES_MIN:
+            self._judged_at = min(self._judged_at, read.ended_at + BATCH_SPREAD)
 
     def _judge(self, now: float) -> None:
         self.cancel()
         gaps = [after - before for before, after in zip(self._came, self._came[1:], strict=False)]
-        gaps = sorted(gap for gap in gaps if gap <= BATCH)
+        gaps = sorted(gap for gap in gaps if gap <= BATCH_SPREAD)
         if not gaps:
             self.finish(math.inf, now)
             return
-        self.finish(self._count * max(gaps[len(gaps) // 2] / LIST_SHARE, QUICKEST_GAP), now)
+        self.finish(self._count * max(gaps[len(gaps) // 2] / LIST_SHARE, LIST_GAP_MIN), now)

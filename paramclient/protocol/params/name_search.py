@@ -1,4 +1,4 @@
-"""Search for names that may not exist: PARAM_REQUEST_READ for all of them, and what silence means."""
+"""Search for many names that may not exist: windows of PARAM_REQUEST_READ, each with control reads."""
 
 from __future__ import annotations
 
@@ -17,22 +17,23 @@ from paramclient.protocol.wire import ParamError, ParamRequestRead, ParamValue
 
 __all__ = ["NameSearch", "NameSearches"]
 
-WINDOW: Final = 18
-"""Names that are requested at once. With the control, and one of an earlier window, they fit into the 20
-requests that ArduPilot queues."""
-LOOK_TIME: Final = 0.01
+WINDOW_SIZE: Final = 18
+"""Names requested at once. With the control, and one of an earlier window, they fit into the 20 requests that
+ArduPilot queues."""
+LOOKUP_TIME: Final = 0.01
 """Seconds that ArduPilot takes to look up one request, at most: its simulation does so about every 5 ms
-(measured), boards every millisecond. One for a parameter that it does not have takes no longer."""
-RISK: Final = 1e-6
-"""The chance that all requests of one name were lost, on a link as bad as it may be by what was seen, below
-which the name counts as unknown."""
-CLEAN_RISK: Final = 1e-3
-"""The same where nothing at all was lost so far: the link is then much better than it may be."""
+(measured), boards every 1 ms. A request for an unknown parameter takes no longer."""
+NAME_LOSS_RISK: Final = 1e-6
+"""The probability that all requests of one name were lost, at the highest loss that the observations allow,
+below which the name counts as unknown."""
+NAME_LOSS_RISK_CLEAN: Final = 1e-3
+"""The same while nothing at all was lost: the link is then much better than that loss."""
 PASSES_MIN: Final = 2
-"""Requests of one name that were passed over, at the least, before it counts as unknown."""
+"""Unanswered requests of one name, at least, before the name counts as unknown."""
 CONTROL_RISK: Final = 0.01
-"""The chance of losing all controls of a window to go below."""
+"""The probability of losing all controls of a window below which no further control is added."""
 CONTROLS_MAX: Final = 4
+"""Control reads of one window, at most."""
 CONTROLS_LOST_MAX: Final = 3
 """Windows in a row without an answer to their control, after which the search gives up."""
 
@@ -42,7 +43,7 @@ class NameSearch(Operation[None]):
 
     Attributes:
         unknown: names that the component does not have.
-        open: names of which nothing is known: the search has given up, or is not over.
+        open: names without a verdict: the search was given up, or is not over.
         attempts: windows sent.
     """
 
@@ -54,29 +55,30 @@ class NameSearch(Operation[None]):
 
     @property
     def open(self) -> frozenset[str]:
-        """Names of which nothing is known."""
+        """Names without a verdict."""
         return frozenset(self.passes)
 
     def leave_out(self, names: Iterable[str]) -> None:
-        """Search no longer for these names. What was requested may still be answered."""
+        """Remove names from the search. Requests in flight may still be answered."""
         for name in names:
             self.passes.pop(name, None)
 
 
 class NameSearches(Machine):
-    """Every search of one component, one after the other.
+    """The searches of one component, one after the other.
 
-    PX4 up to 1.17 and ArduPilot say nothing to a name that they do not have. Both serve requests in order, so
-    an answer to a later request says that a name before it was lost or does not exist. A window of names is
-    therefore followed by a control, an index that exists, or by several where much is lost. What is silent
-    when one is answered is requested again with the next window, without waiting for a timeout. Each window
-    has other controls, so that a late answer is not taken for one of a later window.
+    PX4 up to 1.17 and ArduPilot do not respond to a name that they do not have. Both serve requests in order,
+    so the response to a later request shows that an unanswered name before it was lost or does not exist. A
+    window of names is therefore followed by a control read, an index that exists, or by several where packet
+    loss is high. Names that are silent when a control is answered are requested again with the next window,
+    without waiting for a timeout. Each window has other controls, so that a late response is not taken for
+    one of a later window.
 
-    A value that comes goes into the table as any other does.
+    Received values go into the table like any other.
 
     Args:
         context, reads, table: the component's.
-        following: the list that another station may be having sent.
+        following: the list that another station may have requested.
     """
 
     def __init__(
@@ -105,13 +107,14 @@ class NameSearches(Machine):
         return len(self._searches)
 
     def _is_listing(self, now: float) -> bool:
-        """Whether a list comes, for us or for another station: then an index comes without a request."""
+        """Return whether a list is received, for us or for another station: then an index arrives without a
+        request."""
         reads = self._reads
         is_ours = reads.list_runs_again or not reads.is_idle or now < reads.list_until
         return is_ours or self._following.is_running(now)
 
     def begin(self, names: Iterable[str], now: float) -> NameSearch:
-        """Search for names, behind the searches that are open.
+        """Begin a search for names, after the open searches.
 
         Args:
             names: param_ids, as the component spells them.
@@ -127,12 +130,12 @@ class NameSearches(Machine):
         return search
 
     def cancel(self, search: NameSearch, now: float) -> None:
-        """End a search early. What was sent cannot be taken back, and is answered or not."""
+        """Cancel a search. Requests in flight cannot be recalled and may be answered."""
         if search in self._searches:
             self._leave(search, now)
 
     def heard(self, message: ParamValue, now: float) -> None:
-        """Every PARAM_VALUE of the component passes here after it went into the table."""
+        """Process a PARAM_VALUE of the component, after the table has stored it."""
         if not self._searches:
             return
         search = self._searches[0]
@@ -140,12 +143,12 @@ class NameSearches(Machine):
         is_found = passes is not None
         if passes is not None:
             for _ in range(passes):
-                self._round_trip.timed_out(1)  # it exists: what was passed over was lost
+                self._round_trip.timed_out(1)  # exists: the unanswered request was lost
             self._round_trip.answered(self._sent_at, now, 2)
             self._heard_at = now
             self._window.discard(message.param_id)
         if message.param_index in self._controls and not self._is_listing(now):
-            is_sure = self._heard_at <= self._sent_at  # else the vehicle may have served names first
+            is_sure = self._heard_at <= self._sent_at  # otherwise the vehicle may have served names first
             self._round_trip.answered(self._sent_at, now, 1 if is_sure else 2)
             self._controls_lost = 0
             self._pass_over(search)
@@ -154,7 +157,7 @@ class NameSearches(Machine):
             self._go_on(search, now)
 
     def refused(self, message: ParamError, now: float) -> None:
-        """A PARAM_ERROR that may be about a name."""
+        """Process a PARAM_ERROR that may belong to a name."""
         if not self._searches or message.param_index >= 0:
             return
         search = self._searches[0]
@@ -165,7 +168,7 @@ class NameSearches(Machine):
             self._go_on(search, now)
 
     def tick(self, now: float) -> None:
-        """See that a control is lost."""
+        """Detect a lost control."""
         if self.next_deadline() > now:
             return
         search = self._searches[0]
@@ -178,32 +181,32 @@ class NameSearches(Machine):
             self._send_window(search, now)
 
     def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity."""
+        """Return when `tick` is due, or infinity."""
         if not self._searches:
             return math.inf
         serving = 0.0
-        if self._reads.pace.is_batched:  # the next batch may begin only then
-            serving = BATCH_INTERVAL + LOOK_TIME * len(self._window)
+        if self._reads.pace.is_batched:  # the next batch cannot begin before
+            serving = BATCH_INTERVAL + LOOKUP_TIME * len(self._window)
         return max(self._sent_at, self._heard_at) + self._round_trip.timeout + serving
 
     def resume(self, now: float) -> None:
-        """The link is back: what was in flight is requested again."""
+        """Repeat what was in flight: the link is back."""
         if self._searches:
             self._start(now)
 
     def lose(self, now: float) -> None:
-        """The component is lost."""
+        """End all searches: the component is lost."""
         what = f"names of {self._target[0]}/{self._target[1]} (lost)"
         self._end_all(
             lambda search: NoReply(what, attempts=search.attempts, waited=now - search.begun_at), now
         )
 
     def fail_all(self, error: Exception, now: float) -> None:
-        """Nothing can be answered any more."""
+        """End all searches with the error."""
         self._end_all(lambda search: error, now)
 
     def _start(self, now: float) -> None:
-        """Begin the first search, or begin it again."""
+        """Begin the first search, also after an interruption."""
         search = self._searches[0]
         self._waiting = deque(search.passes)
         self._silent = []
@@ -211,13 +214,13 @@ class NameSearches(Machine):
         self._send_window(search, now)
 
     def _go_on(self, search: NameSearch, now: float) -> None:
-        """Send the next window if nothing of this one is awaited."""
+        """Send the next window if nothing of this one is in flight."""
         if not self._window:
             self._send_window(search, now)
 
     def _pass_over(self, search: NameSearch) -> None:
-        """The control of this window is answered: what is silent is lost, or does not exist."""
-        risk = RISK if self._round_trip.seen_loss else CLEAN_RISK
+        """Count silent names after an answered control: they are lost, or do not exist."""
+        risk = NAME_LOSS_RISK if self._round_trip.seen_loss else NAME_LOSS_RISK_CLEAN
         enough = max(PASSES_MIN, math.ceil(math.log(risk) / math.log(self._round_trip.feared_loss)))
         for name in sorted(search.passes.keys() & self._window):
             search.passes[name] += 1
@@ -235,7 +238,7 @@ class NameSearches(Machine):
             self._waiting.extend(self._silent)
             self._silent = []
         controls = self._round_trip.copies(CONTROL_RISK, CONTROLS_MAX)
-        most = WINDOW - 2 * (controls - 1)  # the others of the window before may be queued still
+        most = WINDOW_SIZE - 2 * (controls - 1)  # requests of the window before may still be queued
         while self._waiting and len(self._window) < most:
             name = self._waiting.popleft()
             if name in search.passes:
@@ -246,15 +249,15 @@ class NameSearches(Machine):
             self._sent_at = now
             for _ in range(controls):
                 self._send_control()
-        elif search.passes:  # what was left over has been answered meanwhile
+        elif search.passes:  # the remaining names have been answered meanwhile
             self._send_window(search, now)
         else:
             self._leave(search, now)
 
     def _send_control(self) -> None:
-        """Request an index that exists, and was not requested before if there are several.
+        """Send a control read of an existing index that was not used before, if there are several.
 
-        They fall, as rising ones would look like a list that another station has requested.
+        The indices fall: rising ones would look like a list that another station has requested.
         """
         self._controls_sent += 1
         count = self._table.count

@@ -1,4 +1,4 @@
-"""Tables that fill by what others ask for: on a link on which nothing is sent, and in logs."""
+"""Passive tables: from the traffic of other stations, on listen-only links and in logs."""
 
 from __future__ import annotations
 
@@ -15,35 +15,36 @@ from paramclient.protocol.params.passive_file import FileObserver, ObservedPack
 from paramclient.protocol.params.sync import Sync
 from paramclient.protocol.wire import MOST_PARAMETERS, ParamValue
 
-__all__ = ["OVERHEARING_PATIENCE", "Overheard", "Overhearing"]
+__all__ = ["PASSIVE_TIMEOUT", "Overheard", "Overhearing"]
 
-OVERHEARING_PATIENCE: Final = 20.0
-"""Seconds in which somebody may begin to ask for the list, where the caller sets no limit."""
-LONGEST_PAUSE: Final = 5.0
-"""Seconds without a new value after which a list counts as over: in PX4's low-bandwidth mode one comes every
-0.13 s, and who misses some asks for them again within a second or two."""
+PASSIVE_TIMEOUT: Final = 20.0
+"""Seconds, by default, in which another station may begin to request the list."""
+LIST_PAUSE_MAX: Final = 5.0
+"""Seconds without a new value after which a list counts as over: in PX4's low-bandwidth mode a value comes
+every 0.13 s, and a station that missed some requests them again within 1 to 2 s."""
 
 
 class Overheard:
-    """Follows the lists of a component that others ask for, and the hashes that it announces to them.
+    """Collects the lists of a component that other stations request, and the hashes that it announces to
+    them.
 
-    A table is whole when every index below the count has come since it was last in doubt, from lists, or in
-    the packed file that another station reads over MAVFTP. What was announced proves it where the hash
-    computed from it is the same.
+    A table is complete when every index below the count was received since the table was last in doubt, from
+    lists, or in the packed file that another station reads over MAVFTP. An announced hash proves it where the
+    hash recomputed from the table is the same.
 
     Args:
         means: the component's.
         sync: the component's.
-        whole: is told each time that the table is whole or confirmed.
+        whole: called each time that the table is complete or confirmed.
         is_log: whether the link is a log, which ends.
 
     Attributes:
-        names: what has come, by index under `count`.
-        count: as it was heard with them, or None.
-        news_at: when the last index came that was not there yet.
+        names: received names, by index under `count`.
+        count: the param_count received with them, or None.
+        news_at: when the last new index was received.
         is_log: as above.
-        is_over: whether nothing more will come.
-        file: the packed file, as others read it.
+        is_over: whether nothing more is received.
+        file: the packed file, as other stations read it.
     """
 
     def __init__(
@@ -64,7 +65,7 @@ class Overheard:
         self._source = "stream"
 
     def heard(self, message: ParamValue, now: float) -> None:
-        """Every PARAM_VALUE of the component passes here after it went into the table."""
+        """Process a PARAM_VALUE of the component, after the table has stored it."""
         name, _, _, count, index = message
         if self.file.is_reading:
             self.file.value_heard(message)
@@ -82,7 +83,7 @@ class Overheard:
                 self._complete("stream", now)
 
     def announced(self, announcement: Announcement, now: float) -> None:
-        """The component has announced a hash to somebody."""
+        """Process a hash that the component has announced to any station."""
         table = self._table
         if not table.complete:
             return
@@ -96,20 +97,20 @@ class Overheard:
             self._sync.contradicted()
 
     def forget(self) -> None:
-        """What has come may not hold any more: it counts when it has come again."""
+        """Discard the received indices: they count when they are received again."""
         self.names.clear()
         self.count = None
         self._is_whole = False
 
     def settled(self, now: float, notes: tuple[str, ...] = ()) -> FetchResult | None:
-        """The table, where it is known to be the vehicle's."""
+        """Return the table as a result if it is known to match the vehicle's."""
         if not self._sync.synced:
             return None
         source = self._source if self._is_whole else "cache"
         return self._result(source, (), self._table.hash, now, notes)
 
     def result(self, now: float, notes: tuple[str, ...] = ()) -> FetchResult | None:
-        """What has come so far; None where that is nothing."""
+        """Return the result so far; None if nothing was received."""
         result = self.settled(now, notes)
         if result is not None:
             return result
@@ -120,7 +121,7 @@ class Overheard:
         return self._result("stream", missing, None, now, notes)
 
     def _file_came(self, came: ObservedPack, now: float) -> None:
-        """Another station has read the packed file, or the beginning of it."""
+        """Take the packed file, or its beginning, that another station has read."""
         table, total = self._table, came.pack.total
         if table.count != total:
             if table.count is not None:
@@ -145,7 +146,7 @@ class Overheard:
             self._complete("ftp" if is_all else "stream", now)
 
     def _complete(self, source: str, now: float) -> None:
-        """Every index has come."""
+        """Finish the table: every index was received."""
         table = self._table
         self._is_whole = True
         self._source = source
@@ -186,11 +187,11 @@ class Overheard:
 
 
 class Overhearing(Fetch):
-    """A fetch where nothing may be asked: it waits until the table that others ask for has come.
+    """A fetch without requests: it waits for a table from the traffic of other stations.
 
-    It ends when the table is whole or confirmed, and with what has come when the list has paused for
-    `LONGEST_PAUSE`. Where nobody asks it does not end by itself. In a log it ends with that, as only then it
-    is known what the last word was.
+    It ends when the table is complete or confirmed, and with a partial result when the list has paused for
+    `LIST_PAUSE_MAX`. Without requests of another station it does not end. In a log it ends with the log, as
+    only then the last values are known.
     """
 
     def __init__(self, means: Means, overheard: Overheard, now: float) -> None:
@@ -207,12 +208,12 @@ class Overhearing(Fetch):
         )
 
     def came(self, result: FetchResult, now: float) -> None:
-        """The table is whole or confirmed."""
+        """End with a table that is complete or confirmed."""
         if not self._overheard.is_log:
             self.finish(result, now)
 
     def over(self, now: float) -> None:
-        """Nothing more will come."""
+        """End with the result so far: nothing more is received."""
         result = self._overheard.result(now)
         if result is None:
             self.fail(self._nothing(now), now)
@@ -227,7 +228,7 @@ class Overhearing(Fetch):
         overheard = self._overheard
         if overheard.is_log or overheard.file.is_reading or not overheard.names:
             return math.inf
-        return max(overheard.news_at, self.begun_at) + LONGEST_PAUSE
+        return max(overheard.news_at, self.begun_at) + LIST_PAUSE_MAX
 
     def partial(self, now: float, note: str) -> FetchResult:
         result = self._overheard.result(now, (note,))

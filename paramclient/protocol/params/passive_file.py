@@ -17,19 +17,19 @@ from paramclient.protocol.wire import MOST_PARAMETERS, FileTransfer, ParamValue
 __all__ = ["FileObserver", "ObservedPack", "acknowledges_open", "opens_parameter_file"]
 
 HEADER_SIZE: Final = 6
-"""Bytes at the beginning of the file that say how many entries it has."""
+"""Bytes of the file's header, which says how many entries the file has."""
 NOTES_MAX: Final = 20
-"""Notes that are kept: a log of a bad link may hold hundreds of reads that failed."""
+"""Notes that are kept: a log of a bad link may contain hundreds of failed reads."""
 
 
 class ObservedPack(NamedTuple):
-    """What is proven of one read of the file.
+    """The proven part of one read of the file.
 
     Attributes:
         pack: the entries, at most those before the first gap.
         start: the index of the first entry.
-        newer: names of which a PARAM_VALUE was heard after the file was opened.
-        began_at: when it was opened, in seconds.
+        newer: names with a PARAM_VALUE received after the file was opened.
+        began_at: when the file was opened, in seconds.
     """
 
     pack: Pack
@@ -38,21 +38,21 @@ class ObservedPack(NamedTuple):
     began_at: float
 
     def entries(self) -> Iterator[tuple[int, PackedParam]]:
-        """Each entry with its index."""
+        """Yield each entry with its index."""
         return enumerate(self.pack.entries, start=self.start)
 
 
 class FileObserver:
-    """Puts the parameter file together that other stations read, and says what it could not use.
+    """Assembles the parameter files that other stations read, and notes what could not be used.
 
-    Only a read whose open request was heard counts, as nothing else names the file. Of a file with gaps the
-    entries before the first one are given: no entry depends on those behind it.
+    Only a read with a received open request counts, as nothing else names the file. Of a file with gaps the
+    entries before the first gap are used: no entry depends on later ones.
 
     Args:
-        came: is called with what is proven of each read, and the time.
+        came: called with the proven part of each read, and the time.
 
     Attributes:
-        notes: what was not taken, and why, since `clear_notes`.
+        notes: what was not used, and why, since `clear_notes`.
     """
 
     def __init__(self, came: Callable[[ObservedPack, float], None]) -> None:
@@ -64,22 +64,22 @@ class FileObserver:
 
     @property
     def is_reading(self) -> bool:
-        """Whether any station is reading the file."""
+        """Whether another station is reading the file."""
         return bool(self._reads.running)
 
     def request_heard(self, message: FileTransfer, station: tuple[int, int], now: float) -> None:
-        """Take a FILE_TRANSFER_PROTOCOL that a station has sent to the component."""
+        """Process a FILE_TRANSFER_PROTOCOL that a station has sent to the component."""
         packet = Packet.unpack(message.payload)
         if packet.opcode < Opcode.ACK:
             self._reads.request_heard(packet, station, now)
 
     def reply_heard(self, message: FileTransfer, now: float) -> None:
-        """Take a FILE_TRANSFER_PROTOCOL that the component has sent to a station."""
+        """Process a FILE_TRANSFER_PROTOCOL that the component has sent to a station."""
         addressee = (message.target_system, message.target_component)
         self._reads.reply_heard(Packet.unpack(message.payload), addressee, now)
 
     def value_heard(self, message: ParamValue) -> None:
-        """Take a PARAM_VALUE of the component: it is newer than what a file holds that was opened before."""
+        """Process a PARAM_VALUE of the component: it is newer than a file that was opened before."""
         for read in self._reads.running:
             self._names.setdefault(read, set()).add(message.param_id)
             if message.param_count <= MOST_PARAMETERS:
@@ -90,15 +90,15 @@ class FileObserver:
         self._reads.tick(now)
 
     def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity."""
+        """Return when `tick` is due, or infinity."""
         return self._reads.next_deadline()
 
     def close(self, now: float) -> None:
-        """Take what there is: the component starts again or is lost, or the log is over."""
+        """End all reads with what was received: the component restarts or is lost, or the log is over."""
         self._reads.close_all(now)
 
     def forget(self) -> None:
-        """Another vehicle has taken the address."""
+        """Forget everything: another vehicle uses the address."""
         self._reads.forget()
         self._names.clear()
         self._counts.clear()
@@ -132,13 +132,13 @@ class FileObserver:
 
 
 def opens_parameter_file(message: FileTransfer) -> bool:
-    """Whether a station asks for the parameter file to be opened."""
+    """Return whether a station requests to open the parameter file."""
     packet = Packet.unpack(message.payload)
     return packet.opcode == Opcode.OPEN_FILE_RO and _is_parameter_file(path_of(packet))
 
 
 def acknowledges_open(message: FileTransfer) -> bool:
-    """Whether a server says that it has opened a file to be read."""
+    """Return whether a server acknowledges that it has opened a file for reading."""
     packet = Packet.unpack(message.payload)
     return packet.opcode == Opcode.ACK and packet.requested == Opcode.OPEN_FILE_RO
 
@@ -148,7 +148,7 @@ def _is_parameter_file(path: str) -> bool:
 
 
 def _start_of(path: str) -> int:
-    """The index of the file's first parameter, by the query with which it was opened."""
+    """Return the index of the file's first parameter, from the query with which it was opened."""
     match = _start(path)
     return 0 if match is None else int(match[1])
 

@@ -1,4 +1,4 @@
-"""One read: PARAM_REQUEST_READ until the answer or the end of patience. All reads share one pace."""
+"""PARAM_REQUEST_READ: timeouts, retries, pacing, and detection of unknown parameters."""
 
 from __future__ import annotations
 
@@ -30,45 +30,49 @@ from paramclient.protocol.wire import MOST_PARAMETERS, ParamError, ParamRequestR
 __all__ = ["Key", "Read", "Reads"]
 
 Key: TypeAlias = str | int
-"""What a read asks for: a name, or an index."""
+"""The parameter of a read: a name, or an index."""
 
-CONTROL: Final = 0
-"""The index that every component with parameters has, and that is asked for where none is known to answer."""
+CONTROL_INDEX: Final = 0
+"""The index of the control read: every component with parameters has it. Used until another index is known to
+be answered."""
 COPY_RESERVE: Final = 2.0
-"""Requests that must remain possible when one is sent again early."""
+"""Requests that the pacing must still allow when a request is sent again early."""
 COPY_RISK: Final = 0.01
-"""The chance of no answer to go below by asking again early."""
-MOST_COPIES: Final = 6
-SILENCES_TO_SPARE: Final = 16
-"""Time-outs in a row, with no answer at all between them, after which asking twice cannot be of help."""
-SILENCES_TO_GIVE_UP: Final = 16
-"""Time-outs in a row, in twice `LONGEST_SILENCE` at the least, after which a component that is heard is one
-that answers no reads at all: where two exchanges of three are lost, it comes to that once in 650 times."""
-FEWEST_CONTROLS: Final = 3
-BAD_LUCK: Final = 1e-6
-"""Answered controls, at the least, and the chance of bad luck below which a silence is the component's doing,
-by the controls that were answered. Where much is silent, nothing else tells of the link."""
-ENOUGH_CONTROLS: Final = 4
-"""Answered controls, at the least, after which a silence is the component's and not the link's."""
+"""The probability of no response below which early copies bring a read."""
+READ_COPIES_MAX: Final = 6
+"""Early copies of one request, at most: further ones gain little and take bandwidth."""
+COPY_TIMEOUTS_MAX: Final = 16
+"""Timeouts in a row, without any response between them, after which early copies are of no use."""
+TIMEOUTS_MAX: Final = 16
+"""Timeouts in a row, over at least twice `LONGEST_SILENCE`, after which a component with heartbeats counts as
+one that answers no reads: with two of three exchanges lost, this happens once in 650 times."""
+CONTROLS_MIN: Final = 3
+"""Answered control reads, at least, before a silent parameter counts as unknown."""
+LOSS_RISK: Final = 1e-6
+"""The probability of mere packet loss, by the outcome of the control reads, below which a silent parameter
+counts as unknown. Where many reads are silent, only control reads tell the link's loss."""
+CONTROLS_CERTAIN: Final = 4
+"""Answered control reads, at least, after which silence is due to the component and not to the link."""
 READS_PER_BATCH: Final = 5
+"""Reads that ArduPilot answers at once (measured)."""
 BATCH_INTERVAL: Final = 0.1
-"""Reads that ArduPilot answers at once, and seconds from one such batch to the next (measured)."""
+"""Seconds from one such batch to the next (measured)."""
 
 
 class Read(Operation[ParamValue]):
-    """One PARAM_REQUEST_READ and its answer, shared by everyone who wants the same.
+    """One PARAM_REQUEST_READ and its response, shared by all callers of the same parameter.
 
     Attributes:
         key: name or index.
-        holders: how many want the answer; nobody any more: it is dropped.
+        holders: callers that wait for the response; at 0 the read is dropped.
         attempts: requests sent.
-        copies: requests sent on top of the last one, before it had timed out.
-        is_of_caller: whether somebody waits for it, and not only a fetch.
-        controls: reads of something that exists which were answered while this one stayed silent.
-        sent_at: when the last request was sent; infinity while none is awaited.
+        copies: requests sent on top of the last one before it had timed out.
+        is_of_caller: whether a caller waits for it, and not only a fetch.
+        controls: reads of existing parameters that were answered while this one stayed silent.
+        sent_at: when the last request was sent; infinity while none is in flight.
         serving_time: seconds that the vehicle needs for the requests ahead of it; its timeout is no shorter.
-        ask_again_at: when the request is sent again, because the answer may be older than a set; else
-            infinity.
+        ask_again_at: when the request is sent again because the response may be older than a PARAM_SET;
+            otherwise infinity.
     """
 
     def __init__(self, key: Key, begun_at: float) -> None:
@@ -85,39 +89,39 @@ class Read(Operation[ParamValue]):
 
 
 class KnownParams(Protocol):
-    """What reads need of a table, to tell a parameter that is unknown from an answer that was lost."""
+    """The part of a table that tells an unknown parameter from a lost response."""
 
     @property
     def params(self) -> Container[str]:
-        """The names that are known."""
+        """The known names."""
 
     @property
     def count(self) -> int | None:
-        """The number of parameters in the list, None while it is unknown."""
+        """The number of parameters in the list; None while it is unknown."""
 
 
 class Reads(Machine):
-    """Every read of one component: as fast as it serves them, single ones before a download's.
+    """The reads of one component: paced by how fast it serves them, callers' reads before those of a
+    download.
 
-    Silence is not an answer: PX4 up to 1.17 and ArduPilot say nothing to what they do not have. What stays
-    silent is therefore asked for together with an index that it has. When that
-    keeps being answered, and a name that nobody has heard of or an index that is not below the count does
-    not, the link is not the reason: the parameter is unknown.
+    Silence is not a response: PX4 up to 1.17 and ArduPilot do not respond to a read of a parameter that they
+    do not have. A silent read is therefore accompanied by a control read of an index that exists. If the
+    control reads are answered, and a name that nothing has announced or an index that is not below the count
+    is not, the link is not the cause: the parameter is unknown.
 
     Args:
         context, table: the component's.
-        share: what all reads of the link may take of it together; None for a link of its own.
+        share: the bandwidth that all reads of the link may use together; None for a link with one component.
 
     Attributes:
-        pace: how fast requests may go out.
-        asked, retries: reads so far, and requests that were sent for another time.
-        answered_at: when a read, or the index asked for with it, was answered last.
-        list_runs_again: set while a list comes for another time: then it may answer reads by index, and that
-            tells nothing of the round trip.
-        is_idle: false while a list comes: then nothing is asked for twice to save time.
-        list_until: until when a list may still come that nobody follows any more.
-        control: the index that is asked for to learn whether the component answers at all: one that is known
-            to be there.
+        pace: the rate limit of requests.
+        asked, retries: reads so far, and repeated requests.
+        answered_at: when a read, or its control read, was answered last.
+        list_runs_again: set while a list is sent another time: it may then contain the response to a read by
+            index, which tells nothing of the round trip.
+        is_idle: false while a list is received: then no request is sent twice to save time.
+        list_until: until when values of an abandoned list may still arrive.
+        control: the index of the control read, which is known to exist.
         sent_at: when a request was sent last.
     """
 
@@ -142,14 +146,14 @@ class Reads(Machine):
         self.answered_at = self.sent_at = -math.inf
         self.list_runs_again = False
         self.is_idle = True
-        self._silences = 0  # time-outs since anything was answered
+        self._silences = 0  # timeouts since the last response
         self._silent_since = math.inf  # the first request since then
         self.list_until = -math.inf
-        self.control = CONTROL
+        self.control = CONTROL_INDEX
         self._control_at = math.inf
-        self._control_index = CONTROL  # of the one under way
+        self._control_index = CONTROL_INDEX  # of the control read in flight
         self._control_attempts = 0
-        self._controls_sent = 0.0  # the last fifty or so count
+        self._controls_sent = 0.0  # about the last fifty count
         self._controls_answered = 0.0
 
     def __len__(self) -> int:
@@ -159,17 +163,17 @@ class Reads(Machine):
         return key in self._open
 
     def _is_known(self, key: Key) -> bool:
-        """Whether anything speaks for such a parameter."""
+        """Return whether anything has announced such a parameter."""
         if isinstance(key, str):
             return key in self._table.params
         return self._table.count is None or key < self._table.count
 
     def awaits(self, message: ParamValue) -> bool:
-        """Whether this is the answer to a read under way."""
+        """Return whether this is the response to an open read."""
         return message.param_id in self._open or message.param_index in self._open
 
     def ask(self, key: Key, now: float, *, urgent: bool = True) -> Read:
-        """Want an answer; joins an open read of the same. Give it back with `release`."""
+        """Begin a read, or join an open one of the same parameter. Give it back with `release`."""
         read = self._open.get(key)
         if read is None:
             read = Read(key, now)
@@ -180,17 +184,17 @@ class Reads(Machine):
             self._patient.remove(read)
             self._urgent.append(read)
         read.holders += 1
-        self._send_waiting(now, may_copy=False)  # others may be asked for at the same moment
+        self._send_waiting(now, may_copy=False)  # other reads may begin at the same moment
         return read
 
     def release(self, read: Read) -> None:
-        """Want it no longer. The last holder drops it."""
+        """Give a read back. The last holder drops it."""
         read.holders -= 1
         if read.holders <= 0 and self._open.get(read.key) is read:
             self._drop(read)
 
     def heard(self, message: ParamValue, now: float) -> None:
-        """Every PARAM_VALUE of the component passes here after it went into the table."""
+        """Process a PARAM_VALUE of the component, after the table has stored it."""
         name, _, _, count, index = message
         wanted = self._open
         is_answer = False
@@ -213,7 +217,7 @@ class Reads(Machine):
         self._hear_control(index, count, now, is_answer=is_answer)
 
     def defer(self, message: ParamValue, until: float, now: float) -> None:
-        """Take an answer whose value may be older than a set: it ends no read; ask again at `until`."""
+        """Ignore a response whose value may be older than a PARAM_SET, and request it again at `until`."""
         is_answer = False
         for key in (message.param_id, message.param_index):
             read = self._flying.get(key)
@@ -225,26 +229,27 @@ class Reads(Machine):
         self._hear_control(message.param_index, message.param_count, now, is_answer=is_answer)
 
     def _hear_control(self, index: int, count: int, now: float, *, is_answer: bool) -> None:
-        """Take an index that was answered: it exists, and may be the one asked for to learn of the link.
+        """Process a response with an index: the index exists and may serve for control reads.
 
-        Where a read of the same parameter was in flight, the message may answer either request: `is_answer`.
+        If a read of the same parameter was in flight, the message may be the response to either request:
+        `is_answer`.
         """
         if index < count <= MOST_PARAMETERS:
-            self.control = index  # it exists, and is answered
+            self.control = index  # exists and is answered
         if index == self._control_index and self._control_at < math.inf:
-            # one that was lost may have nobody left to ask again; then this is not its answer
+            # a lost control read may have no read left that repeats it; then this is not its response
             is_late = now - self._control_at > 2 * self._round_trip.timeout
             attempts = self._control_attempts + is_late + is_answer
             self._round_trip.answered(self._control_at, now, attempts)
             self._control_at = math.inf
-            self._not_silent(now)
-            if not self.list_runs_again:  # else it may have brought the value
+            self._note_response(now)
+            if not self.list_runs_again:  # otherwise the list may have brought the value
                 self._controls_answered += 1
                 for read in self._flying.values():
                     read.controls += read.attempts > 1
 
     def refused(self, message: ParamError, now: float) -> None:
-        """A PARAM_ERROR that may be about a read."""
+        """Process a PARAM_ERROR that may belong to a read."""
         key: Key = message.param_id if message.param_index < 0 else message.param_index
         read = self._flying.get(key)
         if read is not None:
@@ -254,7 +259,7 @@ class Reads(Machine):
             self._send_waiting(now)
 
     def error_of(self, message: ParamError, key: Key) -> VehicleError:
-        """A PARAM_ERROR as an exception."""
+        """Return the exception for a PARAM_ERROR."""
         system, component = self._target
         name, index = (key, None) if isinstance(key, str) else (None, key)
         words = ParamErrorCode.name_of(message.error)
@@ -285,11 +290,11 @@ class Reads(Machine):
         )
 
     def tick(self, now: float) -> None:
-        """Ask again what stayed unanswered, give up what stayed so too often."""
+        """Repeat timed-out requests and give up reads that are out of attempts."""
         timeout = self._round_trip.timeout
         for read in [read for read in self._flying.values() if self._due_at(read) <= now]:
             if self._flying.get(read.key) is not read:
-                continue  # what the end of another one brought about
+                continue  # ended by the end of another read
             if read.ask_again_at < math.inf:
                 read.ask_again_at = math.inf
                 self._again.append(read)
@@ -300,7 +305,7 @@ class Reads(Machine):
             if self._is_hopeless(read, now):
                 self._drop(read)
                 self._trace("%s/%s %s: given up after try %s", *self._target, read.key, read.attempts)
-                read.fail(self._silence(read, now), now)
+                read.fail(self._timeout_error(read, now), now)
             else:
                 self._trace(
                     "%s/%s %s: no answer to try %s in %.3f s", *self._target, read.key, read.attempts, timeout
@@ -310,17 +315,18 @@ class Reads(Machine):
         self._send_waiting(now)
 
     def is_silent(self, now: float) -> bool:
-        """Whether nothing at all was answered for so long, and so often, that it leads nowhere."""
+        """Return whether all requests have been unanswered for so long, and so often, that more are
+        pointless."""
         tries = min(self._round_trip.tries, MOST_TRIES)
         return self._silences >= tries and now - self._silent_since >= LONGEST_SILENCE
 
     def forgive(self) -> None:
-        """The silence so far has another reason."""
+        """Reset the count of timeouts: the silence has another cause."""
         self._silences = 0
         self._silent_since = math.inf
 
     def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity."""
+        """Return when `tick` is due, or infinity."""
         earliest = math.inf
         if self._flying:
             earliest = min(map(self._due_at, self._flying.values()))
@@ -331,7 +337,7 @@ class Reads(Machine):
         return earliest
 
     def resume(self, now: float) -> None:
-        """The link is back: ask again, in its turn, for everything that was in flight."""
+        """Queue everything that was in flight again: the link is back."""
         self._control_at = self._silent_since = math.inf
         self._again.clear()
         for read in self._flying.values():
@@ -341,7 +347,7 @@ class Reads(Machine):
         self._send_waiting(now)
 
     def lose(self, now: float) -> None:
-        """The component is lost: callers wait no longer. What a fetch asks for goes on for a while."""
+        """End the reads of callers: the component is lost. Those of a fetch go on for a while."""
         for read in list(self._open.values()):
             if self._open.get(read.key) is read and read.is_of_caller:
                 self._drop(read)
@@ -349,22 +355,22 @@ class Reads(Machine):
                 read.fail(NoReply(what, attempts=read.attempts, waited=now - read.begun_at), now)
 
     def fail_all(self, error: Exception, now: float) -> None:
-        """Nothing can be answered any more. What is asked for from now on stands."""
+        """End all open reads with the error. Later reads are not affected."""
         for read in list(self._open.values()):
             if self._open.get(read.key) is read:
                 self._drop(read)
                 read.fail(error, now)
 
     def _due_at(self, read: Read) -> float:
-        """When a read in flight times out, or is sent again."""
+        """Return when a read in flight times out, or is sent again."""
         timeout = max(self._round_trip.read_timeout(read.attempts), read.serving_time)
         return min(read.sent_at + timeout, read.ask_again_at)
 
     def _time_to_serve(self) -> float:
-        """Seconds until the request that is sent now is answered, by the requests that are in flight.
+        """Return the seconds until a request sent now is answered, given the requests in flight.
 
-        The requests that reach the vehicle wait for each other: 12 in flight are served within three batches,
-        and the first batch may be a whole interval away.
+        Requests that reach the vehicle are served in order: 12 in flight are served within three batches, and
+        the first batch may be a whole interval away.
         """
         in_flight = sum(1 + read.copies for read in self._flying.values() if read.sent_at < math.inf)
         batches = math.ceil(in_flight / READS_PER_BATCH)
@@ -374,21 +380,21 @@ class Reads(Machine):
         silent_for = now - self._silent_since
         is_mute = read.attempts >= FEWEST_TRIES and silent_for >= 2 * LONGEST_SILENCE
         if (self._silences >= MOST_TRIES and silent_for >= LONGEST_SILENCE) or (
-            self._silences >= SILENCES_TO_GIVE_UP and is_mute
+            self._silences >= TIMEOUTS_MAX and is_mute
         ):
-            return True  # not one of all these was answered
-        are_enough = read.controls >= FEWEST_CONTROLS and read.attempts >= FEWEST_TRIES
-        if are_enough and self._bad_luck(read.attempts) < BAD_LUCK:
+            return True  # none of all these was answered
+        are_enough = read.controls >= CONTROLS_MIN and read.attempts >= FEWEST_TRIES
+        if are_enough and self._loss_probability(read.attempts) < LOSS_RISK:
             return True
-        # half as often will do where nothing speaks for it and the link is good enough for others
+        # half as many are enough if nothing has announced the parameter and the link serves others
         weight = 2 if self._seems_unknown(read) else 1
         return self._round_trip.is_hopeless(weight * read.attempts, now)
 
-    def _bad_luck(self, attempts: int) -> float:
-        """The chance that so many reads in a row get lost, by what became of the controls.
+    def _loss_probability(self, attempts: int) -> float:
+        """Return the probability that so many reads in a row get lost, from the outcome of the control reads.
 
-        It is reckoned by the rule of succession: ten of ten that were answered are no proof of a link that
-        loses nothing, where so many reads ask that the luckiest ten and the unluckiest read come together.
+        Uses the rule of succession: ten answered of ten do not prove a link without loss, where so many reads
+        are open that the luckiest ten and the unluckiest read coincide.
         """
         lost = self._controls_sent - self._controls_answered
         return math.prod(
@@ -396,21 +402,21 @@ class Reads(Machine):
         )
 
     def _seems_unknown(self, read: Read) -> bool:
-        return read.controls >= ENOUGH_CONTROLS and not self._is_known(read.key)
+        return read.controls >= CONTROLS_CERTAIN and not self._is_known(read.key)
 
     def _count_answer(self, read: Read, now: float) -> None:
-        self._not_silent(now)
+        self._note_response(now)
         if self.list_runs_again and isinstance(read.key, int):
             return
         is_sure = read.attempts + read.copies == 1 and read.sent_at < math.inf
         self._round_trip.answered(read.sent_at, now, 1 if is_sure else read.attempts + 1)
         self.pace.answered(now - read.sent_at if is_sure else None, now)
 
-    def _not_silent(self, now: float) -> None:
+    def _note_response(self, now: float) -> None:
         self.answered_at = now
         self.forgive()
 
-    def _silence(self, read: Read, now: float) -> Exception:
+    def _timeout_error(self, read: Read, now: float) -> Exception:
         system, component = self._target
         name, index = (read.key, None) if isinstance(read.key, str) else (None, read.key)
         what = name if name is not None else f"parameter {index}"
@@ -430,7 +436,7 @@ class Reads(Machine):
 
     @property
     def _is_answered(self) -> bool:
-        """Whether everything that was sent has been answered: one more request cannot make a queue."""
+        """Whether no request is unanswered: one more cannot make a queue."""
         return not self._flying and self.answered_at >= self.sent_at
 
     def _transmit(self, read: Read, now: float, *, is_charged: bool = True) -> None:
@@ -453,7 +459,7 @@ class Reads(Machine):
             self._send(ParamRequestRead(*self._target, read.key, -1))
 
     def _send_control(self, now: float) -> None:
-        """Ask for what is known to exist, unless that is under way for another read."""
+        """Send a control read, unless another one or a read of that index is in flight."""
         if self._control_at < math.inf:
             if now - self._control_at < self._round_trip.timeout:
                 return
@@ -462,7 +468,7 @@ class Reads(Machine):
         else:
             self._control_attempts = 1
         if not self._is_known(self.control):
-            self.control = CONTROL  # the vehicle has fewer by now
+            self.control = CONTROL_INDEX  # the vehicle has fewer parameters by now
         self._control_at = now
         self._control_index = self.control
         self._controls_sent = self._controls_sent * MEMORY + 1
@@ -471,10 +477,10 @@ class Reads(Machine):
         self._send(ParamRequestRead(*self._target, "", self.control))
 
     def _send_waiting(self, now: float, *, may_copy: bool = True) -> None:
-        """Send what waits, as far as the pace allows; on an idle link ask twice rather than wait.
+        """Send waiting requests as the rate limit allows; on an idle link, send copies instead of waiting.
 
-        A caller's read goes out whatever the pace when nothing is in flight and the last request was
-        answered: whoever asks for one value after the other is as quick as the vehicle.
+        A caller's read is sent regardless of the rate limit if nothing is in flight and the last request was
+        answered: a caller that reads one value after the other is as fast as the vehicle.
         """
         while self._again or self._urgent or self._patient:
             queue = self._urgent or self._again or self._patient
@@ -497,10 +503,10 @@ class Reads(Machine):
             self._request(read_again, now)
 
     def _copy_wanted(self) -> Read | None:
-        """A read that is worth asking for once more while its answer may be on the way."""
-        if not self.is_idle or not self._flying or self._silences >= SILENCES_TO_SPARE:
+        """Return a read for which a copy is worthwhile while its response may be on the way."""
+        if not self.is_idle or not self._flying or self._silences >= COPY_TIMEOUTS_MAX:
             return None
-        most = self._round_trip.copies(COPY_RISK, MOST_COPIES + 1) - 1
+        most = self._round_trip.copies(COPY_RISK, READ_COPIES_MAX + 1) - 1
         if not most:
             return None
         fewest = min(self._flying.values(), key=lambda read: read.copies)

@@ -1,4 +1,4 @@
-"""Whether a cached table is still the vehicle's, judged by a sample of it: for vehicles without a hash."""
+"""Random-sample check of a cached table, for vehicles without a hash."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from paramclient.protocol.requests.operation import Operation
 __all__ = ["SAMPLE_SIZE", "Sample", "Sampling"]
 
 SAMPLE_SIZE: Final = 30
-"""Parameters in a sample, unless the caller says otherwise: ArduPilot serves them in 0.6 s, and of a table of
-1,400 in which one in ten differs, 96 samples in 100 show it."""
+"""Parameters in a sample, by default: ArduPilot serves them in 0.6 s, and in a table of 1,400 with one in ten
+changed, 96 of 100 samples detect it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """What a sample of a table has shown.
+    """The outcome of a sample.
 
     Attributes:
         size: parameters that were read.
-        count: those that the table has.
-        differing: what did not agree, in words; empty where everything did.
+        count: parameters of the table.
+        differing: the differences as text; empty where everything matched.
     """
 
     size: int
@@ -36,14 +36,13 @@ class Sample:
 
     @property
     def agrees(self) -> bool:
-        """Whether name, value and count were the cached ones for each."""
+        """Whether name, value and count matched the cached ones for each parameter."""
         return not self.differing
 
     def confidence(self, changed: int = 1) -> float:
-        """The chance with which such a sample shows it when so many parameters have changed, 0 to 1.
+        """Return the probability, 0 to 1, that such a sample detects this many changed parameters.
 
-        It says nothing of which ones may have: of a single changed parameter a sample of 30 in 1,400 mostly
-        knows nothing.
+        It does not say which ones: a sample of 30 in 1,400 rarely detects a single changed parameter.
         """
         left = self.count - changed
         if left < self.size:
@@ -53,16 +52,16 @@ class Sample:
 
 
 class Sampling(Operation[Sample]):
-    """Reads of some indices, drawn with a seed. It ends with the sample, or with the error of a read.
+    """Reads of indices drawn with a seed. Ends with the sample, or with the error of a read.
 
-    It ends at the first that does not agree.
+    It ends at the first mismatch.
 
     Args:
         reads: the component's.
-        params: the table, which the answers go into before they come here.
-        encoding: how the component writes values.
-        count: parameters that the table has.
-        size: how many to read.
+        params: the table, into which the responses go before they arrive here.
+        encoding: how the component encodes values.
+        count: parameters of the table.
+        size: parameters to read.
         seed: of the draw.
         now: the time.
     """
@@ -84,7 +83,7 @@ class Sampling(Operation[Sample]):
         self._count = count
         by_index = {param.index: param for param in params.values() if param.index is not None}
         drawn = random.Random(seed).sample(range(count), min(size, count))
-        # the answers change the table, so what is expected is taken down before
+        # responses change the table, so the expected values are copied before
         self._expected = {index: by_index.get(index) for index in sorted(drawn)}
         self._size = len(drawn)
         self._open = {index: reads.ask(index, now, urgent=False) for index in self._expected}
@@ -92,7 +91,7 @@ class Sampling(Operation[Sample]):
             read.on_done.append(partial(self._came, index, read))
 
     def cancel(self) -> None:
-        """Nobody wants it any more."""
+        """Cancel the reads."""
         left, self._open = self._open, {}
         for read in left.values():
             self._reads.release(read)

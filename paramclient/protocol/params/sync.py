@@ -1,4 +1,4 @@
-"""Whether a table is still the vehicle's, and what is done to keep it so."""
+"""Sync: whether the table still matches the vehicle's, and the checks that keep it so."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from paramclient.protocol.params.fetch import Check, Fetch
 from paramclient.protocol.params.fetch_result import Announcement, FetchResult, Policy
 from paramclient.protocol.params.reads import Read, Reads
 from paramclient.protocol.params.sync_interval import CheckPace
-from paramclient.protocol.params.table import MOST_NAMES, Table
+from paramclient.protocol.params.table import NAMES_MAX, Table
 from paramclient.protocol.params.volatile_values import Refresh
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
@@ -26,43 +26,44 @@ from paramclient.protocol.wire import HASH_CHECK, ParamValue
 __all__ = ["Sync", "SyncState", "Upkeep"]
 
 WATCH_INTERVAL: Final = 30.0
-"""Seconds after which a vehicle with a hash is asked for it again, unless the user says otherwise."""
-SHORTEST_INTERVAL: Final = 1.0
-"""Seconds that may be chosen instead, at the least."""
+"""Seconds between two checks of the hash, by default."""
+WATCH_INTERVAL_MIN: Final = 1.0
+"""The shortest interval in seconds that a user may choose."""
 SETTLING_TIME: Final = 0.06
-"""Seconds from the last of our writes until the hash is asked for: what PX4 changed with it, it pushes 10 to
+"""Seconds from the last of our writes to the check of the hash: PX4 pushes changes caused by the write 10 to
 24 ms later."""
 FOREIGN_SETTLING_TIME: Final = 0.5
-"""Seconds from the last value that the vehicle or another station has changed until the hash is asked for. Of
-200 values that another station set at full speed, PX4 told this one 73 to 178; the others it had passed or
-saved before their turn came (measured)."""
+"""Seconds from the last change by the vehicle or another station to the check of the hash. Of 200 values that
+another station set at full speed, PX4 pushed 73 to 178 to this one; the others it had passed or saved before
+their turn came (measured)."""
 FOREIGN_CHECK_INTERVAL: Final = 2.0
-"""Seconds between two such questions, at the least: values may change for ever."""
+"""Seconds between two such checks, at least: values may change without end."""
 VOLATILE_SHARE: Final = 0.05
-"""The share of the time that may be taken by reading again what the hash leaves out."""
-BUSY_WAIT: Final = 0.1
-"""Seconds until it is looked again whether the link is idle."""
-GAPS_INTERVAL: Final = 5.0
-"""Seconds between two checks that gaps in the heartbeats bring about: they are many on a bad link."""
-SKIPPED_TURN_WAIT: Final = 5.0
-"""Seconds until a check is made that was skipped as another station has a file open. ArduPilot ends a session
-3 s after its last reply to anybody, so asking more often would keep open what nobody uses any more."""
+"""The share of time for repeated reads of the values that the hash does not cover."""
+IDLE_CHECK_INTERVAL: Final = 0.1
+"""Seconds until the next look at whether the link is idle."""
+GAP_CHECK_INTERVAL: Final = 5.0
+"""Seconds between two checks caused by gaps in the heartbeats, which are frequent on a bad link."""
+FILE_IN_USE_RETRY: Final = 5.0
+"""Seconds until the next attempt of a check that was skipped because another station has a file open.
+ArduPilot ends a session 3 s after its last reply to any station, so frequent attempts would keep an unused
+session open."""
 LOW_BANDWIDTH_GAP: Final = 0.1
-"""Seconds from one value of the list to the next that tell of a low-bandwidth mode: PX4's sends 8 a second, a
+"""Seconds between two values of the list that indicate a low-bandwidth mode: PX4's sends 8 values/s, a
 57600-baud radio carries 40."""
 
-_PAST: Final = -math.inf  # when something was announced that is no longer so
+_EXPIRED: Final = -math.inf  # the time of an announcement that is stale
 
 
 class SyncState(StrEnum):
-    """How the table of a component stands to the vehicle's.
+    """The relation of a component's table to the vehicle's.
 
     Attributes:
-        UNSYNCED: it was never brought up to date on this link, or a sign has come since that it moved.
-        SYNCED: it was brought up to date, and no sign has come since that it moved.
-        CHECKING: the vehicle was lost or has started again: its identity and its hash are being asked for.
-        RESYNCING: it has moved, and what did is being fetched.
-        LOST: the component is not heard any more.
+        UNSYNCED: never fetched on this link, or changed since by some sign.
+        SYNCED: fetched, without a sign of change since.
+        CHECKING: the vehicle was lost or has restarted: identity and hash are being requested.
+        RESYNCING: the vehicle's table has changed and is being fetched.
+        LOST: the component is lost.
     """
 
     UNSYNCED = "unsynced"
@@ -74,15 +75,15 @@ class SyncState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Upkeep:
-    """What is done for a table without being asked.
+    """What is done for a table without a request of the user.
 
     Attributes:
-        interval: seconds after which the vehicle is asked again whether it has moved; infinity for never.
-        without_hash: whether that goes for every vehicle without a hash too: its whole table is then fetched.
-            It goes anyway for those that give it as a file, as often as that costs little.
-        policy: what may be asked.
-        listens_only: nothing is sent at all, for whatever reason; the policy is then "cache-only".
-        is_log: the link is a log, in which nobody can be asked and which ends.
+        interval: seconds between two checks whether the table has changed; infinity for none.
+        without_hash: whether every vehicle without a hash is checked too, by fetching its whole table.
+            Vehicles that serve it as a file are checked anyway, as often as that costs little.
+        policy: what may be requested.
+        listens_only: nothing is sent, for any reason; the policy is then "cache-only".
+        is_log: the link is a log, which accepts no requests and ends.
     """
 
     interval: float = math.inf
@@ -100,11 +101,11 @@ class Upkeep:
         listen_only: bool = False,
         is_log: bool = False,
     ) -> Upkeep:
-        """What a user's choice means; see `ParamClient`.
+        """Return the upkeep for a user's choice; see `ParamClient`.
 
         Raises:
-            UsageError: there is no such policy, the interval is too short, or either is chosen where nothing
-                may be asked.
+            UsageError: no such policy, the interval is too short, or either is chosen where nothing may be
+                requested.
         """
         if listen_only or is_log:
             if interval or policy != Policy.AUTO:
@@ -116,17 +117,17 @@ class Upkeep:
             raise UsageError(f"policy is one of {', '.join(Policy)}, not {policy!r}") from None
         if interval is None:
             return cls(WATCH_INTERVAL, policy=policy)
-        if not (interval == 0 or interval >= SHORTEST_INTERVAL):
-            raise UsageError(f"watch_interval is 0 or seconds from {SHORTEST_INTERVAL:g} up, not {interval}")
+        if not (interval == 0 or interval >= WATCH_INTERVAL_MIN):
+            raise UsageError(f"watch_interval is 0 or seconds from {WATCH_INTERVAL_MIN:g} up, not {interval}")
         return cls(interval or math.inf, without_hash=True, policy=policy)
 
 
 class SyncHost(Protocol):
-    """What the watch of a table needs of its component."""
+    """The part of a component that sync uses."""
 
     @property
     def is_link_busy(self) -> bool:
-        """Whether anything is requested on the link."""
+        """Whether requests are in flight on the link."""
 
     @property
     def may_use_file(self) -> bool:
@@ -136,35 +137,35 @@ class SyncHost(Protocol):
         """Begin a fetch (with a check, of everything); give it back with `end_fetch`."""
 
     def end_fetch(self, fetch: Fetch, now: float) -> None:
-        """Wait for it no longer."""
+        """Give a fetch back."""
 
     def resynced(self, changed: tuple[str, ...], confirmed: int | None) -> None:
-        """Take that the table agrees with the vehicle's again, what had moved, and the hash."""
+        """Report that the table matches the vehicle's again, with the changed names and the hash."""
 
 
 class Sync(Machine):
-    """Follows the hashes that one component announces, and asks for them when there is a reason to.
+    """Follows the hashes that one component announces, and requests them when changes may have been missed.
 
-    Reasons are a write of ours, which moves the hash; values that others have changed, of which the vehicle
-    may not have told all; a silence, in which an update may have been lost; and the interval of the upkeep,
-    as PARAM_VALUEs of changes are sent once and never repeated. All but the first count only for a table that
-    was brought up to date on this link. Nothing is asked for in high-latency mode, or on a link that is
-    measured to be a low-bandwidth one, nor, but after changes, while anything else goes on.
+    The reasons are: a write of ours, which changes the hash; changes by others, of which the vehicle may not
+    have pushed all; a gap in the heartbeats, in which a change may have been lost; and the interval of the
+    upkeep, as a PARAM_VALUE of a change is sent once and never repeated. All but the first apply only to a
+    table that was fetched on this link. Nothing is requested in high-latency mode, or on a link measured to
+    be in a low-bandwidth mode, nor, except after changes, while other requests are in flight.
 
-    With each interval, the values that the hash leaves out are read again. Of a component without a hash the
-    file, or the list, is fetched, as often as `check_pace` says.
+    With each interval, the values that the hash does not cover are read again. For a component without a hash
+    the file, or the list, is fetched, as often as `check_pace` says.
 
     Args:
         context, reads, table, presence, files: the component's.
-        upkeep: what is done without being asked.
-        check_pace: how often a table without a hash is fetched again.
-        host: the component itself.
+        upkeep: what is done without a request.
+        check_pace: the interval of fetches without a hash.
+        host: the component.
 
     Attributes:
-        announced: the last hash that was heard, or None.
-        synced: whether the table was brought up to date on this link and no sign came since that it moved.
-        refresh: the reading of what a hash that confirmed the table does not cover, or None.
-        holds: how many set-ups are under way, which read the table themselves: no check is begun meanwhile.
+        announced: the last hash received, or None.
+        synced: whether the table was fetched on this link, without a sign of change since.
+        refresh: the reads of values that a confirmed hash does not cover, or None.
+        holds: set-ups in progress, which read the table themselves: no check begins meanwhile.
     """
 
     def __init__(
@@ -190,23 +191,23 @@ class Sync(Machine):
         self.synced = False
         self.refresh: Refresh | None = None
         self.holds = 0
-        self._was_synced = False  # at any time on this link: only then is there something to keep up
+        self._was_synced = False  # at any time on this link: checks are for such tables only
         self._moved_by_us_alone = False
-        self._settle_at = math.inf  # when to ask for the hash after our writes
-        self._foreign_check_at = math.inf  # when to ask for the hash after changes by others
+        self._settle_at = math.inf  # when to request the hash after our writes
+        self._foreign_check_at = math.inf  # when to request the hash after changes by others
         self._foreign_checked_at = -math.inf
         self._check_at = math.inf
         self._checked_at = -math.inf
         self._is_checking = False
-        self._volatile_at = -math.inf  # when what the hash leaves out may be read again
-        self._reads_volatile = False  # once the hash that is being asked for agrees
+        self._volatile_at = -math.inf  # when values outside the hash may be read again
+        self._reads_volatile = False  # after a match of the requested hash
         self._resync: Fetch | None = None
-        self._has_fallen = False  # it was synced, and is not
-        self._moved: dict[str, None] = {}  # what has changed since then
+        self._was_marked_unsynced = False  # was synced and is not
+        self._moved: dict[str, None] = {}  # names changed since then
 
     @property
     def state(self) -> SyncState:
-        """How the table stands to the vehicle's, of a component that is heard."""
+        """The state of the table of a component that is not lost."""
         if self.synced:
             return SyncState.SYNCED
         if self._resync is not None:
@@ -215,34 +216,34 @@ class Sync(Machine):
 
     @property
     def expects_hash(self) -> bool:
-        """Whether the component has a hash, as far as is known."""
+        """Whether the component has a hash, as far as known."""
         return self._context.expects_hash
 
     @property
     def is_doubted(self) -> bool:
-        """Whether it is open who the component is."""
+        """Whether the component's identity is in doubt."""
         return self._context.is_doubted
 
     @property
     def is_settling(self) -> bool:
-        """Whether the hash after a write of ours has not come yet."""
+        """Whether the hash after a write of ours has not been received yet."""
         return self._settle_at < math.inf or HASH_CHECK in self._reads
 
-    # what is heard
+    # received messages
 
     def hash_heard(self, message: ParamValue, now: float) -> Announcement:
-        """A `_HASH_CHECK` has come."""
+        """Process a `_HASH_CHECK`."""
         self.announced = Announcement.of(message, now)
         self._context.has_hash = True
         return self.announced
 
     def changed(self, name: str, by: str, now: float | None = None) -> None:
-        """A parameter has changed: the hash that was announced is of the past, unless that leaves it out.
+        """Process a changed parameter: the announced hash is stale, unless it excludes the parameter.
 
         Args:
             name: param_id.
-            by: who has changed it.
-            now: the time; None where a fetch has found it out, which brings the others too.
+            by: the author of the change.
+            now: the time; None for a change found by a fetch, which brings other changes too.
         """
         if name not in self._table.volatile:
             if not is_ours(by):
@@ -250,91 +251,91 @@ class Sync(Machine):
                 if now is not None:
                     self._foreign_changed(now)
             self.expire_hash()
-        if (self._has_fallen or self._resync is not None) and len(self._moved) < MOST_NAMES:
+        if (self._was_marked_unsynced or self._resync is not None) and len(self._moved) < NAMES_MAX:
             self._moved[name] = None
 
     def expire_hash(self) -> None:
-        """The hash that was announced last is of the past: it is asked for again before it counts."""
+        """Mark the last announced hash as stale: it is requested again before it counts."""
         announced = self.announced
-        if announced is not None and announced.at != _PAST:
-            self.announced = replace(announced, at=_PAST)
+        if announced is not None and announced.at != _EXPIRED:
+            self.announced = replace(announced, at=_EXPIRED)
 
     def count_moved(self, now: float) -> None:
-        """Another number of parameters was heard: the table is not what it was."""
-        self._fall()
+        """Process a changed count: the table has changed."""
+        self._mark_unsynced()
         if self._is_kept_up:
             pause = 0.0 if self.expects_hash else self._check_pace.shortest_pause
             self._check_at = min(self._check_at, max(now, self._checked_at + pause))
 
     def silence(self, now: float) -> None:
-        """The component is heard again after a silence in which something may have been missed.
+        """Process the end of a gap in which changes may have been missed.
 
-        That is worth a question for the hash, but no list of one that has none: gaps are many on a bad link.
+        Requests the hash, but no list of a component without one: gaps are frequent on a bad link.
         """
         if self._is_kept_up and self.expects_hash:
-            self._check_at = min(self._check_at, max(now, self._checked_at + GAPS_INTERVAL))
+            self._check_at = min(self._check_at, max(now, self._checked_at + GAP_CHECK_INTERVAL))
 
     def write_ended(self, now: float) -> None:
-        """A write of ours has ended, and may have moved the hash."""
+        """Process the end of a write of ours, which may have changed the hash."""
         if self.expects_hash and now < math.inf:
             self._settle_at = now + SETTLING_TIME
 
     def doubt(self) -> None:
-        """The component is lost, or has started again: the table counts once its hash has confirmed it."""
-        self._fall()
+        """Doubt the table until its hash has confirmed it: the component is lost or has restarted."""
+        self._mark_unsynced()
         self.stop()
         self.expire_hash()
 
     def check(self, now: float) -> None:
-        """It is there again: see whether the table still holds, as soon as the link is idle."""
+        """Plan a check of the table as soon as the link is idle: the component is back."""
         may_ask = self._upkeep.policy is not Policy.CACHE_ONLY
         if may_ask and (self._table.complete or self._is_kept_up):
             self._is_checking = self.expects_hash
             self._check_at = now
 
     def fetched(self, result: FetchResult, now: float) -> bool:
-        """A fetch has ended, not only one of ours. False when the vehicle has said nothing of its table."""
+        """Process the end of any fetch. Return False when the vehicle has sent nothing of its table."""
         if result.source == "cache" and result.hash is None:
             self._not_confirmed()
             return False
         table = self._table
         complete = result.complete and table.complete and not result.has_moved
-        if result.hash is None:  # what came before it was lost may have moved since
+        if result.hash is None:  # values from before the loss may have changed since
             complete = complete and not table.only_cached
         if not complete:
-            self._fall()
+            self._mark_unsynced()
         self.synced = complete
         self._was_synced |= complete or result.has_moved
         self._moved_by_us_alone = result.hash is not None
         self._settled(now, now if result.hash is not None else now - result.elapsed)
         if result.has_moved and self._is_kept_up:
-            self._check_at = now + GAPS_INTERVAL
+            self._check_at = now + GAP_CHECK_INTERVAL
         if result.hash is not None:
             self._read_unhashed(result.hash, now)
         return True
 
     def contradicted(self) -> None:
-        """A hash has come that is not the table's, and nothing can be done about it."""
+        """Process a hash mismatch after which nothing can be fetched."""
         self._not_confirmed()
 
     def forget(self) -> None:
-        """Another vehicle has taken the address: nothing that is known is about it."""
+        """Forget everything: another vehicle uses the address."""
         self.announced = None
         self._context.has_hash = None
         self.synced = self._was_synced = self._moved_by_us_alone = False
-        self._has_fallen = False
+        self._was_marked_unsynced = False
         self.stop()
 
-    # what is asked
+    # requests
 
     def ask(self, now: float) -> None:
-        """Ask for the hash: ahead of a fetch, so that it need not wait for it, or to see whether it moved."""
+        """Request the hash: ahead of a fetch, to save its round trip, or to detect a change."""
         if self._upkeep.policy is not Policy.CACHE_ONLY:
             read = self._reads.ask(HASH_CHECK, now)
             read.on_done.append(lambda: self._hash_came(read))
 
     def fetch_quick_file(self, now: float) -> bool:
-        """Fetch the table anew where it comes as a file in no time; false where it does not, or may not."""
+        """Fetch the table again if its file is fast; return False where it is not, or is not permitted."""
         may_fetch = self._is_kept_up and not self.is_spared and not self._files.is_in_use(now)
         if not may_fetch or not self._check_pace.file_is_quick:
             return False
@@ -342,7 +343,7 @@ class Sync(Machine):
         return True
 
     def compare(self, now: float) -> bool:
-        """Whether the vehicle has just announced the hash that belongs to the table; then it is confirmed."""
+        """Return whether the vehicle has just announced the table's hash, which is then confirmed."""
         table, announced = self._table, self.announced
         if announced is None or not announced.is_fresh(now) or announced.hash != table.hash:
             return False
@@ -353,7 +354,7 @@ class Sync(Machine):
         return True
 
     def tick(self, now: float) -> None:
-        """Ask for the hash when it is due."""
+        """Request the hash when it is due."""
         if self._settle_at <= now:
             self._settle_at = math.inf
             self.ask(now)
@@ -364,59 +365,59 @@ class Sync(Machine):
             self._check(now)
 
     def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity."""
+        """Return when `tick` is due, or infinity."""
         return min(self._settle_at, self._foreign_check_at, self._check_at)
 
     def fail_all(self, error: Exception, now: float) -> None:
-        """End the reading of volatile values with the error, and request nothing any more."""
+        """End the reads of volatile values with the error, and request nothing any more."""
         if self.refresh is not None:
             self.refresh.fail(error, now)
         self.stop()
 
     def stop(self) -> None:
-        """Ask for nothing any more, unless there is a new reason to."""
+        """Request nothing any more until there is a new reason."""
         self._settle_at = self._foreign_check_at = self._check_at = math.inf
         self._is_checking = self._reads_volatile = False
 
     @property
     def is_spared(self) -> bool:
-        """Whether the component is lost, or in a mode in which nothing is requested unasked."""
+        """Whether the component is lost, or in a mode in which requests are sent for callers only."""
         presence = self._presence
         return presence.is_lost or presence.is_high_latency or self._reads.pace.gap >= LOW_BANDWIDTH_GAP
 
     @property
     def wants_start_values(self) -> bool:
-        """Whether what is measured at each start is to be read again unasked, as no hash shows it."""
+        """Whether values measured at boot are to be read again, as no hash covers them."""
         upkeep = self._upkeep
         is_kept_up = upkeep.interval < math.inf and upkeep.policy is Policy.AUTO
         return is_kept_up and not self.expects_hash and not self.is_spared
 
     @property
     def may_resync(self) -> bool:
-        """Whether a hash that is not the table's leads to a new fetch."""
+        """Whether a hash mismatch leads to a new fetch."""
         return self._is_kept_up and not self.is_spared
 
     # private
 
     @property
     def _is_kept_up(self) -> bool:
-        """Whether the table is to be followed without being asked."""
+        """Whether the table is to be kept in sync."""
         upkeep = self._upkeep
         return self._was_synced and upkeep.interval < math.inf and upkeep.policy is Policy.AUTO
 
-    def _fall(self) -> None:
+    def _mark_unsynced(self) -> None:
         if self.synced:
             self.synced = False
-            self._has_fallen = True
+            self._was_marked_unsynced = True
             self._moved.clear()
 
     def _not_confirmed(self) -> None:
-        """The table was to be confirmed, and is not: what a hash has confirmed before is in doubt."""
-        self._fall()
+        """Doubt the verified values: the table was to be confirmed and was not."""
+        self._mark_unsynced()
         self._table.doubt(Trust.VERIFIED)
 
     def _read_unhashed(self, confirmed: int, now: float, *, again: bool = False) -> None:
-        """Read what the hash says nothing about; `again` is as in `Refresh`."""
+        """Read the values that the hash does not cover; `again` is as in `Refresh`."""
         if self._upkeep.policy is not Policy.AUTO:
             return
         refresh = Refresh(self._reads, self._table, confirmed, self._context, now, again=again)
@@ -431,21 +432,21 @@ class Sync(Machine):
             self.refresh = None
 
     def _foreign_changed(self, now: float) -> None:
-        """The vehicle or another station has changed a value. A fetch under way brings the others too."""
+        """Process a change by the vehicle or another station. A fetch in progress brings further ones too."""
         if self._is_kept_up and self.expects_hash and not self._context.is_fetching:
             earliest = self._foreign_checked_at + FOREIGN_CHECK_INTERVAL
             self._foreign_check_at = max(now + FOREIGN_SETTLING_TIME, earliest)
 
     def _check_after_foreign(self, now: float) -> None:
-        """Values of others have stopped: ask for the hash where it can prove the present values."""
+        """Request the hash, where it can prove the present values: changes by others have stopped."""
         if self._table.is_provable and not (self._context.is_fetching or self.is_spared):
             self._foreign_checked_at = now
             self.ask(now)
 
     def _check(self, now: float) -> None:
-        """See whether the table still is the vehicle's, if there is room for that on the link."""
+        """Check whether the table still matches the vehicle's, if the link is idle."""
         if self.holds or self._host.is_link_busy:
-            self._check_at = now + BUSY_WAIT
+            self._check_at = now + IDLE_CHECK_INTERVAL
             return
         self._plan_check(now, now)
         if self.is_spared:
@@ -455,12 +456,12 @@ class Sync(Machine):
             self.ask(now)
         elif self._check_at < math.inf:
             if self._files.is_in_use(now):
-                self._check_at = min(self._check_at, now + SKIPPED_TURN_WAIT)
+                self._check_at = min(self._check_at, now + FILE_IN_USE_RETRY)
             else:
                 self._begin_resync(now, Check(may_list=self._check_pace.may_list))
 
     def _plan_check(self, now: float, known_at: float) -> None:
-        """Plan the next check so that it ends an interval after the moment of which the table is known."""
+        """Plan the next check to end an interval after the moment of the known table."""
         self._checked_at = now
         self._check_at = math.inf
         if self._is_kept_up:
@@ -472,7 +473,7 @@ class Sync(Machine):
                 self._check_at = max(known_at + interval, now + pace.shortest_pause)
 
     def _hash_came(self, read: Read) -> None:
-        """A hash has come, or will not come, for which nobody but us waits."""
+        """Process a response to our own request for the hash, or its absence."""
         table, now = self._table, read.ended_at
         reads_volatile, self._reads_volatile = self._reads_volatile, False
         if read.result is None:
@@ -483,14 +484,14 @@ class Sync(Machine):
                 self._context.has_hash = None
             self._is_checking = False
             if has_none and self._is_kept_up:
-                self._check_at = now  # in the way of those without one
+                self._check_at = now  # blocks checks of tables without one
             return
         if self._context.is_doubted:
-            self._check_at = now  # again, when it is known whose it is
+            self._check_at = now  # again once the identity is known
             return
         announced = int.from_bytes(read.result.raw, "little")
         if self.compare(now):
-            if self._has_fallen:
+            if self._was_marked_unsynced:
                 self.synced = True
                 self._read_unhashed(announced, now)
             if reads_volatile and now >= self._volatile_at:
@@ -499,7 +500,7 @@ class Sync(Machine):
         elif self._context.is_writing or self._context.is_fetching:
             return
         elif table.hash is None and self._moved_by_us_alone and not self._is_kept_up:
-            # it cannot be computed here: what moved it may be our doing alone, or something unheard too
+            # cannot be recomputed here: the cause may be our writes only, or also a missed change
             self._is_checking = False
         else:
             self._not_confirmed()
@@ -514,7 +515,7 @@ class Sync(Machine):
             self._resync = None
             self._host.end_fetch(fetch, fetch.ended_at)
             if isinstance(fetch.error, FileTransferError) and fetch.error.code in BUSY:
-                self._check_at = min(self._check_at, fetch.ended_at + SKIPPED_TURN_WAIT)
+                self._check_at = min(self._check_at, fetch.ended_at + FILE_IN_USE_RETRY)
 
         if fetch.done:
             ended()
@@ -522,17 +523,17 @@ class Sync(Machine):
             fetch.on_done.append(ended)
 
     def _settled(self, now: float, known_at: float) -> None:
-        """It is known how the table stands: say so, if it was in doubt.
+        """Take the state of the table as known, and report that if it was in doubt.
 
         Args:
             now: the time.
-            known_at: the moment of the vehicle's table that is known: what changed later may be missing.
+            known_at: the moment of the vehicle's table that is known: later changes may be missing.
         """
         self._is_checking = False
         self._plan_check(now, known_at)
         if not self.synced:
             return
-        if self._has_fallen or self._moved:
+        if self._was_marked_unsynced or self._moved:
             self._host.resynced(tuple(self._moved), self._table.hash)
-        self._has_fallen = False
+        self._was_marked_unsynced = False
         self._moved.clear()

@@ -1,4 +1,5 @@
-"""The parameters of one component as they are known now, by name, each with how far it can be trusted."""
+"""The parameter table of one component: values by name, how far each is trusted, and the hash that covers
+them."""
 
 from __future__ import annotations
 
@@ -43,32 +44,33 @@ from paramclient.protocol.params.change_origin import is_ours
 from paramclient.protocol.params.hash_exclusions import hash_of
 from paramclient.protocol.wire import MOST_PARAMETERS, NO_INDEX, ParamValue
 
-__all__ = ["MOST_NAMES", "Observation", "Room", "Table"]
+__all__ = ["NAMES_MAX", "Observation", "Room", "Table"]
 
-MOST_NAMES: Final = 65_535
-"""Names that one table may hold: as many as can have an index, and as many again of parameters that are not
-in use and have none. A component that invents further ones is ill."""
+NAMES_MAX: Final = 65_535
+"""Names in one table: as many as there are indices, and as many again without an index (parameters not in
+use). No real component has more."""
 
-ENOUGH_NAMES: Final = 2_000
-"""Names that every table may hold, whatever the others of its link do: more than autopilots have."""
-MOST_NAMES_OF_LINK: Final = 400_000
-"""Names that all tables of one link may hold together before each is held to `ENOUGH_NAMES`: 250 vehicles
-with 1,600 parameters each. A name takes about a quarter of a kilobyte."""
-MOST_OVERWRITTEN: Final = 1_024
-"""What we wrote and was replaced before the cache was told: some tens fit between two writes to the disk."""
-MOST_GONE: Final = MOST_NAMES
-"""Names that have changed or gone and wait to be told to the cache, above which further gone ones are not
-told: the next whole table that is kept is without them."""
+NAMES_GUARANTEED: Final = 2_000
+"""Names that every table may hold, however full the other tables of the link are: more than autopilots
+have."""
+LINK_NAMES_MAX: Final = 400_000
+"""Names in all tables of one link, above which each table is limited to `NAMES_GUARANTEED`: 250 vehicles with
+1,600 parameters each. A name takes about 0.25 kB."""
+OVERWRITTEN_MAX: Final = 1_024
+"""Replaced values that wait for the cache: some tens fit between two writes to the disk."""
+REMOVED_NAMES_MAX: Final = NAMES_MAX
+"""Changed and removed names that wait for the cache. Above it, further removals are not reported: the next
+complete table in the cache is without these names."""
 
-_EXACT = 1 << 24  # up to here every integer is a float32
-_new = tuple.__new__  # what the constructor of a tuple ends in, after several times the time
+_EXACT = 1 << 24  # every integer up to here is a float32
+_new = tuple.__new__  # the constructor of a tuple ends in this call and takes several times as long
 
 
 class Room:
-    """How many names the tables of one link hold together.
+    """The number of names in the tables of one link.
 
     Attributes:
-        taken: so many.
+        taken: names in all tables of the link.
     """
 
     __slots__ = ("taken",)
@@ -77,16 +79,16 @@ class Room:
         self.taken = 0
 
     def has_some(self, held: int) -> bool:
-        """Whether a table that holds so many names may take another one."""
-        return held < MOST_NAMES and (held < ENOUGH_NAMES or self.taken < MOST_NAMES_OF_LINK)
+        """Return whether a table with this many names may add one."""
+        return held < NAMES_MAX and (held < NAMES_GUARANTEED or self.taken < LINK_NAMES_MAX)
 
 
 class Observation(NamedTuple):
-    """One value of a parameter as it was observed.
+    """One observed value of a parameter.
 
     Attributes:
         param: the parameter with that value.
-        by: the author of the change that brought it, as in `Change`.
+        by: the author of the change to that value, as in `Change`.
         moment: when the value came from the link, in seconds of the core's clock.
     """
 
@@ -96,36 +98,36 @@ class Observation(NamedTuple):
 
 
 class Table:
-    """All that is known of a component's parameters.
+    """The parameters of one component.
 
     Each value carries the moment at which it came from the link (`Params.moments`), in seconds of the core's
     clock, whenever it is processed or written to the cache.
 
     Args:
-        encoding: how the component writes values, as far as known.
-        room: what all tables of the link share; None for one that is alone.
+        encoding: how the component encodes values, as far as known.
+        room: the name count shared by all tables of the link; None for a table on its own.
 
     Attributes:
-        params: by name, in the order in which they were first heard. Shared with readers; never replaced.
-        count: the param_count heard last, or None. Indices are those under this count: when it moves, none is
-            known any more.
-        volatile: names that the vehicle leaves out of its hash, as far as known.
-        volatile_known: whether a recomputed hash has proven that set.
-        complete: whether every index below `count` has its parameter here.
-        hash: the PX4 hash under which the vehicle would confirm exactly this table, or None while unknown.
-        displaced: names whose index was of an earlier count, and that the vehicle may no longer have; some of
-            them may have come again since.
-        doubts: how often what had been heard was no longer to be relied on.
-        passed_over: by a name that several parameters share, the indices of those that it does not mean.
-        dirty: names whose value, type or index changed since `take_dirty` was called last.
-        gone: the moments at which removed names were found missing, since `take_gone` was called last.
-        slept: seconds of sleep of this computer by which moments were moved back, see `age`.
-        left_out: how often something was said under a name that no parameter file can hold, see `leave_out`.
+        params: by name, in the order of first reception. Shared with readers; never replaced.
+        count: the latest param_count, or None. Indices are valid for this count only: a changed count
+            invalidates all of them.
+        volatile: names that the vehicle excludes from its hash, as far as known.
+        volatile_known: whether a recomputed hash has proven `volatile`.
+        complete: whether the table has a parameter for every index below `count`.
+        hash: the PX4 hash by which the vehicle would confirm exactly this table, or None while unknown.
+        displaced: names whose index belongs to an earlier count. The vehicle may no longer have them; some
+            may have been received again since.
+        doubts: how often live values were marked as stale.
+        passed_over: for a name that several parameters share, the indices of the other parameters.
+        dirty: names whose value, type or index changed since the last `take_dirty`.
+        gone: when each removed name was found missing, since the last `take_gone`.
+        slept: seconds of system suspend by which moments were moved back, see `age`.
+        left_out: PARAM_VALUEs ignored because no parameter file can hold their name, see `leave_out`.
         left_out_name: the last such name, or an empty text.
-        keeps_all: whether `overwritten` has every value that was replaced before the cache was told of it, as
-            while the cache cannot be written; else only those of our writes.
-        overwritten: values that the cache has not been told of and that are no longer current: those that
-            our writes have set or replaced, and the first observation of a changed value that came again.
+        keeps_all: whether `overwritten` keeps every value that was replaced before it reached the cache
+            (while the cache cannot be written), rather than only values related to our writes.
+        overwritten: values that never reached the cache and are no longer current: values that our writes set
+            or replaced, and the first observation of a changed value that was received again.
     """
 
     def __init__(self, encoding: Encoding = Encoding.BYTEWISE, room: Room | None = None) -> None:
@@ -135,7 +137,7 @@ class Table:
         self._defaults = self.params.defaults
         self._moments = self.params.moments
         self._latest = -math.inf  # the moment of the newest observation
-        self._changed: dict[str, tuple[float, str]] = {}  # when a value changed, by whom: not yet told
+        self._changed: dict[str, tuple[float, str]] = {}  # when it changed, author: not yet in the cache
         self.gone: dict[str, float] = {}
         self.slept = 0.0
         self.count: int | None = None
@@ -153,8 +155,8 @@ class Table:
         self._hash: int | None = None
         self._hash_is_stale = False
         self._encoding = encoding
-        self._wire: dict[str, bytes] = {}  # the four bytes as they came, for another encoding
-        self._filed: set[str] = set()  # whose value came in a file, which has no such encoding
+        self._wire: dict[str, bytes] = {}  # the 4 bytes as received, to decode them again in another encoding
+        self._filed: set[str] = set()  # values that came in a file, which does not depend on the encoding
 
     @property
     def encoding(self) -> Encoding:
@@ -168,11 +170,11 @@ class Table:
         return self._hash
 
     def confirm(self, announced: int, volatile: frozenset[str], *, proven: bool) -> None:
-        """The vehicle announced this hash for exactly this table.
+        """Record that the vehicle announced this hash for exactly this table.
 
-        With `proven`, the hash computed here without the volatile names was the same. Then it can be computed
-        again whenever a value moves, and the vehicle can confirm the table in the next session as well. What
-        is taken for volatile now and was not before, or the other way round, is news for the cache.
+        With `proven`, the hash computed here without the volatile names was the same. The hash can then be
+        recomputed whenever a value changes, and the vehicle can confirm the table in the next session as
+        well. Names that become volatile, or are no longer volatile, are dirty for the cache.
         """
         for name in volatile ^ self.volatile:
             if name in self.params:
@@ -183,33 +185,33 @@ class Table:
         self.volatile_known = proven
 
     def leave_out(self, name: str) -> None:
-        """Count what was said under a name that no parameter file can hold: it is not taken."""
+        """Count a PARAM_VALUE that is ignored because no parameter file can hold its name."""
         self.left_out += 1
         self.left_out_name = name
 
     def unconfirm(self) -> None:
-        """No hash is known to belong to this table any more."""
+        """Forget the hash: none is known to belong to this table any more."""
         self._hash = None
         self._hash_is_stale = False
 
     def rehash(self) -> None:
-        """Values may have moved under the confirmed hash: compute it again when it is asked for."""
+        """Mark the hash as stale, so that the next access recomputes it."""
         self._hash_is_stale = self._hash is not None
 
     def hear(
         self, message: ParamValue, by: str, moment: float = 0.0, *, is_exact: bool = False
     ) -> Change | None:
-        """Take one PARAM_VALUE; give the change if it brought one (a first value is one).
+        """Store one PARAM_VALUE and return the change, if there is one (a first value is one).
 
-        The value counts whatever the index says. An index of 65535 leaves the known one as it is, one that
-        is not below the count is no index.
+        The value counts whatever its index is. Index 65535 keeps the known index; an index that is not below
+        the count is ignored.
 
         Args:
-            message: what came.
-            by: who did it, as in `Change`.
-            moment: when it came from the link, not before the last one.
-            is_exact: whether it says what was just written, so that it cannot stand for an integer that it
-                would round.
+            message: the PARAM_VALUE.
+            by: the author of the change, as in `Change`.
+            moment: when it came from the link, not before the previous one.
+            is_exact: whether it repeats the value that was just written, so that it cannot be a rounded form
+                of a known integer.
         """
         name, raw, number, count, given = message
         if self.passed_over and given in self.passed_over.get(name, ()):
@@ -217,7 +219,7 @@ class Table:
         everything = self._held
         old = everything.get(name)
         self._latest = moment
-        if old is None:  # the short way for a first value
+        if old is None:  # fast path for a first value
             room = self._room
             if not room.has_some(len(everything)):
                 return None
@@ -229,17 +231,16 @@ class Table:
             self._moments[name] = moment
             self.dirty[name] = by
             if self._hash is not None:
-                self._moved(name)
+                self._invalidate_hash(name)
             return _new(Change, (name, None, new, by, None, None))
-        return self._hear_again(name, old, message, by, moment, is_exact=is_exact)
+        return self._update(name, old, message, by, moment, is_exact=is_exact)
 
     def with_known_type(self, message: ParamValue) -> ParamValue:
         """Return a PARAM_VALUE of the type REAL32 with the integer type that is known of the parameter.
 
         ArduPilot answers a PARAM_SET with REAL32, whatever the parameter's type is, if the value is the
-        default and was never stored (measured on 4.6-dev). A cached type that nothing has confirmed does not
-        count. Without a type, or if the number is not whole or out of its range, the message is returned
-        unchanged.
+        default and was never stored (measured on 4.6-dev). A cached, unconfirmed type does not count. Without
+        a known type, or if the number is not whole or out of its range, the message is returned unchanged.
         """
         name = message.param_id
         held = self._held.get(name)
@@ -256,7 +257,7 @@ class Table:
         return message._replace(param_type=known) if low <= value <= high else message
 
     def hear_index(self, message: ParamValue) -> None:
-        """Take the index of a PARAM_VALUE of a known parameter, and leave the value as it is."""
+        """Store the index of a PARAM_VALUE of a known parameter, without its value."""
         name, _, _, count, given = message
         held = self._held[name]
         is_index = given < count <= MOST_PARAMETERS and given not in self.passed_over.get(name, ())
@@ -264,10 +265,10 @@ class Table:
             self._held[name] = with_index(held, given)
             self.dirty.setdefault(name, "vehicle")
 
-    def _hear_again(
+    def _update(
         self, name: str, old: Held, message: ParamValue, by: str, moment: float, *, is_exact: bool
     ) -> Change | None:
-        """Take a PARAM_VALUE of a parameter that is known."""
+        """Store a PARAM_VALUE of a known parameter."""
         _, raw, number, count, given = message
         old_bits, old_number, old_is_raw, _, place = unpack_fields(old)
         if given != NO_INDEX:
@@ -280,7 +281,7 @@ class Table:
                 self._held[name] = pack_fields(old_bits, number, old_is_raw, LIVE, place)
                 self.dirty.setdefault(name, by)
             return None
-        if is_same_type and not is_exact and self._rounds(old, raw):
+        if is_same_type and not is_exact and self._is_rounded(old, raw):
             bits, is_raw = old_bits, old_is_raw
         else:
             bits, is_raw = bits_of_wire(raw, number, self._encoding)
@@ -292,9 +293,9 @@ class Table:
             if with_index(old, place) != old:
                 self.dirty.setdefault(name, by)
             return None
-        self._news(name, old, by, before, seen_at)
+        self._record_change(name, old, by, before, seen_at)
         if self._hash is not None:
-            self._moved(name)
+            self._invalidate_hash(name)
         return _new(Change, (name, old, new, by, self._defaults.get(name), before))
 
     def take(
@@ -308,17 +309,17 @@ class Table:
         *,
         is_older: bool,
     ) -> Change | None:
-        """Take one entry of a packed parameter file; give the change if it brought one.
+        """Store one entry of a packed parameter file and return the change, if there is one.
 
-        Its integers are exact, also where a PARAM_VALUE rounds them.
+        The file's integers are exact, also where a PARAM_VALUE rounds them.
 
         Args:
             name, number: param_id and type.
             bits, default: the value and the firmware's default, as in `Param.bits`.
-            index: its place in the list.
+            index: its index in the list.
             moment: when the file was requested: the vehicle may have read the value at any time since.
-            is_older: whether a PARAM_VALUE of it was heard since the file was asked for: then that counts,
-                unless it rounds what the file says.
+            is_older: whether a PARAM_VALUE of the parameter was received since the file was requested. That
+                value then wins, unless it is a rounded form of the file's.
         """
         initial = None if default is None else from_bits(default, number)
         old = self._held.get(name)
@@ -330,7 +331,7 @@ class Table:
         before = self._defaults.get(name)
         is_same_type = old is None or unpack_fields(old)[1] == number
         if is_older and old is not None and not (is_same_type and self._wire.get(name) == raw):
-            if is_same_type:  # else it is the default of something else
+            if is_same_type:  # otherwise the default belongs to another type
                 self._set_default(name, initial)
             self._held[name] = with_index(old, index)
             self.dirty.setdefault(name, "vehicle")
@@ -347,19 +348,19 @@ class Table:
             self.dirty.setdefault(name, "vehicle")
         if old is not None and same_held(old, new):
             return None
-        self._news(name, old, "vehicle", before, seen_at)
-        self._moved(name)
+        self._record_change(name, old, "vehicle", before, seen_at)
+        self._invalidate_hash(name)
         return _new(Change, (name, old, new, "vehicle", initial, before))
 
     def take_pack(self, pack: Pack, moment: float, newer: Collection[str], *, start: int = 0) -> list[Change]:
-        """Take the entries of a packed parameter file; give the changes that they brought.
+        """Store the entries of a packed parameter file and return the changes.
 
-        Entries whose names no other form of file can hold are left out.
+        Entries whose names no other file format can hold are left out.
 
         Args:
             pack: the file, or a part of it.
-            moment: when it was asked for.
-            newer: names of which a PARAM_VALUE was heard since the file was asked for, as in `take`.
+            moment: when it was requested.
+            newer: names with a PARAM_VALUE received since the file was requested, as in `take`.
             start: the index of the first entry.
         """
         changes = []
@@ -368,14 +369,14 @@ class Table:
                 self.leave_out(name)
                 continue
             if default is None and pack.with_defaults:
-                default = bits  # the vehicle gives those that differ
+                default = bits  # the file has only defaults that differ from the value
             change = self.take(name, number, bits, index, default, moment, is_older=name in newer)
             if change is not None:
                 changes.append(change)
         return changes
 
     def use_encoding(self, encoding: Encoding) -> list[Change]:
-        """Read everything that was heard in another encoding; give what looks different now."""
+        """Decode all received values again in another encoding and return the values that differ."""
         if encoding is self._encoding:
             return []
         self._encoding = encoding
@@ -405,16 +406,16 @@ class Table:
         volatile_known: bool,
         moments: Mapping[str, float] | None = None,
     ) -> list[Change]:
-        """Put in what the cache knows, as *cached*; what was heard on this link stays.
+        """Load the cached table as *cached*; values received on this link stay.
 
-        A table whose list has a name that no parameter file can hold was kept by an earlier version: that
-        name is left out, and the table is downloaded anew.
+        A table whose list has a name that no parameter file can hold was cached by an earlier version: that
+        name is left out, and the table is downloaded again.
 
         Args:
             params: the cached table.
-            count: the param_count with it; with another one than was heard, nothing below counts.
-            confirmed: the hash under which the vehicle would confirm it, or None.
-            placed: whether its indices still hold.
+            count: its param_count; if a different one was received, all arguments below are ignored.
+            confirmed: the hash by which the vehicle would confirm it, or None.
+            placed: whether its indices are still valid.
             complete, volatile, volatile_known: as the attributes.
             moments: as in `fill`.
         """
@@ -429,7 +430,7 @@ class Table:
         if confirmed is not None:
             self.confirm(confirmed, volatile, proven=volatile_known)
             if volatile_known:
-                self.rehash()  # what is in the table counts, not what stood beside it
+                self.rehash()  # the hash covers the table's values, not those stored with the hash
             elif any(
                 name not in self._held or not same_held(self._held[name], held)
                 for name, held in known.held.items()
@@ -445,13 +446,14 @@ class Table:
         are_placed: bool = True,
         moments: Mapping[str, float] | None = None,
     ) -> list[Change]:
-        """Put in what the cache knows, as *cached*; what was heard on this link stays.
+        """Add cached values as *cached*; values received on this link stay.
 
-        To that it adds the firmware's default, and an integer that the message has rounded.
+        A received value is completed with the firmware's default, and with the exact integer that the message
+        rounded.
 
         Args:
             params: the cached table.
-            are_placed: whether its indices are still worth anything.
+            are_placed: whether its indices are still valid.
             moments: when each value was observed last, in seconds of the core's clock.
         """
         seen = {} if moments is None else moments
@@ -462,7 +464,7 @@ class Table:
             default = known.defaults.get(name)
             if old is not None:
                 if unpack_fields(old)[1] == unpack_fields(cached)[1] and name not in self._filed:
-                    changes += self._complement(name, old, cached, default)
+                    changes += self._merge_cached(name, old, cached, default)
             elif is_portable_name(name) and self._room.has_some(len(self._held)):
                 self._room.taken += 1
                 new = with_trust_number(cached, CACHED)
@@ -477,10 +479,10 @@ class Table:
         return changes
 
     def renew(self, params: Mapping[str, Param], moments: Mapping[str, float] | None = None) -> list[Change]:
-        """Take what another station has heard since, where a value is only *cached* here.
+        """Replace values that are only *cached* here with those that another station has received since.
 
         Args:
-            params: the table as it is cached now.
+            params: the present table in the cache.
             moments: as in `fill`.
         """
         seen = {} if moments is None else moments
@@ -495,14 +497,14 @@ class Table:
             new = self._held[name] = with_index(with_trust_number(cached, CACHED), place)
             if name in seen:
                 self._moments[name] = seen[name]
-            self._wire.pop(name, None)  # should the vehicle say that again, it is a change
+            self._wire.pop(name, None)  # the same value from the vehicle must then count as a change
             if self._hash is not None:
-                self._moved(name)
+                self._invalidate_hash(name)
             changes.append(_new(Change, (name, old, new, "vehicle", self._defaults.get(name), before)))
         return changes
 
     def move(self, count: int) -> None:
-        """Another count was heard: which parameter has which index is open again."""
+        """Take a changed count: all indices become invalid."""
         if self.count is not None:
             self.complete = False
             self.passed_over.clear()
@@ -513,13 +515,13 @@ class Table:
 
     @property
     def is_displaced(self) -> bool:
-        """Whether there are names whose index is open since the count moved."""
+        """Whether some names have no valid index since the count changed."""
         held = self._held
         self.displaced = {name for name in self.displaced if name in held and not is_listed(held[name])}
         return bool(self.displaced)
 
     def place(self, names: Mapping[int, str]) -> None:
-        """A download has settled which parameter has which index."""
+        """Set the indices that a download has determined."""
         everything, passed_over = self._held, self.passed_over
         for index, name in names.items():
             held = everything.get(name)
@@ -531,7 +533,7 @@ class Table:
                 self.dirty.setdefault(name, "vehicle")
 
     def settle(self, names: Mapping[int, str]) -> list[Change]:
-        """A download is whole: place what it brought, and take out what the vehicle no longer has."""
+        """Finish a complete download: set its indices and remove what the vehicle no longer has."""
         self.place(names)
         present = frozenset(names.values())
         gone = [
@@ -543,7 +545,7 @@ class Table:
         return self._remove(gone)
 
     def present(self) -> dict[int, str]:
-        """Names by index, as far as they are known under the count of now; none where two claim one index."""
+        """Return the names by index under the present count, without indices that two names claim."""
         names: dict[int, str] = {}
         twice = set()
         for name, held in self._held.items():
@@ -554,35 +556,35 @@ class Table:
         return {index: name for index, name in names.items() if index < count and index not in twice}
 
     def verify(self) -> None:
-        """The vehicle's hash has confirmed it: what is cached and counts into it becomes *verified*."""
+        """Mark cached values that the hash covers as *verified*: the vehicle's hash has confirmed them."""
         if not self.volatile_known:
-            return  # the hash may say nothing of any of them
+            return  # the hash may cover none of them
         for name, held in self._held.items():
             if trust_of(held) == CACHED and is_listed(held) and name not in self.volatile:
                 self._held[name] = with_trust_number(held, VERIFIED)
 
     def doubt(self, *trusts: Trust) -> None:
-        """It may have moved unheard: what was trusted like this is no more than *cached*."""
+        """Mark all values of these trust levels as *cached*: they may have changed unnoticed."""
         self.doubts += Trust.LIVE in trusts
         doubted = {number_of(trust) for trust in trusts}
         for name, held in self._held.items():
             if trust_of(held) in doubted:
-                self._wire.pop(name, None)  # the next value counts, also if it is the same
+                self._wire.pop(name, None)  # the next value counts, even if it is the same
                 self._held[name] = with_trust_number(held, CACHED)
 
     def doubt_value(self, name: str) -> None:
-        """One value may have changed unheard: it is no more than *cached*."""
+        """Mark one value as *cached*: it may have changed unnoticed."""
         held = self._held.get(name)
         if held is not None:
-            self._wire.pop(name, None)  # the next value counts, also if it is the same
+            self._wire.pop(name, None)  # the next value counts, even if it is the same
             self._held[name] = with_trust_number(held, CACHED)
 
     def remove(self, condition: Callable[[Param], bool]) -> list[Change]:
-        """Take out the parameters that meet a condition."""
+        """Remove the parameters that meet a condition."""
         return self._remove([param.name for param in self.params.values() if condition(param)])
 
     def forget(self) -> list[Change]:
-        """It is another vehicle's: nothing is known of it."""
+        """Remove everything: another vehicle uses the address."""
         changes = self._remove(list(self._held))
         self.unconfirm()
         self.volatile = frozenset()
@@ -592,53 +594,55 @@ class Table:
         return changes
 
     def forget_defaults(self) -> None:
-        """They were those of another firmware."""
+        """Remove the defaults: they belong to another firmware."""
         self._defaults.clear()
 
     @property
     def is_provable(self) -> bool:
-        """Whether the vehicle's hash can prove the present values of all that it covers."""
+        """Whether the vehicle's hash can prove the present values of all parameters that it covers."""
         return self.complete and self.volatile_known and self.hash is not None
 
     def is_hashed(self, name: str) -> bool:
-        """Whether the vehicle's hash covers a parameter, while that is known."""
+        """Return whether the vehicle's hash is known to cover a parameter."""
         held = self._held.get(name)
         return held is not None and is_listed(held) and name not in self.volatile
 
     def listed_bits(self) -> dict[str, int]:
-        """The bits of those that have an index, which the count and the hash are about, by name."""
+        """Return the bits of the listed parameters by name: those with an index, which count and hash
+        cover."""
         return {name: unpack_fields(held)[0] for name, held in self._held.items() if is_listed(held)}
 
     @property
     def size(self) -> int:
-        """How many those are."""
+        """The number of listed parameters."""
         return sum(map(is_listed, self._held.values()))
 
     @property
     def only_cached(self) -> int:
-        """How many of those are no more than *cached*."""
+        """The number of listed parameters that are only *cached*."""
         return sum(trust_of(held) == CACHED and is_listed(held) for held in self._held.values())
 
     def gaps(self) -> tuple[int, tuple[int, ...]]:
-        """How many parameters there should be, and the indices of those that are not known."""
+        """Return the number of parameters that the table should have, and the missing indices."""
         present = {unpack_fields(held)[4] for held in self._held.values()}
         present.discard(NOWHERE)
         count = len(present) if self.count is None else self.count
         return count, tuple(index for index in range(count) if index not in present)
 
     def unhashed(self) -> set[str]:
-        """The names that the hash says nothing about: the volatile ones, or any while those are not known."""
+        """Return the names that the hash does not cover: the volatile ones, or all while those are
+        unknown."""
         return set(self.volatile) if self.volatile_known else set(self.listed_bits())
 
     def take_dirty(self) -> dict[str, str]:
-        """Names that changed since the last call, each with who did it; gone names too."""
+        """Return names changed or removed since the last call, each with the author of the change."""
         dirty, self.dirty = self.dirty, {}
         return dirty
 
     def take_overwritten(self) -> list[Observation]:
         """Return the observations since the last call that are not the latest of their parameter.
 
-        A value that changed and was heard again is among them with the moment of the change.
+        A value that changed and was received again is among them, with the moment of the change.
         """
         overwritten, self.overwritten = self.overwritten, []
         changed, self._changed = self._changed, {}
@@ -649,7 +653,7 @@ class Table:
 
     @property
     def changed(self) -> dict[str, tuple[float, str]]:
-        """When each value has changed since `take_overwritten` was called last, and by whom."""
+        """When each value changed since the last `take_overwritten`, and the author of the change."""
         return self._changed.copy()
 
     def give_back(
@@ -660,7 +664,7 @@ class Table:
         changed: Mapping[str, tuple[float, str]],
         params: Params,
     ) -> None:
-        """Take back what the cache was to be told and was not: it is news again, with its moments.
+        """Take back changes that could not be written to the cache: they are dirty again, with their moments.
 
         A value that was replaced meanwhile is kept in `overwritten`.
 
@@ -675,22 +679,22 @@ class Table:
                 continue
             if name in self._changed or name not in self._held:
                 replaced.append(Observation(params[name], by, heard_at))
-            elif changed.get(name, (math.inf, ""))[0] == heard_at:  # else `overwritten` has it
+            elif changed.get(name, (math.inf, ""))[0] == heard_at:  # otherwise `overwritten` has it
                 self._changed[name] = changed[name]
         self.dirty = {**dirty, **self.dirty}
-        self.overwritten = [*overwritten, *replaced, *self.overwritten][-MOST_OVERWRITTEN:]
+        self.overwritten = [*overwritten, *replaced, *self.overwritten][-OVERWRITTEN_MAX:]
         self.gone = {**gone, **self.gone}
 
     def take_gone(self) -> dict[str, float]:
-        """Return the moments at which names removed since the last call were found missing."""
+        """Return when each name removed since the last call was found missing."""
         gone, self.gone = self.gone, {}
         return gone
 
     def age(self, seconds: float) -> None:
-        """Move every moment back by time that has passed but that the core's clock has left out.
+        """Move every moment back by time that the core's clock has left out.
 
         Args:
-            seconds: of sleep of this computer, see `Station.stood_still`.
+            seconds: of system suspend, see `Station.stood_still`.
         """
         if not seconds:
             return
@@ -702,7 +706,7 @@ class Table:
         self.slept += seconds
 
     def _remove(self, names: Collection[str]) -> list[Change]:
-        """Take out these."""
+        """Remove these names."""
         changes = []
         for name in names:
             held = self._held.pop(name)
@@ -711,12 +715,12 @@ class Table:
             self._filed.discard(name)
             self._moments.pop(name, None)
             self._changed.pop(name, None)
-            if name in self.dirty or len(self.dirty) < MOST_GONE:
+            if name in self.dirty or len(self.dirty) < REMOVED_NAMES_MAX:
                 self.dirty[name] = "vehicle"
                 if self._latest > -math.inf:
                     self.gone[name] = self._latest
             if self._hash is not None:
-                self._moved(name)
+                self._invalidate_hash(name)
             changes.append(_new(Change, (name, held, None, "vehicle", None, default)))
         self._room.taken -= len(changes)
         return changes
@@ -731,16 +735,18 @@ class Table:
         default = self._defaults.get(name)
         return _new(Change, (name, old, new, "vehicle", default, default))
 
-    def _news(self, name: str, old: Held | None, by: str, default: Value | None, seen_at: float) -> None:
-        """Note that a value has changed, at the moment that the table has of it by now.
+    def _record_change(
+        self, name: str, old: Held | None, by: str, default: Value | None, seen_at: float
+    ) -> None:
+        """Record that a value has changed, at the moment that the table already has for it.
 
-        The cache is told of each value that our writes have set, however short it stood, and of what they
-        replaced; with `keeps_all`, of each value.
+        The cache receives each value that our writes have set, however short its life, and the values that
+        they replaced; with `keeps_all`, every value.
 
         Args:
             name, by: the parameter and the author of the change.
-            old, default: what it was, and the default of its type then; None where it is new.
-            seen_at: the moment at which it was observed last as it was.
+            old, default: the value before, and the default of its type then; None for a new parameter.
+            seen_at: when the value before was observed last.
         """
         before = self.dirty.get(name)
         if old is not None:
@@ -750,14 +756,14 @@ class Table:
                 if since < seen_at:
                     self.overwritten.append(Observation(param, author, since))
                 self.overwritten.append(Observation(param, before, seen_at))
-                del self.overwritten[:-MOST_OVERWRITTEN]
+                del self.overwritten[:-OVERWRITTEN_MAX]
             self._changed[name] = (self._moments[name], by)
         self.dirty[name] = by
 
-    def _complement(self, name: str, heard: Held, cached: Held, default: Value | None) -> list[Change]:
-        """Add to what was heard what its message does not say."""
+    def _merge_cached(self, name: str, heard: Held, cached: Held, default: Value | None) -> list[Change]:
+        """Complete a received value with what its message lacks: the default and the exact integer."""
         bits, number, is_raw, trust, place = unpack_fields(heard)
-        if self._rounds(cached, self._wire.get(name, b"")):
+        if self._is_rounded(cached, self._wire.get(name, b"")):
             bits, _, is_raw, *_ = unpack_fields(cached)
         if default is not None and name not in self._defaults:
             self._defaults[name] = default
@@ -768,8 +774,8 @@ class Table:
         self.dirty.setdefault(name, "vehicle")
         return [self._change(name, heard, new)]
 
-    def _rounds(self, known: Held, raw: bytes) -> bool:
-        """Whether a message rounds what is known exactly: an integer beyond the 24 bits of a float32."""
+    def _is_rounded(self, known: Held, raw: bytes) -> bool:
+        """Return whether a message is a rounded form of a known integer beyond the 24 bits of a float32."""
         if self._encoding is not Encoding.C_CAST:
             return False
         bits, number, is_raw, *_ = unpack_fields(known)
@@ -780,7 +786,7 @@ class Table:
         self.displaced.add(name)
         return with_index(held, NOWHERE)
 
-    def _moved(self, name: str) -> None:
+    def _invalidate_hash(self, name: str) -> None:
         if name in self.volatile:
             return
         if self.volatile_known:

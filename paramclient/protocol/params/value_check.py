@@ -1,4 +1,4 @@
-"""Values that were just replaced and may still come, and values that are to be read again."""
+"""Values that may be older than a change: which ones are ambiguous, and when they are read again."""
 
 from __future__ import annotations
 
@@ -18,31 +18,31 @@ from paramclient.protocol.wire import ParamValue
 __all__ = ["LATER_CHANGE_TIME", "Rereads", "ValueChecks"]
 
 DISTRUST_TIME: Final = 0.3
-"""Seconds after a change in which a PARAM_VALUE with the value before it is no observation: ArduPilot takes
-the value of a read when it queues the answer, and sends it up to 100 ms later. Jitter comes on top."""
+"""Seconds after a change in which a PARAM_VALUE with the previous value is ambiguous: ArduPilot takes the
+value of a read when it queues the response, and sends it up to 100 ms later. Jitter comes on top."""
 LATER_CHANGE_TIME: Final = 1.2
-"""Seconds after its acknowledgement until a value is read again on PX4, whose modules clamp values 25 to
-815 ms after it, and set others up to 1 s after it (measured)."""
+"""Seconds from the acknowledgement until a value is read again on PX4, whose modules clamp values 25 to 815
+ms after it, and set others up to 1 s after it (measured)."""
 LATE_ANSWER_TIME: Final = 1.0
-"""Seconds after a request was sent in which its answer may still come."""
-READS_MAX: Final = 256
-"""Open reads of a component beyond which no value is read again: each takes its share of the link."""
+"""Seconds after a request was sent in which its response may still arrive."""
+REREADS_MAX: Final = 256
+"""Open reads of a component above which no value is read again: each uses bandwidth."""
 READS_PAUSE: Final = 0.1
-"""Seconds until a value is read again for which there is no room among the reads."""
+"""Seconds until the next attempt to read a value again when too many reads are open."""
 REPLACED_MAX: Final = 4_096
-"""Names whose replaced values are remembered, more than an autopilot has; the oldest is dropped first."""
+"""Names with a remembered previous value, more than an autopilot has; the oldest is dropped first."""
 
 
 class Rereads(Machine):
-    """Reads again the values whose last observation may be older than a change, or may have been clamped.
+    """Reads values again whose last observation may be older than a change, or that may have been clamped.
 
     Args:
         context, reads, table, sync: the component's.
         policy: whether reads are allowed.
 
     Attributes:
-        authors: who changed which value.
-        checks: the values that were just replaced, and those that are to be read again.
+        authors: the authors of changes.
+        checks: the previous values, and the values to be read again.
     """
 
     def __init__(self, context: Context, reads: Reads, table: Table, sync: Sync, policy: Policy) -> None:
@@ -55,7 +55,7 @@ class Rereads(Machine):
         self._policy = policy
 
     def write_ended(self, write: Write, now: float) -> None:
-        """Plan to read a value after a write, where the vehicle may change it without telling."""
+        """Plan to read a value after a write, where the vehicle may change it without a PARAM_VALUE."""
         if (
             self._context.is_px4
             and write.result is not None
@@ -65,19 +65,19 @@ class Rereads(Machine):
             self.checks.ask(write.name, now + LATER_CHANGE_TIME)
 
     def forget_old(self, now: float) -> None:
-        """Drop what is too old to matter; once a second is enough."""
+        """Drop expired entries; once a second is enough."""
         self.authors.forget(now)
         self.checks.forget(now)
 
     def clear(self) -> None:
-        """Drop everything: the vehicle has started again."""
+        """Drop everything: the vehicle has restarted."""
         self.authors.clear()
         self.checks.clear()
 
     def tick(self, now: float) -> None:
-        """Read what is due."""
+        """Read the values that are due."""
         for name in self.authors.doubted(now):
-            if self._policy is Policy.AUTO and len(self._reads) < READS_MAX:
+            if self._policy is Policy.AUTO and len(self._reads) < REREADS_MAX:
                 self._reads.ask(name, now, urgent=False)
         if self.checks.next_deadline() <= now:
             self._read_due(now)
@@ -91,7 +91,7 @@ class Rereads(Machine):
         self.clear()
 
     def _read_due(self, now: float) -> None:
-        """Read again what is due; by the vehicle's hash alone, as far as that proves it."""
+        """Read the values that are due, by the hash alone as far as the hash proves them."""
         names = self.checks.due(now)
         if self._context.is_px4 and self._sync.may_resync and self._table.is_provable:
             names = [name for name in names if not self._table.is_hashed(name)]
@@ -99,22 +99,21 @@ class Rereads(Machine):
         for name in names:
             if self._policy is not Policy.AUTO:
                 self._table.doubt_value(name)
-            elif len(self._reads) < READS_MAX:
+            elif len(self._reads) < REREADS_MAX:
                 self._reads.ask(name, now, urgent=False)
             else:
                 self.checks.ask(name, now + READS_PAUSE)
 
 
 class ValueChecks:
-    """What one component's values were shortly before, and which of them are to be read again, and when.
+    """The previous values of one component's parameters, and which parameters to read again, and when.
 
-    The rule: what may be older than a change is no observation of the present. Within `DISTRUST_TIME` of a
-    change only the value before it is ambiguous. It may have been taken before the change, or be another
-    change back. It is not believed, and the parameter is read again when that time is over. Every other value
-    is news.
+    The rule: a value that may be older than a change is not an observation of the present. Within
+    `DISTRUST_TIME` of a change only the previous value is ambiguous: it may have been taken before the
+    change, or be a change back. It is ignored, and the parameter is read again at the end of that time. Every
+    other value is news.
 
-    It goes for the answers to reads and for lists. In a file that was being read, what was heard meanwhile
-    counts anyway.
+    This applies to responses to reads and to lists. During a file read, PARAM_VALUEs have precedence anyway.
     """
 
     __slots__ = ("_ask_at", "_replaced")
@@ -124,21 +123,21 @@ class ValueChecks:
         self._ask_at: dict[str, float] = {}
 
     def __bool__(self) -> bool:
-        """Whether any replaced value is remembered."""
+        """Return whether any previous value is remembered."""
         return bool(self._replaced)
 
     def replaced(
         self, name: str, number: int, old: bytes, new: ParamValue, now: float, sent_at: float
     ) -> None:
-        """Note that a value has changed.
+        """Record that a value has changed.
 
         Args:
             name: param_id.
-            number: the type of the value before.
-            old: its 4 bytes, as a message has them.
+            number: the type of the previous value.
+            old: its 4 bytes, as in a message.
             new: the message with the present value.
             now: the time.
-            sent_at: when the last read of any parameter was sent: without one, no answer of ours can be late.
+            sent_at: when the last read of any parameter was sent: without a read, no response can be late.
         """
         values = self._replaced.pop(name, {})
         values.pop((new.param_type, new.raw), None)
@@ -151,10 +150,10 @@ class ValueChecks:
         """Return until when the value of a message may be older than the last change.
 
         Args:
-            message: what came.
+            message: the PARAM_VALUE.
             now: the time.
-            is_wanted: whether it has the value of a PARAM_SET under way. Then it is believed, unless it may
-                be the answer to an earlier read.
+            is_wanted: whether it has the value of an active PARAM_SET. Then it counts, unless it may be the
+                response to an earlier read.
 
         Returns:
             A time after `now`, or -infinity where the value is news.
@@ -166,7 +165,7 @@ class ValueChecks:
         return until if until > now and (was_read or not is_wanted) else -math.inf
 
     def ask(self, name: str, at: float) -> None:
-        """Read a value again at a time, or at the later one that is noted already."""
+        """Plan to read a value again at a time, or at a later one that is already planned."""
         self._ask_at[name] = max(at, self._ask_at.get(name, at))
 
     def due(self, now: float) -> list[str]:
@@ -177,11 +176,11 @@ class ValueChecks:
         return names
 
     def next_deadline(self) -> float:
-        """When `due` has something to give, or infinity."""
+        """Return when `due` has names, or infinity."""
         return min(self._ask_at.values(), default=math.inf)
 
     def forget(self, now: float) -> None:
-        """Drop what is too old to matter; once a second is enough."""
+        """Drop expired entries; once a second is enough."""
         if self._replaced:
             self._replaced = {
                 name: values
@@ -190,6 +189,6 @@ class ValueChecks:
             }
 
     def clear(self) -> None:
-        """Drop everything: the vehicle has started again, or is another one."""
+        """Drop everything: the vehicle has restarted, or is another one."""
         self._replaced.clear()
         self._ask_at.clear()

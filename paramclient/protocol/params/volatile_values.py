@@ -1,4 +1,4 @@
-"""After a hash hit: read what the hash says nothing about, and learn from it what that is."""
+"""Reads of the values that a confirmed hash does not cover, and what they prove about volatile names."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from paramclient.protocol.wire import HASH_CHECK
 
 __all__ = ["Refresh"]
 
-MOST_AT_ONCE: Final = 16
-"""Values that are asked for at a time: more than are on their way on any link but one that is fast as well as
-far. Each that waits is an object, and 250 vehicles have 14,000 such values together."""
+REFRESH_READS_MAX: Final = 16
+"""Values requested at a time: more than are in flight on any link except a fast one with a long round trip.
+Each waiting read is an object, and 250 vehicles have 14,000 such values together."""
 
 
 class Refresh(Operation[None]):
-    """The reading of values that a confirmed hash does not cover. It ends when each has come or was given up.
+    """The reads of all values that a confirmed hash does not cover. Ends when each was answered or given up.
 
-    While it is not known which parameters are volatile, that is every value that was not heard on this link.
-    Then the hash is asked for once more: if it still holds, what differs from before is volatile, and with
-    that the whole set may be proven.
+    While the volatile parameters are unknown, these are all values that were not received on this link. Then
+    the hash is requested once more: if it still holds, values that differ from before are volatile, which may
+    prove the whole set.
 
     Args:
         reads: the component's.
-        table: what is refreshed.
+        table: the table to refresh.
         confirmed: the hash that the vehicle has just announced for the table.
-        again: whether to read all that count as volatile once more, also those heard on this link, and to
-            learn nothing from it.
-        context: the component's; a write in progress moves the table too.
+        again: whether to read all volatile values once more, also those received on this link, without
+            learning from them.
+        context: the component's; a write in progress changes the table too.
         now: the time.
 
     Attributes:
-        in_flight: reads that are under way for it.
+        in_flight: its open reads.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class Refresh(Operation[None]):
             self.finish(None, now)
 
     def _ask(self, now: float) -> None:
-        while self._waiting and self.in_flight < MOST_AT_ONCE:
+        while self._waiting and self.in_flight < REFRESH_READS_MAX:
             name = self._waiting.popleft()
             if name in self._table.params:
                 self.in_flight += 1
@@ -78,7 +78,7 @@ class Refresh(Operation[None]):
     def _one_ended(self, read: Read) -> None:
         self.in_flight -= 1
         if isinstance(read.error, LinkError | ContestedAddress):
-            self._waiting.clear()  # nothing can be asked any more
+            self._waiting.clear()  # no further request is possible
         self._ask(read.ended_at)
         if self.in_flight:
             return

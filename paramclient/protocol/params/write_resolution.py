@@ -1,4 +1,4 @@
-"""Changes that are too small for PX4 to keep."""
+"""Changes that are too small for PX4 to save."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from paramclient.model.values import Param, ParamType, format_value
 __all__ = ["note_on_small_change"]
 
 CHANGE_MIN: Final = 2.0**-23
-"""FLT_EPSILON, about 1.19e-07: by as much or less PX4 takes two floats for the same (parameters.cpp)."""
+"""FLT_EPSILON, about 1.19e-07: PX4 treats two floats that differ by this or less as equal
+(parameters.cpp)."""
 
 
 def note_on_small_change(before: Param, after: Param) -> str:
-    """Return what becomes of a small change of a float on PX4; "" where it is kept as any other.
+    """Return a note on a small change of a float on PX4; "" where it is saved as any other.
 
     Args:
         before: the parameter before it was set.

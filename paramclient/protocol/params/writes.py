@@ -1,4 +1,4 @@
-"""One write: PARAM_SET until its value is proven. Writes to one name queue up in order."""
+"""PARAM_SET: acknowledgement, verification, retries, and one queue per name."""
 
 from __future__ import annotations
 
@@ -39,18 +39,18 @@ __all__ = ["SetResult", "Write", "Writes"]
 
 @dataclass(frozen=True, slots=True)
 class SetResult:
-    """What became of a `set`.
+    """The outcome of a `set`.
 
     Attributes:
         name: param_id.
-        status: "accepted" (the vehicle holds what was asked for, as far as its type can), or "adjusted" (it
-            took the value and made another of it, as ArduPilot makes 1234 of 1234.7 for an integer; or it
-            changed it while it was watched, as modules of PX4 clamp values within a second).
-        requested: the value that was asked for.
+        status: "accepted" (the vehicle holds the requested value, as far as the type can represent it), or
+            "adjusted" (the vehicle changed the value: ArduPilot makes 1234 of 1234.7 for an integer; modules
+            of PX4 clamp values within a second, which is seen while the value is watched).
+        requested: the requested value.
         actual: the value that the vehicle reports.
         param: the parameter as it is now.
-        attempts: how many PARAM_SETs were sent.
-        note: what else is to be known, in a sentence: that PX4 does not keep a change as small as this one.
+        attempts: PARAM_SETs sent.
+        note: a further sentence: PX4 does not save a change as small as this one.
     """
 
     name: str
@@ -73,12 +73,12 @@ class SetResult:
 
 
 class Write(Operation[SetResult]):
-    """One PARAM_SET until its value is proven; see `Writes`.
+    """One PARAM_SET until its value is confirmed; see `Writes`.
 
     Attributes:
         settle: seconds from the acknowledgement until the value is read once more.
-        is_forced: whether a value that the vehicle cannot store is sent all the same.
-        acknowledged: the result so far, while the value is watched for that time.
+        is_forced: whether a value that the vehicle cannot store is sent anyway.
+        acknowledged: the result so far, while the value is watched for `settle` seconds.
     """
 
     def __init__(
@@ -103,53 +103,52 @@ class Write(Operation[SetResult]):
         self.number = 0  # the type that was sent
         self.wanted: Param | None = None
         self.before: Param | None = None
-        self.is_answered = False  # a value that is not the wanted one came after the last PARAM_SET
-        self.made: Param | None = None  # what the vehicle held after an earlier one: not the old value either
+        self.is_answered = False  # a value other than the requested one came after the last PARAM_SET
+        self.made: Param | None = None  # the value after an earlier PARAM_SET, if not the old one
         self.verify_at = math.inf
         self.read: Read | None = None
         self.was_retyped = False
 
 
 class WritePermission(Protocol):
-    """Says whether anything may be written.
+    """Says whether writes are permitted.
 
-    It is asked before each PARAM_SET, and not set on the context: it depends on other components of the
-    vehicle, and an old answer could send a write to another vehicle.
+    Queried before each PARAM_SET rather than set on the context: it depends on other components of the
+    vehicle, and a stale permission could send a write to another vehicle.
     """
 
     @property
     def may_be_written(self) -> bool:
-        """Whether it is certain whom a write reaches, and in which encoding."""
+        """Whether it is certain which vehicle receives a write, and in which encoding."""
 
 
 class Writes(Machine):
-    """Every write to one component: those to one name in order, those to different names side by side.
+    """The writes to one component: in order for one name, in parallel for different names.
 
-    How a write goes: learn the type (unless it was heard or verified on this link), send exactly that type,
-    wait for a PARAM_VALUE of the name. Only the wanted value proves success. Another value may be an old
-    read's answer or the stream passing by: wait a little, read by name, then decide. A value that is neither
-    the old nor the wanted one may be the vehicle's adjustment, or another station's that came between: the
-    PARAM_SET is sent again, and if the same comes of it, it is the adjustment. The old one means that nothing
-    was applied, and the PARAM_SET is sent again, as it may have been lost, until that is no longer likely.
+    The steps of a write: learn the type (unless it was received or verified on this link), send exactly that
+    type, wait for a PARAM_VALUE of the name. Only the requested value proves success. Another value may be
+    the response to an old read, or part of a list: wait a little, read by name, then decide. A value that is
+    neither the old nor the requested one may be the vehicle's adjustment, or a PARAM_SET of another station
+    that came between: the PARAM_SET is sent again, and an equal result is the adjustment. The old value means
+    that nothing was applied; the PARAM_SET may have been lost and is sent again until loss is unlikely.
 
-    Where the caller asks for it, the value is watched for a while after that, and then read once more: what
-    the vehicle has made of it meanwhile is its adjustment. All that time the write is acknowledged, so that
+    If the caller requests it, the value is watched for a while after that and then read once more: a
+    different value is then the vehicle's adjustment. The write is acknowledged during this time, so that
     changes of the value are not ours, but the next write to the name waits.
 
-    Nothing is sent before it is certain how the component writes values: an integer in the wrong encoding
-    would be taken as another number.
+    Nothing is sent until the component's encoding is certain: an integer in the wrong encoding would be taken
+    as another number.
 
     Args:
         context, reads, table: the component's.
-        permission: says whether anything may be written.
+        permission: says whether writes are permitted.
 
     Attributes:
-        queues: by name, those that are open, the one under way first; no name has an empty one.
-        is_held: whether one waits for that.
-        asked, retries: writes so far, and PARAM_SETs that were sent for another time.
-        against_non_finite: why the vehicle must not be sent NaN and infinity; "" where it may be.
-        left_open: is told the name and the author of a write of which nobody learns any more whether the
-            vehicle takes it.
+        queues: open writes by name, the active one first; no name has an empty queue.
+        is_held: whether a write waits for the permission.
+        asked, retries: writes so far, and repeated PARAM_SETs.
+        against_non_finite: why NaN and infinity must not be sent to the vehicle; "" where they may.
+        left_open: called with the name and the author of a write that ended with its outcome unknown.
     """
 
     def __init__(
@@ -172,13 +171,13 @@ class Writes(Machine):
         self.is_held = False
         self.against_non_finite = ""
         self.queues: dict[str, deque[Write]] = {}
-        self.left_open: Callable[[str, str, float], None] = _nobody
+        self.left_open: Callable[[str, str, float], None] = _ignore
 
     def __len__(self) -> int:
         return len(self.queues)
 
     def author(self, name: str) -> str | None:
-        """Who a change of this name is by, as far as a PARAM_SET to it is under way."""
+        """Return the author of an active PARAM_SET to this name, or None."""
         write = self._active(name)
         return None if write is None else write.by
 
@@ -192,7 +191,7 @@ class Writes(Machine):
         settle: float = 0.0,
         force: bool = False,
     ) -> Write:
-        """Begin a write, behind those to the same name that are open."""
+        """Begin a write, after the open ones to the same name."""
         write = Write(name, value, now, asker, settle=settle, is_forced=force)
         self.asked += 1
         queue = self.queues.setdefault(name, deque())
@@ -203,10 +202,10 @@ class Writes(Machine):
         return write
 
     def check_finite(self, name: str, value: Value, *, force: bool) -> None:
-        """See that a value may be sent as far as it is a finite number.
+        """Check that a value may be sent as far as it must be a finite number.
 
         Raises:
-            UsageError: it is NaN or infinite, and the vehicle must not be sent that.
+            UsageError: the value is NaN or infinite, and the vehicle must not receive that.
         """
         if isinstance(value, float) and not math.isfinite(value) and self.against_non_finite and not force:
             raise UsageError(
@@ -215,7 +214,7 @@ class Writes(Machine):
             )
 
     def cancel(self, write: Write, now: float) -> None:
-        """Forget a write. What was sent cannot be taken back: the vehicle may have applied it."""
+        """Cancel a write. A PARAM_SET that was sent cannot be recalled: the vehicle may have applied it."""
         queue = self.queues.get(write.name)
         if queue is None or write not in queue:
             return
@@ -226,14 +225,14 @@ class Writes(Machine):
             queue.remove(write)
 
     def proceed(self, now: float) -> None:
-        """It is certain now how the component writes values: begin what had to wait for that."""
+        """Begin the writes that waited for the permission."""
         self.is_held = False
         for queue in list(self.queues.values()):
             if queue and not queue[0].attempts and queue[0].read is None:
                 self._start(queue[0], now)
 
     def wants(self, message: ParamValue) -> bool:
-        """Whether a PARAM_VALUE says what the PARAM_SET under way to its name has said."""
+        """Return whether a PARAM_VALUE has the value of the active PARAM_SET to its name."""
         write = self._active(message.param_id)
         wanted = None if write is None else write.wanted
         if wanted is None or wanted.type != message.param_type:
@@ -241,7 +240,7 @@ class Writes(Machine):
         return wanted.bits == decode(message.raw, message.param_type, self._table.encoding)[1]
 
     def heard(self, message: ParamValue, now: float) -> None:
-        """Every PARAM_VALUE of the component passes here after it went into the table."""
+        """Process a PARAM_VALUE of the component, after the table has stored it."""
         write = self._active(message.param_id)
         if write is None:
             return
@@ -264,9 +263,9 @@ class Writes(Machine):
                 write.verify_at = min(write.verify_at, now + self._grace)
 
     def defer(self, message: ParamValue, until: float) -> None:
-        """Take a PARAM_VALUE that may be older than the last change: it proves nothing.
+        """Process a PARAM_VALUE that may be older than the last change: it proves nothing.
 
-        Where it has the wanted value, the parameter is read at `until` to decide.
+        If it has the requested value, the parameter is read at `until` to decide.
         """
         write = self._active(message.param_id)
         if write is not None and write.read is None and self.wants(message):
@@ -274,7 +273,7 @@ class Writes(Machine):
             write.verify_at = min(write.verify_at, until)
 
     def refused(self, message: ParamError, now: float) -> bool:
-        """A PARAM_ERROR: true when it ended a write."""
+        """Process a PARAM_ERROR and return whether it ended a write."""
         write = self._active(message.param_id) if message.param_index < 0 or message.param_id else None
         if write is None:
             return False
@@ -282,14 +281,14 @@ class Writes(Machine):
         return True
 
     def denied(self, name: str, now: float) -> None:
-        """ArduPilot's text says that a write to this name was denied."""
+        """Process ArduPilot's STATUSTEXT that a write to this name was denied."""
         write = self._active(name)
         if write is not None:
             message = ParamError(0, 0, name, -1, ParamErrorCode.READ_ONLY)
             self._fail(write, self._reads.error_of(message, name), now)
 
     def tick(self, now: float) -> None:
-        """Verify, send again, give up; but nothing while it is open who would get it."""
+        """Verify, repeat and give up writes; nothing while writes are not permitted."""
         if not self._permission.may_be_written:
             return
         timeout = self._round_trip.timeout
@@ -297,22 +296,22 @@ class Writes(Machine):
             if not queue:
                 continue
             write = queue[0]
-            if write.verify_at <= now:  # also where it is watched, and that time is over
+            if write.verify_at <= now:  # also for a watched write at the end of that time
                 write.verify_at = math.inf
                 self._read(write, now)
             elif self._awaits_answer(write) and not write.is_answered and write.sent_at + timeout <= now:
                 self._round_trip.timed_out(write.attempts)
                 if self._round_trip.is_hopeless(write.attempts, now):
-                    # reads in between have shown that nothing came of it
+                    # reads in between have shown that nothing was applied
                     self._fail(write, self._not_applied(write, self._params[write.name]), now)
                     continue
                 self._transmit(write, now)
                 if write.attempts > 2 and not write.done:
-                    # the vehicle may be silent on just this write: what does it hold?
+                    # the vehicle may be silent on this write only: read the value that it holds
                     self._read(write, now)
 
     def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity."""
+        """Return when `tick` is due, or infinity."""
         earliest = math.inf
         if not self.queues or not self._permission.may_be_written:
             return earliest
@@ -325,7 +324,7 @@ class Writes(Machine):
         return earliest
 
     def resume(self, now: float) -> None:
-        """The link is back: what was under way goes on at once."""
+        """Continue active writes at once: the link is back."""
         for queue in list(self.queues.values()):
             if queue and self._awaits_answer(queue[0]):
                 if self._permission.may_be_written:
@@ -333,11 +332,11 @@ class Writes(Machine):
                 self._transmit(queue[0], now)
 
     def lose(self, now: float) -> None:
-        """The component is lost: nobody waits any longer. What it has taken is not known."""
+        """End all writes: the component is lost. Whether it applied them is unknown."""
         self._end_all(lambda write: self._no_reply(write, now, " (lost)"), now)
 
     def fail_all(self, error: Exception, now: float) -> None:
-        """Nothing can be acknowledged any more."""
+        """End all writes with the error."""
         self._end_all(lambda write: error, now)
 
     def _end_all(self, error_of: Callable[[Write], Exception], now: float) -> None:
@@ -352,11 +351,11 @@ class Writes(Machine):
 
     @property
     def _grace(self) -> float:
-        # an old answer can be at most about one round trip ahead of the one that counts
+        # an old response is at most about one round trip ahead of the valid one
         return max(self._round_trip.timeout / 2, 0.05)
 
     def _active(self, name: str) -> Write | None:
-        """The write whose PARAM_SET to this name is under way and not acknowledged."""
+        """Return the write whose PARAM_SET to this name is in flight and not acknowledged."""
         queue = self.queues.get(name)
         return queue[0] if queue and queue[0].attempts and queue[0].acknowledged is None else None
 
@@ -381,7 +380,8 @@ class Writes(Machine):
 
     def _transmit(self, write: Write, now: float) -> None:
         if not self._permission.may_be_written:
-            # whoever may be there now is not meant: as soon as it is known, it is begun, or overdue
+            # the write is not meant for whichever vehicle is there now: it begins, or is overdue, once that
+            # is known
             self.is_held = True
             write.sent_at = -math.inf
             write.is_answered = False
@@ -391,7 +391,7 @@ class Writes(Machine):
         try:
             raw = encode(write.value, write.number, encoding)
         except UsageError as error:
-            # once something was sent, it is the vehicle that has turned out to be different
+            # something was sent before, and the vehicle has turned out to be a different one
             self._fail(write, self._type_mismatch(write, str(error)) if write.was_retyped else error, now)
             return
         value, bits = decode(raw, write.number, encoding)
@@ -409,12 +409,12 @@ class Writes(Machine):
         self._send(ParamSet(*self._target, write.name, raw, write.number))
 
     def _read(self, write: Write, now: float) -> None:
-        """Ask what the vehicle holds: before the first PARAM_SET to learn the type, later to decide."""
+        """Read the vehicle's value: before the first PARAM_SET for the type, later to decide."""
         read = write.read = self._reads.ask(write.name, now)
 
         def answered() -> None:
             if write.read is not read:
-                return  # it has ended meanwhile, or nobody wants it any more
+                return  # ended meanwhile, or cancelled
             write.read = None
             if isinstance(read.error, NoReply) and write.attempts:
                 self._fail(write, self._no_reply(write, read.ended_at), read.ended_at)
@@ -430,7 +430,7 @@ class Writes(Machine):
         read.on_done.append(answered)
 
     def _decide(self, write: Write, actual: Param, now: float) -> None:
-        """A read after the PARAM_SET showed a value that is not the wanted one."""
+        """Decide after a read that followed the PARAM_SET and showed a value other than the requested one."""
         is_made_again = write.made is not None and write.made.same_value(actual)
         if write.is_answered and is_made_again:
             self._succeed(write, now)
@@ -463,7 +463,7 @@ class Writes(Machine):
         write.finish(result, now)
 
     def _end_watch(self, write: Write, result: SetResult, now: float) -> None:
-        """The value was read once more: what has become of it since the acknowledgement?"""
+        """Compare the value that was read after the watch with the acknowledged one."""
         actual = self._params[write.name]
         if not result.param.same_value(actual):
             result = replace(result, status="adjusted", actual=actual.value)
@@ -522,5 +522,5 @@ class Writes(Machine):
         )
 
 
-def _nobody(_name: str, _by: str, _now: float) -> None:
+def _ignore(_name: str, _by: str, _now: float) -> None:
     return

@@ -10,10 +10,10 @@ import pytest
 from paramclient import ParamClient
 from paramclient.model.values import ParamType
 from paramclient.protocol.params.duplicate_names import (
-    ANSWERS_PAUSE,
-    ENOUGH_ANSWERS,
-    MOST_ANSWERS,
-    MOST_TOLD,
+    EQUAL_RESPONSES_MIN,
+    NAMES_LISTED_MAX,
+    RESPONSE_PAUSE,
+    RESPONSES_MAX,
     Repeated,
     repeated_names,
 )
@@ -146,13 +146,13 @@ def answer(desk: Desk, asking: Repeated, name: str, index: int) -> None:
 def test_late_values_that_come_in_one_moment_are_one_answer() -> None:
     desk = Desk("A")
     asking, table = repeated(desk, A=(3, 5))
-    for _ in range(ENOUGH_ANSWERS):
+    for _ in range(EQUAL_RESPONSES_MIN):
         desk.hear("A", index=5)
     assert not asking.done
-    assert asking.next_deadline() == desk.now + ANSWERS_PAUSE
-    desk.now += ANSWERS_PAUSE
+    assert asking.next_deadline() == desk.now + RESPONSE_PAUSE
+    desk.now += RESPONSE_PAUSE
     asking.tick(desk.now)
-    for _ in range(ENOUGH_ANSWERS):
+    for _ in range(EQUAL_RESPONSES_MIN):
         answer(desk, asking, "A", 3)
     assert is_so(asking.done)
     assert table.passed_over == {"A": {5}}
@@ -161,7 +161,7 @@ def test_late_values_that_come_in_one_moment_are_one_answer() -> None:
 def test_answers_that_never_agree_leave_it_open() -> None:
     desk = Desk("A")
     asking, table = repeated(desk, A=(3, 5))
-    for number in range(MOST_ANSWERS):
+    for number in range(RESPONSES_MAX):
         assert not asking.done
         answer(desk, asking, "A", (3, 5)[number % 2])
     assert asking.done
@@ -171,7 +171,7 @@ def test_answers_that_never_agree_leave_it_open() -> None:
 def test_a_name_that_is_not_answered_leaves_it_open() -> None:
     desk = Desk("A", "B")
     asking, table = repeated(desk, A=(3, 5), B=(0, 1))
-    for _ in range(ENOUGH_ANSWERS):
+    for _ in range(EQUAL_RESPONSES_MIN):
         answer(desk, asking, "B", 1)
     desk.pass_time()
     assert asking.done
@@ -182,7 +182,7 @@ def test_a_name_that_is_not_answered_leaves_it_open() -> None:
 
 
 def test_the_note_names_a_few() -> None:
-    names = {f"N{number}": (number, number + 100) for number in range(MOST_TOLD + 2)}
+    names = {f"N{number}": (number, number + 100) for number in range(NAMES_LISTED_MAX + 2)}
     note = Repeated(names, RoundTrip(), Desk().reads, Table(), 0.0).note
     assert "N0 (indices 0, 100)" in note
     assert "N4 (indices 4, 104) and 2 more" in note

@@ -9,7 +9,7 @@ import pytest
 from paramclient.protocol import wire
 from paramclient.protocol.ftp.packets import Opcode, Packet
 from paramclient.protocol.ftp.transfer_job import QUIET_TIME
-from paramclient.protocol.params.fetch import BLIND_PATIENCE, FILE_PATIENCE, Fetch
+from paramclient.protocol.params.fetch import FILE_OPEN_TIMEOUT, FILE_OPEN_TIMEOUT_SILENT, Fetch
 from paramclient.protocol.params.fetch_notes import FILE_IN_USE
 from paramclient.protocol.requests.round_trip import FIRST_TIMEOUT
 from paramclient.protocol.wire import (
@@ -158,8 +158,8 @@ def test_an_open_that_stays_unanswered_brings_the_list_beside_it() -> None:
     began = session.now
     result = session.outcome(fetch)
     assert (result.source, bits(result.params)) == ("stream", bits(vehicle.params))
-    assert times_of(session, ParamRequestList)[0] - began == pytest.approx(FILE_PATIENCE, abs=0.1)
-    assert result.elapsed < FILE_PATIENCE + 1.5
+    assert times_of(session, ParamRequestList)[0] - began == pytest.approx(FILE_OPEN_TIMEOUT, abs=0.1)
+    assert result.elapsed < FILE_OPEN_TIMEOUT + 1.5
 
 
 def test_where_nothing_is_answered_at_all_the_list_is_asked_for_later() -> None:
@@ -169,7 +169,7 @@ def test_where_nothing_is_answered_at_all_the_list_is_asked_for_later() -> None:
     fetch = begin_at_heartbeat(session)
     began = session.now
     assert session.outcome(fetch).source == "stream"
-    assert times_of(session, ParamRequestList)[0] - began == pytest.approx(BLIND_PATIENCE, abs=0.1)
+    assert times_of(session, ParamRequestList)[0] - began == pytest.approx(FILE_OPEN_TIMEOUT_SILENT, abs=0.1)
 
 
 def test_a_list_that_has_begun_gives_way_to_a_file_that_is_served() -> None:

@@ -78,7 +78,7 @@ def test_an_empty_table() -> None:
 
 
 def test_the_search_does_not_grow_with_the_square_of_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hash_exclusions, "MOST_HASHED", 100)
+    monkeypatch.setattr(hash_exclusions, "HASHED_PARAMETERS_MAX", 100)
     table = [known(f"N{number:02d}", number, index=number) for number in range(20)]
     assert found(table, announced(table, ["N04"])) == (frozenset({"N04"}), True)
     assert found(table, announced(table, ["N05"])) == (frozenset(), False)

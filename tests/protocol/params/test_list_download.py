@@ -10,18 +10,18 @@ import pytest
 from paramclient.errors import LinkError, NoReply
 from paramclient.protocol.params import list_download as room
 from paramclient.protocol.params.list_download import (
-    FEW,
-    LIST_PATIENCE,
-    LIST_TRIES,
-    LONGEST_LIST_WAIT,
-    MOST_ASKED,
-    MOST_LISTS_AT_ONCE,
-    MOST_MOVES,
-    MOST_VAIN_PASSES,
+    COUNT_CHANGES_MAX,
+    EMPTY_LISTS_MAX,
+    LIST_ATTEMPTS_MIN,
+    LIST_COPIES_MAX,
+    LIST_RETRY_INTERVAL_MAX,
+    LIST_TIMEOUT,
+    MISSING_WITHOUT_LIST_MAX,
+    REQUESTED_INDICES_MAX,
     Download,
 )
-from paramclient.protocol.params.list_stream import LONGEST_JUMP, REORDER_DEPTH
-from paramclient.protocol.params.reads import CONTROL, Reads
+from paramclient.protocol.params.list_stream import JUMP_MAX, LIST_REORDER_DEPTH
+from paramclient.protocol.params.reads import CONTROL_INDEX, Reads
 from paramclient.protocol.params.table import Table
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.pacing import REQUEST_SIZE, UPSTREAM_SHARE, VALUE_SIZE
@@ -163,9 +163,9 @@ def test_silence_ends_with_no_reply() -> None:
     desk = Desk()
     desk.pass_time()
     assert isinstance(desk.download.error, NoReply)
-    assert LIST_PATIENCE <= desk.now <= LIST_PATIENCE + LONGEST_LIST_WAIT
+    assert LIST_TIMEOUT <= desk.now <= LIST_TIMEOUT + LIST_RETRY_INTERVAL_MAX
     assert desk.download.error.attempts == desk.download.lists == desk.take().count("list")
-    assert LIST_TRIES <= desk.download.lists < LIST_TRIES + 4
+    assert LIST_ATTEMPTS_MIN <= desk.download.lists < LIST_ATTEMPTS_MIN + 4
     assert "list of 1/1" in str(desk.download.error)
     assert desk.download.missing == ()
     assert desk.reads.is_idle
@@ -173,10 +173,10 @@ def test_silence_ends_with_no_reply() -> None:
 
 def test_a_list_that_is_lost_often_is_asked_for_often_enough() -> None:
     desk = Desk(round_trip=3.0)
-    desk.pass_time(LIST_PATIENCE + 5.0)
+    desk.pass_time(LIST_TIMEOUT + 5.0)
     assert not desk.download.done, "not before it was asked for often enough"
     desk.pass_time()
-    assert desk.download.lists == LIST_TRIES
+    assert desk.download.lists == LIST_ATTEMPTS_MIN
 
 
 def test_a_component_that_is_not_heard_either_is_given_up_sooner() -> None:
@@ -184,7 +184,7 @@ def test_a_component_that_is_not_heard_either_is_given_up_sooner() -> None:
     desk.trip.heard_at = 0.0
     desk.pass_time()
     assert isinstance(desk.download.error, NoReply)
-    assert desk.now < LIST_PATIENCE + 5.0
+    assert desk.now < LIST_TIMEOUT + 5.0
 
 
 def test_another_pass_is_asked_for_twice_at_once_on_a_link_that_loses() -> None:
@@ -195,7 +195,7 @@ def test_another_pass_is_asked_for_twice_at_once_on_a_link_that_loses() -> None:
     desk.stream(range(50), count=1000)
     assert desk.take() == ["list"]
     desk.pass_time(0.6)
-    assert desk.take().count("list") == MOST_LISTS_AT_ONCE
+    assert desk.take().count("list") == LIST_COPIES_MAX
 
 
 def test_on_a_slow_link_the_list_is_not_asked_for_while_the_answer_is_on_its_way() -> None:
@@ -240,11 +240,11 @@ def test_a_gap_is_asked_for_while_the_stream_runs() -> None:
     desk = Desk()
     desk.stream([0, 1, 4])
     assert desk.take() == ["list"]
-    desk.stream(range(5, 5 + REORDER_DEPTH - 1))
+    desk.stream(range(5, 5 + LIST_REORDER_DEPTH - 1))
     assert desk.take() == [2, 3]
     desk.hear(2)
     desk.hear(3)
-    desk.stream(range(5 + REORDER_DEPTH - 1, 100))
+    desk.stream(range(5 + LIST_REORDER_DEPTH - 1, 100))
     assert desk.download.done
     assert desk.take() == []
     assert desk.download.missing == ()
@@ -366,14 +366,14 @@ def test_no_more_is_asked_for_at_a_time_than_is_bounded() -> None:
     desk.download.resume(0.0)
     desk.stream([0, *range(30_000, 30_100)], count=60_000)
     desk.pass_time(1.0)
-    assert len(desk.reads) <= MOST_ASKED
+    assert len(desk.reads) <= REQUESTED_INDICES_MAX
 
 
 def test_a_large_table_read_one_by_one_takes_linear_time() -> None:
     desk = Desk()
     count = 20_000
     desk.stream([0], count=count)
-    for _ in range(MOST_VAIN_PASSES + 2):
+    for _ in range(EMPTY_LISTS_MAX + 2):
         desk.pass_time(1.0)
     asked = 0
     while not desk.download.done:
@@ -400,7 +400,7 @@ def test_a_value_pushed_far_ahead_is_no_gap() -> None:
 
 def test_a_long_gap_is_believed_when_the_stream_goes_on_behind_it() -> None:
     desk = Desk()
-    ahead = 10 + LONGEST_JUMP + 5
+    ahead = 10 + JUMP_MAX + 5
     desk.stream([*range(10), ahead])
     assert desk.take() == ["list"]
     desk.stream(range(ahead + 1, ahead + 5))
@@ -409,7 +409,7 @@ def test_a_long_gap_is_believed_when_the_stream_goes_on_behind_it() -> None:
 
 def test_pushes_far_apart_are_not_the_stream() -> None:
     desk = Desk()
-    desk.stream([*range(10), *range(300, 900, LONGEST_JUMP + 1), 10, 11, 12, 13], count=1000)
+    desk.stream([*range(10), *range(300, 900, JUMP_MAX + 1), 10, 11, 12, 13], count=1000)
     assert desk.take() == ["list"]
 
 
@@ -486,7 +486,7 @@ def test_a_stream_that_stops_is_asked_for_once_more_when_that_is_faster() -> Non
 
 def test_a_little_is_always_read_one_by_one() -> None:
     desk = Desk()
-    desk.stream(range(1000 - FEW), count=1000)
+    desk.stream(range(1000 - MISSING_WITHOUT_LIST_MAX), count=1000)
     desk.take()
     desk.pass_time(0.3)
     assert "list" not in desk.take()
@@ -497,7 +497,7 @@ def test_lists_that_bring_nothing_are_not_asked_for_for_ever() -> None:
     desk.stream(range(30), count=1000)
     desk.take()
     desk.pass_time(5.0)
-    assert desk.take().count("list") == MOST_VAIN_PASSES
+    assert desk.take().count("list") == EMPTY_LISTS_MAX
     desk.answer(count=1000)
     assert desk.download.missing == ()
 
@@ -611,7 +611,7 @@ def test_two_counts_that_alternate_come_to_an_end() -> None:
     for index in range(100):
         desk.stream([index], count=100 + index % 2)
     assert not desk.download.is_settled
-    for _ in range(3 * MOST_MOVES):
+    for _ in range(3 * COUNT_CHANGES_MAX):
         if not desk.download.done:
             desk.pass_time(1.0)
             for each in desk.take():
@@ -624,18 +624,18 @@ def test_two_counts_that_alternate_come_to_an_end() -> None:
 
 def test_once_the_count_is_taken_as_it_is_what_lies_beyond_it_is_passed_over() -> None:
     desk = Desk()
-    for move in range(MOST_MOVES + 1):
+    for move in range(COUNT_CHANGES_MAX + 1):
         desk.stream([0], count=100 + move)
     assert not desk.download.is_settled
     desk.hear(150, count=200)
-    assert desk.download.count == 100 + MOST_MOVES
+    assert desk.download.count == 100 + COUNT_CHANGES_MAX
     assert 150 not in desk.download.names
 
 
 def test_when_the_list_was_asked_for_often_enough_another_count_is_settled_by_reads(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(room, "MOST_PASSES", 1)
+    monkeypatch.setattr(room, "LISTS_MAX", 1)
     desk = Desk()
     desk.stream([*range(7), *range(8, 100)])
     desk.hear(7, count=104)
@@ -743,13 +743,13 @@ def test_the_end_of_the_link_while_a_read_is_open() -> None:
 
 def test_when_the_link_is_back_the_list_is_asked_for_at_once_and_anew() -> None:
     desk = Desk()
-    desk.pass_time(LIST_PATIENCE - 1)
+    desk.pass_time(LIST_TIMEOUT - 1)
     desk.take()
     desk.now = 100.0
     desk.download.resume(100.0)
     desk.pass_time(0.0)
     assert desk.take() == ["list"]
-    desk.pass_time(LIST_PATIENCE - 1)
+    desk.pass_time(LIST_TIMEOUT - 1)
     assert not desk.download.done
 
 
@@ -870,6 +870,6 @@ def test_a_reboot_in_the_middle() -> None:
 def test_the_control_index_is_among_what_may_be_missing() -> None:
     desk = Desk()
     desk.stream(range(1, 100))
-    assert CONTROL in desk.take()
-    desk.answer(silent=(CONTROL,))
-    assert desk.download.missing == (CONTROL,)
+    assert CONTROL_INDEX in desk.take()
+    desk.answer(silent=(CONTROL_INDEX,))
+    assert desk.download.missing == (CONTROL_INDEX,)

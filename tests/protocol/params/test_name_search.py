@@ -14,9 +14,9 @@ from paramclient.protocol.params.name_search import (
     CONTROL_RISK,
     CONTROLS_LOST_MAX,
     CONTROLS_MAX,
+    NAME_LOSS_RISK,
     PASSES_MIN,
-    RISK,
-    WINDOW,
+    WINDOW_SIZE,
     NameSearches,
 )
 from paramclient.protocol.params.reads import Reads
@@ -101,7 +101,7 @@ def test_the_more_is_lost_the_more_often_a_name_is_requested() -> None:
     while not search.done:
         desk.answer()
         passes += 1
-    assert passes == math.ceil(math.log(RISK) / math.log(desk.round_trip.feared_loss)) > PASSES_MIN
+    assert passes == math.ceil(math.log(NAME_LOSS_RISK) / math.log(desk.round_trip.feared_loss)) > PASSES_MIN
     desk.searches.begin(["A"], 0.0)
     assert len(set(desk.take())) == 1 + desk.round_trip.copies(CONTROL_RISK, CONTROLS_MAX) > 2
 
@@ -126,14 +126,14 @@ def test_no_more_is_in_flight_than_the_vehicle_queues() -> None:
     while not search.done:
         sizes.append(len(desk.sent))
         controls.append(desk.answer(*names[:10])[-1])
-    assert sizes == [WINDOW + 1, WINDOW + 1, 4 + 1, WINDOW + 1, 12 + 1]
+    assert sizes == [WINDOW_SIZE + 1, WINDOW_SIZE + 1, 4 + 1, WINDOW_SIZE + 1, 12 + 1]
     assert controls == [99, 98, 97, 96, 95]  # rising ones would look like a list
     assert search.unknown == set(names[10:])
 
 
 def test_a_window_that_is_answered_whole_waits_for_no_control() -> None:
     desk = Desk()
-    names = [f"N{number:02}" for number in range(WINDOW + 1)]
+    names = [f"N{number:02}" for number in range(WINDOW_SIZE + 1)]
     search = desk.searches.begin(names, 0.0)
     *first, control = desk.take()
     for name in first:

@@ -14,7 +14,14 @@ from paramclient.errors import (
     TypeMismatch,
     UnknownParameter,
 )
-from paramclient.protocol.params.reads import CONTROL, ENOUGH_CONTROLS, MOST_COPIES, Key, Read, Reads
+from paramclient.protocol.params.reads import (
+    CONTROL_INDEX,
+    CONTROLS_CERTAIN,
+    READ_COPIES_MAX,
+    Key,
+    Read,
+    Reads,
+)
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.pacing import FIRST_RATE, SMALLEST_BURST
 from paramclient.protocol.requests.round_trip import (
@@ -262,7 +269,7 @@ def test_on_an_idle_link_that_loses_a_request_is_doubled() -> None:
     desk.ask("A")
     assert desk.take() == ["A"]
     desk.reads.tick(desk.now)  # when everything is asked for that is wanted at this moment
-    assert 1 <= desk.take().count("A") <= MOST_COPIES
+    assert 1 <= desk.take().count("A") <= READ_COPIES_MAX
     assert len(desk.reads) == 1
 
 
@@ -277,7 +284,7 @@ def test_to_a_vehicle_that_is_silent_throughout_nothing_is_doubled_any_more() ->
     desk.pass_time(5.0)
     more = sum(read.attempts for read in desk.reads._open.values()) - attempts
     assert more > 20
-    assert len([each for each in desk.take() if each != CONTROL]) == more
+    assert len([each for each in desk.take() if each != CONTROL_INDEX]) == more
 
 
 def test_while_a_list_comes_nothing_is_doubled() -> None:
@@ -327,7 +334,7 @@ def answering_desk(*known: str, count: int = 100) -> Desk:
 
     def send(message: Message) -> None:
         original(message)
-        if isinstance(message, ParamRequestRead) and message.param_index == CONTROL:
+        if isinstance(message, ParamRequestRead) and message.param_index == CONTROL_INDEX:
             controls.append(desk.now)
 
     controls: list[float] = []
@@ -339,7 +346,7 @@ def answering_desk(*known: str, count: int = 100) -> Desk:
         tick(now)
         while controls:
             controls.pop()
-            desk.hear("ZERO", index=CONTROL)
+            desk.hear("ZERO", index=CONTROL_INDEX)
 
     desk.reads.tick = tick_and_answer  # type: ignore[method-assign]  # the vehicle's part in it
     return desk
@@ -352,10 +359,10 @@ def test_a_vehicle_that_answers_all_else_does_not_have_it(key: Key) -> None:
     desk.pass_time()
     assert isinstance(read.error, UnknownParameter)
     assert (read.error.name, read.error.index) == ((key, None) if isinstance(key, str) else (None, key))
-    assert read.controls >= ENOUGH_CONTROLS
+    assert read.controls >= CONTROLS_CERTAIN
     assert read.attempts < desk.round_trip.tries
     assert desk.now < 3.0
-    assert desk.take().count(CONTROL) >= ENOUGH_CONTROLS
+    assert desk.take().count(CONTROL_INDEX) >= CONTROLS_CERTAIN
 
 
 @pytest.mark.parametrize("key", ["A", 99])
@@ -364,7 +371,7 @@ def test_of_what_is_known_silence_is_silence(key: Key) -> None:
     read = desk.ask(key)
     desk.pass_time()
     assert isinstance(read.error, NoReply)
-    assert desk.sent.count(CONTROL) > 0
+    assert desk.sent.count(CONTROL_INDEX) > 0
 
 
 def test_where_much_is_silent_the_controls_tell_how_good_the_link_is() -> None:
@@ -378,8 +385,8 @@ def test_where_much_is_silent_the_controls_tell_how_good_the_link_is() -> None:
     read = desk.ask(7)
     for _ in range(100):
         desk.pass_time(0.05)
-        if CONTROL in desk.take():
-            desk.hear("P0", index=CONTROL)
+        if CONTROL_INDEX in desk.take():
+            desk.hear("P0", index=CONTROL_INDEX)
     assert read.done
     assert 9 < read.attempts < 15  # five answered controls of five are no proof of a link that loses nothing
 
@@ -391,7 +398,7 @@ def test_what_a_list_may_have_brought_is_no_answered_control() -> None:
     read = desk.ask(7)
     for _ in range(10):
         desk.pass_time(0.05)
-        desk.hear("P0", index=CONTROL)
+        desk.hear("P0", index=CONTROL_INDEX)
     assert read.controls == 0
 
 
@@ -400,7 +407,7 @@ def test_without_answered_controls_nothing_is_called_unknown() -> None:
     read = desk.ask("NOWHERE")
     desk.pass_time()
     assert isinstance(read.error, NoReply)
-    assert desk.sent.count(CONTROL) > 1  # asked for again as well
+    assert desk.sent.count(CONTROL_INDEX) > 1  # asked for again as well
 
 
 def test_a_control_that_was_lost_is_not_answered_by_what_passes_by_much_later() -> None:
@@ -408,15 +415,15 @@ def test_a_control_that_was_lost_is_not_answered_by_what_passes_by_much_later() 
     desk.reads.is_idle = False
     read = desk.ask("A")
     desk.pass_time(FIRST_TIMEOUT + 0.1)
-    assert desk.take() == ["A", "A", CONTROL]
+    assert desk.take() == ["A", "A", CONTROL_INDEX]
     desk.hear("A")
     assert read.done
     desk.now = 300.0
-    desk.hear("ZERO", index=CONTROL)
+    desk.hear("ZERO", index=CONTROL_INDEX)
     assert desk.round_trip.timeout == INITIAL_TIMEOUT
 
 
-@pytest.mark.parametrize(("count", "control"), [(20, 7), (5, CONTROL)])
+@pytest.mark.parametrize(("count", "control"), [(20, 7), (5, CONTROL_INDEX)])
 def test_the_index_heard_last_is_the_control_as_long_as_there_is_one(count: int, control: int) -> None:
     desk = Desk(count=count)
     desk.reads.is_idle = False
@@ -437,13 +444,13 @@ def test_index_0_has_the_index_heard_last_as_its_control() -> None:
     desk.reads.is_idle = False
     desk.hear("B", index=7)
     desk.measure()
-    read = desk.ask(CONTROL)
+    read = desk.ask(CONTROL_INDEX)
     while not read.done:
         desk.now = desk.reads.next_deadline()
         desk.reads.tick(desk.now)
         if desk.take()[-1:] == [7]:
             desk.hear("B", index=7)
-    assert read.controls >= ENOUGH_CONTROLS
+    assert read.controls >= CONTROLS_CERTAIN
     assert isinstance(read.error, NoReply)
     assert desk.now < 5.0
 
@@ -461,9 +468,9 @@ def test_answered_controls_end_what_stays_silent_soon() -> None:
 def test_index_0_needs_no_other_control() -> None:
     desk = Desk()
     desk.reads.is_idle = False
-    desk.ask(CONTROL)
+    desk.ask(CONTROL_INDEX)
     desk.pass_time(3.5 * FIRST_TIMEOUT)
-    assert desk.take() == [CONTROL] * 3
+    assert desk.take() == [CONTROL_INDEX] * 3
 
 
 def test_silences_of_the_past_do_not_count_against_what_is_asked_later() -> None:

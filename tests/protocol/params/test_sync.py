@@ -21,10 +21,10 @@ from paramclient.protocol.events import (
     ParamChanged,
     TableResynced,
 )
-from paramclient.protocol.params.fetch import MOST_RESTARTS
+from paramclient.protocol.params.fetch import FETCH_RESTARTS_MAX
 from paramclient.protocol.params.fetch_result import Policy
 from paramclient.protocol.params.reads import Read
-from paramclient.protocol.params.sync import GAPS_INTERVAL, WATCH_INTERVAL, SyncState, Upkeep
+from paramclient.protocol.params.sync import GAP_CHECK_INTERVAL, WATCH_INTERVAL, SyncState, Upkeep
 from paramclient.protocol.params.sync_interval import RESERVE_SHARE
 from paramclient.protocol.params.writes import Write
 from paramclient.protocol.station import Station
@@ -393,7 +393,7 @@ def test_gaps_are_many_on_a_bad_link_and_checks_are_not() -> None:
     world.run(1800.0)
     apart = [after - before for before, after in pairwise(times)]
     assert len(times) > 1800.0 / INTERVAL, "there were gaps"
-    assert min(apart) > GAPS_INTERVAL - 1e-6
+    assert min(apart) > GAP_CHECK_INTERVAL - 1e-6
     assert max(apart) <= INTERVAL + 5.0
     assert state(world) is SyncState.SYNCED
     assert len(world.told(TableResynced)) == len(world.told(ComponentLost))
@@ -406,7 +406,7 @@ def test_gaps_lead_to_one_check_in_five_seconds() -> None:
         world.away(2.6)
         world.run(1.9)
     assert len(times) >= 15
-    assert min(after - before for before, after in pairwise(times)) > GAPS_INTERVAL - 1e-6
+    assert min(after - before for before, after in pairwise(times)) > GAP_CHECK_INTERVAL - 1e-6
 
 
 class Rare(Tap):
@@ -941,7 +941,7 @@ def test_a_vehicle_that_never_stops_starting_again_ends_a_fetch() -> None:
         vehicle.reboot(world.now, down=1.5)
         world.run(5.0)
         assert reboots < 20
-    assert reboots == MOST_RESTARTS + 1 == 9
+    assert reboots == FETCH_RESTARTS_MAX + 1 == 9
     assert isinstance(fetch.error, NoReply)
     assert "started again" in str(fetch.error)
     assert world.machine.fetch is None
@@ -1085,7 +1085,7 @@ def test_a_table_that_moved_while_it_came_is_fetched_again() -> None:
     assert "A_LATE" not in world.outcome(fetch).params
     assert fetch.result is not None
     assert fetch.result.hash is not None
-    world.run(GAPS_INTERVAL + 5.0)
+    world.run(GAP_CHECK_INTERVAL + 5.0)
     assert state(world) is SyncState.SYNCED
     assert "A_LATE" in world.machine.table.params
 

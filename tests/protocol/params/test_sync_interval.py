@@ -15,13 +15,13 @@ from paramclient.protocol.ftp.packets import Opcode, Packet
 from paramclient.protocol.params.fetch import Check
 from paramclient.protocol.params.fetch_result import FetchResult
 from paramclient.protocol.params.sync import (
+    FILE_IN_USE_RETRY,
     FOREIGN_CHECK_INTERVAL,
     FOREIGN_SETTLING_TIME,
-    SKIPPED_TURN_WAIT,
     SyncState,
     Upkeep,
 )
-from paramclient.protocol.params.sync_interval import FETCHES_KEPT, SHORTEST_PAUSE, CheckPace
+from paramclient.protocol.params.sync_interval import FETCHES_KEPT, PAUSE_MIN, CheckPace
 from paramclient.protocol.wire import CommandLong, FileTransfer, ParamRequestList, ParamRequestRead
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, SimParam, px4_table
 from tests.protocol.params.test_sync import INTERVAL, NAMES, PLAIN, TABLE, World, fetched, resynced, state
@@ -159,9 +159,7 @@ def test_a_count_that_moves_all_the_time_is_followed_once_a_second() -> None:
         vehicle.set_param("P01", number)  # tells the count
         world.run(0.05)
     times = openings(world)
-    assert 5 <= len(times) <= 2 * 10.0 / SHORTEST_PAUSE, (
-        "some are read twice, as the count has moved meanwhile"
-    )
+    assert 5 <= len(times) <= 2 * 10.0 / PAUSE_MIN, "some are read twice, as the count has moved meanwhile"
 
 
 # other stations' files
@@ -185,11 +183,11 @@ def test_while_another_station_has_a_file_open_a_check_skips_its_turn(is_heard: 
     assert [packets(world, opcode) for opcode in closing] == [[], []], "which may close what others have open"
     times = openings(world)
     assert is_heard == (not times)
-    assert len(times) <= 60.0 / SKIPPED_TURN_WAIT + 2, "with another number where the first one was in use"
+    assert len(times) <= 60.0 / FILE_IN_USE_RETRY + 2, "with another number where the first one was in use"
     assert resynced(world) == []
     assert vehicle.open_files == [PATH.decode()]
     other.ask(Opcode.TERMINATE_SESSION)
-    world.run((INTERVAL if is_heard else 2 * SKIPPED_TURN_WAIT) + 1.0)
+    world.run((INTERVAL if is_heard else 2 * FILE_IN_USE_RETRY) + 1.0)
     assert resynced(world) == [("P07",)]
     world.sent.clear()
     world.run(3 * INTERVAL)

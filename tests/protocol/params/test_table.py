@@ -109,7 +109,7 @@ def test_an_index_may_move(value: float) -> None:
 
 
 def test_a_table_has_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(room, "MOST_NAMES", 3)
+    monkeypatch.setattr(room, "NAMES_MAX", 3)
     table = Table()
     for number in range(10):
         table.hear(param_value(f"N{number}", 1.0), "vehicle")

@@ -11,7 +11,7 @@ from paramclient.model.values import ParamType
 from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ComponentRebooted, Event, EventMaker
-from paramclient.protocol.params.boot_values import MEASURING_TIME, YOUNG
+from paramclient.protocol.params.boot_values import MEASURING_TIME, MEASURING_UPTIME_MAX
 from paramclient.protocol.params.sync import Upkeep
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.station import Station
@@ -353,7 +353,9 @@ def test_measuring_counts_from_the_first_clock() -> None:
     assert desk.names_read() == {"BARO1_GND_PRESS"}
 
 
-@pytest.mark.parametrize(("uptime", "is_young"), [(YOUNG - 1.0, True), (YOUNG + 1.0, False)])
+@pytest.mark.parametrize(
+    ("uptime", "is_young"), [(MEASURING_UPTIME_MAX - 1.0, True), (MEASURING_UPTIME_MAX + 1.0, False)]
+)
 def test_a_vehicle_that_is_met_soon_after_its_start(uptime: float, is_young: bool) -> None:
     desk = Desk(uptime=int(1000 * uptime))
     desk.value("BARO1_GND_PRESS")
