@@ -1,1 +1,13 @@
-"""Identification, presence, commands, reboot and system id of a vehicle."""
+"""Identification, presence, commands, reboot and peers of a vehicle.
+
+`boot_time_requests`: requests for SYSTEM_TIME.
+`boot_time_sampling`: reads of clocks in telemetry.
+`claims`: what one peer sends under an address.
+`commands`: COMMAND_LONG.
+`identification`: identity and parameter encoding.
+`kinds`: autopilots and vehicle types as text.
+`metadata_location`: COMPONENT_METADATA.
+`peers`: the peers of a component, and contested addresses.
+`presence`: heartbeats, loss, and detection of reboots.
+`reboot`: a reboot on command.
+"""

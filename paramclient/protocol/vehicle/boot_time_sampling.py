@@ -1,4 +1,4 @@
-"""Which components' telemetry is looked into for their time since boot."""
+"""The components whose telemetry is read for their time since boot."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from typing import Final
 __all__ = ["ClockSampling"]
 
 SAMPLE_TIME: Final = 0.1
-"""Seconds after a heartbeat for which a component's clocks are read. Messages at 10 Hz and more come in that
-time; longer for one none of whose clocks has come, until one does."""
+"""Seconds after a heartbeat in which a component's clocks are read. Messages at 10 Hz and more arrive in that
+time; without any clock the window stays open until one arrives."""
 
 
 class ClockSampling:
-    """Opens a window with each heartbeat in which frames with `time_boot_ms` are given out.
+    """Opens a window after each heartbeat in which frames with `time_boot_ms` are decoded.
 
-    To make an object of each frame of telemetry would cost a third of what framing costs. A restart shows in
-    any later clock as well as in the first.
+    An object for each telemetry frame would take a third of the time of framing. A reboot shows in any later
+    clock as well as in the first.
 
     Args:
-        choose: takes whether frames with clocks are wanted now, whenever that changes.
+        choose: called with whether frames with clocks are wanted, at each change.
     """
 
     def __init__(self, choose: Callable[[bool], None]) -> None:
         self._choose = choose
-        self._open: dict[tuple[int, int], float] = {}  # by component, until when at the least
+        self._open: dict[tuple[int, int], float] = {}  # by component, until when at least
 
     def open(self, address: tuple[int, int], now: float) -> None:
         """Read the clocks of a component for a while."""
@@ -33,11 +33,11 @@ class ClockSampling:
         self._open[address] = now + SAMPLE_TIME
 
     def is_open(self, address: tuple[int, int]) -> bool:
-        """Whether clocks of this component are read now."""
+        """Return whether clocks of this component are read now."""
         return address in self._open
 
     def sampled(self, address: tuple[int, int], now: float) -> None:
-        """A clock of this component was read."""
+        """Record that a clock of this component was read."""
         if self._open[address] <= now:
             self.close(address)
 

@@ -1,4 +1,4 @@
-"""What one peer says under the address of a component, and whether two peers are the same vehicle."""
+"""What one peer sends under the address of a component, and whether two peers are the same vehicle."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Final, Generic, NamedTuple, TypeVar
 from paramclient.model.identity import SHARED_UIDS, hardware_id
 from paramclient.protocol.addresses import Peer, peer_in_words
 from paramclient.protocol.vehicle.kinds import kind_in_words
-from paramclient.protocol.vehicle.presence import OUT_OF_ORDER
+from paramclient.protocol.vehicle.presence import REORDERING_TIME
 from paramclient.protocol.wire import (
     SYSTEM_TIME_ID,
     AutopilotVersion,
@@ -22,30 +22,32 @@ from paramclient.protocol.wire import (
 
 __all__ = ["Claim", "Verdict", "Variants", "compare", "compare_in_turn"]
 
-ANOTHER_START: Final = 10.0
-"""Seconds by which two starts must differ to be those of two vehicles, where one peer tells both in turn:
-more than by what a clock may come late."""
-TURNS: Final = 4
-TURNS_WINDOW: Final = 15.0
-"""How often one must follow the other in so many seconds: what comes late after a restart does so twice."""
-START_TOLERANCE: Final = 2.0
-"""Seconds by which the boot times of one vehicle may differ that were heard over two ways: its messages take
-longer on one of them."""
+BOOT_DIFFERENCE_MIN: Final = 10.0
+"""Seconds between two boots that make them those of two vehicles, if one peer sends both alternately: more
+than the latency of a clock."""
+ALTERNATIONS_MIN: Final = 4
+"""Alternations between two boots, within the time below, that show two vehicles: late messages after a reboot
+cause two."""
+ALTERNATION_WINDOW: Final = 15.0
+"""Seconds in which these alternations must happen."""
+BOOT_TOLERANCE: Final = 2.0
+"""Seconds by which the boot times of one vehicle may differ when received over two paths: one of them has
+more latency."""
 CLOCK_DELAY: Final = 5.0
-"""Seconds by which a clock may come late over a slow link. One that was told less than that after another
-peer's start may belong to the run before that start."""
+"""Seconds by which a clock may be late over a slow link. A clock received less than that after another peer's
+boot may belong to the run before that boot."""
 CLOCK_DRIFT: Final = 0.05
-"""The share by which a vehicle's clock may go slower than ours: that of a simulation on a busy computer."""
+"""The share by which a vehicle's clock may be slower than ours: that of a simulation on a busy computer."""
 CLAIMED_CLOCKS_MAX: Final = 4
 """Message ids whose time since boot is remembered for one peer."""
 VARIANTS_MAX: Final = 8
-"""Earlier variants that are remembered, of a peer that says each time that it is another vehicle."""
+"""Earlier variants that are remembered, of a peer that claims to be another vehicle each time."""
 
 Value = TypeVar("Value", bound=Hashable)
 
 
 class Verdict(Enum):
-    """How two claims to one address stand to each other."""
+    """The relation of two claims to one address."""
 
     OPEN = "open"
     SAME = "the same vehicle"
@@ -53,14 +55,14 @@ class Verdict(Enum):
 
 
 class Variants(Generic[Value]):
-    """What a peer says about one thing, and whether that alternates.
+    """The values that a peer sends for one property, and whether they alternate.
 
-    A change is no alternation: another firmware was started, or another vehicle plugged in. It is one when
-    what was said before comes back within the timeout.
+    A change is no alternation: another firmware was started, or another vehicle plugged in. It is one when an
+    earlier value returns within the timeout.
 
     Attributes:
-        current: what was said last; None before anything was.
-        is_mixed: whether it alternates, until only one variant was said for the timeout.
+        current: the latest value; None before the first.
+        is_mixed: whether the values alternate, until only one was received for the timeout.
     """
 
     __slots__ = ("_at", "_earlier", "current", "is_mixed")
@@ -69,20 +71,20 @@ class Variants(Generic[Value]):
         self.current: Value | None = None
         self.is_mixed = False
         self._at = -math.inf
-        self._earlier: dict[Value, float] = {}  # what else was said lately, and when last
+        self._earlier: dict[Value, float] = {}  # other recent values, and when each was received last
 
     @property
     def is_moving(self) -> bool:
-        """Whether something else was said within the timeout, as far as `settle` was called."""
+        """Whether another value was received within the timeout, as of the last `settle`."""
         return bool(self._earlier)
 
     @property
     def all(self) -> list[Value]:
-        """What was said within the timeout, the earliest first."""
+        """The values received within the timeout, the earliest first."""
         return [*self._earlier, *(() if self.current is None else (self.current,))]
 
     def say(self, value: Value, now: float, timeout: float) -> bool:
-        """Take what is said; true when it is something else than before."""
+        """Take a value and return whether it differs from the one before."""
         if value == self.current:
             self._at = now
             return False
@@ -98,14 +100,15 @@ class Variants(Generic[Value]):
         return is_change
 
     def settle(self, now: float, timeout: float) -> None:
-        """Forget what was not said for the timeout."""
+        """Drop values that were not received within the timeout."""
         if self._earlier:
             self._earlier = {value: at for value, at in self._earlier.items() if now - at < timeout}
         self.is_mixed = self.is_mixed and bool(self._earlier)
 
 
 class _Clock(NamedTuple):
-    """The time since boot in messages of one id: the start that it implies, when it was told, and what."""
+    """The time since boot in messages of one id: the boot that it implies, when it was received, and its
+    value."""
 
     started_at: float
     told_at: float
@@ -113,10 +116,10 @@ class _Clock(NamedTuple):
 
 
 class _Starts:
-    """The starts that messages of one id imply, as far as they lie apart.
+    """The boots that messages of one id imply, as far as they differ.
 
     Attributes:
-        turns: when the start was another one than in the message before, in the last 15 s.
+        turns: when the boot differed from that of the message before, in the last 15 s.
     """
 
     __slots__ = ("_current", "turns")
@@ -126,13 +129,13 @@ class _Starts:
         self.turns: list[float] = []
 
     def tell(self, started_at: float, now: float) -> None:
-        if self._current is not None and abs(started_at - self._current) > ANOTHER_START:
+        if self._current is not None and abs(started_at - self._current) > BOOT_DIFFERENCE_MIN:
             self.turns.append(now)
         self._current = started_at
         self.settle(now)
 
     def settle(self, now: float) -> None:
-        self.turns = [at for at in self.turns if now - at < TURNS_WINDOW]
+        self.turns = [at for at in self.turns if now - at < ALTERNATION_WINDOW]
 
     def age(self, seconds: float) -> None:
         self.turns.clear()
@@ -141,17 +144,17 @@ class _Starts:
 
 
 class Claim:
-    """What one peer says under one address.
+    """What one peer sends under one address.
 
     Attributes:
-        peer: who it is.
-        first_at, heard_at: when it was heard first and last.
+        peer: the peer.
+        first_at, heard_at: when its first and last message were received.
         kind: autopilot and vehicle type of its heartbeats.
-        uid: the hardware id of its AUTOPILOT_VERSION, "" where that gives none.
-        asks, asked_at: how often and when it was asked who it is.
-        verdict: how it stands to the peer that has the address.
-        heartbeat, version: the last ones, to be taken where the peer gets the address.
-        version_at: when the version came; infinity before it did.
+        uid: the hardware id of its AUTOPILOT_VERSION, "" where that has none.
+        asks, asked_at: the number of identity requests to it, and the time of the last.
+        verdict: its relation to the peer with the address.
+        heartbeat, version: its last ones, used when it becomes the peer with the address.
+        version_at: when the version was received; infinity before.
     """
 
     __slots__ = (
@@ -186,16 +189,16 @@ class Claim:
 
     @property
     def is_mixed(self) -> bool:
-        """Whether several vehicles speak through this peer."""
+        """Whether several vehicles send through this peer."""
         return self.kind.is_mixed or self.uid.is_mixed or self.has_two_starts
 
     @property
     def has_two_starts(self) -> bool:
         """Whether the times since boot are those of several vehicles."""
-        return any(len(each.turns) >= TURNS for each in self._starts.values())
+        return any(len(each.turns) >= ALTERNATIONS_MIN for each in self._starts.values())
 
     def settle(self, now: float, timeout: float) -> None:
-        """Forget what was not said for the timeout."""
+        """Drop values that were not received within the timeout."""
         self.kind.settle(now, timeout)
         self.uid.settle(now, timeout)
         for each in self._starts.values():
@@ -203,11 +206,11 @@ class Claim:
 
     @property
     def is_moving(self) -> bool:
-        """Whether something was said lately that may show that."""
+        """Whether recent values may show that."""
         return self.kind.is_moving or self.uid.is_moving
 
     def take(self, message: Message, now: float, timeout: float) -> None:
-        """Note what a message of this peer says of the vehicle."""
+        """Record what a message of this peer says about the vehicle."""
         if isinstance(message, Heartbeat | HighLatency2):
             self.kind.say((message.autopilot, message.type), now, timeout)
             if isinstance(message, Heartbeat):
@@ -219,7 +222,7 @@ class Claim:
             self.take_clock(SYSTEM_TIME_ID, message.time_boot_ms, now)
 
     def take_clock(self, message_id: int, boot_ms: int, now: float) -> None:
-        """Note `time_boot_ms` of a message; 0 says nothing."""
+        """Record `time_boot_ms` of a message; 0 is ignored."""
         clock = self._clocks.get(message_id)
         if not boot_ms or (clock is None and len(self._clocks) >= CLAIMED_CLOCKS_MAX):
             return
@@ -227,38 +230,38 @@ class Claim:
         self._starts.setdefault(message_id, _Starts()).tell(started_at, now)
         is_same_run = (
             clock is not None
-            and boot_ms + 1000 * OUT_OF_ORDER >= clock.boot_ms
+            and boot_ms + 1000 * REORDERING_TIME >= clock.boot_ms
             and started_at <= clock.started_at + CLOCK_DELAY
         )
-        if clock is not None and is_same_run:  # delays only ever make it later
+        if clock is not None and is_same_run:  # latency only ever makes it later
             started_at = min(started_at, clock.started_at + CLOCK_DRIFT * (now - clock.told_at))
         self._clocks[message_id] = _Clock(started_at, now, boot_ms)
 
     @property
     def is_by_satellite(self) -> bool:
-        """Whether nothing but HIGH_LATENCY2 tells what it is: that path is not asked, and no contest."""
+        """Whether only HIGH_LATENCY2 says what it is: such a path gets no requests and is no contest."""
         return self.kind.current is not None and self.heartbeat is None
 
     @property
     def has_own_uid(self) -> bool:
-        """Whether it has given a hardware id that names one vehicle alone."""
+        """Whether it has sent a hardware id that is unique to one vehicle."""
         return bool(self.uid.current) and self.uid.current not in SHARED_UIDS
 
     @property
     def tells_clock(self) -> bool:
-        """Whether it has told its time since boot."""
+        """Whether it has sent its time since boot."""
         return bool(self._clocks)
 
     @property
     def started_at(self) -> float:
-        """When its run has begun, as it told last; minus infinity before it did."""
+        """The last boot time that it has implied; minus infinity before."""
         told = max(self._clocks.values(), key=lambda clock: clock.told_at, default=None)
         return -math.inf if told is None else told.started_at
 
     def has_one_start(self, other: Claim) -> bool | None:
-        """Whether the vehicle of another claim started at the same time; None where that cannot be told.
+        """Return whether another claim's vehicle booted at the same time; None while unknown.
 
-        Only times of one message are compared: each has its own delay, and some firmware fills one with
+        Only times of one message are compared: each has its own latency, and some firmware fills one with
         another clock.
         """
         answers = [
@@ -269,7 +272,7 @@ class Claim:
         return False if False in answers else True if True in answers else None
 
     def age(self, seconds: float) -> None:
-        """So much time has passed that the clock did not count."""
+        """Move all moments back by time that the clock left out."""
         self.first_at -= seconds
         self.heard_at -= seconds
         self.version_at -= seconds
@@ -281,7 +284,7 @@ class Claim:
         }
 
     def in_words(self) -> str:
-        """Return what it says and the peer: `PX4 quadrotor with the id 00…2a from 127.0.0.1:14550`."""
+        """Return vehicle and peer as text: `PX4 quadrotor with the id 00…2a from 127.0.0.1:14550`."""
         kinds = [kind_in_words(*kind) or "an unknown kind" for kind in self.kind.all]
         words = " and ".join(dict.fromkeys(kinds)) or "no heartbeat"
         ids = " and ".join(uid for uid in self.uid.all if uid)
@@ -291,12 +294,12 @@ class Claim:
 
 
 def compare(mine: Claim, other: Claim, *, is_over: bool, may_ask: bool) -> tuple[Verdict, str]:
-    """Return whether two claims are of one vehicle, and in words what tells them apart.
+    """Return whether two claims are of one vehicle, and their difference as text.
 
     Args:
         mine, other: the claims.
-        is_over: whether everything was done to learn more.
-        may_ask: whether anything could be asked at all.
+        is_over: whether all requests that could tell more were sent.
+        may_ask: whether requests may be sent at all.
     """
     kinds = mine.kind.current, other.kind.current
     uids = mine.uid.current, other.uid.current
@@ -322,15 +325,15 @@ def compare(mine: Claim, other: Claim, *, is_over: bool, may_ask: bool) -> tuple
 
 
 def compare_in_turn(mine: Claim, other: Claim, *, may_ask: bool) -> Verdict:
-    """Return whether a claim is of the vehicle that has spoken under another one until it fell silent.
+    """Return whether a claim is of the vehicle that has sent under another one until it went silent.
 
-    It may have started again since, so only the hardware id proves that. `OPEN` where there is none to be
-    compared with: the other one has not said it, or neither has one of its own.
+    The vehicle may have rebooted since, so only the hardware id proves that. `OPEN` where there is none to
+    compare: the other claim has not received it, or neither has a unique one.
 
     Args:
-        mine: the claim of the one that is silent.
+        mine: the claim of the silent peer.
         other: the claim.
-        may_ask: whether anything could be asked at all.
+        may_ask: whether requests may be sent at all.
     """
     kinds = mine.kind.current, other.kind.current
     if None not in kinds and kinds[0] != kinds[1]:
@@ -344,7 +347,7 @@ def compare_in_turn(mine: Claim, other: Claim, *, may_ask: bool) -> Verdict:
 
 
 def _is_one_start(one: _Clock, another: _Clock) -> bool | None:
-    if abs(one.started_at - another.started_at) <= START_TOLERANCE:
+    if abs(one.started_at - another.started_at) <= BOOT_TOLERANCE:
         return True
     older, newer = sorted((one, another))
     return None if older.told_at <= newer.started_at + CLOCK_DELAY else False

@@ -1,4 +1,4 @@
-"""Commands: COMMAND_LONG until COMMAND_ACK has said what becomes of it."""
+"""COMMAND_LONG: retries until COMMAND_ACK reports the result."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from paramclient.protocol.wire import CommandAck, CommandLong
 
 __all__ = ["Command", "Commands"]
 
-PROGRESS_PATIENCE: Final = 10.0
-"""Seconds for which "in progress" is good: a component that works on a command says so again, and then says
-what came of it (MAVLink guide, "Command Protocol": the time-out begins anew with each)."""
-MOST_CONFIRMATIONS: Final = 255
-"""What fits into the field that counts the repetitions."""
+PROGRESS_TIMEOUT: Final = 10.0
+"""Seconds for which "in progress" is valid: a component repeats it while it works on a command, and then
+reports the result (MAVLink guide, "Command Protocol": the timeout restarts with each)."""
+CONFIRMATIONS_MAX: Final = 255
+"""The largest value of the field that counts repetitions."""
 
 
 class Command(Operation[None]):
@@ -28,7 +28,7 @@ class Command(Operation[None]):
     Attributes:
         number: MAV_CMD.
         params: its seven parameters.
-        repeats: whether it is sent again by itself while no answer comes.
+        repeats: whether it is repeated automatically while it is not acknowledged.
         attempts: how often it was sent.
         sent_at: when it was sent last.
     """
@@ -44,15 +44,15 @@ class Command(Operation[None]):
 
 
 class Commands(Machine):
-    """Every command to one component.
+    """The commands to one component.
 
-    An answer names the command and nothing else, so those of one number are done one after the other, and
-    those of different numbers side by side. What is not answered is sent again after the measured time-out,
-    with `confirmation` counted up, as often as a read would be.
+    An acknowledgement names only the command, so commands of one number run one after the other, and those of
+    different numbers in parallel. Without an acknowledgement, a command is repeated after the measured
+    timeout, with `confirmation` counted up, as often as a read would be.
 
     Args:
         target: the component.
-        own: system and component that we send as: answers to others are not for us.
+        own: our system and component: acknowledgements to other addresses are ignored.
         round_trip: the component's.
         send: takes each message.
     """
@@ -62,7 +62,7 @@ class Commands(Machine):
         context: Context,
     ) -> None:
         self._target = context.target
-        self._addressees = (context.own, (0, 0))  # MAVLink 1 and older firmware name nobody
+        self._addressees = (context.own, (0, 0))  # MAVLink 1 and older firmware name no addressee
         self._round_trip = context.round_trip
         self._send = context.send
         self._queues: dict[int, deque[Command]] = {}
@@ -71,13 +71,14 @@ class Commands(Machine):
         return len(self._queues)
 
     def begin(self, number: int, params: tuple[float, ...], now: float, *, repeats: bool = True) -> Command:
-        """Send a command, or put it behind those of the same number.
+        """Send a command, or queue it behind those of the same number.
 
         Args:
             number: MAV_CMD.
             params: up to seven; the others are 0.
             now: the time.
-            repeats: whether to send it again while no answer comes; else only `repeat` does.
+            repeats: whether to repeat it automatically while it is not acknowledged; otherwise only `repeat`
+                does.
         """
         command = Command(number, (*params, *[0.0] * (7 - len(params))), repeats, now)
         queue = self._queues.setdefault(number, deque())
@@ -87,20 +88,20 @@ class Commands(Machine):
         return command
 
     def repeat(self, command: Command, now: float) -> None:
-        """Send one that is under way once more."""
-        confirmation = min(command.attempts, MOST_CONFIRMATIONS)
+        """Send a command in progress once more."""
+        confirmation = min(command.attempts, CONFIRMATIONS_MAX)
         command.attempts += 1
         command.sent_at = now
         self._send(CommandLong(*self._target, command.number, command.params, confirmation))
 
     def cancel(self, command: Command, now: float) -> None:
-        """Forget a command. What was sent cannot be taken back."""
+        """Cancel a command. A sent one cannot be recalled."""
         queue = self._queues.get(command.number)
         if queue is not None and command in queue:
             self._leave(command, now)
 
     def acknowledged(self, message: CommandAck, now: float) -> None:
-        """Take a COMMAND_ACK."""
+        """Process a COMMAND_ACK."""
         queue = self._queues.get(message.command)
         if queue is None or (message.target_system, message.target_component) not in self._addressees:
             return
@@ -117,7 +118,7 @@ class Commands(Machine):
             command.fail(CommandRefused(*self._target, command.number, message.result), now)
 
     def tick(self, now: float) -> None:
-        """Send again, give up."""
+        """Repeat or give up unacknowledged commands."""
         for queue in list(self._queues.values()):
             command = queue[0]
             if self._due(command) > now:
@@ -131,27 +132,27 @@ class Commands(Machine):
             command.fail(self._no_reply(command, now), now)
 
     def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity."""
+        """Return when `tick` is due, or infinity."""
         return min((self._due(queue[0]) for queue in self._queues.values()), default=math.inf)
 
     def resume(self, now: float) -> None:
-        """The link is back: what was under way is asked for again."""
+        """Repeat commands in progress: the link is back."""
         for queue in self._queues.values():
             if queue[0].repeats:
                 queue[0].attempts -= 1
                 self.repeat(queue[0], now)
 
     def lose(self, now: float, why: str = " (lost)") -> None:
-        """Nobody is there to answer. Whether anything was obeyed is not known."""
+        """End all commands: the component is lost. Whether it has executed any is unknown."""
         self._end_all(lambda command: self._no_reply(command, now, why), now)
 
     def fail_all(self, error: Exception, now: float) -> None:
-        """Nothing can be answered any more."""
+        """End all commands with the error."""
         self._end_all(lambda command: error, now)
 
     def _due(self, command: Command) -> float:
         if command.progress_at is not None:
-            return command.progress_at + PROGRESS_PATIENCE
+            return command.progress_at + PROGRESS_TIMEOUT
         return command.sent_at + self._round_trip.timeout if command.repeats else math.inf
 
     def _leave(self, command: Command, now: float) -> None:

@@ -1,4 +1,4 @@
-"""Who a component is and how it writes values: by its heartbeat and its AUTOPILOT_VERSION."""
+"""Identity and parameter encoding of a component, from HEARTBEAT and AUTOPILOT_VERSION."""
 
 from __future__ import annotations
 
@@ -35,43 +35,44 @@ PX4_WITH_FILE: Final = 0x01120000
 """flight_sw_version of the first PX4 that serves the packed parameter file: 1.18."""
 ARDUPILOT_WITH_DEFAULTS: Final = 0x04040000
 """flight_sw_version of the first ArduPilot of which every build adds the defaults to that file: 4.4. They
-came during the development of 4.3."""
-TRIES: Final = 4
-"""AUTOPILOT_VERSION is asked for so often where nothing is known of the link, or where it was refused; many
-components (cameras, radios) never give one."""
-HEARTBEAT_PATIENCE: Final = 3.0
-"""Seconds for which the encoding is open after a version that does not tell it, where no heartbeat came yet:
+were added during the development of 4.3."""
+VERSION_ATTEMPTS: Final = 4
+"""Requests for AUTOPILOT_VERSION where nothing is known of the link, or after a refusal; many components
+(cameras, radios) never send one."""
+HEARTBEAT_WAIT: Final = 3.0
+"""Seconds for which the encoding stays open after a version without encoding bits and before a heartbeat:
 autopilots send one every second."""
 ENCODING_CAPABILITIES: Final = CAPABILITY_PARAM_ENCODE_BYTEWISE | CAPABILITY_PARAM_ENCODE_C_CAST
+"""The capability bits that tell the encoding."""
 VERSION_DELAY: Final = 0.1
-"""Seconds by which AUTOPILOT_VERSION may follow the acknowledgement of its request; then it was lost."""
-DOUBT_PATIENCE: Final = 5.0
-"""Seconds for which one that has said it before is asked at the least: it may only be starting."""
-DOUBT_PACE: Final = 1.0
-"""Seconds between two questions when the usual number of them has not helped."""
-LATER_PACE: Final = 5.0
-"""Seconds between two questions to one that has given its hardware id before and did not in that time, while
-it is heard: its radio may have been deaf."""
+"""Seconds between the acknowledgement of the request and AUTOPILOT_VERSION; later, it counts as lost."""
+DOUBT_TIME_MIN: Final = 5.0
+"""Seconds, at least, for which a component that has sent it before is asked again: it may be booting."""
+DOUBT_REQUEST_INTERVAL: Final = 1.0
+"""Seconds between two requests after the usual number of them."""
+LATER_REQUEST_INTERVAL: Final = 5.0
+"""Seconds between two requests to a component that has sent its hardware id before and did not in that time,
+while it is not lost: its radio may have received nothing."""
 
 
-_WAYS: Final = (
+_COMMANDS: Final = (
     (MAV_CMD_REQUEST_MESSAGE, float(AUTOPILOT_VERSION_ID)),
     (MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, 1.0),
 )
-"""The commands that bring AUTOPILOT_VERSION, and their first parameters."""
+"""The commands that request AUTOPILOT_VERSION, and their first parameters."""
 
 
 def judge_encoding(
     chosen: Encoding | None, capabilities: int | None, autopilot: int | None
 ) -> tuple[Encoding, str]:
-    """The encoding of a component and the reason, by the first evidence there is.
+    """Return the encoding of a component and the reason, by the first available evidence.
 
-    What the user said; the capability bits of AUTOPILOT_VERSION; the autopilot in its own heartbeat; the
+    The user's choice; the capability bits of AUTOPILOT_VERSION; the autopilot in its own heartbeat; the
     standard. ArduPilot sets neither capability bit, PX4 before 1.12 neither, and MAV_PROTOCOL_CAPABILITY_
     PARAM_FLOAT is set by both, so it proves nothing (measured).
 
     Args:
-        chosen: what the user said, or None.
+        chosen: the user's choice, or None.
         capabilities: the bits of AUTOPILOT_VERSION, or None while unknown.
         autopilot: MAV_AUTOPILOT, or None before a heartbeat.
     """
@@ -90,16 +91,16 @@ def judge_encoding(
 
 
 class Identification(Machine):
-    """Follows a component's heartbeat, asks for its AUTOPILOT_VERSION, and draws the conclusions.
+    """Follows a component's heartbeat, requests its AUTOPILOT_VERSION, and derives identity and encoding.
 
     Attributes:
-        identity: who the vehicle is; without a hardware id until AUTOPILOT_VERSION came.
-        known_at: when the version came; minus infinity before that.
-        attempts: how often it was asked for since it was open.
-        doubted_at: since when that is; minus infinity where it was not open but at the beginning.
-        settled: whether `identity` is as good as it gets: the version came, or it never will.
-        autopilot, vehicle_type: of the heartbeat; None before one came.
-        encoding, encoding_reason: how it writes values, and why that is believed.
+        identity: the vehicle's identity; without a hardware id until AUTOPILOT_VERSION is received.
+        known_at: when the version was received; minus infinity before.
+        attempts: requests since the identity was open.
+        doubted_at: since when the identity is in doubt; minus infinity before the first doubt.
+        settled: whether `identity` is as complete as it gets: the version was received, or never will be.
+        autopilot, vehicle_type: of the heartbeat; None before the first.
+        encoding, encoding_reason: the parameter encoding and its evidence.
     """
 
     def __init__(
@@ -123,18 +124,19 @@ class Identification(Machine):
         self.attempts = 0
         self.doubted_at = -math.inf
         self._asked_at = -math.inf
-        self._asks_until = -math.inf  # however often that is
-        self._denied_at = math.inf  # when the last way of asking was refused
-        self._lost_at = math.inf  # when the answer counts as lost, as the request was acknowledged
+        self._asks_until = -math.inf  # regardless of the number of requests
+        self._denied_at = math.inf  # when the last of the commands was refused
+        self._lost_at = math.inf  # when the acknowledged response counts as lost
         self._beat_awaited_until = math.inf  # while a heartbeat may still tell the encoding
         self._heard_at = -math.inf
         self._was_doubted = False  # since the last version
         self.encoding, self.encoding_reason = judge_encoding(chosen, None, None)
-        self._judge()
+        self._derive()
 
     @property
     def was_away(self) -> bool:
-        """Whether another vehicle may have taken its place since it was identified, or has, and is asked."""
+        """Whether another vehicle may have taken its place since the identification, or has and is being
+        identified."""
         return self._context.may_be_another
 
     @was_away.setter
@@ -143,15 +145,15 @@ class Identification(Machine):
 
     @property
     def has_parameters(self) -> bool:
-        """Whether parameters can be expected of it: it is no ground station."""
+        """Whether it may have parameters: it is not a ground station."""
         return self.vehicle_type != MAV_TYPE_GCS
 
     @property
     def says_file(self) -> bool:
-        """Whether it says that it serves files, and has the packed parameter file among them.
+        """Whether it claims to serve files, including the packed parameter file.
 
-        PX4 says so since long before it had that: 1.17 answers "file not found" (measured). An ArduPilot,
-        which mostly has it, is believed to have it until its version says otherwise.
+        PX4 has claimed so since long before it had that file: 1.17 responds "file not found" (measured). An
+        ArduPilot, which mostly has it, counts as having it until its version says otherwise.
         """
         if self.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA and self.capabilities is None:
             return True
@@ -160,40 +162,41 @@ class Identification(Machine):
 
     @property
     def adds_defaults(self) -> bool:
-        """Whether it is known to serve that file with the defaults, if it serves it."""
+        """Whether it is known to serve that file with defaults, if it serves it."""
         is_ardupilot = self.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA
         return is_ardupilot and self.identity.firmware >= ARDUPILOT_WITH_DEFAULTS
 
     @property
     def firmware(self) -> tuple[int, str] | None:
-        """Its version and git hash, once it has said them."""
+        """Its version and git hash; None before they are received."""
         return None if self.known_at == -math.inf else (self.identity.firmware, self.identity.git_hash)
 
     @property
     def encoding_is_certain(self) -> bool:
-        """Whether nothing that is still to come can tell otherwise."""
+        """Whether no further message can change the encoding."""
         has_said = self.autopilot in (MAV_AUTOPILOT_ARDUPILOTMEGA, MAV_AUTOPILOT_PX4)
         is_known = self.settled and self._beat_awaited_until == math.inf
         return self._chosen is not None or has_said or is_known or not self.has_parameters
 
     @property
     def is_doubted(self) -> bool:
-        """Whether another vehicle may have taken its place, and the answer is awaited."""
+        """Whether another vehicle may have taken its place, and the response is awaited."""
         return self._context.is_doubted
 
     @property
     def is_unconfirmed(self) -> bool:
-        """Whether another vehicle may have taken its place, and it was asked in vain."""
+        """Whether another vehicle may have taken its place, and its identity was requested without
+        success."""
         return self.was_away and not self._context.is_identifying and self._may_ask
 
     @property
     def may_be_written(self) -> bool:
-        """Whether it is certain whom a write reaches, and what it makes of it."""
+        """Whether it is certain which vehicle receives a write, and in which encoding."""
         return self.encoding_is_certain and not self.was_away
 
     @property
     def has_spoken(self) -> bool:
-        """Whether it has said what it is, by a heartbeat or its version, or has been asked in vain."""
+        """Whether it has sent a heartbeat or its version, or was asked without success."""
         return self.vehicle_type is not None or self.settled
 
     @property
@@ -207,7 +210,8 @@ class Identification(Machine):
         return self._context.is_identifying
 
     def heartbeat(self, message: Heartbeat | HighLatency2) -> bool:
-        """Take a heartbeat, or what stands for it; true when it shows another kind than was known."""
+        """Process a heartbeat or HIGH_LATENCY2, and return whether the autopilot or vehicle type has
+        changed."""
         self._beat_awaited_until = math.inf
         is_another_kind = False
         if (message.autopilot, message.type) != (self.autopilot, self.vehicle_type):
@@ -215,17 +219,17 @@ class Identification(Machine):
             self.autopilot = message.autopilot
             self.vehicle_type = message.type
             self.identity = replace(self.identity, autopilot=message.autopilot, vehicle_type=message.type)
-            self._judge()
+            self._derive()
         return is_another_kind
 
     def heard(self, now: float) -> None:
-        """Something came: ask who it is, if that has not been asked."""
+        """Process any message: request the identity unless that was done."""
         self._heard_at = now
         if not self.attempts and self.has_parameters:
             self._ask(now)
 
     def doubt(self, now: float) -> None:
-        """It was away, or has started again: ask who it is now."""
+        """Request the identity again: the component was lost, or has rebooted."""
         if self.has_parameters:
             is_open = self._may_ask and (self.settled or self.was_away)
             self.was_away = self.identity.uid is not None or is_open
@@ -233,30 +237,30 @@ class Identification(Machine):
             self.attempts = 0
             self.doubted_at = now
             if self.identity.uid is not None:
-                self._asks_until = now + DOUBT_PATIENCE
+                self._asks_until = now + DOUBT_TIME_MIN
             self._ask(now)
 
     def forget(self, now: float) -> None:
-        """Another vehicle has its address: ask that one who it is."""
+        """Forget the identity and request it again: another vehicle uses the address."""
         system, link = self.identity.system, self.identity.link
         self.identity = Identity(system, link)
         self.settled = False
         self.known_at = -math.inf
         self.autopilot = self.vehicle_type = self.capabilities = None
         self._beat_awaited_until = math.inf
-        self._judge()
+        self._derive()
         self.was_away = True
         self._was_doubted = False
         self.attempts = 0
         self.doubted_at = now
-        self._asks_until = now + DOUBT_PATIENCE
+        self._asks_until = now + DOUBT_TIME_MIN
         self._ask(now)
 
     def version(self, message: AutopilotVersion, now: float) -> bool:
-        """Take an AUTOPILOT_VERSION; true when what is known may not be of the vehicle that has sent it.
+        """Process an AUTOPILOT_VERSION, and return whether the known state may be that of another vehicle.
 
-        So it is with another hardware id, with the first one where there may have been another vehicle, and
-        with any where it was open for a while who speaks.
+        That is the case with a changed hardware id, with the first one where the vehicle may have been
+        replaced, and with any after a time in which the identity was in doubt.
         """
         was_unconfirmed = self.is_unconfirmed
         if self._context.is_identifying:
@@ -279,9 +283,9 @@ class Identification(Machine):
             capabilities=message.capabilities,
         )
         self.capabilities = message.capabilities
-        self._judge()
+        self._derive()
         if self.autopilot is None and not message.capabilities & ENCODING_CAPABILITIES:
-            self._beat_awaited_until = now + HEARTBEAT_PATIENCE
+            self._beat_awaited_until = now + HEARTBEAT_WAIT
         is_known = before.uid is not None or self._was_doubted
         is_another = self.settled and is_known and before.key != self.identity.key
         self._was_doubted = False
@@ -290,20 +294,21 @@ class Identification(Machine):
         return is_another or was_unconfirmed
 
     def ask_again(self, now: float) -> None:
-        """Another vehicle may have taken the address: ask, if it has ever been said who it is."""
+        """Request the identity again, if it was ever received: another vehicle may have taken the address."""
         if self.identity.uid is not None and not self._context.is_identifying:
             self.attempts = 0
             self._ask(now)
 
     def lose(self, now: float) -> None:
-        """It is not heard any more. Who has said it before is asked again when it is; others are asked on."""
+        """Stop requests to a component that has sent its identity, until it is heard again; others
+        continue."""
         if self.settled:
             self._context.is_identifying = False
 
     def acknowledged(self, message: CommandAck, now: float) -> None:
-        """Take a COMMAND_ACK: a refusal of one way to ask leads to the other at once.
+        """Process a COMMAND_ACK: after a refusal the other command is sent at once.
 
-        What is accepted comes with the acknowledgement, or was lost.
+        An accepted request is followed by the version at once, or the version was lost.
         """
         asked = (MAV_CMD_REQUEST_MESSAGE, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES)
         if self._context.is_identifying and message.command in asked:
@@ -313,37 +318,37 @@ class Identification(Machine):
                 self._lost_at = min(self._lost_at, now + VERSION_DELAY)
 
     def tick(self, now: float) -> None:
-        """Ask again, or let it be."""
+        """Repeat the request, or give up."""
         if self._beat_awaited_until <= now:
             self._beat_awaited_until = math.inf
         if self._next_request_at() <= now:
             self._ask(now)
 
     def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity."""
+        """Return when `tick` is due, or infinity."""
         return min(self._next_request_at(), self._beat_awaited_until)
 
     def _next_request_at(self) -> float:
-        """When to ask again, or infinity; that follows what other answers tell of the link."""
+        """Return when to repeat the request, or infinity; it depends on the measured round trip."""
         if self.is_unconfirmed:
-            return self._asked_at + LATER_PACE if self._heard_at > self._asked_at else math.inf
+            return self._asked_at + LATER_REQUEST_INTERVAL if self._heard_at > self._asked_at else math.inf
         if not self._context.is_identifying:
             return math.inf
         pause = self._round_trip.repeat_timeout(self.attempts)
         if self.attempts >= self._tries and self._asked_at < self._asks_until:
-            pause = max(pause, DOUBT_PACE)
+            pause = max(pause, DOUBT_REQUEST_INTERVAL)
         return min(self._denied_at, self._lost_at, self._asked_at + pause)
 
     @property
     def _tries(self) -> int:
         is_blind = self._round_trip.smoothed is None or self._denied_at < math.inf
-        return TRIES if is_blind else self._round_trip.tries
+        return VERSION_ATTEMPTS if is_blind else self._round_trip.tries
 
     def _ask(self, now: float) -> None:
         if not self._may_ask:
             return
         if self.is_unconfirmed and self.attempts:
-            self._request(now, _WAYS)
+            self._request(now, _COMMANDS)
             return
         if self.attempts >= self._tries and now >= self._asks_until:
             self._context.is_identifying = False
@@ -353,12 +358,12 @@ class Identification(Machine):
         was_refused = self._denied_at < math.inf
         self.attempts += 1
         self._context.is_identifying = True
-        ways: tuple[tuple[int, float], ...] = _WAYS
+        ways: tuple[tuple[int, float], ...] = _COMMANDS
         if was_refused:
-            ways = (_WAYS[(self.attempts + 1) % 2],)
+            ways = (_COMMANDS[(self.attempts + 1) % 2],)
         elif self.attempts == 1:
-            ways = _WAYS[:1]
-        self._request(now, ways)  # after silence both: a request or its answer may have been lost
+            ways = _COMMANDS[:1]
+        self._request(now, ways)  # after silence both: a request or its response may have been lost
 
     def _request(self, now: float, ways: tuple[tuple[int, float], ...]) -> None:
         self._asked_at = now
@@ -366,8 +371,8 @@ class Identification(Machine):
         for command, first in ways:
             self._send(CommandLong(*self._target, command, (first, *[0.0] * 6)))
 
-    def _judge(self) -> None:
-        """Draw the conclusions of what the component has said of itself."""
+    def _derive(self) -> None:
+        """Derive encoding and identity from what the component has sent."""
         context = self._context
         context.autopilot = self.autopilot
         context.serves_file = self.says_file

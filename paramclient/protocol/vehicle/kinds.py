@@ -1,4 +1,4 @@
-"""Autopilots and kinds of vehicles in the words of users."""
+"""Names of autopilots and vehicle types for users."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ __all__ = ["kind_in_words"]
 
 _AUTOPILOTS: Final = {MAV_AUTOPILOT_ARDUPILOTMEGA: "ArduPilot", MAV_AUTOPILOT_PX4: "PX4"}
 _VEHICLES: Final = {1: "plane", 10: "rover", 11: "boat"}
-"""MAV_TYPE in the words of users, where these differ from those of the enumeration."""
+"""Names of MAV_TYPE for users, where they differ from those of the enumeration."""
 
 
 def kind_in_words(autopilot: int | None, kind: int | None) -> str:
-    """Return autopilot and kind of vehicle, `PX4 quadrotor`; "" where neither is known or says anything.
+    """Return autopilot and vehicle type as text, `PX4 quadrotor`; "" where neither is known or tells
+    anything.
 
     Args:
         autopilot: MAV_AUTOPILOT, or None.
@@ -36,6 +37,6 @@ def kind_in_words(autopilot: int | None, kind: int | None) -> str:
 
 
 def _word(enum: str, what: str, number: int) -> str:
-    """Return the name of a number, or the number with a word of what it is."""
+    """Return the name of a number, or the number with the kind of number."""
     word = enum_word(enum, number)
     return f"{what} {word}" if word.isdecimal() else word

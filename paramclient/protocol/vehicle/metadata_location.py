@@ -1,6 +1,6 @@
-"""Where a component says that the descriptions of what it has lie: MAVLink's component metadata protocol.
+"""COMPONENT_METADATA: the location of a component's metadata files.
 
-MAV_CMD_REQUEST_MESSAGE asks for COMPONENT_METADATA, which names a general file; that names the others
+MAV_CMD_REQUEST_MESSAGE requests COMPONENT_METADATA, which names a general file; that names the other files
 (MAVLink guide, "Component Metadata Protocol").
 """
 
@@ -23,15 +23,15 @@ from paramclient.protocol.wire import (
 
 __all__ = ["DescriptionAsk", "Descriptions"]
 
-NONE_THERE: Final = (CommandResult.UNSUPPORTED, CommandResult.DENIED, CommandResult.FAILED)
-"""Results that say that the protocol is not spoken; others are no answer."""
+NOT_SUPPORTED: Final = (CommandResult.UNSUPPORTED, CommandResult.DENIED, CommandResult.FAILED)
+"""Results that mean that the protocol is not supported; other results are ignored."""
 
 
 class DescriptionAsk(Operation[ComponentMetadata | None]):
-    """One question for the general file; its result is None where the component has none.
+    """One request for the general file; its result is None where the component has none.
 
     Attributes:
-        attempts: how often it was asked.
+        attempts: requests sent.
     """
 
     def __init__(self, begun_at: float) -> None:
@@ -40,11 +40,11 @@ class DescriptionAsk(Operation[ComponentMetadata | None]):
 
 
 class Descriptions(Machine):
-    """Asks a component for its COMPONENT_METADATA, again in time, until there is an answer or no hope of one.
+    """Requests COMPONENT_METADATA of a component until it is received, refused or given up.
 
     Args:
-        context: the component's. While AUTOPILOT_VERSION is requested with the same command, a refusal is
-            not taken for one of COMPONENT_METADATA.
+        context: the component's. While AUTOPILOT_VERSION is requested with the same command, a refusal is not
+            taken for one of COMPONENT_METADATA.
     """
 
     def __init__(
@@ -61,11 +61,11 @@ class Descriptions(Machine):
 
     @property
     def is_asking(self) -> bool:
-        """Whether an answer is awaited."""
+        """Whether a response is awaited."""
         return bool(self._asks)
 
     def ask(self, now: float) -> DescriptionAsk:
-        """Ask; give it back with `release`. Those who ask at the same time share the answer."""
+        """Request the message; give the request back with `release`. Parallel requests share the response."""
         ask = DescriptionAsk(now)
         self._asks.append(ask)
         self._context.is_locating_metadata = True
@@ -76,27 +76,27 @@ class Descriptions(Machine):
         return ask
 
     def release(self, ask: DescriptionAsk) -> None:
-        """Wait for it no longer."""
+        """Give a request back."""
         if ask in self._asks:
             self._asks.remove(ask)
             self._context.is_locating_metadata = self.is_asking
 
     def heard(self, message: ComponentMetadata, now: float) -> None:
-        """The answer has come; an empty address means none."""
+        """Process COMPONENT_METADATA; an empty address means none."""
         if self._asks:
             self._round_trip.answered(self._asked_at, now, self._asks[0].attempts)
             self._finish(message if message.uri else None, now)
 
     def acknowledged(self, message: CommandAck, now: float) -> None:
-        """Take a COMMAND_ACK: a refusal is an answer too."""
+        """Process a COMMAND_ACK: a refusal ends the request with None."""
         is_ours = (message.target_system, message.target_component) in (self._own, (0, 0))
         is_meant = message.command == MAV_CMD_REQUEST_MESSAGE and is_ours and not self._context.is_identifying
-        if self._asks and is_meant and message.result in NONE_THERE:
+        if self._asks and is_meant and message.result in NOT_SUPPORTED:
             self._round_trip.answered(self._asked_at, now, self._asks[0].attempts)
             self._finish(None, now)
 
     def tick(self, now: float) -> None:
-        """Ask again, or give up."""
+        """Repeat the request, or give up."""
         if self.next_deadline() > now:
             return
         first = self._asks[0]
@@ -107,20 +107,20 @@ class Descriptions(Machine):
             self._request(now)
 
     def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity."""
+        """Return when `tick` is due, or infinity."""
         return self._asked_at + self._round_trip.timeout if self._asks else math.inf
 
     def lose(self, now: float) -> None:
-        """The component is lost: whoever waits gets NoReply."""
+        """End the request with NoReply: the component is lost."""
         self._give_up(" (lost)", now)
 
     def resume(self, now: float) -> None:
-        """The link was away and is back."""
+        """Repeat the request: the link is back."""
         if self._asks:
             self._request(now)
 
     def fail_all(self, error: Exception, now: float) -> None:
-        """No answer can come any more."""
+        """End the request with the error."""
         asks, self._asks = self._asks, []
         self._context.is_locating_metadata = False
         for ask in asks:

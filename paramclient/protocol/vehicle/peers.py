@@ -1,4 +1,4 @@
-"""Which peers speak for a component: paths to one vehicle, or several vehicles that contest its address."""
+"""The peers of a component: several paths to one vehicle, or several vehicles that contest its address."""
 
 from __future__ import annotations
 
@@ -23,35 +23,36 @@ from paramclient.protocol.wire import (
 __all__ = ["NO_PEER", "ComponentPeers", "Contest", "Host"]
 
 CLAIMS_MAX: Final = 8
-"""Further peers that are followed for one component. Those above it are not heard until one of these has been
-silent for the heartbeat timeout."""
-ASKS_MAX: Final = 4
-ASK_PAUSES: Final = (0.5, 1.0, 1.5, 2.0)
-"""How often a further peer is asked who it is, and the seconds after each time: 5 s in all, in which a radio
-with a round trip of 1 s that loses every second message answers three times out of four."""
-LATER_PAUSE: Final = 5.0
-"""Seconds between further questions to a peer that contests the address and has told nothing that differs:
-its radio may have been deaf. No more often than that, as it may also be a stranger."""
-JUDGING_TIME: Final = sum(ASK_PAUSES)
-"""Seconds until a further peer must have shown who it is where nothing can be asked."""
-LOOK_PACE: Final = 0.25
-"""Seconds between two looks at the peers of a component that has several."""
-RECHECK_PACE: Final = 1.0
-"""Seconds between two requests for the hardware id of a peer that has just given two different ones."""
-FIRST_GRACE: Final = 0.25
-"""Seconds for which the peer with the address may still give its hardware id where another one was quicker:
-over two paths to one vehicle the same message comes twice."""
+"""Further peers that are followed for one component. Others are ignored until one of these has been silent
+for the heartbeat timeout."""
+IDENTITY_REQUESTS_MAX: Final = 4
+"""Identity requests to a further peer."""
+IDENTITY_REQUEST_PAUSES: Final = (0.5, 1.0, 1.5, 2.0)
+"""Seconds after each of them: 5 s in all, in which a radio with a round trip of 1 s and a packet loss of one
+half responds in three of four cases."""
+LATER_REQUEST_PAUSE: Final = 5.0
+"""Seconds between further requests to a peer that contests the address without a known difference: its radio
+may have received nothing. Not more often, as the peer may also be unrelated."""
+IDENTIFICATION_TIME: Final = sum(IDENTITY_REQUEST_PAUSES)
+"""Seconds until a further peer must have shown its identity where no request can be sent."""
+REVIEW_INTERVAL: Final = 0.25
+"""Seconds between two reviews of the peers of a component with several."""
+RECHECK_INTERVAL: Final = 1.0
+"""Seconds between two requests for the hardware id of a peer that has just sent two different ones."""
+UID_GRACE: Final = 0.25
+"""Seconds in which the peer with the address may still send its hardware id after another one was faster:
+over two paths to one vehicle the same message arrives twice."""
 PATH_SILENCE: Final = 1.5
-"""Seconds of silence after which requests go to another path to the same vehicle: a heartbeat was lost."""
+"""Seconds of silence after which requests use another path to the same vehicle: a heartbeat was lost."""
 RESTART_SILENCE: Final = 1.5
-"""Seconds of silence after which a peer gets the address that gives the same hardware id and has started
-since: a vehicle that comes back from another port."""
+"""Seconds of silence after which the address goes to a peer with the same hardware id and a later boot: a
+vehicle that comes back from another port."""
 COMMANDED_SILENCE: Final = 0.5
-"""The same while a restart on command is awaited, which itself makes sure that it is the same vehicle."""
+"""The same while a reboot on command is awaited, which verifies the vehicle anyway."""
 RESTART_SLACK: Final = 1.0
-"""Seconds by which a start may seem to lie before the last word of the run before."""
+"""Seconds by which a boot may seem earlier than the last message of the run before."""
 NO_PEER: Final = object()
-"""A peer that nothing comes from."""
+"""A peer that sends nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +61,8 @@ class Contest:
 
     Attributes:
         system, component: its address.
-        claimants: the peers with the address, in words, and what each says.
-        difference: what tells them apart, in words.
+        claimants: the peers with the address and their vehicles, as text.
+        difference: the difference between them, as text.
     """
 
     system: int
@@ -71,20 +72,20 @@ class Contest:
 
     @property
     def error(self) -> ContestedAddress:
-        """The error of what is asked of the component meanwhile; another object each time."""
+        """The error of requests to the component meanwhile; a new object each time."""
         return ContestedAddress(self.system, self.component, self.claimants, self.difference)
 
 
 class Host(Protocol):
-    """The component that the peers speak for, as `ComponentPeers` needs it."""
+    """The part of a component that `ComponentPeers` uses."""
 
     @property
     def presence(self) -> Presence:
-        """Whether it is there."""
+        """Its presence."""
 
     @property
     def is_restarting(self) -> bool:
-        """Whether it was told to start again, and that is awaited."""
+        """Whether a reboot on command is in progress."""
 
     @abstractmethod
     def send_to(self, message: Message, peer: Peer) -> None:
@@ -92,7 +93,7 @@ class Host(Protocol):
 
     @property
     def is_identified(self) -> bool:
-        """Whether it is settled who it is, and that is not being asked for."""
+        """Whether its identity is settled and not being requested."""
 
     @abstractmethod
     def read_clock(self, now: float) -> None:
@@ -100,39 +101,40 @@ class Host(Protocol):
 
     @abstractmethod
     def peer_moved(self, claim: Claim, now: float, verdict: Verdict) -> None:
-        """Another peer has the address now; the verdict is that of `compare_in_turn`."""
+        """Take another peer as the one with the address; the verdict is that of `compare_in_turn`."""
 
     @abstractmethod
     def contest_began(self, contest: Contest, now: float) -> None:
-        """Several vehicles have the address."""
+        """Take that several vehicles use the address."""
 
     @abstractmethod
     def contest_ended(self, claim: Claim, now: float, *, is_same: bool) -> None:
-        """One vehicle has the address; `is_same` where it is the one of before, by peer and kind or by id."""
+        """Take that one vehicle uses the address; `is_same` for the one before the contest, by peer and kind
+        or by id."""
 
 
 class ComponentPeers:
-    """Judges whose messages are taken for a component, and where requests for it go.
+    """Decides whose messages count for a component, and to which peer its requests go.
 
-    The first peer that was heard has the address, until another one gives a hardware id first. Messages of a
-    further peer are not taken before it is proven to be a path to the same vehicle: by autopilot, vehicle
-    type, hardware id and boot time, for which it is asked. A peer that has fallen silent loses the address to
-    one that speaks: to the same vehicle by its hardware id, or, where it does not give that when it is asked,
-    to another one. Two peers that speak and are not proven to be one vehicle contest it, and so do several
-    vehicles that speak through one peer.
+    The first peer has the address, until another one sends a hardware id first. Messages of a further peer
+    count only once it is proven to be a path to the same vehicle: by autopilot, vehicle type, hardware id and
+    boot time, which are requested from it. A silent peer loses the address to an active one: to the same
+    vehicle by its hardware id, or, if that is requested without success, to another vehicle. Two active peers
+    that are not proven to be one vehicle contest the address, and so do several vehicles that send through
+    one peer.
 
     Args:
         target: the component.
         host: the component.
-        may_ask: whether anything may be sent.
+        may_ask: whether requests may be sent.
 
     Attributes:
-        home: the peer that has the address; NO_PEER before one was heard, or after its connection has ended.
-        has_left: whether that has ended: nothing may be sent until another one has the address.
-        speaker: the peer whose messages may be taken without another look: `home`, but for a contest.
-        heard_at: when the home was heard last.
+        home: the peer with the address; NO_PEER before the first, or after the end of its connection.
+        has_left: whether that connection has ended: nothing may be sent until another peer has the address.
+        speaker: the peer whose messages count without a check: `home`, except during a contest.
+        heard_at: when the last message of `home` was received.
         contest: why the address is contested, or None.
-        foreign: messages that were not taken, as they came from another peer.
+        foreign: messages of other peers that were ignored.
     """
 
     def __init__(self, target: tuple[int, int], host: Host, *, may_ask: bool) -> None:
@@ -152,17 +154,17 @@ class ComponentPeers:
 
     @property
     def is_unclear(self) -> bool:
-        """Whether it is open which vehicle speaks: nothing may be kept that came meanwhile."""
+        """Whether it is open which vehicle is active: nothing received meanwhile may be kept."""
         mine = self._mine
         return self.contest is not None or (mine is not None and (mine.is_moving or mine.is_mixed))
 
     def is_rival(self, peer: Peer) -> bool:
-        """Whether a peer speaks for the component too, and is not proven to be the same vehicle."""
+        """Return whether a peer also sends for the component without being proven the same vehicle."""
         claim = self._others.get(peer)
         return claim is not None and claim.verdict is not Verdict.SAME
 
     def takes(self, peer: Peer, now: float) -> bool:
-        """Whether a message without anything to tell vehicles apart may be taken, such as PARAM_VALUE."""
+        """Return whether to accept a message that cannot tell vehicles apart, such as PARAM_VALUE."""
         self._mine_or(peer, now)
         if peer == self.home:
             self.heard_at = now
@@ -172,7 +174,7 @@ class ComponentPeers:
         return self._is_path(self._claim_of(peer, now))
 
     def hears(self, message: Message, peer: Peer, now: float) -> bool:
-        """Take note of a message that may tell vehicles apart; return whether it may be taken."""
+        """Record a message that may tell vehicles apart; return whether to accept it."""
         mine = self._mine_or(peer, now)
         claim = mine if peer == self.home else self._claim_of(peer, now)
         if claim is None:
@@ -187,7 +189,7 @@ class ComponentPeers:
         return self.contest is None
 
     def hears_clock(self, message_id: int, boot_ms: int, peer: Peer, now: float) -> bool:
-        """Take note of the time since boot in telemetry; return whether it may be taken."""
+        """Record the time since boot in telemetry; return whether to accept it."""
         is_taken = self.takes(peer, now)
         claim = self._mine if peer == self.home else self._others.get(peer)
         if claim is not None:
@@ -198,17 +200,17 @@ class ComponentPeers:
 
     @property
     def wants_clocks(self) -> bool:
-        """Whether clocks in telemetry tell whether two peers are one vehicle."""
+        """Whether clocks in telemetry may show that two peers are one vehicle."""
         return any(claim.verdict is Verdict.OPEN for claim in self._others.values())
 
     def follow(self, peer: Peer) -> None:
-        """Take the messages of this peer whatever it is: those of ground stations are of no account."""
+        """Accept the messages of this peer in any case: those of ground stations do not matter."""
         self.home = self.speaker = peer
         self.has_left = False
         self._mine = None
 
     def left(self, peer: Peer, now: float) -> None:
-        """The connection of a peer has ended."""
+        """Process the end of a peer's connection."""
         self._others.pop(peer, None)
         if peer == self.home:
             self.home = self.speaker = NO_PEER
@@ -216,13 +218,13 @@ class ComponentPeers:
             self._look_at = min(self._look_at, now)
 
     def forget(self) -> None:
-        """The link is away: the one that comes back has others."""
+        """Forget all peers: the link is down, and comes back with other peers."""
         self._others.clear()
         self.home, self.speaker, self._mine = NO_PEER, NO_PEER, None
         self.has_left = False
 
     def age(self, seconds: float) -> None:
-        """So much time has passed that the clock did not count."""
+        """Move all moments back by time that the clock left out."""
         self.heard_at -= seconds
         for claim in (self._mine, *self._others.values()):
             if claim is not None:
@@ -234,7 +236,7 @@ class ComponentPeers:
             self._review(now)
 
     def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity."""
+        """Return when `tick` is due, or infinity."""
         return self._look_at
 
     # private
@@ -245,14 +247,14 @@ class ComponentPeers:
         return patience if patience < math.inf else LOST_AFTER
 
     def _mine_or(self, peer: Peer, now: float) -> Claim:
-        """What the peer with the address says; where none has had it yet, this one gets it."""
+        """Return the claim of the peer with the address; the first peer gets the address."""
         if self._mine is None:
             self._settle_at(claim := self._others.pop(peer, None) or Claim(peer, now))
             return claim
         return self._mine
 
     def _claim_of(self, peer: Peer, now: float) -> Claim | None:
-        """What a further peer says; None where there are too many of them."""
+        """Return the claim of a further peer; None where there are too many."""
         claim = self._others.get(peer)
         if claim is None:
             if len(self._others) >= CLAIMS_MAX:
@@ -263,14 +265,14 @@ class ComponentPeers:
         return claim
 
     def _is_path(self, claim: Claim | None) -> bool:
-        """Whether a message of a further peer may be taken; one that may not is counted."""
+        """Return whether to accept a message of a further peer; count it otherwise."""
         is_known = claim is not None and (claim.verdict is Verdict.SAME or claim is self._mine)
         is_taken = is_known and self.contest is None
         self.foreign += not is_taken
         return is_taken
 
     def _review(self, now: float) -> None:
-        """See who speaks, who is silent, and who is proven to be whom."""
+        """Review the peers: active and silent ones, proven paths, contests."""
         timeout = self._timeout
         self._others = {p: each for p, each in self._others.items() if now - each.heard_at < timeout}
         mine = self._mine
@@ -285,10 +287,10 @@ class ComponentPeers:
         self._move_on(now)
         self._decide(difference, now)
         is_settled = not self._others and not self.is_unclear
-        self._look_at = math.inf if is_settled else now + LOOK_PACE
+        self._look_at = math.inf if is_settled else now + REVIEW_INTERVAL
 
     def _judge(self, claim: Claim, now: float) -> str:
-        """Compare a further peer with the one that has the address; in words what tells them apart."""
+        """Compare a further peer with the one that has the address; return the difference as text."""
         mine = self._mine
         if mine is None:
             return ""
@@ -304,16 +306,18 @@ class ComponentPeers:
             self._ask(claim, now)
             self._host.read_clock(now)
             is_here = self.home is not NO_PEER
-            if is_here and self._host.is_identified:  # else an acknowledgement would be another request's
+            if is_here and self._host.is_identified:  # otherwise ambiguous acknowledgements
                 self._request(mine, SYSTEM_TIME_ID)
         return difference if claim.verdict is Verdict.OTHER else ""
 
     def _is_over(self, claim: Claim, now: float) -> bool:
-        """Whether everything was done to learn who a further peer is."""
+        """Return whether everything was done to identify a further peer."""
         if not self._may_ask:
-            return now >= claim.first_at + JUDGING_TIME
-        has_had_all = claim.asks == ASKS_MAX and now >= claim.asked_at + ASK_PAUSES[-1]
-        return claim.asks > ASKS_MAX or has_had_all
+            return now >= claim.first_at + IDENTIFICATION_TIME
+        has_had_all = (
+            claim.asks == IDENTITY_REQUESTS_MAX and now >= claim.asked_at + IDENTITY_REQUEST_PAUSES[-1]
+        )
+        return claim.asks > IDENTITY_REQUESTS_MAX or has_had_all
 
     def _decide(self, difference: str, now: float) -> None:
         """Begin a contest, or end it."""
@@ -351,19 +355,17 @@ class ComponentPeers:
                 self._host.contest_ended(mine, now, is_same=is_same)
 
     def _follow_id(self, now: float) -> None:
-        """Give the address to a peer that has given a hardware id before the one that has it: to that go the
-        requests.
-        """
+        """Give the address to a peer that has sent a hardware id first: requests go to it."""
         mine = self._mine
         if mine is None or mine.uid.current or self._host.is_identified or self.contest is not None:
             return
         for claim in self._others.values():
-            if claim.uid.current and now >= claim.version_at + FIRST_GRACE:
+            if claim.uid.current and now >= claim.version_at + UID_GRACE:
                 self._swap(claim, now)
                 return
 
     def _move_on(self, now: float) -> None:
-        """Give the address to a peer that speaks, where the one that has it is silent."""
+        """Give the address to an active peer, where the one that has it is silent."""
         mine = self._mine
         if mine is None:
             return
@@ -380,7 +382,8 @@ class ComponentPeers:
                 return
 
     def _awaits_id(self, claim: Claim, now: float) -> bool:
-        """Whether a further peer is still being asked for the hardware id of the vehicle that is silent."""
+        """Return whether the hardware id of the silent vehicle is still being requested from a further
+        peer."""
         mine = self._mine
         is_over = self._is_over(claim, now) and not self._host.is_restarting
         if mine is None or self.contest is not None or is_over:
@@ -389,11 +392,11 @@ class ComponentPeers:
 
     @staticmethod
     def _hides_id(before: Claim, claim: Claim) -> bool:
-        """Whether a peer has not given a hardware id, and the one before it has."""
+        """Return whether a peer has sent no hardware id, unlike the one before it."""
         return bool(before.uid.current) and claim.uid.current is None
 
     def _silence_before(self, claim: Claim) -> float:
-        """Seconds for which the peer with the address must have been silent for this one to have it."""
+        """Return the seconds of silence of the peer with the address after which this one gets it."""
         if self.contest is not None or self._mine is None:
             return self._timeout
         usual = self._host.presence.gap
@@ -406,7 +409,7 @@ class ComponentPeers:
         return RESTART_SILENCE if len(uids) == 1 and has_started and claim.uid.current else usual
 
     def _swap(self, claim: Claim, now: float, *, is_proven: bool = False) -> None:
-        """Let a further peer have the address."""
+        """Give the address to a further peer."""
         before = self._mine
         assert before is not None, "it has the address"
         del self._others[claim.peer]
@@ -420,7 +423,7 @@ class ComponentPeers:
             return
         verdict = self._in_turn(before, claim)
         if verdict is Verdict.OPEN and self._hides_id(before, claim):
-            verdict = Verdict.OTHER  # it was asked in vain
+            verdict = Verdict.OTHER  # requested without success
         self._host.peer_moved(claim, now, verdict)
 
     def _settle_at(self, claim: Claim) -> None:
@@ -433,7 +436,7 @@ class ComponentPeers:
         return compare_in_turn(before, claim, may_ask=self._may_ask)
 
     def _ask(self, claim: Claim, now: float) -> None:
-        """Ask a peer who it is, and when it has started."""
+        """Request identity and boot time from a peer."""
         claim.asked_at = now
         if claim.uid.current is None:
             self._request(claim, AUTOPILOT_VERSION_ID)
@@ -443,8 +446,8 @@ class ComponentPeers:
         self._request(claim, SYSTEM_TIME_ID)
 
     def _ask_again(self, claim: Claim, now: float) -> None:
-        """Ask the peer that has the address for its hardware id, of which it has just given two."""
-        if self._may_ask and now >= claim.asked_at + RECHECK_PACE:
+        """Request the hardware id of the peer with the address, which has just sent two."""
+        if self._may_ask and now >= claim.asked_at + RECHECK_INTERVAL:
             claim.asked_at = now
             self._request(claim, AUTOPILOT_VERSION_ID)
 
@@ -454,10 +457,16 @@ class ComponentPeers:
 
 
 def _pause_after(asks: int) -> float:
-    """Seconds from a question to the next one, by how many there were."""
-    return 0.0 if not asks else ASK_PAUSES[asks - 1] if asks < ASKS_MAX else LATER_PAUSE
+    """Return the seconds until the next request, by the number of requests so far."""
+    return (
+        0.0
+        if not asks
+        else IDENTITY_REQUEST_PAUSES[asks - 1]
+        if asks < IDENTITY_REQUESTS_MAX
+        else LATER_REQUEST_PAUSE
+    )
 
 
 def _preference(claim: Claim) -> tuple[bool, float]:
-    """Proven paths first, then whoever spoke last."""
+    """Return the sort key: proven paths first, then the latest message."""
     return claim.verdict is not Verdict.SAME, -claim.heard_at

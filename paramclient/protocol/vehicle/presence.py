@@ -1,4 +1,4 @@
-"""Whether a component is there: its heartbeats, its silence, its reboots."""
+"""Presence of a component: heartbeats, silence, loss, and detection of reboots."""
 
 from __future__ import annotations
 
@@ -10,52 +10,54 @@ from paramclient.protocol.wire import MAV_STATE_BOOT, SYSTEM_TIME_ID, Heartbeat,
 __all__ = ["Presence"]
 
 LOST_AFTER: Final = 5.0
-"""Seconds without a word after which a component that sent heartbeats counts as lost: five in a row."""
-BEATS_TO_MISS: Final = 3.0
-"""For one that is known to send fewer heartbeats than one a second: so many of its own intervals."""
-LONGEST_PATIENCE: Final = 60.0
-"""The most that comes to: two heartbeats far apart may as well be those of one that was away between them."""
-USUAL_INTERVAL: Final = 1.0
-"""Seconds from one heartbeat to the next, by the standard."""
-BEATS_IN_A_GAP: Final = 2.5
-"""Intervals of silence in which an update may have been lost as well: two heartbeats were."""
-BEATS_OVERDUE: Final = 1.5
-"""The same after which one is late: the link, or whoever is behind with all that there is to do, owes it."""
-COPY: Final = 0.5
-"""Seconds within which a second heartbeat is one that came twice, or late."""
+"""Seconds of silence after which a component with heartbeats counts as lost: five missed in a row."""
+LOST_INTERVALS: Final = 3.0
+"""The heartbeat timeout of a component with a known longer interval, in its own intervals."""
+LOST_AFTER_MAX: Final = 60.0
+"""The longest heartbeat timeout in seconds: two heartbeats far apart may also be those of a component that
+was away between them."""
+HEARTBEAT_INTERVAL_STANDARD: Final = 1.0
+"""Seconds between two heartbeats, by the standard."""
+GAP_INTERVALS: Final = 2.5
+"""Intervals of silence in which a change may have been lost as well: two heartbeats were."""
+OVERDUE_INTERVALS: Final = 1.5
+"""Intervals after which a heartbeat is late: the link or the event loop delays it."""
+DUPLICATE_TIME: Final = 0.5
+"""Seconds within which a second heartbeat is a duplicate or a late one."""
 LOST_AFTER_HIGH_LATENCY: Final = 20.0
-"""The same in high-latency mode, where PX4 sends one HIGH_LATENCY2 every 5 seconds and nothing else."""
-OUT_OF_ORDER: Final = 2.0
-"""Seconds by which one message may be late because a link brought two of them in the wrong order."""
-DETOUR: Final = 5.0
-"""Seconds by which a message may be late that took another way: vehicles are heard over radio and satellite
+"""The heartbeat timeout in high-latency mode, in seconds: PX4 sends one HIGH_LATENCY2 every 5 s and nothing
+else."""
+REORDERING_TIME: Final = 2.0
+"""Seconds by which a message may be late because the link reordered two messages."""
+PATH_LATENCY_MAX: Final = 5.0
+"""Seconds by which a message over another path may be late: vehicles are connected over radio and satellite
 at once."""
-WRAP: Final = 1 << 32
-"""Where time_boot_ms begins anew, after 49 days."""
+BOOT_CLOCK_WRAP: Final = 1 << 32
+"""Where time_boot_ms wraps, after 49 days."""
 CLOCKS_MAX: Final = 64
 """Message ids whose time_boot_ms is remembered for one component: more than the dialect has."""
 FIRST_FRAMES: Final = 8
 """Sequence numbers from 0 on that belong to the first frames of a numbering: some may be lost."""
 SEQUENCE_GAP: Final = 8
-"""Frames that must lie between two sequence numbers for the second one not to be the usual step over 255."""
+"""Frames, at least, between two sequence numbers for the second one not to be the usual wrap at 255."""
 
 
 class Presence:
-    """What a component's own messages tell of its coming, going and starting again.
+    """Loss, return and reboots of a component, as its own messages show them.
 
-    A component that never sent a heartbeat is never lost: nothing says when it should have been heard.
+    A component without heartbeats is never lost: nothing says when its next message is due.
 
     Attributes:
-        beat_at: when a heartbeat came last; minus infinity before one did.
-        base_mode: MAV_MODE_FLAG bits of that heartbeat; None before one came, and while it is known that
-            others follow of which none is heard.
-        gap: seconds of silence from which on something may have been missed.
-        heard_at: when anything came from it last.
-        clock_at: when a message told its time since boot last; minus infinity before one did.
-        is_lost: whether it has been silent for too long since.
-        since: when it was heard first, or again after it was lost.
-        state: MAV_STATE of the last heartbeat; None before one came.
-        is_high_latency: whether it said so: HIGH_LATENCY2 came, and no heartbeat since.
+        beat_at: when the last heartbeat was received; minus infinity before the first.
+        base_mode: MAV_MODE_FLAG bits of that heartbeat; None before the first, and while later ones are known
+            to be lost.
+        gap: seconds of silence after which a change may have been missed.
+        heard_at: when the last message was received.
+        clock_at: when the last time since boot was received; minus infinity before the first.
+        is_lost: whether it has been silent for the heartbeat timeout.
+        since: when its first message was received, or the first after a loss.
+        state: MAV_STATE of the last heartbeat; None before the first.
+        is_high_latency: whether HIGH_LATENCY2 was received, and no heartbeat since.
     """
 
     __slots__ = (
@@ -82,29 +84,29 @@ class Presence:
         self.is_lost = False
         self.since = math.inf
         self.is_high_latency = False
-        self.gap = BEATS_IN_A_GAP * USUAL_INTERVAL
+        self.gap = GAP_INTERVALS * HEARTBEAT_INTERVAL_STANDARD
         self.beat_at = -math.inf
         self.base_mode: int | None = None
-        self._interval = math.inf  # the shortest time between two heartbeats: the others were lost
+        self._interval = math.inf  # the shortest time between two heartbeats: in longer ones some were lost
         self.state: int | None = None
-        self._boot_beat_at = -math.inf  # the last heartbeat that said it was booting
+        self._boot_beat_at = -math.inf  # the last heartbeat with MAV_STATE_BOOT
         self.clock_at = -math.inf
-        self._boot_ms: int | None = None  # as told then
-        self._clocks: dict[int, tuple[int, float]] = {}  # by message id, what was told last, and when
-        self._restarted_at = -math.inf  # when a restart was recognized last
-        self._started_before = -math.inf  # when the run before that had begun, if it told
+        self._boot_ms: int | None = None  # the value received then
+        self._clocks: dict[int, tuple[int, float]] = {}  # by message id, the last value and when
+        self._restarted_at = -math.inf  # when a reboot was detected last
+        self._started_before = -math.inf  # the boot time of the run before that, if known
         self._sequence: int | None = None
 
     @property
     def patience(self) -> float:
-        """Seconds of silence after which it is lost; infinity as long as nothing can be expected of it."""
+        """The heartbeat timeout in seconds; infinity before the first heartbeat."""
         if self.is_high_latency:
             return LOST_AFTER_HIGH_LATENCY
         if not self.has_beaten:
             return math.inf
         if self._interval == math.inf:
             return LOST_AFTER
-        return min(max(LOST_AFTER, BEATS_TO_MISS * self._interval), LONGEST_PATIENCE)
+        return min(max(LOST_AFTER, LOST_INTERVALS * self._interval), LOST_AFTER_MAX)
 
     @property
     def has_beaten(self) -> bool:
@@ -112,28 +114,28 @@ class Presence:
         return self.beat_at > -math.inf
 
     def is_overdue(self, now: float) -> bool:
-        """Whether it should have been heard since, and is not lost yet: what it owes besides says nothing."""
-        late = BEATS_OVERDUE / BEATS_IN_A_GAP * self.gap
+        """Return whether a message is overdue though it is not lost: a missing response then says nothing."""
+        late = OVERDUE_INTERVALS / GAP_INTERVALS * self.gap
         return self.has_beaten and not self.is_lost and now - self.heard_at > late
 
     @property
     def is_booting(self) -> bool:
-        """Whether its last heartbeat said so."""
+        """Whether its last heartbeat has MAV_STATE_BOOT."""
         return self.state == MAV_STATE_BOOT
 
     @property
     def started_at(self) -> float | None:
-        """When it has started by what its clock told last, or later by what that took; None before it did."""
+        """Its latest boot time by its clock, which includes latency; None before the first clock."""
         return None if self._boot_ms is None else self.clock_at - self._boot_ms / 1000
 
     def heard(self, now: float) -> float:
-        """Anything has come. Gives the seconds of silence before it: infinity for the first word."""
+        """Process any message and return the seconds of silence before it: infinity for the first one."""
         silence = now - self.heard_at
         self.heard_at = now
         return silence
 
     def age(self, seconds: float) -> None:
-        """So much time has passed that the clock did not count."""
+        """Move all moments back by time that the clock left out."""
         self.heard_at -= seconds
         self.beat_at -= seconds
         self._boot_beat_at -= seconds
@@ -143,26 +145,27 @@ class Presence:
         self._clocks = {number: (told, at - seconds) for number, (told, at) in self._clocks.items()}
 
     def heartbeat(self, message: Heartbeat, now: float) -> bool:
-        """Take a heartbeat; true when it shows that the component has started again."""
+        """Process a heartbeat and return whether it shows a reboot."""
         interval = now - self.beat_at
-        if COPY <= interval < self._interval:
+        if DUPLICATE_TIME <= interval < self._interval:
             self._interval = interval
-            self.gap = BEATS_IN_A_GAP * max(interval, USUAL_INTERVAL)
+            self.gap = GAP_INTERVALS * max(interval, HEARTBEAT_INTERVAL_STANDARD)
         self.beat_at = now
         self.base_mode = message.base_mode
         self.is_high_latency = False
         before, self.state = self.state, message.system_status
         if message.system_status != MAV_STATE_BOOT:
             return False
-        is_late = now - self._boot_beat_at <= OUT_OF_ORDER
+        is_late = now - self._boot_beat_at <= REORDERING_TIME
         self._boot_beat_at = now
         if before in (None, MAV_STATE_BOOT) or is_late:
             return False
-        self.forget_clock(now)  # it need not tell it again
+        self.forget_clock(now)  # its clock need not show it again
         return True
 
     def forget_clock(self, now: float) -> None:
-        """It has started again, which its clock has not shown: what that tells next is no other restart."""
+        """Forget the clock after a reboot that the clock has not shown: its next value shows no other
+        reboot."""
         started_at = self.started_at
         self._started_before = -math.inf if started_at is None else started_at
         self._clocks.clear()
@@ -170,35 +173,36 @@ class Presence:
         self._restarted_at = now
 
     def numbering_begins(self, sequence: int) -> bool:
-        """Take a frame's sequence number; true when a numbering may begin with it, as after a start.
+        """Process a sequence number and return whether a numbering may begin with it, as after a boot.
 
-        That is a hint and no proof: the numbers of one that sends a lot pass 0 several times a second.
+        That is a hint and no proof: with a lot of traffic the numbers pass 0 several times a second.
         """
         before, self._sequence = self._sequence, sequence
         return before is not None and sequence < FIRST_FRAMES and (sequence - before) % 256 >= SEQUENCE_GAP
 
     def high_latency(self) -> None:
-        """HIGH_LATENCY2 has come: what it sends from now on is one of those every few seconds."""
+        """Process HIGH_LATENCY2: further ones come every few seconds."""
         self.is_high_latency = True
         self.base_mode = None
 
     def system_time(self, message: SystemTime, now: float) -> bool:
-        """Take a SYSTEM_TIME; true when it shows that the component has started again."""
+        """Process a SYSTEM_TIME and return whether it shows a reboot."""
         return self._clock(SYSTEM_TIME_ID, message.time_boot_ms, now)
 
     def boot_clock(self, message_id: int, boot_ms: int, now: float) -> bool:
-        """Take `time_boot_ms` of any message; true when it shows that the component has started again.
+        """Process `time_boot_ms` of any message and return whether it shows a reboot.
 
-        Only times of one message id are compared: each has its own delay, and some firmware fills one with
-        another clock, or with 0, which says nothing.
+        Only times of one message id are compared: each has its own latency, and some firmware fills one with
+        another clock, or with 0, which is ignored.
         """
         return boot_ms > 0 and self._clock(message_id, boot_ms, now)
 
     def _clock(self, message_id: int, boot_ms: int, now: float) -> bool:
         """Compare a time with the one before it.
 
-        The component has started again when its clock has gone back, and is no further than the time since
-        it was heard before. One that has gone back and is further is an old message that took a longer way.
+        The component has rebooted when its clock has gone back and does not exceed the time since the last
+        message before. A clock that has gone back and exceeds it belongs to a late message over a longer
+        path.
         """
         if self._is_of_run_before(now - boot_ms / 1000, now):
             return False
@@ -206,9 +210,9 @@ class Presence:
         has_started_again = False
         if before is not None and boot_ms < before:
             passed = 1000 * (now - before_at)
-            possible = passed + 1000 * DETOUR
-            has_wrapped = boot_ms + WRAP - before <= possible
-            is_late = boot_ms > possible or before + passed - boot_ms <= 1000 * OUT_OF_ORDER
+            possible = passed + 1000 * PATH_LATENCY_MAX
+            has_wrapped = boot_ms + BOOT_CLOCK_WRAP - before <= possible
+            is_late = boot_ms > possible or before + passed - boot_ms <= 1000 * REORDERING_TIME
             if is_late and not has_wrapped:
                 return False
             has_started_again = not has_wrapped
@@ -220,20 +224,24 @@ class Presence:
         return has_started_again
 
     def _is_of_run_before(self, started_at: float, now: float) -> bool:
-        """Whether a time comes late, from before the restart that was recognized just now.
+        """Return whether a time is a late one, from before the last detected reboot.
 
         Args:
-            started_at: the start that the time implies.
+            started_at: the boot time that it implies.
             now: the time.
         """
-        is_recent = now - self._restarted_at < DETOUR
-        return is_recent and started_at < min(self._restarted_at, self._started_before + 2 * DETOUR) - DETOUR
+        is_recent = now - self._restarted_at < PATH_LATENCY_MAX
+        return (
+            is_recent
+            and started_at
+            < min(self._restarted_at, self._started_before + 2 * PATH_LATENCY_MAX) - PATH_LATENCY_MAX
+        )
 
     def lost_at(self) -> float:
-        """When it will be lost if nothing comes; infinity while it is lost."""
+        """Return when it will be lost without a message; infinity while it is lost."""
         return math.inf if self.is_lost else self.heard_at + self.patience
 
     def was_away(self, silence: float) -> bool:
-        """Whether another vehicle may have taken its place in so many seconds."""
+        """Return whether another vehicle may have taken its place in this many seconds."""
         patience = self.patience
         return silence >= (patience if patience < math.inf else LOST_AFTER)

@@ -1,4 +1,4 @@
-"""One restart of a component on our command: asked for, gone, back, and proven to be the same vehicle."""
+"""A reboot on command: the command, the silence, the return, and the proof that it is the same vehicle."""
 
 from __future__ import annotations
 
@@ -20,43 +20,44 @@ from paramclient.protocol.wire import MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
 __all__ = ["Restart", "Restarts"]
 
 SAVING_TIME: Final = 2.5
-"""Seconds from a write until it outlives a restart: PX4 saves changed parameters up to two seconds later
-(its `param_autosave` waits 0.3 s, and saves no more often than every 2 s)."""
-STILL_THERE: Final = 1.0
-"""Seconds after the command: a component that still sends heartbeats then has not obeyed it. PX4 goes down
-0.4 s after it has accepted, ArduPilot 0.2 s (their sources), and neither starts in so little time."""
-GRACE: Final = 0.5
-"""Seconds after such a heartbeat in which a clock may show that it was the first of a new start."""
-MOST_TRIES: Final = 5
-"""Commands that a component may leave unanswered which is heard all the time."""
-CLOCK_PATIENCE: Final = 2.5
-"""Seconds after a silence in which SYSTEM_TIME, where the component sends it, tells what the silence was."""
-STEP: Final = 0.15
-"""Seconds by which a start must be later than the one before for the clock to show that it is another one:
-messages are not equally long on their way."""
+"""Seconds from a write until the value survives a reboot: PX4 saves changed parameters up to 2 s later (its
+`param_autosave` waits 0.3 s, and saves at most every 2 s)."""
+SHUTDOWN_TIME_MAX: Final = 1.0
+"""Seconds after the command: a component that still sends heartbeats then has not executed it. PX4 goes down
+0.4 s after it has accepted, ArduPilot 0.2 s (their sources), and neither boots in so little time."""
+FIRST_HEARTBEAT_GRACE: Final = 0.5
+"""Seconds after such a heartbeat in which a clock may show that it was the first after a boot."""
+COMMANDS_MAX: Final = 5
+"""Unanswered commands to a component that is heard all the time."""
+CLOCK_TIMEOUT: Final = 2.5
+"""Seconds after a silence in which SYSTEM_TIME, where the component sends it, shows the cause of the
+silence."""
+BOOT_TIME_STEP: Final = 0.15
+"""Seconds by which a boot time must be later than the one before to show another boot: the latency of
+messages differs."""
 DOWN_DELAY: Final = 0.3
-"""Seconds from accepting until a vehicle is certainly off: ArduPilot goes off after 0.2 s, and the first
-frame of its new run comes at the earliest 0.31 s after the acknowledgement (measured)."""
+"""Seconds from the acknowledgement until a vehicle is certainly off: ArduPilot goes off after 0.2 s, and the
+first frame of its new run comes 0.31 s after the acknowledgement at the earliest (measured)."""
 CLOCK_SILENCE: Final = 0.25
-"""Seconds without a clock from a vehicle before the numbers of its frames mean anything: of one that streams
-telemetry they pass 0 all the time."""
-UNNOTICED: Final = 10.0
-"""Seconds after which an accepted restart counts as done where nothing can show it: the component is heard
-without a gap, tells no clock, and does not say that it boots."""
-ASKING_PACE: Final = 1.0
-"""Seconds between two rounds of questions to a component that is back and does not say who it is."""
+"""Seconds without a clock from a vehicle before its frame numbering counts: with telemetry the numbers pass 0
+all the time."""
+UNOBSERVED_TIMEOUT: Final = 10.0
+"""Seconds after which an accepted reboot counts as done where nothing can show it: the component is heard
+without a gap, sends no clock, and no MAV_STATE_BOOT."""
+REBOOT_IDENTITY_INTERVAL: Final = 1.0
+"""Seconds between two identity requests to a component that is back."""
 
 
 class Restarts(Machine):
-    """The restart on command of one component: at most one at a time, which all callers share.
+    """The reboot on command of one component: at most one at a time, shared by all callers.
 
     Args:
         context, commands, who, presence, clock_requests: the component's.
-        restarted: is told when the component has started again and nobody else has noticed; calls `rebooted`.
+        restarted: called when the component has rebooted and nothing else has detected it; calls `rebooted`.
 
     Attributes:
-        current: the restart in progress or just ended, or None.
-        saved_at: the time at which all that was written is saved.
+        current: the reboot in progress or just ended, or None.
+        saved_at: when the vehicle has saved all written values.
     """
 
     def __init__(
@@ -79,11 +80,11 @@ class Restarts(Machine):
 
     @property
     def is_under_way(self) -> bool:
-        """Whether the component was told to start again, and that is awaited."""
+        """Whether a reboot was commanded and is awaited."""
         return self.current is not None and not self.current.done
 
     def begin(self, now: float, *, returns: bool) -> Restart:
-        """Begin a restart, or join the one in progress; give it back with `end`.
+        """Begin a reboot, or join the one in progress; give it back with `end`.
 
         Args:
             now: the time.
@@ -105,7 +106,7 @@ class Restarts(Machine):
         return self.current
 
     def end(self, restart: Restart, now: float) -> None:
-        """Wait for it no longer. The last waiter ends it; whether it is obeyed is then not known."""
+        """Give a reboot back. The last holder ends it; whether the command takes effect is then unknown."""
         restart.waiters -= 1
         if not restart.waiters:
             restart.stop(now)
@@ -113,7 +114,7 @@ class Restarts(Machine):
                 self.current = None
 
     def write_ended(self, now: float) -> None:
-        """Take that a write has ended: the vehicle saves the value `SAVING_TIME` later at most."""
+        """Process the end of a write: the vehicle saves the value within `SAVING_TIME`."""
         self.saved_at = now + SAVING_TIME
 
     def tick(self, now: float) -> None:
@@ -153,24 +154,25 @@ class Restarts(Machine):
 class Restart(Operation[None]):
     """MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN until the same vehicle is back, or until another one is.
 
-    Before it, who the component is must be known, or asked in vain, and what was written must be saved. The
-    command is repeated only to a component that is heard to be still there: one that has obeyed and whose
-    answer was lost would start twice. That it has started again is shown by its clock, by its heartbeat, or
-    by a silence behind which a clock does not go on; without an answer to the command too. It ends when the
-    component says who it is (by its heartbeat, where it has no hardware id) and no longer that it boots. It
-    has no time limit of its own.
+    Before it, the identity must be known, or requested without success, and all written values must be saved.
+    The command is repeated only while the component is heard: a component that has executed it and whose
+    acknowledgement was lost would boot twice. The reboot is shown by its clock, by its heartbeat, or by a
+    silence after which the clock does not continue; also without an acknowledgement. It ends when the
+    identity is received (with the heartbeat, for a vehicle without a hardware id) and MAV_STATE_BOOT is over.
+    It has no time limit of its own.
 
     Args:
         context, commands, who, presence: the component's.
-        saved_at: when all that was written is saved.
-        restarted: is told when the component has started again and nobody else has noticed; calls `rebooted`.
+        saved_at: when the vehicle has saved all written values.
+        restarted: called when the component has rebooted and nothing else has detected it; calls `rebooted`.
         clock_requests: the component's.
-        returns: whether it comes back under its address. Else it ends as soon as it obeys, or is gone.
+        returns: whether it comes back under its address. Otherwise it ends with the acknowledgement, or with
+            the silence.
         now: the time.
 
     Attributes:
-        waiters: how many wait for it.
-        stage: what is awaited, in words.
+        waiters: callers that wait for it.
+        stage: what is awaited, as text.
     """
 
     def __init__(
@@ -201,7 +203,7 @@ class Restart(Operation[None]):
         self._before: Identity | None = None
         self._started_before: float | None = None
         self._accepted_at: float | None = None
-        self._heard_again_at: float | None = None  # after a silence of which it is open what it was
+        self._heard_again_at: float | None = None  # after a silence of unknown cause
         self._numbering_began_at = -math.inf  # where that proves nothing
         self._back_at: float | None = None
         self._ask_at = -math.inf
@@ -221,7 +223,7 @@ class Restart(Operation[None]):
         return f"the restart of {system}/{component}"
 
     def rebooted(self, now: float) -> None:
-        """Its clock or its heartbeat shows that it has started again."""
+        """Process a reboot that its clock or its heartbeat shows."""
         if self._command is None:
             return
         self._clock_requests.stop_following()
@@ -231,10 +233,10 @@ class Restart(Operation[None]):
         self._ask_at = now
 
     def numbering_began(self, now: float) -> bool:
-        """Its frames may be numbered from 0 again; gives whether that shows that it has started again.
+        """Process a possible new frame numbering; return whether it shows a reboot.
 
-        It does where the component has accepted the command, has had the time to go off, and is not telling
-        its clock meanwhile. ArduPilot sends its clock only 1.4 s after its first heartbeat.
+        It does if the component has accepted the command, has had the time to go off, and sends no clock
+        meanwhile. ArduPilot sends its clock only 1.4 s after its first heartbeat.
         """
         accepted_at = self._accepted_at
         if self.done or self._back_at is not None:
@@ -248,7 +250,7 @@ class Restart(Operation[None]):
         return True
 
     def silent(self, silence: float, now: float) -> None:
-        """It is heard again after so many seconds that something must have happened."""
+        """Process the end of a long silence."""
         command = self._command
         if command is None or self._back_at is not None:
             return
@@ -256,12 +258,12 @@ class Restart(Operation[None]):
             self._heard_again_at = now
 
     def another(self, now: float) -> None:
-        """Another vehicle has said that the address is its own."""
+        """End with an error: another vehicle uses the address."""
         if self._before is not None:
             self._fail_for_another(now)
 
     def stop(self, now: float) -> None:
-        """Nobody waits any more. What was sent cannot be taken back."""
+        """End the reboot for all callers. A sent command cannot be recalled."""
         self._clock_requests.stop_following()
         if self._command is not None:
             self._commands.cancel(self._command, now)
@@ -274,7 +276,7 @@ class Restart(Operation[None]):
                 step(now)
 
     def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity."""
+        """Return when `tick` is due, or infinity."""
         return math.inf if self.done else self._next_step()[0]
 
     def _next_step(self) -> tuple[float, Callable[[float], None]]:
@@ -290,14 +292,14 @@ class Restart(Operation[None]):
         if self._clock_shows_it(command.sent_at):
             return -math.inf, self._restarted
         if self._heard_again_at is not None:
-            return self._heard_again_at + CLOCK_PATIENCE, self._judge_silence
+            return self._heard_again_at + CLOCK_TIMEOUT, self._judge_silence
         if self._accepted_at is not None:
-            due = max(self._accepted_at, presence.clock_at) + UNNOTICED
+            due = max(self._accepted_at, presence.clock_at) + UNOBSERVED_TIMEOUT
             return (math.inf if presence.is_lost else due), self._restarted
-        if presence.beat_at >= command.sent_at + STILL_THERE:
-            due = max(presence.beat_at + GRACE, command.sent_at + self._round_trip.timeout)
+        if presence.beat_at >= command.sent_at + SHUTDOWN_TIME_MAX:
+            due = max(presence.beat_at + FIRST_HEARTBEAT_GRACE, command.sent_at + self._round_trip.timeout)
             if self._numbering_began_at >= max(command.sent_at, presence.clock_at):
-                due = max(due, self._numbering_began_at + CLOCK_PATIENCE)  # it may have obeyed
+                due = max(due, self._numbering_began_at + CLOCK_TIMEOUT)  # may have executed it
             return due, self._repeat
         return math.inf, self._repeat
 
@@ -320,32 +322,32 @@ class Restart(Operation[None]):
         elif not isinstance(command.error, NoReply):
             self.fail(command.error, command.ended_at)
         elif not self._returns:
-            self.finish(None, command.ended_at)  # it is lost, as it should be
+            self.finish(None, command.ended_at)  # lost, as expected
 
     def _repeat(self, now: float) -> None:
         command = self._command
         assert command is not None
-        if command.done or command.attempts >= MOST_TRIES:
+        if command.done or command.attempts >= COMMANDS_MAX:
             self.fail(NoReply(self.stage, attempts=command.attempts, waited=now - self.begun_at), now)
         else:
             self._commands.repeat(command, now)
 
     def _judge_silence(self, now: float) -> None:
-        """The clock has had the time to tell."""
+        """Decide about the silence: the clock has had the time to show its cause."""
         heard_again_at, self._heard_again_at = self._heard_again_at, None
         assert heard_again_at is not None
-        if self._presence.clock_at < heard_again_at:  # one that had gone back would have ended the waiting
+        if self._presence.clock_at < heard_again_at:  # a clock that had gone back would have ended the wait
             self._restarted(now)
 
     def _clock_shows_it(self, sent_at: float) -> bool:
-        """Whether it has started since the command was sent, also where its clock was hardly older before."""
+        """Return whether it has booted since the command was sent, also with a young clock before."""
         started_at = self._presence.started_at
         if started_at is None or started_at < sent_at:
             return False
-        return self._started_before is None or started_at >= self._started_before + STEP
+        return self._started_before is None or started_at >= self._started_before + BOOT_TIME_STEP
 
     def _ask(self, now: float) -> None:
-        self._ask_at = now + ASKING_PACE
+        self._ask_at = now + REBOOT_IDENTITY_INTERVAL
         self._who.doubt(now)
 
     def _has_said_who(self, since: float) -> bool:

@@ -17,9 +17,9 @@ from paramclient.protocol.requests.context import Context
 from paramclient.protocol.station import Station
 from paramclient.protocol.vehicle.boot_time_requests import (
     BASELINE_DELAY,
-    QUICK_TIME,
-    REQUEST_PACE,
-    SLOW_PACE,
+    FAST_REQUESTS_TIME,
+    REQUEST_INTERVAL,
+    SLOW_REQUEST_INTERVAL,
     ClockRequests,
 )
 from paramclient.protocol.vehicle.boot_time_sampling import SAMPLE_TIME, ClockSampling
@@ -94,7 +94,10 @@ def test_a_component_without_a_clock_is_asked_for_a_baseline() -> None:
 def test_nobody_waits_for_a_baseline() -> None:
     desk = Requests()
     desk.requests.want_baseline(desk.now)
-    times = [BASELINE_DELAY + SLOW_PACE * turn for turn in range(int(QUICK_TIME / SLOW_PACE))]
+    times = [
+        BASELINE_DELAY + SLOW_REQUEST_INTERVAL * turn
+        for turn in range(int(FAST_REQUESTS_TIME / SLOW_REQUEST_INTERVAL))
+    ]
     assert desk.run(60.0) == times
 
 
@@ -109,7 +112,9 @@ def test_a_component_that_tells_its_clock_is_not_asked_for_a_baseline() -> None:
 def test_a_clock_that_does_not_come_is_given_up() -> None:
     desk = Requests()
     desk.requests.want(desk.now)
-    assert desk.run(60.0) == [REQUEST_PACE * turn for turn in range(int(QUICK_TIME / REQUEST_PACE))]
+    assert desk.run(60.0) == [
+        REQUEST_INTERVAL * turn for turn in range(int(FAST_REQUESTS_TIME / REQUEST_INTERVAL))
+    ]
 
 
 def test_a_clock_of_before_is_not_the_one_that_is_wanted() -> None:
@@ -126,9 +131,9 @@ def test_after_the_command_to_restart_it_is_asked_until_it_is_back() -> None:
     desk = Requests()
     desk.requests.follow(desk.now)
     sent = desk.run(20.0)
-    assert sent[0] == REQUEST_PACE
-    assert sent[:20] == [REQUEST_PACE * (turn + 1) for turn in range(20)]
-    assert sent[-1] - sent[-2] == SLOW_PACE
+    assert sent[0] == REQUEST_INTERVAL
+    assert sent[:20] == [REQUEST_INTERVAL * (turn + 1) for turn in range(20)]
+    assert sent[-1] - sent[-2] == SLOW_REQUEST_INTERVAL
     desk.tell(100_000)  # it is still there: that is not the end
     assert desk.run(22.5) != []
     desk.requests.want(desk.now)  # joins what is going on

@@ -9,7 +9,7 @@ import pytest
 from paramclient import CommandRefused, CommandResult, LinkError, NoReply, Refused
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.round_trip import RoundTrip
-from paramclient.protocol.vehicle.commands import PROGRESS_PATIENCE, Command, Commands
+from paramclient.protocol.vehicle.commands import PROGRESS_TIMEOUT, Command, Commands
 from paramclient.protocol.wire import CommandAck, CommandLong, Message
 from tests.simulation import is_so
 
@@ -132,7 +132,7 @@ def test_one_in_progress_of_which_nothing_more_is_heard_ends() -> None:
     desk = Desk()
     command = desk.commands.begin(NUMBER, (), 0.0)
     desk.acknowledge(CommandResult.IN_PROGRESS, 0.1)
-    assert desk.run(100.0) == 0.1 + PROGRESS_PATIENCE
+    assert desk.run(100.0) == 0.1 + PROGRESS_TIMEOUT
     assert isinstance(command.error, NoReply)
     assert len(desk.sent) == 1
 

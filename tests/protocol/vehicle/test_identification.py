@@ -11,9 +11,9 @@ from paramclient.model.values import Encoding
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.round_trip import FIRST_TIMEOUT, RoundTrip
 from paramclient.protocol.vehicle.identification import (
-    DOUBT_PACE,
-    DOUBT_PATIENCE,
-    TRIES,
+    DOUBT_REQUEST_INTERVAL,
+    DOUBT_TIME_MIN,
+    VERSION_ATTEMPTS,
     Identification,
     judge_encoding,
 )
@@ -175,7 +175,7 @@ def test_both_ways_to_ask_are_tried_in_turn_and_then_it_is_let_be() -> None:
     assert desk.who.next_deadline() == FIRST_TIMEOUT
     desk.let_it_be()
     both = [MAV_CMD_REQUEST_MESSAGE, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES]
-    assert desk.commands() == [MAV_CMD_REQUEST_MESSAGE, *both * (TRIES - 1)]
+    assert desk.commands() == [MAV_CMD_REQUEST_MESSAGE, *both * (VERSION_ATTEMPTS - 1)]
     assert desk.who.settled
     assert desk.who.identity.uid is None
     assert desk.who.identity.key == "system:1@udpin:x"
@@ -308,9 +308,9 @@ def test_one_that_was_away_is_asked_for_five_seconds_and_not_more_than_once_a_se
         times.append(deadline)
         desk.who.tick(deadline)
     usual = desk.trip.tries
-    assert times[-1] >= 30.0 + DOUBT_PATIENCE
-    assert all(after - before >= DOUBT_PACE for before, after in pairwise(times[usual - 1 : -1]))
-    assert len(times) <= usual + DOUBT_PATIENCE / DOUBT_PACE + 2
+    assert times[-1] >= 30.0 + DOUBT_TIME_MIN
+    assert all(after - before >= DOUBT_REQUEST_INTERVAL for before, after in pairwise(times[usual - 1 : -1]))
+    assert len(times) <= usual + DOUBT_TIME_MIN / DOUBT_REQUEST_INTERVAL + 2
     assert desk.who.is_unconfirmed, "it has not said that it is the same"
     assert not desk.who.may_be_written
     desk.who.version(AutopilotVersion(0, uid=7), 60.0)

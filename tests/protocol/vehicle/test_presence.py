@@ -8,14 +8,14 @@ from collections.abc import Sequence
 import pytest
 
 from paramclient.protocol.vehicle.presence import (
+    BOOT_CLOCK_WRAP,
     CLOCKS_MAX,
-    DETOUR,
     FIRST_FRAMES,
-    LONGEST_PATIENCE,
     LOST_AFTER,
     LOST_AFTER_HIGH_LATENCY,
-    OUT_OF_ORDER,
-    WRAP,
+    LOST_AFTER_MAX,
+    PATH_LATENCY_MAX,
+    REORDERING_TIME,
     Presence,
 )
 from paramclient.protocol.wire import (
@@ -92,7 +92,7 @@ def test_lost_heartbeats_do_not_make_it_one_that_beats_rarely() -> None:
 
 
 def test_patience_has_an_end() -> None:
-    assert beating(0.0, 1e6).patience == LONGEST_PATIENCE
+    assert beating(0.0, 1e6).patience == LOST_AFTER_MAX
 
 
 def test_high_latency_needs_more_patience_until_the_next_heartbeat() -> None:
@@ -126,7 +126,7 @@ def reboots(clock: Sequence[tuple[float, int]]) -> list[float]:
 def test_a_clock_that_begins_anew_is_a_reboot() -> None:
     assert reboots([(0.0, 500_000), (1.0, 501_000), (6.0, 1_200), (7.0, 2_200)]) == [6.0]
     assert reboots([(0.0, 50_000), (60.0, 40_000)]) == [60.0], "it was away for a minute"
-    assert reboots([(0.0, 3 * WRAP // 4), (9.0, 3_000)]) == [9.0], "after weeks"
+    assert reboots([(0.0, 3 * BOOT_CLOCK_WRAP // 4), (9.0, 3_000)]) == [9.0], "after weeks"
 
 
 def test_each_reboot_counts_once() -> None:
@@ -136,13 +136,13 @@ def test_each_reboot_counts_once() -> None:
 
 def test_what_comes_in_the_wrong_order_or_twice_is_no_reboot() -> None:
     assert reboots([(0.0, 50_000), (0.1, 49_000), (0.2, 51_000), (0.2, 51_000), (1.0, 50_000)]) == []
-    soon = int(1000 * OUT_OF_ORDER) + 100
+    soon = int(1000 * REORDERING_TIME) + 100
     assert reboots([(0.0, soon), (0.1, 200), (1.0, soon + 1_000)]) == [], "soon after it was switched on"
     assert reboots([(0.0, soon), (0.1, 150)]) == [0.1]
 
 
 def test_a_second_way_that_takes_longer_is_no_reboot() -> None:
-    lag = int(1000 * (DETOUR - 1))
+    lag = int(1000 * (PATH_LATENCY_MAX - 1))
     clock = [(float(second), 100_000 + 1000 * second - (lag if second % 2 else 0)) for second in range(60)]
     assert reboots(clock) == []
     assert reboots([*clock, (65.0, 1_000), (66.0, 2_000)]) == [65.0]
@@ -155,8 +155,8 @@ def test_a_simulated_clock_may_run_faster() -> None:
 
 
 def test_a_clock_that_is_full_begins_at_zero() -> None:
-    assert reboots([(0.0, WRAP - 500), (1.0, 500), (2.0, 1_500)]) == []
-    assert reboots([(0.0, WRAP - 500), (1.0, 500), (9.0, 8_500), (14.0, 1_000)]) == [14.0]
+    assert reboots([(0.0, BOOT_CLOCK_WRAP - 500), (1.0, 500), (2.0, 1_500)]) == []
+    assert reboots([(0.0, BOOT_CLOCK_WRAP - 500), (1.0, 500), (9.0, 8_500), (14.0, 1_000)]) == [14.0]
 
 
 def states(*beats: tuple[float, Heartbeat]) -> list[float]:
@@ -228,9 +228,12 @@ def test_a_second_reboot_soon_after_the_first_one_counts() -> None:
 
 
 def test_clocks_of_telemetry_may_wrap_and_come_over_two_ways() -> None:
-    wrapping = [(now, ATTITUDE_ID, (WRAP - 3_000 + int(1000 * now)) % WRAP or 1) for now in range(10)]
+    wrapping = [
+        (now, ATTITUDE_ID, (BOOT_CLOCK_WRAP - 3_000 + int(1000 * now)) % BOOT_CLOCK_WRAP or 1)
+        for now in range(10)
+    ]
     assert telemetry_reboots(wrapping) == []
-    lag = int(1000 * (DETOUR - 1))
+    lag = int(1000 * (PATH_LATENCY_MAX - 1))
     ways = [(0.5 * turn, ATTITUDE_ID, 100_000 + 500 * turn - (lag if turn % 2 else 0)) for turn in range(40)]
     assert telemetry_reboots(ways) == []
 

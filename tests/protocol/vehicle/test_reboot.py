@@ -25,7 +25,7 @@ from paramclient.client.link_component import REBOOT_PATIENCE
 from paramclient.client.local import local
 from paramclient.protocol import wire
 from paramclient.protocol.system_id_change import HUSH
-from paramclient.protocol.vehicle.reboot import MOST_TRIES, SAVING_TIME, UNNOTICED
+from paramclient.protocol.vehicle.reboot import COMMANDS_MAX, SAVING_TIME, UNOBSERVED_TIMEOUT
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle, Vehicle
 from tests.shell import FlakyLink, Tap, a_client, generic, outcome, residue, swiftly, tasks_beside
 from tests.simulation import is_so
@@ -185,7 +185,7 @@ async def test_a_vehicle_that_hears_nothing_is_given_up() -> None:
         tap.is_deaf = True
         error = await outcome(component.reboot())
         assert isinstance(error, NoReply)
-        assert error.attempts == MOST_TRIES
+        assert error.attempts == COMMANDS_MAX
         assert "the restart of 1/1" in str(error)
         assert residue(component) == []
 
@@ -204,7 +204,7 @@ async def test_a_bad_link_starts_it_once(make: Make, seed: int) -> None:
         assert len(starts) == 1
 
 
-@pytest.mark.parametrize(("down", "longest"), [(1.0, UNNOTICED + 2.0), (4.0, 8.0), (12.0, 16.0)])
+@pytest.mark.parametrize(("down", "longest"), [(1.0, UNOBSERVED_TIMEOUT + 2.0), (4.0, 8.0), (12.0, 16.0)])
 @MAKES
 @swiftly
 async def test_a_vehicle_without_a_clock(make: Make, down: float, longest: float) -> None:
