@@ -21,11 +21,11 @@ from paramclient.client.signing import Signing, timestamp_now
 from paramclient.client.worker_thread import Worker
 from paramclient.errors import UsageError
 from paramclient.protocol.wire import Signer, SigningPolicy, Verifier
-from paramclient.protocol.wire.signing import MOST_AHEAD, UNITS
+from paramclient.protocol.wire.signing import ADOPTED_TIMESTAMP_MAX, UNITS_PER_SECOND
 
 __all__ = ["TimestampFile", "TimestampKeeper"]
 
-RESERVED: Final = 60 * UNITS
+RESERVED: Final = 60 * UNITS_PER_SECOND
 """How far ahead of use a timestamp is written down: at most so much is skipped after a crash."""
 LEAST_RESERVED: Final = RESERVED // 2
 """When so little of that is left, it is written again."""
@@ -91,7 +91,7 @@ class TimestampFile:
             text = path.read_text(encoding="ascii", errors="replace")
         except FileNotFoundError:
             return 0
-        if text.strip().isdecimal() and (timestamp := int(text)) <= MOST_AHEAD + RESERVED:
+        if text.strip().isdecimal() and (timestamp := int(text)) <= ADOPTED_TIMESTAMP_MAX + RESERVED:
             return timestamp
         logger.warning("%s: holds no timestamp; the time of day counts", path)
         return 0
