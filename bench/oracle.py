@@ -24,7 +24,7 @@ from heapq import heappop, heappush
 from typing import Any, Final
 
 from paramclient.protocol import wire
-from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
+from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.params.file_download import PARAMETER_FILE, WITH_DEFAULTS
 from paramclient.sim import Air, Endpoint, FaultyLink
 
@@ -32,7 +32,7 @@ __all__ = ["FILE_FRAME", "TellingLink", "file_oracle_time", "oracle_time"]
 
 GROUND = {"system": 255, "component": 190}
 LIMIT: Final = 600.0
-FILE_FRAME: Final = 27 + MOST_DATA
+FILE_FRAME: Final = 27 + DATA_SIZE_MAX
 """Bytes of a frame with a full block of a file."""
 SESSION: Final = 1
 ROUNDING: Final = 1e-9
@@ -298,14 +298,14 @@ class _FileOracle(_Oracle):
     def ask(self, now: float) -> None:
         while self.to_ask and self.next_send <= now + ROUNDING:
             offset = self.to_ask.popleft()
-            self._request(Packet(0, SESSION, Opcode.READ_FILE, size=MOST_DATA, offset=offset), now)
+            self._request(Packet(0, SESSION, Opcode.READ_FILE, size=DATA_SIZE_MAX, offset=offset), now)
             self.next_send = max(self.next_send, now) + self.per_read
 
     def is_done(self) -> bool:
         return self.is_closed
 
     def _burst(self, now: float) -> None:
-        self._request(Packet(0, SESSION, Opcode.BURST_READ_FILE, size=MOST_DATA), now)
+        self._request(Packet(0, SESSION, Opcode.BURST_READ_FILE, size=DATA_SIZE_MAX), now)
         self.next_send = now + self.burst_seconds
 
     def _close_when_whole(self, now: float) -> None:
@@ -375,6 +375,6 @@ def file_oracle_time(
     assert alone.end is not None
     return _FileOracle(
         Air([make()], uplink=uplink, downlink=downlink),
-        burst_seconds=math.ceil(alone.end / MOST_DATA) * FILE_FRAME / burst_rate,
+        burst_seconds=math.ceil(alone.end / DATA_SIZE_MAX) * FILE_FRAME / burst_rate,
         reads_per_second=reads_per_second,
     ).run()

@@ -43,8 +43,8 @@ BOUNDS: Final = (
     (table, "NAMES_GUARANTEED", 6),
     (table, "LINK_NAMES_MAX", 25),
     (change_origin, "RECENT_CHANGES_MAX", 5),
-    (traffic, "MOST_COMPONENTS", 4),
-    (traffic, "MOST_PEERS", 3),
+    (traffic, "COUNTED_COMPONENTS_MAX", 4),
+    (traffic, "COUNTED_PEERS_MAX", 3),
     (change_origin, "FOREIGN_SETS_MAX", 4),
 )
 LISTENS: Final = 0xE0
@@ -102,7 +102,7 @@ class _Session:
         self.operations: list[tuple[ComponentMachine, Operation[Any]]] = []
         self.begun: list[Operation[Any]] = []
         self.requests: list[Message] = []
-        self.framer = Framer(wire.UNDERSTOOD, stream=False)
+        self.framer = Framer(wire.DECODED_IDS, stream=False)
         self.steps = (
             *(self.value, self.value, self.values, self.heartbeat, self.version, self.answer, self.answer),
             *(self.file_answer, self.param_error, self.acknowledge, self.denied, self.clock, self.satellite),

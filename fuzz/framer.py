@@ -9,7 +9,7 @@ from pymavlink.generator.mavcrc import x25crc
 
 from fuzz.draw import Draw
 from paramclient.protocol import wire
-from paramclient.protocol.stats.sniffer import MOST_KEPT, Sniffer
+from paramclient.protocol.stats.sniffer import UNPROVEN_BYTES_MAX, Sniffer
 from paramclient.protocol.wire import Frame, Framer, Signer, SigningKey, SigningPolicy, Verifier
 
 __all__ = ["LONGEST", "run"]
@@ -40,7 +40,7 @@ def run(data: bytes) -> None:
 
 
 def _check_datagrams(chunks: list[bytes]) -> None:
-    framer, chosen, guarded = (Framer(ids, stream=False) for ids in (None, wire.UNDERSTOOD, None))
+    framer, chosen, guarded = (Framer(ids, stream=False) for ids in (None, wire.DECODED_IDS, None))
     guarded.guard = Verifier(Signer(KEY, timestamp=0), SigningPolicy.ACCEPT_ALL).accepts
     for chunk in chunks:
         frames = _frames_of(chunk)
@@ -48,7 +48,7 @@ def _check_datagrams(chunks: list[bytes]) -> None:
         assert framer.receive(chunk) == [frame for frame, _ in frames]
         assert framer.skipped - before == len(chunk) - sum(size for _, size in frames)
         assert guarded.receive(chunk) == [frame for frame, _ in frames]
-        understood = [frame for frame, _ in frames if frame.message_id in wire.UNDERSTOOD]
+        understood = [frame for frame, _ in frames if frame.message_id in wire.DECODED_IDS]
         assert chosen.receive(chunk) == understood
         for frame in understood:
             _check_codec(frame)
@@ -72,7 +72,7 @@ def _check_sniffer(chunks: list[bytes]) -> None:
     seen = []
     for chunk in chunks:
         seen += sniffer.receive(chunk)
-        assert len(sniffer._tail) <= MOST_KEPT + LONGEST_FRAME
+        assert len(sniffer._tail) <= UNPROVEN_BYTES_MAX + LONGEST_FRAME
     seen += sniffer.flush()
     data = b"".join(chunks)
     # bytes that cannot be checked may count as a frame, but must not displace a verified frame

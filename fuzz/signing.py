@@ -11,7 +11,7 @@ from fuzz.draw import Draw
 from paramclient.errors import UsageError
 from paramclient.protocol import wire
 from paramclient.protocol.wire import Framer, Refusal, Signer, SigningKey, SigningPolicy, Verifier
-from paramclient.protocol.wire.signing import LAST_TIMESTAMP, MOST_AHEAD
+from paramclient.protocol.wire.signing import ADOPTED_TIMESTAMP_MAX, LAST_TIMESTAMP
 
 __all__ = ["LONGEST", "run"]
 
@@ -24,7 +24,7 @@ MOST_STREAMS: Final = 4
 MINUTE: Final = 60 * 100_000
 IDS: Final = (0, 22, 109, 166, 253, 256)
 LEAPS: Final = (1, 1, 2, 0, -1, 100_000, -MINUTE, -MINUTE - 1, MINUTE, 10**12, -(10**12), LAST_TIMESTAMP)
-STARTS: Final = (36_000_000_000_000, 36_000_000_000_000, 0, MOST_AHEAD)
+STARTS: Final = (36_000_000_000_000, 36_000_000_000_000, 0, ADOPTED_TIMESTAMP_MAX)
 
 
 def run(data: bytes) -> None:
@@ -118,7 +118,7 @@ class _Session:
         elif len(self.streams) == MOST_STREAMS:
             return Refusal.TOO_MANY_STREAMS
         self.streams[stream] = when
-        self.time = max(self.time, min(when, MOST_AHEAD))
+        self.time = max(self.time, min(when, ADOPTED_TIMESTAMP_MAX))
         self.signed += 1
         return None
 

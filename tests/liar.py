@@ -52,7 +52,7 @@ class LiarVehicle:
         self._rate = rate
         self.random = Random(1)
         self.numbers = count()
-        self._framer = Framer(wire.UNDERSTOOD, stream=False)
+        self._framer = Framer(wire.DECODED_IDS, stream=False)
         self._outbox: list[bytes] = []
         self._next_at = 0.0
         self._beat_at = 0.0

@@ -179,7 +179,7 @@ class Tap:
         self.is_deaf = False
         self.is_mute = False
         self._endpoint = endpoint
-        self._framer = wire.Framer(wire.UNDERSTOOD, stream=False)
+        self._framer = wire.Framer(wire.DECODED_IDS, stream=False)
 
     def messages(self, kind: type[T]) -> list[T]:
         """What the station has sent, of one kind."""

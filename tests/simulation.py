@@ -98,7 +98,7 @@ class Simulation:
         self.now = 0.0
         self.sent: list[tuple[float, Message]] = []
         self.events: list[Event] = []
-        self._own = Framer(wire.UNDERSTOOD, stream=False)
+        self._own = Framer(wire.DECODED_IDS, stream=False)
         self._others = 0
         self.air.tick(self.now)
         self.exchange()

@@ -67,9 +67,9 @@ def test_a_fault_is_found() -> None:
     ):
         target("component")((found / "capital-beyond-latin-1").read_bytes())
     with (
-        mock.patch.object(component, "MOST_PARAMETERS", 65535),
-        mock.patch.object(table, "MOST_PARAMETERS", 65535),
-        mock.patch.object(reads, "MOST_PARAMETERS", 65535),
+        mock.patch.object(component, "PARAMETERS_MAX", 65535),
+        mock.patch.object(table, "PARAMETERS_MAX", 65535),
+        mock.patch.object(reads, "PARAMETERS_MAX", 65535),
         pytest.raises(Exception, match="short format requires"),
     ):
         target("component")((found / "index-beyond-32767").read_bytes())

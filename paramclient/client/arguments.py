@@ -6,7 +6,7 @@ from typing import Final
 
 from paramclient.errors import UsageError
 from paramclient.model.values import check_name, is_portable_name
-from paramclient.protocol.wire import MOST_PARAMETERS
+from paramclient.protocol.wire import PARAMETERS_MAX
 
 __all__ = [
     "COMPONENT_TIMEOUT",
@@ -35,8 +35,8 @@ def check_asked(name: str | int) -> None:
     """
     if isinstance(name, str):
         check_asked_name(name)
-    elif not isinstance(name, int) or not 0 <= name < MOST_PARAMETERS:
-        raise UsageError(f"parameter index {name}: indices are 0 to {MOST_PARAMETERS - 1}")
+    elif not isinstance(name, int) or not 0 <= name < PARAMETERS_MAX:
+        raise UsageError(f"parameter index {name}: indices are 0 to {PARAMETERS_MAX - 1}")
 
 
 def check_asked_name(name: str) -> str:

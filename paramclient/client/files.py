@@ -10,7 +10,7 @@ import anyio
 
 from paramclient.client.component import Component
 from paramclient.client.local import local
-from paramclient.protocol.ftp import LARGEST_FILE, DirectoryEntry, FileTransfers
+from paramclient.protocol.ftp import FILE_SIZE_MAX, DirectoryEntry, FileTransfers
 from paramclient.protocol.ftp.transfer_job import Job
 
 __all__ = ["Ftp"]
@@ -42,7 +42,7 @@ class Ftp:
         *,
         timeout: float | None = None,
         progress: Callable[[int, int | None], None] | None = None,
-        limit: int = LARGEST_FILE,
+        limit: int = FILE_SIZE_MAX,
     ) -> bytes:
         """Read a file and return its content.
 

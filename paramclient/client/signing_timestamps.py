@@ -21,11 +21,11 @@ from paramclient.client.signing import Signing, timestamp_now
 from paramclient.client.worker_thread import Worker
 from paramclient.errors import UsageError
 from paramclient.protocol.wire import Signer, SigningPolicy, Verifier
-from paramclient.protocol.wire.signing import MOST_AHEAD, UNITS
+from paramclient.protocol.wire.signing import ADOPTED_TIMESTAMP_MAX, UNITS_PER_SECOND
 
 __all__ = ["TimestampFile", "TimestampKeeper"]
 
-TIMESTAMP_RESERVE: Final = 60 * UNITS
+TIMESTAMP_RESERVE: Final = 60 * UNITS_PER_SECOND
 """Timestamp units (60 s) by which the written limit is ahead of the used timestamps. A crash skips at most
 this many."""
 TIMESTAMP_RESERVE_MIN: Final = TIMESTAMP_RESERVE // 2
@@ -102,7 +102,7 @@ class TimestampFile:
             text = path.read_text(encoding="ascii", errors="replace")
         except FileNotFoundError:
             return 0
-        if text.strip().isdecimal() and (timestamp := int(text)) <= MOST_AHEAD + TIMESTAMP_RESERVE:
+        if text.strip().isdecimal() and (timestamp := int(text)) <= ADOPTED_TIMESTAMP_MAX + TIMESTAMP_RESERVE:
             return timestamp
         logger.warning("%s: no valid signature timestamp; using the system clock", path)
         return 0

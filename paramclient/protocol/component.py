@@ -52,8 +52,8 @@ from paramclient.protocol.wire import (
     HASH_CHECK,
     MAV_AUTOPILOT_ARDUPILOTMEGA,
     MAV_AUTOPILOT_PX4,
-    MOST_PARAMETERS,
     NO_INDEX,
+    PARAMETERS_MAX,
     AutopilotVersion,
     CommandAck,
     ComponentMetadata,
@@ -474,7 +474,7 @@ class ComponentMachine:
                 message = message._replace(param_id=name)
             if number == ParamType.REAL32 and index == NO_INDEX:
                 message = table.with_known_type(message)
-        if count != table.count and count <= MOST_PARAMETERS:
+        if count != table.count and count <= PARAMETERS_MAX:
             self._count_moved(count, now)
         authors = self._authors
         writes = self.writes
@@ -594,7 +594,7 @@ class ComponentMachine:
         """
         if self.table.complete:
             return
-        if count is not None and count > MOST_PARAMETERS:  # what an earlier version has believed
+        if count is not None and count > PARAMETERS_MAX:  # what an earlier version has believed
             count, complete, placed = None, False, False
         changes = self.table.restore(
             params,

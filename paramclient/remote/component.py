@@ -20,7 +20,7 @@ from paramclient.protocol.params.sampling import SAMPLE_SIZE
 from paramclient.protocol.params.sync import SyncState
 from paramclient.protocol.params.writes import SetResult
 from paramclient.protocol.vehicle.peers import Contest
-from paramclient.protocol.wire import MOST_PARAMETERS, SigningKey
+from paramclient.protocol.wire import PARAMETERS_MAX, SigningKey
 from paramclient.remote.connection import Connection, telling
 from paramclient.remote.decoding import (
     Document,
@@ -257,7 +257,7 @@ class RemoteComponent(Component):
         began = anyio.current_time()
         before = self._mirrored.progress_count
         check_accepted(accept, sample)
-        body: dict[str, Any] = {"refresh": refresh, "accept": accept, "sample": min(sample, MOST_PARAMETERS)}
+        body: dict[str, Any] = {"refresh": refresh, "accept": accept, "sample": min(sample, PARAMETERS_MAX)}
         if seed is not None:
             body["seed"] = seed
 

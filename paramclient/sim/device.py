@@ -78,7 +78,7 @@ class Device(ABC):
         self._boot_time = boot_time
         self._telemetry_period = 1.0 / telemetry if telemetry else math.inf
         self._mavlink_version = mavlink_version
-        self._framer = wire.Framer(wire.UNDERSTOOD, stream=stream)
+        self._framer = wire.Framer(wire.DECODED_IDS, stream=stream)
         self._usb = usb
         self._signer: wire.Signer | None = None
         self._verifier: wire.Verifier | None = None

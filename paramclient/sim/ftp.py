@@ -11,7 +11,7 @@ from typing import Final, NamedTuple, TypeAlias
 from paramclient.errors import FileErrorCode, PackError, UsageError
 from paramclient.model.values import crc32_px4
 from paramclient.protocol.ftp import param_pck
-from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
+from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.ftp.param_pck import PackedParam
 
 __all__ = ["PARAM_FILE", "Address", "FileServer"]
@@ -225,7 +225,7 @@ class FileServer:
             self._free_at = max(self._free_at, now)
 
     def _block_size(self, request: Packet) -> int:
-        return MOST_DATA if self.is_px4 else request.size or MOST_DATA
+        return DATA_SIZE_MAX if self.is_px4 else request.size or DATA_SIZE_MAX
 
     def _next_block(self, burst: _Burst, now: float) -> Packet:
         session = burst.request.session
@@ -322,7 +322,7 @@ class FileServer:
             rows = self.params()
             if rows is None or (size != first_size and not self.is_px4):
                 return None
-            aligned = MOST_DATA if self.is_px4 else min(size, MOST_DATA)
+            aligned = DATA_SIZE_MAX if self.is_px4 else min(size, DATA_SIZE_MAX)
             key = (start, count, with_defaults, aligned, rows)
             if self._packed is None or self._packed[0] != key:
                 part = rows[start:] if count is None else rows[start : start + count]
@@ -349,7 +349,7 @@ class FileServer:
             )
         data = b""
         for entry in list(entries.values())[skip:]:
-            if len(data) + len(entry) > MOST_DATA:
+            if len(data) + len(entry) > DATA_SIZE_MAX:
                 break
             data += entry
         return _Answer(Opcode.ACK, data) if data else _no(FileErrorCode.EOF)

@@ -52,7 +52,7 @@ class Program:
         self._news.set()
 
     def messages(self) -> list[wire.Message]:
-        framer = wire.Framer(wire.UNDERSTOOD, stream=False)
+        framer = wire.Framer(wire.DECODED_IDS, stream=False)
         found = [wire.decode(each) for data in self.heard for each in framer.receive(data)]
         return [message for message in found if message is not None]
 

@@ -30,7 +30,7 @@ from paramclient.protocol.ftp import blocks as blocks_room
 from paramclient.protocol.ftp import file_read as reading_room
 from paramclient.protocol.ftp import transfers as transfers_room
 from paramclient.protocol.ftp.blocks import Blocks
-from paramclient.protocol.ftp.packets import MOST_DATA
+from paramclient.protocol.ftp.packets import DATA_SIZE_MAX
 from paramclient.protocol.params import change_origin as authors_room
 from paramclient.protocol.params import list_download as download_room
 from paramclient.protocol.params import sync as sync_room
@@ -45,8 +45,8 @@ from paramclient.protocol.station import Station
 from paramclient.protocol.stats import traffic as traffic_room
 from paramclient.protocol.vehicle.presence import LOST_AFTER
 from paramclient.protocol.wire import (
-    MOST_PARAMETERS,
     NO_INDEX,
+    PARAMETERS_MAX,
     AutopilotVersion,
     Heartbeat,
     Message,
@@ -55,7 +55,7 @@ from paramclient.protocol.wire import (
     encode,
     text_of,
 )
-from paramclient.protocol.wire.codec import MOST_TEXTS
+from paramclient.protocol.wire.codec import TEXTS_MAX
 from paramclient.sim import Air
 from tests.liar import ESCAPE, LIES, LiarVehicle
 from tests.shell import bits, generic, small_px4, swiftly
@@ -77,12 +77,12 @@ def beat(session: Simulation, *, system: int = 1, component: int = 1, autopilot:
 # Numbers that cannot be
 
 
-@pytest.mark.parametrize("count", [MOST_PARAMETERS + 1, NO_INDEX - 1, NO_INDEX])
+@pytest.mark.parametrize("count", [PARAMETERS_MAX + 1, NO_INDEX - 1, NO_INDEX])
 def test_a_count_above_what_can_be_asked_for_is_none(count: int) -> None:
     """PARAM_REQUEST_READ has a signed index: one above 32767 cannot even be written down."""
     session = Simulation()
     beat(session)
-    say(session, param_value("A", 1.0, index=MOST_PARAMETERS, count=count))
+    say(session, param_value("A", 1.0, index=PARAMETERS_MAX, count=count))
     table = session.machine.table
     assert (table.count, table.params["A"].index) == (None, None)
     fetch = session.machine.begin_fetch(session.now)
@@ -97,12 +97,12 @@ def test_a_count_above_what_can_be_asked_for_is_none(count: int) -> None:
 def test_the_largest_count_is_one() -> None:
     session = Simulation()
     beat(session)
-    say(session, param_value("A", 1.0, index=MOST_PARAMETERS - 1, count=MOST_PARAMETERS))
-    assert session.machine.table.count == MOST_PARAMETERS
-    assert session.machine.table.params["A"].index == MOST_PARAMETERS - 1
-    session.machine.read(MOST_PARAMETERS - 1, session.now)
+    say(session, param_value("A", 1.0, index=PARAMETERS_MAX - 1, count=PARAMETERS_MAX))
+    assert session.machine.table.count == PARAMETERS_MAX
+    assert session.machine.table.params["A"].index == PARAMETERS_MAX - 1
+    session.machine.read(PARAMETERS_MAX - 1, session.now)
     session.exchange()
-    assert MOST_PARAMETERS - 1 in [request.param_index for request in session.sent_of(ParamRequestRead)]
+    assert PARAMETERS_MAX - 1 in [request.param_index for request in session.sent_of(ParamRequestRead)]
 
 
 def test_a_cached_count_above_what_can_be_asked_for_is_none() -> None:
@@ -255,15 +255,15 @@ def test_a_value_that_flips_is_asked_for_only_so_often(monkeypatch: pytest.Monke
 def test_so_many_texts_are_remembered_and_no_more() -> None:
     """Those that come again and again are one object each."""
     known_well = text_of(b"MC_ROLL_P")
-    for number in range(2 * MOST_TEXTS):
+    for number in range(2 * TEXTS_MAX):
         text_of(b"NAME%d" % number)
         assert text_of(b"MC_ROLL_P") is known_well
-    assert text_of.cache_info().currsize == MOST_TEXTS
+    assert text_of.cache_info().currsize == TEXTS_MAX
 
 
 def test_a_file_has_so_many_gaps_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
     """What would leave one more is passed over; all else still fits, and the file is whole in the end."""
-    monkeypatch.setattr(blocks_room, "MOST_GAPS", 2)
+    monkeypatch.setattr(blocks_room, "GAPS_MAX", 2)
     blocks = Blocks()
     for offset in (2, 6, 10, 14):
         blocks.take(offset, b"ab")
@@ -278,15 +278,15 @@ def test_a_file_has_so_many_gaps_and_no_more(monkeypatch: pytest.MonkeyPatch) ->
 def test_a_file_comes_in_so_many_pieces_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reading_room, "SPARE_PIECES", 10)
     session = Simulation(LiarVehicle("crumbs", system=1))
-    job = session.meet().files.read("/crumbs", session.now, limit=10 * MOST_DATA)
+    job = session.meet().files.read("/crumbs", session.now, limit=10 * DATA_SIZE_MAX)
     session.until(lambda: job.done)
     assert isinstance(job.error, FileTransferError)
     assert "too many pieces" in str(job.error)
-    assert job._blocks.pieces == reading_room.SMALLEST_SHARE * 10 + 10 + 1
+    assert job._blocks.pieces == reading_room.PIECES_PER_BLOCK * 10 + 10 + 1
 
 
 def test_a_directory_has_so_many_entries_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(transfers_room, "MOST_ENTRIES", 100)
+    monkeypatch.setattr(transfers_room, "ENTRIES_MAX", 100)
     session = Simulation(LiarVehicle("endless file", system=1))
     job = session.meet().files.list("/endless", session.now)
     assert len(session.outcome(job)) == 100
@@ -295,18 +295,18 @@ def test_a_directory_has_so_many_entries_and_no_more(monkeypatch: pytest.MonkeyP
 def test_what_is_remembered_of_the_reads_of_a_file_is_so_much_and_no_more() -> None:
     session = Simulation(LiarVehicle("crumbs", system=1))
     job = session.meet().files.read("/crumbs", session.now)
-    for number in range(2 * reading_room.LATE_KEPT):
+    for number in range(2 * reading_room.LATE_READS_MAX):
         job._flights[number] = reading_room._Flight(number, number, session.now, 0, False)
         job._give_up(number)
-    for _ in range(3 * reading_room.BURSTS_KEPT):
+    for _ in range(3 * reading_room.BURSTS_MAX):
         job._burst(session.now)
         job._burst_attempts = 0
-    assert len(job._late) == reading_room.LATE_KEPT
-    assert len(job._bursts) == reading_room.BURSTS_KEPT
+    assert len(job._late) == reading_room.LATE_READS_MAX
+    assert len(job._bursts) == reading_room.BURSTS_MAX
 
 
 def test_a_resync_tells_of_so_many_names_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sync_room, "MOST_NAMES", 3)
+    monkeypatch.setattr(sync_room, "NAMES_MAX", 3)
     session = Simulation(listing_ardupilot())
     session.fetch()
     say(session, param_value("ONE_MORE", 1.0, count=9))  # another count: it has fallen behind
@@ -371,14 +371,14 @@ def test_all_lies_at_once_cost_no_more_than_so_much_memory() -> None:
         mock.patch.object(table_room, "NAMES_MAX", names),
         mock.patch.object(station_room, "MOST_COMPONENTS", components),
         mock.patch.object(authors_room, "RECENT_CHANGES_MAX", 100),
-        mock.patch.object(traffic_room, "MOST_COMPONENTS", components),
-        mock.patch.object(component_room, "MOST_PARAMETERS", 1_000),
-        mock.patch.object(table_room, "MOST_PARAMETERS", 1_000),
-        mock.patch.object(download_room, "MOST_PARAMETERS", 1_000),
+        mock.patch.object(traffic_room, "COUNTED_COMPONENTS_MAX", components),
+        mock.patch.object(component_room, "PARAMETERS_MAX", 1_000),
+        mock.patch.object(table_room, "PARAMETERS_MAX", 1_000),
+        mock.patch.object(download_room, "PARAMETERS_MAX", 1_000),
     ):
         tracemalloc.start()
         text_of.cache_clear()  # what it holds from before is not traced, and its next growth would be
-        for number in range(MOST_TEXTS):
+        for number in range(TEXTS_MAX):
             text_of(b"%d" % number)  # what remembers names is full
         liars = [LiarVehicle(*list(LIES)[start::3], system=66 + start, rate=150) for start in range(3)]
         station = Station(link="sim:test", is_stream=False, upkeep=Upkeep(30.0), counts_traffic=True)

@@ -74,7 +74,7 @@ class Unheard(Tap):
 
     def data_to_send(self) -> list[bytes]:
         is_asked = any(message.params[0] == wire.HEARTBEAT_ID for message in self.messages(wire.CommandLong))
-        framer = wire.Framer(wire.UNDERSTOOD, stream=False)
+        framer = wire.Framer(wire.DECODED_IDS, stream=False)
         return [
             data
             for data in super().data_to_send()

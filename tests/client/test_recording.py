@@ -23,7 +23,7 @@ from paramclient.client import recording
 from paramclient.client.recording import Capture
 from paramclient.links.tlog import TIME_MAX, TIME_STEP_MAX, Record, packed_time, read_records
 from paramclient.protocol import wire
-from paramclient.protocol.stats.sniffer import MOST_PEERS, FrameCutter
+from paramclient.protocol.stats.sniffer import UNFINISHED_PEERS_MAX, FrameCutter
 from paramclient.sim import ArduPilotVehicle
 from tests.recordings import DATA, NAMES, read
 from tests.shell import VALUES, FlakyLink, Tap, a_client, settled, small_px4, swiftly
@@ -46,7 +46,7 @@ def records(data: bytes) -> list[Record]:
 
 
 def messages(path: Path) -> list[wire.Message]:
-    framer = wire.Framer(wire.UNDERSTOOD, stream=False)
+    framer = wire.Framer(wire.DECODED_IDS, stream=False)
     found = [
         wire.decode(each) for record in records(path.read_bytes()) for each in framer.receive(record.data)
     ]
@@ -309,9 +309,9 @@ def test_streams_are_cut_into_whole_frames() -> None:
     # a header that promises more than ever comes hides what stands behind it only until the end
     assert cutter.cut(b"\xfd\xff\x00\x00\x00\x01\x01\x00\x00\x00" + first, "one") == []
     assert cutter.flush() == [first]
-    for number in range(MOST_PEERS + 10):
+    for number in range(UNFINISHED_PEERS_MAX + 10):
         cutter.cut(first[:5], number)
-    assert len(cutter._sniffers) == MOST_PEERS
+    assert len(cutter._sniffers) == UNFINISHED_PEERS_MAX
 
 
 class Stream(FlakyLink):

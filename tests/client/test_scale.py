@@ -83,7 +83,7 @@ def test_a_deadline_is_kept_whoever_was_looked_at_meanwhile() -> None:
         now = station.next_deadline(everyone=False)
         station.tick(now, everyone=False)
         for data, _ in station.data_to_send():
-            for frame in wire.Framer(wire.UNDERSTOOD, stream=False).receive(data):
+            for frame in wire.Framer(wire.DECODED_IDS, stream=False).receive(data):
                 message = wire.decode(frame)
                 if isinstance(message, wire.CommandLong):
                     asked.append((round(now, 3), message.target_system))

@@ -30,7 +30,7 @@ from paramclient.logs.telemetry import import_log
 from paramclient.metadata import ParamInfo
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import Param, ParamType, from_bits, type_name
-from paramclient.protocol.ftp.packets import MOST_DATA
+from paramclient.protocol.ftp.packets import DATA_SIZE_MAX
 from paramclient.protocol.params.write_resolution import CHANGE_MIN
 from paramclient.protocol.vehicle.reboot import SAVING_TIME
 from paramclient.protocol.wire import AUTOPILOT_VERSION_ID, message_name
@@ -732,7 +732,7 @@ async def read_file_once(session: Session, *, conditions: Conditions) -> Measure
             raise Skip(f"the vehicle serves no parameter file: {error}") from error
         seconds = time.monotonic() - began
         datagrams = session.relay.counts().down - before
-    blocks = math.ceil(size / MOST_DATA)
+    blocks = math.ceil(size / DATA_SIZE_MAX)
     told = f"{size} bytes in {seconds:.2f} s, {datagrams} datagrams for {blocks} blocks"
     if datagrams > 1.5 * blocks + HEARTBEATS:
         raise CheckFailed(told)

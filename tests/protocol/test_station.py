@@ -43,7 +43,7 @@ def frame(message: Message, system: int = 1, component: int = 1, *, version: int
 
 def sent(station: Station) -> list[tuple[Message, int, object]]:
     """What goes out: message, MAVLink version, and for whom."""
-    framer = Framer(wire.UNDERSTOOD, stream=False)
+    framer = Framer(wire.DECODED_IDS, stream=False)
     out = []
     for data, peer in station.data_to_send():
         for each in framer.receive(data):
@@ -100,7 +100,7 @@ def test_frames_are_numbered_and_counted() -> None:
     for now in range(300):
         station.tick(float(now))
     data = [each for each, _ in station.data_to_send()]
-    frames = [each for datagram in data for each in Framer(wire.UNDERSTOOD, stream=False).receive(datagram)]
+    frames = [each for datagram in data for each in Framer(wire.DECODED_IDS, stream=False).receive(datagram)]
     assert [each.sequence for each in frames] == [number % 256 for number in range(300)]
     assert station.bytes_sent == sum(map(len, data))
     assert station.data_to_send() == []

@@ -351,7 +351,7 @@ def test_a_table_grows_no_further_than_that_of_a_service(monkeypatch: pytest.Mon
     def param(number: int) -> Param:
         return Param(f"P{number}", 1, ParamType.INT32, 0, 1, Trust.LIVE)
 
-    monkeypatch.setattr(mirror, "MOST_NAMES", 3)
+    monkeypatch.setattr(mirror, "NAMES_MAX", 3)
     table = Mirror()
     table.begin()
     with pytest.raises(ValueError, match="names"):

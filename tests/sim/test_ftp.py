@@ -10,7 +10,7 @@ from paramclient.errors import FileErrorCode, UsageError
 from paramclient.model.values import ParamType, crc32_px4
 from paramclient.protocol import wire
 from paramclient.protocol.ftp import param_pck
-from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
+from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.ftp.param_pck import PackedParam
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam, Vehicle
 
@@ -59,7 +59,7 @@ class Pilot:
         assert answer.requested == opcode
         return answer
 
-    def burst(self, *, session: int = 3, offset: int = 0, size: int = MOST_DATA) -> list[Packet]:
+    def burst(self, *, session: int = 3, offset: int = 0, size: int = DATA_SIZE_MAX) -> list[Packet]:
         self.sequence += 2
         self.send(Packet(self.sequence, session, Opcode.BURST_READ_FILE, size=size, offset=offset))
         self.sequence += 10_000
@@ -240,7 +240,7 @@ def test_a_long_directory_is_listed_in_parts() -> None:
     pilot.vehicle.files.update(dict.fromkeys((f"d/{name}" for name in names), b""))
     heard: list[bytes] = []
     while (answer := pilot.ask(Opcode.LIST_DIRECTORY, b"d", offset=len(heard))).opcode == Opcode.ACK:
-        assert len(answer.data) <= MOST_DATA
+        assert len(answer.data) <= DATA_SIZE_MAX
         heard += answer.data.split(b"\0")[:-1]
     assert heard == [f"F{name}\t0".encode() for name in names]
 
@@ -407,7 +407,7 @@ class TestPace:
         framer = wire.Framer(stream=False)
         air.tick(0.0)
         opening = Packet(100, 3, Opcode.OPEN_FILE_RO, PARAMS + b"?withdefaults=1")
-        for request in (opening, opening, Packet(200, 3, Opcode.BURST_READ_FILE, size=MOST_DATA)):
+        for request in (opening, opening, Packet(200, 3, Opcode.BURST_READ_FILE, size=DATA_SIZE_MAX)):
             air.receive(file_request(request), 0.5)
         blocks: list[float] = []
         now = 0.5
@@ -423,7 +423,7 @@ class TestPace:
                     blocks += [now] * (answer.requested == Opcode.BURST_READ_FILE)
         assert 0.095 <= blocks[0] - 0.5 <= 0.125
         gaps = [later - earlier for earlier, later in pairwise(blocks)]
-        assert gaps == pytest.approx([(MOST_DATA + 27) / 5760] * 3, abs=0.01)
+        assert gaps == pytest.approx([(DATA_SIZE_MAX + 27) / 5760] * 3, abs=0.01)
 
     def test_px4_ends_a_burst_after_168_blocks(self) -> None:
         pilot = Pilot(PX4Vehicle())

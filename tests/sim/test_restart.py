@@ -28,7 +28,7 @@ class Desk:
         self.vehicle = vehicle
         self.now = 0.0
         self.heard: list[tuple[float, wire.Frame, wire.Message]] = []
-        self._framer = wire.Framer(wire.UNDERSTOOD, stream=False)
+        self._framer = wire.Framer(wire.DECODED_IDS, stream=False)
         self._sequence = 0
         vehicle.tick(0.0)
         self._take()

@@ -1,8 +1,17 @@
-"""The files of a component over MAVFTP, without input and output."""
+"""MAVFTP: the files of a component.
+
+`blocks`: received pieces of a file, and its gaps.
+`file_read`: the read of a file: one burst, and single reads of lost blocks.
+`packets`: the payload of FILE_TRANSFER_PROTOCOL.
+`param_pck`: the packed parameter file.
+`passive`: files that other stations read.
+`transfer_job`: sessions, retries and errors, common to all transfers.
+`transfers`: the queue of transfers of a component: reads, writes, lists, checksums.
+"""
 
 from __future__ import annotations
 
-from paramclient.protocol.ftp.file_read import LARGEST_FILE, FileRead
+from paramclient.protocol.ftp.file_read import FILE_SIZE_MAX, FileRead
 from paramclient.protocol.ftp.passive import ObservedRead, ObservedReads
 from paramclient.protocol.ftp.transfer_job import BUSY
 from paramclient.protocol.ftp.transfers import (
@@ -15,7 +24,7 @@ from paramclient.protocol.ftp.transfers import (
 
 __all__ = [
     "BUSY",
-    "LARGEST_FILE",
+    "FILE_SIZE_MAX",
     "DirectoryEntry",
     "FileChecksum",
     "FileList",

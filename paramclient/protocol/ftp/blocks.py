@@ -1,4 +1,4 @@
-"""What has come of a file, in whatever order it came, what is missing, and where the file ends."""
+"""The received pieces of a file, its gaps, and its end."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from typing import Final
 
 __all__ = ["Blocks"]
 
-MOST_GAPS: Final = 8_192
-"""Gaps that are kept: more than a burst of ArduPilot has blocks. A piece that would leave another one is
-passed over, and is asked for again: each piece that comes is compared with every gap."""
+GAPS_MAX: Final = 8_192
+"""Gaps of a file: more than a burst of ArduPilot has blocks. A piece that would leave another gap is dropped,
+and requested again: each received piece is compared with every gap."""
 
 
 class Blocks:
-    """The pieces of a file. What was there first stays; memory is taken for what has come, and no more.
+    """The pieces of a file. The first piece for an offset stays; memory is used for received bytes only.
 
     Attributes:
-        received: bytes that have come.
-        reached: behind the last byte that is known to be in the file.
-        end: where the file ends, or None as long as that is not known.
+        received: bytes received.
+        reached: the offset behind the last byte that is known to be in the file.
+        end: the end of the file, or None while unknown.
     """
 
     __slots__ = ("_gaps", "_pieces", "end", "reached", "received")
@@ -41,7 +41,7 @@ class Blocks:
 
     @property
     def prefix(self) -> bytes:
-        """Everything from the beginning of the file to its first gap."""
+        """The bytes from the beginning of the file to its first gap."""
         pieces: list[bytes] = []
         reached = 0
         while (piece := self._pieces.get(reached)) is not None:
@@ -51,22 +51,22 @@ class Blocks:
 
     @property
     def pieces(self) -> int:
-        """How many pieces it has come in."""
+        """The number of pieces received."""
         return len(self._pieces)
 
     @property
     def beginning(self) -> bytes:
-        """The first piece; b"" where that has not come."""
+        """The first piece; b"" before it is received."""
         return self._pieces.get(0, b"")
 
     def take(self, offset: int, data: bytes) -> bool:
-        """A piece has come; whether anything in it is new. What lies behind the end is passed over."""
+        """Store a piece and return whether it has new bytes. Bytes behind the end are dropped."""
         stop = offset + len(data)
         if self.end is not None:
             stop = min(stop, self.end)
         before = self.received
         if offset > self.reached and offset < stop:
-            if len(self._gaps) >= MOST_GAPS:
+            if len(self._gaps) >= GAPS_MAX:
                 return False
             self._gaps.append((self.reached, offset))
             self.reached = offset
@@ -88,7 +88,7 @@ class Blocks:
         return self.received > before
 
     def ends_at(self, offset: int) -> None:
-        """There is nothing at this offset and behind; what lies before it may still be missing."""
+        """Set the end of the file; bytes before it may still be missing."""
         if self.end is not None and offset >= self.end:
             return
         self.end = offset
@@ -105,12 +105,12 @@ class Blocks:
         self.reached = offset
 
     def missing(self, size: int) -> Iterator[int]:
-        """Where to read, `size` bytes each time, to fill the gaps, in rising order."""
+        """Yield the offsets of reads of `size` bytes that fill the gaps, rising."""
         for first, last in self._gaps:
             yield from range(first, last, size)
 
     def is_missing(self, offset: int) -> bool:
-        """Whether the byte at this offset is not there, as far as it is known to be in the file."""
+        """Return whether the byte at this offset is missing, as far as it is known to be in the file."""
         return any(first <= offset < last for first, last in self._gaps)
 
     def _keep(self, at: int, piece: bytes) -> None:

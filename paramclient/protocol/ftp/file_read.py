@@ -1,4 +1,4 @@
-"""Reading a file: one burst from its beginning to its end, and single reads for what got lost of it."""
+"""The read of a file: one burst from beginning to end, and single reads of lost blocks."""
 
 from __future__ import annotations
 
@@ -8,71 +8,76 @@ from typing import Final, NamedTuple
 
 from paramclient.errors import FileErrorCode, FileTransferError, UsageError
 from paramclient.protocol.ftp.blocks import Blocks
-from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
+from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.ftp.transfer_job import Job, Line
-from paramclient.protocol.requests.round_trip import LONGEST_SILENCE, MOST_TRIES
+from paramclient.protocol.requests.round_trip import ATTEMPTS_MAX, SILENCE_MAX
 
-__all__ = ["LARGEST_FILE", "FileRead"]
+__all__ = ["FILE_SIZE_MAX", "FileRead"]
 
-LARGEST_FILE: Final = 64 * 1024 * 1024
-"""Bytes that a file may have unless it is said otherwise: more than any log of a flight, less than memory."""
-BURST_ANSWERS: Final = 4096
-"""Numbers that the answers to one burst may take; ArduPilot ends one after 2000 (GCS_FTP.cpp)."""
-MOST_DOUBLINGS: Final = 1
-"""How often the time to wait for a burst doubles."""
-BURSTS_KEPT: Final = 4
-"""Bursts whose late answers are still taken."""
-FIRST_BLOCK: Final = 0.7
-FIRST_BLOCK_TRIPS: Final = 2.5
-"""Seconds, and round trips, by which the first block of a burst may come later than a short answer: on 1,200
-bytes a second it takes 0.22 s alone, and 0.67 s where the vehicle keeps to a third of that. After that a read
-is sent behind the burst: its answer, and no block before it, tells that the burst was lost."""
+FILE_SIZE_MAX: Final = 64 * 1024 * 1024
+"""Bytes of a file, by default: more than any flight log, less than memory."""
+BURST_RESPONSES_MAX: Final = 4096
+"""Sequence numbers of the responses to one burst; ArduPilot ends one after 2000 (GCS_FTP.cpp)."""
+BURST_DOUBLINGS_MAX: Final = 1
+"""Doublings of the timeout of a burst."""
+BURSTS_MAX: Final = 4
+"""Bursts whose late responses are still accepted."""
+FIRST_BLOCK_DELAY: Final = 0.7
+"""Seconds by which the first block of a burst may be later than a short response: at 1,200 bytes/s it takes
+0.22 s alone, and 0.67 s where the vehicle uses a third of that. After that a read is sent behind the burst:
+its response, without a block before it, shows that the burst was lost."""
+FIRST_BLOCK_ROUND_TRIPS: Final = 2.5
+"""The same in round trips."""
 BURST_SILENCE: Final = 0.5
-"""Seconds without a message of the server after which a burst of which nothing came is asked for again. At
-57600 baud its first block comes 0.1 s after the request, behind the banner (measured), and later behind
-telemetry. ArduPilot ends no burst for another one: repeated while it comes, the whole file is sent twice."""
-SLOWEST_GAP: Final = 2.0
-"""Seconds to wait for the second block of a burst, when nothing is known of its pace."""
-QUIET_BLOCKS: Final = 6
-SHORTEST_QUIET: Final = 0.05
-"""A burst in which nothing came for so many times the usual gap, and for so many seconds, is over, or what is
-left of it was lost."""
-HELD: Final = 4
+"""Seconds without a message of the server after which a burst without a block is repeated. At 57600 baud its
+first block comes 0.1 s after the request, behind the banner (measured), and later behind telemetry. ArduPilot
+ends no burst for another one: repeated meanwhile, the whole file is sent twice."""
+SECOND_BLOCK_TIMEOUT: Final = 2.0
+"""Seconds until the second block of a burst counts as late while the pace is unknown."""
+SILENT_GAPS: Final = 6
+"""Usual gaps of silence after which a burst is over, or its remaining blocks were lost."""
+BURST_END_SILENCE_MIN: Final = 0.05
+"""The same in seconds, at least."""
+READS_BEHIND_BURST_MAX: Final = 4
 """Reads that may wait in the vehicle for the end of its burst: ArduPilot queues 5."""
-SMALLEST_WINDOW: Final = 3
-LARGEST_WINDOW: Final = 64
-"""Reads in flight at once; in between it is what one round trip can hold."""
+WINDOW_MIN: Final = 3
+"""Reads in flight, at least; above that, as many as one round trip can hold."""
+WINDOW_MAX: Final = 64
+"""Reads in flight, at most."""
 SEND_BURST: Final = 3.0
-"""Reads that may go out at one time, so that they do not overflow ArduPilot's queue."""
-UNKNOWN_GAP: Final = 0.01
-"""Seconds from one block to the next before any was seen."""
-SHORTEST_GAP: Final = 1e-5
-"""Seconds from one block to the next that are reckoned with at the least. Two blocks taken in one turn can be
-nanoseconds apart, and a pace by them has deadlines that no clock can tell from now."""
-OVERTAKEN: Final = 2
-"""Later reads that must be answered for one to count as lost."""
+"""Reads that may be sent at once without an overflow of ArduPilot's queue."""
+BLOCK_GAP_DEFAULT: Final = 0.01
+"""Seconds between two blocks before any measurement."""
+BLOCK_GAP_MIN: Final = 1e-5
+"""Seconds between two blocks that calculations assume, at least. Two blocks processed together can be
+nanoseconds apart, and deadlines from such a pace are too close for any clock."""
+OVERTAKING_READS: Final = 2
+"""Answered later reads after which a read counts as lost."""
 COPY_RISK: Final = 0.01
-MOST_COPIES: Final = 6
-"""The chance of no answer to go below by asking again early, and how often that may be done."""
+"""The probability of no response below which early copies bring a read."""
+FILE_READ_COPIES_MAX: Final = 6
+"""Early copies of one read, at most."""
 TAIL_BLOCKS: Final = 4
+"""Missing blocks at the end of a file up to which single reads are better than a new burst."""
 TAIL_SHARE: Final = 0.15
-"""What may be left of a file, in blocks and as a share of an estimated size, for reads to be better than a
-new burst. ArduPilot's estimate for param.pck is a tenth too large."""
-MADE_AT_READING: Final = b"@"
-"""How the paths begin of what a server makes at reading, such as param.pck: their size is an estimate."""
+"""The same as a share of an estimated size. ArduPilot's estimate for param.pck is a tenth too large."""
+GENERATED_PREFIX: Final = b"@"
+"""The beginning of the paths of files that a server generates at reading, such as param.pck: their size is an
+estimate."""
 UNKNOWN_SIZE: Final = 1 << 32
 """Bytes that no file has: an offset has 32 bits."""
 BURST_DELAY: Final = 0.03
-"""Seconds by which the first block of a burst may come later than the answer to a read that was sent behind
+"""Seconds by which the first block of a burst may be later than the response to a read that was sent behind
 it: PX4 answers reads at once, and begins a burst up to 20 ms later (measured)."""
-LATE_KEPT: Final = 256
-"""Reads that count as lost and whose answers are taken all the same, should they still come."""
-MOST_RESTARTS: Final = 2
-"""How often a file is opened anew when nobody can tell whether it is open."""
-SMALLEST_SHARE: Final = 4
+LATE_READS_MAX: Final = 256
+"""Lost reads whose late responses are still accepted."""
+REOPENS_MAX: Final = 2
+"""Times that a file is opened again when it is unknown whether it is open."""
+PIECES_PER_BLOCK: Final = 4
+"""Pieces of a file for each block of its largest size: each piece takes memory, however short it is, and some
+servers send less than requested."""
 SPARE_PIECES: Final = 1_000
-"""A file may come in so many times as many pieces as its largest size has blocks, and some more: each piece
-takes memory, however short it is, and some servers give less than was asked for."""
+"""Further pieces of a file."""
 
 
 class _Flight(NamedTuple):
@@ -81,20 +86,20 @@ class _Flight(NamedTuple):
     sent_at: float
     ahead: int
     is_only: bool
-    """Whether it tells of the round trip: nothing of this offset was asked for before, and no burst runs."""
+    """Whether it measures the round trip: no earlier request for this offset, and no burst running."""
 
 
 class FileRead(Job[bytes]):
-    """The content of a file. See `FileTransfers.read`.
+    """One read of a file. See `FileTransfers.read`.
 
     Attributes:
-        size: bytes that the server says the file has; an estimate for what is made at reading, such as
-            ArduPilot's param.pck. None at first.
+        size: the file size in bytes by the server; an estimate for generated files, such as ArduPilot's
+            param.pck. None at first.
     """
 
     def __init__(self, line: Line, path: str, now: float, *, read_size: int, limit: int) -> None:
-        if not 1 <= read_size <= MOST_DATA:
-            raise UsageError(f"a file is read by 1 to {MOST_DATA} bytes, not {read_size}")
+        if not 1 <= read_size <= DATA_SIZE_MAX:
+            raise UsageError(f"a file is read by 1 to {DATA_SIZE_MAX} bytes, not {read_size}")
         super().__init__(line, path, now)
         self.size: int | None = None
         self._read_size = read_size
@@ -102,7 +107,7 @@ class FileRead(Job[bytes]):
         self._restarts = 0
         self._has_bursts = True
         self._start_anew()
-        self._gap = UNKNOWN_GAP
+        self._gap = BLOCK_GAP_DEFAULT
         self._came = 0
         self._lost = 0
         self._number = 0
@@ -110,60 +115,60 @@ class FileRead(Job[bytes]):
         self._tokens_at = -math.inf
 
     def _start_anew(self) -> None:
-        """Nothing has come, and nothing is asked for."""
+        """Reset all state: nothing is received, and nothing requested."""
         self._blocks = Blocks()
         self._bursts: list[int] = []
         self._burst_runs = False
-        self._read_behind_at = -math.inf  # when a read of where the burst begins was sent behind it last
+        self._read_behind_at = -math.inf  # when a read of the burst's first offset was sent behind it last
         self._burst_attempts = 0
         self._burst_session = 0
         self._has_early_burst = False
         self._may_burst = False
         self._burst_sent_at = math.inf
         self._opened_at = math.inf
-        self._block_at = math.inf  # the last block of the burst that runs
+        self._block_at = math.inf  # the last block of the running burst
         self._overtaken_at = math.inf  # the first read behind that burst was answered before any block of it
         self._first_block: tuple[float, int] | None = None
-        self._flights: dict[int, _Flight] = {}  # by the number of the request
+        self._flights: dict[int, _Flight] = {}  # by sequence number of the request
         self._late: dict[int, _Flight] = {}
-        self._unheard = 0  # blocks that came before the answer to the open
-        self._is_silent = False  # nothing came since what timed out last was sent
-        self._asked: dict[int, tuple[int, float]] = {}  # how often each offset was so in vain, and when last
+        self._unheard = 0  # blocks received before the response to the open
+        self._is_silent = False  # silence since the last timed-out request was sent
+        self._asked: dict[int, tuple[int, float]] = {}  # unanswered reads by offset: how often, and when last
 
     @property
     def received(self) -> int:
-        """Bytes that have come."""
+        """Bytes received."""
         return self._blocks.received
 
     @property
     def beginning(self) -> bytes:
-        """What stands at the beginning of the file, as much of it as has come in one piece; b"" before."""
+        """The beginning of the file, as far as it was received in one piece; b"" before."""
         return self._blocks.beginning
 
     def begin(self, now: float) -> None:
         self._start_anew()
         round_trip = self._line.round_trip
-        # where the round trip is not measured, what waits for an answer may wait for several timeouts
+        # before the round trip is measured, a response may take several timeouts
         is_worth_it = round_trip.smoothed is None or round_trip.seen_loss < COPY_RISK
-        # MAVSDK's server closes the file when a request with another number comes (measured)
+        # MAVSDK's server closes the file on a request with another number (measured)
         if is_worth_it and self._line.keeps_session:
             self._begin_early(now)
         else:
             self._open_file(Opcode.OPEN_FILE_RO, self._opened, now)
 
     def _begin_early(self, now: float) -> None:
-        """Ask for the burst together with the open: a server that keeps to our number of the session begins.
+        """Request the burst together with the open: a server that uses our session number begins at once.
 
-        What it sends counts when it has said so, which therefore is asked for twice.
+        Its blocks count once the response to the open is received, which therefore is requested twice.
         """
         self._open_file(Opcode.OPEN_FILE_RO, self._opened, now, copies=2)
         self._burst(now)
 
     def _shows_lost_open(self, packet: Packet) -> bool:
-        """Whether the server says to our burst that no file is open: the open before it did not arrive."""
+        """Return whether the server responds to our burst that no file is open: the open was lost."""
         if packet.opcode != Opcode.NAK or packet.requested != Opcode.BURST_READ_FILE:
             return False
-        is_open_awaited = self._has_request and self.blocked_until is None and self._restarts < MOST_RESTARTS
+        is_open_awaited = self._has_request and self.blocked_until is None and self._restarts < REOPENS_MAX
         return (
             is_open_awaited
             and self._is_of_a_burst(packet)
@@ -171,11 +176,12 @@ class FileRead(Job[bytes]):
         )
 
     def _is_unheard(self, packet: Packet) -> bool:
-        """Whether this shows that the answer to our open got lost: it comes of the burst behind it."""
+        """Return whether this shows that the response to our open was lost: it belongs to the burst behind
+        it."""
         if packet.session != self.asked_session or packet.requested != Opcode.BURST_READ_FILE:
             return False
         self._unheard += packet.opcode == Opcode.ACK and self._is_of_a_burst(packet)
-        return self._unheard == OVERTAKEN and self._restarts < MOST_RESTARTS
+        return self._unheard == OVERTAKING_READS and self._restarts < REOPENS_MAX
 
     def take(self, packet: Packet, now: float) -> None:
         super().take(packet, now)
@@ -185,7 +191,7 @@ class FileRead(Job[bytes]):
             self._restarts += 1
             self._begin_early(now)
         if self.session is None and self._is_unheard(packet):
-            # whether the file is ours nobody can tell any more: close it, and begin anew when the burst ends
+            # whether the file is ours is unknown: close it, and start again at the end of the burst
             self._restarts += 1
             self._line.close_session(packet.session)
             self._start_anew()
@@ -240,21 +246,21 @@ class FileRead(Job[bytes]):
         if len(packet.data) >= 4:
             self.size = int.from_bytes(packet.data[:4], "little")
         self._opened_at = now
-        # also where the open was repeated: on a slow link its answer may only be late
+        # also after a repeated open: on a slow link its response may only be late
         self._has_early_burst = self._burst_runs and packet.session == self._burst_session
         if not self._has_early_burst:
             self._burst_attempts = 0
             self._burst(now)
 
-    # The burst
+    # the burst
 
     def _burst(self, now: float) -> None:
-        """Let everything come from where we stand."""
+        """Request everything from the present offset as a burst."""
         if self._line.round_trip.is_hopeless(self._burst_attempts, now):
             self.fail(self._no_reply(self._burst_attempts, now), now)
             return
-        sequence = self._line.next_sequence(answers=BURST_ANSWERS)
-        self._bursts = [*self._bursts[1 - BURSTS_KEPT :], sequence]
+        sequence = self._line.next_sequence(answers=BURST_RESPONSES_MAX)
+        self._bursts = [*self._bursts[1 - BURSTS_MAX :], sequence]
         self._burst_runs = True
         self._read_behind_at = -math.inf
         self._has_early_burst = False
@@ -279,14 +285,14 @@ class FileRead(Job[bytes]):
                 self._read_behind(now)
 
     def _is_of_a_burst(self, packet: Packet) -> bool:
-        return any(0 < (packet.sequence - first) & 0xFFFF <= BURST_ANSWERS for first in self._bursts)
+        return any(0 < (packet.sequence - first) & 0xFFFF <= BURST_RESPONSES_MAX for first in self._bursts)
 
     def _take_burst(self, packet: Packet, now: float) -> None:
         if self._block_at == math.inf and self._burst_runs:
             first_answer = (self._bursts[-1] + 1) & 0xFFFF
             if packet.sequence == first_answer and self._burst_attempts == 1:
                 self._line.round_trip.answered(self._burst_sent_at, now, 1)
-        is_latest = 0 < (packet.sequence - self._bursts[-1]) & 0xFFFF <= BURST_ANSWERS
+        is_latest = 0 < (packet.sequence - self._bursts[-1]) & 0xFFFF <= BURST_RESPONSES_MAX
         if packet.opcode == Opcode.NAK:
             self._end_of_burst(packet, is_latest, now)
             return
@@ -298,13 +304,13 @@ class FileRead(Job[bytes]):
         if self._keep(packet, packet.offset, now):
             self._burst_attempts = 0
         if not packet.burst_complete:
-            self._burst_runs = True  # also when it was taken for over
+            self._burst_runs = True  # also after it was taken to be over
         elif is_latest:
             self._may_burst = True
             self._stop_burst(now)
 
     def _measure(self, packet: Packet, now: float) -> None:
-        """How long one block takes."""
+        """Measure the time between two blocks."""
         self._block_at = now
         if self._first_block is None:
             self._first_block = (now, packet.offset)
@@ -312,19 +318,19 @@ class FileRead(Job[bytes]):
         began_at, offset = self._first_block
         blocks = (packet.offset - offset) / self._read_size
         if blocks > 0 and now > began_at:
-            self._gap = max((now - began_at) / blocks, SHORTEST_GAP)
+            self._gap = max((now - began_at) / blocks, BLOCK_GAP_MIN)
 
     def _end_of_burst(self, packet: Packet, is_latest: bool, now: float) -> None:
         code = self._code(packet)
         if code == FileErrorCode.EOF:
-            if packet.offset >= self._blocks.reached:  # else the server does not say where, and a read will
+            if packet.offset >= self._blocks.reached:  # otherwise the end is unknown, and a read shows it
                 self._ends_at(packet.offset)
         elif not is_latest:
             return
         elif code == FileErrorCode.UNKNOWN_COMMAND:
             self._has_bursts = False
         elif self._has_early_burst and self._blocks.reached == 0:
-            self._burst(now)  # the first one came there before the open
+            self._burst(now)  # the first one arrived before the open
             return
         else:
             self._does_not_read(packet, now)
@@ -332,7 +338,7 @@ class FileRead(Job[bytes]):
             self._stop_burst(now)
 
     def _stop_burst(self, now: float) -> None:
-        """It is over: what was asked for meanwhile is answered only now."""
+        """End the burst: reads sent meanwhile are answered only now."""
         self._burst_runs = False
         for sequence, flight in self._flights.items():
             self._flights[sequence] = flight._replace(sent_at=now, is_only=False)
@@ -340,30 +346,30 @@ class FileRead(Job[bytes]):
     def _quiet_at(self) -> float:
         if self._block_at == math.inf:
             return min(self._next_read_behind_at, self._repeats_at, self._overtaken_at + BURST_DELAY)
-        if self._gap == UNKNOWN_GAP:
-            return self._block_at + SLOWEST_GAP
-        return self._block_at + max(QUIET_BLOCKS * self._gap, SHORTEST_QUIET)
+        if self._gap == BLOCK_GAP_DEFAULT:
+            return self._block_at + SECOND_BLOCK_TIMEOUT
+        return self._block_at + max(SILENT_GAPS * self._gap, BURST_END_SILENCE_MIN)
 
     @property
     def _begins_by(self) -> float:
         """When the first block of the burst is late."""
         round_trip = self._line.round_trip
-        longer = min(FIRST_BLOCK, FIRST_BLOCK_TRIPS * (round_trip.smoothed or FIRST_BLOCK))
+        longer = min(FIRST_BLOCK_DELAY, FIRST_BLOCK_ROUND_TRIPS * (round_trip.smoothed or FIRST_BLOCK_DELAY))
         if self._has_early_burst:
             return self._opened_at + longer
-        backoff = 2.0 ** min(max(self._burst_attempts - 2, 0), MOST_DOUBLINGS)
+        backoff = 2.0 ** min(max(self._burst_attempts - 2, 0), BURST_DOUBLINGS_MAX)
         return self._burst_sent_at + (round_trip.timeout + longer) * backoff
 
     @property
     def _repeats_at(self) -> float:
-        """When a burst of which nothing has come is asked for again."""
-        heard_at = min(self._line.heard_at, self._burst_sent_at + LONGEST_SILENCE)
+        """When a burst without a block is requested again."""
+        heard_at = min(self._line.heard_at, self._burst_sent_at + SILENCE_MAX)
         return max(self._begins_by, max(self._burst_sent_at, heard_at) + BURST_SILENCE)
 
     @property
     def _next_read_behind_at(self) -> float:
-        """When a read is sent behind a burst of which nothing has come; infinity where enough were sent."""
-        if len(self._flights) >= HELD:
+        """When a read is sent behind a burst without a block; infinity after enough of them."""
+        if len(self._flights) >= READS_BEHIND_BURST_MAX:
             return math.inf
         if self._read_behind_at == -math.inf:
             return self._begins_by
@@ -383,15 +389,16 @@ class FileRead(Job[bytes]):
             self._read_behind(now)
 
     def _read_behind(self, now: float) -> None:
-        """Send a read behind the burst: its answer, and no block before it, tells that the burst was lost."""
+        """Send a read behind the burst: its response, without a block before it, shows that the burst was
+        lost."""
         self._read_behind_at = now
         self._read(self._blocks.reached, now)
 
-    # Single reads
+    # single reads
 
     def _take_read(self, packet: Packet, flight: _Flight, now: float) -> None:
         for sequence, other in list(self._flights.items()):
-            if other.number <= flight.number - OVERTAKEN:
+            if other.number <= flight.number - OVERTAKING_READS:
                 self._give_up(sequence)
                 self._line.round_trip.timed_out(1)
         self._line.round_trip.answered(flight.sent_at, now, 1 if flight.is_only else 2)
@@ -410,22 +417,22 @@ class FileRead(Job[bytes]):
     def _give_up(self, sequence: int) -> None:
         """Count a read as lost."""
         self._late[sequence] = self._flights.pop(sequence)._replace(is_only=False)
-        if len(self._late) > LATE_KEPT:
+        if len(self._late) > LATE_READS_MAX:
             del self._late[next(iter(self._late))]
 
     def _in_vain(self, flight: _Flight, now: float) -> None:
-        """A read stayed without an answer; those of one offset that went out meanwhile count as one."""
+        """Record an unanswered read; those of one offset that were sent meanwhile count as one."""
         attempts, counted_at = self._asked.get(flight.offset, (0, -math.inf))
         if not self._is_wanted(flight.offset) or flight.sent_at < counted_at:
             return
         attempts += 1
         self._asked[flight.offset] = attempts, now
         is_silence = self._line.heard_at < flight.sent_at
-        if not (is_silence and self._is_silent):  # of a silence that all share one tells enough
+        if not (is_silence and self._is_silent):  # a silence that all reads share counts once
             self._line.round_trip.timed_out(attempts)
         self._is_silent = is_silence
-        # a server that answers other requests meanwhile is there, and the link is worse than it looks
-        if attempts >= MOST_TRIES or (is_silence and self._line.round_trip.is_hopeless(attempts, now)):
+        # a server that answers other requests meanwhile is there, and the loss is higher than measured
+        if attempts >= ATTEMPTS_MAX or (is_silence and self._line.round_trip.is_hopeless(attempts, now)):
             self.fail(self._no_reply(attempts, now), now)
 
     def _flight_deadline(self, flight: _Flight) -> float:
@@ -441,15 +448,15 @@ class FileRead(Job[bytes]):
     @property
     def _window(self) -> int:
         if self._burst_runs:
-            return HELD
+            return READS_BEHIND_BURST_MAX
         if self._is_silent:
-            return SMALLEST_WINDOW
+            return WINDOW_MIN
         round_trip = self._line.round_trip.smoothed or self._line.round_trip.timeout
-        return min(max(math.ceil(round_trip / self._gap) + 2, SMALLEST_WINDOW), LARGEST_WINDOW)
+        return min(max(math.ceil(round_trip / self._gap) + 2, WINDOW_MIN), WINDOW_MAX)
 
     @property
     def _interval(self) -> float:
-        """Seconds from one request to the next: the burst takes a third of the link, reads may take more."""
+        """Seconds between two requests: the burst uses a third of the link, reads may use more."""
         return self._gap / 2
 
     @property
@@ -458,11 +465,11 @@ class FileRead(Job[bytes]):
         return self._tokens_at + max(1.0 - self._tokens, 0.0) * self._interval
 
     def _wanted(self) -> Iterator[int]:
-        """What to read singly, the most useful first."""
+        """Yield the offsets of useful single reads, the most useful first."""
         yield from self._blocks.missing(self._read_size)
         if self._blocks.end is None and not self._burst_runs:
             reached = self._blocks.reached
-            ahead = TAIL_BLOCKS if self._has_bursts else LARGEST_WINDOW
+            ahead = TAIL_BLOCKS if self._has_bursts else WINDOW_MAX
             if self.size is not None:
                 left = (self.size - reached) // self._read_size
                 ahead = 1 if self._has_bursts and self._is_worth_a_burst() else max(min(ahead, left + 1), 1)
@@ -471,12 +478,12 @@ class FileRead(Job[bytes]):
 
     @property
     def _exact_size(self) -> int:
-        """Bytes of the file; `UNKNOWN_SIZE` where the server estimates them, or says 0 of what it makes."""
-        is_estimate = self._path_data.startswith(MADE_AT_READING)
+        """Bytes of the file; `UNKNOWN_SIZE` for an estimate, or for the 0 of a generated file."""
+        is_estimate = self._path_data.startswith(GENERATED_PREFIX)
         return UNKNOWN_SIZE if is_estimate or not self.size else self.size
 
     def _next_wanted(self) -> int | None:
-        """What to read now: what is not asked for yet, else once more what is, if that is worth it."""
+        """Return the next offset: an unrequested one, otherwise a copy, if that is worthwhile."""
         if len(self._flights) >= self._window:
             return None
         copies: dict[int, int] = {}
@@ -498,7 +505,7 @@ class FileRead(Job[bytes]):
         loss = max(self._line.round_trip.seen_loss, 1.0 - passed * passed)
         if loss < COPY_RISK:
             return 0
-        return min(math.ceil(math.log(COPY_RISK) / math.log(loss)) - 1, MOST_COPIES)
+        return min(math.ceil(math.log(COPY_RISK) / math.log(loss)) - 1, FILE_READ_COPIES_MAX)
 
     def _read(self, offset: int, now: float) -> None:
         sequence = self._line.next_sequence()
@@ -506,25 +513,25 @@ class FileRead(Job[bytes]):
         self._number += 1
         self._flights[sequence] = _Flight(offset, self._number, now, len(self._flights), is_only)
         self._tokens -= 1.0
-        # MAVSDK's server refuses to read beyond the end; a file that grows has more by now
+        # MAVSDK's server refuses to read beyond the end; a growing file is longer by now
         left = self._exact_size - offset
         size = min(self._read_size, left) if left > 0 else self._read_size
         self._line.send(Packet(sequence, self.session or 0, Opcode.READ_FILE, size=size, offset=offset))
 
-    # Both
+    # both
 
     def _keep(self, packet: Packet, offset: int, now: float) -> bool:
-        """Take what has come; whether anything in it is new."""
+        """Store received data and return whether it has new bytes."""
         if offset + len(packet.data) > self._limit:
             self._is_no_file(f"is longer than {self._limit} bytes", now)
             return False
-        if self._blocks.pieces > SMALLEST_SHARE * self._limit // self._read_size + SPARE_PIECES:
+        if self._blocks.pieces > PIECES_PER_BLOCK * self._limit // self._read_size + SPARE_PIECES:
             self._is_no_file("comes in too many pieces", now)
             return False
         return self._blocks.take(offset, packet.data)
 
     def _is_no_file(self, why: str, now: float) -> None:
-        """What comes is more than a file can be."""
+        """End with an error: the received data exceeds any file."""
         system, component = self._line.target
         self.fail(
             FileTransferError(
@@ -538,7 +545,7 @@ class FileRead(Job[bytes]):
         )
 
     def _does_not_read(self, packet: Packet, now: float) -> None:
-        """The server refuses; where the session is lost, as when another station resets all, begin anew."""
+        """Process a refusal; start again if the session is lost, as when another station resets all."""
         if self._may_reopen(packet):
             self._start_anew()
             self._open_file(Opcode.OPEN_FILE_RO, self._opened, now)
@@ -549,7 +556,7 @@ class FileRead(Job[bytes]):
         self._blocks.ends_at(min(offset, self._limit))
 
     def _go_on(self, now: float) -> None:
-        """Ask for what is wanted, as far as the pace allows; end when all is there."""
+        """Request what is missing, as far as the pace allows; end when all is received."""
         if self.is_ended or self.session is None:
             return
         if self._blocks.end is None and not self._burst_runs and self._blocks.reached >= self._exact_size:
@@ -565,12 +572,12 @@ class FileRead(Job[bytes]):
             self._tokens = min(self._tokens + elapsed / self._interval, SEND_BURST)
             self._tokens_at = now
         if is_due:
-            self._tokens = max(self._tokens, 1.0)  # else rounding could make it due again and again
+            self._tokens = max(self._tokens, 1.0)  # otherwise rounding could make it due again and again
         while self._tokens >= 1.0 and (offset := self._next_wanted()) is not None:
             self._read(offset, now)
 
     def _is_worth_a_burst(self) -> bool:
-        """Whether so much is left behind what has come that reads would take longer."""
+        """Return whether single reads of the missing end would take longer than a burst."""
         if self._blocks.end is not None or self.size is None:
             return False
         left = self.size - self._blocks.reached

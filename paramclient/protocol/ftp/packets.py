@@ -1,4 +1,4 @@
-"""What stands in the payload of FILE_TRANSFER_PROTOCOL (MAVLink guide, "File Transfer Protocol (FTP)")."""
+"""The payload of FILE_TRANSFER_PROTOCOL (MAVLink guide, "File Transfer Protocol (FTP)")."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Final, NamedTuple
 
 __all__ = ["Opcode", "Packet"]
 
-MOST_DATA: Final = 239
-"""Bytes of a file that one message can carry."""
+DATA_SIZE_MAX: Final = 239
+"""Bytes of a file in one message, at most."""
 
 
 class Opcode(IntEnum):
@@ -29,17 +29,17 @@ class Opcode(IntEnum):
 
 
 class Packet(NamedTuple):
-    """A request, or the answer to one.
+    """A request or its response.
 
     Attributes:
-        sequence: of a request, any number that rises; of its answer, one more; of a burst, rising from there.
-        session: which open file it is about.
-        opcode: what to do; ACK or NAK in an answer.
+        sequence: of a request, any rising number; of its response, one more; of a burst, rising from there.
+        session: the open file.
+        opcode: the operation; ACK or NAK in a response.
         data: up to 239 bytes.
-        size: of a read, the bytes wanted; else the length of `data`.
-        offset: in the file; of a list, the entries to pass over.
-        requested: in an answer, the opcode of the request.
-        burst_complete: whether no more comes of this burst.
+        size: of a read, the requested bytes; otherwise the length of `data`.
+        offset: in the file; of a list, the entries to skip.
+        requested: in a response, the opcode of the request.
+        burst_complete: whether this is the last message of the burst.
     """
 
     sequence: int
@@ -53,13 +53,13 @@ class Packet(NamedTuple):
 
     @classmethod
     def unpack(cls, payload: bytes) -> Packet:
-        """From the 251 bytes of a message; `data` is what `size` says, at most what there is."""
+        """Decode the 251 bytes of a message; `data` has `size` bytes, or as many as there are."""
         sequence, session, opcode, size, requested, complete, offset = _HEADER.unpack_from(payload)
         data = payload[_HEADER.size : _HEADER.size + size]
         return cls(sequence, session, opcode, data, size, offset, requested, bool(complete))
 
     def pack(self) -> bytes:
-        """To the payload of a message; the message pads it."""
+        """Encode as the payload of a message; the message pads it."""
         head = _HEADER.pack(
             self.sequence & 0xFFFF,
             self.session,

@@ -1,10 +1,10 @@
-"""param.pck to parameters and back: the whole table as one file, with its types and defaults.
+"""The packed parameter file (param.pck): the whole table as one file, with types and defaults.
 
 The file (ArduPilot, AP_Filesystem/README.md; MAVLink guide, "Parameters over MAVLink FTP"; newest PX4 serves
-the same) has a header of three 16-bit numbers: a magic, the entries that follow, and the parameters that the
-vehicle has; in a file to be written to it, the last is the length of the file. An entry is: zero bytes as
-padding; the type, with a flag that a default follows; how many characters the name shares with the one
-before; the others; the value in its own size; the default likewise. Integers are exact, also those
+the same) has a header of three 16-bit numbers: a magic, the number of entries in the file, and the number of
+parameters of the vehicle; in a file for writing, the last is the length of the file. An entry has: zero bytes
+as padding; the type, with a flag for a default; the number of characters that the name shares with the one
+before; the other characters; the value in its own size; the default likewise. Integers are exact, also those
 that a PARAM_VALUE of ArduPilot would round.
 """
 
@@ -20,14 +20,14 @@ from paramclient.model.values import NAME_LENGTH, ParamType, check_name
 
 __all__ = ["Pack", "PackedParam", "decode", "decode_prefix", "decode_upload", "encode", "encode_upload"]
 
-FULL_READ: Final = 239
-"""Bytes that one message of MAVFTP carries at the most, and that a file is usually read by."""
-LARGEST_FILE: Final = 6 + 65535 * (2 + NAME_LENGTH + 2 * 4 + 7)
-"""Bytes of the largest file there can be: as many entries as the header can count, each with the longest
-name, a default, and the most padding that is ever useful. What is longer is not looked at."""
+READ_SIZE_DEFAULT: Final = 239
+"""Bytes in one message of MAVFTP, at most, and the usual size of reads of the file."""
+PACK_SIZE_MAX: Final = 6 + 65535 * (2 + NAME_LENGTH + 2 * 4 + 7)
+"""Bytes of the largest possible file: as many entries as the header can count, each with the longest name, a
+default, and the most padding that is useful. Longer files are rejected."""
 
 PACKABLE: Final = frozenset({ParamType.INT8, ParamType.INT16, ParamType.INT32, ParamType.REAL32})
-"""The types that a file can hold."""
+"""The parameter types that a file can contain."""
 
 _MAGIC = 0x671B
 _MAGIC_WITH_DEFAULTS = 0x671C
@@ -45,8 +45,8 @@ class PackedParam(NamedTuple):
         name: param_id.
         type: INT8, INT16, INT32 or REAL32; the file has no others.
         bits: the value, as in `Param.bits`.
-        default: the firmware's default in the same form; None where the file does not say, and in one
-            with defaults where the value is the default. ArduPilot compares the two as float32.
+        default: the firmware's default, likewise; None where the file has none, and in a file with defaults
+            where the value is the default. ArduPilot compares the two as float32.
     """
 
     name: str
@@ -56,11 +56,11 @@ class PackedParam(NamedTuple):
 
 
 class Pack(NamedTuple):
-    """What a file says.
+    """The content of a file.
 
     Attributes:
         entries: in the order of the file, which is that of the parameters' indices.
-        total: how many parameters the vehicle has: more than there are entries in a part of the table.
+        total: the number of parameters of the vehicle: more than entries in a part of the table.
         with_defaults: whether an entry without a default has its default value.
     """
 
@@ -70,11 +70,11 @@ class Pack(NamedTuple):
 
 
 def decode(data: bytes) -> Pack:
-    """Read a file that came from a vehicle.
+    """Decode a file from a vehicle.
 
     Raises:
-        PackError: it is not one: its magic, a type, a flag or a name cannot be, a name comes twice, it is cut
-            off, it has more or less than the header says, or is longer than any can be.
+        PackError: the file is invalid: magic, type, flag or name, a name that occurs twice, a truncated file,
+            another number of entries than in the header, or more bytes than possible.
     """
     magic, number, total = _header(data)
     _check_header(magic, number, total)
@@ -83,13 +83,13 @@ def decode(data: bytes) -> Pack:
 
 
 def decode_prefix(data: bytes) -> tuple[Pack, int]:
-    """Read the beginning of a file that came from a vehicle: the entries of which every byte is there.
+    """Decode the complete entries at the beginning of a file from a vehicle.
 
-    No entry depends on those behind it, so each of these holds, whatever is missing. With them comes the
-    number of entries that the whole file has by its header.
+    No entry depends on later ones, so each of these is valid, whatever is missing. Also returns the number of
+    entries in the whole file by its header.
 
     Raises:
-        PackError: as in `decode`, but for a file that is cut off behind its header.
+        PackError: as in `decode`, except for a file that is truncated behind its header.
     """
     magic, number, total = _header(data)
     _check_header(magic, number, total)
@@ -98,7 +98,7 @@ def decode_prefix(data: bytes) -> tuple[Pack, int]:
 
 
 def total_of(beginning: bytes) -> int | None:
-    """How many parameters the vehicle has, by the beginning of its file; None where that does not say."""
+    """Return the vehicle's number of parameters by the beginning of its file; None if that is too short."""
     if len(beginning) < _HEADER.size:
         return None
     magic, _, total = _header(beginning)
@@ -106,10 +106,10 @@ def total_of(beginning: bytes) -> int | None:
 
 
 def decode_upload(data: bytes) -> tuple[PackedParam, ...]:
-    """Read a file in the form that is written to a vehicle.
+    """Decode a file of the format that is written to a vehicle.
 
     Raises:
-        PackError: as in `decode`; and its length is not the one that it gives, or it has defaults.
+        PackError: as in `decode`; and its length differs from the header's, or it has defaults.
     """
     magic, number, length = _header(data)
     if magic != _MAGIC:
@@ -124,24 +124,24 @@ def encode(
     *,
     total: int | None = None,
     with_defaults: bool = False,
-    read_size: int = FULL_READ,
+    read_size: int = READ_SIZE_DEFAULT,
 ) -> bytes:
-    """Make the file that ArduPilot gives to those who read it by `read_size` bytes.
+    """Encode the file that ArduPilot serves to a client that reads `read_size` bytes at a time.
 
-    Padding keeps a value from lying in two reads, so that one that is done again later cannot give half of
-    it. ArduPilot sees to the last bytes of an entry alone: where a default follows, to that.
+    Padding keeps a value from being split between two reads, so that a repeated read cannot replace half of
+    it. ArduPilot aligns only the last bytes of an entry: a default, where there is one.
 
     Args:
         entries: in the order of their indices.
-        total: the parameters that the vehicle has; None: these are all.
-        with_defaults: give the defaults of those entries that have one; otherwise they are left out.
+        total: the number of parameters of the vehicle; None: these are all.
+        with_defaults: include the defaults of entries that have one; otherwise they are left out.
         read_size: 1 to 239.
 
     Raises:
-        UsageError: a name, type or value cannot be in such a file, or a name comes twice.
+        UsageError: a name, type or value does not fit such a file, or a name occurs twice.
     """
-    if not 1 <= read_size <= FULL_READ:
-        raise UsageError(f"a file is read by 1 to {FULL_READ} bytes, not {read_size}")
+    if not 1 <= read_size <= READ_SIZE_DEFAULT:
+        raise UsageError(f"a file is read by 1 to {READ_SIZE_DEFAULT} bytes, not {read_size}")
     rows = list(entries)
     total = len(rows) if total is None else total
     if not len(rows) <= total <= 0xFFFF:
@@ -153,10 +153,10 @@ def encode(
 
 
 def encode_upload(entries: Iterable[PackedParam]) -> bytes:
-    """Make the file that is written to a vehicle to set parameters; it has no padding and no defaults.
+    """Encode the file that is written to a vehicle to set parameters; it has no padding and no defaults.
 
     Raises:
-        UsageError: as in `encode`; or it would be longer than 65535 bytes, which its header cannot say.
+        UsageError: as in `encode`; or it would be longer than 65535 bytes, the limit of its header.
     """
     rows = list(entries)
     out = bytearray(_HEADER.size)
@@ -168,8 +168,8 @@ def encode_upload(entries: Iterable[PackedParam]) -> bytes:
 
 
 def _header(data: bytes) -> tuple[int, int, int]:
-    if len(data) > LARGEST_FILE:
-        raise PackError(f"no packed parameter file has {len(data)} bytes", offset=LARGEST_FILE)
+    if len(data) > PACK_SIZE_MAX:
+        raise PackError(f"no packed parameter file has {len(data)} bytes", offset=PACK_SIZE_MAX)
     if len(data) < _HEADER.size:
         raise PackError("the file is cut off in its header", offset=len(data))
     magic, number, last = _HEADER.unpack_from(data)
@@ -186,7 +186,7 @@ def _check_header(magic: int, number: int, total: int) -> None:
 def _entries(
     data: bytes, number: int, with_defaults: bool, *, may_end: bool = False
 ) -> tuple[PackedParam, ...]:
-    """All entries behind the header: so many, and nothing else; fewer where the file may end before."""
+    """Decode all entries behind the header: exactly that many; fewer where the file may be truncated."""
     found: dict[str, PackedParam] = {}
     name = b""
     at = _HEADER.size
@@ -257,6 +257,6 @@ def _append(out: bytearray, rows: list[PackedParam], with_defaults: bool, read_s
 
 
 def _shared(last: str, name: str) -> int:
-    """How many characters to take over; one of the name's own is left, as the file cannot say none."""
+    """Return how many characters to share; one of the name's own remains, as the file cannot encode none."""
     most = min(len(last), len(name) - 1)
     return next((at for at in range(most) if last[at] != name[at]), most)

@@ -1,4 +1,4 @@
-"""Files that other stations read over MAVFTP, put together from their requests and the server's replies."""
+"""Files that other stations read over MAVFTP, assembled from their requests and the server's responses."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from paramclient.protocol.ftp.transfer_job import SESSION_LOST
 __all__ = ["ObservedRead", "ObservedReads", "path_of"]
 
 IDLE_TIMEOUT: Final = 10.0
-"""Seconds without a reply after which a read is over: PX4 frees a session after 10, ArduPilot after 3."""
+"""Seconds without a response after which a read ends: PX4 frees a session after 10 s, ArduPilot after 3 s."""
 OPENINGS_MAX: Final = 64
-"""Open requests that may wait for their reply. Beyond that the oldest one is forgotten."""
+"""Open requests that wait for their response. Above it, the oldest is dropped."""
 READS_MAX: Final = 4
-"""Reads of one server that are followed at the same time; servers have one session, or a few."""
+"""Parallel reads of one server; servers have one session, or a few."""
 OFFSETS_MAX: Final = 512
-"""Single read requests whose offsets are kept; clients have up to 64 in flight."""
+"""Single read requests with a remembered offset; clients have up to 64 in flight."""
 PIECES_MAX: Final = 65_536
-"""Pieces in which a file may come: each takes memory, however short it is."""
+"""Pieces of a file: each takes memory, however short it is."""
 
 _OPEN_FILE_WO: Final = 11
 _OPENINGS: Final = frozenset({Opcode.OPEN_FILE_RO, Opcode.CREATE_FILE, _OPEN_FILE_WO})
@@ -39,10 +39,10 @@ class ObservedRead:
         station: system and component of the station.
         path: of the file, with its query.
         session: number of the session.
-        opened_by: sequence number of the reply that has opened it.
-        began_at: when the reply to the open request was heard, in seconds.
-        heard_at: when the last reply was heard.
-        blocks: what has come of the file.
+        opened_by: sequence number of the response that has opened it.
+        began_at: when that response was received, in seconds.
+        heard_at: when the last response was received.
+        blocks: the received pieces of the file.
     """
 
     def __init__(self, station: Address, path: str, session: int, opened_by: int, now: float) -> None:
@@ -63,14 +63,14 @@ class ObservedRead:
 class ObservedReads:
     """The reads of files of one component by other stations, each from its open request to its end.
 
-    Requests and replies are matched by station and session, so sessions may be interleaved. Replies that
-    came twice count once. A read ends when the whole file has come, when its session is closed, taken for
-    another file or lost on board, and after `IDLE_TIMEOUT` without a reply.
+    Requests and responses are matched by station and session, so sessions may be interleaved. Duplicate
+    responses count once. A read ends when the whole file was received, when its session is closed, reused or
+    lost on board, and after `IDLE_TIMEOUT` without a response.
 
     Args:
-        is_wanted: whether the file of this path is to be put together.
+        is_wanted: whether the file of this path is to be assembled.
         size_max: bytes above which a file is given up.
-        ended: is called with each read that has ended and the time, also where nothing has come of it.
+        ended: called with each ended read and the time, also where nothing was received.
     """
 
     def __init__(
@@ -88,15 +88,15 @@ class ObservedReads:
 
     @property
     def running(self) -> Collection[ObservedRead]:
-        """The reads that have begun and not ended."""
+        """The reads in progress."""
         return self._reads.values()
 
     def request_heard(self, packet: Packet, station: Address, now: float) -> None:
-        """Take a request that a station has sent to the server."""
+        """Process a request of a station to the server."""
         sequence = (packet.sequence + 1) & 0xFFFF
         if packet.opcode in _OPENINGS:
             self._openings.pop((station, sequence), None)
-            is_read = packet.opcode == Opcode.OPEN_FILE_RO  # else no reply of data follows
+            is_read = packet.opcode == Opcode.OPEN_FILE_RO  # no data follows otherwise
             self._openings[station, sequence] = path_of(packet) if is_read else None
             if len(self._openings) > OPENINGS_MAX:
                 del self._openings[next(iter(self._openings))]
@@ -113,7 +113,7 @@ class ObservedReads:
                     del read.offsets[next(iter(read.offsets))]
 
     def reply_heard(self, packet: Packet, addressee: Address, now: float) -> None:
-        """Take a reply of the server to a station; an id of 0 in the address stands for any."""
+        """Process a response of the server to a station; an id of 0 in the address means any."""
         if packet.opcode not in (Opcode.ACK, Opcode.NAK):
             return
         self.tick(now)
@@ -126,23 +126,23 @@ class ObservedReads:
                     self._take(key, read, packet, now)
 
     def tick(self, now: float) -> None:
-        """End the reads of which nothing has come for `IDLE_TIMEOUT` seconds."""
+        """End the reads without a response for `IDLE_TIMEOUT` seconds."""
         for key, read in list(self._reads.items()):
             if read.heard_at + IDLE_TIMEOUT <= now:
                 self._close(key, now)
 
     def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity."""
+        """Return when `tick` is due, or infinity."""
         return min((read.heard_at + IDLE_TIMEOUT for read in self._reads.values()), default=math.inf)
 
     def close_all(self, now: float) -> None:
-        """End every read: nothing more comes of them."""
+        """End every read: nothing more is received."""
         for key in list(self._reads):
             self._close(key, now)
         self._openings.clear()
 
     def forget(self) -> None:
-        """Drop every read, and tell nobody: the server is another one now."""
+        """Drop every read without calling `ended`: the server is another one now."""
         self._reads.clear()
         self._openings.clear()
 
@@ -154,7 +154,7 @@ class ObservedReads:
         key = (station, packet.session)
         read = self._reads.get(key)
         if read is not None and read.opened_by == packet.sequence:
-            return  # the reply to a repeated request
+            return  # the response to a repeated request
         self._close(key, now)
         path = self._openings[station, packet.sequence]
         if path is None or not self._is_wanted(path):
@@ -175,7 +175,7 @@ class ObservedReads:
             blocks.take(offset, packet.data)
         elif packet.opcode == Opcode.ACK or packet.data[:1] == bytes([FileErrorCode.EOF]):
             if (is_known or offset >= blocks.reached) and offset <= self._size_max:
-                blocks.ends_at(offset)  # else the server does not say where
+                blocks.ends_at(offset)  # otherwise the end is unknown
         elif packet.data[:1] and packet.data[0] in SESSION_LOST:
             self._close(key, now)
             return
@@ -189,7 +189,7 @@ class ObservedReads:
 
 
 def path_of(packet: Packet) -> str:
-    """The file that an open request names."""
+    """Return the path in an open request."""
     return packet.data.partition(b"\0")[0].decode("latin-1")
 
 

@@ -1,4 +1,4 @@
-"""One piece of work with the files of a component: requests one at a time, each until it is answered."""
+"""The base of all file transfers: one request at a time, retries, sessions, errors."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from collections.abc import Callable
 from typing import Final, TypeVar
 
 from paramclient.errors import FileErrorCode, FileTransferError, NoReply, UsageError
-from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
+from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.operation import Operation
-from paramclient.protocol.requests.round_trip import LONGEST_SILENCE
+from paramclient.protocol.requests.round_trip import SILENCE_MAX
 from paramclient.protocol.wire import FileTransfer
 
 __all__ = ["BUSY", "SESSION_LOST", "Job", "Line", "path_bytes"]
@@ -19,60 +19,60 @@ __all__ = ["BUSY", "SESSION_LOST", "Job", "Line", "path_bytes"]
 Result = TypeVar("Result")
 
 COPY_RISK: Final = 0.01
-"""The share of requests without an answer from which on each is sent twice: servers give the same answer to
-the same request, so that costs its few bytes."""
-QUIET_TIME: Final = 3.2
-"""Seconds for which nothing is sent to a server whose session is in use: ArduPilot ends a session 3 s after
-its last reply to anybody, and the refusal of an open is such a reply (measured)."""
-BUSY_PATIENCE: Final = 30.0
-"""Seconds for which the session of another station is waited for. Its transfer keeps the session alive."""
-MOST_FAILURES: Final = 8
-"""How often an open may fail without a reason. ArduPilot says no more when the session is open already, as
-after an open whose answer was lost; it is then closed and opened again at once."""
-FAILURES_IN_LOSS: Final = 16
-"""The same where requests are lost: a closing that is lost, or that an open has overtaken, leaves the session
+"""The share of unanswered requests above which each is sent twice: servers send the same response to the same
+request, so the copy costs only its few bytes."""
+SESSION_IDLE_TIME: Final = 3.2
+"""Seconds without a request to a server whose session is in use: ArduPilot ends a session 3 s after its last
+response to any station, and the refusal of an open is such a response (measured)."""
+BUSY_TIMEOUT: Final = 30.0
+"""Seconds of waiting for the end of another station's session. Its transfer keeps the session open."""
+OPEN_FAILURES_MAX: Final = 8
+"""Failures of an open without a reason. ArduPilot says no more when the session is open already, as after an
+open whose response was lost; it is then closed and opened again at once."""
+OPEN_FAILURES_LOSSY_MAX: Final = 16
+"""The same with packet loss: a lost close request, or one that arrives after the open, leaves the session
 open."""
 CLOSE_ATTEMPTS: Final = 4
-"""Times that the closing of a session is asked for, or the answer to its open. A server that keeps silent for
-so long ends the session by its own timeout: ArduPilot after 3 s, PX4 after 10 s."""
-MOST_CLOSE_COPIES: Final = 4
-"""Requests to close that go out at once on a lossy link: each has 12 bytes of payload."""
-UNHEARD_ATTEMPTS: Final = 16
-"""Requests after which a server that has never answered counts as none: where two exchanges of three are
-lost, all of them are lost once in 700 times."""
-EVEN_ATTEMPTS: Final = 2
-MOST_DOUBLINGS: Final = 4
-"""Requests to a server that has not answered yet which follow each other without a longer wait, and how often
-the wait doubles after that."""
+"""Close requests, or requests for the response to an open. The session of a server that is silent for that
+long ends by its own timeout: ArduPilot after 3 s, PX4 after 10 s."""
+CLOSE_COPIES_MAX: Final = 4
+"""Copies of a close request on a lossy link: each has 12 bytes of payload."""
+UNHEARD_ATTEMPTS_MAX: Final = 16
+"""Requests after which a server that has never responded counts as none: with two of three exchanges lost,
+all of them are lost once in 700 times."""
+ATTEMPTS_WITHOUT_BACKOFF: Final = 2
+"""Requests without backoff to a server that has not responded yet."""
+BACKOFF_DOUBLINGS_MAX: Final = 4
+"""Doublings of the timeout after these."""
 BUSY = frozenset((FileErrorCode.INVALID_SESSION, FileErrorCode.NO_SESSIONS_AVAILABLE))
-"""What servers say of an open while another station has a file open, or has left one open."""
+"""Responses to an open while another station has a file open, or has left one open."""
 SESSION_LOST = frozenset((FileErrorCode.INVALID_SESSION, FileErrorCode.FILE_NOT_FOUND))
-"""What servers say to a request in a session that is not open."""
-MOST_OPENINGS: Final = 3
-"""How often a file is opened when its session is lost on board."""
+"""Responses to a request in a session that is not open."""
+OPENS_MAX: Final = 3
+"""Opens of a file whose session is lost on board."""
 
 
 def path_bytes(path: str) -> bytes:
-    """A path as it stands in a request.
+    """Encode a path for a request.
 
     Raises:
-        UsageError: it is empty, longer than a request can hold, or has a NUL in it.
+        UsageError: it is empty, longer than a request can hold, or contains NUL.
     """
     data = path.encode("utf-8", "surrogateescape")
     if not data or b"\0" in data:
         raise UsageError(f"the path of a file has at least one character, and no NUL: {path!r}")
-    if len(data) > MOST_DATA:
-        raise UsageError(f"the path of a file has at most {MOST_DATA} bytes, not {len(data)}")
+    if len(data) > DATA_SIZE_MAX:
+        raise UsageError(f"the path of a file has at most {DATA_SIZE_MAX} bytes, not {len(data)}")
     return data
 
 
 class Line:
-    """The way to the files of one component, which all work there shares.
+    """The way to the files of one component, shared by all transfers.
 
     Attributes:
         target: system and component.
-        round_trip: the component's; requests feed it, and it says when to repeat them.
-        heard_at: when the server sent us anything last.
+        round_trip: the component's; requests feed it, and it decides when to repeat them.
+        heard_at: when the server's last message to us was received.
     """
 
     def __init__(
@@ -85,21 +85,21 @@ class Line:
         self.heard_at = -math.inf
         self._context = context
         self._send = context.send
-        # Where the numbers begin differs from one program to the next: a server gives its last answer once
-        # more to a request that has the number of the one before.
+        # The first number differs between runs of the program: a server repeats its last response to a
+        # request that has the number of the one before.
         self._sequence = int(now * 1000) & 0xFFFF
         self._session = self._sequence % 255
 
     @property
     def keeps_session(self) -> bool:
-        """Whether the server gives a session the number that its open requested, as ArduPilot does."""
+        """Whether the server uses the session number that its open requested, as ArduPilot does."""
         return self._context.is_ardupilot
 
     def send(self, packet: Packet) -> None:
         self._send(FileTransfer(0, *self.target, packet.pack()))
 
     def close_session(self, session: int) -> None:
-        """Request the closing of one session, and do not wait for it; twice, as one may get lost.
+        """Send a request to close one session, without waiting for it; twice, as one may be lost.
 
         A reset of all sessions would close those of other stations too (measured with PX4).
         """
@@ -108,32 +108,32 @@ class Line:
         self.send(packet)
 
     def next_sequence(self, *, answers: int = 1) -> int:
-        """A number for a request that may get so many answers, each with a number of its own."""
+        """Return a number for a request that may have this many responses, each with a number of its own."""
         number = self._sequence
         self._sequence = (number + 1 + answers) & 0xFFFF
         return number
 
     def next_session(self) -> int:
-        """The number of a session that we ask for; never 0, in whose place a server may put another."""
+        """Return a session number for an open; never 0, which a server may replace by another."""
         self._session = self._session % 255 + 1
         return self._session
 
 
 class Job(Operation[Result]):
-    """Something that is done with one file. Its owner gives it the answers and the time.
+    """One transfer with one file. Its owner passes responses and time to it.
 
     A job ends with its result or its error when its session is closed: the server has acknowledged that, or
-    has kept silent for `CLOSE_ATTEMPTS` timeouts. So whoever gets the result may open the next file at once.
+    was silent for `CLOSE_ATTEMPTS` timeouts. The receiver of the result may thus open the next file at once.
 
     Attributes:
         path: of the file or directory.
-        asked_at: when the opening of the file was asked for last, but for repeats; infinity before.
+        asked_at: when the opening of the file was requested last, except for repeats; infinity before.
         is_over: whether the job needs the server no longer: nothing was begun, or its session is closed.
-        is_of_caller: whether somebody waits for it who is to be told when the component is lost.
-        yields: whether it ends with the server's refusal while another station has a file open, and does not
-            wait for that; to be set before any answer comes.
-        session: the number of the session that is open for it, or None.
-        asked_session: the one that was asked for when it is not known whether that is open, or None.
+        is_of_caller: whether a caller waits that gets an error when the component is lost.
+        yields: whether it ends with the server's refusal while another station has a file open, instead of
+            waiting; to be set before any response.
+        session: the number of its open session, or None.
+        asked_session: the requested session while it is unknown whether that is open, or None.
     """
 
     def __init__(self, line: Line, path: str, now: float) -> None:
@@ -147,7 +147,7 @@ class Job(Operation[Result]):
         self.is_over = False
         self.asked_at = math.inf
         self._path_data = path_bytes(path)
-        self._tell: Callable[[float], None] | None = None  # what ends it, once its session is closed
+        self._tell: Callable[[float], None] | None = None  # reports the end, once its session is closed
         self._request: Packet | None = None
         self._then: Callable[[Packet, float], None] | None = None
         self._attempts = 0
@@ -155,21 +155,21 @@ class Job(Operation[Result]):
         self._failures = 0
         self._openings = 1
         self._busy_since = math.inf
-        self._open_at = math.inf  # when the file is opened again, as the server's session is in use
+        self._open_at = math.inf  # when the file is opened again, while the server's session is in use
 
     @property
     def attempts(self) -> int:
-        """How often the present request was sent."""
+        """The number of times the present request was sent."""
         return self._attempts
 
     @property
     def _has_request(self) -> bool:
-        """Whether the answer to a request is awaited."""
+        """Whether a response is awaited."""
         return self._request is not None
 
     @property
     def blocked_until(self) -> float | None:
-        """When the file is opened again, while the server's session is in use; None where it is not."""
+        """When the file is opened again, while the server's session is in use; None otherwise."""
         return None if self._open_at == math.inf else self._open_at
 
     @property
@@ -179,7 +179,7 @@ class Job(Operation[Result]):
 
     @abstractmethod
     def begin(self, now: float) -> None:
-        """The server is free: start."""
+        """Start: the server is free."""
 
     def finish(self, result: Result, now: float) -> None:
         """End with a result as soon as the session is closed; later ends are ignored."""
@@ -196,27 +196,27 @@ class Job(Operation[Result]):
         self._close(lambda at: Operation.fail(self, error, at), now)
 
     def abandon(self, now: float) -> None:
-        """End, and await nothing more of a component that has no server; nobody is told."""
+        """End without a report and without waiting: the component has no server."""
         self.on_done.clear()
         self._send_blind_close()
         self.session = self.asked_session = None
-        self._close(_nothing, now)
+        self._close(_ignore, now)
 
     def stop(self, now: float, error: Exception | None = None) -> None:
-        """End without waiting for the session's closing, which goes on until `is_over`.
+        """End without waiting for the closing of the session, which continues until `is_over`.
 
         Args:
             now: the time.
-            error: what to end with; None where nobody waits any more, and nobody is told.
+            error: the error to end with; None without a report.
         """
         if error is None:
             self.on_done.clear()
         else:
             Operation.fail(self, error, now)
-        self._close(_nothing, now)
+        self._close(_ignore, now)
 
     def _close(self, tell: Callable[[float], None], now: float) -> None:
-        """Close the session, then tell of the end."""
+        """Close the session, then report the end."""
         if self._tell is not None:
             return
         self._tell = tell
@@ -224,15 +224,15 @@ class Job(Operation[Result]):
         if self.session is not None:
             self._terminate(self.session, now)
         elif self.asked_session is not None and self._request is not None:
-            # An open is on its way. Its answer says which session to close, as PX4 gives numbers of its own;
-            # ArduPilot keeps to ours, so this closes it even where nobody waits for that answer any more.
+            # An open is in flight. Its response says which session to close, as PX4 uses numbers of its own;
+            # ArduPilot uses ours, so this closes the session even without that response.
             self._send_blind_close()
             self._attempts = min(self._attempts, 1)
         else:
             self._closed(now)
 
     def _terminate(self, session: int, now: float) -> None:
-        copies = self._line.round_trip.copies(COPY_RISK, MOST_CLOSE_COPIES)
+        copies = self._line.round_trip.copies(COPY_RISK, CLOSE_COPIES_MAX)
         self._ask(
             Opcode.TERMINATE_SESSION, lambda _, now: self._closed(now), now, session=session, copies=copies
         )
@@ -244,25 +244,25 @@ class Job(Operation[Result]):
         self._tell(now)
 
     def _send_blind_close(self) -> None:
-        """Ask for the session to be closed, and do not wait for it; twice, as one may get lost."""
+        """Send requests to close the session, without waiting for it; twice, as one may be lost."""
         session = self.asked_session if self.session is None else self.session
         if session is not None:
             self._line.close_session(session)
 
     def server_heard(self, now: float) -> None:
-        """The server has sent something to anybody: a session that is in use lives on."""
+        """Note any response of the server to another station: the session in use stays open."""
         if self._open_at < math.inf:
-            self._open_at = now + QUIET_TIME
+            self._open_at = now + SESSION_IDLE_TIME
 
     def take(self, packet: Packet, now: float) -> None:
-        """Something came from the server for us."""
+        """Process a response of the server to us."""
         request = self._request
         if request is None or self._then is None:
             return
         is_answer = packet.sequence == (request.sequence + 1) & 0xFFFF and packet.requested == request.opcode
         if is_answer and packet.opcode in (Opcode.ACK, Opcode.NAK):
             then = self._then
-            # what takes long on board says nothing of the link
+            # slow operations on board say nothing of the link
             attempts = 2 if request.opcode == Opcode.CALC_FILE_CRC32 else self._attempts
             self._line.round_trip.answered(self._sent_at, now, attempts)
             self._request = self._then = None
@@ -285,11 +285,11 @@ class Job(Operation[Result]):
                 self._transmit(self._request, now)
 
     def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity."""
+        """Return when `tick` is due, or infinity."""
         return min(self._open_at, self._deadline() if self._request is not None else math.inf)
 
     def resume(self, now: float) -> None:
-        """The link is back: ask again."""
+        """Repeat the request: the link is back."""
         if self._request is not None:
             self._attempts = 0
             self._transmit(self._request, now)
@@ -305,7 +305,7 @@ class Job(Operation[Result]):
         offset: int = 0,
         copies: int = 1,
     ) -> None:
-        """Send a request, again and again until its answer comes, which goes to `then`."""
+        """Send a request and repeat it until its response, which is passed to `then`."""
         sequence = self._line.next_sequence()
         self._request = Packet(sequence, session, opcode, data, offset=offset)
         self._then = then
@@ -317,7 +317,7 @@ class Job(Operation[Result]):
     ) -> None:
         """Open the file in a session of its own, which `session` names when `then` is called.
 
-        Where an open is on its way already, its number is used again.
+        If an open is in flight already, its number is used again.
         """
 
         def opened(packet: Packet, now: float) -> None:
@@ -329,16 +329,16 @@ class Job(Operation[Result]):
                 else:
                     then(packet, now)
             elif self.is_ended and code == FileErrorCode.FAIL:
-                self._terminate(number, now)  # it is open already, by an open of ours whose answer was lost
+                self._terminate(number, now)  # open already, by an open of ours whose response was lost
             elif self.is_ended:
                 self._closed(now)
             elif is_first and code == FileErrorCode.FAIL and self._attempts == 1 and not self._failures:
-                # no answer was lost, so it is another station's session that has this number
+                # no response was lost, so another station's session has this number
                 self._failures = 1
                 self.asked_session = None
                 self.begin(now)
             elif code == FileErrorCode.FAIL and self._failures < self._failures_allowed:
-                # what is open may be what an open of ours has opened whose answer was lost
+                # the open session may be that of an open whose response was lost
                 self._failures += 1
                 self._line.close_session(number)
                 self.begin(now)
@@ -352,45 +352,45 @@ class Job(Operation[Result]):
         self._ask(opcode, opened, now, data=self._path_data, session=number, copies=copies)
 
     def _wait_or_refuse(self, packet: Packet, what: str, now: float) -> None:
-        """Begin again later where the server's session is in use; else end with the error of a NAK."""
+        """Retry later while the server's session is in use; otherwise end with the error of a NAK."""
         self._busy_since = min(self._busy_since, now)
-        is_in_use = self._code(packet) in BUSY and now - self._busy_since < BUSY_PATIENCE
+        is_in_use = self._code(packet) in BUSY and now - self._busy_since < BUSY_TIMEOUT
         if is_in_use and not self.yields:
-            self._open_at = now + QUIET_TIME
+            self._open_at = now + SESSION_IDLE_TIME
         else:
             self.asked_session = None
             self._refused(packet, what, now)
 
     def _may_reopen(self, packet: Packet) -> bool:
-        """Drop a session that the server has given up; gives whether its file may be opened again."""
+        """Drop a session that the server has lost; return whether its file may be opened again."""
         self._openings += 1
-        if self._code(packet) not in SESSION_LOST or self._openings > MOST_OPENINGS:
+        if self._code(packet) not in SESSION_LOST or self._openings > OPENS_MAX:
             return False
         self.session = None
         return True
 
     @property
     def _failures_allowed(self) -> int:
-        return FAILURES_IN_LOSS if self._is_lossy else MOST_FAILURES
+        return OPEN_FAILURES_LOSSY_MAX if self._is_lossy else OPEN_FAILURES_MAX
 
     @property
     def _is_lossy(self) -> bool:
-        """Whether requests are seen to be lost on this link."""
+        """Whether requests are known to be lost on this link."""
         return self._line.round_trip.seen_loss >= COPY_RISK
 
     def _is_hopeless(self, now: float) -> bool:
-        """Whether the request was sent often enough."""
-        is_unheard = self._line.heard_at == -math.inf  # of what is lost on the way there, nothing is known
+        """Return whether the request was sent often enough."""
+        is_unheard = self._line.heard_at == -math.inf  # the loss of requests is unknown
         if (
             is_unheard
-            and self._attempts < UNHEARD_ATTEMPTS
-            and now - self._line.round_trip.heard_at < LONGEST_SILENCE
+            and self._attempts < UNHEARD_ATTEMPTS_MAX
+            and now - self._line.round_trip.heard_at < SILENCE_MAX
         ):
             return False
         return self._line.round_trip.is_hopeless(self._attempts, now)
 
     def _refused(self, packet: Packet, what: str, now: float) -> None:
-        """End with the error that a NAK names."""
+        """End with the error in a NAK."""
         system, component = self._line.target
         code = self._code(packet)
         errno = packet.data[1] if code == FileErrorCode.FAIL_ERRNO and len(packet.data) > 1 else 0
@@ -422,19 +422,19 @@ class Job(Operation[Result]):
             self._line.send(request)
 
     def _deadline(self) -> float:
-        # while a burst comes the server does nothing else
-        since = min(max(self._sent_at, self._line.heard_at), self._sent_at + LONGEST_SILENCE)
+        # during a burst the server does nothing else
+        since = min(max(self._sent_at, self._line.heard_at), self._sent_at + SILENCE_MAX)
         round_trip = self._line.round_trip
-        # what takes long on board is not asked for again at once
+        # slow operations on board are not repeated at once
         is_slow = self._request is not None and self._request.opcode == Opcode.CALC_FILE_CRC32
         if is_slow:
             return since + round_trip.timeout
         timeout = round_trip.repeat_timeout(self._attempts)
         if self._line.heard_at == -math.inf and round_trip.smoothed is not None:
-            # the server may be at work for another station, whose burst nothing interrupts
-            timeout *= 2.0 ** min(max(self._attempts - EVEN_ATTEMPTS, 0), MOST_DOUBLINGS)
+            # the server may be busy with another station, whose burst nothing interrupts
+            timeout *= 2.0 ** min(max(self._attempts - ATTEMPTS_WITHOUT_BACKOFF, 0), BACKOFF_DOUBLINGS_MAX)
         return since + timeout
 
 
-def _nothing(now: float) -> None:
-    """Whoever waited is told already."""
+def _ignore(now: float) -> None:
+    """Report nothing: the error was reported before."""

@@ -1,7 +1,7 @@
-"""The files of one component over MAVFTP: reads, writes, lists and checksums, one after the other.
+"""The file transfers of one component over MAVFTP: reads, writes, lists and checksums, one after the other.
 
-Servers have few sessions, ArduPilot 4.6 and PX4 one, so whatever is asked for waits until what came before it
-has ended and its session is closed.
+Servers have few sessions, ArduPilot 4.6 and PX4 one, so a transfer waits until the one before it has ended
+and its session is closed.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from collections.abc import Callable
 from typing import Any, Final, NamedTuple, TypeVar
 
 from paramclient.errors import FileErrorCode, NoReply, UsageError
-from paramclient.protocol.ftp.file_read import LARGEST_FILE, FileRead
-from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
+from paramclient.protocol.ftp.file_read import FILE_SIZE_MAX, FileRead
+from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.ftp.transfer_job import Job, Line
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
@@ -23,11 +23,11 @@ __all__ = ["DirectoryEntry", "FileChecksum", "FileList", "FileRead", "FileTransf
 
 AnyJob = TypeVar("AnyJob", bound=Job[Any])
 
-MOST_ENTRIES: Final = 65_536
-"""Entries of a directory that are taken: more than a card of FAT can hold in one."""
+ENTRIES_MAX: Final = 65_536
+"""Entries of a directory: more than a FAT card can hold in one."""
 SESSION_TIMEOUT: Final = 3.3
 """Seconds after the last message to another station for which its session may still be open: ArduPilot ends
-one 3 s after its last reply (measured)."""
+one 3 s after its last response (measured)."""
 
 
 class DirectoryEntry(NamedTuple):
@@ -42,15 +42,15 @@ class DirectoryEntry(NamedTuple):
 
 
 class FileWrite(Job[None]):
-    """Writes a file; done when the server has closed it. See `FileTransfers.write`.
+    """One write of a file; ends when the server has closed it. See `FileTransfers.write`.
 
     Attributes:
         written: bytes that the server has acknowledged.
     """
 
     def __init__(self, line: Line, path: str, data: bytes, now: float, *, write_size: int) -> None:
-        if not 1 <= write_size <= MOST_DATA:
-            raise UsageError(f"a file is written by 1 to {MOST_DATA} bytes, not {write_size}")
+        if not 1 <= write_size <= DATA_SIZE_MAX:
+            raise UsageError(f"a file is written by 1 to {DATA_SIZE_MAX} bytes, not {write_size}")
         super().__init__(line, path, now)
         self.written = 0
         self._data = data
@@ -61,7 +61,7 @@ class FileWrite(Job[None]):
         self._open_file(Opcode.CREATE_FILE, lambda _, now: self._write(now), now)
 
     def _write(self, now: float) -> None:
-        """The next piece, or the end. One at a time: PX4 takes a param.pck in its order only."""
+        """Send the next piece, or close. One at a time: PX4 accepts a param.pck in order only."""
         session = self.session or 0
         piece = self._data[self.written : self.written + self._write_size]
         if not piece:
@@ -78,7 +78,7 @@ class FileWrite(Job[None]):
         self._ask(Opcode.WRITE_FILE, answered, now, data=piece, session=session, offset=self.written)
 
     def _refused_or_lost(self, packet: Packet, what: str, now: float) -> None:
-        """The server refuses; where it has given up the session, as after a long silence, begin anew."""
+        """Process a refusal; start again if the server has lost the session, as after a long silence."""
         if self._may_reopen(packet):
             self.begin(now)
         else:
@@ -94,7 +94,7 @@ class FileWrite(Job[None]):
 
 
 class FileList(Job[tuple[DirectoryEntry, ...]]):
-    """The entries of a directory. See `FileTransfers.list`."""
+    """One list of a directory. See `FileTransfers.list`."""
 
     def __init__(self, line: Line, path: str, now: float) -> None:
         super().__init__(line, path, now)
@@ -121,14 +121,14 @@ class FileList(Job[tuple[DirectoryEntry, ...]]):
             elif kind == b"D":
                 self._entries.append(DirectoryEntry(text, None))
         self._passed += len(items)
-        if items and self._passed < MOST_ENTRIES:
+        if items and self._passed < ENTRIES_MAX:
             self.begin(now)
         else:
-            self.finish(tuple(self._entries[:MOST_ENTRIES]), now)
+            self.finish(tuple(self._entries[:ENTRIES_MAX]), now)
 
 
 class FileChecksum(Job[int]):
-    """The checksum of a file. See `FileTransfers.checksum`."""
+    """One checksum of a file. See `FileTransfers.checksum`."""
 
     def begin(self, now: float) -> None:
         self._ask(Opcode.CALC_FILE_CRC32, self._answered, now, data=self._path_data)
@@ -141,18 +141,18 @@ class FileChecksum(Job[int]):
 
 
 class FileTransfers(Machine):
-    """All work with the files of one component, in the order in which it was asked for.
+    """The transfers with the files of one component, in the order of the calls.
 
-    Every call gives an `Operation` at once; it begins when what is before it has ended, ends with its result,
-    with a `FileTransferError` that carries the server's reason, or with `NoReply`. Whoever wants it no longer
-    gives it back with `release`. However it ends, its session on board is closed.
+    Every call returns an `Operation` at once; it begins at the end of the one before it, and ends with its
+    result, with a `FileTransferError` that has the server's reason, or with `NoReply`. Give it back with
+    `release` to cancel it. At any end, its session on board is closed.
 
     Args:
-        context: the component's. What the server sends to other stations is passed over.
+        context: the component's. The server's messages to other stations are ignored.
 
     Attributes:
-        on_closed: called once, in order, with the time, when the session of a job that has ended is closed.
-        foreign_at: when something between the server and another station was heard last.
+        on_closed: called once, in order, with the time, when the session of an ended job is closed.
+        foreign_at: when the last message between the server and another station was received.
     """
 
     def __init__(
@@ -170,49 +170,49 @@ class FileTransfers(Machine):
         self.foreign_at = -math.inf
 
     def is_in_use(self, now: float) -> bool:
-        """Whether another station was heard to read or write files, so that its session may be open."""
+        """Return whether another station was seen to read or write files, so that its session may be open."""
         return now < self.foreign_at + SESSION_TIMEOUT
 
     @property
     def is_idle(self) -> bool:
-        """Whether nothing is under way, not even the closing of a session."""
+        """Whether nothing is in progress, not even the closing of a session."""
         return self._job is None
 
     @property
     def is_closing(self) -> bool:
-        """Whether nobody waits for what is under way any more, and its session is still to be closed."""
+        """Whether the transfer in progress was released, and its session is still to be closed."""
         return self._job is not None and self._job.is_ended
 
     @property
     def has_idle_session(self) -> bool:
-        """Whether a session is open on board for what nobody waits for any more."""
+        """Whether a session of a released transfer is open on board."""
         return self._job is not None and self._job.is_ended and self._job.session is not None
 
     def read(
-        self, path: str, now: float, *, read_size: int = MOST_DATA, limit: int = LARGEST_FILE
+        self, path: str, now: float, *, read_size: int = DATA_SIZE_MAX, limit: int = FILE_SIZE_MAX
     ) -> FileRead:
-        """Read a whole file; `size` and `received` of what this gives tell how far it is.
+        """Read a whole file; `size` and `received` of the result tell the progress.
 
         Args:
             path: as the server names it, with a query where it takes one.
             now: seconds.
-            read_size: bytes of one read, 1 to 239: one size for all, as ArduPilot asks for param.pck. Less
-                than 239 is better on a radio that loses long frames.
-            limit: bytes above which the file is not taken.
+            read_size: bytes of one read, 1 to 239: one size for all, as ArduPilot requires for param.pck.
+                Less than 239 is better on a radio that loses long frames.
+            limit: bytes above which the file is rejected.
 
         Raises:
-            UsageError: the path or a size cannot be.
+            UsageError: the path or a size is invalid.
         """
         return self._begin(FileRead(self._line_at(now), path, now, read_size=read_size, limit=limit), now)
 
-    def write(self, path: str, data: bytes, now: float, *, write_size: int = MOST_DATA) -> FileWrite:
-        """Write a whole file in the place of one that may be there.
+    def write(self, path: str, data: bytes, now: float, *, write_size: int = DATA_SIZE_MAX) -> FileWrite:
+        """Write a whole file, and replace an existing one.
 
-        When it fails or is released half-way, what was written until then stays on board. ArduPilot and PX4
-        then refuse a param.pck as a whole.
+        If it fails or is released, the part written so far stays on board. ArduPilot and PX4 then refuse a
+        param.pck as a whole.
 
         Raises:
-            UsageError: the path or the size of one piece cannot be.
+            UsageError: the path or the size of one piece is invalid.
         """
         return self._begin(FileWrite(self._line_at(now), path, data, now, write_size=write_size), now)
 
@@ -220,7 +220,7 @@ class FileTransfers(Machine):
         """List a directory.
 
         Raises:
-            UsageError: the path cannot be.
+            UsageError: the path is invalid.
         """
         return self._begin(FileList(self._line_at(now), path, now), now)
 
@@ -228,17 +228,17 @@ class FileTransfers(Machine):
         """Let the server compute the CRC-32 of a file, which is that of `paramclient.model.values.crc32_px4`.
 
         Raises:
-            UsageError: the path cannot be.
+            UsageError: the path is invalid.
         """
         return self._begin(FileChecksum(self._line_at(now), path, now), now)
 
     def release(self, job: Job[Any], now: float, *, is_served: bool = True) -> None:
-        """Want it no longer: nobody is told of its end, and its session is closed.
+        """Cancel a transfer: its end is not reported, and its session is closed.
 
         Args:
-            job: what was asked for.
+            job: the transfer.
             now: the time.
-            is_served: whether the component may have a server; else nothing is awaited.
+            is_served: whether the component may have a server; otherwise no response is awaited.
         """
         if job in self._waiting:
             self._waiting.remove(job)
@@ -247,7 +247,7 @@ class FileTransfers(Machine):
             self._go_on(now)
 
     def heard(self, message: FileTransfer, now: float) -> None:
-        """Every FILE_TRANSFER_PROTOCOL of the component passes here."""
+        """Process a FILE_TRANSFER_PROTOCOL of the component."""
         system, component = self._own
         if self._job is not None:
             self._job.server_heard(now)
@@ -260,23 +260,23 @@ class FileTransfers(Machine):
             self._go_on(now)
 
     def tick(self, now: float) -> None:
-        """Repeat what stayed unanswered, give up what stayed so too often."""
+        """Repeat or give up unanswered requests."""
         if self._job is not None:
             self._job.tick(now)
             self._go_on(now)
 
     def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity."""
+        """Return when `tick` is due, or infinity."""
         return math.inf if self._job is None else self._job.next_deadline()
 
     def resume(self, now: float) -> None:
-        """The link is back: what is under way is asked for again."""
+        """Repeat the request in flight: the link is back."""
         if self._job is not None:
             self._job.resume(now)
             self._go_on(now)
 
     def lose(self, now: float) -> None:
-        """The component is lost: callers wait no longer. What a fetch reads goes on for a while."""
+        """End the transfers of callers: the component is lost. The reads of a fetch go on for a while."""
         system, component = self._target
         jobs = [*([] if self._job is None else [self._job]), *self._waiting]
         for job in jobs:
@@ -289,9 +289,8 @@ class FileTransfers(Machine):
         self._go_on(now)
 
     def fail_all(self, error: Exception, now: float) -> None:
-        """Nothing is awaited any more. The closing of an open session goes on; what is asked for from now on
-        stands.
-        """
+        """End all transfers with the error. The closing of an open session goes on; later transfers are not
+        affected."""
         jobs = [*([] if self._job is None else [self._job]), *self._waiting]
         self._waiting.clear()
         for job in jobs:
@@ -310,7 +309,7 @@ class FileTransfers(Machine):
         return job
 
     def _go_on(self, now: float) -> None:
-        """Begin the next when what was under way has ended and its session is closed."""
+        """Begin the next transfer when the one before has ended and its session is closed."""
         if self._job is not None and self._job.is_over:
             self._job = None
             self._next(now)

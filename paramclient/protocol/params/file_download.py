@@ -10,15 +10,15 @@ from typing import Final
 from paramclient.errors import FileErrorCode, FileTransferError, NoReply, PackError
 from paramclient.model.values import is_portable_name
 from paramclient.protocol.ftp import BUSY, FileRead, FileTransfers
-from paramclient.protocol.ftp.packets import MOST_DATA
-from paramclient.protocol.ftp.param_pck import LARGEST_FILE, Pack, decode, total_of
+from paramclient.protocol.ftp.packets import DATA_SIZE_MAX
+from paramclient.protocol.ftp.param_pck import PACK_SIZE_MAX, Pack, decode, total_of
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.fetch_result import Progress
 from paramclient.protocol.params.table import Table
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.scheduler import Seen, Turns
-from paramclient.protocol.wire import MOST_PARAMETERS, ParamValue
+from paramclient.protocol.wire import PARAMETERS_MAX, ParamValue
 
 __all__ = ["PARAMETER_FILE", "PackFetch"]
 
@@ -140,7 +140,7 @@ class PackFetch(Operation[None]):
 
     def seen(self) -> Seen:
         """Return the statistics in messages: a burst that is repaired separately skips nothing."""
-        came = 0 if self._job is None else self._job.received // MOST_DATA
+        came = 0 if self._job is None else self._job.received // DATA_SIZE_MAX
         return Seen(came, came, 0.0, False)
 
     def begin(self, now: float) -> None:
@@ -170,7 +170,7 @@ class PackFetch(Operation[None]):
     def heard(self, message: ParamValue) -> None:
         """Process a PARAM_VALUE of the component, after the table has stored it."""
         self._heard.add(message.param_id)
-        if message.param_count <= MOST_PARAMETERS:
+        if message.param_count <= PARAMETERS_MAX:
             self._heard_count = message.param_count
 
     def look(self, now: float) -> None:
@@ -195,7 +195,7 @@ class PackFetch(Operation[None]):
         self._doubts = self._table.doubts
         self._heard.clear()
         self._heard_count = None
-        job = self._job = self._files.read(PARAMETER_FILE + self._query, now, limit=LARGEST_FILE)
+        job = self._job = self._files.read(PARAMETER_FILE + self._query, now, limit=PACK_SIZE_MAX)
         job.yields = self._yields
         job.on_done.append(partial(self._came, job))
 
@@ -229,7 +229,7 @@ class PackFetch(Operation[None]):
             pack = decode(job.result)
             if len(pack.entries) < pack.total:
                 raise PackError(f"it has {len(pack.entries)} of {pack.total} parameters", offset=2)
-            if pack.total > MOST_PARAMETERS:
+            if pack.total > PARAMETERS_MAX:
                 raise PackError(f"no component has {pack.total} parameters", offset=4)
         except PackError as error:
             self._is_none(error, now, is_useless=True)

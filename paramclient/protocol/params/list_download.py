@@ -12,9 +12,9 @@ from paramclient.protocol.params.reads import Read, Reads
 from paramclient.protocol.params.table import Table
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.operation import Operation
-from paramclient.protocol.requests.round_trip import LONGEST_SILENCE
+from paramclient.protocol.requests.round_trip import SILENCE_MAX
 from paramclient.protocol.scheduler import Seen, Turns
-from paramclient.protocol.wire import MOST_PARAMETERS, NO_INDEX, ParamRequestList, ParamValue
+from paramclient.protocol.wire import NO_INDEX, PARAMETERS_MAX, ParamRequestList, ParamValue
 
 __all__ = ["Download", "present_of"]
 
@@ -89,7 +89,7 @@ class Download(Operation[None]):
 
     The list waits for its turn where other lists of the link run. It does not end early while the component
     answers, however slowly: an index is given up when reads sent together with it are answered, and all of
-    them when nothing at all is answered for `LONGEST_SILENCE`.
+    them when nothing at all is answered for `SILENCE_MAX`.
 
     With values present from an earlier download only the missing ones are requested. If those values turn out
     to belong to another count or to other names, they are discarded.
@@ -246,8 +246,8 @@ class Download(Operation[None]):
             self._repeated_in_row = 0
             stream.goes_on(index, now)
             return
-        if index >= count or count > MOST_PARAMETERS:
-            if index == NO_INDEX and self.count is not None and count <= MOST_PARAMETERS:
+        if index >= count or count > PARAMETERS_MAX:
+            if index == NO_INDEX and self.count is not None and count <= PARAMETERS_MAX:
                 # pushed, or a response by name: it has the present count, where ArduPilot's list does not
                 self._other_count = None if count == self.count else count
             return
@@ -317,7 +317,7 @@ class Download(Operation[None]):
             if self._list_at + self._list_wait <= now and not self.gives_way:
                 if self._turns.is_beside_others(self):
                     self._patient_since = now  # the vehicle may have no bandwidth to answer
-                is_gone = now - self._round_trip.heard_at >= LONGEST_SILENCE
+                is_gone = now - self._round_trip.heard_at >= SILENCE_MAX
                 is_enough = is_gone or self._list_asked >= LIST_ATTEMPTS_MIN
                 if is_enough and now - self._patient_since >= LIST_TIMEOUT:
                     self._end_unanswered(now)
@@ -615,7 +615,7 @@ class Download(Operation[None]):
         elif not isinstance(read.error, NoReply) or self._seems_dead(index, read):
             self.given_up.add(index)
             return
-        elif now - self._round_trip.heard_at >= LONGEST_SILENCE or self._reads.is_silent(now):
+        elif now - self._round_trip.heard_at >= SILENCE_MAX or self._reads.is_silent(now):
             self._give_up_the_rest()
         self._next = min(self._next, index)
 

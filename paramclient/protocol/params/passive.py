@@ -13,7 +13,7 @@ from paramclient.protocol.params.fetch_result import Announcement, FetchResult, 
 from paramclient.protocol.params.hash_check import Proof
 from paramclient.protocol.params.passive_file import FileObserver, ObservedPack
 from paramclient.protocol.params.sync import Sync
-from paramclient.protocol.wire import MOST_PARAMETERS, ParamValue
+from paramclient.protocol.wire import PARAMETERS_MAX, ParamValue
 
 __all__ = ["PASSIVE_TIMEOUT", "Overheard", "Overhearing"]
 
@@ -69,7 +69,7 @@ class Overheard:
         name, _, _, count, index = message
         if self.file.is_reading:
             self.file.value_heard(message)
-        if index >= count or count > MOST_PARAMETERS:
+        if index >= count or count > PARAMETERS_MAX:
             return
         names = self.names
         if count != self.count or names.get(index, name) != name:

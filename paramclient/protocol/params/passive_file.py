@@ -9,10 +9,10 @@ from typing import Final, NamedTuple
 from paramclient.errors import PackError
 from paramclient.protocol.ftp import ObservedRead, ObservedReads
 from paramclient.protocol.ftp.packets import Opcode, Packet
-from paramclient.protocol.ftp.param_pck import LARGEST_FILE, Pack, PackedParam, decode_prefix
+from paramclient.protocol.ftp.param_pck import PACK_SIZE_MAX, Pack, PackedParam, decode_prefix
 from paramclient.protocol.ftp.passive import path_of
 from paramclient.protocol.params.file_download import PARAMETER_FILE
-from paramclient.protocol.wire import MOST_PARAMETERS, FileTransfer, ParamValue
+from paramclient.protocol.wire import PARAMETERS_MAX, FileTransfer, ParamValue
 
 __all__ = ["FileObserver", "ObservedPack", "acknowledges_open", "opens_parameter_file"]
 
@@ -58,7 +58,7 @@ class FileObserver:
     def __init__(self, came: Callable[[ObservedPack, float], None]) -> None:
         self.notes: list[str] = []
         self._came = came
-        self._reads = ObservedReads(_is_parameter_file, size_max=LARGEST_FILE, ended=self._ended)
+        self._reads = ObservedReads(_is_parameter_file, size_max=PACK_SIZE_MAX, ended=self._ended)
         self._names: dict[ObservedRead, set[str]] = {}
         self._counts: dict[ObservedRead, int] = {}
 
@@ -82,7 +82,7 @@ class FileObserver:
         """Process a PARAM_VALUE of the component: it is newer than a file that was opened before."""
         for read in self._reads.running:
             self._names.setdefault(read, set()).add(message.param_id)
-            if message.param_count <= MOST_PARAMETERS:
+            if message.param_count <= PARAMETERS_MAX:
                 self._counts[read] = message.param_count
 
     def tick(self, now: float) -> None:
@@ -116,7 +116,7 @@ class FileObserver:
             if len(data) < HEADER_SIZE:
                 raise PackError("its first bytes were not heard", offset=0)
             pack, number = decode_prefix(data)
-            if count not in (None, pack.total) or pack.total > MOST_PARAMETERS:
+            if count not in (None, pack.total) or pack.total > PARAMETERS_MAX:
                 raise PackError(f"it is of {pack.total} parameters, and the vehicle has {count}", offset=4)
         except PackError as error:
             self._note(f"Nothing was taken from {file}: {error}.")

@@ -20,12 +20,12 @@ from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.requests.pacing import Pace, Share
 from paramclient.protocol.requests.round_trip import (
-    FEWEST_TRIES,
-    LONGEST_SILENCE,
-    MEMORY,
-    MOST_TRIES,
+    ATTEMPTS_MAX,
+    ATTEMPTS_MIN,
+    SAMPLE_WEIGHT,
+    SILENCE_MAX,
 )
-from paramclient.protocol.wire import MOST_PARAMETERS, ParamError, ParamRequestRead, ParamValue
+from paramclient.protocol.wire import PARAMETERS_MAX, ParamError, ParamRequestRead, ParamValue
 
 __all__ = ["Key", "Read", "Reads"]
 
@@ -44,7 +44,7 @@ READ_COPIES_MAX: Final = 6
 COPY_TIMEOUTS_MAX: Final = 16
 """Timeouts in a row, without any response between them, after which early copies are of no use."""
 TIMEOUTS_MAX: Final = 16
-"""Timeouts in a row, over at least twice `LONGEST_SILENCE`, after which a component with heartbeats counts as
+"""Timeouts in a row, over at least twice `SILENCE_MAX`, after which a component with heartbeats counts as
 one that answers no reads: with two of three exchanges lost, this happens once in 650 times."""
 CONTROLS_MIN: Final = 3
 """Answered control reads, at least, before a silent parameter counts as unknown."""
@@ -234,7 +234,7 @@ class Reads(Machine):
         If a read of the same parameter was in flight, the message may be the response to either request:
         `is_answer`.
         """
-        if index < count <= MOST_PARAMETERS:
+        if index < count <= PARAMETERS_MAX:
             self.control = index  # exists and is answered
         if index == self._control_index and self._control_at < math.inf:
             # a lost control read may have no read left that repeats it; then this is not its response
@@ -317,8 +317,8 @@ class Reads(Machine):
     def is_silent(self, now: float) -> bool:
         """Return whether all requests have been unanswered for so long, and so often, that more are
         pointless."""
-        tries = min(self._round_trip.tries, MOST_TRIES)
-        return self._silences >= tries and now - self._silent_since >= LONGEST_SILENCE
+        tries = min(self._round_trip.tries, ATTEMPTS_MAX)
+        return self._silences >= tries and now - self._silent_since >= SILENCE_MAX
 
     def forgive(self) -> None:
         """Reset the count of timeouts: the silence has another cause."""
@@ -378,12 +378,12 @@ class Reads(Machine):
 
     def _is_hopeless(self, read: Read, now: float) -> bool:
         silent_for = now - self._silent_since
-        is_mute = read.attempts >= FEWEST_TRIES and silent_for >= 2 * LONGEST_SILENCE
-        if (self._silences >= MOST_TRIES and silent_for >= LONGEST_SILENCE) or (
+        is_mute = read.attempts >= ATTEMPTS_MIN and silent_for >= 2 * SILENCE_MAX
+        if (self._silences >= ATTEMPTS_MAX and silent_for >= SILENCE_MAX) or (
             self._silences >= TIMEOUTS_MAX and is_mute
         ):
             return True  # none of all these was answered
-        are_enough = read.controls >= CONTROLS_MIN and read.attempts >= FEWEST_TRIES
+        are_enough = read.controls >= CONTROLS_MIN and read.attempts >= ATTEMPTS_MIN
         if are_enough and self._loss_probability(read.attempts) < LOSS_RISK:
             return True
         # half as many are enough if nothing has announced the parameter and the link serves others
@@ -471,8 +471,8 @@ class Reads(Machine):
             self.control = CONTROL_INDEX  # the vehicle has fewer parameters by now
         self._control_at = now
         self._control_index = self.control
-        self._controls_sent = self._controls_sent * MEMORY + 1
-        self._controls_answered *= MEMORY
+        self._controls_sent = self._controls_sent * SAMPLE_WEIGHT + 1
+        self._controls_answered *= SAMPLE_WEIGHT
         self.pace.sent(now)
         self._send(ParamRequestRead(*self._target, "", self.control))
 

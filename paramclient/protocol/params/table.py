@@ -42,7 +42,7 @@ from paramclient.protocol.ftp.param_pck import Pack
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.change_origin import is_ours
 from paramclient.protocol.params.hash_exclusions import hash_of
-from paramclient.protocol.wire import MOST_PARAMETERS, NO_INDEX, ParamValue
+from paramclient.protocol.wire import NO_INDEX, PARAMETERS_MAX, ParamValue
 
 __all__ = ["NAMES_MAX", "Observation", "Room", "Table"]
 
@@ -224,7 +224,7 @@ class Table:
             if not room.has_some(len(everything)):
                 return None
             room.taken += 1
-            place = NOWHERE if given >= count or count > MOST_PARAMETERS else given
+            place = NOWHERE if given >= count or count > PARAMETERS_MAX else given
             bits, is_raw = bits_of_wire(raw, number, self._encoding)
             new = everything[name] = pack_fields(bits, number, is_raw, LIVE, place)
             self._wire[name] = raw
@@ -260,7 +260,7 @@ class Table:
         """Store the index of a PARAM_VALUE of a known parameter, without its value."""
         name, _, _, count, given = message
         held = self._held[name]
-        is_index = given < count <= MOST_PARAMETERS and given not in self.passed_over.get(name, ())
+        is_index = given < count <= PARAMETERS_MAX and given not in self.passed_over.get(name, ())
         if is_index and with_index(held, given) != held:
             self._held[name] = with_index(held, given)
             self.dirty.setdefault(name, "vehicle")
@@ -272,7 +272,7 @@ class Table:
         _, raw, number, count, given = message
         old_bits, old_number, old_is_raw, _, place = unpack_fields(old)
         if given != NO_INDEX:
-            place = NOWHERE if given >= count or count > MOST_PARAMETERS else given
+            place = NOWHERE if given >= count or count > PARAMETERS_MAX else given
         seen_at = self._moments.get(name, moment)
         self._moments[name] = moment
         is_same_type = old_number == number

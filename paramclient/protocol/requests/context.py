@@ -1,4 +1,4 @@
-"""What the machines of one component share: the way to the component, and the facts about it."""
+"""The facts about one component that its machines share, and the way to send to it."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from paramclient.protocol.wire import MAV_AUTOPILOT_ARDUPILOTMEGA, MAV_AUTOPILOT
 __all__ = ["Context"]
 
 OWN_ADDRESS: Final = (255, 190)
-"""System and component that a ground station usually has: MAV_COMP_ID_MISSIONPLANNER of system 255."""
+"""System and component of a usual ground station: MAV_COMP_ID_MISSIONPLANNER of system 255."""
 
 
 @dataclass(slots=True, eq=False)
 class Context:
-    """The way to one component, and the facts about it that several of its machines need.
+    """The facts about one component that several of its machines need, and the way to send to it.
 
     One machine learns a fact and sets it when it changes; the others read it.
 
@@ -26,18 +26,18 @@ class Context:
         target: system and component.
         send: takes each message for the component, in order.
         own: system and component that requests are sent as.
-        round_trip: the measured round-trip time and loss of its responses.
+        round_trip: the measured round-trip time and packet loss.
         trace: takes a line for each step.
-        may_send: whether requests may be sent to it; false for links that are only listened to.
+        may_send: whether requests may be sent to it; false for listen-only links.
         autopilot: MAV_AUTOPILOT of its heartbeat, None before the first one. Set by `Identification`.
         is_identifying: whether AUTOPILOT_VERSION is requested. Set by `Identification`.
-        may_be_another: whether another vehicle may have taken its place since it was identified, or has, and
+        may_be_another: whether another vehicle may have taken its place since the identification, or has, and
             is being identified. Set by `Identification`.
-        serves_file: whether it serves its table as a file over MAVFTP, as far as it has said. Set by
+        serves_file: whether it serves its table as a file over MAVFTP, as far as known. Set by
             `Identification`.
         adds_defaults: whether it is known to serve that file with defaults. Set by `Identification`.
         is_locating_metadata: whether COMPONENT_METADATA is requested. Set by `Descriptions`.
-        has_hash: whether it has a `_HASH_CHECK`; None while that is unknown. Set by `Sync`.
+        has_hash: whether it has a `_HASH_CHECK`; None while unknown. Set by `Sync`.
         is_writing: whether a write is in progress. Set by `Writes`.
         is_fetching: whether a fetch is in progress. Set by `Fetches`.
     """
@@ -60,20 +60,20 @@ class Context:
 
     @property
     def is_px4(self) -> bool:
-        """Whether the heartbeat names a PX4."""
+        """Whether the heartbeat names PX4."""
         return self.autopilot == MAV_AUTOPILOT_PX4
 
     @property
     def is_ardupilot(self) -> bool:
-        """Whether the heartbeat names an ArduPilot."""
+        """Whether the heartbeat names ArduPilot."""
         return self.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA
 
     @property
     def is_doubted(self) -> bool:
-        """Whether another vehicle may have taken its place, and the answer is awaited."""
+        """Whether another vehicle may have taken its place, and its identity is awaited."""
         return self.may_be_another and self.is_identifying
 
     @property
     def expects_hash(self) -> bool:
-        """Whether it has a hash, as far as is known: every PX4 has one until it answers otherwise."""
+        """Whether it has a hash, as far as known: every PX4 has one until it responds otherwise."""
         return self.is_px4 if self.has_hash is None else self.has_hash

@@ -1,4 +1,4 @@
-"""What was begun and will end once: every read, write and download is one."""
+"""An operation with exactly one end: the base of every read, write and download."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ Result = TypeVar("Result")
 
 
 class Operation(Generic[Result]):
-    """Something that was begun and will end: with a result or with an error, once.
+    """An operation that ends once, with a result or with an error.
 
     Attributes:
         result, error: one of them is set when `done`.
-        begun_at, ended_at: in the time that was passed in.
-        on_done: called once, in order, when it ends. Whoever waits puts a callback here.
+        begun_at, ended_at: in the time of the `now` arguments.
+        on_done: called once, in order, at the end. Callers that wait add a callback here.
     """
 
     def __init__(self, begun_at: float) -> None:

@@ -1,1 +1,7 @@
-"""Traffic, packet loss by sequence numbers, and traces of a link."""
+"""Statistics of a link.
+
+`packet_loss`: lost frames, by sequence numbers.
+`sniffer`: all frames of a link, including damaged and unknown ones.
+`trace`: trace lines for debugging.
+`traffic`: counts, rates and losses by component and message.
+"""

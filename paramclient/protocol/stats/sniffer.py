@@ -1,7 +1,7 @@
-"""Everything that goes over a link, what cannot be used included: frames, damaged frames, and other bytes.
+"""All bytes of a link, including unusable ones: frames, damaged frames, and other bytes.
 
-`Framer` gives out what is proven and passes over the rest as fast as it can. Here the rest counts too, and
-speed does not matter: this runs only where somebody wants to look at the link itself.
+`Framer` returns proven frames and skips everything else as fast as it can. Here everything counts, and speed
+does not matter: this runs only where a user looks at the link itself.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from paramclient.protocol.wire import bears_key, checksum
 
 __all__ = ["FrameCutter", "Seen", "Sniffer"]
 
-MOST_KEPT: Final = 4096
-"""Bytes of a stream in which nothing was proven that are kept to see what follows them."""
-MOST_PEERS: Final = 256
-"""Peers of a stream whose unfinished frames are kept, by `FrameCutter`."""
+UNPROVEN_BYTES_MAX: Final = 4096
+"""Bytes of a stream without a proven frame that are kept until the following ones arrive."""
+UNFINISHED_PEERS_MAX: Final = 256
+"""Peers of a stream with an unfinished frame in a `FrameCutter`."""
 
 _MAGIC_V1 = 0xFE
 _MAGIC_V2 = 0xFD
@@ -32,9 +32,9 @@ class Seen(NamedTuple):
     Attributes:
         message_id, system, component, sequence, payload, version: as in `Frame`.
         size: of the whole frame, in bytes.
-        is_signed: whether it carries a signature, which is not verified.
-        is_known: false for an id that the dialect does not have, so that no checksum proves the frame.
-        data: the whole frame as it stood on the wire.
+        is_signed: whether it has a signature, which is not verified.
+        is_known: false for an id outside the dialect, so that no checksum proves the frame.
+        data: the bytes of the whole frame.
     """
 
     message_id: int
@@ -50,18 +50,18 @@ class Seen(NamedTuple):
 
 
 class Sniffer:
-    """Finds every frame in what a link delivers, and accounts for each other byte.
+    """Finds every frame in received bytes, and accounts for each other byte.
 
-    What stands between two proven frames is explained from its beginning: a whole frame with a known id is
-    one with a wrong checksum; one with an unknown id counts as a frame when another one, or the end, follows
-    right behind it; whatever is neither is other bytes.
+    Bytes between two proven frames are classified from their beginning: a whole frame with a known id has a
+    wrong checksum; one with an unknown id counts as a frame when another one, or the end, follows directly;
+    anything else is other bytes.
 
     Args:
         stream: whether a frame may be spread over several calls; see `Framer`.
 
     Attributes:
         damaged: frames with a wrong checksum.
-        other_bytes: bytes that belong to no frame.
+        other_bytes: bytes outside of frames.
     """
 
     def __init__(self, *, stream: bool) -> None:
@@ -71,18 +71,18 @@ class Sniffer:
         self._tail = b""
 
     def receive(self, data: bytes) -> list[Seen]:
-        """Take bytes from the link; give the frames that are told by now, in order."""
+        """Process received bytes and return the frames that are decided by now, in order."""
         seen, rest = self._scan(self._tail + data, final=not self._stream)
         self._tail = rest
         return seen
 
     def flush(self) -> list[Seen]:
-        """The stream has ended or was interrupted: give what stands in its unfinished end."""
+        """Return the frames in the unfinished end: the stream has ended or was interrupted."""
         seen, self._tail = self._scan(self._tail, final=True)
         return seen
 
     def _scan(self, data: bytes, *, final: bool) -> tuple[list[Seen], bytes]:
-        """The frames in `data`, and what of its end is to be looked at again when more has come."""
+        """Return the frames in `data`, and the undecided bytes at its end."""
         seen: list[Seen] = []
         explained = at = 0
         while (found := _MAGIC(data, at)) is not None:
@@ -99,13 +99,13 @@ class Sniffer:
             at += 1
         else:
             at = len(data)
-        if final or at - explained > MOST_KEPT:
+        if final or at - explained > UNPROVEN_BYTES_MAX:
             seen += self._explain(data[explained:at])
             explained = at
         return seen, data[explained:]
 
     def _explain(self, gap: bytes) -> list[Seen]:
-        """What stands between two proven frames: those that nothing proves are given."""
+        """Classify the bytes between two proven frames; return the frames that nothing proves."""
         seen: list[Seen] = []
         at = 0
         while at < len(gap):
@@ -124,9 +124,9 @@ class Sniffer:
 
 
 class FrameCutter:
-    """Cuts what a link delivers into whole frames, for those who pass them on as they are.
+    """Cuts received bytes into whole frames, for programs that forward them unchanged.
 
-    Damaged frames and bytes that belong to none are left out, and so are those that bear a key.
+    Left out are damaged frames, bytes outside of frames, and frames with a signing key.
 
     Args:
         stream: whether a frame may be spread over several calls.
@@ -137,7 +137,8 @@ class FrameCutter:
         self._sniffers: dict[Hashable, Sniffer] = {}
 
     def cut(self, data: bytes, peer: Hashable) -> list[bytes]:
-        """The frames that a chunk completes, in order. An empty one says that the peer's stream has ended."""
+        """Return the frames that a chunk completes, in order. An empty chunk means the end of the peer's
+        stream."""
         if not data:
             sniffer = self._sniffers.pop(peer, None)
             return [] if sniffer is None else self._clean(sniffer.flush())
@@ -145,12 +146,12 @@ class FrameCutter:
         sniffer = self._sniffers.get(key)
         if sniffer is None:
             sniffer = self._sniffers[key] = Sniffer(stream=self._stream)
-            if len(self._sniffers) > MOST_PEERS:
+            if len(self._sniffers) > UNFINISHED_PEERS_MAX:
                 del self._sniffers[next(iter(self._sniffers))]
         return self._clean(sniffer.receive(data))
 
     def flush(self) -> list[bytes]:
-        """The link is away, or closed: give what stands in the unfinished ends."""
+        """Return the frames in the unfinished ends: the link is down, or closed."""
         return [data for peer in list(self._sniffers) for data in self.cut(b"", peer)]
 
     def _clean(self, frames: list[Seen]) -> list[bytes]:
@@ -161,7 +162,7 @@ _MAGICS = (bytes((_MAGIC_V1,)), bytes((_MAGIC_V2,)))
 
 
 def _frame_at(data: bytes, at: int) -> Seen | None:
-    """What the header there says, true or not; None where it is none or is cut off by the end."""
+    """Return the frame by the header there, proven or not; None without one, or if it is cut off."""
     magic = data[at]
     if magic == _MAGIC_V1 and at + 6 <= len(data):
         size, sequence, system, component, message_id = data[at + 1 : at + 6]

@@ -1,4 +1,4 @@
-"""What the core says of its steps, for those who look for a fault: made up only where it is wanted."""
+"""Trace lines of the core's steps for debugging, formatted only where they are wanted."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from paramclient.protocol.wire import (
 __all__ = ["Told", "Trace", "silent"]
 
 Trace: TypeAlias = Callable[..., None]
-"""Takes a %-format and what belongs into it, as `logging.Logger.debug` does."""
+"""Takes a %-format and its arguments, as `logging.Logger.debug` does."""
 
 
 def silent(text: str, *details: object) -> None:
-    """Nobody looks."""
+    """Discard the line."""
 
 
 class Told:
-    """A message in words, when they are wanted; of what is not named here, such as a key, only the kind."""
+    """A message as text, formatted on demand; of types not listed here, such as a key, only the type."""
 
     __slots__ = ("_message",)
 

@@ -1,4 +1,4 @@
-"""What goes over a link, counted: by component and by message, with rates and losses."""
+"""Traffic of a link by component and message: counts, rates and losses."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ from paramclient.protocol.wire import HEARTBEAT_ID, Frame, Heartbeat, decode, me
 
 __all__ = ["ComponentTraffic", "MessageTraffic", "RadioStatus", "Traffic", "TrafficReport"]
 
-WINDOW: Final = 5.0
-"""Seconds over which rates and losses are measured: some heartbeats, and short enough to turn an antenna."""
+RATE_WINDOW: Final = 5.0
+"""Seconds over which rates and losses are measured: several heartbeats, and short enough to adjust an
+antenna."""
 SLICE: Final = 0.5
-"""Seconds that are counted as one."""
-SHORTEST_TIME: Final = 1.0
-"""Seconds below which a rate would be made of too little."""
-MOST_COMPONENTS: Final = 1_000
-"""Components that are counted one by one; frames of further ones count for the link alone."""
-MOST_MESSAGES: Final = 500
-"""Message ids counted one by one for a component; the dialect has fewer than that."""
-MOST_PEERS: Final = 256
-"""Peers whose unfinished frames, and peers of one component whose numbers, are followed."""
+"""Seconds of one slice of that time."""
+RATE_TIME_MIN: Final = 1.0
+"""Seconds, at least, over which a rate is computed."""
+COUNTED_COMPONENTS_MAX: Final = 1_000
+"""Components that are counted separately; frames of further ones count for the link only."""
+COUNTED_MESSAGES_MAX: Final = 500
+"""Message ids of a component that are counted separately; the dialect has fewer."""
+COUNTED_PEERS_MAX: Final = 256
+"""Peers with an unfinished frame, and peers of one component with sequence numbers."""
 RADIO_STATUS_IDS: Final = frozenset({109, 166})
-"""RADIO_STATUS, and RADIO as older firmware of SiK radios sends it; they have the same layout."""
+"""RADIO_STATUS, and RADIO from older firmware of SiK radios; both have the same layout."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,10 +36,10 @@ class MessageTraffic:
     """One kind of message from one component.
 
     Attributes:
-        name: `HEARTBEAT`, …; `UNKNOWN_4711` for an id that the dialect does not have.
+        name: `HEARTBEAT`, …; `UNKNOWN_4711` for an id outside the dialect.
         message_id: its number.
         count: frames since the link was opened.
-        rate: frames a second, of late.
+        rate: recent frames per second.
     """
 
     name: str
@@ -49,13 +50,13 @@ class MessageTraffic:
 
 @dataclass(frozen=True, slots=True)
 class RadioStatus:
-    """What a telemetry radio last said of itself, in its own units (SiK: 0 to 254, about half a dB each).
+    """The last status of a telemetry radio, in its own units (SiK: 0 to 254, about half a dB each).
 
     Attributes:
-        rssi, noise: signal and noise here.
-        remote_rssi, remote_noise: the same at the other end.
-        free: percent of its buffer for sending that is free.
-        errors, fixed: packets received with errors, and of these those that were corrected, since its start.
+        rssi, noise: signal and noise at this end.
+        remote_rssi, remote_noise: at the other end.
+        free: free percentage of its transmit buffer.
+        errors, fixed: packets received with errors, and the corrected ones among them, since its start.
     """
 
     rssi: int
@@ -69,22 +70,22 @@ class RadioStatus:
 
 @dataclass(frozen=True, slots=True)
 class ComponentTraffic:
-    """What was heard of one component since the link was opened; rates and `loss` are those of late.
+    """The traffic of one component since the link was opened; rates and `loss` are recent ones.
 
     Attributes:
-        system, component: who it is.
+        system, component: its address.
         version: the MAVLink version of its last frame, 1 or 2.
         heartbeat: its last HEARTBEAT, or None.
-        heartbeat_age: seconds since that came, or None.
-        age: seconds since anything came.
-        frames, bytes: how much came.
-        frame_rate, byte_rate: a second.
-        lost: frames that did not come, by the gaps in their numbers; see `SequenceCheck` for the rule.
-        loss: the share of its frames that was lost, 0 to 1; None where nothing new has come of late.
-        repeated, late: frames that came twice, or after a later one.
+        heartbeat_age: seconds since that, or None.
+        age: seconds since its last frame.
+        frames, bytes: received in total.
+        frame_rate, byte_rate: per second.
+        lost: lost frames, by the gaps in their numbers; see `SequenceCheck` for the rule.
+        loss: the share of its frames that was lost, 0 to 1; None without recent frames.
+        repeated, late: frames received twice, or after a later one.
         signed: frames with a signature; it is not verified.
         messages: by kind, the most frequent one first.
-        radio: what it says of itself, if it is a radio.
+        radio: its status, if it is a radio.
     """
 
     system: int
@@ -108,17 +109,17 @@ class ComponentTraffic:
 
 @dataclass(frozen=True, slots=True)
 class TrafficReport:
-    """What has gone over a link.
+    """The traffic of a link.
 
     Attributes:
-        seconds: for how long it was listened to.
+        seconds: the observed time.
         components: by address.
-        bytes_received, bytes_sent: how much came and went.
-        received_rate, sent_rate: bytes a second, of late.
-        frames: whole frames that came.
+        bytes_received, bytes_sent: in total.
+        received_rate, sent_rate: recent bytes per second.
+        frames: whole frames received.
         damaged: frames with a wrong checksum.
-        unknown: frames with an id that the dialect does not have; they are among `frames`.
-        other_bytes: bytes that came and belong to no frame.
+        unknown: frames with an id outside the dialect; included in `frames`.
+        other_bytes: received bytes outside of frames.
     """
 
     seconds: float
@@ -134,7 +135,7 @@ class TrafficReport:
 
 
 class Traffic:
-    """Counts everything that a link delivers, for those who ask for it: an ordinary client does without.
+    """Counts all traffic of a link, on request only: an ordinary client does without.
 
     Args:
         is_stream: whether frames may be spread over several chunks.
@@ -149,44 +150,44 @@ class Traffic:
         self._sent = _Recently()
         self._frames = 0
         self._unknown = 0
-        self._damaged = 0  # and the next: of sniffers that are gone
+        self._damaged = 0  # this and the next: of removed sniffers
         self._other_bytes = 0
 
     def receive(self, data: bytes, peer: Hashable, now: float) -> None:
-        """Take what came; an empty chunk says that the peer's stream has ended."""
+        """Count received bytes; an empty chunk means the end of the peer's stream."""
         self._begin(now)
         self._received.add(now, len(data))
         key = peer if self._is_stream else None
         sniffer = self._sniffers.get(key)
         if sniffer is None:
             sniffer = self._sniffers[key] = Sniffer(stream=self._is_stream)
-            if len(self._sniffers) > MOST_PEERS:
+            if len(self._sniffers) > COUNTED_PEERS_MAX:
                 self._forget(next(iter(self._sniffers)))
         for seen in sniffer.receive(data) if data else self._forget(key):
             self._count(seen, peer, now)
 
     def sent(self, total: int, now: float) -> None:
-        """Take note of how many bytes were sent up to now."""
+        """Record the total of sent bytes."""
         self._begin(now)
         self._sent.add(now, total - self._sent.total)
 
     def pause(self) -> None:
-        """The link is away: what was cut off by that is not continued."""
+        """End all unfinished frames: the link is down, and they are not continued."""
         for peer in list(self._sniffers):
             self._forget(peer)
 
     @property
     def lost(self) -> int:
-        """Frames of all components that have not come."""
+        """Lost frames of all components."""
         return sum(source.lost for source in self._sources.values())
 
     @property
     def repeated(self) -> int:
-        """Frames of all components that came twice."""
+        """Frames of all components received twice."""
         return sum(source.repeated for source in self._sources.values())
 
     def report(self, now: float) -> TrafficReport:
-        """How it stands."""
+        """Return the present counts."""
         began = now if self._began is None else self._began
         sniffers = self._sniffers.values()
         return TrafficReport(
@@ -207,7 +208,7 @@ class Traffic:
             self._began = now
 
     def _forget(self, peer: Hashable) -> list[Seen]:
-        """Part with a peer's stream; what stood in its unfinished end."""
+        """Remove a peer's stream; return the frames in its unfinished end."""
         sniffer = self._sniffers.pop(peer)
         seen = sniffer.flush()
         self._damaged += sniffer.damaged
@@ -221,8 +222,8 @@ class Traffic:
         address = (seen.system, seen.component)
         source = self._sources.get(address)
         if source is None:
-            if not seen.is_known or len(self._sources) >= MOST_COMPONENTS:
-                return  # an address that no checksum proves is none
+            if not seen.is_known or len(self._sources) >= COUNTED_COMPONENTS_MAX:
+                return  # an address that no checksum proves does not count
             source = self._sources[address] = _Source(address)
         source.heard(seen, peer, now)
 
@@ -244,7 +245,7 @@ class _Source:
         self._heartbeat: Heartbeat | None = None
         self._heartbeat_at = 0.0
         self._radio: RadioStatus | None = None
-        self._late = 0  # of peers that are gone
+        self._late = 0  # of removed peers
 
     def heard(self, seen: Seen, peer: Hashable, now: float) -> None:
         self._heard_at = now
@@ -253,7 +254,7 @@ class _Source:
         self._bytes.add(now, seen.size)
         self._frames.add(now, 1)
         messages = self._messages.get(seen.message_id)
-        if messages is None and len(self._messages) < MOST_MESSAGES:
+        if messages is None and len(self._messages) < COUNTED_MESSAGES_MAX:
             messages = self._messages[seen.message_id] = _Recently()
         if messages is not None:
             messages.add(now, 1)
@@ -311,19 +312,19 @@ class _Source:
         check = self._checks.get(peer)
         if check is None:
             check = self._checks[peer] = SequenceCheck()
-            if len(self._checks) > MOST_PEERS:
+            if len(self._checks) > COUNTED_PEERS_MAX:
                 self._late += self._checks.pop(next(iter(self._checks))).late
         return check
 
 
 class _Recently:
-    """A sum, and how much of it was added within the last `WINDOW` seconds."""
+    """A sum, and its increase within the last `RATE_WINDOW` seconds."""
 
     __slots__ = ("_slices", "total")
 
     def __init__(self) -> None:
         self.total = 0
-        self._slices: deque[list[int]] = deque(maxlen=round(WINDOW / SLICE))  # number of the slice, sum
+        self._slices: deque[list[int]] = deque(maxlen=round(RATE_WINDOW / SLICE))  # number of the slice, sum
 
     def add(self, now: float, amount: int) -> None:
         self.total += amount
@@ -338,13 +339,13 @@ class _Recently:
         return sum(amount for number, amount in self._slices if number >= first)
 
     def rate(self, began: float, now: float) -> float:
-        """So much a second."""
-        return self.of_late(now) / max(now - max(_first_slice(now) * SLICE, began), SHORTEST_TIME)
+        """Return the recent increase per second."""
+        return self.of_late(now) / max(now - max(_first_slice(now) * SLICE, began), RATE_TIME_MIN)
 
 
 def _first_slice(now: float) -> int:
-    """The oldest slice that is still of late."""
-    return int(now / SLICE) - round(WINDOW / SLICE) + 1
+    """Return the oldest slice within that time."""
+    return int(now / SLICE) - round(RATE_WINDOW / SLICE) + 1
 
 
 _RADIO_STATUS = struct.Struct("<HHBBBBB")

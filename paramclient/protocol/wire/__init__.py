@@ -1,9 +1,15 @@
-"""Bytes to messages and back. The only room that knows pymavlink."""
+"""Bytes to messages and back. The only package that uses pymavlink.
+
+`codec`: messages from and to payloads.
+`frames`: frames from and to bytes; checksums.
+`messages`: the message classes and their constants.
+`signing`: signatures of MAVLink 2.
+"""
 
 from __future__ import annotations
 
 from paramclient.protocol.wire.codec import (
-    UNDERSTOOD,
+    DECODED_IDS,
     decode,
     decode_param_value,
     encode,
@@ -49,9 +55,9 @@ from paramclient.protocol.wire.messages import (
     MAV_STATE_BOOT,
     MAV_TYPE_GCS,
     MAV_TYPE_GENERIC,
-    MOST_PARAMETERS,
     NO_INDEX,
     PARAM_VALUE_ID,
+    PARAMETERS_MAX,
     SYSTEM_TIME_ID,
     AutopilotVersion,
     CommandAck,
@@ -119,7 +125,7 @@ __all__ = [
     "MAV_STATE_BOOT",
     "MAV_TYPE_GCS",
     "MAV_TYPE_GENERIC",
-    "MOST_PARAMETERS",
+    "PARAMETERS_MAX",
     "Message",
     "NO_INDEX",
     "PARAM_VALUE_ID",
@@ -138,7 +144,7 @@ __all__ = [
     "SYSTEM_TIME_ID",
     "StatusText",
     "SystemTime",
-    "UNDERSTOOD",
+    "DECODED_IDS",
     "Verifier",
     "bears_key",
     "build_frame",

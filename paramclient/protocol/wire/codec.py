@@ -1,6 +1,6 @@
-"""Frames to messages, and messages to bytes: the few of this protocol, on raw bytes.
+"""Decoder and encoder of the messages that this library uses, on raw bytes.
 
-A parameter's value must not pass through a Python float on its way (see `paramclient.model.values`).
+A parameter's value must not pass through a Python float (see `paramclient.model.values`).
 """
 
 from __future__ import annotations
@@ -33,26 +33,26 @@ from paramclient.protocol.wire.messages import (
 )
 from paramclient.protocol.wire.signing import SigningKey
 
-__all__ = ["UNDERSTOOD", "decode", "decode_param_value", "encode"]
+__all__ = ["DECODED_IDS", "decode", "decode_param_value", "encode"]
 
-MOST_TEXTS: Final = 4096
-"""Texts that are remembered: the names of a few autopilots of different kinds, 100 bytes each. A vehicle that
-tells ever new ones costs no more than that, and decoding takes a microsecond longer."""
+TEXTS_MAX: Final = 4096
+"""Remembered texts: the names of a few different autopilots, 100 bytes each. A vehicle with ever new names
+uses no more memory than that, and decoding takes a microsecond longer."""
 
-_new = tuple.__new__  # what a named tuple's own constructor ends in, after twice the time
+_new = tuple.__new__  # the constructor of a named tuple ends in this call and takes twice as long
 
 
 def decode(frame: Frame) -> Message | None:
-    """The message in a frame, or None where this library has no use for its id.
+    """Decode the message in a frame; return None for an id that this library does not use.
 
-    Missing trailing bytes count as zero and further ones are passed over, as MAVLink 2 asks.
+    Missing trailing bytes count as zero and further ones are ignored, as MAVLink 2 requires.
     """
     decoder = _DECODERS.get(frame.message_id)
     return None if decoder is None else decoder(frame.payload)
 
 
 def decode_param_value(payload: bytes) -> ParamValue:
-    """The message in the payload of a PARAM_VALUE, as `decode` gives it: for those who know the id."""
+    """Decode the payload of a PARAM_VALUE, as `decode` does: for callers that know the id."""
     if len(payload) < 25:
         payload = payload.ljust(25, b"\0")
     raw, count, index, name, number = _PARAM_VALUE.unpack_from(payload)
@@ -60,13 +60,13 @@ def decode_param_value(payload: bytes) -> ParamValue:
 
 
 def encode(message: Message, *, system: int, component: int, sequence: int, version: int = 2) -> bytes:
-    """Pack a message into a frame.
+    """Encode a message as a frame.
 
     Args:
-        message: any of this room's messages.
+        message: any message of this package.
         system, component: the sender, 1 to 255.
         sequence: 0 to 255.
-        version: 2, or 1 for peers that know only that; ids above 255 (PARAM_ERROR) exist in 2 alone.
+        version: 2, or 1 for peers without MAVLink 2; ids above 255 (PARAM_ERROR) exist in 2 only.
     """
     number, payload = _ENCODERS[type(message)](message)
     if version == 1:
@@ -76,11 +76,11 @@ def encode(message: Message, *, system: int, component: int, sequence: int, vers
     )
 
 
-@lru_cache(maxsize=MOST_TEXTS)
+@lru_cache(maxsize=TEXTS_MAX)
 def text_of(field: bytes) -> str:
-    """A text field: cut at the first NUL. Latin-1 keeps every byte, so that odd names can be told apart.
+    """Decode a text field up to the first NUL. Latin-1 keeps every byte, so that damaged names differ.
 
-    Remembered, because the same names come again and again: equal names are then one object.
+    Results are remembered, because the same names are repeated: equal names are then one object.
     """
     return field.split(b"\0", 1)[0].decode("latin-1")
 
@@ -93,7 +93,7 @@ _PARAM_REQUEST_READ = struct.Struct("<hBB16s")
 _PARAM_REQUEST_LIST = struct.Struct("<BB")
 _PARAM_VALUE = struct.Struct("<4sHH16sB")
 _PARAM_SET = struct.Struct("<4sBB16sB")
-_STATUSTEXT = struct.Struct("<B50s")  # its extension fields, for long texts in pieces, are not read
+_STATUSTEXT = struct.Struct("<B50s")  # the extension fields, for long texts in pieces, are not read
 _PARAM_ERROR = struct.Struct("<hBB16sB")
 _FILE_TRANSFER = struct.Struct("<BBB251s")
 _SYSTEM_TIME = struct.Struct("<QI")
@@ -196,8 +196,8 @@ _DECODERS: dict[int, Callable[[bytes], Message]] = {
     COMPONENT_METADATA_ID: _decode_component_metadata,
 }
 
-UNDERSTOOD: Final = frozenset(_DECODERS)
-"""The message ids that `decode` knows."""
+DECODED_IDS: Final = frozenset(_DECODERS)
+"""The message ids that `decode` supports."""
 
 
 def _name(param_id: str) -> bytes:

@@ -1,7 +1,7 @@
-"""Bytes to frames and back: framing and checking, on raw bytes, for every message of the dialect.
+"""Framing of every message of the dialect, on raw bytes: frames from and to bytes, checksums.
 
-pymavlink gives the CRC_EXTRA byte of every message of its `all` dialect, and the names of messages and
-enums. Most frames on a link need no decoding at all, so framing makes no objects of those that nobody wants.
+pymavlink provides the CRC_EXTRA byte of every message of its `all` dialect, and the names of messages and
+enums. Most frames on a link need no decoding, so framing makes no objects of unwanted ones.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ _START = struct.Struct("<BBBxBBB3s").unpack_from  # a header of MAVLink 2; versi
 _CRC_AT = struct.Struct("<H").unpack_from
 _HEADER_LENGTH = 10  # of MAVLink 2
 _PADDING = bytes(_HEADER_LENGTH)  # behind the data: a header can be read at its last byte
-_new = tuple.__new__  # what a named tuple's own constructor ends in, after twice the time
+_new = tuple.__new__  # the constructor of a named tuple ends in this call and takes twice as long
 _SETUP_SIGNING = (256).to_bytes(3, "little")
 _NO_KEY = b""  # of no message
 
 
 class Frame(NamedTuple):
-    """One frame, its checksum proven. A named tuple, because making one is part of the hot path.
+    """One frame with a valid checksum. A named tuple, as its creation is part of the hot path.
 
     Attributes:
         message_id: 24 bits.
-        system, component: who sent it.
+        system, component: the sender.
         sequence: 0 to 255.
         payload: as sent; MAVLink 2 cuts trailing zero bytes.
         version: 1 or 2.
@@ -62,24 +62,24 @@ class Frame(NamedTuple):
 
 
 class Framer:
-    """Finds the frames in what a link delivers.
+    """Finds the frames in received bytes.
 
-    Every frame whose message id is known is checked by its CRC; one with an unknown id cannot be checked
-    and is passed over. A candidate that fails is retried from its second byte, so that no noise can hide a
-    frame that stands whole outside a longer valid one. The 13 bytes behind the checksum of a signed frame
-    count as its signature, whatever they are; to look at them is the guard's business.
+    Every frame with a known message id is checked by its CRC; one with an unknown id cannot be checked and is
+    skipped. A rejected candidate is retried from its second byte, so that no noise can hide a frame that
+    stands whole outside a longer valid one. The 13 bytes behind the checksum of a signed frame count as its
+    signature without a check; the guard verifies them.
 
     Args:
-        wanted: the message ids to give out; None for every known one. Frames with other ids are still
-            checked and stepped over, but no object is made of them.
-        occasional: further ids, given out only while `takes_occasional` is set.
-        stream: whether a frame may be spread over several calls (TCP, serial). Datagrams are taken one by
+        wanted: the message ids to return; None for every known one. Frames with other ids are still checked
+            and skipped, but no object is made of them.
+        occasional: further ids, returned only while `takes_occasional` is set.
+        stream: whether a frame may be spread over several calls (TCP, serial). Datagrams are processed one by
             one and never joined.
 
     Attributes:
-        frames: frames that were found whole, wanted or not.
-        skipped: bytes that belonged to no such frame.
-        damaged: what looked like a frame of a known id and had a wrong checksum.
+        frames: whole frames, wanted or not.
+        skipped: bytes outside of these.
+        damaged: candidates with a known id and a wrong checksum.
     """
 
     def __init__(
@@ -102,9 +102,10 @@ class Framer:
 
     @property
     def guard(self) -> Callable[[bytes], bool] | None:
-        """Is asked of every frame, wanted or not, by its bytes, whether it may be taken; None: all may.
+        """Called with the bytes of every frame, wanted or not; returns whether to accept it. None: accept
+        all.
 
-        Also asked of a signed frame whose signature is cut off, which is passed over whatever the answer.
+        Also called for a signed frame with a truncated signature, which is skipped in any case.
         """
         return self._guard
 
@@ -115,7 +116,7 @@ class Framer:
 
     @property
     def takes_occasional(self) -> bool:
-        """Whether frames with the occasional ids are given out too. Choosing costs nothing per frame."""
+        """Whether frames with the occasional ids are returned too. The choice costs nothing per frame."""
         return self._numbers is self._all
 
     @takes_occasional.setter
@@ -124,16 +125,16 @@ class Framer:
         self._choose()
 
     def _choose(self) -> None:
-        # a guarded frame never takes the short way, so that the guard costs nothing where there is none
+        # with a guard, no frame takes the fast path, so that the guard costs nothing where there is none
         self._number_of = self._numbers.get if self._guard is None else _NO_NUMBERS.get
 
     def receive(self, data: bytes, *, final: bool = False) -> list[Frame]:
-        """Take bytes from the link; give the frames that are complete now, in order.
+        """Process received bytes and return the frames that are complete now, in order.
 
         Of a stream, at most one unfinished frame (less than 280 bytes) is kept between calls. Where `data` is
-        final, as datagrams always are, nothing will complete such a candidate, and it is passed over like any
-        other that fails. The loop is the hot path of the library: about ten operations for each frame,
-        nothing for each byte.
+        final, as datagrams always are, nothing completes such a candidate, and it is skipped like any
+        rejected one. The loop is the hot path of the library: about ten operations for each frame, none for
+        each byte.
         """
         if self._tail:
             data = self._tail + data
@@ -202,18 +203,18 @@ class Framer:
         return found
 
     def flush(self) -> list[Frame]:
-        """The stream has ended or was interrupted: give what stands behind the unfinished candidate."""
+        """Return the frames behind the unfinished candidate: the stream has ended or was interrupted."""
         return self.receive(b"", final=True)
 
     def _show_if_cut_off(self, data: bytes, crc_at: int, extra: bytes) -> None:
-        """Let the guard see a frame of which a part of the signature alone is missing."""
+        """Call the guard with a frame that lacks only a part of its signature."""
         is_proven = crc_at + 2 <= len(data) and _CRC_AT(data, crc_at)[0] == mcrf4xx(data[1:crc_at] + extra)
         if self._guard is not None and is_proven:
             self._guard(data)
 
 
 def _flagged(frame: bytes, flags: int) -> bytes:
-    """A frame of MAVLink 2, given without its checksum, with these flags and the checksum to them."""
+    """Return a frame of MAVLink 2 with these flags and a new checksum; it is passed without a checksum."""
     body = frame[1:2] + bytes((flags,)) + frame[3:]
     crc: int = mcrf4xx(body + _EXTRA_BY_ID_BYTES[frame[7:10]])
     return frame[:1] + body + crc.to_bytes(2, "little")
@@ -222,7 +223,7 @@ def _flagged(frame: bytes, flags: int) -> bytes:
 def build_frame(
     message_id: int, payload: bytes, *, system: int, component: int, sequence: int, version: int = 2
 ) -> bytes:
-    """Put a payload into a frame; for messages that have no class here, any id of the dialect.
+    """Build a frame from a payload: for messages without a class here, with any id of the dialect.
 
     MAVLink 2 drops the payload's trailing zeros. The other arguments are those of `encode`.
     """
@@ -239,16 +240,16 @@ def build_frame(
 
 
 def sign_frame(frame: bytes, signer: Signer) -> bytes:
-    """The same frame with a signature; one of MAVLink 1, which has no place for it, as it is."""
+    """Return the frame with a signature; a frame of MAVLink 1, which has no place for one, unchanged."""
     if frame[0] != _MAGIC_V2:
         return frame
     return signer.sign(_flagged(frame[:-2], _SIGNED))
 
 
 def unsign_frame(frame: bytes) -> bytes:
-    """The same frame as if it had never been signed; one with an id that the dialect does not have, as it is.
+    """Return the frame without its signature; one with an id outside the dialect unchanged.
 
-    The guide to message signing asks for that in logs: signatures in numbers help who looks for the key.
+    The guide to message signing requires that for logs: many signatures help to find the key.
     """
     if frame[0] != _MAGIC_V2 or frame[2] != _SIGNED or frame[7:10] not in _EXTRA_BY_ID_BYTES:
         return frame
@@ -256,24 +257,26 @@ def unsign_frame(frame: bytes) -> bytes:
 
 
 def bears_key(frame: bytes) -> bool:
-    """Whether it is a SETUP_SIGNING, with a key in clear: the guide asks not to log and not to forward it."""
+    """Return whether it is a SETUP_SIGNING, with a key in clear: the guide requires not to log or forward
+    it."""
     return frame[0] == _MAGIC_V2 and frame[7:10] == _SETUP_SIGNING
 
 
 def checksum(message_id: int, body: bytes) -> int | None:
-    """The checksum of a frame's bytes between its first one and the checksum; None for an unknown id."""
+    """Return the checksum of a frame's bytes between its first one and the checksum; None for an unknown
+    id."""
     extra = _CRC_EXTRA.get(message_id)
     return None if extra is None else int(mcrf4xx(body + bytes((extra,))))
 
 
 def message_name(message_id: int) -> str:
-    """`HEARTBEAT` for 0, and so on; `UNKNOWN_4711` for an id that the dialect does not have."""
+    """Return `HEARTBEAT` for 0, and so on; `UNKNOWN_4711` for an id outside the dialect."""
     known = dialect.mavlink_map.get(message_id)
     return _MISSING_NAMES.get(message_id, f"UNKNOWN_{message_id}") if known is None else str(known.msgname)
 
 
 def enum_word(enum: str, number: int) -> str:
-    """A number of one of the dialect's enums in words, `fixed wing` for 1 of MAV_TYPE; else the number."""
+    """Return a value of an enum of the dialect as text, `fixed wing` for 1 of MAV_TYPE; else the number."""
     entry = dialect.enums[enum].get(number)
     return (
         str(number) if entry is None else str(entry.name.removeprefix(f"{enum}_").lower().replace("_", " "))
@@ -281,12 +284,12 @@ def enum_word(enum: str, number: int) -> str:
 
 
 def _by_id_bytes(ids: Collection[int]) -> dict[bytes, int]:
-    """Message ids by their three bytes in a header of MAVLink 2."""
+    """Return message ids by their three bytes in a header of MAVLink 2."""
     return {number.to_bytes(3, "little"): number for number in ids}
 
 
 def _boot_clock_offsets() -> dict[int, int]:
-    """Where `time_boot_ms` lies in the payload, for each message in which its sender tells its own clock."""
+    """Return the offset of `time_boot_ms` in the payload, for each message with the sender's own clock."""
     offsets = {}
     for number, message in dialect.mavlink_map.items():
         names = message.ordered_fieldnames
@@ -300,14 +303,14 @@ def _boot_clock_offsets() -> dict[int, int]:
 
 
 def _frame_of(number: int, data: bytes) -> Frame:
-    """The frame that stands in its bytes from the first one to the checksum."""
+    """Return the frame in its bytes from the first one to the checksum."""
     if data[0] == _MAGIC_V2:
         return Frame(number, data[5], data[6], data[4], data[10:], 2)
     return Frame(number, data[3], data[4], data[2], data[6:], 1)
 
 
 _NO_NUMBERS: dict[bytes, int] = {}
-# of MAVLink's common set, which pymavlink 2.4.50 has without its unfinished messages
+# in MAVLink's common set, which pymavlink 2.4.50 has without its unfinished messages
 _MISSING_NAMES = {397: "COMPONENT_METADATA"}
 _MISSING_EXTRA = {397: 182}
 _CRC_EXTRA: dict[int, int] = _MISSING_EXTRA | {
@@ -329,10 +332,10 @@ _SIZES = {
     "double": 8,
 }
 _OTHER_CLOCKS = frozenset({251, 252, 254, 257, 263, 11060})
-"""Messages whose `time_boot_ms` is no clock of the sender at the moment of sending: NAMED_VALUE_FLOAT,
+"""Messages whose `time_boot_ms` is not the sender's clock at the moment of sending: NAMED_VALUE_FLOAT,
 NAMED_VALUE_INT, DEBUG and NAMED_VALUE_STRING have the time of an application, BUTTON_CHANGE and
 CAMERA_IMAGE_CAPTURED that of an earlier event, and are repeated."""
 
 BOOT_CLOCK_OFFSETS: Final = _boot_clock_offsets()
-"""By message id, where the four bytes of `time_boot_ms` begin in the payload. Messages with a target are
-requests to a vehicle, whose time is that of another program, and are left out. SYSTEM_TIME is among them."""
+"""The offset of the 4 bytes of `time_boot_ms` in the payload, by message id. Messages with a target are
+requests to a vehicle, with the time of another program, and are left out. SYSTEM_TIME is included."""

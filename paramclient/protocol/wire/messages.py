@@ -1,4 +1,4 @@
-"""The messages that this library understands, and the numbers in them that mean something to it."""
+"""The message classes of this library, and the MAVLink constants in their fields."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ __all__ = [
     "MAV_STATE_BOOT",
     "MAV_TYPE_GCS",
     "MAV_TYPE_GENERIC",
-    "MOST_PARAMETERS",
+    "PARAMETERS_MAX",
     "Message",
     "NO_INDEX",
     "PARAM_VALUE_ID",
@@ -58,17 +58,19 @@ __all__ = [
 ]
 
 NO_INDEX: Final = 65535
-"""param_index of a PARAM_VALUE that has no place in the list (PX4: `_HASH_CHECK` and parameters not in use;
-ArduPilot: replies by name and unasked updates)."""
-MOST_PARAMETERS: Final = 32_768
-"""Parameters that a component can have: param_index of PARAM_REQUEST_READ is signed, so that no index above
-32767 can be asked for. A param_count above this is none."""
+"""param_index of a PARAM_VALUE without a place in the list (PX4: `_HASH_CHECK` and parameters not in use;
+ArduPilot: responses by name and pushed changes)."""
+PARAMETERS_MAX: Final = 32_768
+"""Parameters of a component, at most: param_index of PARAM_REQUEST_READ is signed, so no index above 32767
+can be requested. A larger param_count is ignored."""
 HASH_CHECK: Final = "_HASH_CHECK"
-"""param_id under which PX4 gives the hash of its table."""
+"""The param_id of PX4's hash of its table."""
 COMP_ID_ALL: Final = 0
+"""MAV_COMP_ID_ALL: every component of a system."""
 AUTOPILOT_COMPONENT: Final = 1
+"""MAV_COMP_ID_AUTOPILOT1: the usual component id of an autopilot."""
 COMP_ID_MISSIONPLANNER: Final = 190
-"""MAV_COMP_ID_MISSIONPLANNER: the component id of ground stations."""
+"""MAV_COMP_ID_MISSIONPLANNER: the usual component id of a ground station."""
 
 MAV_TYPE_GENERIC: Final = 0
 MAV_TYPE_GCS: Final = 6
@@ -155,7 +157,7 @@ class ParamRequestList:
 
 
 class ParamValue(NamedTuple):
-    """PARAM_VALUE; `raw` is the four value bytes, undecoded. A named tuple for the same reason as `Frame`."""
+    """PARAM_VALUE; `raw` has the 4 value bytes, undecoded. A named tuple for the same reason as `Frame`."""
 
     param_id: str
     raw: bytes
@@ -166,7 +168,7 @@ class ParamValue(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ParamSet:
-    """PARAM_SET; `raw` is the four value bytes."""
+    """PARAM_SET; `raw` has the 4 value bytes."""
 
     target_system: int
     target_component: int
@@ -177,7 +179,7 @@ class ParamSet:
 
 @dataclass(frozen=True, slots=True)
 class ParamError:
-    """PARAM_ERROR; `param_index` −1 says that `param_id` counts; the id may be empty for a read by index."""
+    """PARAM_ERROR; with `param_index` −1 the `param_id` counts; the id may be empty for a read by index."""
 
     target_system: int
     target_component: int
@@ -204,7 +206,7 @@ class FileTransfer:
 
 @dataclass(frozen=True, slots=True)
 class SystemTime:
-    """SYSTEM_TIME; `time_unix_usec` is 0 where the vehicle does not know it."""
+    """SYSTEM_TIME; `time_unix_usec` is 0 while unknown to the vehicle."""
 
     time_unix_usec: int
     time_boot_ms: int
@@ -212,7 +214,7 @@ class SystemTime:
 
 @dataclass(frozen=True, slots=True)
 class HighLatency2:
-    """HIGH_LATENCY2, in the place of the heartbeat on satellite links; its telemetry is left out, or zero."""
+    """HIGH_LATENCY2, which replaces the heartbeat on satellite links; its telemetry is left out, or zero."""
 
     type: int
     autopilot: int
@@ -220,9 +222,9 @@ class HighLatency2:
 
 @dataclass(frozen=True, slots=True)
 class SetupSigning:
-    """SETUP_SIGNING: gives a vehicle its key, in clear; without one (zeros) it signs no more.
+    """SETUP_SIGNING: sets a vehicle's key, in clear; without a key (zeros) it disables signing.
 
-    There is no answer to it. It exists in MAVLink 2 alone.
+    There is no acknowledgement. It exists in MAVLink 2 only.
     """
 
     target_system: int
@@ -233,7 +235,7 @@ class SetupSigning:
 
 @dataclass(frozen=True, slots=True)
 class ComponentMetadata:
-    """COMPONENT_METADATA: where the general metadata file lies, and its CRC-32; its time is not read."""
+    """COMPONENT_METADATA: the location of the general metadata file, and its CRC-32; its time is not read."""
 
     uri: str
     file_crc: int

@@ -1,4 +1,4 @@
-"""Signatures of MAVLink 2: made for what is sent, checked with their timestamps in what comes.
+"""Signatures of MAVLink 2: created for sent frames, verified with their timestamps in received ones.
 
 The rules are those of the MAVLink guide, "Message Signing". A signature proves that the sender has the key
 and that the frame is new; it hides nothing. MAVLink 1 has no place for one.
@@ -31,25 +31,27 @@ __all__ = [
 ]
 
 KEY_LENGTH: Final = 32
+"""Bytes of a signing key."""
 SIGNATURE_LENGTH: Final = 13
 """Bytes behind the checksum: link id, timestamp (6), signature (6)."""
-UNITS: Final = 100_000
-"""Of the timestamp in a second: it counts 10 microseconds."""
+UNITS_PER_SECOND: Final = 100_000
+"""Units of the timestamp in a second: one is 10 microseconds."""
 EPOCH: Final = 1_420_070_400
-"""Unix time at which it begins: 2015-01-01 UTC."""
+"""Unix time of timestamp 0: 2015-01-01 UTC."""
 LAST_TIMESTAMP: Final = 2**48 - 1
-MOST_BEHIND: Final = 60 * UNITS
-"""How far behind ours the timestamp of a stream's first frame may be: one minute."""
-MOST_AHEAD: Final = LAST_TIMESTAMP - 24 * 60 * 60 * UNITS
-"""The highest timestamp that is taken over from others: behind it a day is left to be signed."""
-MOST_STREAMS: Final = 4_000
-"""Streams whose timestamps are kept: a thousand components over a few links each. Only who has the key can
-begin one. Further ones are refused: to forget one would open the way for its old frames."""
+"""The highest timestamp: it has 48 bits."""
+TIMESTAMP_LAG_MAX: Final = 60 * UNITS_PER_SECOND
+"""Units by which the timestamp of a stream's first frame may be behind ours: 1 minute."""
+ADOPTED_TIMESTAMP_MAX: Final = LAST_TIMESTAMP - 24 * 60 * 60 * UNITS_PER_SECOND
+"""The highest timestamp that is adopted from other senders: above it one day of signing is left."""
+STREAMS_MAX: Final = 4_000
+"""Streams with a timestamp: a thousand components over a few links each. Only a sender with the key can begin
+one. Further ones are refused: a removed stream would accept its old frames again."""
 
 _MAGIC_V2 = 0xFD
 _SIGNED = 0x01
 _UNSIGNED_LENGTH = 12  # of a frame of MAVLink 2 without its payload
-_RADIO_IDS = frozenset({109, 166})  # RADIO_STATUS, and RADIO as older SiK radios send it: they have no key
+_RADIO_IDS = frozenset({109, 166})  # RADIO_STATUS, and RADIO from older SiK radios: they have no key
 
 
 class SigningKey:
@@ -59,10 +61,10 @@ class SigningKey:
         secret: 32 bytes, not all of them zero: that means no signing.
 
     Attributes:
-        fingerprint: 16 hexadecimal digits that tell a key from others and do not give it away.
+        fingerprint: 16 hexadecimal digits that identify a key without revealing it.
 
     Raises:
-        UsageError: it is no such key. The text never repeats what was given.
+        UsageError: the key is invalid. The text never repeats the argument.
     """
 
     __slots__ = ("_hash", "_secret", "fingerprint")
@@ -74,12 +76,13 @@ class SigningKey:
             raise UsageError("a signing key of zeros means no signing")
         self._secret = bytes(secret)
         self._hash = hashlib.sha256(self._secret)
-        # begins otherwise than what is signed, so it is the signature of nothing
+        # differs from signed data in its beginning, so it is no signature of a frame
         self.fingerprint = hashlib.sha256(b"paramclient fingerprint\0" + self._secret).hexdigest()[:16]
 
     @classmethod
     def from_text(cls, text: str) -> SigningKey:
-        """The key in 64 hexadecimal digits, or in base64 (44 characters), with or without space around."""
+        """Return the key in 64 hexadecimal digits, or in base64 (44 characters), with or without space
+        around."""
         text = text.strip()
         secret = b""
         try:
@@ -98,18 +101,18 @@ class SigningKey:
 
     @classmethod
     def from_passphrase(cls, passphrase: str) -> SigningKey:
-        """The SHA-256 of the text in UTF-8, as Mission Planner and MAVProxy make it."""
+        """Return the key of a passphrase: its SHA-256 in UTF-8, as in Mission Planner and MAVProxy."""
         if not passphrase:
             raise UsageError("an empty passphrase means no signing")
         return cls(hashlib.sha256(passphrase.encode()).digest())
 
     @property
     def secret(self) -> bytes:
-        """The bytes themselves, for SETUP_SIGNING."""
+        """The 32 bytes, for SETUP_SIGNING."""
         return self._secret
 
     def signature(self, signed: bytes) -> bytes:
-        """The 6 bytes for a frame with its checksum, link id and timestamp."""
+        """Return the 6 bytes for a frame with its checksum, link id and timestamp."""
         digest = self._hash.copy()
         digest.update(signed)
         return digest.digest()[:6]
@@ -134,29 +137,30 @@ class SigningKey:
 
 
 class SigningPolicy(StrEnum):
-    """What is accepted of what comes, where there is a key."""
+    """The received frames that are accepted, where there is a key."""
 
     SIGNED_ONLY = "signed-only"
-    """Only what is rightly signed."""
+    """Frames with a valid signature only."""
 
     UNSIGNED_RADIOS = "unsigned-radios"
-    """That, and RADIO_STATUS without a signature, which telemetry radios put in on the way."""
+    """Also RADIO_STATUS without a signature, which telemetry radios insert."""
 
     ACCEPT_ALL = "accept-all"
-    """Everything, wrongly signed frames too; what is wrong is counted. For links that nobody else reaches."""
+    """All frames, also those with an invalid signature, which are counted. For links that no other sender can
+    reach."""
 
 
 class Refusal(StrEnum):
-    """What is wrong with a frame."""
+    """The reason to refuse a frame."""
 
     UNSIGNED = "unsigned"
-    """It has no signature, and the policy asks for one."""
+    """It has no signature, and the policy requires one."""
 
     BAD_SIGNATURE = "bad signature"
-    """The signature does not fit frame and key: another key, or a forgery."""
+    """The signature does not match frame and key: another key, or a forgery."""
 
     REPLAYED = "replayed"
-    """Its stream has had this timestamp or a later one: sent again, or overtaken on the way."""
+    """Its stream has had this timestamp or a later one: a replayed or reordered frame."""
 
     OLD = "old timestamp"
     """The first frame of its stream is more than a minute behind our timestamp."""
@@ -165,15 +169,15 @@ class Refusal(StrEnum):
     """A part of the signature is missing."""
 
     TOO_MANY_STREAMS = "too many streams"
-    """There is no room for the timestamp of one more stream."""
+    """The limit of streams with a timestamp is reached."""
 
 
 @dataclass(frozen=True, slots=True)
 class SigningStream:
-    """One sender on one of its links, as its signed frames tell.
+    """One sender on one of its links, by its signed frames.
 
     Attributes:
-        system, component, link_id: who it is.
+        system, component, link_id: its address and link.
         timestamp: of its last frame.
     """
 
@@ -185,18 +189,18 @@ class SigningStream:
 
 @dataclass(frozen=True, slots=True)
 class SigningReport:
-    """How the signatures on a link stand, since it was opened.
+    """The signatures on a link since it was opened.
 
     Attributes:
-        fingerprint: tells the key from others.
-        link_id: with which our frames are signed.
-        policy: what is accepted.
-        timestamp: the last one that was signed, or heard of.
-        signed: frames that came with a right signature.
-        unsigned: frames without one that were accepted.
-        unproven: frames that only `SigningPolicy.ACCEPT_ALL` let pass, by what is wrong with them.
-        refused: frames that were refused, by the reason.
-        streams: who signs.
+        fingerprint: identifies the key.
+        link_id: of our signatures.
+        policy: the frames that are accepted.
+        timestamp: the last one signed or received.
+        signed: received frames with a valid signature.
+        unsigned: accepted frames without one.
+        unproven: frames accepted only by `SigningPolicy.ACCEPT_ALL`, by reason.
+        refused: refused frames, by reason.
+        streams: the signing senders.
     """
 
     fingerprint: str
@@ -211,16 +215,16 @@ class SigningReport:
 
 
 class Signer:
-    """Signs what is sent, with a timestamp that rises from frame to frame and with the time.
+    """Signs sent frames, with a timestamp that rises from frame to frame and with the time.
 
     Args:
         key: the key.
-        link_id: which of our links this is, 0 to 255.
-        timestamp: where it begins: the time of day, or the last one used with this key if that is higher.
+        link_id: the number of our link, 0 to 255.
+        timestamp: the first one: the time of day, or the last one used with this key if that is higher.
 
     Attributes:
         key, link_id: as given.
-        timestamp: the last one used, or heard of.
+        timestamp: the last one used or received.
     """
 
     def __init__(self, key: SigningKey, *, link_id: int = 0, timestamp: int) -> None:
@@ -234,29 +238,29 @@ class Signer:
         self._started_at: float | None = None
 
     def advance(self, now: float) -> None:
-        """Let the timestamp follow the time, where frames have not brought it further already."""
+        """Advance the timestamp with the time, unless frames have advanced it further."""
         if self._started_at is None:
             self._started_at = now
-        self.catch_up(self._start + int((now - self._started_at) * UNITS))
+        self.catch_up(self._start + int((now - self._started_at) * UNITS_PER_SECOND))
 
     def catch_up(self, timestamp: int) -> None:
-        """Go on from another's timestamp, if that is later."""
-        self.timestamp = max(self.timestamp, min(timestamp, MOST_AHEAD))
+        """Adopt a received timestamp, if that is later."""
+        self.timestamp = max(self.timestamp, min(timestamp, ADOPTED_TIMESTAMP_MAX))
 
     def sign(self, frame: bytes) -> bytes:
-        """The signature put to a frame of MAVLink 2 that ends in its checksum and has the flag set."""
+        """Return the signature of a frame of MAVLink 2 that ends in its checksum and has the flag set."""
         self.timestamp += 1
         signed = frame + self._link + self.timestamp.to_bytes(6, "little")
         return signed + self.key.signature(signed)
 
 
 class Verifier:
-    """Says of each frame that comes whether it may be believed.
+    """Decides for each received frame whether to accept it.
 
     Args:
-        signer: ours: its key is the one that counts, and its timestamp goes on from later ones that come.
-        policy: what is accepted.
-        most_streams: how many streams are followed.
+        signer: ours: its key is the valid one, and its timestamp adopts later received ones.
+        policy: the frames that are accepted.
+        most_streams: the number of streams that are followed.
     """
 
     def __init__(
@@ -264,7 +268,7 @@ class Verifier:
         signer: Signer,
         policy: SigningPolicy = SigningPolicy.UNSIGNED_RADIOS,
         *,
-        most_streams: int = MOST_STREAMS,
+        most_streams: int = STREAMS_MAX,
     ) -> None:
         self.policy = policy
         self._signer = signer
@@ -276,7 +280,7 @@ class Verifier:
         self._refused: Counter[Refusal] = Counter()
 
     def accepts(self, frame: bytes) -> bool:
-        """Whether a frame, its checksum proven, is to be taken; it may be one whose end is cut off."""
+        """Return whether to accept a frame with a valid checksum; its signature may be truncated."""
         flaw = self._flaw(frame)
         if flaw is None:
             return True
@@ -285,7 +289,7 @@ class Verifier:
         return is_accepted
 
     def report(self) -> SigningReport:
-        """How it stands."""
+        """Return the present counts."""
         return SigningReport(
             fingerprint=self._signer.key.fingerprint,
             link_id=self._signer.link_id,
@@ -310,7 +314,7 @@ class Verifier:
         timestamp = int.from_bytes(frame[-12:-6], "little")
         last = self._streams.get(stream)
         if last is None:
-            if timestamp < signer.timestamp - MOST_BEHIND:
+            if timestamp < signer.timestamp - TIMESTAMP_LAG_MAX:
                 return Refusal.OLD
             if len(self._streams) >= self._most_streams:
                 return Refusal.TOO_MANY_STREAMS
@@ -331,5 +335,5 @@ class Verifier:
 
 
 def timestamp_of(unix_time: float) -> int:
-    """The timestamp of a moment; 0 before 2015, where a clock is not set."""
-    return min(max(int((unix_time - EPOCH) * UNITS), 0), MOST_AHEAD)
+    """Return the timestamp of a moment; 0 before 2015, as with a clock that is not set."""
+    return min(max(int((unix_time - EPOCH) * UNITS_PER_SECOND), 0), ADOPTED_TIMESTAMP_MAX)

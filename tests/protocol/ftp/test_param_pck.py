@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from paramclient.errors import PackError, UsageError
 from paramclient.model.values import ParamType
 from paramclient.protocol.ftp.param_pck import (
-    LARGEST_FILE,
+    PACK_SIZE_MAX,
     Pack,
     PackedParam,
     decode,
@@ -166,7 +166,7 @@ class TestTheFormat:
 
     def test_what_is_longer_than_any_file_is_not_looked_at(self) -> None:
         with pytest.raises(PackError, match="no packed parameter file has"):
-            decode(packed(bytes(LARGEST_FILE)))
+            decode(packed(bytes(PACK_SIZE_MAX)))
 
     @pytest.mark.parametrize(
         ("rows", "words"),

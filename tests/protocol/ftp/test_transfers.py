@@ -14,13 +14,18 @@ from paramclient.errors import FileErrorCode, FileTransferError, LinkError, NoRe
 from paramclient.model.values import ParamType, crc32_px4
 from paramclient.protocol import wire
 from paramclient.protocol.ftp import DirectoryEntry, FileRead, FileTransfers, param_pck
-from paramclient.protocol.ftp.file_read import MOST_RESTARTS, SMALLEST_WINDOW
-from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
+from paramclient.protocol.ftp.file_read import REOPENS_MAX, WINDOW_MIN
+from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.ftp.param_pck import PackedParam
-from paramclient.protocol.ftp.transfer_job import BUSY_PATIENCE, MOST_FAILURES, MOST_OPENINGS, QUIET_TIME
+from paramclient.protocol.ftp.transfer_job import (
+    BUSY_TIMEOUT,
+    OPEN_FAILURES_MAX,
+    OPENS_MAX,
+    SESSION_IDLE_TIME,
+)
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.operation import Operation
-from paramclient.protocol.requests.round_trip import FEWEST_TRIES, MOST_TRIES, RoundTrip
+from paramclient.protocol.requests.round_trip import ATTEMPTS_MAX, ATTEMPTS_MIN, RoundTrip
 from paramclient.protocol.wire import FileTransfer, Message
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
 from paramclient.sim.ftp import IDLE_LIMIT
@@ -156,7 +161,7 @@ class TestReading:
         desk.answer(request, (300).to_bytes(4, "little"), session=9)
         assert read.size == 300
         burst = desk.next(Opcode.BURST_READ_FILE)
-        assert (burst.session, burst.offset, burst.size) == (9, 0, MOST_DATA)
+        assert (burst.session, burst.offset, burst.size) == (9, 0, DATA_SIZE_MAX)
         desk.answer(burst, b"a" * 239)
         assert read.received == 239
         desk.answer(burst, b"b" * 61, offset=239, nth=2)
@@ -605,7 +610,7 @@ class TestRefusals:
     def test_but_not_for_ever(self) -> None:
         desk = Desk()
         read, burst = desk.opened()
-        for _ in range(MOST_OPENINGS - 1):
+        for _ in range(OPENS_MAX - 1):
             desk.answer(burst, code=FileErrorCode.FILE_NOT_FOUND)
             desk.answer(desk.opening(), bytes(4), session=9)
             burst = desk.next(Opcode.BURST_READ_FILE)
@@ -623,13 +628,13 @@ class TestRefusals:
         while not read.done:
             desk.answer(request, code=code)
             if not read.done:
-                assert read.blocked_until == pytest.approx(desk.now + QUIET_TIME)
-                desk.pass_time(QUIET_TIME - 0.01)
+                assert read.blocked_until == pytest.approx(desk.now + SESSION_IDLE_TIME)
+                desk.pass_time(SESSION_IDLE_TIME - 0.01)
                 assert desk.take() == []
                 desk.pass_time(0.02)
                 request = desk.opening()
         assert error_of(read).code == code
-        assert BUSY_PATIENCE <= desk.now - began <= BUSY_PATIENCE + 2 * QUIET_TIME
+        assert BUSY_TIMEOUT <= desk.now - began <= BUSY_TIMEOUT + 2 * SESSION_IDLE_TIME
         assert desk.transfers.is_idle
 
     def test_whatever_the_server_says_lets_that_session_live_on(self) -> None:
@@ -640,7 +645,7 @@ class TestRefusals:
         for to in (OWN, (254, 190)):  # the refusal of a copy, and what another station reads
             desk.pass_time(2.0)
             desk.hear(Packet(9, 77, Opcode.ACK, b"x", requested=Opcode.READ_FILE), to=to)
-        desk.pass_time(QUIET_TIME - 0.01)
+        desk.pass_time(SESSION_IDLE_TIME - 0.01)
         assert desk.take() == []
         desk.pass_time(0.02)
         assert desk.opening().session == request.session
@@ -656,7 +661,7 @@ class TestRefusals:
     def test_an_open_that_fails_without_a_reason_is_tried_again_a_few_times(self) -> None:
         desk = Desk()
         read = desk.transfers.read("a", desk.now)
-        for _ in range(MOST_FAILURES + 1):
+        for _ in range(OPEN_FAILURES_MAX + 1):
             request = next(packet for packet in desk.take() if packet.opcode == Opcode.OPEN_FILE_RO)
             desk.answer(request, code=FileErrorCode.FAIL)
         assert error_of(read).code == FileErrorCode.FAIL
@@ -672,7 +677,7 @@ class TestSilence:
         assert read.error.awaited == "a of 1/1"
         opens = [packet for packet in desk.take() if packet.opcode == Opcode.OPEN_FILE_RO]
         assert len(set(opens)) == 1
-        assert FEWEST_TRIES <= read.error.attempts <= MOST_TRIES
+        assert ATTEMPTS_MIN <= read.error.attempts <= ATTEMPTS_MAX
         assert desk.transfers.is_idle
 
     def test_who_fell_silent_is_told_once_to_close(self) -> None:
@@ -714,7 +719,7 @@ class TestSilence:
         assert isinstance(read.error, NoReply)
         reads = [packet for packet in desk.take() if packet.opcode == Opcode.READ_FILE]
         assert len(reads) >= 2 * read.error.attempts
-        assert read.error.attempts >= FEWEST_TRIES
+        assert read.error.attempts >= ATTEMPTS_MIN
 
     def test_into_a_silence_only_a_few_reads_go_out(self) -> None:
         desk = Desk()
@@ -725,11 +730,11 @@ class TestSilence:
         desk.answer(burst, code=FileErrorCode.EOF, offset=239 * 199, nth=200)
         desk.round_trip.answered(0.0, 0.1, 1)
         desk.pass_time(0.09)
-        assert len(desk.take()) > 2 * SMALLEST_WINDOW
+        assert len(desk.take()) > 2 * WINDOW_MIN
         desk.pass_time(0.4)
         desk.take()
         desk.pass_time(0.5)
-        assert 0 < len(desk.take()) <= 5 * SMALLEST_WINDOW
+        assert 0 < len(desk.take()) <= 5 * WINDOW_MIN
         assert not read.done
 
     def test_a_server_that_sends_the_same_for_ever(self) -> None:
@@ -978,7 +983,7 @@ class TestHaste:
                 opened += 1
                 burst = sent[-1]
             desk.answer(burst, b"x" * 239)
-        assert opened == 2 + MOST_RESTARTS
+        assert opened == 2 + REOPENS_MAX
 
     def test_one_that_got_lost_is_asked_for_soon(self) -> None:
         desk = self.known_link()
@@ -1228,7 +1233,7 @@ class Ground:
             self.round_trip.answered(0.0, round_trip, 1)
         self.requests = 0
         self._outbox: list[Message] = []
-        self._framer = wire.Framer(wire.UNDERSTOOD, stream=False)
+        self._framer = wire.Framer(wire.DECODED_IDS, stream=False)
         is_ardupilot = isinstance(vehicle, ArduPilotVehicle)
         autopilot = wire.MAV_AUTOPILOT_ARDUPILOTMEGA if is_ardupilot else None
         self.transfers = FileTransfers(

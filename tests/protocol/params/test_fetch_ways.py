@@ -8,7 +8,7 @@ import pytest
 
 from paramclient.protocol import wire
 from paramclient.protocol.ftp.packets import Opcode, Packet
-from paramclient.protocol.ftp.transfer_job import QUIET_TIME
+from paramclient.protocol.ftp.transfer_job import SESSION_IDLE_TIME
 from paramclient.protocol.params.fetch import FILE_OPEN_TIMEOUT, FILE_OPEN_TIMEOUT_SILENT, Fetch
 from paramclient.protocol.params.fetch_notes import FILE_IN_USE
 from paramclient.protocol.requests.round_trip import FIRST_TIMEOUT
@@ -41,7 +41,7 @@ class Uplink(Tap):
         self.arrived: list[Message] = []
 
     def receive(self, data: bytes, now: float) -> None:
-        message = wire.decode(wire.Framer(wire.UNDERSTOOD, stream=False).receive(data)[0])
+        message = wire.decode(wire.Framer(wire.DECODED_IDS, stream=False).receive(data)[0])
         assert message is not None
         if not self.loses(message):
             self.arrived.append(message)
@@ -257,7 +257,7 @@ def test_beside_a_session_that_was_left_open_a_quick_list_is_taken() -> None:
     assert result.elapsed < 1.3
     assert {at for at, _ in requests_to_server(session)} == {began}
     assert session.machine.fetches.file_works is None
-    session.run(QUIET_TIME)
+    session.run(SESSION_IDLE_TIME)
     assert session.fetch().source == "ftp"
 
 
@@ -274,8 +274,8 @@ def test_on_a_radio_the_end_of_the_session_is_waited_for() -> None:
     asked = sorted({at for at, opcode in requests_to_server(session) if opcode is Opcode.OPEN_FILE_RO})
     assert len(asked) == 2
     assert asked[0] == began
-    assert QUIET_TIME < asked[1] - began < QUIET_TIME + 0.4
-    assert result.elapsed < QUIET_TIME + 4.5
+    assert SESSION_IDLE_TIME < asked[1] - began < SESSION_IDLE_TIME + 0.4
+    assert result.elapsed < SESSION_IDLE_TIME + 4.5
 
 
 def test_nothing_is_sent_while_another_station_reads() -> None:
@@ -294,5 +294,5 @@ def test_nothing_is_sent_while_another_station_reads() -> None:
     session.until(lambda: fetch.done or len(requests_to_server(session)) > sent)
     assert not fetch.done
     heard.append(session.now)
-    assert session.now > QUIET_TIME + 6.0  # the other one's file took 7 s
+    assert session.now > SESSION_IDLE_TIME + 6.0  # the other one's file took 7 s
     assert session.outcome(fetch).source == "ftp"

@@ -43,7 +43,7 @@ class Server(Tap):
         self._sequence = -1
 
     def receive(self, data: bytes, now: float) -> None:
-        frame = wire.Framer(wire.UNDERSTOOD, stream=False).receive(data)[0]
+        frame = wire.Framer(wire.DECODED_IDS, stream=False).receive(data)[0]
         message = wire.decode(frame)
         if isinstance(message, wire.FileTransfer):
             request = Packet.unpack(message.payload)

@@ -23,20 +23,20 @@ from paramclient.protocol.params.reads import (
     Reads,
 )
 from paramclient.protocol.requests.context import Context
-from paramclient.protocol.requests.pacing import FIRST_RATE, SMALLEST_BURST
+from paramclient.protocol.requests.pacing import BURST_MIN, FIRST_RATE
 from paramclient.protocol.requests.round_trip import (
-    FEWEST_TRIES,
+    ATTEMPTS_MAX,
+    ATTEMPTS_MIN,
     FIRST_TIMEOUT,
     INITIAL_TIMEOUT,
-    LONGEST_SILENCE,
-    MOST_TRIES,
+    SILENCE_MAX,
     RoundTrip,
 )
 from paramclient.protocol.wire import Message, ParamError, ParamRequestRead, ParamValue
 from paramclient.sim import Air, ArduPilotVehicle
 from tests.simulation import Simulation, param_value
 
-BURST = int(SMALLEST_BURST)
+BURST = int(BURST_MIN)
 
 
 class Desk:
@@ -321,7 +321,7 @@ def test_silence_on_something_known_ends_with_no_reply() -> None:
     read = desk.ask("A")
     desk.pass_time()
     assert isinstance(read.error, NoReply)
-    assert read.error.attempts == read.attempts == desk.sent.count("A") <= MOST_TRIES
+    assert read.error.attempts == read.attempts == desk.sent.count("A") <= ATTEMPTS_MAX
     assert read.error.waited == pytest.approx(desk.now)
     assert "A of 1/1" in str(read.error)
     assert len(desk.reads) == 0
@@ -461,7 +461,7 @@ def test_answered_controls_end_what_stays_silent_soon() -> None:
     silent = [desk.ask(index) for index in range(20, 50)]
     desk.pass_time()
     assert all(isinstance(read.error, NoReply) for read in silent)
-    assert FEWEST_TRIES <= max(read.attempts for read in silent) <= FEWEST_TRIES + 1 < desk.round_trip.tries
+    assert ATTEMPTS_MIN <= max(read.attempts for read in silent) <= ATTEMPTS_MIN + 1 < desk.round_trip.tries
     assert desk.now < 10.0
 
 
@@ -475,8 +475,8 @@ def test_index_0_needs_no_other_control() -> None:
 
 def test_silences_of_the_past_do_not_count_against_what_is_asked_later() -> None:
     """A vehicle that was away for long and is back: each read has its tries again."""
-    desk = Desk("A", count=MOST_TRIES)
-    gone = [desk.ask(index) for index in range(MOST_TRIES)]
+    desk = Desk("A", count=ATTEMPTS_MAX)
+    gone = [desk.ask(index) for index in range(ATTEMPTS_MAX)]
     desk.pass_time()
     assert all(read.done for read in gone)
     desk.now += 60.0
@@ -496,7 +496,7 @@ def test_a_component_that_is_gone_is_given_up_sooner() -> None:
         read = desk.ask("A")
         desk.pass_time()
         assert isinstance(read.error, NoReply)
-    assert LONGEST_SILENCE <= gone.now < LONGEST_SILENCE + 5.0
+    assert SILENCE_MAX <= gone.now < SILENCE_MAX + 5.0
     assert gone.now < patient.now
 
 
@@ -504,7 +504,7 @@ def test_when_not_one_of_many_is_answered_all_are_given_up() -> None:
     desk = Desk()
     desk.measure(0.1)
     reads = [desk.ask(index, urgent=False) for index in range(1, 200)]
-    desk.pass_time(LONGEST_SILENCE - 0.1)
+    desk.pass_time(SILENCE_MAX - 0.1)
     assert not any(read.done for read in reads)
     desk.pass_time(8.0)
     assert all(isinstance(read.error, NoReply) for read in reads)
@@ -514,7 +514,7 @@ def test_one_answer_is_enough_to_go_on() -> None:
     desk = Desk()
     desk.measure(0.1)
     reads = [desk.ask(index, urgent=False) for index in range(1, 200)]
-    desk.pass_time(LONGEST_SILENCE - 1.0)
+    desk.pass_time(SILENCE_MAX - 1.0)
     desk.hear("X", index=1)
     desk.pass_time(3.0)
     assert not any(read.done for read in reads[1:])

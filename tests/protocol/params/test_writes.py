@@ -23,7 +23,7 @@ from paramclient.protocol.params.reads import Reads
 from paramclient.protocol.params.table import Table
 from paramclient.protocol.params.writes import Write, Writes
 from paramclient.protocol.requests.context import Context
-from paramclient.protocol.requests.round_trip import FEWEST_TRIES, INITIAL_TIMEOUT, RoundTrip
+from paramclient.protocol.requests.round_trip import ATTEMPTS_MIN, INITIAL_TIMEOUT, RoundTrip
 from paramclient.protocol.wire import Message, ParamError, ParamRequestRead, ParamSet, ParamValue
 from tests.simulation import is_so, known, param_value
 
@@ -429,7 +429,7 @@ def test_silence_on_the_write_alone_says_that_it_is_not_applied() -> None:
     assert isinstance(error, ValueNotApplied)
     assert math.isnan(float(error.requested))
     assert error.actual == 1.0
-    assert write.attempts >= FEWEST_TRIES
+    assert write.attempts >= ATTEMPTS_MIN
     assert desk.now < 5.0
     assert "keeps A at 1.0" in str(error)
 

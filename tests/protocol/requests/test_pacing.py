@@ -6,12 +6,12 @@ import pytest
 
 from paramclient.protocol.requests.pacing import (
     BATCHED_RATE,
+    BURST_MIN,
     FIRST_RATE,
-    LARGEST_RATE,
-    LIST_READS,
-    QUEUEING,
-    SMALLEST_BURST,
-    SMALLEST_RATE,
+    QUEUEING_DELAY,
+    RATE_MAX,
+    RATE_MIN,
+    READS_PER_LIST_VALUE,
     UPSTREAM_SHARE,
     Pace,
     Share,
@@ -47,7 +47,7 @@ def serve(pace: Pace, seconds: float, delay: float, *, rate: float = 1e9, since:
 
 def test_it_begins_with_what_the_slowest_autopilot_serves() -> None:
     pace = Pace(RoundTrip())
-    assert burst(pace, 5.0) == SMALLEST_BURST
+    assert burst(pace, 5.0) == BURST_MIN
     assert pace.next_at() == pytest.approx(5.0 + 1 / FIRST_RATE)
     assert not pace.may_send(5.01)
     assert pace.may_send(pace.next_at())
@@ -64,7 +64,7 @@ def test_what_next_at_promises_holds_to_the_last_bit() -> None:
 
 def test_a_reserve_is_kept() -> None:
     pace = Pace(RoundTrip())
-    for _ in range(int(SMALLEST_BURST) - 2):
+    for _ in range(int(BURST_MIN) - 2):
         pace.sent(0.0)
     assert pace.may_send(0.0, reserve=1.0)
     assert not pace.may_send(0.0, reserve=1.5)
@@ -74,7 +74,7 @@ def test_a_reserve_is_kept() -> None:
 def test_it_speeds_up_as_long_as_answers_keep_up() -> None:
     pace = Pace(RoundTrip())
     serve(pace, 3.0, 0.02)
-    assert pace.rate == LARGEST_RATE
+    assert pace.rate == RATE_MAX
 
 
 def test_it_stays_near_what_is_served() -> None:
@@ -105,7 +105,7 @@ def test_answers_that_queue_up_slow_it_down() -> None:
     pace = Pace(RoundTrip())
     serve(pace, 1.0, 0.02)
     fast = pace.rate
-    serve(pace, 3.0, 0.02 + 3 * QUEUEING, since=1.0)
+    serve(pace, 3.0, 0.02 + 3 * QUEUEING_DELAY, since=1.0)
     assert pace.rate < fast
 
 
@@ -150,7 +150,7 @@ def test_it_leaves_most_of_the_link_to_others() -> None:
     pace.stream_seen(0.01)
     assert pace.rate == FIRST_RATE
     pace.stream_seen(0.001)
-    assert pace.rate == pytest.approx(LIST_READS / 0.001)
+    assert pace.rate == pytest.approx(READS_PER_LIST_VALUE / 0.001)
 
 
 @pytest.mark.parametrize("gap", [0.125, 0.2, 1.0, 60.0])
@@ -158,13 +158,13 @@ def test_something_may_always_be_asked_even_on_the_slowest_link(gap: float) -> N
     pace = Pace(RoundTrip())
     burst(pace, 0.0)
     pace.stream_seen(gap)
-    assert pace.rate >= SMALLEST_RATE
+    assert pace.rate >= RATE_MIN
     now = 0.0
     for _ in range(5):
         now = max(pace.next_at(), now)
         assert pace.may_send(now)
         pace.sent(now)
-    assert now < 5 / SMALLEST_RATE + 1.0
+    assert now < 5 / RATE_MIN + 1.0
 
 
 def test_what_the_component_drops_does_not_pass_for_a_bad_link() -> None:

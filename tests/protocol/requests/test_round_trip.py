@@ -7,15 +7,15 @@ import math
 import pytest
 
 from paramclient.protocol.requests.round_trip import (
-    FEWEST_SILENCES,
-    FEWEST_TRIES,
+    ATTEMPTS_MAX,
+    ATTEMPTS_MIN,
+    BACKOFF_TIMEOUTS_MAX,
+    BACKOFF_TIMEOUTS_MIN,
     INITIAL_TIMEOUT,
-    LONGEST_SILENCE,
-    LONGEST_TIMEOUT,
-    MOST_SILENCES,
-    MOST_TRIES,
     SERVING_TIME,
-    SHORTEST_TIMEOUT,
+    SILENCE_MAX,
+    TIMEOUT_MAX,
+    TIMEOUT_MIN,
     RoundTrip,
 )
 
@@ -49,7 +49,7 @@ def test_samples_are_smoothed() -> None:
 
 
 def test_a_steady_link_is_not_asked_sooner_than_a_vehicle_answers() -> None:
-    assert measured(0.001, 100).timeout == SHORTEST_TIMEOUT
+    assert measured(0.001, 100).timeout == TIMEOUT_MIN
     steady = measured(0.3, 100)
     assert 0.3 < steady.timeout < 0.35
 
@@ -63,14 +63,14 @@ def test_what_was_asked_for_twice_is_no_sample() -> None:
 def test_silences_in_a_row_back_off_and_a_sample_ends_that() -> None:
     trip = measured(0.1, 50)
     before = trip.timeout
-    for _ in range(FEWEST_SILENCES - 1):
+    for _ in range(BACKOFF_TIMEOUTS_MIN - 1):
         trip.timed_out(1)
     assert trip.timeout == before
     trip.timed_out(1)
     assert trip.timeout == 2 * before
-    for _ in range(20 * FEWEST_SILENCES):
+    for _ in range(20 * BACKOFF_TIMEOUTS_MIN):
         trip.timed_out(3)
-    assert trip.timeout == LONGEST_TIMEOUT
+    assert trip.timeout == TIMEOUT_MAX
     trip.answered(0.0, 0.1, 1)
     assert trip.timeout == pytest.approx(before)
 
@@ -78,11 +78,11 @@ def test_silences_in_a_row_back_off_and_a_sample_ends_that() -> None:
 def test_an_answer_that_fits_the_last_request_ends_the_silences() -> None:
     trip = measured(0.1, 50)
     for _ in range(4):
-        for _ in range(FEWEST_SILENCES - 1):
+        for _ in range(BACKOFF_TIMEOUTS_MIN - 1):
             trip.timed_out(1)
         trip.answered(0.0, 0.09, 2)
     assert trip.timeout < 0.2
-    for _ in range(MOST_SILENCES):
+    for _ in range(BACKOFF_TIMEOUTS_MAX):
         trip.timed_out(1)
         trip.answered(0.0, 0.01, 2)  # too soon to be the answer to the last request
     assert trip.timeout > 0.2
@@ -98,19 +98,19 @@ def test_the_worse_the_link_the_more_silences_are_no_surprise() -> None:
             bad.timed_out(1)
         bad.answered(0.0, 0.1, 1)
     before = bad.timeout
-    for _ in range(FEWEST_SILENCES):
+    for _ in range(BACKOFF_TIMEOUTS_MIN):
         good.timed_out(3)
         bad.timed_out(3)
     assert good.timeout > 1.9 * 0.12
     assert bad.timeout == before
-    for _ in range(MOST_SILENCES):
+    for _ in range(BACKOFF_TIMEOUTS_MAX):
         bad.timed_out(3)
     assert bad.timeout > 1.9 * before
 
 
 def test_before_reads_are_known_they_get_longer_than_what_is_answered_at_once() -> None:
     trip = measured(0.02, 2)
-    assert trip.prompt_timeout == SHORTEST_TIMEOUT
+    assert trip.prompt_timeout == TIMEOUT_MIN
     assert trip.timeout == pytest.approx(0.02 + SERVING_TIME)
     known = measured(0.02, 50)
     assert known.timeout == known.prompt_timeout
@@ -148,27 +148,27 @@ def test_the_share_that_is_lost() -> None:
 
 def test_the_number_of_tries_follows_the_loss() -> None:
     clean = measured(0.1, 200)
-    assert clean.tries == FEWEST_TRIES
+    assert clean.tries == ATTEMPTS_MIN
     lossy = measured(0.1)
     for number in range(200):
         lossy.answered(0.0, 0.1, 1)
         if number % 2:
             lossy.timed_out(1)
-    assert FEWEST_TRIES < lossy.tries < MOST_TRIES
+    assert ATTEMPTS_MIN < lossy.tries < ATTEMPTS_MAX
     dead = RoundTrip()
     for _ in range(200):
         dead.timed_out(1)
-    assert dead.tries == MOST_TRIES
+    assert dead.tries == ATTEMPTS_MAX
 
 
 def test_enough_is_enough() -> None:
     trip = measured(0.1, 200)
-    assert not trip.is_hopeless(FEWEST_TRIES - 1, 1e9)
-    assert trip.is_hopeless(FEWEST_TRIES, 0.0)
+    assert not trip.is_hopeless(ATTEMPTS_MIN - 1, 1e9)
+    assert trip.is_hopeless(ATTEMPTS_MIN, 0.0)
     for _ in range(50):
         trip.timed_out(1)
-    assert trip.tries > FEWEST_TRIES
-    assert not trip.is_hopeless(FEWEST_TRIES, 1e9)  # nobody keeps its `heard_at`
+    assert trip.tries > ATTEMPTS_MIN
+    assert not trip.is_hopeless(ATTEMPTS_MIN, 1e9)  # nobody keeps its `heard_at`
 
 
 def test_a_component_that_is_gone_is_not_asked_for_ever() -> None:
@@ -176,9 +176,9 @@ def test_a_component_that_is_gone_is_not_asked_for_ever() -> None:
     for _ in range(50):
         trip.timed_out(1)
     trip.heard_at = 100.0
-    assert not trip.is_hopeless(FEWEST_TRIES, 99.0 + LONGEST_SILENCE)
-    assert trip.is_hopeless(FEWEST_TRIES, 100.0 + LONGEST_SILENCE)
-    assert not trip.is_hopeless(FEWEST_TRIES - 1, 100.0 + LONGEST_SILENCE)
+    assert not trip.is_hopeless(ATTEMPTS_MIN, 99.0 + SILENCE_MAX)
+    assert trip.is_hopeless(ATTEMPTS_MIN, 100.0 + SILENCE_MAX)
+    assert not trip.is_hopeless(ATTEMPTS_MIN - 1, 100.0 + SILENCE_MAX)
 
 
 def test_an_answer_to_what_was_sent_at_no_known_time_tells_nothing_of_the_round_trip() -> None:

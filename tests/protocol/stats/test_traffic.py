@@ -15,15 +15,15 @@ from paramclient.protocol.station import Station
 from paramclient.protocol.stats import packet_loss as numbers
 from paramclient.protocol.stats import traffic as room
 from paramclient.protocol.stats.packet_loss import (
-    LONGEST_GAP,
+    CERTAIN_GAP,
+    GAP_MAX,
+    NUMBERING_TIMEOUT,
     PROBATION,
     REORDER_DEPTH,
-    SILENCE,
-    SURE_GAP,
     SequenceCheck,
 )
-from paramclient.protocol.stats.sniffer import MOST_KEPT, Seen, Sniffer
-from paramclient.protocol.stats.traffic import WINDOW, ComponentTraffic, Traffic
+from paramclient.protocol.stats.sniffer import UNPROVEN_BYTES_MAX, Seen, Sniffer
+from paramclient.protocol.stats.traffic import RATE_WINDOW, ComponentTraffic, Traffic
 from paramclient.protocol.wire import Framer, Heartbeat
 from paramclient.sim import Air, FaultyLink, PX4Vehicle
 from tests.simulation import Simulation
@@ -115,7 +115,7 @@ def test_what_is_kept_of_a_stream_in_which_nothing_is_proven_is_bounded() -> Non
     count = 0
     for _ in range(2000):
         count += len(sniffer.receive(unknown()))
-        assert len(sniffer._tail) <= MOST_KEPT + 280
+        assert len(sniffer._tail) <= UNPROVEN_BYTES_MAX + 280
     assert count > 1500
     noisy = Sniffer(stream=True)
     for _ in range(100):
@@ -169,7 +169,7 @@ def test_any_loss_of_few_in_a_row_is_counted_exactly(start: int, arrives: list[b
     heard = [start]
     lost = run = 0
     for offset, came in enumerate(arrives, start=1):
-        if came or run == SURE_GAP:
+        if came or run == CERTAIN_GAP:
             heard.append(start + offset)
             lost += run
             run = 0
@@ -179,7 +179,7 @@ def test_any_loss_of_few_in_a_row_is_counted_exactly(start: int, arrives: list[b
     assert (check.lost, check.repeated, check.late) == (lost, 0, 0)
 
 
-@given(st.integers(0, 255), st.lists(st.tuples(st.integers(0, LONGEST_GAP), st.integers(0, 300)), max_size=8))
+@given(st.integers(0, 255), st.lists(st.tuples(st.integers(0, GAP_MAX), st.integers(0, 300)), max_size=8))
 def test_a_long_gap_is_counted_exactly(start: int, gaps: list[tuple[int, int]]) -> None:
     number = start
     heard = [number]
@@ -196,7 +196,7 @@ def test_what_comes_twice_is_no_loss(start: int, copies: list[int]) -> None:
     assert (check.lost, check.repeated, check.late) == (0, sum(copies) - len(copies), 0)
 
 
-@given(st.integers(0, 255), st.lists(st.integers(0, SURE_GAP - 1), min_size=1, max_size=600))
+@given(st.integers(0, 255), st.lists(st.integers(0, CERTAIN_GAP - 1), min_size=1, max_size=600))
 def test_what_comes_a_little_late_is_no_loss(start: int, delays: list[int]) -> None:
     order = sorted(range(1, len(delays) + 1), key=lambda each: (each + delays[each - 1], each))
     check = check_of([start, *(start + each for each in order)])
@@ -219,7 +219,7 @@ def test_a_late_one_of_a_long_gap_makes_that_shorter() -> None:
 @given(st.integers(0, 2000), st.integers(0, 255), st.integers(1, 600))
 def test_a_sender_that_starts_anew_has_lost_nothing(before: int, first: int, after: int) -> None:
     jump = (first - before) % 256
-    if LONGEST_GAP + 1 < jump < 256 - REORDER_DEPTH:
+    if GAP_MAX + 1 < jump < 256 - REORDER_DEPTH:
         check = check_of([*range(before + 1), *range(first, first + after)])
         assert (check.lost, check.repeated, check.late) == (0, 0, 0)
 
@@ -227,10 +227,10 @@ def test_a_sender_that_starts_anew_has_lost_nothing(before: int, first: int, aft
 @given(st.integers(0, 2000), st.integers(0, 255), st.integers(1, 600))
 def test_after_a_silence_a_jump_tells_of_nothing(before: int, first: int, after: int) -> None:
     check = check_of(range(before + 1))
-    now = before * 0.02 + SILENCE + 0.1
+    now = before * 0.02 + NUMBERING_TIMEOUT + 0.1
     for count in range(after):
         check.heard((first + count) % 256, now + count * 0.02)
-    assert check.lost <= SURE_GAP
+    assert check.lost <= CERTAIN_GAP
 
 
 def test_what_comes_late_and_twice_is_both() -> None:
@@ -280,7 +280,7 @@ def test_many_numberings_are_forgotten_again() -> None:
     check = SequenceCheck()
     for number in range(5000):
         check.heard(number * 67 % 256, 0.0)
-        assert len(check._numberings) <= numbers.MOST_NUMBERINGS
+        assert len(check._numberings) <= numbers.NUMBERINGS_MAX
 
 
 # counted by component and by message
@@ -330,9 +330,9 @@ def test_rates_and_loss_are_those_of_late() -> None:
     component = only(traffic.report(12.0))
     assert (component.lost, component.loss) == (99, 0.0)
     assert component.frame_rate == pytest.approx(50, rel=0.01)
-    component = only(traffic.report(12.0 + 2 * WINDOW))
+    component = only(traffic.report(12.0 + 2 * RATE_WINDOW))
     assert (component.frame_rate, component.byte_rate, component.loss, component.lost) == (0.0, 0.0, None, 99)
-    assert component.age == pytest.approx(2 * WINDOW + 0.02)
+    assert component.age == pytest.approx(2 * RATE_WINDOW + 0.02)
 
 
 def test_what_comes_twice_does_not_hide_what_is_lost() -> None:
@@ -347,9 +347,9 @@ def test_what_comes_twice_does_not_hide_what_is_lost() -> None:
 
 def test_a_frame_that_comes_late_makes_no_loss_negative() -> None:
     traffic = Traffic(is_stream=False)
-    for sequence, now in ((0, 0.0), (2, 0.1), (1, 4 * WINDOW), (3, 4 * WINDOW)):
+    for sequence, now in ((0, 0.0), (2, 0.1), (1, 4 * RATE_WINDOW), (3, 4 * RATE_WINDOW)):
         traffic.receive(frame(30, sequence), "peer", now)
-    assert only(traffic.report(4 * WINDOW)).loss == 0.0
+    assert only(traffic.report(4 * RATE_WINDOW)).loss == 0.0
 
 
 def test_a_heartbeat_in_a_format_to_come_is_not_read() -> None:
@@ -417,7 +417,7 @@ def test_a_stream_is_followed_for_each_peer_and_its_end_counts() -> None:
 
 
 def test_what_others_can_stretch_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("MOST_COMPONENTS", "MOST_MESSAGES", "MOST_PEERS"):
+    for name in ("COUNTED_COMPONENTS_MAX", "COUNTED_MESSAGES_MAX", "COUNTED_PEERS_MAX"):
         monkeypatch.setattr(room, name, 3)
     traffic = Traffic(is_stream=True)
     for number in range(1, 10):

@@ -459,6 +459,6 @@ def test_a_station_passes_on_the_numbers_of_frames() -> None:
     station.data_to_send()
     station.receive(wire.encode(COPTER, system=1, component=1, sequence=0), "peer", 1.0)
     station.tick(1.0)
-    framer = wire.Framer(wire.UNDERSTOOD, stream=False)
+    framer = wire.Framer(wire.DECODED_IDS, stream=False)
     sent = [wire.decode(frame) for data, _ in station.data_to_send() for frame in framer.receive(data)]
     assert CLOCK_REQUEST in sent

@@ -73,7 +73,7 @@ class Speaker:
         self._obeys = obeys
         self._system = system
         self._beats = 0
-        self._framer = Framer(wire.UNDERSTOOD, stream=False)
+        self._framer = Framer(wire.DECODED_IDS, stream=False)
         self._out: list[bytes] = []
 
     def say(self, message: Message) -> None:
@@ -444,7 +444,7 @@ def test_components_of_one_system_may_come_from_several_peers() -> None:
 def test_a_heartbeat_from_a_forged_address_brings_that_seven_requests_and_no_more() -> None:
     station = Station(link="udpin:test", is_stream=False, upkeep=Upkeep.chosen(None, "auto"))
     station.receive(wire.encode(PX4, system=9, component=1, sequence=0), "victim", 0.0)
-    framer, sent = Framer(wire.UNDERSTOOD, stream=False), []
+    framer, sent = Framer(wire.DECODED_IDS, stream=False), []
     for step in range(1200):
         station.tick(step * STEP)
         for data, peer in station.data_to_send():

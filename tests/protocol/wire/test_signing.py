@@ -32,7 +32,13 @@ from paramclient.protocol.wire import (
     sign_frame,
     timestamp_of,
 )
-from paramclient.protocol.wire.signing import EPOCH, LAST_TIMESTAMP, MOST_AHEAD, MOST_BEHIND, UNITS
+from paramclient.protocol.wire.signing import (
+    ADOPTED_TIMESTAMP_MAX,
+    EPOCH,
+    LAST_TIMESTAMP,
+    TIMESTAMP_LAG_MAX,
+    UNITS_PER_SECOND,
+)
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
 from tests.shell import VALUES, small_px4
 from tests.simulation import PEER, Simulation
@@ -45,7 +51,7 @@ NOW = 36_000_000_000_000
 VALUE = ParamValue("MC_ROLL_P", struct.pack("<f", 6.5), 9, 903, 441)
 
 byte = st.integers(0, 255)
-timestamps = st.integers(MOST_BEHIND, MOST_AHEAD)
+timestamps = st.integers(TIMESTAMP_LAG_MAX, ADOPTED_TIMESTAMP_MAX)
 
 
 def signed_frame(
@@ -189,8 +195,8 @@ def test_what_pymavlink_refuses_we_refuse() -> None:
         signed_frame(timestamp=NOW + 9),
         signed_frame(timestamp=NOW + 11),
         signed_frame(timestamp=NOW, system=2),
-        signed_frame(timestamp=NOW + 11 - MOST_BEHIND, system=3),
-        signed_frame(timestamp=NOW + 10 - MOST_BEHIND, system=4),
+        signed_frame(timestamp=NOW + 11 - TIMESTAMP_LAG_MAX, system=3),
+        signed_frame(timestamp=NOW + 10 - TIMESTAMP_LAG_MAX, system=4),
         signed_frame(timestamp=NOW + 20, link_id=3),
         signed_frame(timestamp=NOW + 30, key=OTHER_KEY, system=5),
         encode(VALUE, system=6, component=1, sequence=0),
@@ -221,13 +227,13 @@ def test_the_timestamp_rises_from_frame_to_frame_and_with_the_time() -> None:
     signer.advance(50.0)
     assert used() == NOW + 3
     signer.advance(51.0)
-    assert used() == NOW + UNITS + 1
+    assert used() == NOW + UNITS_PER_SECOND + 1
     signer.advance(50.5)
-    assert used() == NOW + UNITS + 2
-    signer.catch_up(NOW + 5 * UNITS)
-    assert used() == NOW + 5 * UNITS + 1
+    assert used() == NOW + UNITS_PER_SECOND + 2
+    signer.catch_up(NOW + 5 * UNITS_PER_SECOND)
+    assert used() == NOW + 5 * UNITS_PER_SECOND + 1
     signer.advance(52.0)
-    assert used() == NOW + 5 * UNITS + 2
+    assert used() == NOW + 5 * UNITS_PER_SECOND + 2
 
 
 def test_a_frame_of_mavlink_1_stays_as_it_is() -> None:
@@ -240,11 +246,11 @@ def test_a_frame_of_mavlink_1_stays_as_it_is() -> None:
 def test_timestamps_count_from_2015_and_never_reach_their_end() -> None:
     assert timestamp_of(EPOCH) == timestamp_of(0.0) == 0
     assert timestamp_of(EPOCH + 1.00001) == 100_001
-    assert timestamp_of(1e12) == MOST_AHEAD
+    assert timestamp_of(1e12) == ADOPTED_TIMESTAMP_MAX
     signer = Signer(KEY, timestamp=NOW)
     verifier = Verifier(signer)
     assert verifier.accepts(signed_frame(timestamp=LAST_TIMESTAMP))
-    assert signer.timestamp == MOST_AHEAD < LAST_TIMESTAMP
+    assert signer.timestamp == ADOPTED_TIMESTAMP_MAX < LAST_TIMESTAMP
     with pytest.raises(UsageError, match="0 to 255"):
         Signer(KEY, link_id=256, timestamp=NOW)
 
@@ -474,7 +480,7 @@ def test_a_vehicle_whose_timestamps_are_old_takes_ours_and_is_heard() -> None:
 
 
 def test_a_vehicle_that_is_ahead_takes_us_along() -> None:
-    ahead = NOW + 100 * MOST_BEHIND
+    ahead = NOW + 100 * TIMESTAMP_LAG_MAX
     vehicle = small_px4(signing_key=KEY, signing_timestamp=ahead)
     simulation = Simulation(vehicle, station=a_station())
     assert simulation.fetch().complete
@@ -495,7 +501,7 @@ def test_a_vehicle_that_has_lost_its_time_is_heard_again() -> None:
     """PX4 keeps the timestamp of its set-up alone, and begins there after each start."""
     simulation = Simulation(small_px4(signing_key=KEY, signing_timestamp=NOW), station=a_station())
     simulation.fetch()
-    simulation.air = Air([small_px4(signing_key=KEY, signing_timestamp=NOW - 2 * MOST_BEHIND)])
+    simulation.air = Air([small_px4(signing_key=KEY, signing_timestamp=NOW - 2 * TIMESTAMP_LAG_MAX)])
     simulation.run(6.0)
     assert simulation.set("PARAM_04", 5).actual == 5
     assert simulation.station.verifier is not None
@@ -567,7 +573,7 @@ def test_a_vehicle_obeys_setup_signing(make: Any) -> None:
     simulation.station.send_setup_signing(1, 1, None, 0)
     simulation.run(1.0)
     assert vehicle.signing_key == KEY, "what is not signed is not for it any more"
-    simulation.next_session(a_station(timestamp=NOW + MOST_BEHIND))
+    simulation.next_session(a_station(timestamp=NOW + TIMESTAMP_LAG_MAX))
     assert simulation.fetch().complete
     simulation.station.send_setup_signing(1, 1, None, 0)
     simulation.run(1.0)
