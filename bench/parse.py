@@ -23,7 +23,7 @@ from typing import Any
 from pymavlink.dialects.v20 import common
 
 from paramclient.protocol import wire
-from paramclient.protocol.station import HEARD
+from paramclient.protocol.station import HANDLED_IDS
 
 FRAMES = 30_000
 ROUNDS = 7
@@ -94,7 +94,7 @@ def parse_with_pymavlink(stream: bytes) -> Messages:
 
 
 def parse_with_paramclient(stream: bytes) -> Messages:
-    return [wire.decode(frame) for frame in wire.Framer(HEARD).receive(stream)]
+    return [wire.decode(frame) for frame in wire.Framer(HANDLED_IDS).receive(stream)]
 
 
 def passes_per_second(parse: Callable[[bytes], Messages], stream: bytes, seconds: float) -> float:

@@ -49,7 +49,7 @@ from paramclient.cache import CachedComponent, TableUpdate
 from paramclient.links import Peer, parse_link
 from paramclient.links.udp import UdpIn
 from paramclient.model.values import ParamType
-from paramclient.protocol.station import HEARD
+from paramclient.protocol.station import HANDLED_IDS
 from paramclient.protocol.wire import Framer
 from paramclient.sim import PX4Vehicle, SimParam, px4_table
 
@@ -235,7 +235,7 @@ class Record:
         """Return the CPU seconds for framing `count` of the datagrams."""
         self._bytes.seek(0)
         datagrams = [self._bytes.read(size) for size in self._sizes[:count]]
-        framer = Framer(HEARD, stream=False)
+        framer = Framer(HANDLED_IDS, stream=False)
         start = time.process_time()
         for data in datagrams:
             framer.receive(data)

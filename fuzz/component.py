@@ -37,8 +37,8 @@ LONGEST: Final = 400
 """Maximum bytes of an input: longer ones are slow and find nothing new."""
 
 BOUNDS: Final = (
-    (station, "MOST_COMPONENTS", 5),
-    (station, "MOST_PEERS", 3),
+    (station, "COMPONENTS_MAX", 5),
+    (station, "STREAM_PEERS_MAX", 3),
     (table, "NAMES_MAX", 12),
     (table, "NAMES_GUARANTEED", 6),
     (table, "LINK_NAMES_MAX", 25),

@@ -53,7 +53,7 @@ from paramclient.protocol.params.fetch_result import Policy, Progress
 from paramclient.protocol.params.sync import Upkeep
 from paramclient.protocol.station import Station
 from paramclient.protocol.stats.traffic import TrafficReport
-from paramclient.protocol.system_id_change import SEARCH_PACE, Succession
+from paramclient.protocol.system_id_change import SEARCH_INTERVAL, Succession
 from paramclient.protocol.vehicle_selection import LOOK_TIME, VehicleChoice
 from paramclient.protocol.wire import SigningKey, SigningReport
 
@@ -375,7 +375,7 @@ class LinkClient(LocalClient):
         with anyio.move_on_after(timeout):
             while not search.look(self.station.components, anyio.current_time()):
                 self.wake()
-                with anyio.move_on_after(SEARCH_PACE):
+                with anyio.move_on_after(SEARCH_INTERVAL):
                     await self.link_task.news.wait()
                 self.check_open()
             found = self._components[search.address]

@@ -1,1 +1,16 @@
-"""The parameter protocol without a socket, a clock or a disk: time comes in as an argument."""
+"""The sans-I/O core: no socket, no clock, no disk; bytes and the time come in as arguments.
+
+`station`: one link: components, our heartbeat, routing of messages.
+`component`: one component: its state and its machines.
+`events`: events of the components.
+`scheduler`: turns of the list downloads of many components.
+`addresses`: addresses of components and peers.
+`vehicle_selection`: the only vehicle that an incomplete address fits.
+`system_id_change`: the search for a vehicle under a new system id.
+`wire`: frames, messages, signatures.
+`params`: the parameter protocol.
+`requests`: timeouts, retries and pacing.
+`vehicle`: identification, presence, commands, reboot.
+`ftp`: MAVFTP.
+`stats`: traffic and packet loss.
+"""

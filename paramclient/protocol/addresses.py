@@ -1,4 +1,4 @@
-"""What components are known by: system and component, and where these are kept apart also the peer."""
+"""Addresses: system and component, and the peer where components are told apart by peer."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ __all__ = ["Address", "Peer", "PeerAddress", "peer_in_words"]
 Address: TypeAlias = tuple[int, int]
 """System and component."""
 Peer: TypeAlias = Hashable
-"""Who sent something, as the link tells them apart."""
+"""The sender of received bytes, as the link tells senders apart."""
 
 
 class PeerAddress(tuple[int, int]):
-    """System and component behind one peer: not equal to those behind another one, nor to the ids alone.
+    """A component's address behind one peer: not equal to that behind another peer, nor to the bare ids.
 
     Attributes:
         peer: the peer.
@@ -42,7 +42,7 @@ class PeerAddress(tuple[int, int]):
 
 
 def peer_in_words(peer: Peer) -> str:
-    """A peer for people: `127.0.0.1:14550` for the addresses of a link."""
+    """Return a peer as text: `127.0.0.1:14550` for an address of a link."""
     if isinstance(peer, tuple):
         for host, port in pairwise(peer):
             if isinstance(host, str) and isinstance(port, int):

@@ -1,4 +1,4 @@
-"""One component: what is known of it, its table, and the exchanges with it."""
+"""One component: its identity, presence and table, and the machines that exchange messages with it."""
 
 from __future__ import annotations
 
@@ -69,95 +69,97 @@ from paramclient.protocol.wire import (
 
 __all__ = ["ComponentMachine", "ComponentObserver"]
 
-RESTART_SILENCE: Final = 0.25
-"""Seconds of silence behind which a new numbering of frames has a fetch begun anew: an ArduPilot that starts
-again says nothing for that long at least (measured: 0.31 s with a station that talks to it, else 1.0 s)."""
-FRESH_IDENTITY: Final = 1.0
-"""Seconds for which an AUTOPILOT_VERSION needs no other."""
+NUMBERING_SILENCE: Final = 0.25
+"""Seconds of silence before a new frame numbering, after which a fetch restarts: an ArduPilot that reboots is
+silent for at least that long (measured: 0.31 s with a station that talks to it, otherwise 1.0 s)."""
+IDENTITY_VALID_TIME: Final = 1.0
+"""Seconds for which an AUTOPILOT_VERSION is not requested again."""
 
 
 class ComponentObserver(Protocol):
-    """Is told what happens to components. `paramclient.protocol.events` makes events of it."""
+    """Receives what happens to components. `paramclient.protocol.events` makes events of it."""
 
     def identified(self, machine: ComponentMachine) -> None:
-        """The identity is settled, as far as it ever will be; the cached table can be looked up."""
+        """The identity is as complete as it gets; the cached table can be looked up."""
 
     def lost(self, machine: ComponentMachine, silence: float) -> None:
         """The heartbeat timeout has expired; `silence` is the time since the last message in s."""
 
     def found(self, machine: ComponentMachine, silence: float) -> None:
-        """A lost component is heard again, after `silence` s."""
+        """Messages of a lost component are received again, after `silence` s."""
 
     def rebooted(self, machine: ComponentMachine) -> None:
-        """The vehicle has started again."""
+        """The vehicle has rebooted."""
 
     def replaced(self, machine: ComponentMachine) -> None:
-        """Another vehicle has the address: nothing that was known is about that one."""
+        """Another vehicle uses the address: everything known is invalid."""
 
     def contested(self, machine: ComponentMachine, contest: Contest) -> None:
-        """Several vehicles have the address: nothing is taken from them or requested of them."""
+        """Several vehicles use the address: their messages are ignored and nothing is requested of them."""
 
     def uncontested(self, machine: ComponentMachine) -> None:
-        """One vehicle alone has the address again, or the peers are proven to be one vehicle."""
+        """Only one vehicle uses the address again, or the peers are proven to be one vehicle."""
 
     def changed(self, machine: ComponentMachine, change: Change) -> None:
-        """A parameter appeared, changed or went away, and each change is to be told (`tells_changes`)."""
+        """A parameter appeared, changed or was removed; called for each change with `tells_changes`."""
 
     def moved(self, machine: ComponentMachine) -> None:
-        """Parameters have changed, and not each change is to be told."""
+        """Parameters have changed; called once for several changes without `tells_changes`."""
 
     def fetched(self, machine: ComponentMachine, result: FetchResult) -> None:
         """A fetch has ended with a result."""
 
     def resynced(self, machine: ComponentMachine, changed: tuple[str, ...], confirmed: int | None) -> None:
-        """The table agrees with the vehicle's again; see `TableResynced`."""
+        """The table matches the vehicle's again; see `TableResynced`."""
 
 
 class ComponentMachine:
-    """Everything about one component that needs no clock and no socket.
+    """The sans-I/O state of one component.
 
     Args:
-        system, component: who it is.
-        own: system and component that we send as.
+        system, component: its address.
+        own: system and component that requests are sent as.
         link: the link's canonical name, part of an identity without a hardware id.
-        send: takes each message for it, in order.
-        observer: is told what happens to the component.
-        send_to: takes each message that is for one of its peers; None where there is only one.
-        encoding: what the user said about its encoding, or None.
-        upkeep: what is done for its table without being asked.
-        is_link_busy: whether anything is being asked for on the link.
-        vehicle: gives all components of its vehicle.
-        another: is told that another vehicle has taken the system id; by default `become_another`.
-        read_clock: has `boot_clock` called with clocks from its telemetry for a while; see `ClockSampling`.
-        peer: the peer that it is of, where components are kept apart by their peers; else None.
-        turns: those of the lists on the link; None for a link that it has for itself.
-        room: what the tables of the link may hold together; None likewise.
-        trace: is told of each step.
+        send: takes each message for the component, in order.
+        observer: receives what happens to the component.
+        send_to: takes each message for one of its peers; None where there is only one.
+        encoding: the user's choice of its encoding, or None.
+        upkeep: what is done for its table without a request of the user.
+        is_link_busy: whether any request is in flight on the link.
+        vehicle: returns all components of its vehicle.
+        another: called when another vehicle has taken the system id; by default `become_another`.
+        read_clock: enables `boot_clock` calls with clocks from its telemetry for a while; see
+            `ClockSampling`.
+        peer: its peer, where components are told apart by peer; otherwise None.
+        turns: the turns of lists on the link; None for a link with one component.
+        room: the name count shared by the tables of the link; None likewise.
+        trace: receives each step.
 
     Attributes:
-        address: system and component, and with `peer` that as well.
-        vehicle: what all components of a vehicle have in common: the system, and with `peer` that as well.
-        version: the MAVLink version that it speaks, as far as heard.
-        who: its identity, and how it writes values.
+        address: system and component, with `peer` also the peer.
+        vehicle: the address part that all components of a vehicle share: the system, with `peer` also the
+            peer.
+        version: the MAVLink version of its frames.
+        who: its identity and encoding.
         table: its parameters.
-        round_trip: what its answers tell of the link.
-        presence: whether it is there.
-        peers: which peers speak for it, and whether several vehicles do.
-        following: the list that another station has asked for, while none of ours comes.
-        sync: whether the table is still the vehicle's.
-        files: its files.
-        descriptions: where it says that what it has to say of itself lies.
-        name_searches: the search for names that may not exist.
-        commands: what it is told to do.
+        round_trip: round-trip time and loss of its responses.
+        presence: whether its messages are received.
+        peers: the peers that send with its address, and whether several vehicles do.
+        following: the list that another station has requested, while none of ours runs.
+        sync: whether the table still matches the vehicle's.
+        files: its files over MAVFTP.
+        descriptions: the location of its metadata.
+        name_searches: the searches for names that may not exist.
+        commands: its commands.
         clock_requests: the requests for its time since boot.
-        start_values: the reading of what it measures at each start.
-        restarts: the restart that it was told to make.
-        rereads: the values that are to be read again.
-        fetches: what was and is being fetched.
-        tells_changes: whether somebody wants to be told of each change. An event for each value of a long
-            list takes a tenth of what the value takes, and the garbage collector goes through those that
-            wait.
-        has_moved: whether an event says that something has changed; who hands it out sets this back.
+        start_values: the reads of values that it measures at each boot.
+        restarts: its reboot on command.
+        rereads: the values to be read again.
+        fetches: the fetches of its table.
+        tells_changes: whether the observer is called for each change. An event for each value of a long list
+            takes a tenth of the time of the value itself, and the garbage collector visits all waiting
+            events.
+        has_moved: whether an unhandled event reports changes; the consumer of events resets it.
     """
 
     def __init__(
@@ -222,7 +224,7 @@ class ComponentMachine:
         )
         self.fetches = Fetches(means, self.sync, upkeep, check_pace, ended=self._fetched)
         self.name_searches = NameSearches(context, self.reads, self.table, self.following)
-        # where nothing is asked there are no reads: what others ask for is heard in their place
+        # without requests there are no reads: the lists of other stations take their place
         overheard = self.fetches.overheard
         self._value_heard = self.reads.heard if overheard is None else overheard.heard
         self._own = own
@@ -234,7 +236,7 @@ class ComponentMachine:
         self._another = another or self.become_another
         self._read_clock = read_clock
         self._vehicle = vehicle
-        self._known_as: str | None = None  # the key of the identity that was reported
+        self._known_as: str | None = None  # the key of the reported identity
         self.tells_changes = True
         self.has_moved = False
         self.rereads = Rereads(context, self.reads, self.table, self.sync, upkeep.policy)
@@ -246,30 +248,30 @@ class ComponentMachine:
             *(self.restarts, self.fetches, self.who, self.descriptions, self.clock_requests),
             *(self.start_values, self.rereads),
         )
-        """Each stands behind those that it uses or tells. They end in the reverse order: a machine does not
-        take the end of what it uses for a result, and is told nothing after its own end."""
+        """Each machine stands behind those that it uses or calls. They end in reverse order: a machine does
+        not take the end of another one for a result, and is not called after its own end."""
 
     @property
     def peer_in_words(self) -> str:
-        """Where its messages come from, `127.0.0.1:14550`; "" while that is not known."""
+        """The peer of its messages, `127.0.0.1:14550`; "" while unknown."""
         if isinstance(self.address, PeerAddress):
             return peer_in_words(self.address.peer)
         return "" if self.peers.home is NO_PEER else peer_in_words(self.peers.home)
 
     def address_in(self, system: int) -> Address:
-        """The address that it has under another system id."""
+        """Return its address under another system id."""
         if isinstance(self.address, PeerAddress):
             return PeerAddress(system, self.component, self.address.peer)
         return system, self.component
 
     @property
     def identity(self) -> Identity:
-        """Who the vehicle is, as far as this component has said."""
+        """The identity of the vehicle, as far as this component has sent it."""
         return self.who.identity
 
     @property
     def may_be_written(self) -> bool:
-        """Whether it is certain whom a write reaches, and what it makes of it."""
+        """Whether it is certain which vehicle receives a write, and in which encoding."""
         home = self.peers.home
         is_open = any(each.who.was_away or each.peers.is_rival(home) for each in self._autopilots())
         return self.who.may_be_written and not is_open
@@ -281,12 +283,12 @@ class ComponentMachine:
 
     @property
     def is_link_busy(self) -> bool:
-        """Whether anything is requested on the link."""
+        """Whether any request is in flight on the link."""
         return self._is_link_busy()
 
     @property
     def state(self) -> str:
-        """The table's state in a word: new, cached, fetching, synced, partial, contested, lost."""
+        """The state of the table: new, cached, fetching, synced, partial, contested, lost."""
         if self.presence.is_lost:
             return "lost"
         if self.peers.contest is not None:
@@ -300,55 +302,55 @@ class ComponentMachine:
         return "cached" if self.table.complete else "partial"
 
     def _autopilots(self) -> Iterator[ComponentMachine]:
-        """The autopilot that it belongs to, where that is another component."""
+        """Yield the autopilot of its vehicle, where that is another component."""
         return (each for each in self._vehicle() if each is not self and each.who.is_autopilot)
 
     @property
     def is_restarting(self) -> bool:
-        """Whether it was told to start again, and that is awaited."""
+        """Whether a reboot on command is in progress."""
         return self.restarts.is_under_way
 
     @property
     def is_identified(self) -> bool:
-        """Whether it is settled who it is, and that is not being asked for."""
+        """Whether its identity is settled and not being requested."""
         return self.who.settled and not self.who.is_asking
 
     def read_clock(self, now: float) -> None:
-        """Have clocks in telemetry read for a while."""
+        """Have clocks in its telemetry read for a while."""
         self._read_clock(now)
 
     def send_to(self, message: Message, peer: Peer) -> None:
-        """Send a message to one of the peers that speak for it."""
+        """Send a message to one of its peers."""
         self._send_to(message, peer)
 
     @property
     def fetch(self) -> Fetch | None:
-        """The fetch under way, or None."""
+        """The fetch in progress, or None."""
         return self.fetches.current
 
     @property
     def sync_state(self) -> SyncState:
-        """How the table stands to the vehicle's."""
+        """The relation of the table to the vehicle's."""
         return SyncState.LOST if self.presence.is_lost else self.sync.state
 
     @property
     def refresh(self) -> Refresh | None:
-        """The reading of volatile values under way after a hash hit, or None."""
+        """The reads of volatile values in progress after a hash match, or None."""
         return self.sync.refresh
 
     @property
     def can_hit(self) -> bool:
-        """Whether the vehicle's hash may confirm the table as it stands."""
+        """Whether the vehicle's hash may confirm the present table."""
         return self.table.complete and self.table.hash is not None
 
     @property
     def is_waiting(self) -> bool:
-        """Whether anything is awaited: an answer, a fetch, a file, or who it is."""
+        """Whether anything is in progress: a request, a fetch, a file, or the identification."""
         return len(self.reads) > 0 or self.is_busy
 
     @property
     def is_busy(self) -> bool:
-        """Whether anything is awaited but the values that are read after the hash has agreed."""
+        """Whether anything is in progress except reads of volatile values after a hash match."""
         in_background = 0 if self.refresh is None else self.refresh.in_flight
         is_asked = len(self.reads) > in_background or len(self.writes) > 0 or not self.files.is_idle
         is_asked = is_asked or len(self.commands) > 0 or self.restarts.current is not None
@@ -357,10 +359,10 @@ class ComponentMachine:
 
     @property
     def is_settling(self) -> bool:
-        """Whether a write is under way, or the hash after one has not come yet."""
+        """Whether a write is in progress, or the hash after one has not been received yet."""
         return len(self.writes) > 0 or self.sync.is_settling
 
-    # what comes in
+    # received messages
 
     def receive(
         self,
@@ -371,9 +373,9 @@ class ComponentMachine:
         moment: float | None = None,
         sequence: int | None = None,
     ) -> None:
-        """Take a message that this component sent; the arguments are those of `receive_value`.
+        """Process a message of this component; the arguments are those of `receive_value`.
 
-        `sequence` is the sequence number of its frame, where it had one.
+        `sequence` is the sequence number of its frame, if it had one.
         """
         if isinstance(message, ParamValue):
             self.receive_value(message, now, version, moment)
@@ -391,7 +393,7 @@ class ComponentMachine:
                 self.clock_requests.want(now)
             self.rereads.forget_old(now)
             if self.fetches.overheard is not None:
-                self.fetches.overheard.file.tick(now)  # in a log nothing else tells the time
+                self.fetches.overheard.file.tick(now)  # in a log the time advances with messages only
         elif isinstance(message, AutopilotVersion):
             before = self.who.firmware
             if self.who.version(message, now):
@@ -428,14 +430,15 @@ class ComponentMachine:
         self._follow_identity(now)
 
     def _kind_told(self, message: Heartbeat | HighLatency2, now: float) -> None:
-        """Another autopilot or vehicle type is another vehicle's, or the same one has other firmware."""
+        """Process a changed autopilot or vehicle type: another vehicle, or the same one with other
+        firmware."""
         if self.who.heartbeat(message) and self.who.settled:
             self._doubt()
             self.sync.check(now)
             self.who.doubt(now)
 
     def receive_contested(self, message: Message, now: float, *, version: int = 2) -> None:
-        """Take a message while several vehicles have the address: it shows that one is there."""
+        """Process a message while several vehicles use the address: it only shows that one is there."""
         self._heard(now, version)
         if isinstance(message, Heartbeat):
             self.presence.heartbeat(message, now)
@@ -443,13 +446,13 @@ class ComponentMachine:
     def receive_value(
         self, message: ParamValue, now: float, version: int = 2, moment: float | None = None
     ) -> None:
-        """Take a PARAM_VALUE that it sent: for those who know that it is one.
+        """Process a PARAM_VALUE of the component; a fast path for callers that know the type of message.
 
         Args:
             message: the message.
             now: the time.
             version: the MAVLink version of the frame.
-            moment: when it came from the link, where that was earlier; None for `now`.
+            moment: when it came from the link, if earlier; None for `now`.
         """
         self._heard(now, version)
         who = self.who
@@ -498,7 +501,7 @@ class ComponentMachine:
             self.sync.changed(name, by, now)
             self._tell(change)
         elif name not in table.params:
-            return  # more names than there can be
+            return  # more names than the table may hold
         fetch = self.fetches.current
         if fetch is not None:
             fetch.heard(message, now)
@@ -511,7 +514,7 @@ class ComponentMachine:
             self.name_searches.heard(message, now)
 
     def boot_clock(self, message_id: int, boot_ms: int, now: float) -> None:
-        """Take `time_boot_ms` of a message of telemetry that it sent."""
+        """Process `time_boot_ms` of a telemetry message."""
         self._clock_told(self.presence.boot_clock(message_id, boot_ms, now), now)
 
     def _clock_told(self, has_restarted: bool, now: float) -> None:
@@ -522,19 +525,20 @@ class ComponentMachine:
             self.start_values.clock_told(now - started_at, now)
 
     def _numbering_began(self, silent_since: float, now: float) -> None:
-        """Its frames may be numbered from 0 again, as after a start: its clock tells whether it is one.
+        """Process a possible new frame numbering, as after a reboot: the clock decides whether it is one.
 
-        A fetch that was held up meanwhile does not wait for that.
+        A fetch that was interrupted does not wait for the clock.
         """
         if self.restarts.numbering_began(now):
             return
         self.clock_requests.want(now)
-        if now - silent_since >= RESTART_SILENCE and self.fetches.seems_restarted(silent_since, now):
+        if now - silent_since >= NUMBERING_SILENCE and self.fetches.seems_restarted(silent_since, now):
             self.following.forget()
             self._doubt()
 
     def _note_replaced(self, change: Change, message: ParamValue, now: float) -> None:
-        """Remember the value before a change. PX4 has none on the way: it answers with the value of now."""
+        """Remember the value before a change. PX4 has none in flight: its responses have the present
+        value."""
         old = change[1]
         if old is not None and self.who.autopilot != MAV_AUTOPILOT_PX4:
             bits, number, *_ = unpack_fields(old)
@@ -542,7 +546,7 @@ class ComponentMachine:
             self._checks.replaced(change.name, number, raw, message, now, self.reads.sent_at)
 
     def _receive_ambiguous(self, message: ParamValue, until: float, now: float) -> None:
-        """Take a PARAM_VALUE whose value may be older than the last change: only its index counts."""
+        """Process a PARAM_VALUE whose value may be older than the last change: only its index counts."""
         self.table.hear_index(message)
         self._checks.ask(message.param_id, until)
         fetch = self.fetches.current
@@ -556,14 +560,14 @@ class ComponentMachine:
         self.reads.defer(message, until, now)
 
     def foreign_set(self, name: str, raw: bytes, station: str, now: float) -> None:
-        """Another station was heard setting a parameter of this component to these four bytes."""
+        """Record another station's PARAM_SET to this component, with the 4 bytes of its value."""
         if not is_portable_name(name):
             self.table.leave_out(name)
             return
         self._authors.foreign_set(self.spelling(name), station, now, raw)
 
     def foreign_file_request(self, message: FileTransfer, station: tuple[int, int], now: float) -> None:
-        """Another station was heard asking for a file of this component."""
+        """Process another station's request for a file of this component."""
         self.files.foreign_at = now
         if self.fetches.overheard is not None:
             self.fetches.overheard.file.request_heard(message, station, now)
@@ -581,20 +585,21 @@ class ComponentMachine:
         placed: bool = True,
         moments: Mapping[str, float] | None = None,
     ) -> None:
-        """Take what the cache knows of this component. What was heard on this link stays as it is.
+        """Load the cached table of this component. Values received on this link stay.
 
         Args:
             params: the cached table.
             now: the time.
-            count: the param_count with it.
-            confirmed: the hash under which the vehicle would confirm it, or None.
-            complete, placed: whether it held every index below the count, and whether these still hold.
+            count: its param_count.
+            confirmed: the hash by which the vehicle would confirm it, or None.
+            complete, placed: whether it had every index below the count, and whether the indices are still
+                valid.
             volatile, volatile_known: as in `Table`.
             moments: when each value was observed last, in seconds as `now`.
         """
         if self.table.complete:
             return
-        if count is not None and count > PARAMETERS_MAX:  # what an earlier version has believed
+        if count is not None and count > PARAMETERS_MAX:  # accepted by an earlier version
             count, complete, placed = None, False, False
         changes = self.table.restore(
             params,
@@ -610,17 +615,17 @@ class ComponentMachine:
         self.sync.compare(now)
 
     def renew(self, params: Mapping[str, Param], moments: Mapping[str, float] | None = None) -> None:
-        """Take what another station has heard since, where a value is only *cached* here.
+        """Replace values that are only *cached* here with those that another station has received since.
 
         Args:
             params, moments: as in `use_cached`.
         """
         self._report(self.table.renew(params, moments))
 
-    # what is asked of it
+    # requests
 
     def read(self, key: Key, now: float) -> Read:
-        """Ask for one parameter; give it back with `reads.release`.
+        """Read one parameter; give it back with `reads.release`.
 
         Raises:
             NoReply: the component is lost. Nothing was sent.
@@ -632,7 +637,7 @@ class ComponentMachine:
         return read
 
     def search(self, names: Iterable[str], now: float) -> NameSearch:
-        """Search for parameters that may not exist; give it back with `name_searches.cancel`.
+        """Search for parameters that may not exist; give the search back with `name_searches.cancel`.
 
         Raises:
             NoReply: the component is lost. Nothing was sent.
@@ -650,7 +655,7 @@ class ComponentMachine:
         settle: float = 0.0,
         force: bool = False,
     ) -> Write:
-        """Write one parameter, for somebody.
+        """Write one parameter, also on behalf of another user.
 
         Args:
             name, value, asker: as in `Component.set`.
@@ -677,7 +682,7 @@ class ComponentMachine:
         return write
 
     def begin_restart(self, now: float, *, returns: bool = True) -> Restart:
-        """Tell it to start again, or join the one under way; give it back with `end_restart`.
+        """Reboot the component, or join the reboot in progress; give it back with `end_restart`.
 
         Args:
             now: the time.
@@ -693,7 +698,7 @@ class ComponentMachine:
         return self.restarts.begin(now, returns=returns)
 
     def end_restart(self, restart: Restart, now: float) -> None:
-        """Wait for it no longer. The last one who waited ends it; whether it is obeyed is then not known."""
+        """Give a reboot back. The last holder ends it; whether the command takes effect is then unknown."""
         self.restarts.end(restart, now)
 
     def begin_fetch(
@@ -706,19 +711,19 @@ class ComponentMachine:
         check: Check | None = None,
         sampled: Sampled | None = None,
     ) -> Fetch:
-        """Begin a fetch, or join the one under way; give it back with `end_fetch`.
+        """Begin a fetch, or join the one in progress; give it back with `end_fetch`.
 
         Args:
             now: the time.
             refresh: download even if the vehicle's hash would confirm the cached table.
-            listed: the list has been asked for already, of all components at once.
-            by_list: download by list also where the vehicle serves the file.
-            check: how, where nobody waits for it but the watch.
-            sampled: the sample that may settle it where there is no hash, or None.
+            listed: the list was requested already, of all components at once.
+            by_list: download by list even if the vehicle serves the file.
+            check: the options of a fetch that only the watch has requested.
+            sampled: the sample that may confirm a table without a hash, or None.
 
         Raises:
-            ContestedAddress: several vehicles have its address.
-            NoReply: the component is lost, and no fetch is under way. Nothing was sent.
+            ContestedAddress: several vehicles use its address.
+            NoReply: the component is lost, and no fetch is in progress. Nothing was sent.
         """
         self.check_uncontested()
         if self.fetch is None and self._policy is not Policy.CACHE_ONLY:
@@ -728,20 +733,21 @@ class ComponentMachine:
         )
 
     def end_fetch(self, fetch: Fetch, now: float) -> None:
-        """Wait for it no longer. The last one who waited cancels it."""
+        """Give a fetch back. The last holder cancels it."""
         self.fetches.end(fetch, now)
 
     def spelling(self, name: str) -> str:
-        """The name as the vehicle has it. ArduPilot answers to any case; its own names have capitals only."""
+        """Return the vehicle's spelling of a name. ArduPilot accepts any case; its own names are in
+        capitals."""
         return _in_capitals(name) if self.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA else name
 
     def check_present(self, what: str, now: float) -> None:
-        """See whether it can be asked for something.
+        """Check that requests can be sent to it.
 
         Raises:
             UsageError: nothing may be sent.
-            ContestedAddress: several vehicles have its address.
-            NoReply: it is lost.
+            ContestedAddress: several vehicles use its address.
+            NoReply: the component is lost.
         """
         if self._listens_only:
             raise UsageError(
@@ -753,10 +759,10 @@ class ComponentMachine:
             raise NoReply(f"{what} (lost)", attempts=0, waited=silence)
 
     def check_uncontested(self) -> None:
-        """See whether one vehicle alone has the address, and that of its autopilot.
+        """Check that one vehicle alone uses the address, and that of its autopilot.
 
         Raises:
-            ContestedAddress: several have it.
+            ContestedAddress: several vehicles do.
         """
         for each in (self, *self._autopilots()):
             if each.peers.contest is not None:
@@ -765,7 +771,7 @@ class ComponentMachine:
     # peers
 
     def peer_moved(self, claim: Claim, now: float, verdict: Verdict) -> None:
-        """Another peer has the address now, and is asked who it is."""
+        """Take another peer as the one with the address, and request its identity."""
         if verdict is Verdict.OTHER:
             self._replaced(now)
         else:
@@ -777,13 +783,13 @@ class ComponentMachine:
         self.clock_requests.want(now)
 
     def contest_began(self, contest: Contest, now: float) -> None:
-        """Several vehicles have the address: whoever waits for one of them gets the error."""
+        """End all operations with an error: several vehicles use the address."""
         self._observer.contested(self, contest)
         self.fail_all(contest.error, now)
         self._forget_companions(contest.error, now)
 
     def contest_ended(self, claim: Claim, now: float, *, is_same: bool) -> None:
-        """One vehicle has the address: it is asked who it is before anything counts or is kept."""
+        """Request the identity of the one vehicle with the address, before anything of it counts."""
         if is_same:
             self._doubt()
             self.who.doubt(now)
@@ -798,7 +804,8 @@ class ComponentMachine:
         self.clock_requests.want(now)
 
     def _forget_companions(self, error: ParamClientError, now: float) -> None:
-        """Where the autopilot was contested, its other components may have been heard from either vehicle."""
+        """Forget the autopilot's other components after a contest: their messages may be of either
+        vehicle."""
         if self.who.is_autopilot:
             for each in self._vehicle():
                 if each is not self and each.who.has_parameters:
@@ -806,7 +813,8 @@ class ComponentMachine:
                     each.become_another(now)
 
     def _replaced(self, now: float) -> None:
-        """Another vehicle has the address: with an autopilot go the components of its vehicle."""
+        """Forget the vehicle: another one uses the address. An autopilot takes its vehicle's components with
+        it."""
         is_autopilot = self.who.is_autopilot
         self.who.forget(now)
         if is_autopilot:
@@ -815,7 +823,7 @@ class ComponentMachine:
             self.become_another(now)
 
     def _take_claim(self, claim: Claim, now: float) -> None:
-        """Take what a peer has said of itself before its messages counted."""
+        """Process what a peer has sent before its messages counted."""
         for message in (claim.heartbeat, claim.version):
             if message is not None:
                 self.receive(message, now, version=self.version)
@@ -834,7 +842,7 @@ class ComponentMachine:
         self._follow_identity(now)
 
     def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity."""
+        """Return when `tick` is due, or infinity."""
         first = min(self.presence.lost_at(), self.peers.next_deadline())
         if self.peers.contest is not None:
             return first
@@ -845,25 +853,25 @@ class ComponentMachine:
         return first
 
     def resume(self, now: float) -> None:
-        """The link was away and is back: whatever waits for an answer is asked for again."""
+        """Repeat all requests in flight: the link is back."""
         self.round_trip.heard_at = now
         if not self.presence.is_lost:
             if self.presence.was_away(silence := self.presence.heard(now)):
                 self._doubt()
                 self.sync.check(now)
             elif self.identity.uid is not None:
-                self.who.doubt(now)  # it may be another one that was plugged in
+                self.who.doubt(now)  # another vehicle may have been plugged in
             self._was_silent(silence, now)
         for machine in self._machines:
             machine.resume(now)
 
     def fail_all(self, error: ParamClientError, now: float) -> None:
-        """The link is gone for good, or the address is contested: every operation ends with the error."""
+        """End every operation with the error: the link has ended, or the address is contested."""
         for machine in reversed(self._machines):
             machine.fail_all(error, now)
 
     def become_another(self, now: float) -> None:
-        """Another vehicle has taken this system id: nothing that is known is about it."""
+        """Forget everything: another vehicle uses the system id."""
         self._report(self.table.forget())
         self._observer.replaced(self)
         self.sync.forget()
@@ -884,7 +892,7 @@ class ComponentMachine:
         return f"<ComponentMachine {self.system}/{self.component} {kind} {self.state}>"
 
     def _heard(self, now: float, version: int) -> None:
-        """Anything has come."""
+        """Process the arrival of any message."""
         presence = self.presence
         silence = presence.heard(now)
         self.round_trip.heard_at = now
@@ -899,7 +907,7 @@ class ComponentMachine:
         self.table.move(count)
 
     def _doubt(self) -> None:
-        """What is known may be of the past: it counts again when the vehicle has confirmed it."""
+        """Doubt everything known: it counts again when the vehicle has confirmed it."""
         self.table.doubt(Trust.LIVE, Trust.VERIFIED)
         self.sync.doubt()
         if self.fetch is not None:
@@ -908,7 +916,7 @@ class ComponentMachine:
             self.fetches.overheard.forget()
 
     def _lose(self, now: float) -> None:
-        """It is not heard any more. A fetch goes on for a while: it may only be starting again."""
+        """Mark the component as lost. A fetch goes on for a while: the component may only be rebooting."""
         presence = self.presence
         presence.is_lost = True
         self._observer.lost(self, now - presence.heard_at)
@@ -917,29 +925,29 @@ class ComponentMachine:
         self._doubt()
 
     def _was_silent(self, silence: float, now: float) -> None:
-        """It is heard again. After a while, who it is and its hash are asked for before anything counts."""
+        """Process the end of a silence. After a long one, identity and hash are requested again."""
         presence = self.presence
         if presence.is_lost or silence == math.inf:
             presence.since = now
         if presence.is_lost:
             presence.is_lost = False
-            self.reads.forgive()  # the silence of before says nothing of it
+            self.reads.forgive()  # its cause has nothing to do with the silence before
             self._observer.found(self, silence)
             self.sync.check(now)
             self.who.doubt(now)
         elif presence.was_away(silence) and silence < math.inf:
             self.who.doubt(now)
         self.restarts.silent(silence, now)
-        if presence.has_beaten:  # else nothing says when it should have been heard
+        if presence.has_beaten:  # without heartbeats, no message is ever overdue
             self.sync.silence(now)
 
     def _restart_noticed(self, now: float) -> None:
-        """It has started again on command, and its clock has not shown that, or not by going back."""
+        """Process a reboot on command that the clock has not shown, or not by going back."""
         self.presence.forget_clock(now)
         self._rebooted(now)
 
     def _rebooted(self, now: float, *, by_clock: bool = False) -> None:
-        """The vehicle has started again: what it had not saved is gone, and its list begins anew."""
+        """Process a reboot: unsaved values are lost, and a list starts again."""
         self._observer.rebooted(self)
         self.fetches.interrupt(now)
         self.start_values.restarted(now, by_clock=by_clock)
@@ -958,11 +966,11 @@ class ComponentMachine:
             self.fetch.restart(now)
 
     def _follow_identity(self, now: float) -> None:
-        """What the identification has come to know takes effect."""
+        """Apply the results of the identification."""
         self._report(self.table.use_encoding(self.who.encoding))
         autopilot = self.who.autopilot
         self.reads.pace.is_batched = autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA
-        name = autopilot_name(MAV_AUTOPILOT_PX4 if autopilot is None else autopilot)  # it may be one
+        name = autopilot_name(MAV_AUTOPILOT_PX4 if autopilot is None else autopilot)  # may be one
         self.writes.against_non_finite = reason_against_non_finite(name)
         if self.fetch is not None:
             self.fetch.look(now)
@@ -977,7 +985,8 @@ class ComponentMachine:
             self._fail_unconfirmed(now)
 
     def _fail_unconfirmed(self, now: float) -> None:
-        """Nothing is written where it was asked in vain which vehicle it is, or that of its autopilot."""
+        """End writes with an error: the identity of the vehicle, or of its autopilot, was requested without
+        success."""
         for each in (self, *self._autopilots()):
             if each.who.is_unconfirmed:
                 what = f"{each.system}/{each.component} has not said since it was away which vehicle it is"
@@ -985,12 +994,12 @@ class ComponentMachine:
                 self.writes.fail_all(NoReply(what, attempts=each.who.attempts, waited=waited), now)
 
     def _doubt_identity(self, now: float) -> None:
-        """The table is not what it was: it may be another vehicle that answers by now."""
-        if self.who.settled and now - self.who.known_at > FRESH_IDENTITY:
+        """Doubt the table: another vehicle may respond by now."""
+        if self.who.settled and now - self.who.known_at > IDENTITY_VALID_TIME:
             self.who.ask_again(now)
 
     def _moved(self, changes: list[Change]) -> None:
-        """What a fetch has found out otherwise than by a PARAM_VALUE."""
+        """Report changes that a fetch has found without a PARAM_VALUE."""
         for change in changes:
             self.sync.changed(change.name, change.by)
         self._report(changes)
@@ -1002,7 +1011,7 @@ class ComponentMachine:
         self.rereads.write_ended(write, now)
 
     def resynced(self, changed: tuple[str, ...], confirmed: int | None) -> None:
-        """Report that the table agrees with the vehicle's again."""
+        """Report that the table matches the vehicle's again."""
         self._observer.resynced(self, changed, confirmed)
 
     def _fetched(self, result: FetchResult) -> None:
@@ -1021,9 +1030,8 @@ class ComponentMachine:
 
 
 def _in_capitals(name: str) -> str:
-    """The name with capitals for its ASCII letters. Of others, as damage may bring them, the capital may be
-    two letters or none that a message can hold.
-    """
+    """Return the name with its ASCII letters in capitals. The capital of other letters, which only damage
+    brings, may have two letters or not fit into a message."""
     return name.encode("latin-1").upper().decode("latin-1")
 
 

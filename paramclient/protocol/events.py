@@ -32,21 +32,21 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class ComponentHeard:
-    """A component was heard for the first time."""
+    """The first message of a component was received."""
 
     machine: ComponentMachine
 
 
 @dataclass(frozen=True, slots=True)
 class ComponentIdentified:
-    """It is settled who the component is, as far as it ever will be; its cached table can be looked for."""
+    """The identity of a component is as complete as it gets; its cached table can be looked up."""
 
     machine: ComponentMachine
 
 
 @dataclass(frozen=True, slots=True)
 class ComponentLost:
-    """Nothing has come from it for too long: `silence` seconds."""
+    """No message of the component was received for the heartbeat timeout; `silence` is in seconds."""
 
     machine: ComponentMachine
     silence: float
@@ -54,7 +54,7 @@ class ComponentLost:
 
 @dataclass(frozen=True, slots=True)
 class ComponentFound:
-    """One that was lost is heard again, after `silence` seconds."""
+    """Messages of a lost component are received again, after `silence` seconds."""
 
     machine: ComponentMachine
     silence: float
@@ -62,21 +62,21 @@ class ComponentFound:
 
 @dataclass(frozen=True, slots=True)
 class ComponentRebooted:
-    """The vehicle has started again."""
+    """The vehicle has rebooted."""
 
     machine: ComponentMachine
 
 
 @dataclass(frozen=True, slots=True)
 class ComponentReplaced:
-    """Another vehicle has its address: nothing that was known is about that one."""
+    """Another vehicle uses the address: everything known is invalid."""
 
     machine: ComponentMachine
 
 
 @dataclass(frozen=True, slots=True)
 class ComponentContested:
-    """Several vehicles have its address: nothing is taken from them, and nothing is asked of them."""
+    """Several vehicles use the address: their messages are ignored and nothing is requested of them."""
 
     machine: ComponentMachine
     contest: Contest
@@ -84,22 +84,21 @@ class ComponentContested:
 
 @dataclass(frozen=True, slots=True)
 class ComponentUncontested:
-    """One vehicle alone has its address again, or the peers are proven to be one vehicle. It is asked who it
-    is.
-    """
+    """Only one vehicle uses the address again, or the peers are proven to be one vehicle. It is identified
+    again."""
 
     machine: ComponentMachine
 
 
 @dataclass(frozen=True, slots=True)
 class ComponentForgotten:
-    """It is not followed any more, as it was lost and others want to be heard. Should it speak, it is new."""
+    """The component was removed: it was lost and others needed its place. Its next message adds it again."""
 
     machine: ComponentMachine
 
 
 class ParamChanged(NamedTuple):
-    """A parameter appeared, changed or went away. A named tuple: each first value makes one."""
+    """A parameter appeared, changed or was removed. A named tuple: each first value makes one."""
 
     machine: ComponentMachine
     change: Change
@@ -107,7 +106,7 @@ class ParamChanged(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ParamsMoved:
-    """Parameters have changed of which nobody wants to be told one by one."""
+    """Parameters have changed, without an event for each."""
 
     machine: ComponentMachine
 
@@ -122,12 +121,12 @@ class Fetched:
 
 @dataclass(frozen=True, slots=True)
 class TableResynced:
-    """The table had fallen behind the vehicle's, or might have, and agrees with it again.
+    """The table was, or might have been, out of sync with the vehicle's, and matches it again.
 
     Attributes:
-        changed: names of what had moved, in the order in which that was found out; empty where the vehicle's
-            hash showed that nothing had.
-        hash: the hash that confirms it, or None for a vehicle without one.
+        changed: names of changed parameters, in the order of detection; empty where the vehicle's hash showed
+            no change.
+        hash: the hash that confirms the table, or None for a vehicle without one.
     """
 
     machine: ComponentMachine
@@ -167,7 +166,7 @@ class EventMaker:
         self._emit(ComponentHeard(machine))
 
     def forgotten(self, machine: ComponentMachine) -> None:
-        """Report that a component is not followed any more."""
+        """Report that a component was removed."""
         self._emit(ComponentForgotten(machine))
 
     def identified(self, machine: ComponentMachine) -> None:

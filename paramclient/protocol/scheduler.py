@@ -1,4 +1,4 @@
-"""Whose list is sent now: the components of one link take turns, as many at a time as it has room for."""
+"""Turns: which list downloads of one link run in parallel, by the bandwidth that they show."""
 
 from __future__ import annotations
 
@@ -10,49 +10,52 @@ from paramclient.protocol.requests.pacing import Share
 
 __all__ = ["Seen", "Stream", "Turns"]
 
-ENOUGH_SEEN: Final = 20
-"""Values of a new list after which it has shown how it comes beside the others."""
-FEWEST_EXPECTED: Final = 10.0
-"""Values of the earlier lists that must have been due meanwhile for their pace to tell anything."""
-SHOWING_GAPS: Final = 8.0
-"""The same in its longest gaps: a burst of PX4 is 20 values at once, and says nothing of the time between."""
-BURSTY_GAPS: Final = 2.0
-"""The same where a burst takes no time: then loss tells, and not the pace."""
-SHOWING_TIME: Final = 0.5
-"""Seconds after which a slow list has shown enough: it does not take much of the link."""
+JUDGED_VALUES_MIN: Final = 20
+"""Values of a new list after which its effect on the others is judged."""
+EXPECTED_VALUES_MIN: Final = 10.0
+"""Expected values of the earlier lists, at least, before their pace is judged."""
+JUDGED_GAPS: Final = 8.0
+"""The same in longest gaps of the list: a burst of PX4 is 20 values at once, and says nothing of the time
+between bursts."""
+JUDGED_GAPS_BURSTY: Final = 2.0
+"""The same where a burst takes no time: then loss decides, and not the pace."""
+JUDGED_TIME: Final = 0.5
+"""Seconds after which a slow list is judged anyway: it does not use much of the link."""
 GROWTH: Final = 2
-"""How many times as many may run when those that run have shown room."""
-FAST_GROWTH: Final = 8
-"""The same where values come in bursts that take no time, until any were lost for want of room: then the link
-is idle nearly all of the time. So many begin at once, too: their bursts find room in any buffer."""
-SPREAD: Final = 0.00015
-"""Seconds between the beginnings of further ones there, for each that runs. Those that begin together bring
-nothing at first, and then more than can be read before it is lost: PX4 answers within 20 ms, and what one
-brings is to be seen before many have followed. As PX4's list of 1,000 values takes a second, no more than 80
-of them run beside each other: more than one core reads."""
-FAST_RETRY: Final = 0.25
-RETRY: Final = 5.0
-LONGEST_RETRY: Final = 60.0
-"""Seconds after which more are tried again when there was no room; doubled from the first to the longest.
-The fast one is for lists that come in bursts which take no time: they last no longer than a second."""
-MEMORY: Final = 30.0
-"""Seconds without any list after which what was found out about the link counts no more."""
-LOSSIER: Final = 0.1
-"""By how much the share of lost values must rise, at the least, before that is for want of room."""
-UNLIKELY: Final = 2.0
-"""Standard deviations by which it must rise as well."""
-SLOWER: Final = 0.8
-"""To which share of their pace the earlier lists must fall before that is for want of room."""
+"""The factor by which the number of parallel lists may grow when the running ones show free bandwidth."""
+GROWTH_BURSTY: Final = 8
+"""The same for lists in bursts that take no time, until values are lost at the limit: the link is then idle
+nearly all of the time. The same number begins at once: their bursts fit into any buffer."""
+START_INTERVAL_BURSTY: Final = 0.00015
+"""Seconds between the starts of further lists in bursts, for each running list. Lists that start together
+send nothing at first, and then more than can be read before it is lost: PX4 answers within 20 ms, and the
+effect of one list is to be seen before many have followed. As PX4's list of 1,000 values takes 1 s, no more
+than 80 of them run in parallel: more than one core reads."""
+RETRY_DELAY_BURSTY: Final = 0.25
+"""Seconds until the next attempt with more lists after a failed one, for lists in bursts that take no time:
+they last no longer than 1 s."""
+RETRY_DELAY: Final = 5.0
+"""The same for other lists; doubled after each failed attempt."""
+RETRY_DELAY_MAX: Final = 60.0
+"""The longest delay in seconds until the next attempt."""
+MEASUREMENT_LIFETIME: Final = 30.0
+"""Seconds without any list after which the measurements of the link expire."""
+LOSS_RISE_MIN: Final = 0.1
+"""The increase of the share of lost values, at least, that indicates a lack of bandwidth."""
+LOSS_RISE_DEVIATIONS: Final = 2.0
+"""The same in standard deviations; both must be exceeded."""
+PACE_DROP: Final = 0.8
+"""The share of their former pace below which the earlier lists indicate a lack of bandwidth."""
 
 
 class Seen(NamedTuple):
-    """What a list has shown since it was asked for.
+    """The statistics of a list since its request.
 
     Attributes:
-        came: values by which it went forward.
-        passed: indices that it went over, with those that were lost.
-        longest: the longest time of late between two values, in seconds.
-        is_bursty: whether most of them come together.
+        came: values by which it advanced.
+        passed: indices that it passed, including lost ones.
+        longest: the longest recent time between two values, in seconds.
+        is_bursty: whether most values are received together.
     """
 
     came: int
@@ -62,11 +65,11 @@ class Seen(NamedTuple):
 
 
 class Stream(Protocol):
-    """Someone whose list wants a turn.
+    """A list download that needs a turn.
 
     Attributes:
-        silent_at: while nothing has come: when that has lasted too long. Else infinity.
-        is_awaited: whether nothing of the list has come since the turn began.
+        silent_at: when the list counts as silent, while nothing was received; otherwise infinity.
+        is_awaited: whether nothing of the list was received since the turn began.
     """
 
     @property
@@ -76,7 +79,7 @@ class Stream(Protocol):
     def is_awaited(self) -> bool: ...
 
     def begin(self, now: float) -> None:
-        """It is this one's turn: ask for the list."""
+        """Request the list: its turn begins."""
 
     def seen(self) -> Seen: ...
 
@@ -84,39 +87,38 @@ class Stream(Protocol):
 class Turns:
     """Gives the lists of one link their turns.
 
-    A list that is alone begins at once. Others begin when those that run have shown their pace and the last
-    ones to begin made none of them slower or lossier: as many again each time. When they did, no more run
-    beside each other than before, and one more is tried a while later; where lists come in bursts that take
-    no time, soon, and as many again. One that stays silent takes nothing of the link: it is no longer counted
-    once its time-out is over.
+    A single list begins at once. Others begin when the running lists have shown their pace and the last ones
+    to begin made none of them slower or lossier: each time as many again. If they did, no more lists run in
+    parallel than before, and one more is tried later; with lists in bursts that take no time, after a short
+    delay, and as many again. A silent list uses no bandwidth: it is no longer counted after its timeout.
 
-    On a link that is faster than the program it is the program that has no room. So beyond the first few,
-    lists that come in bursts begin one after the other, and none while more has come than was read.
+    On a link that is faster than the program, the program is the bottleneck. Beyond the first few, lists in
+    bursts therefore begin one after the other, and none while unread data is waiting.
 
     Attributes:
-        share: what all reads of the link may take of it together.
+        share: the bandwidth that all reads of the link may use together.
     """
 
     def __init__(self) -> None:
         self.share = Share()
-        self._are_bursty = False  # whether the lists that were looked at last come in bursts: on a fast link
+        self._are_bursty = False  # whether the lists judged last come in bursts: on a fast link
         self._now = -math.inf
         self._limit = 1
-        self._shown = 0  # how many have run beside each other and had room
+        self._shown = 0  # the number of parallel lists that had enough bandwidth
         self._failures = 0
         self._again_at = -math.inf  # when more may be tried
         self._idle_since = -math.inf
-        self._begun_at = -math.inf  # when a turn was given last
-        self._crowded_at = -math.inf  # when several lists came last
+        self._begun_at = -math.inf  # when a turn began last
+        self._crowded_at = -math.inf  # when several lists ran last
         self._is_crowded = False  # whether other links have lists too
-        self._lone: Stream | None = None  # the list that came alone last
+        self._lone: Stream | None = None  # the last list that ran alone
         self._lone_at = -math.inf  # when that was
         self._waiting: deque[Stream] = deque()
-        self._running: dict[Stream, Seen] = {}  # with what it had shown when the newest began to come
+        self._running: dict[Stream, Seen] = {}  # with their statistics when the newest began to arrive
         self._newest: set[Stream] = set()
         self._marked_at: float | None = None  # when that was
-        self._paces: dict[Stream, float] = {}  # as they were at the last look
-        self._came = self._passed = 0  # of all lists, as long as there was room
+        self._paces: dict[Stream, float] = {}  # at the last look
+        self._came = self._passed = 0  # of all lists while there was enough bandwidth
 
     @property
     def is_free(self) -> bool:
@@ -125,17 +127,17 @@ class Turns:
 
     @property
     def bursts(self) -> int:
-        """How many lists come in bursts."""
+        """The number of lists in bursts."""
         return sum(not stream.is_awaited and stream.seen().is_bursty for stream in self._running)
 
     def awaited(self, now: float) -> int:
-        """How many may do so soon: nothing has come of them, and their time-out is not over."""
+        """Return the number of lists about to start: nothing was received of them, within their timeout."""
         return sum(stream.is_awaited and stream.silent_at > now for stream in self._running)
 
     def ask(self, stream: Stream, now: float) -> None:
-        """Want a turn; `Stream.begin` is called at once, or when it comes. Ended by `give_back`."""
+        """Request a turn; `Stream.begin` is called at once or later. Give it back with `give_back`."""
         self._now = now
-        if not self._running and now - self._idle_since > MEMORY:
+        if not self._running and now - self._idle_since > MEASUREMENT_LIFETIME:
             self._limit = 1
             self._failures = self._came = self._passed = self._shown = 0
             self._again_at = -math.inf
@@ -145,19 +147,19 @@ class Turns:
             self._waiting.append(stream)
 
     def has_begun(self, stream: Stream) -> None:
-        """A list runs that was asked for without a turn."""
+        """Record a list that was requested without a turn."""
         self._running[stream] = _NOTHING
-        is_one_more = len(self._running) > self._shown  # else it has taken the place of one that is over
+        is_one_more = len(self._running) > self._shown  # otherwise it replaces a finished list
         if is_one_more or not self._are_bursty:
             self._newest.add(stream)
             self._marked_at = None
 
     def give_back(self, stream: Stream, *, is_cut: bool = False) -> None:
-        """The list is over, or is wanted no more. The next one begins with the next `tick`.
+        """Give a turn back. The next list begins with the next `tick`.
 
         Args:
-            stream: whose it is.
-            is_cut: whether it fell quiet before its end.
+            stream: the holder of the turn.
+            is_cut: whether the list went silent before its end.
         """
         if self._running.pop(stream, None) is None:
             if stream in self._waiting:
@@ -171,20 +173,20 @@ class Turns:
             self._idle_since = self._now
 
     def is_beside_others(self, stream: Stream) -> bool:
-        """Whether lists of others come now, be it on other links that take the program's time."""
+        """Return whether other lists run, also on other links that share the event loop."""
         return self._is_crowded or any(each is not stream and not each.is_awaited for each in self._running)
 
     def beside_others_at(self, stream: Stream) -> float:
-        """When a list of another one came last."""
+        """Return when another list ran last."""
         return max(self._crowded_at, -math.inf if self._lone is stream else self._lone_at)
 
     def tick(self, now: float, *, most: float = math.inf, is_crowded: bool = False) -> bool:
-        """Let the next ones begin, if there is room; whether any has.
+        """Begin further lists if there is bandwidth; return whether any has begun.
 
         Args:
             now: the time.
-            most: so many may run beside each other, as the program has no time for more.
-            is_crowded: whether lists of other links take the program's time.
+            most: the limit of parallel lists by the event-loop latency.
+            is_crowded: whether lists of other links share the event loop.
         """
         self._now = now
         coming = [stream for stream in self._running if not stream.is_awaited]
@@ -207,22 +209,22 @@ class Turns:
         return begins > 0
 
     def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity."""
+        """Return when `tick` is due, or infinity."""
         if not self._waiting:
             return math.inf
         if self._active() < self._limit:
             return self._now if self._room() > 0 else self._next_at
         times = [stream.silent_at for stream in self._running if stream.silent_at > self._now]
         if not self._newest:
-            # lists in bursts are judged once they come: while all are awaited, nothing is due
+            # lists in bursts are judged on arrival: while all are awaited, nothing is due
             if not self._are_bursty or any(not stream.is_awaited for stream in self._running):
                 times.append(max(self._again_at, self._now))
         elif self._marked_at is not None:
-            times.append(self._marked_at + SHOWING_TIME)
+            times.append(self._marked_at + JUDGED_TIME)
         return min(times, default=math.inf)
 
     def resume(self, now: float) -> None:
-        """The link is back: what was measured before it went counts no more."""
+        """Drop the measurements: the link is back, and may have changed."""
         self._now = now
         self._paces.clear()
         self._marked_at = None
@@ -237,23 +239,23 @@ class Turns:
 
     @property
     def _next_at(self) -> float:
-        """When the next one begins beside many that come in bursts."""
-        return self._begun_at + SPREAD * len(self._running)
+        """When the next list begins beside many lists in bursts."""
+        return self._begun_at + START_INTERVAL_BURSTY * len(self._running)
 
     def _room(self) -> int:
-        """How many may begin now."""
+        """Return how many lists may begin now."""
         room = self._limit - self._active()
         if self._are_bursty:
-            room = min(room, max(FAST_GROWTH - len(self._running), int(self._now >= self._next_at)))
+            room = min(room, max(GROWTH_BURSTY - len(self._running), int(self._now >= self._next_at)))
         return room
 
     def _look(self, now: float) -> None:
-        """Judge by what has come whether the newest lists had room."""
+        """Judge by the statistics whether the newest lists had enough bandwidth."""
         active = [stream for stream in self._running if stream.silent_at > now]
         judged = self._newest.intersection(active) if self._are_bursty else active
         if any(stream.is_awaited for stream in judged):
             return
-        if not active:  # all keep silent, so nothing is known of the link, and nobody is in the way
+        if not active:  # all are silent: nothing is known of the link, and its bandwidth is free
             self._limit *= GROWTH
             self._newest.clear()
             return
@@ -269,12 +271,12 @@ class Turns:
         paces = {}
         for stream in active:
             seen, mark = stream.seen(), self._running[stream]
-            if seen.passed < mark.passed:  # it has begun anew
+            if seen.passed < mark.passed:  # restarted
                 mark = _NOTHING
             one_came, one_passed = seen.came - mark.came, seen.passed - mark.passed
             if stream in self._newest:
-                gaps = BURSTY_GAPS if seen.is_bursty else SHOWING_GAPS
-                is_shown = is_shown and one_came >= ENOUGH_SEEN and since >= gaps * seen.longest
+                gaps = JUDGED_GAPS_BURSTY if seen.is_bursty else JUDGED_GAPS
+                is_shown = is_shown and one_came >= JUDGED_VALUES_MIN and since >= gaps * seen.longest
                 is_bursty = is_bursty and seen.is_bursty
             came += one_came
             passed += one_passed
@@ -282,10 +284,10 @@ class Turns:
             if stream in self._paces:
                 earlier += one_passed
                 expected += self._paces[stream] * since
-        if not is_shown and now < self._marked_at + SHOWING_TIME:
+        if not is_shown and now < self._marked_at + JUDGED_TIME:
             return
         self._are_bursty = is_bursty
-        is_slower = expected >= FEWEST_EXPECTED and not is_bursty and earlier < SLOWER * expected
+        is_slower = expected >= EXPECTED_VALUES_MIN and not is_bursty and earlier < PACE_DROP * expected
         if is_slower or self._is_lossier(came, passed):
             self._fail(len(active) - len(self._newest) or len(active) // 2 * self._are_bursty)
         else:
@@ -293,9 +295,9 @@ class Turns:
             self._came += came
             self._passed += passed
             self._paces = paces
-            # several that began together have shown nothing of how each one comes alone
+            # several lists that began together show nothing of a single one
             if now >= self._again_at and (expected or len(active) == 1):
-                growth = FAST_GROWTH if is_bursty and not self._failures else GROWTH
+                growth = GROWTH_BURSTY if is_bursty and not self._failures else GROWTH
                 is_careful = self._failures and not is_bursty
                 more = len(active) + 1 if is_careful else len(active) * growth
                 self._limit = max(self._limit, more)
@@ -303,23 +305,23 @@ class Turns:
         self._marked_at = None
 
     def _fail(self, limit: int) -> None:
-        """There was no room: no more than so many for a while."""
+        """Limit the number of parallel lists for a while: there was not enough bandwidth."""
         if self._are_bursty and self._now < self._again_at:
-            return  # of as many lists as run there, others are cut for the same want of room
+            return  # with as many lists as run there, further ones are cut off for the same reason
         self._limit = self._shown = max(min(limit, self._limit), 1)
-        retry = FAST_RETRY if self._are_bursty else RETRY
-        self._again_at = self._now + min(retry * 2**self._failures, LONGEST_RETRY)
+        retry = RETRY_DELAY_BURSTY if self._are_bursty else RETRY_DELAY
+        self._again_at = self._now + min(retry * 2**self._failures, RETRY_DELAY_MAX)
         self._failures += 1
 
     def _is_lossier(self, came: int, passed: int) -> bool:
-        """Whether more was lost in this window than is lost on this link anyway."""
+        """Return whether more was lost in this window than the link usually loses."""
         if not passed or not self._passed:
             return False
         before = 1 - self._came / self._passed
         rise = 1 - came / passed - before
         pooled = 1 - (came + self._came) / (passed + self._passed)
         deviation = math.sqrt(pooled * (1 - pooled) * (1 / passed + 1 / self._passed))
-        return rise > max(LOSSIER, UNLIKELY * deviation)
+        return rise > max(LOSS_RISE_MIN, LOSS_RISE_DEVIATIONS * deviation)
 
 
 _NOTHING = Seen(0, 0, 0.0, False)

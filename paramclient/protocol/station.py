@@ -1,4 +1,4 @@
-"""The ground station's side of one link: every component heard on it, our heartbeat, and who gets what."""
+"""The ground station's side of one link: its components, our heartbeat, and the routing of messages."""
 
 from __future__ import annotations
 
@@ -61,63 +61,67 @@ __all__ = ["Address", "Peer", "Station"]
 
 
 HEARTBEAT_INTERVAL: Final = 1.0
-NOBODY: Final = (0, 0)
-"""Who we are where we only listen: then whoever has our ids is somebody else."""
-MOST_COMPONENTS: Final = 1_000
-"""Components followed on one link: more than 250 systems with a few each have. Further ones are heard
-when one that is lost and has told of no parameter can be forgotten for them."""
-MOST_AT_ONCE: Final = 64
-"""Components that do what is due in one `tick`, a few milliseconds. For more it is to be called again."""
-MOST_PAST: Final = 8
-"""Deadlines of the past that are kept for each component before they are sorted out."""
-SEARCH_INTERVAL: Final = 0.5
-"""Seconds between two searches for one that can be forgotten, where there was none: each looks at all."""
+"""Seconds between two heartbeats of ours, by the standard."""
+NO_ADDRESS: Final = (0, 0)
+"""Our own address where nothing is sent: a sender with our ids is then another station."""
+COMPONENTS_MAX: Final = 1_000
+"""Components followed on one link: more than 250 systems with a few each. Further ones replace a lost
+component without parameters."""
+TICKED_COMPONENTS_MAX: Final = 64
+"""Components handled in one `tick`, which takes a few milliseconds. For more, `tick` is due again at once."""
+STALE_DEADLINES_MAX: Final = 8
+"""Stale deadlines for each component that the heap may hold before it is rebuilt."""
+REMOVAL_SEARCH_INTERVAL: Final = 0.5
+"""Seconds between two searches for a component to forget, where there was none: each looks at all."""
 HEARTBEAT_REQUEST_INTERVAL: Final = 0.25
-"""Seconds between two requests for the heartbeat of a vehicle that speaks and has not sent one yet."""
+"""Seconds between two requests for the heartbeat of a vehicle that has sent other messages only."""
 HEARTBEAT_REQUESTS_MAX: Final = 8
-"""Such requests on one link: in the 2 s that they take, two heartbeats are due."""
-MOST_PEERS: Final = 256
-"""Stream peers whose unfinished frames are kept."""
+"""Such requests on one link: two heartbeats are due in the 2 s that they take."""
+STREAM_PEERS_MAX: Final = 256
+"""Stream peers with an incomplete frame."""
 EARLY_REQUESTS_MAX: Final = 32
-"""Requests for parameter files that are kept for components that were not heard yet: a log may begin with the
-reading of one."""
-HEARD: Final = frozenset({0, 2, 22, 23, 77, 110, 148, 235, 253, 345, 397})
-"""The message ids that matter here: HEARTBEAT, SYSTEM_TIME, PARAM_VALUE, PARAM_SET (of others), COMMAND_ACK,
-FILE_TRANSFER_PROTOCOL, AUTOPILOT_VERSION, HIGH_LATENCY2, STATUSTEXT, PARAM_ERROR."""
+"""Requests for parameter files that are kept for components that are not known yet: a log may begin with the
+read of one."""
+HANDLED_IDS: Final = frozenset({0, 2, 22, 23, 77, 110, 148, 235, 253, 345, 397})
+"""The message ids that the core handles: HEARTBEAT, SYSTEM_TIME, PARAM_VALUE, PARAM_SET (of other stations),
+COMMAND_ACK, FILE_TRANSFER_PROTOCOL, AUTOPILOT_VERSION, HIGH_LATENCY2, STATUSTEXT, PARAM_ERROR,
+COMPONENT_METADATA."""
 _SETS: Final = frozenset({23})
-_TELEMETRY_CLOCKS: Final = {number: at for number, at in BOOT_CLOCK_OFFSETS.items() if number not in HEARD}
-"""Where `time_boot_ms` stands in messages that matter for nothing else."""
+_TELEMETRY_CLOCKS: Final = {
+    number: at for number, at in BOOT_CLOCK_OFFSETS.items() if number not in HANDLED_IDS
+}
+"""The offset of `time_boot_ms` in messages that are read for nothing else."""
 
 
 class Station:
-    """Turns what a link delivers into tables and answers, and what is wanted into bytes to send.
+    """Turns received bytes into tables and responses, and requests into bytes to send.
 
-    Feed it with `receive`, call `tick` at `next_deadline`, send what `data_to_send` gives, look at `events`.
-    Both look at every component, as anything may have been asked of any. Where there are many that takes
-    longer than all the rest; whoever calls `touch` for what was asked may have the others left out.
+    Call `receive` with received bytes and `tick` at `next_deadline`, send what `data_to_send` returns, and
+    handle `events`. `tick` and `next_deadline` look at every component, as requests may have been made of
+    any. With many components that is most of the time; a caller that passes the components of its requests to
+    `touch` may skip the others.
 
     Args:
         link: the link's canonical name.
         is_stream: whether frames may be spread over several chunks.
-        system, component: who we are.
-        encoding: for all components, where the user knows better; None: judged by the evidence.
-        upkeep: what is done for tables without being asked; by default nothing.
-        split_peers: whether components with equal ids are different ones where they come from different
-            peers.
-        counts_traffic: whether everything on the link is counted, which takes time for each frame.
-        trace: is told of each step.
+        system, component: our address.
+        encoding: of all components, by the user's choice; None: judged by the evidence.
+        upkeep: what is done for tables without a request of the user; by default nothing.
+        split_peers: whether components with equal ids but different peers are different components.
+        counts_traffic: whether all traffic of the link is counted, which takes time for each frame.
+        trace: receives each step.
 
     Attributes:
-        components: every component heard, by (system, component); with `split_peers` by `PeerAddress`.
+        components: every known component, by (system, component); with `split_peers` by `PeerAddress`.
         bytes_received, bytes_sent, frames_sent: on this link, by this station.
-        traffic: the counts, or None where they are not wanted.
-        policy: what may be asked to bring tables up to date.
+        traffic: the counts, or None without `counts_traffic`.
+        policy: the requests that may be sent to bring tables up to date.
         listens_only: whether nothing is ever sent.
-        listening_since: since when everything on the link is received, without an absence of the link or of
-            this program; infinity while the link is away.
-        is_log: whether the link is a log, which ends: then no time-out means anything, and nobody is lost.
-        is_over: whether nothing more will come, as at the end of a log.
-        verifier: looks at signatures; None where there is no key, and they count for nothing.
+        listening_since: since when everything on the link is received, without an outage of the link or a
+            suspend; infinity while the link is down.
+        is_log: whether the link is a log, which ends: then timeouts do not apply, and no component is lost.
+        is_over: whether nothing more is received, as at the end of a log.
+        verifier: verifies signatures; None without a key: signatures are then ignored.
     """
 
     def __init__(
@@ -139,18 +143,18 @@ class Station:
         self.is_log = upkeep is not None and upkeep.is_log
         self.is_over = False
         self.listening_since = -math.inf
-        self.own: Address = NOBODY if self.listens_only else (system, component)
+        self.own: Address = NO_ADDRESS if self.listens_only else (system, component)
         self.components: dict[Address, ComponentMachine] = {}
         self.bytes_received = 0
         self.bytes_sent = self.frames_sent = 0
         self._trace = trace
-        self._frames = self._skipped = self._damaged = 0  # of framers that are gone
+        self._frames = self._skipped = self._damaged = 0  # of removed framers
         self._is_stream = is_stream
         self._encoding = encoding
         self.policy = Policy.AUTO if upkeep is None else upkeep.policy
         self._upkeep = upkeep
-        # for datagrams, whoever they come from
-        self._framer = Framer(HEARD, occasional=_TELEMETRY_CLOCKS, stream=False)
+        # for datagrams of all peers
+        self._framer = Framer(HANDLED_IDS, occasional=_TELEMETRY_CLOCKS, stream=False)
         self._clock_sampling = ClockSampling(self._take_clocks)
         self._framers: dict[Peer, Framer] = {}  # for streams
         self._outbox: list[tuple[bytes, Peer | None]] = []
@@ -158,7 +162,7 @@ class Station:
         self._reporter = EventMaker(self._events.append)
         self._sequence = 0
         self._signer: Signer | None = None
-        self._is_watched = counts_traffic  # one look in the hot path for both
+        self._is_watched = counts_traffic  # one check in the hot path for both
         self.verifier: Verifier | None = None
         self._heartbeat_at = math.inf if self.listens_only else -math.inf
         self._is_paused = False
@@ -167,44 +171,45 @@ class Station:
         self._of_vehicle: dict[tuple[int, Peer], list[ComponentMachine]] = {}
         self._last_waiting: ComponentMachine | None = None
         self._last_busy: ComponentMachine | None = None
-        self._touched: dict[ComponentMachine, None] = {}  # whose deadline may be another than was noted
+        self._touched: dict[ComponentMachine, None] = {}  # with a deadline other than the noted one
         self._deadlines: dict[ComponentMachine, float] = {}  # as noted
-        self._order: list[tuple[float, Address]] = []  # a heap of these, with some that are of the past
+        self._order: list[tuple[float, Address]] = []  # a heap of these, some of them stale
         self._room = Room()
         self._early_requests: deque[tuple[FileTransfer, Address]] = deque(maxlen=EARLY_REQUESTS_MAX)
         self._full_until = -math.inf
-        self._awaits_autopilot = not self.listens_only  # none was heard yet
+        self._awaits_autopilot = not self.listens_only  # none was received yet
         self._heartbeat_requested_at = -math.inf
         self._heartbeat_requests = 0
-        self._foreign = 0  # of components that are forgotten
+        self._foreign = 0  # of forgotten components
         self._looks_for_others = 0  # callers of `looking_for_others`
 
     def begin_signing(self, signer: Signer, verifier: Verifier) -> None:
-        """From now on sign what is sent and take what the verifier accepts; before anything has come."""
+        """Sign what is sent and accept what the verifier accepts from now on; call it before `receive`."""
         self._signer = signer
         self._is_watched = True
         self.verifier = verifier
         self._framer.guard = verifier.accepts
-        self._awaits_autopilot = False  # a frame is proven once, and what asks for heartbeats proves none
+        self._awaits_autopilot = False  # would verify each signature twice
 
     def send_setup_signing(
         self, system: int, component: int, key: SigningKey | None, timestamp: int, *, peer: Peer = None
     ) -> None:
-        """Give a vehicle its signing key, in clear, or with None take it away. Nothing answers.
+        """Give a vehicle its signing key, in clear, or with None disable signing. There is no
+        acknowledgement.
 
-        `peer` is the one that the vehicle is of, with `split_peers`; else None.
+        `peer` is the vehicle's peer, with `split_peers`; otherwise None.
         """
         self._send(SetupSigning(system, component, key, timestamp), self._key(system, component, peer), 2)
 
     def receive(self, data: bytes, peer: Peer, now: float, moment: float | None = None) -> bool:
-        """Take a datagram, or a chunk of a stream. An empty chunk says that the peer's stream has ended.
+        """Process a datagram, or a chunk of a stream. An empty chunk means the end of the peer's stream.
 
-        Gives whether there was anything of interest in it; all that is not telemetry is.
+        Return whether it contained anything except telemetry.
 
         Args:
-            data, peer: what came, and from where.
+            data, peer: the bytes, and their sender.
             now: the time.
-            moment: when it came from the link, where it is taken later than that; None for `now`.
+            moment: when they came from the link, if earlier; None for `now`.
         """
         self.bytes_received += len(data)
         if self._is_watched:
@@ -217,7 +222,7 @@ class Station:
             machine = self.components.get(address)
             if number == PARAM_VALUE_ID and component == COMP_ID_MISSIONPLANNER and self._is_made_up(machine):
                 continue
-            if number == PARAM_VALUE_ID and machine is not None:  # the short way for what comes in thousands
+            if number == PARAM_VALUE_ID and machine is not None:  # fast path for the most frequent message
                 peers = machine.peers
                 if peer == peers.speaker:
                     peers.heard_at = now
@@ -242,9 +247,9 @@ class Station:
 
     @contextmanager
     def looking_for_others(self) -> Iterator[None]:
-        """Request the heartbeats of vehicles that speak and have not sent one, for the time of the block.
+        """Request the heartbeats of vehicles that send other messages only, for the time of the block.
 
-        So a vehicle that sends telemetry is found although its heartbeat is lost.
+        A vehicle that sends telemetry is thus found although its heartbeat was lost.
         """
         self._looks_for_others += 1
         try:
@@ -253,12 +258,13 @@ class Station:
             self._looks_for_others -= 1
 
     def touch(self, machine: ComponentMachine) -> None:
-        """Something was asked of a component, or is no longer."""
+        """Note that requests of a component have begun or ended."""
         if self.components.get(machine.address) is machine:
             self._touched[machine] = None
 
     def overhear(self, data: bytes, now: float) -> None:
-        """Take note of a frame that another program sends to the vehicles over this link: who sets what."""
+        """Process a frame that another program sends to the vehicles over this link: it may be a
+        PARAM_SET."""
         for frame in Framer(_SETS, stream=False).receive(data):
             message = decode(frame)
             if isinstance(message, ParamSet):
@@ -267,12 +273,12 @@ class Station:
     def tick(
         self, now: float, *, everyone: bool = True, most_lists: float = math.inf, is_crowded: bool = False
     ) -> None:
-        """Do what is due: our heartbeat, and time-outs of up to `MOST_AT_ONCE` components.
+        """Do what is due: our heartbeat, and the timeouts of up to `TICKED_COMPONENTS_MAX` components.
 
-        Without `everyone`, only components that were heard or touched, or whose deadline has come, are
-        looked at: a share of the link that has become larger meanwhile is then used a little later. No
-        list begins beside `most_lists` others. Where it `is_crowded`, lists of other links come as well.
-        In a log nothing is due but the end of what others have begun and left.
+        Without `everyone`, only components with a new message, touched ones, or those with a due deadline are
+        handled: a larger share of the link's bandwidth is then used a little later. No list begins beside
+        `most_lists` others. With `is_crowded`, lists of other links run as well. In a log nothing is due
+        except the end of unfinished exchanges of other stations.
         """
         if self.is_log:
             self._tick_log(now)
@@ -291,9 +297,9 @@ class Station:
         done = 0
         for machine in list(self.components.values() if everyone else self._touched):
             is_due = machine.next_deadline() <= now
-            if is_due and done == MOST_AT_ONCE:
-                self._deadlines[machine] = math.inf  # so it is noted anew, and is past
-            elif is_due or machine.writes.is_held:  # for another component's word
+            if is_due and done == TICKED_COMPONENTS_MAX:
+                self._deadlines[machine] = math.inf  # stale, so that it is noted again
+            elif is_due or machine.writes.is_held:  # waits for a message of another component
                 machine.tick(now)
                 done += is_due
             else:
@@ -305,9 +311,9 @@ class Station:
             self.traffic.sent(self.bytes_sent, now)
 
     def next_deadline(self, *, everyone: bool = True) -> float:
-        """When `tick` has something to do, or infinity while the link is away, and in a log.
+        """Return when `tick` is due, or infinity while the link is down, and in a log.
 
-        `everyone` is as there.
+        `everyone` is as in `tick`.
         """
         if self._is_paused or self.is_log:
             return math.inf
@@ -319,8 +325,8 @@ class Station:
             if deadline != deadlines.get(machine):
                 deadlines[machine] = deadline
                 heappush(order, (deadline, machine.address))
-        self._touched = {each: None for each in self._touched if each.writes.is_held}  # till another speaks
-        if len(order) > MOST_PAST * (len(deadlines) + 1):
+        self._touched = {each: None for each in self._touched if each.writes.is_held}  # until another message
+        if len(order) > STALE_DEADLINES_MAX * (len(deadlines) + 1):
             self._order = order = sorted((at, each.address) for each, at in deadlines.items())
         while order and deadlines[self.components[order[0][1]]] != order[0][0]:
             heappop(order)
@@ -328,18 +334,18 @@ class Station:
         return min(self._heartbeat_at, self._turns.next_deadline(), first)
 
     def data_to_send(self) -> list[tuple[bytes, Peer | None]]:
-        """Frames to send, in order, each with the peer it is for; None is for all."""
+        """Return the frames to send, in order, each with its peer; None means all."""
         outbox, self._outbox = self._outbox, []
         return outbox
 
     def events(self) -> list[Event]:
-        """What has happened since the last call."""
-        events = self._events.copy()  # the components hold on to the list itself
+        """Return the events since the last call."""
+        events = self._events.copy()  # the components hold a reference to the list
         self._events.clear()
         return events
 
     def pause(self) -> None:
-        """The link is away: time stands still for whatever waits."""
+        """Stop all timeouts: the link is down."""
         self._is_paused = True
         self.listening_since = math.inf
         self._outbox.clear()
@@ -351,7 +357,7 @@ class Station:
             machine.peers.forget()
 
     def resume(self, now: float) -> None:
-        """The link is back: our heartbeat goes out, and whatever waits is asked for again."""
+        """Send our heartbeat and repeat all requests in flight: the link is back."""
         self._is_paused = False
         self.listening_since = now
         if not self.listens_only:
@@ -362,13 +368,14 @@ class Station:
             machine.resume(now)
 
     def stood_still(self, unseen: float, now: float) -> None:
-        """Nobody was at work here, as when the computer slept: that others were silent means nothing.
+        """Process a time in which this program did not run, as in a system suspend: silence then means
+        nothing.
 
-        Where it was as long as it takes to get lost, every component is looked at anew, as after an absence
-        of the link. Whatever waits is asked for again.
+        If it was as long as the heartbeat timeout, every component is identified again, as after an outage of
+        the link. Requests in flight are repeated.
 
         Args:
-            unseen: seconds of it that have passed for everyone else, but not in `now`.
+            unseen: seconds of it that are missing in `now`.
             now: the time.
         """
         for machine in self.components.values():
@@ -376,18 +383,18 @@ class Station:
             machine.peers.age(unseen)
             machine.table.age(unseen)
         if not self._is_paused:
-            self._outbox.clear()  # for whoever was there before
+            self._outbox.clear()  # meant for the components before it
             self.resume(now)
 
     def over(self, now: float) -> None:
-        """Nothing more will come: whoever waits gets what there is."""
+        """End all waits with what was received: nothing more is received."""
         self.is_over = True
         for machine in self.components.values():
             machine.fetches.over(now)
 
     @property
     def framing(self) -> tuple[int, int, int]:
-        """Frames that came, bytes that belonged to none, and frames with a wrong checksum among these."""
+        """Received frames, bytes outside of frames, and damaged frames among these."""
         framers = [self._framer, *self._framers.values()]
         return (
             self._frames + sum(framer.frames for framer in framers),
@@ -397,43 +404,45 @@ class Station:
 
     @property
     def foreign(self) -> int:
-        """Messages that were not taken, as they came from a peer that may be another vehicle."""
+        """Messages that were ignored because their peer may be another vehicle."""
         return self._foreign + sum(machine.peers.foreign for machine in self.components.values())
 
     def bursts(self, now: float) -> tuple[int, int]:
-        """Lists that come in bursts, as on a link faster than the program, and that may do so soon."""
+        """Return the number of lists in bursts, as on a link faster than the program, and of those about to
+        start."""
         return self._turns.bursts, self._turns.awaited(now)
 
     @property
     def is_waiting(self) -> bool:
-        """Whether anything is awaited of any component."""
+        """Whether any component waits for anything."""
         last = self._last_waiting
-        if last is None or not last.is_waiting:  # one is asked after the other: mostly it still is the same
+        if last is None or not last.is_waiting:  # mostly still the same one
             self._last_waiting = next((each for each in self.components.values() if each.is_waiting), None)
         return self._last_waiting is not None
 
     @property
     def _is_busy(self) -> bool:
-        """Whether anything is awaited that a check would be in the way of."""
+        """Whether any operation is in progress that a check would delay."""
         last = self._last_busy
         if last is None or not last.is_busy:
             self._last_busy = next((each for each in self.components.values() if each.is_busy), None)
         return self._last_busy is not None
 
     def fail_all(self, error: LinkError, now: float) -> None:
-        """The link is gone for good: everyone who waits gets its error."""
+        """End all operations with the error: the link has ended."""
         for machine in list(self.components.values()):
             machine.fail_all(error, now)
 
     def identity_of(self, machine: ComponentMachine) -> Identity | None:
-        """Who the vehicle is that a component belongs to: its autopilot says. None while that is open."""
+        """Return the identity of a component's vehicle, which its autopilot has sent; None while it is
+        open."""
         autopilot = self.autopilot_of(*machine.vehicle) or machine
         return autopilot.identity if autopilot.who.settled else None
 
     def is_doubted(self, machine: ComponentMachine) -> bool:
-        """Whether it is open which vehicle a component belongs to.
+        """Return whether it is in doubt which vehicle a component belongs to.
 
-        Its autopilot is away, or was and has not said since who it is; or several vehicles seem to have the
+        Its autopilot is lost, or was lost and is not identified since; or several vehicles seem to use the
         address of either.
         """
         autopilot = self.autopilot_of(*machine.vehicle) or machine
@@ -445,11 +454,11 @@ class Station:
         return is_lost or autopilot.who.was_away
 
     def autopilot_of(self, system: int, peer: Peer = None) -> ComponentMachine | None:
-        """The component of a system that is its autopilot: the usual id first.
+        """Return the component of a system that is its autopilot: the usual id first.
 
         Args:
             system: the system.
-            peer: the peer that it is of, with `split_peers`; else None.
+            peer: its peer, with `split_peers`; otherwise None.
         """
         first = self.components.get(self._key(system, AUTOPILOT_COMPONENT, peer))
         if first is not None and first.who.is_autopilot:
@@ -460,7 +469,7 @@ class Station:
         return None
 
     def at_peer(self, peer: str | None) -> list[ComponentMachine]:
-        """The components whose messages come from a peer, by its address or the host alone; None for all."""
+        """Return the components of a peer, by its address or the host alone; None for all."""
         machines = list(self.components.values())
         if peer is None:
             return machines
@@ -470,7 +479,7 @@ class Station:
     def find(
         self, system: int | None, component: int | None, peer: str | None = None
     ) -> ComponentMachine | None:
-        """The first component with this address, as far as it is given; without its id, an autopilot."""
+        """Return the first component that an address fits; without a component id, an autopilot."""
         for machine in self.at_peer(peer):
             if system not in (None, machine.system):
                 continue
@@ -481,10 +490,10 @@ class Station:
         return None
 
     def check_refresh(self, refresh: bool) -> None:
-        """See whether a fetch may download what the cache has.
+        """Check that a fetch may download what is cached.
 
         Raises:
-            UsageError: the policy says no, or nothing is sent at all.
+            UsageError: the policy forbids it, or nothing is sent at all.
         """
         if refresh and self.listens_only:
             raise UsageError("nothing can be downloaded where nothing is sent, so not with refresh")
@@ -496,8 +505,8 @@ class Station:
     ) -> list[Fetch]:
         """Begin a fetch of several components of one system.
 
-        When they are all that is known of it, none of them has a table worth going on with, none is being
-        fetched, none may give it as a file, and no other list runs, the list is asked for once, of all.
+        The list is requested once for all components if they are all known ones of the system, none of them
+        has a table worth resuming, a fetch in progress or a file to serve, and no other list runs.
         """
         is_new = self._turns.is_free and not any(
             machine.fetch is not None or machine.following.is_running(now) for machine in machines
@@ -526,20 +535,20 @@ class Station:
                 machine.fetches.overheard.file.tick(now)
 
     def _watch(self, data: bytes, peer: Peer, now: float) -> None:
-        """What somebody wants done with everything that comes, before it is looked into."""
+        """Pass received bytes to traffic counts and the search for heartbeats, before they are decoded."""
         if self._signer is not None:
             self._signer.advance(now)
         if self.traffic is not None:
             self.traffic.receive(data, peer, now)
 
     def _cut_stream(self, data: bytes, peer: Peer) -> list[Frame]:
-        """The frames that a chunk of a peer's stream completes, or that its end leaves."""
+        """Return the frames that a chunk of a peer's stream completes, or that its end leaves."""
         framer = self._framers.get(peer)
         if framer is None:
-            framer = self._framers[peer] = Framer(HEARD, occasional=_TELEMETRY_CLOCKS)
+            framer = self._framers[peer] = Framer(HANDLED_IDS, occasional=_TELEMETRY_CLOCKS)
             framer.guard = self._framer.guard
             framer.takes_occasional = self._framer.takes_occasional
-            if len(self._framers) > MOST_PEERS:
+            if len(self._framers) > STREAM_PEERS_MAX:
                 self._retire(next(iter(self._framers)))
         if data:
             return framer.receive(data)
@@ -550,9 +559,9 @@ class Station:
     def _request_heartbeat(self, data: bytes, peer: Peer, now: float) -> bool:
         """Request the heartbeat of an autopilot that sends other messages; return whether one was found.
 
-        A heartbeat comes once a second; MAV_CMD_REQUEST_MESSAGE brings it in one round trip (measured on PX4
-        and ArduPilot). That is done until the first autopilot is heard, and while others are looked for: else
-        these are heard by the heartbeats that they send.
+        A heartbeat is due once a second; MAV_CMD_REQUEST_MESSAGE brings it in one round trip (measured on PX4
+        and ArduPilot). This is done until the first autopilot is found, and while others are searched:
+        otherwise the regular heartbeats are enough.
         """
         if self._is_paused or now < self._heartbeat_requested_at + HEARTBEAT_REQUEST_INTERVAL:
             return False
@@ -572,19 +581,19 @@ class Station:
         return False
 
     def _retire(self, peer: Peer) -> None:
-        """Part with the framer of a peer, and keep what it has counted."""
+        """Remove the framer of a peer, and keep its counts."""
         framer = self._framers.pop(peer)
         self._frames += framer.frames
         self._skipped += framer.skipped
         self._damaged += framer.damaged
 
     def _is_made_up(self, machine: ComponentMachine | None) -> bool:
-        """Whether a PARAM_VALUE of component 190 comes from no component that has parameters.
+        """Return whether a PARAM_VALUE of component 190 comes from no component that has parameters.
 
         After MAVProxy has read a parameter file, it writes a PARAM_VALUE of each parameter into its log, with
         the vehicle's system id, component 190 and the type REAL32 (measured with 1.8.75). Nothing sends
-        heartbeats from that address, unless a ground station has the system id of the vehicle. On a link on
-        which requests are sent, a ground station is believed to have the parameters that it sends.
+        heartbeats from that address, unless a ground station has the vehicle's system id. On a link with
+        requests, parameters sent by a ground station are accepted.
 
         Args:
             machine: the component with the address, or None where none is known.
@@ -592,7 +601,7 @@ class Station:
         return machine is None or (self.listens_only and not machine.who.has_parameters)
 
     def _receive_other(self, frame: Frame, peer: Peer, now: float, moment: float | None) -> None:
-        """Take a frame that is no value of a known component."""
+        """Process a frame that is not a value of a known component."""
         sender = (frame.system, frame.component)
         if sender == self.own or frame.system == 0 or (message := decode(frame)) is None:
             return
@@ -607,14 +616,14 @@ class Station:
         machine = self.components.get(address) or self._meet(sender, peer, message, now)
         if machine is None:
             return
-        self._touch_all(self._of_vehicle[machine.vehicle])  # what one says of the vehicle counts for all
+        self._touch_all(self._of_vehicle[machine.vehicle])  # it matters to all of them
         if not machine.who.has_parameters:
             machine.peers.follow(peer)
         elif not machine.peers.hears(message, peer, now):
             if machine.peers.contest is not None and peer == machine.peers.home:
                 machine.receive_contested(message, now, version=frame.version)
                 if isinstance(message, Heartbeat):
-                    self._clock_sampling.open(address, now)  # it may be clocks that tell them apart
+                    self._clock_sampling.open(address, now)  # clocks may tell the peers apart
             return
         machine.receive(message, now, version=frame.version, moment=moment, sequence=frame.sequence)
         if isinstance(message, Heartbeat):
@@ -623,7 +632,7 @@ class Station:
     def _receive_clock(
         self, machine: ComponentMachine, number: int, payload: bytes, peer: Peer, now: float
     ) -> None:
-        """Take the time since boot in a frame of telemetry. Trailing zeros may be cut off."""
+        """Process the time since boot in a telemetry frame. Trailing zeros may be cut off."""
         at = _TELEMETRY_CLOCKS[number]
         self._touched[machine] = None
         boot_ms = int.from_bytes(payload[at : at + 4], "little")
@@ -641,7 +650,7 @@ class Station:
         return PeerAddress(system, component, peer) if self._splits else (system, component)
 
     def _meet(self, sender: Address, peer: Peer, message: Message, now: float) -> ComponentMachine | None:
-        """A component that was not heard before; only what shows that it has parameters makes it one."""
+        """Add a component on its first message; only messages that show parameters make one."""
         is_sign = isinstance(message, Heartbeat | HighLatency2 | ParamValue)
         if not (is_sign or self._is_awaited_file(message, sender)) or not self._has_room(now):
             return None
@@ -686,12 +695,12 @@ class Station:
         return machine
 
     def _has_room(self, now: float) -> bool:
-        """Whether one more component can be followed.
+        """Return whether one more component can be followed.
 
-        Where there are too many, the first one goes that is lost, has told of no parameter, and that nobody
-        waits for: who sends heartbeats in many names must not keep out those that come later.
+        At the limit, the first lost component without parameters and waiting requests is removed: a sender of
+        heartbeats with many addresses must not keep out later components.
         """
-        if len(self.components) < MOST_COMPONENTS:
+        if len(self.components) < COMPONENTS_MAX:
             return True
         if now < self._full_until:
             return False
@@ -699,11 +708,11 @@ class Station:
             if machine.presence.is_lost and not machine.table.params and not machine.is_waiting:
                 self._forget(machine)
                 return True
-        self._full_until = now + SEARCH_INTERVAL
+        self._full_until = now + REMOVAL_SEARCH_INTERVAL
         return False
 
     def _forget(self, machine: ComponentMachine) -> None:
-        """Part with a component, and with what was noted of it: another one may take its address."""
+        """Remove a component and its records: another one may take its address."""
         address = machine.address
         del self.components[address]
         self._of_vehicle[machine.vehicle].remove(machine)
@@ -720,7 +729,7 @@ class Station:
         self._reporter.forgotten(machine)
 
     def _become_another(self, vehicle: tuple[int, Peer], now: float) -> None:
-        """Another vehicle has taken a system id, with all of its components."""
+        """Reset all components of a system id: another vehicle uses it."""
         for machine in self._of_vehicle[vehicle]:
             machine.become_another(now)
 
@@ -733,7 +742,7 @@ class Station:
                 machine.foreign_set(message.param_id, message.raw, station, now)
 
     def _receive_foreign_file_request(self, message: FileTransfer, sender: Address, now: float) -> None:
-        """Take what another station asks for over MAVFTP."""
+        """Process a MAVFTP request of another station."""
         target = (message.target_system, message.target_component)
         if self.listens_only and target not in self.components and opens_parameter_file(message):
             self._early_requests.append((message, sender))
@@ -744,13 +753,13 @@ class Station:
                 machine.foreign_file_request(message, sender, now)
 
     def _is_awaited_file(self, message: Message, sender: Address) -> bool:
-        """Whether a component that was not heard before has opened its parameter file for another station."""
+        """Return whether an unknown component has opened its parameter file for another station."""
         if not isinstance(message, FileTransfer) or not acknowledges_open(message):
             return False
         return any(_is_for(request, sender) for request, _ in self._early_requests)
 
     def _takes(self, machine: ComponentMachine, peer: Peer, now: float) -> bool:
-        """Whether a message may be taken that does not tell vehicles apart."""
+        """Return whether to accept a message that cannot tell vehicles apart."""
         if not machine.who.has_parameters:
             machine.peers.follow(peer)
             return True
@@ -758,9 +767,9 @@ class Station:
         return machine.peers.takes(peer, now)
 
     def _peer_of(self, address: Address) -> Peer | None:
-        """The peer of a component, else of the system's autopilot, else any of the system; None for all.
+        """Return the peer of a component, else of its autopilot, else any of the system; None for all.
 
-        NO_PEER where the connection of the component has ended: another peer would be another vehicle.
+        NO_PEER after the end of the component's connection: another peer would be another vehicle.
         """
         if isinstance(address, PeerAddress):
             return address.peer
@@ -778,7 +787,7 @@ class Station:
             self._transmit(message, peer, version)
 
     def _transmit(self, message: Message, peer: Peer | None, version: int) -> None:
-        """Have a message sent to a peer, or with None to all."""
+        """Queue a message for a peer, or with None for all."""
         if self.listens_only:
             return
         own_system, own_component = self.own

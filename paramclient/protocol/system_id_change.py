@@ -1,4 +1,4 @@
-"""Where a vehicle is that was given another system id."""
+"""The search for a vehicle under the system id that it was given."""
 
 from __future__ import annotations
 
@@ -9,24 +9,23 @@ from typing import Final
 from paramclient.errors import AnotherVehicle
 from paramclient.protocol.component import ComponentMachine
 
-__all__ = ["SEARCH_PACE", "Succession"]
+__all__ = ["SEARCH_INTERVAL", "Succession"]
 
-SEARCH_PACE: Final = 0.5
-"""Seconds after which it is looked again where nothing has come."""
-ASKING_PACE: Final = 2.0
-"""Seconds between two rounds of questions to a candidate that does not say who it is."""
-HUSH: Final = 3.0
-"""Seconds by which a vehicle without a hardware id of its own was heard longer under the new system id than
-under the old one when it has moved: two heartbeats did not come. Whoever was not heard for so long is not
-there to be judged."""
+SEARCH_INTERVAL: Final = 0.5
+"""Seconds until the next look when no message was received."""
+IDENTITY_REQUEST_INTERVAL: Final = 2.0
+"""Seconds between two identity requests to a candidate without a response."""
+OLD_ID_SILENCE_MIN: Final = 3.0
+"""Seconds by which a vehicle without a hardware id of its own must have been silent under the old system id,
+while it is heard under the new one: two heartbeats did not come."""
 
 
 class Succession:
-    """The search for a component that is to speak under another address.
+    """The search for a component under another address.
 
     Args:
-        before: what it was; who it is counts as of now.
-        address: where it is looked for.
+        before: the component before; its present identity is the reference.
+        address: the address to look at.
 
     Attributes:
         address: the same.
@@ -40,20 +39,24 @@ class Succession:
 
     @property
     def awaited(self) -> str:
-        """What is looked for, in words."""
+        """The searched component as text."""
         old, new = self._before, "/".join(map(str, self.address))
         return f"{old.system}/{old.component} ({self._identity}) as {new}"
 
     def look(self, components: Mapping[tuple[int, int], ComponentMachine], now: float) -> bool:
-        """Whether the vehicle is there and is the same.
+        """Return whether the vehicle is there and is the same one.
 
         Raises:
-            AnotherVehicle: another one is.
+            AnotherVehicle: another vehicle uses the address.
         """
-        if self._identity.uid is None:  # it may just be saying it
+        if self._identity.uid is None:  # its identity may be in flight
             self._identity = self._before.identity
         found = components.get(self.address)
-        if found is None or now - found.presence.heard_at > HUSH or not found.presence.has_beaten:
+        if (
+            found is None
+            or now - found.presence.heard_at > OLD_ID_SILENCE_MIN
+            or not found.presence.has_beaten
+        ):
             return False
         identity = found.identity
         if found.who.was_away or (self._identity.uid is not None and identity.uid is None):
@@ -62,9 +65,9 @@ class Succession:
         if not self._identity.is_same_vehicle(identity):
             raise AnotherVehicle(*self.address, str(self._identity), str(identity))
         hush = found.presence.heard_at - self._before.presence.heard_at
-        return hush > 0.0 if self._identity.has_own_uid else hush >= HUSH
+        return hush > 0.0 if self._identity.has_own_uid else hush >= OLD_ID_SILENCE_MIN
 
     def _ask_again(self, found: ComponentMachine, now: float) -> None:
         if now >= self._ask_at:
-            self._ask_at = now + ASKING_PACE
+            self._ask_at = now + IDENTITY_REQUEST_INTERVAL
             found.who.doubt(now)

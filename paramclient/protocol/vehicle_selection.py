@@ -1,4 +1,4 @@
-"""The vehicle that a write is for, where its address is not given in full: the only one that is heard.
+"""The only vehicle on the links, for a write without a full address.
 
 Every autopilot sends a heartbeat once a second (MAVLink's heartbeat protocol). A vehicle is the only one when
 no other was heard for `LOOK_TIME` after it.
@@ -18,27 +18,27 @@ from paramclient.protocol.wire import AUTOPILOT_COMPONENT, MAV_AUTOPILOT_GENERIC
 __all__ = ["LOOK_TIME", "VehicleChoice", "vehicle_in_words"]
 
 LOOK_TIME: Final = 1.2
-"""Seconds from the first autopilot heard in which a second one is looked for: the interval of heartbeats, and
-a fifth of it for jitter."""
+"""Seconds after the first autopilot in which a second one is looked for: the interval of heartbeats, and a
+fifth of it for jitter."""
 
 _PERIPHERALS: Final = frozenset({18, 26, 27, *range(30, 35), *range(36, 43), 44, 48})
-"""MAV_TYPE of what is part of a vehicle: onboard computers, gimbals, cameras, batteries, GPS receivers. Some
-of them name the generic autopilot in their heartbeat, where they should name none."""
+"""MAV_TYPE of the parts of a vehicle: onboard computers, gimbals, cameras, batteries, GPS receivers. Some of
+them name the generic autopilot in their heartbeat, where they should name none."""
 
 
 class VehicleChoice:
-    """Finds the only vehicle that an address fits, which need not be given in full.
+    """Finds the only vehicle that an incomplete address fits.
 
-    A component that is lost is not there. Of a system that is named, component 1 is the autopilot if it is
-    one: that is the address which MAVLink gives to the autopilot.
+    Lost components do not count. With a system id, component 1 is the autopilot if it is one: MAVLink's
+    address of the autopilot.
 
     Args:
-        system, component: the parts of the address that are given.
+        system, component: the given parts of the address.
         spans_links: whether the components are those of several links, which may have equal addresses.
         splits_peers: whether they are those of several peers, which may have equal addresses too.
 
     Attributes:
-        due: when to look again, also if nothing was received; infinity while no vehicle was heard.
+        due: when to look again, also if nothing was received; infinity before the first vehicle.
     """
 
     def __init__(
@@ -59,15 +59,15 @@ class VehicleChoice:
     def look(
         self, machines: Iterable[ComponentMachine], now: float, *, listening_since: float
     ) -> ComponentMachine | None:
-        """Return the component once it is certain that no other can be meant; None before.
+        """Return the component once it is certain that the address fits no other; None before.
 
         Args:
-            machines: every component heard.
+            machines: every known component.
             now: the time.
-            listening_since: since when everything on the links was received; infinity while one is away.
+            listening_since: since when everything on the links was received; infinity while one is down.
 
         Raises:
-            AmbiguousVehicle: several vehicles are there that can be meant.
+            AmbiguousVehicle: the address fits several vehicles.
         """
         machines = list(machines)
         self.due = math.inf
@@ -97,11 +97,11 @@ class VehicleChoice:
         *,
         needs_look: bool = True,
     ) -> ComponentMachine | None:
-        """Return the only one that was found, once it is certain that it is the only one.
+        """Return the only component found, once it is certain that there is no other.
 
         Args:
             found: the components that fit the address.
-            heard: the components of every vehicle that could be meant.
+            heard: the components of every vehicle that the address fits.
         """
         one_of_each = _one_of_each(heard)
         if len(one_of_each) > 1:
@@ -116,7 +116,7 @@ class VehicleChoice:
         return found[0] if not needs_look or now >= self.due else None
 
     def _ambiguous(self, machines: Sequence[ComponentMachine], what: str) -> AmbiguousVehicle:
-        """Return the error that lists them."""
+        """Return the error that lists the vehicles."""
         places = {_place(each, splits_peers=self._splits_peers) for each in machines}
         words = [
             vehicle_in_words(each)
@@ -139,7 +139,7 @@ def vehicle_in_words(machine: ComponentMachine) -> str:
 
 
 def _autopilots(machines: Iterable[ComponentMachine]) -> list[ComponentMachine]:
-    """Return the autopilots that are there, without peripherals that say to be one."""
+    """Return the autopilots that are not lost, without peripherals that claim to be one."""
     found = [each for each in machines if each.who.is_autopilot and not each.presence.is_lost]
     return [each for each in found if not _is_peripheral(each)] or found
 
@@ -149,7 +149,7 @@ def _is_peripheral(machine: ComponentMachine) -> bool:
 
 
 def _one_of_each(machines: Iterable[ComponentMachine]) -> list[ComponentMachine]:
-    """Return one component of each vehicle: the autopilot if it was heard, component 1 before others."""
+    """Return one component of each vehicle: its autopilot if known, component 1 before others."""
     first: dict[tuple[str, int], ComponentMachine] = {}
     for each in sorted(machines, key=lambda each: (not each.who.is_autopilot, each.component)):
         first.setdefault((each.identity.link, each.system), each)
@@ -157,5 +157,5 @@ def _one_of_each(machines: Iterable[ComponentMachine]) -> list[ComponentMachine]
 
 
 def _place(machine: ComponentMachine, *, splits_peers: bool) -> str:
-    """Return where a component is, in words."""
+    """Return the location of a component as text."""
     return f"at {machine.peer_in_words}" if splits_peers else f"on {machine.identity.link}"

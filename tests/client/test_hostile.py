@@ -164,7 +164,7 @@ def test_the_tables_of_a_link_share_a_room(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_a_link_has_so_many_components_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
     """Those that are there keep their place; a lost one without a parameter gives it up."""
-    monkeypatch.setattr(station_room, "MOST_COMPONENTS", 3)
+    monkeypatch.setattr(station_room, "COMPONENTS_MAX", 3)
     session = Simulation()
     for system in (1, 2, 3, 4):
         beat(session, system=system)
@@ -190,8 +190,8 @@ def test_ten_thousand_components_cost_what_a_thousand_do() -> None:
         beat(session, system=2 + number % 250, component=1 + number // 250)
     held, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert len(session.station.components) == station_room.MOST_COMPONENTS
-    assert held < station_room.MOST_COMPONENTS * 30_000
+    assert len(session.station.components) == station_room.COMPONENTS_MAX
+    assert held < station_room.COMPONENTS_MAX * 30_000
 
 
 def test_a_flood_of_random_systems_from_random_peers_stays_within_the_page_of_the_bounds() -> None:
@@ -205,8 +205,8 @@ def test_a_flood_of_random_systems_from_random_peers_stays_within_the_page_of_th
         session.station.data_to_send()
     held, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert len(session.station.components) == station_room.MOST_COMPONENTS
-    assert held < station_room.MOST_COMPONENTS * 28_000, "as docs/internals/bounds.md says"
+    assert len(session.station.components) == station_room.COMPONENTS_MAX
+    assert held < station_room.COMPONENTS_MAX * 28_000, "as docs/internals/bounds.md says"
 
 
 def test_changes_that_nobody_takes_are_so_many_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -342,7 +342,7 @@ def test_no_lie_keeps_another_vehicle_from_being_fetched(
     lie: str, usual: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """While the liar is fetched as well: its list is waited for once, and its values count for it alone."""
-    monkeypatch.setattr(station_room, "MOST_COMPONENTS", 50)
+    monkeypatch.setattr(station_room, "COMPONENTS_MAX", 50)
     honest, liar = listing_ardupilot(), LiarVehicle(lie)
     station = Station(link="sim:test", is_stream=False, upkeep=Upkeep(30.0))
     session = Simulation(honest, liar, station=station)
@@ -369,7 +369,7 @@ def test_all_lies_at_once_cost_no_more_than_so_much_memory() -> None:
     names, components = 100, 10
     with (
         mock.patch.object(table_room, "NAMES_MAX", names),
-        mock.patch.object(station_room, "MOST_COMPONENTS", components),
+        mock.patch.object(station_room, "COMPONENTS_MAX", components),
         mock.patch.object(authors_room, "RECENT_CHANGES_MAX", 100),
         mock.patch.object(traffic_room, "COUNTED_COMPONENTS_MAX", components),
         mock.patch.object(component_room, "PARAMETERS_MAX", 1_000),
@@ -452,7 +452,7 @@ async def test_so_many_tables_are_kept_and_no_more(tmp_path: Path, monkeypatch: 
 
 @swiftly
 async def test_a_component_that_is_forgotten_ends_what_listens_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(station_room, "MOST_COMPONENTS", 2)
+    monkeypatch.setattr(station_room, "COMPONENTS_MAX", 2)
     liar = LiarVehicle("obedient")
     async with ParamClient(Air([generic(), liar]), cache=False) as client:
         await client.component(1, 1)

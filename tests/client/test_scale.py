@@ -115,16 +115,16 @@ def test_what_is_due_of_many_at_once_is_done_in_parts() -> None:
         station.tick(now, everyone=not ticks)
         ticks += 1
         lost = [event for event in station.events() if isinstance(event, ComponentLost)]
-        assert len(lost) <= station_room.MOST_AT_ONCE
+        assert len(lost) <= station_room.TICKED_COMPONENTS_MAX
     assert all(machine.presence.is_lost for machine in station.components.values())
-    assert ticks >= MANY / station_room.MOST_AT_ONCE
+    assert ticks >= MANY / station_room.TICKED_COMPONENTS_MAX
 
 
 def test_who_was_forgotten_leaves_no_deadline_to_whoever_comes_in_its_place(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """One that is lost makes room for another, and is asked for a parameter although it is gone."""
-    monkeypatch.setattr(station_room, "MOST_COMPONENTS", 2)
+    monkeypatch.setattr(station_room, "COMPONENTS_MAX", 2)
     station = Station(link="x", is_stream=False)
     hear(station, 1, 0.0)
     hear(station, 2, 0.0)

@@ -15,15 +15,15 @@ from paramclient import ParamClient
 from paramclient.errors import LinkError, NoReply
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.scheduler import (
-    ENOUGH_SEEN,
-    FAST_GROWTH,
-    FAST_RETRY,
     GROWTH,
-    LONGEST_RETRY,
-    MEMORY,
-    RETRY,
-    SHOWING_TIME,
-    SPREAD,
+    GROWTH_BURSTY,
+    JUDGED_TIME,
+    JUDGED_VALUES_MIN,
+    MEASUREMENT_LIFETIME,
+    RETRY_DELAY,
+    RETRY_DELAY_BURSTY,
+    RETRY_DELAY_MAX,
+    START_INTERVAL_BURSTY,
     Seen,
     Turns,
 )
@@ -122,10 +122,10 @@ def test_where_values_come_in_bursts_it_goes_faster() -> None:
     road = Road(100)
     for lane in road.lanes:
         lane.is_bursty = True
-    while road.running < FAST_GROWTH:
+    while road.running < GROWTH_BURSTY:
         assert road.running == 1
         road.run()
-    assert road.until(FAST_GROWTH**2) < 1.0
+    assert road.until(GROWTH_BURSTY**2) < 1.0
     assert road.until(100) < 2.0
 
 
@@ -144,10 +144,10 @@ def test_where_bursts_are_lost_it_is_tried_again_soon_and_with_as_many_again() -
     for lane in road.lanes[12:16]:
         road.end(lane, is_cut=True)
     assert road.running == 12
-    while road.now < failed_at + FAST_RETRY - STEP:
+    while road.now < failed_at + RETRY_DELAY_BURSTY - STEP:
         road.run()
         assert road.running <= 16, "no more than before"
-    assert road.until(32) < 2 * FAST_RETRY < RETRY
+    assert road.until(32) < 2 * RETRY_DELAY_BURSTY < RETRY_DELAY
 
 
 def test_many_that_are_cut_at_once_have_failed_once() -> None:
@@ -158,11 +158,11 @@ def test_many_that_are_cut_at_once_have_failed_once() -> None:
     for lane in road.lanes[:20]:
         road.end(lane, is_cut=True)
     road.until(31)
-    while road.now < failed_at + FAST_RETRY - STEP:
+    while road.now < failed_at + RETRY_DELAY_BURSTY - STEP:
         road.run()
         assert road.running == 31, "that of the first, without it"
     road.until(40)
-    assert road.now - failed_at < 2 * FAST_RETRY
+    assert road.now - failed_at < 2 * RETRY_DELAY_BURSTY
 
 
 def test_where_all_of_many_bursts_lose_half_as_many_run() -> None:
@@ -170,7 +170,7 @@ def test_where_all_of_many_bursts_lose_half_as_many_run() -> None:
     road = bursty(100)
     road.until(32)
     road.end(road.lanes[31], is_cut=True)
-    road.run(round(FAST_RETRY / STEP) - 2)
+    road.run(round(RETRY_DELAY_BURSTY / STEP) - 2)
     road.run(10, room=16)
     running = [lane for lane in road.lanes if lane.is_running]
     assert len(running) == 31
@@ -205,7 +205,7 @@ def test_one_in_the_place_of_another_holds_up_nobody() -> None:
     road.until(32)
     failed_at = road.now
     road.end(road.lanes[31], is_cut=True)
-    while road.now < failed_at + FAST_RETRY - 5 * STEP:
+    while road.now < failed_at + RETRY_DELAY_BURSTY - 5 * STEP:
         road.run()
     road.end(road.lanes[0])
     road.turns.tick(road.now)
@@ -220,8 +220,8 @@ def test_one_in_the_place_of_another_holds_up_nobody() -> None:
 def test_bursts_begin_one_after_the_other_beyond_the_first_few() -> None:
     """They bring nothing at first, and all together would bring more than can be read."""
     road = bursty(100)
-    road.until(FAST_GROWTH)
-    while road.running == FAST_GROWTH:
+    road.until(GROWTH_BURSTY)
+    while road.running == GROWTH_BURSTY:
         road.run()
     while road.running < 60:
         running, road.now = road.running, road.turns.next_deadline()
@@ -231,7 +231,7 @@ def test_bursts_begin_one_after_the_other_beyond_the_first_few() -> None:
             road.run()
         assert running <= road.running <= running + 1
         began = sorted(lane.began_at for lane in road.lanes if lane.is_running)
-        assert began[-1] - began[-2] >= SPREAD * (len(began) - 1) - 1e-9
+        assert began[-1] - began[-2] >= START_INTERVAL_BURSTY * (len(began) - 1) - 1e-9
 
 
 def test_who_comes_later_waits_for_the_next_one_as_well() -> None:
@@ -245,8 +245,8 @@ def test_who_comes_later_waits_for_the_next_one_as_well() -> None:
 
 def test_nobody_begins_beside_others_while_more_has_come_than_was_read() -> None:
     road = bursty(20)
-    road.until(FAST_GROWTH)
-    for lane in road.lanes[1:FAST_GROWTH]:
+    road.until(GROWTH_BURSTY)
+    for lane in road.lanes[1:GROWTH_BURSTY]:
         road.end(lane)
     for _ in range(50):
         road.now += STEP
@@ -258,13 +258,13 @@ def test_nobody_begins_beside_others_while_more_has_come_than_was_read() -> None
     assert road.turns.tick(road.now, most=1), "else it would wait for nobody"
     assert road.running == 1
     road.run()
-    assert road.running == FAST_GROWTH
+    assert road.running == GROWTH_BURSTY
 
 
 def test_nobody_follows_before_those_that_run_have_shown_how_they_come() -> None:
     road = Road(2)
     road.run()
-    while road.lanes[0].came < ENOUGH_SEEN:
+    while road.lanes[0].came < JUDGED_VALUES_MIN:
         assert road.running == 1
         road.run()
 
@@ -303,7 +303,7 @@ def test_one_more_is_tried_a_while_after_there_was_no_room() -> None:
     road.run(50, room=1.2)
     road.end(road.lanes[0])
     waited = road.until(2)
-    assert RETRY / 2 < waited < 2 * RETRY
+    assert RETRY_DELAY / 2 < waited < 2 * RETRY_DELAY
 
 
 def test_where_there_is_never_room_it_is_tried_ever_more_seldom() -> None:
@@ -320,7 +320,7 @@ def test_where_there_is_never_room_it_is_tried_ever_more_seldom() -> None:
     waits = [later - sooner for sooner, later in pairwise(tried)]
     assert waits == sorted(waits)
     assert waits[1] > 1.5 * waits[0]
-    assert waits[-1] <= LONGEST_RETRY + RETRY
+    assert waits[-1] <= RETRY_DELAY_MAX + RETRY_DELAY
 
 
 def test_a_link_that_loses_much_anyway_has_room_all_the_same() -> None:
@@ -346,7 +346,7 @@ def test_a_silent_one_holds_the_turn_for_no_longer_than_its_time_out() -> None:
 
 def test_many_silent_ones_do_not_wait_for_each_other() -> None:
     road = Road(64)
-    assert road.until(64, silent=64) < 9 * TIMEOUT + 6 * SHOWING_TIME
+    assert road.until(64, silent=64) < 9 * TIMEOUT + 6 * JUDGED_TIME
 
 
 def test_a_slow_one_does_not_hold_up_the_others() -> None:
@@ -395,10 +395,10 @@ def test_what_was_found_out_is_forgotten_when_no_list_came_for_long() -> None:
     for lane in road.lanes:
         road.end(lane)
         lane.came = lane.passed = 0
-    road.now += MEMORY + 1
+    road.now += MEASUREMENT_LIFETIME + 1
     for lane in road.lanes:
         road.turns.ask(lane, road.now)
-    assert road.until(4) < RETRY
+    assert road.until(4) < RETRY_DELAY
 
 
 def test_deadlines_always_lie_ahead_or_something_happens() -> None:

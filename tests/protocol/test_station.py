@@ -287,7 +287,7 @@ def test_a_ground_station_is_not_asked_for_anything() -> None:
 
 
 def test_components_have_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(room, "MOST_COMPONENTS", 5)
+    monkeypatch.setattr(room, "COMPONENTS_MAX", 5)
     station = a_station()
     for component in range(1, 50):
         hear(station, PX4, 1, component)
@@ -355,7 +355,7 @@ def test_an_empty_datagram_forgets_nobody() -> None:
 
 
 def test_unfinished_streams_have_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(room, "MOST_PEERS", 3)
+    monkeypatch.setattr(room, "STREAM_PEERS_MAX", 3)
     station = a_station(is_stream=True)
     for peer in range(100):
         station.receive(b"\xfd", peer, 0.0)

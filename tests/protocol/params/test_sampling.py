@@ -280,5 +280,5 @@ async def test_what_cannot_be_asked_for() -> None:
         component = await client.component()
         with pytest.raises(UsageError, match="accept"):
             await component.fetch_all(accept="perhaps")
-        with pytest.raises(UsageError, match="at least one"):
+        with pytest.raises(UsageError, match="at least 1"):
             await component.fetch_all(accept="sampled", sample=0)

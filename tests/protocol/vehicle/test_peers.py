@@ -534,7 +534,7 @@ def test_split_peers_are_never_contested() -> None:
 
 
 def test_a_split_component_that_is_forgotten_leaves_the_other_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(station_room, "MOST_COMPONENTS", 2)
+    monkeypatch.setattr(station_room, "COMPONENTS_MAX", 2)
     station = Station(link="tcpin:test", is_stream=False, split_peers=True)
     net = Net(a=Speaker(), b=silent_after(2.0), station=station)
     net.run(9.0)

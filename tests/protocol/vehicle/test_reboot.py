@@ -24,7 +24,7 @@ from paramclient import (
 from paramclient.client.link_component import REBOOT_TIMEOUT
 from paramclient.client.local import local
 from paramclient.protocol import wire
-from paramclient.protocol.system_id_change import HUSH
+from paramclient.protocol.system_id_change import OLD_ID_SILENCE_MIN
 from paramclient.protocol.vehicle.reboot import COMMANDS_MAX, SAVING_TIME, UNOBSERVED_TIMEOUT
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle, Vehicle
 from tests.shell import FlakyLink, Tap, a_client, generic, outcome, residue, swiftly, tasks_beside
@@ -563,7 +563,7 @@ async def test_without_a_hardware_id_the_silence_of_the_old_one_tells() -> None:
         first.reboot(down=math.inf)
         moved = await client.successor(component, 9)
         assert moved.system == 9
-        assert HUSH - 1.1 <= anyio.current_time() - silent_from <= HUSH + 1.0
+        assert OLD_ID_SILENCE_MIN - 1.1 <= anyio.current_time() - silent_from <= OLD_ID_SILENCE_MIN + 1.0
 
 
 @swiftly
