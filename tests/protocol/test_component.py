@@ -164,7 +164,7 @@ def test_a_value_goes_into_the_table_and_is_told() -> None:
     assert len(desk.changes) == 1
 
 
-def test_where_nobody_wants_to_know_each_change_it_is_told_once_that_there_are_some() -> None:
+def test_without_tells_changes_several_changes_make_one_event() -> None:
     desk = Desk()
     desk.events.clear()
     desk.machine.tells_changes = False
@@ -430,7 +430,7 @@ def test_a_refusal_for_us(target: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize("target", [(254, 190), (255, 191), (255, 0), (0, 190)])
-def test_a_refusal_for_somebody_else(target: tuple[int, int]) -> None:
+def test_a_refusal_for_another_station(target: tuple[int, int]) -> None:
     desk = Desk()
     desk.hear("A", 1.0)
     read, write = desk.machine.read("B", desk.now), desk.machine.write("A", 2.0, desk.now)
@@ -498,7 +498,7 @@ def test_before_it_is_certain_how_values_are_written_nothing_is_judged_or_sent()
     assert write.result.status == "adjusted"
 
 
-def test_a_component_that_never_says_who_it_is_is_written_to_by_the_standard() -> None:
+def test_an_unidentified_component_is_written_to_by_the_standard() -> None:
     desk = Desk(None)
     desk.receive(SOMETHING)
     desk.hear("A", 5, ParamType.INT32)
@@ -719,7 +719,7 @@ def test_a_table_whose_count_never_rests_is_not_in_step() -> None:
 # identity
 
 
-def test_it_is_told_when_it_is_settled_who_it_is() -> None:
+def test_the_observer_is_called_when_the_identity_is_settled() -> None:
     desk = Desk(None)
     desk.receive(PX4)
     assert desk.events == []

@@ -199,7 +199,7 @@ def test_while_all_bursts_are_awaited_nothing_is_due() -> None:
     assert road.turns.next_deadline() > road.now
 
 
-def test_one_in_the_place_of_another_holds_up_nobody() -> None:
+def test_a_list_in_the_place_of_another_delays_none() -> None:
     """Where so many have run before, it need not have shown anything for further ones to begin."""
     road = bursty(100)
     road.until(32)
@@ -234,7 +234,7 @@ def test_bursts_begin_one_after_the_other_beyond_the_first_few() -> None:
         assert began[-1] - began[-2] >= START_INTERVAL_BURSTY * (len(began) - 1) - 1e-9
 
 
-def test_who_comes_later_waits_for_the_next_one_as_well() -> None:
+def test_a_later_list_waits_for_the_next_one_as_well() -> None:
     road = bursty(40)
     road.until(40)
     late = [Lane() for _ in range(10)]
@@ -243,7 +243,7 @@ def test_who_comes_later_waits_for_the_next_one_as_well() -> None:
     assert sum(lane.is_running for lane in late) <= 1
 
 
-def test_nobody_begins_beside_others_while_more_has_come_than_was_read() -> None:
+def test_no_list_begins_beside_others_while_unread_data_is_waiting() -> None:
     road = bursty(20)
     road.until(GROWTH_BURSTY)
     for lane in road.lanes[1:GROWTH_BURSTY]:
@@ -261,7 +261,7 @@ def test_nobody_begins_beside_others_while_more_has_come_than_was_read() -> None
     assert road.running == GROWTH_BURSTY
 
 
-def test_nobody_follows_before_those_that_run_have_shown_how_they_come() -> None:
+def test_no_list_begins_before_the_running_ones_are_judged() -> None:
     road = Road(2)
     road.run()
     while road.lanes[0].came < JUDGED_VALUES_MIN:
@@ -379,7 +379,7 @@ def test_one_that_falls_quiet_alone_tells_nothing() -> None:
     assert road.running >= 2
 
 
-def test_the_turn_that_is_given_back_while_waiting_is_nobodys() -> None:
+def test_a_turn_given_back_while_waiting_is_dropped() -> None:
     road = Road(3)
     road.turns.give_back(road.lanes[1])
     road.end(road.lanes[0])
@@ -513,7 +513,7 @@ def test_a_read_is_never_held_up() -> None:
     assert not fetches[0].done
 
 
-def test_who_waits_for_its_turn_is_not_silent_and_gives_it_back() -> None:
+def test_a_list_that_waits_for_its_turn_is_not_silent_and_gives_it_back() -> None:
     world = a_radio([MAKES["ArduPilot"](system) for system in (1, 2, 3)])
     first, second, third = begin_all(world, 3)
     world.run(0.3)
@@ -557,7 +557,7 @@ def test_the_turns_go_on_when_the_link_was_away() -> None:
     assert all(fetch.result is not None and fetch.result.complete for fetch in fetches)
 
 
-def test_when_the_link_is_gone_nobody_waits_any_more() -> None:
+def test_when_the_link_has_ended_no_list_waits() -> None:
     world = a_radio([MAKES["ArduPilot"](system) for system in (1, 2)])
     fetches = begin_all(world, 2)
     world.run(0.2)
@@ -647,14 +647,14 @@ async def is_given_up(system: int) -> float:
 
 
 @swiftly
-async def test_those_who_keep_silent_on_two_links_do_not_wait_for_each_other() -> None:
+async def test_silent_lists_on_two_links_do_not_wait_for_each_other() -> None:
     alone = await is_given_up(1)
     with anyio.fail_after(2 * alone):
         both = await asyncio.gather(is_given_up(1), is_given_up(2))
     assert both == pytest.approx([alone, alone], abs=0.01)
 
 
-def test_who_keeps_silent_is_in_nobodys_way_where_the_program_has_time_for_one() -> None:
+def test_a_silent_list_delays_none_where_the_program_has_time_for_one() -> None:
     road = Road(2)
     road.now += TIMEOUT / 2
     assert not road.turns.tick(road.now, most=1)

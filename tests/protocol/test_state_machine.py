@@ -401,7 +401,7 @@ class Sessions(RuleBasedStateMachine):
     @precondition(lambda self: self.is_known and not self.is_dead)
     @rule(after=st.sampled_from([0.0, 3.0]))
     def the_next_session(self, after: float) -> None:
-        """All is let go, the table is kept, and somebody may change something before the next one."""
+        """End the session, keep the table; another station may change a value before the next one."""
         for begun in self.open:
             self.cancel_one(begun)
         self.open.clear()

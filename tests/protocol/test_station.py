@@ -212,7 +212,7 @@ def test_only_an_autopilot_is_asked_for_its_heartbeat(system: int, component: in
     assert heartbeat_requests(station) == []
 
 
-def test_who_only_listens_asks_for_no_heartbeat() -> None:
+def test_a_listen_only_station_requests_no_heartbeat() -> None:
     station = Station(link="x", is_stream=False, upkeep=Upkeep(listens_only=True))
     station.receive(telemetry(), "there", 0.0)
     assert sent(station) == []
@@ -227,7 +227,7 @@ def test_a_vehicle_in_mid_second_is_found_at_once(make: type[PX4Vehicle] | type[
     simulation.until(lambda: bool(simulation.station.components), limit=0.1)
 
 
-def test_our_own_frames_and_those_of_nobody_are_passed_over() -> None:
+def test_our_own_frames_and_those_without_a_sender_are_ignored() -> None:
     station = a_station()
     hear(station, GCS, 255, 190)
     hear(station, PX4, 0, 1)
@@ -345,7 +345,7 @@ def test_the_end_of_a_stream_gives_out_what_is_whole() -> None:
     assert list(station.components) == [(1, 1)]
 
 
-def test_an_empty_datagram_forgets_nobody() -> None:
+def test_an_empty_datagram_removes_no_component() -> None:
     station = a_station()
     station.receive(frame(PX4), "a", 0.0)
     station.data_to_send()
@@ -623,7 +623,7 @@ def test_a_ground_station_in_the_system_is_not_counted() -> None:
     assert lists(world) == [(1, 0)]
 
 
-def test_a_silent_component_holds_nobody_up() -> None:
+def test_a_silent_component_delays_no_other() -> None:
     silent = GenericVehicle({}, component=50)
     world = Simulation(GenericVehicle(rows("A", 50)), silent)
     settle(world, 2)

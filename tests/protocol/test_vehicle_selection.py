@@ -185,7 +185,7 @@ def test_the_list_has_one_line_for_each_vehicle(listening: Listening) -> None:
 # what is named
 
 
-def test_who_is_named_in_full_is_chosen_at_once(listening: Listening) -> None:
+def test_a_full_address_is_chosen_at_once(listening: Listening) -> None:
     listening.hear(PX4, 5.0).hear(ROVER, 5.0, system=2).hear(GIMBAL, 5.0, 2, 154)
     assert listening.chosen(5.0, 2, 1) == (2, 1)
     assert listening.chosen(5.0, 2, 154) == (2, 154)

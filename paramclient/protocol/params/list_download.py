@@ -34,7 +34,7 @@ LIST_RISK: Final = 0.05
 """The probability of no response below which copies bring a repeated request for the list. The first request
 has no copy: PX4 would take it for a restart, and leave out its hash."""
 LIST_COPIES_MAX: Final = 3
-"""Copies of a repeated request for the list, at most."""
+"""Requests for the list that are sent at once, at most."""
 LIST_ATTEMPTS_MIN: Final = 12
 """Requests for the list, at least, before a component that is heard counts as silent: enough at high packet
 loss."""
@@ -143,7 +143,7 @@ class Download(Operation[None]):
         self.held_up = 0.0
         self.held_since: float | None = None
         self._passes = 1
-        self._vain_passes = 0
+        self._empty_passes = 0
         self._moves = 0
         self._stream = ListStream(now)
         self._asked: dict[int, Read] = {}
@@ -289,7 +289,7 @@ class Download(Operation[None]):
         stream, left = self._stream, (self.count or 0) - 1
         if index in self.names or index >= left or len(self.names) >= left or not self._is_streaming:
             return False
-        is_troubled = self._asked or stream.holes or self.given_up or self._vain_passes or self.resumed
+        is_troubled = self._asked or stream.holes or self.given_up or self._empty_passes or self.resumed
         return not (is_troubled or stream.is_awaited or self.done)
 
     def heed(self, now: float) -> None:
@@ -431,7 +431,7 @@ class Download(Operation[None]):
 
     def _ask_for_another_pass(self, now: float) -> None:
         self._passes += 1
-        self._vain_passes += 1
+        self._empty_passes += 1
         self._repeated_in_row = 0
         self._is_streaming = self._reads.list_runs_again = True
         self._next = 0
@@ -442,7 +442,7 @@ class Download(Operation[None]):
         if is_repeated:
             self._repeated_in_row += 1
         else:
-            self._repeated_in_row = self._vain_passes = 0
+            self._repeated_in_row = self._empty_passes = 0
         stream = self._stream
         if self._is_streaming and index > stream.front:
             behind = stream.front + 1
@@ -565,7 +565,7 @@ class Download(Operation[None]):
     def _another_pass_is_faster(self, missing: int) -> bool:
         if self.count is None or self._passes >= LISTS_MAX or missing <= MISSING_WITHOUT_LIST_MAX:
             return False
-        if self._vain_passes >= EMPTY_LISTS_MAX or not self._turns.is_free:
+        if self._empty_passes >= EMPTY_LISTS_MAX or not self._turns.is_free:
             return False
         trip = self._round_trip.smoothed or self._round_trip.timeout
         by_pass = self.count * self._stream.gap + trip + self._time_to_read(missing * self._stream_loss)

@@ -300,8 +300,7 @@ class Identification(Machine):
             self._ask(now)
 
     def lose(self, now: float) -> None:
-        """Stop requests to a component that has sent its identity, until it is heard again; others
-        continue."""
+        """Stop requests to an identified component until it is heard again; other requests continue."""
         if self.settled:
             self._context.is_identifying = False
 

@@ -949,7 +949,7 @@ class TestHaste:
         assert read.result == b""
 
     def test_when_the_answer_to_the_open_got_lost_all_is_begun_anew_behind_the_burst(self) -> None:
-        """Whether the burst is of our file nobody can tell: an open that failed has no answer either."""
+        """The file of the burst is unknown: a failed open has no response either."""
         desk = self.known_link()
         read = desk.transfers.read("a", desk.now)
         first, _, early = desk.take()

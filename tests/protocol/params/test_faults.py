@@ -156,7 +156,7 @@ class TestAListThatStops:
 
     @EVERY_KIND
     def test_before_its_first_value(self, kind: Make, loss: float) -> None:
-        """Nobody knows how many parameters there are: that cannot be told from a component without any."""
+        """The number of parameters is unknown, as with a component without any."""
         vehicle = kind(list_stops_at=0, list_stops=math.inf)
         world = world_of(vehicle, loss=loss)
         with pytest.raises(NoReply, match="the parameter list of 1/1"):

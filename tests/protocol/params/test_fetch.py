@@ -46,7 +46,7 @@ class Headless(PX4Vehicle):
 
 
 def deaf_to(vehicle: PX4Vehicle | GenericVehicle, names: Iterable[str]) -> None:
-    """Let some parameters never be sent, whoever asks."""
+    """Suppress the PARAM_VALUEs of some parameters for all stations."""
     hidden = frozenset(names)
     send_value = vehicle._send_value
 
@@ -635,7 +635,7 @@ def test_a_vehicle_that_is_gone_gives_no_reply_in_bounded_time(is_cached: bool) 
 # those who wait
 
 
-def test_two_who_fetch_share_one() -> None:
+def test_two_callers_share_one_fetch() -> None:
     world = Simulation(PX4Vehicle(table=SMALL))
     machine = world.meet()
     first = machine.begin_fetch(world.now)
@@ -850,7 +850,7 @@ def test_an_ardupilot_may_first_say_whether_it_serves_the_file() -> None:
     assert not world.sent_of(ParamRequestList)
 
 
-def test_one_that_does_not_say_who_it_is_is_asked_for_its_file() -> None:
+def test_the_file_of_an_unidentified_component_is_requested() -> None:
     world = Simulation(air=Air.symmetric([ArduPilotVehicle(live=())], delay=0.05))
     world.until(lambda: (1, 1) in world.station.components)
     world.machine.who.version = lambda message, now: False  # type: ignore[method-assign]  # as if it was lost

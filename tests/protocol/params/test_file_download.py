@@ -344,7 +344,7 @@ def test_a_server_that_keeps_silent_is_remembered_once_the_list_has_come() -> No
 
 
 def test_a_server_that_is_busy_is_asked_again_next_time() -> None:
-    """Another station has left its session open, which ends by itself."""
+    """Another station has left its session open, which ends by its timeout."""
     server = Server(vehicle := ArduPilotVehicle(live_period=0))
     session = Simulation(server)
     session.meet()
@@ -488,7 +488,7 @@ def test_two_callers_share_one_file() -> None:
     assert (is_whole(result, vehicle), server.opened) == (True, [FULL_PATH])
 
 
-def test_one_who_wants_it_anew_while_the_hash_is_awaited_gets_what_has_come() -> None:
+def test_a_refresh_while_the_hash_is_awaited_gets_the_received_file() -> None:
     server = Server(vehicle := PX4Vehicle(ftp=True, ftp_rate=48_500.0))
     session = Simulation(server, air=Air.symmetric([server], delay=0.1))
     fetch = begin(session)

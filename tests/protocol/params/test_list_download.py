@@ -1,4 +1,4 @@
-"""The download by list: its stream, its gaps, and that it ends by itself whatever comes."""
+"""List download: running lists, gaps, and an end in every case."""
 
 from __future__ import annotations
 
@@ -204,7 +204,7 @@ def test_on_a_slow_link_the_list_is_not_asked_for_while_the_answer_is_on_its_way
     assert desk.take() == ["list"]
 
 
-def test_a_list_that_was_asked_for_by_somebody_else_is_waited_for_first() -> None:
+def test_a_list_requested_by_another_station_is_awaited_first() -> None:
     desk = Desk(listed=True)
     assert desk.take() == []
     assert desk.download.lists == 1
@@ -724,7 +724,7 @@ def test_cancelling_gives_everything_back() -> None:
     assert not desk.download.done
 
 
-def test_cancelling_leaves_a_read_to_others_who_want_it() -> None:
+def test_cancelling_keeps_a_read_of_other_holders() -> None:
     desk = Desk()
     desk.stream([*range(7), *range(8, 20)])
     other = desk.reads.ask(7, desk.now)

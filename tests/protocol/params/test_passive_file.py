@@ -90,7 +90,7 @@ EXPECTED = [
 
 
 def assert_whole(log: FileLog, tmp_path: Path) -> ImportedTable:
-    """Import and replay of a log give the whole table, of 1/1 and of nobody else."""
+    """Import and replay of a log give the whole table, of 1/1 only."""
     [told] = imported(log, tmp_path)
     assert (told.system, told.component, told.params, told.complete, told.notes) == (1, 1, COUNT, True, ())
     assert as_rows(kept(tmp_path, told.key)) == EXPECTED
@@ -119,7 +119,7 @@ def test_a_log_of_mavproxy_gives_the_vehicle_with_types_and_defaults(tmp_path: P
         assert {(each.system, each.component) for each in cache.components()} == {(1, 1)}
 
 
-def test_made_up_values_alone_are_nobodys(tmp_path: Path) -> None:
+def test_synthetic_values_alone_make_no_component(tmp_path: Path) -> None:
     log = FileLog().beat().made_up([("A", 1.0), ("B", 2.0)]).wait(1.0).beat()
     assert imported(log, tmp_path) == []
 
@@ -133,7 +133,7 @@ def test_made_up_values_alone_are_nobodys(tmp_path: Path) -> None:
     anyio.run(heard)
 
 
-def test_values_made_up_by_a_station_with_the_vehicles_system_id_are_nobodys(tmp_path: Path) -> None:
+def test_synthetic_values_of_a_station_with_the_vehicles_system_id_make_no_component(tmp_path: Path) -> None:
     """MAVProxy as 1/190, recorded with `--source-system=1 --source-component=190`: it sends heartbeats."""
     station = (1, wire.COMP_ID_MISSIONPLANNER)
     beat = wire.Heartbeat(wire.MAV_TYPE_GCS, wire.MAV_AUTOPILOT_INVALID)

@@ -137,7 +137,7 @@ def test_a_read_that_is_asked_for_anew_while_its_answer_is_handed_out_waits_for_
     assert all(read.done for read in again)
 
 
-def test_a_read_that_nobody_wants_any_more_when_its_turn_comes_is_left_alone() -> None:
+def test_a_released_read_is_not_sent_when_the_pace_allows_it() -> None:
     desk = Desk()
     first, second = desk.ask("A"), desk.ask(3)
     first.on_done.append(lambda: desk.reads.release(second))
@@ -191,7 +191,7 @@ def test_the_urgent_ones_go_first() -> None:
     assert desk.take() == ["A", "B", BURST]
 
 
-def test_a_patient_read_becomes_urgent_when_somebody_waits_for_it() -> None:
+def test_a_read_of_a_fetch_becomes_urgent_when_a_caller_joins() -> None:
     desk = Desk()
     for index in range(30):
         desk.ask(index, urgent=False)
@@ -473,7 +473,7 @@ def test_index_0_needs_no_other_control() -> None:
     assert desk.take() == [CONTROL_INDEX] * 3
 
 
-def test_silences_of_the_past_do_not_count_against_what_is_asked_later() -> None:
+def test_earlier_timeouts_do_not_count_against_later_reads() -> None:
     """A vehicle that was away for long and is back: each read has its tries again."""
     desk = Desk("A", count=ATTEMPTS_MAX)
     gone = [desk.ask(index) for index in range(ATTEMPTS_MAX)]
@@ -642,7 +642,7 @@ def test_the_timeout_of_a_read_covers_the_batches_ahead_of_it() -> None:
     assert [read.attempts for read in reads] == [2] * 5 + [1] * 5  # the others are behind the first batch
 
 
-def test_whoever_asks_for_one_value_after_the_other_is_as_quick_as_the_vehicle() -> None:
+def test_sequential_reads_are_as_fast_as_the_vehicle() -> None:
     desk = Desk()
     for number in range(100):
         desk.ask(f"P{number}")

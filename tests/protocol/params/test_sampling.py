@@ -118,7 +118,7 @@ def test_an_index_that_does_not_answer_leads_to_the_whole_table() -> None:
     assert session.outcome(fetch).sample is None
 
 
-def test_one_who_wants_more_than_a_sample_gets_more() -> None:
+def test_a_fetch_without_a_sample_joins_and_gets_the_whole_table() -> None:
     session = Simulation(generic())
     fetch = sampled(session)
     other = session.machine.begin_fetch(session.now)

@@ -836,7 +836,7 @@ def test_a_write_waits_until_it_is_known_whom_it_reaches() -> None:
     assert world.set("P07", 701).actual == 701
 
 
-def test_a_write_under_way_is_held_while_it_is_open_who_gets_it() -> None:
+def test_a_write_in_progress_is_held_while_the_identity_is_in_doubt() -> None:
     berth = Berth(PX4Vehicle(table=TABLE, uid=1))
     world = World(air=Air([berth]))
     world.fetch()

@@ -194,7 +194,7 @@ def test_while_another_station_has_a_file_open_a_check_skips_its_turn(is_heard: 
     assert len(openings(world)) == 3, "in its intervals again"
 
 
-def test_who_joins_a_check_gets_the_list_where_the_file_is_in_use() -> None:
+def test_a_caller_that_joins_a_check_gets_the_list_where_the_file_is_in_use() -> None:
     world, _ = watched(ArduPilotVehicle(table=PLAIN))
     other = Other(world, is_heard=False)
     other.ask(Opcode.OPEN_FILE_RO, PATH)
@@ -376,7 +376,7 @@ def test_our_own_writes_are_no_foreign_values() -> None:
 
 
 @pytest.mark.parametrize("loaded", [{"P07": 700}, {"P07": 700, "P21": 2100, "COM_FLIGHT_UUID": 8}])
-def test_what_px4_tells_to_nobody_is_found_within_one_interval(loaded: dict[str, int]) -> None:
+def test_changes_that_px4_does_not_push_are_found_within_one_interval(loaded: dict[str, int]) -> None:
     world, vehicle = fetched()
     vehicle.load(loaded)
     world.run(5.0)
@@ -469,7 +469,7 @@ def test_nothing_is_asked_after_foreign_values_in_high_latency_mode() -> None:
     assert world.requests() == 0
 
 
-def test_who_only_listens_sends_nothing_whatever_changes() -> None:
+def test_a_listen_only_station_sends_nothing_after_changes() -> None:
     vehicle = PX4Vehicle(table=TABLE)
     upkeep = Upkeep.chosen(None, "auto", listen_only=True)
     world = World(vehicle, upkeep=upkeep)

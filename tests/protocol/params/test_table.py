@@ -43,7 +43,7 @@ def test_the_same_once_more_is_no_change() -> None:
     assert table.take_dirty() == {}
 
 
-def test_a_change_and_who_did_it() -> None:
+def test_a_change_has_its_author() -> None:
     table = Table()
     table.hear(param_value("A", 1.5, index=3), "vehicle")
     old = table.params["A"]

@@ -122,7 +122,7 @@ def test_the_type_is_learnt_first() -> None:
     assert write.result.param.type is ParamType.INT16
 
 
-def test_writes_to_one_name_have_each_the_author_who_asked_for_it() -> None:
+def test_each_write_to_one_name_has_its_own_author() -> None:
     desk = Desk()
     desk.knows("A", 1.0)
     writes = [desk.set("A", 2.0, "first"), desk.set("A", 3.0), desk.set("A", 4.0, "third")]
@@ -148,7 +148,7 @@ def test_a_cached_type_is_not_enough_but_a_verified_one_is() -> None:
 
 @pytest.mark.parametrize("is_known", [True, False])
 def test_what_has_to_wait_says_so_until_it_is_begun(is_known: bool) -> None:
-    """Whoever may be written again, for however short a time it was not, looks at that."""
+    """A component with a permission again handles its held writes, however short the interruption."""
     desk = Desk()
     if is_known:
         desk.knows("A", 1.0)

@@ -318,7 +318,7 @@ def test_components_messages_and_totals() -> None:
     assert first.messages[0].rate == pytest.approx(4, rel=0.1)
 
 
-def test_rates_and_loss_are_those_of_late() -> None:
+def test_rates_and_loss_are_recent() -> None:
     traffic = Traffic(is_stream=False)
     for number in range(100):  # every second one is lost
         traffic.receive(frame(30, number * 2 % 256), "peer", number * 0.02)

@@ -91,7 +91,7 @@ def test_a_component_without_a_clock_is_asked_for_a_baseline() -> None:
     assert desk.run(60.0) == []
 
 
-def test_nobody_waits_for_a_baseline() -> None:
+def test_requests_for_a_baseline_are_slow() -> None:
     desk = Requests()
     desk.requests.want_baseline(desk.now)
     times = [
@@ -369,7 +369,7 @@ def test_a_vehicle_that_is_met_soon_after_its_start(uptime: float, is_young: boo
 
 
 @pytest.mark.parametrize("desk", [Desk(interval=math.inf), Desk(PX4)], ids=["no upkeep", "a hash"])
-def test_nothing_is_read_by_itself_where_that_is_not_wanted_or_needed(desk: Desk) -> None:
+def test_boot_values_are_not_read_where_that_is_not_wanted_or_needed(desk: Desk) -> None:
     desk.value("BARO1_GND_PRESS")
     desk.run_heard(100.0)
     desk.hear(SystemTime(0, 2_000))

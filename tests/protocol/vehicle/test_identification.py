@@ -258,7 +258,7 @@ def test_a_version_that_tells_the_encoding_waits_for_no_heartbeat() -> None:
     assert desk.who.may_be_written
 
 
-def test_where_it_is_doubted_it_is_asked_again_who_it_is() -> None:
+def test_the_identity_is_requested_again_when_it_is_in_doubt() -> None:
     desk = settled(7)
     desk.beat(PX4, 20.0)
     assert desk.commands() == []

@@ -181,7 +181,7 @@ def test_values_of_the_second_vehicle_never_reach_the_table() -> None:
     assert net.station.foreign >= 60
 
 
-def test_whoever_waits_gets_the_error() -> None:
+def test_waiting_callers_get_the_error() -> None:
     net = Net(a=Speaker(PX4, uid=1, obeys=False), b=Speaker(ARDUPILOT, uid=2, start=2.0))
     net.run(1.5)
     write = net.machine.write("P", 2.0, net.now, settle=5.0)
@@ -375,7 +375,7 @@ def test_a_path_that_could_not_answer_at_first_is_proven_later(monkeypatch: pyte
     assert net.kinds() == ["Contested", "Uncontested"]
 
 
-def test_one_that_never_shows_who_it_is_stays_contested_and_is_asked_rarely() -> None:
+def test_an_unidentified_peer_stays_contested_and_is_asked_rarely() -> None:
     stranger = Speaker(uid=None, booted_at=None, every=0.5)
     net = Net(a=Speaker(), b=stranger)
     net.run(room.IDENTIFICATION_TIME + 1.0)
@@ -684,7 +684,7 @@ def test_a_vehicle_that_connects_anew_goes_on() -> None:
     assert not any(isinstance(each, ComponentReplaced) for each in net.events)
 
 
-def test_one_that_says_no_more_who_it_is_is_not_written_to() -> None:
+def test_a_component_that_no_longer_identifies_itself_is_not_written_to() -> None:
     """At a serial port nothing but the id tells whether it is the vehicle that was there before."""
     speaker = Speaker(end=3.0)
     net = Net(port=speaker)
@@ -706,7 +706,7 @@ def test_one_that_says_no_more_who_it_is_is_not_written_to() -> None:
     assert len([each for each in speaker.heard if isinstance(each, ParamSet)]) == 1
 
 
-def test_another_kind_through_one_peer_is_asked_who_it_is() -> None:
+def test_another_kind_through_one_peer_is_identified() -> None:
     """As where another vehicle was plugged in within the heartbeat timeout."""
     port = Speaker(PX4, end=3.0)
     net = Net(port=port)
@@ -863,7 +863,7 @@ def test_a_component_at_the_peer_of_a_rival_is_neither_kept_nor_written_to() -> 
     assert dict(other.table.params) == {}, "it was heard from the rival's peer"
 
 
-def test_the_components_of_an_autopilot_that_does_not_say_who_it_is_are_not_written_to() -> None:
+def test_the_components_of_an_unidentified_autopilot_are_not_written_to() -> None:
     port = Speaker(end=3.0)
     net = Net(port=port)
     net.run(2.0)

@@ -538,7 +538,7 @@ async def test_a_copter_is_back_as_soon_as_it_is_heard() -> None:
 
 @MAKES
 @swiftly
-async def test_a_restart_by_somebody_else_is_noticed(make: Make) -> None:
+async def test_a_reboot_by_another_station_is_detected(make: Make) -> None:
     vehicle = make()
     async with a_client(vehicle) as client:
         await known(client)
@@ -589,7 +589,7 @@ async def test_a_successor_that_never_speaks() -> None:
 
 
 @swiftly
-async def test_a_successor_that_does_not_say_who_it_is_is_asked_again() -> None:
+async def test_an_unidentified_successor_is_asked_again() -> None:
     vehicle = ardupilot(kind="plane")
     tap = Tap(vehicle)
     async with a_client(tap) as client:

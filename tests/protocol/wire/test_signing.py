@@ -443,7 +443,7 @@ def test_a_signed_session(make: Any, policy: SigningPolicy) -> None:
 
 
 @EVERY_VEHICLE
-def test_without_the_key_nobody_is_heard(make: Any) -> None:
+def test_frames_without_the_key_are_refused(make: Any) -> None:
     vehicle: Vehicle = make(signing_key=KEY)
     simulation = Simulation(vehicle, station=a_station(OTHER_KEY))
     simulation.run(5.0)
@@ -453,7 +453,7 @@ def test_without_the_key_nobody_is_heard(make: Any) -> None:
     assert vehicle.requests == {}
 
 
-def test_a_vehicle_with_a_key_answers_nobody_without_it() -> None:
+def test_a_vehicle_with_a_key_does_not_respond_without_it() -> None:
     vehicle = small_px4(signing_key=KEY)
     simulation = Simulation(vehicle, station=a_station(None))
     simulation.run(5.0)
