@@ -1,15 +1,31 @@
-"""Tables, identities and history on disk: what a vehicle's parameters were when it was last heard.
+"""Parameter cache: tables, vehicle identities, history and snapshots, in a file or a shared database.
 
-`records` says what goes in and comes out. The other rooms stand on one another: `store` is what is called,
-and `interface` what it calls; `operations` are what can be written. `settle` brings in what programs and
-stations observe, and `merge` what is of the past;
-`tables` keeps tables and their history, `earlier` tells what they were before,
-`fleet` puts those of many vehicles beside each other, `rows` lays them into cells. `session` is one
-transaction in the SQL of every database, `sqlite` in that of a file, where `packed` makes a blob of a table;
-`database` looks after the file, and `schema` says what is in it.
-
-Where stations share a database, `shared` puts this together: `postgres` (with `migrations` and `address`),
-and the local copy with its `outbox`. `transfer` copies tables.
+- `database_url`: URL of a PostgreSQL database.
+- `file_ownership`: owner and access rights of files.
+- `fleet`: comparison of parameters across vehicles.
+- `interface`: `Store`, the interface of a file and of a shared database.
+- `lock`: lock on a folder or file.
+- `lookup`: vehicles by system id, hardware id or key.
+- `merge`: merge of earlier observations, such as those of logs.
+- `migrations`: schema of the PostgreSQL database.
+- `observed_table`: parameters of a live table as rows.
+- `operations`: write operations.
+- `outbox`: local copy of a shared database, with the writes that it has not received yet.
+- `packed_table`: a table as one binary blob.
+- `postgres`: PostgreSQL database.
+- `reconciliation`: new observations reconciled with the stored table and history, by time.
+- `records`: records that the cache stores and returns.
+- `rows`: records as database cells.
+- `schema`: schema of the file.
+- `setups`: notes about running and interrupted set-ups.
+- `shared`: a shared database with its local copy.
+- `snapshots`: snapshots, and tables at an earlier time.
+- `sqlite`: SQLite transactions.
+- `sqlite_file`: the SQLite file: opening, checks, replacement of a damaged one.
+- `store`: `ParamCache`, the public class.
+- `tables`: tables and their history.
+- `transaction`: `Session`, one transaction in SQL.
+- `transfer`: copies of tables between stores.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Which database a URL means. What it says of secrets never comes out again as text."""
+"""DatabaseAddress: the URL of a PostgreSQL database. Its text forms never include the password."""
 
 from __future__ import annotations
 
@@ -10,24 +10,25 @@ from urllib.parse import quote
 
 from paramclient.errors import UsageError
 
-__all__ = ["Address", "is_address"]
+__all__ = ["DatabaseAddress", "is_address"]
 
 _SCHEMES: Final = ("postgresql://", "postgres://")
+"""Beginnings of a database URL; any other place is a file."""
 
 
 def is_address(place: object) -> bool:
-    """Whether a place is the URL of a database rather than a file."""
+    """Return whether a place is the URL of a database. Otherwise it is a file."""
     return isinstance(place, str) and place.lower().startswith(_SCHEMES)
 
 
 @dataclass(frozen=True, repr=False)
-class Address:
-    """A database.
+class DatabaseAddress:
+    """A PostgreSQL database.
 
     Attributes:
-        place: the URL for people: without password and options.
-        name: a file name for it: the same for every user and password.
-        options: as libpq takes them.
+        place: the URL for messages, without password and options.
+        name: file name of its local copy, independent of user and password.
+        options: connection options of libpq.
     """
 
     place: str
@@ -35,11 +36,11 @@ class Address:
     options: Mapping[str, Any]
 
     @classmethod
-    def parse(cls, url: str) -> Address:
-        """Read a URL.
+    def parse(cls, url: str) -> DatabaseAddress:
+        """Parse a URL.
 
         Raises:
-            UsageError: it is none, or psycopg is missing.
+            UsageError: the URL is not valid, or psycopg is not installed.
         """
         try:
             from psycopg.conninfo import conninfo_to_dict
@@ -49,13 +50,13 @@ class Address:
             ) from error
         try:
             given = conninfo_to_dict(url)
-        except Exception:  # whatever it is, its text may hold the password
+        except Exception:  # the text of any error may include the password
             given = None
         authority = url.partition("://")[2].partition("/")[0].partition("?")[0]
         if given is None or authority.count("@") > 1 or not _are_ports(given.get("port")):
             raise UsageError(
-                "the URL of the database cannot be read; it has the form postgresql://USER@HOST:PORT/DATABASE,"
-                " and each sign of a password that is neither letter nor digit is written as % and its number"
+                "the URL of the database is not valid; its form is postgresql://USER@HOST:PORT/DATABASE, and"
+                " characters of a password other than letters and digits are percent-encoded"
             ) from None
         host = given.get("host") or given.get("hostaddr") or given.get("service") or ""
         where = f"{host}:{given['port']}" if given.get("port") else str(host)
@@ -72,10 +73,10 @@ class Address:
         return cls(place, f"shared-{name.hexdigest()[:16]}.sqlite3", given)
 
     def __repr__(self) -> str:
-        return f"<Address {self.place}>"
+        return f"<DatabaseAddress {self.place}>"
 
     def without_password(self, text: str) -> str:
-        """The same text, with signs in the place of the password."""
+        """Return a text with `***` in place of the password."""
         for name in ("password", "sslpassword"):
             secret = self.options.get(name)
             for each in {secret, quote(secret), quote(secret, safe="")} if secret else ():

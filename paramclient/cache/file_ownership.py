@@ -1,4 +1,4 @@
-"""Whose a file is, and who else can get at it: for files that hold secrets, or are believed."""
+"""Owner and access rights of files with secrets or with trusted content."""
 
 from __future__ import annotations
 
@@ -19,19 +19,20 @@ __all__ = [
 ]
 
 OF_OTHERS: Final = 0o077
-"""The bits of a file's mode that let others than its owner get at it."""
+"""Mode bits that give access to other users than the owner."""
 OTHERS_WRITE: Final = 0o022
-"""Those of them that let others change it."""
+"""Mode bits that give write access to other users than the owner."""
 GROUP_READS: Final = 0o040
+"""Mode bit that gives read access to the group."""
 
 
 def mode_of(status: os.stat_result) -> int:
-    """Return what a file's mode allows to whom, without its kind; of Windows, which has no such modes, 0."""
+    """Return the permission bits of a file's mode; 0 on Windows, which has no such modes."""
     return 0 if sys.platform == "win32" else stat.S_IMODE(status.st_mode)
 
 
 def is_own(status: os.stat_result) -> bool:
-    """Return whether a file belongs to the user of this process; of Windows, which does not say, True."""
+    """Return whether a file belongs to the user of this process; True on Windows, which has no such ids."""
     return sys.platform == "win32" or status.st_uid == os.geteuid()
 
 
@@ -41,10 +42,10 @@ def has_trusted_owner(status: os.stat_result) -> bool:
 
 
 def make_private(path: Path) -> int:
-    """Take everybody's access but its owner's away from a file that others can write; return the mode it had.
+    """Restrict a file that other users can write to its owner. Return its previous mode.
 
     Raises:
-        OSError: that is not possible.
+        OSError: the mode cannot be read or changed.
     """
     mode = mode_of(path.stat())
     if mode & OTHERS_WRITE:

@@ -1,8 +1,8 @@
-"""The same parameters of many vehicles beside each other: who differs, and since when.
+"""Fleet comparison: parameters of many vehicles, the vehicles that differ, and since when.
 
-Only the parameters that are asked for are read, and put together by value before anything is made of them: a
-fleet has many vehicles and few values. The checksums of whole tables are not looked at here. Each function
-that takes a session works inside its caller's transaction.
+Only the requested parameters are read, and they are grouped by value before they are converted: a fleet has
+many vehicles and few values. Checksums of whole tables are not verified here. Each function with a session
+runs inside the transaction of its caller.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class FleetVehicle:
-    """One vehicle of those that are compared.
+    """A vehicle in a comparison.
 
     Attributes:
-        key: the name under which its tables are kept.
-        system: system id under which it was last seen.
-        complete: its table was heard to the end: what is not in it, the vehicle does not have.
+        key: its key in the cache.
+        system: its last system id.
+        complete: whether its table is complete: the vehicle has no parameter outside it.
     """
 
     key: str
@@ -47,13 +47,14 @@ class FleetVehicle:
 
 @dataclass(frozen=True, slots=True)
 class Holder:
-    """A vehicle with what it has.
+    """A vehicle with a value, or without a parameter.
 
     Attributes:
-        vehicle: which.
-        since: when it was heard to change to this, or that it has this, in unix seconds. None where that is
-            not known, and for those that do not stand out.
-        changed: `since` is the moment of a change. Else it was so at that moment already, and maybe before.
+        vehicle: the vehicle.
+        since: time of the change to this value, or of its first observation, in unix seconds. None if it is
+            not known, and for vehicles that agree.
+        changed: whether `since` is the time of a change. Otherwise the value existed at that time already,
+            and possibly before.
     """
 
     vehicle: FleetVehicle
@@ -63,12 +64,12 @@ class Holder:
 
 @dataclass(frozen=True, slots=True)
 class FleetValue:
-    """A value, and who has it.
+    """A value, and the vehicles that have it.
 
     Attributes:
         param: the value. Its index is None.
         holders: the vehicles, in the order of `FleetDiff.vehicles`.
-        agrees: it is what is wanted, or, where nothing is, what more vehicles have than any other value.
+        agrees: whether it is the wanted value or, without a wanted value, more common than any other value.
     """
 
     param: Param
@@ -82,10 +83,10 @@ class NameSpread:
 
     Attributes:
         name: param_id.
-        wanted: what it is compared with; None where the vehicles are compared with each other.
-        values: the values there are, the most common first.
-        lacking: the vehicles that do not have it.
-        unknown: those of which it was never heard, and whose table is not complete.
+        wanted: the wanted value; None if the vehicles are compared with each other.
+        values: the existing values, the most common first.
+        lacking: vehicles without the parameter.
+        unknown: vehicles with a partial table in which the parameter is missing.
     """
 
     name: str
@@ -96,18 +97,18 @@ class NameSpread:
 
     @property
     def differs(self) -> bool:
-        """Whether any vehicle stands out, or cannot be told not to."""
+        """Whether any vehicle differs, lacks the parameter, or has an unknown value."""
         return bool(self.lacking or self.unknown) or not all(each.agrees for each in self.values)
 
 
 @dataclass(frozen=True, slots=True)
 class FleetDiff:
-    """How vehicles stand to each other, or to what is wanted of them.
+    """Result of a comparison of vehicles with each other, or with wanted values.
 
     Attributes:
-        component: the id of the component that was compared.
-        vehicles: those that have a table of it, the one seen last first.
-        names: what was asked for, in that order.
+        component: id of the compared component.
+        vehicles: vehicles with a table of the component, the last seen first.
+        names: the requested parameters, in the order of the request.
     """
 
     component: int
@@ -116,15 +117,15 @@ class FleetDiff:
 
     @property
     def differs(self) -> bool:
-        """Whether anything stands out."""
+        """Whether any parameter differs."""
         return any(each.differs for each in self.names)
 
 
 Cells: TypeAlias = tuple[int, int, int]
-"""type, bits, is_raw: a value as the database has it."""
+"""A value in the database: type, bits, is_raw."""
 
-_CHUNK: Final = 500
-"""Names in one statement: older builds of SQLite take 999 variables."""
+_NAMES_PER_STATEMENT: Final = 500
+"""Maximum number of names in one statement: older builds of SQLite allow 999 variables."""
 
 
 def spread(
@@ -133,21 +134,22 @@ def spread(
     values: Mapping[Cells, Sequence[Holder]],
     without: Iterable[Holder] = (),
 ) -> NameSpread:
-    """Put vehicles together that have the same value, and say which of the values agree.
+    """Group vehicles by value, and mark the values that agree.
 
     Args:
-        wanted: what is wanted of all; None to compare them with each other. Then the most common value is
-            the one that agrees, and none does where two are equally common.
-        values: who has what.
-        without: those that have no such parameter.
+        name: param_id.
+        wanted: the wanted value; None to compare the vehicles with each other. Then the most common value
+            agrees, and no value agrees if two are equally common.
+        values: vehicles by value.
+        without: vehicles without the parameter in their table.
 
     Raises:
-        Damaged: what is no value.
+        Damaged: a value is not valid.
     """
     same: dict[tuple[int, bool, int], tuple[Param, list[Holder]]] = {}
     for value, holders in values.items():
         param = read_param(name, *value)
-        bits = 0 if same_bits(param.type, param.bits, 0) else param.bits  # -0 is no other value than 0
+        bits = 0 if same_bits(param.type, param.bits, 0) else param.bits  # -0 equals 0
         same.setdefault((param.type, param.is_raw, bits), (param, []))[1].extend(holders)
     groups = sorted(same.values(), key=lambda group: (-len(group[1]), group[0].bits))
     is_clear = len(groups) < 2 or len(groups[0][1]) > len(groups[1][1])
@@ -166,7 +168,7 @@ def spread(
 
 
 def fleet_diff(session: Session, component: int, wanted: Mapping[str, WrittenParam | None]) -> FleetDiff:
-    """Compare the vehicles in what is wanted, by name; None stands for: with each other."""
+    """Compare all vehicles with wanted values, by name; with None, compare them with each other."""
     owners = {
         owner: FleetVehicle(key, system, complete)
         for owner, key, system, complete in session.tables_of(component)
@@ -188,9 +190,9 @@ def fleet_diff(session: Session, component: int, wanted: Mapping[str, WrittenPar
 
 
 def names_like(session: Session, component: int, pattern: str) -> list[str]:
-    """The names that any vehicle has and that fit a pattern of the shell, in alphabetical order.
+    """Return the names of all vehicles that match a shell pattern, in alphabetical order.
 
-    What is no pattern stands for itself, whether any vehicle has it or not.
+    A text without pattern characters is returned unchanged, whether any vehicle has it or not.
     """
     start = pattern[: next((at for at, sign in enumerate(pattern) if sign in "*?["), len(pattern))]
     if start == pattern:
@@ -202,7 +204,7 @@ def names_like(session: Session, component: int, pattern: str) -> list[str]:
 def _dated(
     session: Session, owners: Mapping[int, FleetVehicle], names: Iterable[NameSpread]
 ) -> Iterator[NameSpread]:
-    """The same, with the times of those that stand out."""
+    """Add the times to the vehicles that differ."""
     names = list(names)
     standing_out: defaultdict[str, list[str]] = defaultdict(list)
     for each in names:
@@ -233,10 +235,10 @@ def _others(of: NameSpread) -> Iterator[Holder]:
 def _times(
     session: Session, named: Mapping[int, Sequence[str]]
 ) -> Mapping[int, dict[str, tuple[float, bool]]]:
-    """By table and name, since when it is as it is, and whether that is the moment of a change."""
+    """Return, by table and name, the time since when the value exists, and whether it is that of a change."""
     rows: list[tuple[int, str, str, int, float]] = []
-    for start in range(0, max(map(len, named.values()), default=0), _CHUNK):
-        parts = {owner: names[start : start + _CHUNK] for owner, names in named.items()}
+    for start in range(0, max(map(len, named.values()), default=0), _NAMES_PER_STATEMENT):
+        parts = {owner: names[start : start + _NAMES_PER_STATEMENT] for owner, names in named.items()}
         rows += session.since({owner: names for owner, names in parts.items() if names})
     known = {owner: at for owner, _, what, _, at in rows if what == "known"}
     times: defaultdict[int, dict[str, tuple[float, bool]]] = defaultdict(dict)

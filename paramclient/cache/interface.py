@@ -1,4 +1,4 @@
-"""What a place must do to keep a cache."""
+"""Store: the interface of a place that stores a cache."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ T = TypeVar("T")
 
 
 class Store(Protocol):
-    """Where tables, identities and history are kept. Safe to use from several threads.
+    """Storage of tables, identities and history. Thread-safe.
 
     Attributes:
-        place: what it is, for people and for the log: without a password.
-        path: the file on this computer: the cache, or the local copy of one.
+        place: file, or URL without password, for messages and the log.
+        path: file on this computer: the cache, or the local copy of a database.
     """
 
     @property
@@ -31,47 +31,47 @@ class Store(Protocol):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What went wrong with the file and was mended."""
+        """Repaired problems of the file: one text for each damaged or newer file that was renamed."""
         ...
 
     @property
     def replacements(self) -> int:
-        """How often a fresh file was made, or another one found in its place."""
+        """Number of times that a new file was created, or found in place of the previous one."""
         ...
 
     def read(self, work: Callable[[Session], T]) -> T:
-        """Do work that only reads, in one transaction.
+        """Run a function that only reads, in one transaction, and return its result.
 
         Raises:
-            CacheError: it cannot be read.
+            CacheError: the store cannot be read.
         """
         ...
 
     def do(self, operation: Operation[T]) -> T:
-        """Write, in one transaction: all of it is kept, or nothing.
+        """Run a write operation in one transaction and return its result: either all or nothing is written.
 
         Raises:
-            CacheError: it cannot be written.
-            UsageError: a time that is not in unix seconds.
+            CacheError: the store cannot be written.
+            UsageError: a time is not in unix seconds.
         """
         ...
 
     @property
     def away(self) -> str | None:
-        """Why a local copy is what is read and written at present; None while it is the cache itself."""
+        """Why the local copy is used instead of the database. None while the database is used."""
         ...
 
     def follow(self, key: str, component: int) -> None:
-        """This program has to do with a table: have it where it stays when a database is lost."""
+        """Keep a table of this program in the local copy, for the time without a database connection."""
         ...
 
     def subscribe(self, told: Callable[[CacheChange], None]) -> Callable[[], None]:
-        """Have something called, in a thread of the store, when another station has written to a table.
+        """Call a function, in a thread of the store, after each write of another station to a table.
 
-        Gives what ends that.
+        Return a function that ends the subscription.
         """
         ...
 
     def close(self) -> None:
-        """Let go of everything; later calls raise CacheError."""
+        """Close files, connections and threads; later calls raise CacheError."""
         ...

@@ -1,4 +1,4 @@
-"""A lock on the folder of a cache, for what must not be done by two processes at once."""
+"""Lock on the folder of a cache, or on a file, between processes."""
 
 from __future__ import annotations
 
@@ -15,38 +15,39 @@ from paramclient.errors import CacheError
 __all__ = ["BUSY_TIMEOUT", "locked", "try_to_lock"]
 
 BUSY_TIMEOUT: Final = 5.0
-"""Seconds to wait for another process. Its transactions take milliseconds; who holds the file for longer is
-stuck, and the cache is not worth the wait."""
+"""Timeout in seconds for a lock of another process. Transactions take milliseconds; a process that holds a
+lock for longer is blocked."""
 
 _LOCK_POLL: Final = 0.01
+"""Seconds between two attempts to lock the folder."""
 _LOCK_FILE: Final = ".paramclient.lock"
-"""What is locked on Windows, where a folder cannot be: it stays in the folder, empty."""
+"""Empty file that is locked on Windows, where a folder cannot be locked. It stays in the folder."""
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold the folder against every other process and thread that would open, create or rename a cache.
+    """Lock a folder against other processes and threads that open, create or rename a cache.
 
     Raises:
-        OSError: there is no such folder.
-        CacheError: another process holds it for longer than `BUSY_TIMEOUT`.
+        OSError: the folder does not exist.
+        CacheError: another process holds the lock for longer than `BUSY_TIMEOUT`.
     """
     descriptor = _open(folder)
     try:
         deadline = time.monotonic() + BUSY_TIMEOUT
         while not try_to_lock(descriptor):
             if time.monotonic() > deadline:
-                raise CacheError(f"another process holds the folder {folder}")
+                raise CacheError(f"another process has locked the folder {folder} for {BUSY_TIMEOUT:g} s")
             time.sleep(_LOCK_POLL)
         yield
     finally:
-        os.close(descriptor)  # and the lock goes with it
+        os.close(descriptor)  # releases the lock
 
 
 def try_to_lock(descriptor: int) -> bool:
     """Lock a file or folder until its descriptor is closed or this process ends.
 
-    False where another descriptor holds it.
+    Return False if another descriptor holds the lock.
     """
     from filelock import lock_descriptor  # only here: it adds 10 ms to the import of paramclient
 

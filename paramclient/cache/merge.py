@@ -1,4 +1,4 @@
-"""What was observed in the past, brought into what is kept: the later observation counts."""
+"""Merge of earlier observations, such as those of logs, into the cache. The later observation counts."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from paramclient.cache.transaction import Line, Session
 
 __all__ = ["merge"]
 
-SAME_CHANGE: Final = 2.0
-"""Seconds between two lines of history that tell of one change: who heard it live wrote it up to a quarter of
-a second later, or as much later as a slow disk took."""
+SAME_CHANGE_MAX: Final = 2.0
+"""Maximum seconds between two history lines of one change: a live client writes up to 0.25 s after the
+observation, or later by the delay of a slow disk."""
 
 
 def merge(
@@ -23,7 +23,7 @@ def merge(
     updates: Sequence[TableUpdate],
     based_on: Mapping[tuple[str, int], float],
 ) -> None:
-    """Write past updates, in the order of their times; see `ParamCache.merge`."""
+    """Write earlier updates, in the order of their times; see `ParamCache.merge`."""
     tables: dict[tuple[str, int], _Past] = {}
     for update in updates:
         key = (update.identity.key, update.component)
@@ -37,14 +37,15 @@ def merge(
 
 @dataclass
 class _Past:
-    """What a log holds of one table.
+    """Merge of the updates of one table.
 
     Attributes:
-        based_on: `updated_at` of the table that the updates go on from, or None.
-        owner: of the table in the database, once it is there.
-        goes_on: whether the kept table is the one that the updates know.
-        overtaken: by name, the last observation of which a later one is kept.
-        lines: of history, to be put in their places.
+        session: the transaction.
+        based_on: `updated_at` of the stored table on which the updates are based, or None.
+        owner: id of the table in the database, or None before it exists.
+        goes_on: whether the updates continue from the stored table.
+        overtaken: by name, the last observation for which the cache has a later one.
+        lines: new history lines, to be inserted by time.
     """
 
     session: Session
@@ -55,7 +56,7 @@ class _Past:
     lines: list[Line] = field(default_factory=list)
 
     def take(self, update: TableUpdate) -> None:
-        """Bring in one update."""
+        """Merge one update."""
         vehicle, found = _standing(self.session, update)
         if found is None:
             self.goes_on = True
@@ -74,7 +75,7 @@ class _Past:
         self._save(update, vehicle)
 
     def catch_up(self, names: Iterable[str]) -> None:
-        """Tell of the change between the last observation that was overtaken, and what is kept."""
+        """Add history lines for changes between the last overtaken observation and the stored value."""
         found = [self.overtaken.pop(name) for name in names if name in self.overtaken]
         if self.owner is None or not found:
             return
@@ -87,7 +88,7 @@ class _Past:
             self.lines.append((new.heard_at, name, BY_VEHICLE, *old.value, *new.value))
 
     def finish(self) -> None:
-        """Put the lines of history in their places by time."""
+        """Insert the new history lines by time, and trim the history."""
         self.catch_up(list(self.overtaken))
         if not self.lines:
             return
@@ -108,26 +109,26 @@ class _Past:
         self._widen(update, vehicle)
 
     def _widen(self, update: TableUpdate, vehicle: CachedVehicle | None) -> None:
-        """The vehicle has been seen from the first time to the last, whichever was written first."""
+        """Extend the first and last time of the vehicle by the time of an update."""
         if vehicle is not None:
             first, last = min(vehicle.first_seen, update.at), max(vehicle.last_seen, update.at)
             self.session.seen(vehicle.key, first, last)
 
     def _bring_in(self, update: TableUpdate, table: CachedSummary) -> None:
-        """Bring in what an update has of values that are not kept of a later time."""
+        """Merge an older update: only values without a later observation change the table."""
         assert self.owner is not None
         before = self.session.table(self.owner)
         whole_at = table.synced_at if table.complete and table.synced_at is not None else float("-inf")
         later: list[StoredParam] = []
         heard = {item.param.name for item in update.params}
         for name in set(self.overtaken) - heard if update.replace else update.removed:
-            self.overtaken.pop(name, None)  # what comes under it later is another parameter
+            self.overtaken.pop(name, None)  # a later value of this name is another parameter
         for item in update.params:
             name = item.param.name
             row = before.get(name)
             gone_at = self.session.gone_at(self.owner, name) if row is None else row.heard_at
             if (max(whole_at, gone_at) if row is None else gone_at) < item.heard_at:
-                # its place is that of another count, perhaps
+                # its index may belong to another count
                 later.append(replace(item, param=replace(item.param, index=None)))
                 continue
             before_it = self.overtaken.get(name)
@@ -144,16 +145,18 @@ class _Past:
         self.lines += changes
 
     def _line(self, old_item: StoredParam, item: StoredParam) -> Iterator[Line]:
-        """The line of a change between two observations, unless it is there."""
+        """Yield the history line of a change between two observations, unless it exists."""
         old, new = _row(old_item), _row(item)
         if old.same_value(new):
             return
-        around = self._lines(item.param.name, item.heard_at - SAME_CHANGE, item.heard_at + SAME_CHANGE)
+        around = self._lines(
+            item.param.name, item.heard_at - SAME_CHANGE_MAX, item.heard_at + SAME_CHANGE_MAX
+        )
         if new.value not in around:
             yield (item.heard_at, item.param.name, item.by, *old.value, *new.value)
 
     def _lines(self, name: str, after: float, until: float) -> list[Line]:
-        """What a parameter became in a time, by its lines of history."""
+        """Return the new values of a parameter in a period, from its history lines."""
         assert self.owner is not None
         return self.session.became(self.owner, name, after, until)
 
@@ -161,7 +164,7 @@ class _Past:
 def _standing(
     session: Session, update: TableUpdate
 ) -> tuple[CachedVehicle | None, tuple[int, CachedSummary] | None]:
-    """The vehicle and the table that are kept, as far as they are."""
+    """Return the stored vehicle and table of an update, or None for each that does not exist."""
     key = update.identity.key
     vehicle = next(iter(session.vehicles(key)), None)
     return vehicle, next(iter(session.summaries(key, update.component)), None)

@@ -1,4 +1,4 @@
-"""What a table of the protocol holds, on its way into the cache."""
+"""Parameters of a live table as records and rows of the cache."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ __all__ = ["FirstRows", "HeardParams", "UnixTimes"]
 
 @dataclass(frozen=True, slots=True)
 class UnixTimes:
-    """Turns moments of a clock that nobody sets into unix times.
+    """Converts times of a monotonic clock to unix times.
 
     Attributes:
-        at: the present, in unix seconds: no moment is after it.
-        ahead: seconds that unix time is ahead of the other clock.
-        since, not_before: a moment from `since` on is not before the unix time `not_before`, though the
-            computer's clock was set back a little in between.
+        at: the current time, in unix seconds: an upper limit of all results.
+        ahead: offset of unix time from the monotonic clock, in seconds.
+        since, not_before: monotonic times from `since` on give at least the unix time `not_before`, even if
+            the computer's clock was set back slightly in between.
     """
 
     at: float
@@ -32,14 +32,14 @@ class UnixTimes:
     not_before: float = 0.0
 
     def __call__(self, moment: float) -> float:
-        """Return the unix time of a moment."""
+        """Return the unix time of a monotonic time."""
         at = moment + self.ahead
         if moment >= self.since and at < self.not_before:
             at = self.not_before
         return min(max(at, 0.0), self.at)
 
     def of_all(self, moments: Sequence[float]) -> list[float]:
-        """Return the unix times of many moments, in a tenth of the time that a call for each takes."""
+        """Return the unix times of many monotonic times, in a tenth of the time of single calls."""
         times = [moment + self.ahead for moment in moments]
         was_set_back = self.since + self.ahead < self.not_before
         if times and (was_set_back or min(times) < 0.0 or max(times) > self.at):
@@ -48,17 +48,16 @@ class UnixTimes:
 
 
 class HeardParams(Sequence[StoredParam]):
-    """Parameters to keep, as a table holds them: each `StoredParam` is made when it is asked for.
+    """Parameters of a live table to store. Each `StoredParam` is created on access.
 
-    That is never, where a whole table of a thousand is written: the cells of its rows are made of what the
-    table holds.
+    A write of a whole table creates none: the cells of its rows come from the packed values of the table.
 
     Args:
-        params: as they are now: a copy of what the table holds, with the moments of the observations.
-        times: what turns these into unix times. A value without a moment counts as observed at `times.at`.
-        volatile: the names that it leaves out of its hash; None leaves what is known.
-        by: who caused the changes, by name; of the others it was the vehicle.
-        overwritten: what some of them were before, and is to be kept first.
+        params: a copy of the table's parameters, with the times of the observations.
+        times: converts these to unix times. A value without a time counts as observed at `times.at`.
+        volatile: names outside the vehicle's hash; None keeps the stored flags.
+        by: authors of changes, by name; the default is the vehicle.
+        overwritten: earlier values of some parameters, written first.
     """
 
     def __init__(
@@ -96,13 +95,13 @@ class HeardParams(Sequence[StoredParam]):
             yield StoredParam(param, at, is_volatile, self._by.get(name, BY_VEHICLE))
 
     def heard_at(self) -> Iterator[tuple[str, float]]:
-        """Give the name and the time of each, without making anything of it."""
+        """Yield the name and the unix time of each parameter, without creating records."""
         for item in self._overwritten:
             yield item.param.name, item.heard_at
         yield from zip(self._params.held, self._heard_at(), strict=True)
 
     def _heard_at(self) -> list[float]:
-        """The times of what the table holds, in its order."""
+        """Return the unix times of the table's parameters, in table order."""
         if self._current_times is None:
             times, moments, held = self._times, self._params.moments, self._params.held
             present = times.at - times.ahead
@@ -110,7 +109,7 @@ class HeardParams(Sequence[StoredParam]):
         return self._current_times
 
     def rows(self) -> Iterator[tuple[str, Row, bool | None, str]]:
-        """Each one's name and cells, whether it is volatile, and who caused its change."""
+        """Yield the name, the row, the volatile flag and the author of each parameter."""
         for item in self._overwritten:
             param = item.param
             row = Row.of(param, param.index, bool(item.volatile), item.heard_at)
@@ -120,7 +119,7 @@ class HeardParams(Sequence[StoredParam]):
             yield name, row, is_volatile, self._by.get(name, BY_VEHICLE)
 
     def first_rows(self) -> FirstRows | None:
-        """The rows of a table that had none before, or None where that cannot be told by name."""
+        """Return the rows for a table without rows; None if a name may occur twice, or there is no row."""
         return self._rows() if self._params and not self._overwritten else None
 
     def _rows(self) -> FirstRows:
@@ -131,15 +130,15 @@ class HeardParams(Sequence[StoredParam]):
 
 
 class FirstRows(Mapping[str, Row]):
-    """The rows of parameters as a table holds them: each is made when it is asked for.
+    """Rows of a live table's parameters. Each row is created on access.
 
-    The columns of all of them are made in a few calls, and without an object for each row: those of some
-    tables at once would be what the garbage collector goes through everything for.
+    `columns` returns all columns in a few calls, without an object for each row: the objects of several
+    tables at the same time would trigger full garbage collections.
 
     Args:
-        params: at least one.
-        volatile: the names of those that the vehicle leaves out of its hash.
-        heard_at: when the vehicle said so, in their order.
+        params: at least one parameter.
+        volatile: names outside the vehicle's hash.
+        heard_at: unix times of the observations, in the order of the parameters.
     """
 
     def __init__(self, params: Params, volatile: frozenset[str], heard_at: Sequence[float]) -> None:
@@ -165,7 +164,7 @@ class FirstRows(Mapping[str, Row]):
         return Row(number, signed(bits), is_raw, index, is_volatile, self._by_name[name], initial)
 
     def columns(self) -> tuple[Sequence[str], list[Sequence[Any]]]:
-        """The names, and the cells of all rows in the order of `Row`."""
+        """Return the names, and the columns of all rows in the order of `Row`."""
         held, defaults = self._params.held, self._params.defaults
         bits, types, is_raw, _, places = zip(*iter_unpack_fields(b"".join(held.values())), strict=True)
         initial: Sequence[int | None] = (None,) * len(held)

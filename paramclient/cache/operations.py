@@ -1,4 +1,4 @@
-"""What can be written to a cache: each a record, done in one transaction, wherever and whenever."""
+"""Write operations of a cache: records that a store executes in one transaction, now or later."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 
 from paramclient.cache import snapshots
 from paramclient.cache.merge import merge
-from paramclient.cache.reconciliation import settle
+from paramclient.cache.reconciliation import reconcile
 from paramclient.cache.records import Snapshot, TableUpdate
 from paramclient.cache.rows import read_param
 from paramclient.cache.transaction import Session
@@ -18,16 +18,16 @@ from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import is_portable_name
 
-__all__ = ["Merge", "Operation", "Remove", "Save", "SetDown"]
+__all__ = ["Merge", "Operation", "Remove", "Save", "StoreSnapshot"]
 
 T_co = TypeVar("T_co", covariant=True)
 
 
 class Operation(ABC, Generic[T_co]):
-    """One change of a cache. It happens as a whole, or not at all.
+    """A write to a cache, executed completely or not at all.
 
     Attributes:
-        is_durable: whether it is done only when it is on the disk, past a loss of power.
+        is_durable: whether it ends only when it is synced to the disk, safe from power loss.
     """
 
     is_durable: bool = False
@@ -35,26 +35,26 @@ class Operation(ABC, Generic[T_co]):
     @property
     @abstractmethod
     def tables(self) -> Iterable[tuple[str, int | None]]:
-        """The tables that it may change, by key and component; None for all of the vehicle's."""
+        """Key and component of the tables that it may change; None as component: all of the vehicle."""
 
     @abstractmethod
     def do(self, session: Session) -> T_co:
-        """Do it within a transaction."""
+        """Execute the operation in a transaction, and return its result."""
 
     def done(self, session: Session) -> T_co | None:
-        """What `do` gave, where it is known only that it was done; None where that says nothing."""
+        """Return the result of an earlier `do` that was committed but whose result was lost."""
         return None
 
 
 @dataclass(frozen=True)
 class Save(Operation[None]):
-    """Write what was learnt, see `ParamCache.save`.
+    """Write updates of tables, see `ParamCache.save`.
 
     Attributes:
-        updates: in the order given.
-        clock: gives the present by the clock that their times were read from; None for `at` of each, which is
-            what counts after a wait, too.
-        is_durable: as in `Operation`; without updates it is about all that was saved before.
+        updates: the updates, in order of execution.
+        clock: returns the current time by the clock of the updates; None uses `at` of each update, which also
+            counts for a delayed execution.
+        is_durable: as in `Operation`; without updates it applies to all earlier writes.
     """
 
     updates: Sequence[TableUpdate]
@@ -66,12 +66,17 @@ class Save(Operation[None]):
         return {(each.identity.key, each.component) for each in self.updates}
 
     def do(self, session: Session) -> None:
-        settle(session, self.updates, None if self.clock is None else self.clock())
+        reconcile(session, self.updates, None if self.clock is None else self.clock())
 
 
 @dataclass(frozen=True)
 class Merge(Operation[None]):
-    """Write what was observed in the past, see `ParamCache.merge`."""
+    """Merge earlier updates, see `ParamCache.merge`.
+
+    Attributes:
+        updates: the updates, in order of their times.
+        based_on: as in `ParamCache.merge`.
+    """
 
     updates: Sequence[TableUpdate]
     based_on: Mapping[tuple[str, int], float] = field(default_factory=dict)
@@ -85,13 +90,18 @@ class Merge(Operation[None]):
 
 
 @dataclass(frozen=True)
-class SetDown(Operation[Snapshot]):
-    """Make a snapshot, see `ParamCache.store_snapshot`.
+class StoreSnapshot(Operation[Snapshot]):
+    """Store a snapshot, see `ParamCache.store_snapshot`.
 
     Attributes:
-        vehicle: who it is, or the key of one that is known.
-        params: what to set down; None for the table as it is kept, with its hash.
-        number: the one that it was given elsewhere, or None.
+        vehicle: identity of the vehicle, or the key of a cached one.
+        component: component id.
+        params: the parameters; None for the stored table and its hash.
+        at: time of the snapshot, in unix seconds.
+        reason: the reason, as text.
+        hash: the vehicle's hash of these parameters, or None.
+        complete: whether these are all parameters of the vehicle.
+        number: number that another store has assigned, or None.
     """
 
     vehicle: Identity | str
@@ -134,7 +144,7 @@ class SetDown(Operation[Snapshot]):
         )
 
     def done(self, session: Session) -> Snapshot:
-        """The snapshot of this time."""
+        """Return the stored snapshot of this time."""
         [(key, _)] = self.tables
         owner = session.owner_of(key, self.component)
         number = None if owner is None else session.snapshot_at(owner, snapshots.kept_time(self.at))
@@ -142,8 +152,8 @@ class SetDown(Operation[Snapshot]):
             raise NotInCache(f"the table of {key}, component {self.component}, has just been removed")
         return snapshots.snapshot(session, owner, number)
 
-    def resolved(self, session: Session) -> SetDown:
-        """The same with the parameters that the table has now, where it has none of its own."""
+    def resolved(self, session: Session) -> StoreSnapshot:
+        """Return this operation with the parameters of the stored table, if it has none of its own."""
         if self.params is not None:
             return self
         [(key, _)] = self.tables
@@ -156,10 +166,12 @@ class SetDown(Operation[Snapshot]):
 
 @dataclass(frozen=True)
 class Remove(Operation[int]):
-    """Forget tables, see `ParamCache.remove`.
+    """Remove tables, see `ParamCache.remove`.
 
     Attributes:
-        known: how many there were when that was asked for.
+        key: key of the vehicle.
+        component: component id, or None for all of its tables.
+        known: number of tables at the time of the call.
     """
 
     key: str
@@ -174,7 +186,7 @@ class Remove(Operation[int]):
         return session.remove(self.key, self.component)
 
     def done(self, session: Session) -> int:
-        """How many there were."""
+        """Return the number of tables at the time of the call."""
         return self.known
 
 

@@ -1,4 +1,4 @@
-"""What could not be written to the database yet: kept beside the local copy, in order, until it is there."""
+"""LocalCopy: local copy of a shared database, with an outbox of writes for the database."""
 
 from __future__ import annotations
 
@@ -9,18 +9,19 @@ from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from paramclient.cache.operations import Merge, Operation, Save, SetDown
+from paramclient.cache.operations import Merge, Operation, Save, StoreSnapshot
 from paramclient.cache.records import StoredParam, TableState, TableUpdate
 from paramclient.cache.rows import Damaged, Row, identity_cells, read_identity, read_param
 from paramclient.cache.snapshots import read_written, written_cells
 from paramclient.cache.sqlite import SqliteSession
 from paramclient.cache.sqlite_file import Database
 from paramclient.cache.transaction import Session
-from paramclient.cache.transfer import Whole, put_shots, put_whole
+from paramclient.cache.transfer import WholeTable, put_shots, put_whole
 from paramclient.model.paramset import ParamSet
 
 __all__ = ["Entry", "LocalCopy", "packed", "unpacked"]
 
+# Tables of the local copy beside those of a cache file: the outbox, and the copied revision of each table.
 _TABLES: Final = (
     """CREATE TABLE IF NOT EXISTS outbox (
         id INTEGER PRIMARY KEY AUTOINCREMENT,
@@ -42,11 +43,12 @@ _Key = tuple[str, int]
 
 @dataclass(frozen=True)
 class Entry:
-    """One operation that waits.
+    """A queued operation.
 
     Attributes:
-        id: its place in the order of all that wait.
-        writer, number: under which the database does it once.
+        id: its position in the queue.
+        writer, number: program and number under which the database executes it only once.
+        operation: the operation.
     """
 
     id: int
@@ -56,9 +58,9 @@ class Entry:
 
 
 class LocalCopy:
-    """A file like that of a cache without a database, with what of that this station has to do with.
+    """A cache file with the tables of the database that the programs of this computer use.
 
-    Several processes of one computer share it.
+    Several processes of one computer share the file.
 
     Args:
         path: the file.
@@ -70,23 +72,23 @@ class LocalCopy:
 
     @property
     def exists(self) -> bool:
-        """Whether the database was reached from here before."""
+        """Whether the file exists, that is, whether the database was reached from this computer before."""
         return self.path.exists()
 
     def begin(self) -> None:
-        """Make the file, if need be: the database has been reached."""
+        """Create the file if it does not exist, after the database was reached."""
         self._write(lambda session: None)
 
     def read(self, work: Callable[[Session], T]) -> T:
-        """Do work that only reads, in one transaction."""
+        """Run a function that only reads, in one transaction, and return its result."""
         return self.database.read(lambda connection: work(SqliteSession(connection, is_shared=True)))
 
     def do(self, operation: Operation[T]) -> T:
-        """Do what the database has done."""
+        """Execute an operation that the database has executed."""
         return self._write(operation.do)
 
     def spool(self, operation: Operation[T], writer: str, number: int) -> T:
-        """Do what the database will have to do, and keep it for that; both, or nothing."""
+        """Execute an operation and queue it for the database, in one transaction."""
 
         def work(session: SqliteSession) -> T:
             result = operation.do(session)
@@ -99,7 +101,7 @@ class LocalCopy:
         return self._write(work, durable=operation.is_durable)
 
     def waiting(self, limit: int) -> list[Entry]:
-        """What waits, the oldest first; without what the database has refused."""
+        """Return queued operations, the oldest first, without those that the database has refused."""
 
         def work(session: SqliteSession) -> list[Entry]:
             found = session.connection.execute(
@@ -114,7 +116,7 @@ class LocalCopy:
         return self._write(work) if self.exists else []
 
     def arrived(self, entries: Sequence[Entry], tables: Iterable[_Key]) -> None:
-        """Forget what has been done; these tables are no copies any more."""
+        """Remove executed operations from the queue, and mark these tables as stale."""
 
         def work(session: SqliteSession) -> None:
             done = [(each.id,) for each in entries]
@@ -124,7 +126,7 @@ class LocalCopy:
         self._write(work)
 
     def refuse(self, entry: Entry, why: str) -> None:
-        """Set aside what the database cannot do. It stays in the file."""
+        """Mark an operation as refused by the database. It stays in the file."""
         self._write(
             lambda session: session.connection.execute(
                 "UPDATE outbox SET refused = ? WHERE id = ?", (why, entry.id)
@@ -132,7 +134,7 @@ class LocalCopy:
         )
 
     def revisions(self) -> dict[_Key, int]:
-        """Of which tables this is a copy, and of which revision."""
+        """Return the copied revision of each table."""
 
         def work(session: SqliteSession) -> dict[_Key, int]:
             found = session.connection.execute("SELECT vehicle, component, revision FROM mirrored")
@@ -141,7 +143,7 @@ class LocalCopy:
         return self._write(work) if self.exists else {}
 
     def goes_on(self, key: _Key, revision: int | None) -> None:
-        """Say of which revision a table is a copy; None where it is none any more."""
+        """Set the copied revision of a table; None if it is no longer a copy."""
 
         def work(session: SqliteSession) -> None:
             if revision is None:
@@ -151,8 +153,8 @@ class LocalCopy:
 
         self._write(work)
 
-    def mirror(self, key: _Key, whole: Whole | None, revision: int | None) -> None:
-        """Make a table what the database has of it; None where that has it no more."""
+    def mirror(self, key: _Key, whole: WholeTable | None, revision: int | None) -> None:
+        """Replace a table with that of the database; None removes it."""
 
         def work(session: SqliteSession) -> None:
             if whole is None:
@@ -166,7 +168,7 @@ class LocalCopy:
         self._write(work)
 
     def snapshots(self, key: _Key) -> frozenset[int]:
-        """The numbers of a table's snapshots that are here."""
+        """Return the numbers of the snapshots of a table in this file."""
         return self.read(lambda session: frozenset(each.id for each in session.snapshots(*key)))
 
     def close(self) -> None:
@@ -183,14 +185,18 @@ class LocalCopy:
 
 
 def packed(operation: Operation[object]) -> bytes:
-    """An operation as bytes. One that cannot wait raises TypeError."""
+    """Serialize an operation for the outbox.
+
+    Raises:
+        TypeError: operations of this type cannot be queued.
+    """
     data: list[Any]
     if isinstance(operation, Save):
         data = ["save", [_update_cells(each) for each in operation.updates]]
     elif isinstance(operation, Merge):
         based_on = [[*key, at] for key, at in operation.based_on.items()]
         data = ["merge", [_update_cells(each) for each in operation.updates], based_on]
-    elif isinstance(operation, SetDown):
+    elif isinstance(operation, StoreSnapshot):
         vehicle = operation.vehicle
         who = vehicle if isinstance(vehicle, str) else identity_cells(vehicle)
         params = operation.params
@@ -198,12 +204,16 @@ def packed(operation: Operation[object]) -> bytes:
         shown = None if params is None else [written_cells(each) for each in params.values()]
         data = ["set down", who, operation.component, shown, *rest]
     else:
-        raise TypeError(f"{type(operation).__name__} cannot wait")
+        raise TypeError(f"{type(operation).__name__} cannot be queued")
     return zlib.compress(json.dumps(data, separators=(",", ":")).encode("utf-8", "surrogatepass"))
 
 
 def unpacked(data: object) -> Operation[object]:
-    """The inverse of `packed`; `Damaged` where it is not its result."""
+    """Deserialize a result of `packed`.
+
+    Raises:
+        Damaged: the data is not a result of `packed`.
+    """
     try:
         assert isinstance(data, bytes)
         kind, *rest = json.loads(zlib.decompress(data).decode("utf-8", "surrogatepass"))
@@ -216,9 +226,9 @@ def unpacked(data: object) -> Operation[object]:
         who, component, shown, at, reason, crc, complete, number = rest
         params = None if shown is None else ParamSet({each.name: each for each in map(read_written, shown)})
         vehicle = who if isinstance(who, str) else read_identity(who)
-        return SetDown(vehicle, component, params, at, reason, crc, complete, number)
+        return StoreSnapshot(vehicle, component, params, at, reason, crc, complete, number)
     except (AssertionError, LookupError, TypeError, ValueError, zlib.error) as error:
-        raise Damaged(f"what waits to be written is damaged: {error}") from error
+        raise Damaged(f"a queued operation is damaged: {error}") from error
 
 
 def _update_cells(update: TableUpdate) -> list[Any]:
@@ -238,7 +248,7 @@ def _update_cells(update: TableUpdate) -> list[Any]:
 
 def _update(data: list[Any]) -> TableUpdate:
     who, component, autopilot, at, state, items, removed, is_whole, *times = data
-    removed_at, whole_at = times or ({}, None)  # an earlier version has kept neither
+    removed_at, whole_at = times or ({}, None)  # earlier versions wrote neither
     return TableUpdate(
         identity=read_identity(who),
         component=component,

@@ -1,17 +1,17 @@
-"""A table's parameters as one piece of bytes, column after column.
+"""Packed tables: the parameters of a table as one binary blob, by column.
 
-A thousand rows of SQL cost milliseconds, one blob a tenth of that: each column becomes bytes, and comes back,
-in one call; where only some columns are wanted, the others are not looked at.
+1,000 rows of SQL take milliseconds, one blob a tenth of that: each column is encoded and decoded in one call,
+and unused columns are not decoded.
 
-All numbers are little-endian. First comes a head: version, whether there are defaults, the character between
-two names, how many parameters, bytes of all names. Then the names in UTF-8; a byte of each parameter for its
-type, for is_raw, for volatile and, where there are defaults, for whether it has one; bits, heard_at, index
-and, where there are any, defaults. At last comes a CRC-32 of all that: in here, and not only beside it, so
-that the bytes tell of themselves whether they are whole. The parameters are in the order in which a table
-gives them: who reads need not sort.
+All numbers are little-endian. The header has the version, a flag for defaults, the separator character of
+names, the number of parameters, and the size of all names in bytes. The names in UTF-8 follow; then, for each
+parameter, one byte for its type, is_raw, volatile and, with defaults, whether it has one; then the columns
+bits, heard_at, index and, with defaults, default. The last field is a CRC-32 of the preceding bytes, inside
+the blob, so that the blob can be verified without other data. The parameters are in table order, so that
+readers need not sort.
 
-The file may have come from anywhere. Whatever `pack` would not have made is `Damaged`, before memory is taken
-for what it claims to hold.
+The file may be from an untrusted source. Data that `pack` cannot have written raises `Damaged`, before memory
+is allocated for its claimed size.
 """
 
 from __future__ import annotations
@@ -32,13 +32,19 @@ from paramclient.model.params import Params
 __all__ = ["Packed", "pack", "packed_row", "row_checksum", "unpack"]
 
 _VERSION: Final = 1
+"""Version of the format."""
 _HEAD: Final = struct.Struct("<BBIII")
+"""Header: version, has defaults, separator, number of parameters, size of the names in bytes."""
 _CRC: Final = struct.Struct("<I")
+"""Last field: CRC-32 of all preceding bytes."""
 _NO_INDEX: Final = (1 << 31) - 1
-"""Stands for no index; above all others, so that these parameters come last."""
+"""Encodes a missing index. It is above all indices, so that these parameters are last."""
 _INDEX: Final = Row._fields.index("param_index")
+"""Position of the index among the columns."""
 _CHARACTERS: Final = 0x110000
+"""Number of Unicode code points."""
 _HEARD_AT: Final = Row._fields.index("heard_at")
+"""Position of the observation time among the columns."""
 _new = tuple.__new__  # as in `rows`
 
 S = TypeVar("S", bound=Sequence[float])
@@ -46,10 +52,10 @@ T = TypeVar("T")
 
 
 def pack(rows: Mapping[str, Row]) -> bytes:
-    """The rows of a table as bytes, by index, then name, those without an index last.
+    """Encode the rows of a table, ordered by index, then name, those without an index last.
 
     Raises:
-        UsageError: a name with half a character in it, or a number that is too large.
+        UsageError: a name has a lone surrogate, or a number is too large.
     """
     return _pack(*_columns(rows))
 
@@ -63,7 +69,7 @@ def _columns(rows: Mapping[str, Row]) -> tuple[Sequence[str], list[Sequence[Any]
 def _pack(names: Sequence[str], columns: list[Sequence[Any]]) -> bytes:
     indices = columns[_INDEX]
     if _NO_INDEX in indices:
-        raise UsageError(f"a table cannot be kept: {_NO_INDEX} is no index")
+        raise UsageError(f"the table cannot be stored: {_NO_INDEX} is not a valid index")
     if None in indices:
         indices = columns[_INDEX] = [_NO_INDEX if index is None else index for index in indices]
     if not all(map(lt, indices, indices[1:])):
@@ -89,36 +95,43 @@ def _pack(names: Sequence[str], columns: list[Sequence[Any]]) -> bytes:
             struct.pack(f"<{size}q", *(default or 0 for default in defaults)) if has_defaults else b"",
         ]
     except (Damaged, ValueError, struct.error) as error:
-        raise UsageError(f"a table cannot be kept: {error}") from error
+        raise UsageError(f"the table cannot be stored: {error}") from error
     whole = b"".join(parts)
     return whole + _CRC.pack(zlib.crc32(whole))
 
 
 def unpack(blob: bytes) -> dict[str, Row]:
-    """The rows of a table, in the order of `pack`; `Damaged` where the bytes are not what that gives."""
+    """Decode the rows of a table, in the order of `pack`.
+
+    Raises:
+        Damaged: the bytes are not a result of `pack`.
+    """
     return Packed(blob).rows()
 
 
 def packed_row(rows: Mapping[str, Row]) -> tuple[int, float, bytes]:
-    """What is kept of a table that is not empty: its size, when a value was heard last, and its bytes."""
+    """Return the database cells of a table with parameters: number, last observation time, encoded rows."""
     names, columns = _columns(rows)
     return len(names), max(columns[_HEARD_AT]), _pack(names, columns)
 
 
 def row_checksum(size: int, heard_last: float, blob: bytes) -> int:
-    """What stands with the component: so a row that is missing, or another one's, is found."""
+    """Return the checksum stored with the component, which detects a missing or exchanged row."""
     return zlib.crc32(repr((size, heard_last, blob[-_CRC.size :])).encode())
 
 
 class Packed:
-    """The bytes of a table, of which only what is asked for becomes rows.
+    """An encoded table, of which only the requested columns are decoded.
 
     Args:
-        blob: what `pack` gave; `Damaged` where it is not that.
+        blob: a result of `pack`.
 
     Attributes:
-        size: how many parameters.
-        named: the names as they stand in the bytes; the same for tables of the same names in the same order.
+        size: number of parameters.
+        named: header and names as bytes; equal for tables with equal names in equal order.
+
+    Raises:
+        Damaged: the blob is not a result of `pack`; also from its methods.
     """
 
     def __init__(self, blob: bytes) -> None:
@@ -141,7 +154,7 @@ class Packed:
         self._wide = self._start + size * (3 + has_defaults)
 
     def rows(self) -> dict[str, Row]:
-        """All of it."""
+        """Return all rows by name."""
         rows = zip(
             self._bytes(0),
             self._numbers("q", self._wide),
@@ -155,7 +168,7 @@ class Packed:
         return self._by_name(map(_new, repeat(Row), rows))
 
     def params(self) -> tuple[Params, frozenset[str], dict[str, float]]:
-        """All of it as `Session.params` gives it, without an object for each row."""
+        """Return the result of `Session.params`, without an object for each row."""
         names = self._names()
         volatile = compress(names, _flags(self._bytes(2)))
         heard_at = self._by_name(_checked(self._times()))
@@ -164,16 +177,16 @@ class Packed:
         return params, frozenset(volatile), heard_at
 
     def places(self) -> dict[str, int]:
-        """Where each name stands."""
+        """Return the position of each name."""
         return self._by_name(range(self.size))
 
     def values(self, places: Iterable[tuple[str, int]]) -> list[tuple[str, int, int, int]]:
-        """Name, type, bits, is_raw of the parameters of these names in these places."""
+        """Return name, type, bits, is_raw of the parameters with these names and positions."""
         types, bits, is_raw = self._bytes(0), self._numbers("q", self._wide), _flags(self._bytes(1))
         return [(name, types[place], bits[place], is_raw[place]) for name, place in places]
 
     def heard_at(self, places: Iterable[int]) -> list[float]:
-        """When the parameters in these places were heard."""
+        """Return the observation times of the parameters at these positions, in unix seconds."""
         times = self._times()
         return _checked([times[place] for place in places])
 
@@ -215,7 +228,7 @@ class Packed:
 
 
 def _order(names: Sequence[str], indices: Sequence[int]) -> list[int]:
-    """The places of a table's parameters by index, then name."""
+    """Return the positions of a table's parameters, sorted by index, then name."""
     order: Iterable[int] = range(len(names))
     if len(set(indices)) < len(names):
         order = sorted(order, key=names.__getitem__)
@@ -223,14 +236,22 @@ def _order(names: Sequence[str], indices: Sequence[int]) -> list[int]:
 
 
 def _flags(column: bytes) -> bytes:
-    """A column of zeros and ones; else `Damaged`."""
+    """Check and return a column of zeros and ones.
+
+    Raises:
+        Damaged: a cell has another value.
+    """
     if column.strip(b"\0\1"):
         raise Damaged("a cell is neither 0 nor 1")
     return column
 
 
 def _checked(times: S) -> S:
-    """Times; else `Damaged`."""
+    """Check and return a column of unix times.
+
+    Raises:
+        Damaged: a cell is not a valid time.
+    """
     if times and not (min(times) >= 0 and max(times) < YEAR_10000 and math.isfinite(sum(times))):
         raise Damaged(f"a cell holds {next(at for at in times if not 0 <= at < YEAR_10000)!r}")
     return times

@@ -1,7 +1,7 @@
-"""The cache in PostgreSQL: what that says in its own way. psycopg is loaded when a URL names a database.
+"""The cache in PostgreSQL. psycopg is imported only for the URL of a database.
 
-Everything stands in a schema of its own, `paramclient`. Who writes holds the vehicles that are written to by
-advisory locks, so that what is read before a change is what the change is made of. Reads see one moment.
+All tables are in the schema `paramclient`. A write holds advisory locks on its vehicles, so that no other
+write changes rows between its reads and its writes. A read is a consistent snapshot (REPEATABLE READ).
 """
 
 from __future__ import annotations
@@ -16,67 +16,71 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
 from uuid import uuid4
 
-from paramclient.cache.database_url import Address
+from paramclient.cache.database_url import DatabaseAddress
 from paramclient.cache.migrations import CHANNEL, MIGRATIONS, SCHEMA
 from paramclient.cache.operations import Operation
 from paramclient.cache.rows import Damaged, Row, cells, checksum, read_rows
 from paramclient.cache.transaction import Session
-from paramclient.cache.transfer import OWN_NUMBERS
+from paramclient.cache.transfer import LOCAL_NUMBERS_MIN
 from paramclient.errors import CacheError, UsageError
 
 if TYPE_CHECKING:
     import psycopg
     from psycopg_pool import ConnectionPool
 
-__all__ = ["Away", "PostgresDatabase", "PostgresSession", "Revisions"]
+__all__ = ["Unavailable", "PostgresDatabase", "PostgresSession", "Revisions"]
 
 CONNECT_TIMEOUT: Final = 3
-"""Seconds to reach the database before a station works on without it."""
-SILENCE: Final = 5_000
-"""Milliseconds that what was sent may stay unacknowledged before the connection is given up (Linux)."""
+"""Timeout in seconds for a connection to the database; after it, the local copy is used."""
+UNACKNOWLEDGED_MAX: Final = 5_000
+"""TCP user timeout in milliseconds: a connection with data unacknowledged for longer is closed (Linux)."""
 LOCK_TIMEOUT: Final = "5s"
-"""How long another station's transaction may hold a vehicle; they take milliseconds."""
-ANSWER_TIMEOUT: Final = 20.0
-"""Seconds for a statement. The database ends one that takes longer; where it does not answer even then, as
-its machine swaps or its disk hangs, the connection is closed. The longest of ours take a second or two, and
-wait five for a lock."""
-IDLE_TIMEOUT: Final = "15s"
-"""When the database ends a transaction of a station that stands still, and would hold its vehicles."""
-MOST_CONNECTIONS: Final = 4
-"""Of one cache at once, beside the one that listens."""
+"""Timeout for the lock on a vehicle, as a PostgreSQL setting: transactions take milliseconds."""
+STATEMENT_TIMEOUT: Final = 20.0
+"""Timeout in seconds for a statement. The database cancels a longer one; if it does not respond even then,
+because its machine swaps or its disk hangs, the connection is closed. The longest statements take 1 s to 2 s,
+and wait 5 s for a lock."""
+IDLE_TRANSACTION_TIMEOUT: Final = "15s"
+"""Timeout after which the database ends an idle transaction, as a PostgreSQL setting: a stopped station would
+keep its vehicles locked."""
+POOL_SIZE_MAX: Final = 4
+"""Maximum number of connections of one cache, in addition to the one that listens."""
 
-_LOCKS: Final = 0x5041524D  # `PARM`, the first half of every advisory lock
+_LOCKS: Final = 0x5041524D
+"""First half of the advisory locks on vehicles: `PARM`."""
 _MIGRATION_LOCK: Final = 0x5041524D_0000_0001
-_TRIES: Final = 5
+"""Advisory lock for schema migrations."""
+_DEADLOCK_ATTEMPTS_MAX: Final = 5
+"""Maximum number of attempts of a write that ends in a deadlock."""
 
 Revisions = dict[tuple[str, int], int]
-"""By key and component, a number that is another one whenever a table has been written to. It is drawn by
-lot: so it is another one also where a backup, or another database, has taken the place of the one before."""
+"""Revision of each table, by key and component: a random number that changes with every write. It is random
+so that it also differs after the database was replaced by a backup or by another database."""
 T = TypeVar("T")
 
 
-class Away(Exception):
-    """The database cannot be reached or used at present. What was to be written may have been."""
+class Unavailable(Exception):
+    """The database cannot be reached or used at present. An attempted write may have been executed."""
 
 
 class PostgresDatabase:
-    """A database that stations share. Safe to use from several threads.
+    """A database shared by several stations. Thread-safe.
 
     Args:
-        address: where it is.
+        address: its address.
     """
 
-    def __init__(self, address: Address) -> None:
+    def __init__(self, address: DatabaseAddress) -> None:
         self.address = address
         self._pool: ConnectionPool[psycopg.Connection[tuple[Any, ...]]] | None = None
         self._lock = threading.Lock()
 
     def open(self) -> psycopg.Connection[tuple[Any, ...]]:
-        """Reach the database, and bring its schema up to date; give a connection that listens.
+        """Connect to the database, upgrade its schema, and return a connection that listens to notifications.
 
         Raises:
-            Away: it cannot be reached.
-            CacheError: it is of a later version.
+            Unavailable: the database cannot be reached.
+            CacheError: its schema is of a later version.
         """
         _, pools = _libraries()
         with self._translated():
@@ -89,7 +93,7 @@ class PostgresDatabase:
                     connection_class=kind,
                     kwargs=self._options(),
                     min_size=0,
-                    max_size=MOST_CONNECTIONS,
+                    max_size=POOL_SIZE_MAX,
                     timeout=CONNECT_TIMEOUT,
                     num_workers=1,
                     reconnect_timeout=CONNECT_TIMEOUT,
@@ -105,17 +109,17 @@ class PostgresDatabase:
         return listener
 
     def close(self) -> None:
-        """Let go of every connection but the one that listens."""
+        """Close all connections except the one that listens."""
         with self._lock:
             pool, self._pool = self._pool, None
         _end(pool)
 
     def read(self, work: Callable[[Session], T]) -> T:
-        """Do work that only reads, all of it of one moment.
+        """Run a function that only reads, in one consistent snapshot, and return its result.
 
         Raises:
-            Away: the database cannot be reached.
-            CacheError: it is damaged.
+            Unavailable: the database cannot be reached.
+            CacheError: its content is damaged.
         """
         with self._translated(), self._connection() as connection:
             connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ READ ONLY")
@@ -124,10 +128,10 @@ class PostgresDatabase:
     def read_with_revision(
         self, work: Callable[[Session], T], table: tuple[str, int]
     ) -> tuple[T, int | None]:
-        """Do work that only reads one table; give also the revision of that.
+        """Run a function that only reads one table. Return its result and the revision of the table.
 
         Raises:
-            Away, CacheError: as `read`.
+            Unavailable, CacheError: as `read`.
         """
         with self._translated(), self._connection() as connection:
             connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ READ ONLY")
@@ -136,21 +140,22 @@ class PostgresDatabase:
     def write(
         self, operations: Sequence[tuple[Operation[Any], str, int]]
     ) -> tuple[list[Any], Revisions, Revisions]:
-        """Do operations in one transaction, each once.
+        """Execute operations in one transaction, each exactly once.
 
         Args:
-            operations: each with the number of its writer under which it is done: if that has done one of
-                this number or a higher one before, nothing happens.
+            operations: operations with writer and number. An operation is skipped if this writer has executed
+                one with this number or a higher one before.
 
         Returns:
-            Their results, None where one was done before; the vehicles' revisions before and after.
+            Their results, None for a skipped one; the revisions of the vehicles' tables before and after.
 
         Raises:
-            Away: the database cannot be reached. Whether they were done is open: do them again.
-            CacheError: one of them cannot be done, and none was.
+            Unavailable: the database cannot be reached. It is unknown whether they were executed: repeat the
+                call.
+            CacheError: one of them cannot be executed; none was.
         """
         with self._translated():
-            for _ in range(_TRIES - 1):
+            for _ in range(_DEADLOCK_ATTEMPTS_MAX - 1):
                 try:
                     return self._write(operations)
                 except _libraries()[0].errors.DeadlockDetected:
@@ -158,10 +163,10 @@ class PostgresDatabase:
             return self._write(operations)
 
     def revisions(self) -> Revisions:
-        """The revision of every table.
+        """Return the revision of every table.
 
         Raises:
-            Away, CacheError: as `read`.
+            Unavailable, CacheError: as `read`.
         """
         with self._translated(), self._connection() as connection:
             return _revisions(connection, None)
@@ -206,30 +211,30 @@ class PostgresDatabase:
         with self._lock:
             pool = self._pool
         if pool is None:
-            raise Away("the connection is closed")
+            raise Unavailable("the connection is closed")
         with pool.connection() as connection, connection.transaction():
             yield connection
 
     @contextmanager
     def _translated(self) -> Iterator[None]:
-        """Errors of psycopg as ours, without the password."""
+        """Translate errors of psycopg to `Unavailable` and CacheError, without the password."""
         library, pools = _libraries()
         place = self.address.place
         try:
             yield
         except (pools.PoolClosed, pools.PoolTimeout) as error:
-            raise Away(f"the database {place} does not answer") from error
+            raise Unavailable(f"the database {place} does not respond") from error
         except library.errors.LockNotAvailable as error:
-            raise Away(f"another station holds a vehicle in the cache {place}") from error
+            raise Unavailable(f"another station has locked a vehicle in the cache {place}") from error
         except (library.OperationalError, library.InterfaceError) as error:
             text = self.address.without_password(" ".join(str(error).split()))
-            raise Away(f"the database {place} cannot be reached: {text}") from None
+            raise Unavailable(f"the database {place} cannot be reached: {text}") from None
         except (library.DataError, library.IntegrityError) as error:
             text = self.address.without_password(" ".join(str(error).split()))
-            raise CacheError(f"the cache {place} cannot take this: {text}") from None
-        except library.Error as error:  # read-only, forbidden, dropped: not the fault of what is written
+            raise CacheError(f"the cache {place} cannot store this: {text}") from None
+        except library.Error as error:  # read-only, forbidden, dropped: independent of the written data
             text = self.address.without_password(" ".join(str(error).split()))
-            raise Away(f"the database {place} cannot be used: {text}") from None
+            raise Unavailable(f"the database {place} cannot be used: {text}") from None
         except Damaged as damage:
             raise CacheError(f"the cache {place} is damaged ({damage})") from damage
 
@@ -237,14 +242,14 @@ class PostgresDatabase:
         settings = {
             "search_path": SCHEMA,
             "lock_timeout": LOCK_TIMEOUT,
-            "statement_timeout": round(1000 * ANSWER_TIMEOUT),
-            "idle_in_transaction_session_timeout": IDLE_TIMEOUT,
+            "statement_timeout": round(1000 * STATEMENT_TIMEOUT),
+            "idle_in_transaction_session_timeout": IDLE_TRANSACTION_TIMEOUT,
         }
         chosen = " ".join(f"-c {name}={value}" for name, value in settings.items())
         given = self.address.options
         defaults = {
             "connect_timeout": CONNECT_TIMEOUT,
-            "tcp_user_timeout": SILENCE,
+            "tcp_user_timeout": UNACKNOWLEDGED_MAX,
             "keepalives_idle": 10,
             "keepalives_interval": 5,
             "keepalives_count": 2,
@@ -255,7 +260,7 @@ class PostgresDatabase:
 
 
 class PostgresSession(Session):
-    """One transaction on the database."""
+    """One transaction in PostgreSQL."""
 
     is_shared = True
     SNAPSHOT_ORDER: ClassVar[str] = "s.at, s.id"
@@ -310,7 +315,7 @@ class PostgresSession(Session):
         self, owner: int, row: Sequence[object], blob: bytes, crc: int, number: int | None = None
     ) -> int:
         given = super().add_snapshot(owner, row, blob, crc, number)
-        if number is not None and number < OWN_NUMBERS:
+        if number is not None and number < LOCAL_NUMBERS_MIN:
             self._all(
                 "SELECT setval('snapshot_id_seq', greatest((SELECT last_value FROM snapshot_id_seq), ?))",
                 (number,),
@@ -326,7 +331,7 @@ class PostgresSession(Session):
         return [name for row in found for name in cells(row, "s")]
 
     def holders(self, owners: Sequence[int], names: Sequence[str]) -> Mapping[tuple[Any, ...], list[int]]:
-        # by names alone, so that it is the index by names that is read
+        # filtered by names only, so that the database uses the index by names
         found = self._all(
             "SELECT name, type, bits, is_raw, array_agg(owner) FROM param WHERE name = ANY (?)"
             " GROUP BY name, type, bits, is_raw",
@@ -387,19 +392,19 @@ _LAST: Final = (
 
 @cache
 def _marked(sql: str) -> bytes:
-    """A statement with psycopg's marks; no statement of ours has a question or percent mark in its text."""
+    """Return a statement with psycopg's placeholders. No statement has `?` or `%` in its text."""
     return sql.replace("?", "%s").encode()
 
 
 def _sent(cell: object) -> object:
-    """A cell as PostgreSQL takes it: its text cannot hold a zero, nor half a character."""
+    """Return a cell in PostgreSQL's form: its text type allows neither NUL nor lone surrogates."""
     if isinstance(cell, str):
         return cell.encode("utf-8", "backslashreplace").decode().replace("\0", "\\x00")
     return cell
 
 
 def _is_new(connection: psycopg.Connection[tuple[Any, ...]], writer: str, number: int) -> bool:
-    """Whether a writer has not done anything of this number yet; from now on it has."""
+    """Record an operation of a writer. Return whether it was not executed before."""
     return bool(
         connection.execute(
             "INSERT INTO writer (id, done) VALUES (%s, %s) ON CONFLICT (id)"
@@ -419,18 +424,22 @@ def _revisions(connection: psycopg.Connection[tuple[Any, ...]], keys: Sequence[s
 
 
 def _migrate(connection: psycopg.Connection[tuple[Any, ...]], place: str) -> None:
-    """Bring the schema to this version; two stations that do so at once do it one after the other."""
+    """Upgrade the schema to this version. Concurrent upgrades by several stations run one after another.
+
+    Raises:
+        CacheError: the schema is of a later version.
+    """
     if _version(connection) == len(MIGRATIONS):
         return
-    # ahead of the transaction: what another one has made meanwhile is seen from its beginning on
+    # locked before the transaction, so that the transaction sees an upgrade by another station
     connection.execute("SELECT pg_advisory_lock(%s)", (_MIGRATION_LOCK,))
     try:
         with connection.transaction():
             version = _version(connection)
             if version > len(MIGRATIONS):
                 raise CacheError(
-                    f"the cache {place} is of a later version of paramclient (its schema has {version},"
-                    f" this one knows {len(MIGRATIONS)}): upgrade"
+                    f"the cache {place} is of a later version of paramclient (its schema has version"
+                    f" {version}, this program knows {len(MIGRATIONS)}): upgrade paramclient"
                 )
             if version == 0:
                 connection.execute(f"CREATE SCHEMA IF NOT EXISTS {SCHEMA}")
@@ -453,10 +462,10 @@ def _version(connection: psycopg.Connection[tuple[Any, ...]]) -> int:
 
 @cache
 def _libraries() -> tuple[Any, Any]:
-    """psycopg and its pool.
+    """Return psycopg and psycopg_pool.
 
     Raises:
-        UsageError: they are missing.
+        UsageError: one of them is not installed.
     """
     try:
         import psycopg
@@ -470,19 +479,19 @@ def _libraries() -> tuple[Any, Any]:
 
 @cache
 def _connection_kind() -> Any:
-    """A connection that closes when a statement is not answered in `ANSWER_TIMEOUT`.
+    """Return a connection class that closes the connection when a statement exceeds `STATEMENT_TIMEOUT`.
 
-    No setting of the database or of TCP covers a server that hangs: it cancels no statement, while its
-    operating system goes on to acknowledge what it is sent.
+    No setting of the database or of TCP detects a server that hangs: it cancels no statement, while its
+    operating system continues to acknowledge received packets.
     """
 
-    class Connection(_libraries()[0].Connection):  # type: ignore[misc]  # loaded here, where it is wanted
+    class Connection(_libraries()[0].Connection):  # type: ignore[misc]  # imported at runtime
         def wait(self, work: Any, *arguments: Any, **options: Any) -> Any:
             return super().wait(self._limited(work), *arguments, **options)
 
         def _limited(self, work: Generator[Any, Any, T]) -> Generator[Any, Any, T]:
-            """Do the work, which psycopg resumes when the socket is ready, and ten times a second."""
-            deadline = time.monotonic() + ANSWER_TIMEOUT
+            """Run the work, which psycopg resumes when the socket is ready, and ten times a second."""
+            deadline = time.monotonic() + STATEMENT_TIMEOUT
             try:
                 wanted = next(work)
                 while time.monotonic() < deadline:
@@ -491,7 +500,7 @@ def _connection_kind() -> Any:
                 result: T = end.value
                 return result
             self.close()
-            raise _libraries()[0].OperationalError(f"no answer in {ANSWER_TIMEOUT:g} s")
+            raise _libraries()[0].OperationalError(f"no response in {STATEMENT_TIMEOUT:g} s")
 
     return Connection
 

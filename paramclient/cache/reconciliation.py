@@ -1,15 +1,15 @@
-"""What programs and stations observe of one vehicle, in one table: the later observation of a value counts.
+"""Reconciliation of observations of several programs and stations: the later observation of a value counts.
 
-An observation that is not older than what is kept of its parameter is written, with a line where the value
-has changed. An older one (its program was slow, or a station was away) finds its place in the history, and
-changes of the table only what nobody has observed since. So it does not matter which of two programs comes
-first. That a value was heard again and was the same leaves no line, so a late observation may find its change
-later, or earlier, than a log of everything would have it. Of two observations of the same moment the one that
-is written later counts.
+An observation that is not older than the stored value is written, with a history line if the value has
+changed. An older one (of a slow program, or of a station without a connection) is inserted into the history,
+and changes the table only where no later observation exists. The result therefore does not depend on the
+order of writes. Repeated observations of an unchanged value leave no history line, so a late observation may
+date its change later or earlier than a complete log. Of two observations with equal times, the one written
+later counts.
 
-Times are those of the clocks of the stations: these have to agree. Programs that share a file share a clock
-too. What such a file has of a later time than it is shows that the clock was set back since: that is older
-than what comes, whatever its time says.
+Times are those of the stations' clocks, which have to agree. Programs that share a file share a clock. If
+such a file has a time in the future, the clock was set back since: that value is older than new ones,
+independent of its time.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from paramclient.cache import tables
-from paramclient.cache.merge import SAME_CHANGE
+from paramclient.cache.merge import SAME_CHANGE_MAX
 from paramclient.cache.observed_table import HeardParams
 from paramclient.cache.records import BY_VEHICLE, CachedSummary, StoredParam, TableState, TableUpdate
 from paramclient.cache.rows import Row, time_cell
@@ -33,32 +33,31 @@ from paramclient.cache.tables import (
 )
 from paramclient.cache.transaction import Line, NumberedLine, Session
 
-__all__ = ["Past", "settle"]
+__all__ = ["Past", "reconcile"]
 
 
-def settle(session: Session, updates: Iterable[TableUpdate], present: float | None = None) -> None:
-    """Write what was learnt, see `ParamCache.save`.
+def reconcile(session: Session, updates: Iterable[TableUpdate], present: float | None = None) -> None:
+    """Write updates, see `ParamCache.save`.
 
     Args:
         session: the transaction.
-        updates: in the order given.
-        present: unix seconds by the clock that the times of the updates were read from; None for `at` of
-            each.
+        updates: the updates, in order of execution.
+        present: current time by the clock of the updates, in unix seconds; None uses `at` of each update.
     """
     for update in updates:
-        _settle(session, update, max(time_cell(update.at), 0.0 if present is None else present))
+        _reconcile(session, update, max(time_cell(update.at), 0.0 if present is None else present))
 
 
 @dataclass
 class Past:
-    """The history of a table from some moment on, into which more is put.
+    """The history of a table from some time on, into which observations are inserted.
 
     Attributes:
-        lines: in their order, with the numbers that they have; None for a new one.
-        known_since: since when the states of the table are known.
-        births: by name, when it appeared, or, of one that was in the first table and has changed since, when
-            the value that it had there was observed; the earliest of these times.
-        new_births: those that the observations bring.
+        lines: history lines in order, each with its number, or None for a new line.
+        known_since: time since which the states of the table are known, or None.
+        births: by name, the time at which it appeared or, for a changed parameter of the first table, at
+            which its first value was observed; the earliest of these times.
+        new_births: new or earlier times from the inserted observations.
     """
 
     lines: list[tuple[int | None, Line]]
@@ -69,14 +68,14 @@ class Past:
     def observe(
         self, name: str, seen: Row, by: str, kept: Row | None, *, ahead: Sequence[int | None] | None = None
     ) -> None:
-        """Put in what was observed at a time after which the value was heard again.
+        """Insert an observation of a parameter that was observed again later.
 
         Args:
             name: the parameter.
             seen: the value and its time.
-            by: who caused it, should it be a change.
-            kept: what the table has now, heard later; None where it has no such name.
-            ahead: what the last line of it ahead of `lines` made of it; None where there is none.
+            by: author, if the observation is a change.
+            kept: the stored row, observed later; None if the table has no such name.
+            ahead: new value of its last line before `lines`; None if there is none.
         """
         at = seen.heard_at
         place = next((n for n, (_, line) in enumerate(self.lines) if line[1] == name and line[0] > at), None)
@@ -84,7 +83,7 @@ class Past:
             if line[1] == name:
                 ahead = line[6:]
         is_known = ahead is not None
-        has_come_back = ahead is not None and ahead[0] is None  # with this value, or one that is older still
+        has_come_back = ahead is not None and ahead[0] is None  # with this value, or an older one
         if place is None:
             if kept is None or seen.same_value(kept):
                 return
@@ -101,7 +100,7 @@ class Past:
             return
         number, (later, _, later_by, *values) = self.lines[place]
         old, new = tuple(values[:3]), tuple(values[3:])
-        if _same(seen, old) or has_come_back:  # when it became `old` is not known
+        if _same(seen, old) or has_come_back:  # the time at which it became `old` is not known
             return
         born = self._born(name)
         if born is not None and at < born <= later and not is_known:  # it was `old` at `born`
@@ -109,7 +108,7 @@ class Past:
             self._insert((born, name, BY_VEHICLE, *seen.value, *old), before=place)
             return
         if _same(seen, new):
-            if later - at > SAME_CHANGE:  # it was so earlier than anybody knew
+            if later - at > SAME_CHANGE_MAX:  # the change was earlier than recorded
                 del self.lines[place]
                 self._insert((at, name, by, *old, *new))
             return
@@ -117,20 +116,21 @@ class Past:
         self._insert((at, name, by, *old, *seen.value))
 
     def _born(self, name: str, default: float | None = None) -> float | None:
-        """The time before which nothing is known of a name, as noted for it; a new one is the earlier."""
+        """Return the recorded time before which a name is unknown; a new record is the earlier one."""
         return self.new_births.get(name, self.births.get(name, default))
 
     def add(self, line: Line) -> None:
-        """Put in a line."""
+        """Insert a line by its time."""
         self._insert(line)
 
     def _insert(self, line: Line, *, before: int | None = None) -> None:
-        """Put in a line by its time, and ahead of the line in a place, should they be of one time."""
+        """Insert a line by its time, but at most at position `before`."""
         place = next((n for n, (_, each) in enumerate(self.lines) if each[0] > line[0]), len(self.lines))
         self.lines.insert(place if before is None else min(place, before), (None, line))
 
 
-def _settle(session: Session, update: TableUpdate, present: float) -> None:
+def _reconcile(session: Session, update: TableUpdate, present: float) -> None:
+    """Write one update: identity, values, history and the state of the table."""
     key, at = update.identity.key, update.at
     horizon = math.inf if session.is_shared else present + CLOCK_SLACK
     vehicle = next(iter(session.vehicles(key)), None)
@@ -153,7 +153,7 @@ def _settle(session: Session, update: TableUpdate, present: float) -> None:
     before: Mapping[str, Row] = {}
     after = before
     agrees = is_whole = True
-    if update.params or update.removed or update.replace:  # else it is about the table as a whole only
+    if update.params or update.removed or update.replace:  # otherwise it has only the state of the table
         before = session.table(owner)
         seen = _Seen(session, owner, table, before, horizon)
         after, agrees, is_whole = _write_values(session, owner, update, seen, is_late=is_late)
@@ -162,7 +162,7 @@ def _settle(session: Session, update: TableUpdate, present: float) -> None:
         if agrees:
             write_state(session, owner, state)
         elif state.complete and table is not None and not table.complete:
-            write_state(session, owner, replace(state, hash=None))  # the hash is of other values
+            write_state(session, owner, replace(state, hash=None))  # the hash belongs to other values
         else:
             state = None
     else:
@@ -179,8 +179,8 @@ def _write_values(
     """Write the values of an update.
 
     Returns:
-        the rows then, whether they agree with the update, and whether it has all of their names, where it is
-        of a whole table.
+        The new rows; whether they agree with the update; and, for an update with the whole table, whether it
+        has all of their names.
     """
     before = seen.rows
     part = update
@@ -205,12 +205,12 @@ def _write_values(
 def _divided(
     update: TableUpdate, seen: _Seen, *, is_late: bool
 ) -> tuple[TableUpdate, list[StoredParam], bool]:
-    """Return what of an update is news, what is overtaken, and whether that agrees with what is kept."""
+    """Return the new and the overtaken values of an update, and whether the latter match the stored ones."""
     table = seen.table
     newer: list[StoredParam] = []
     older: list[StoredParam] = []
     agrees = True
-    overtaken: dict[str, float] = {}  # what is older than an overtaken observation is overtaken too
+    overtaken: dict[str, float] = {}  # older observations of these names are overtaken too
     for item in update.params:
         name, is_listed = item.param.name, item.param.index is not None
         if not seen.is_news(name, item.heard_at, is_listed=is_listed):
@@ -223,12 +223,12 @@ def _divided(
         row = seen.rows.get(name)
         older.append(item)
         if row is not None and row.same_value(Row.of(item.param, None, False, item.heard_at)):
-            newer.append(replace(item, heard_at=row.heard_at))  # its place, perhaps, was not known yet
+            newer.append(replace(item, heard_at=row.heard_at))  # its index may have been unknown
         else:
             agrees = False
     count = None if update.table is None else update.table.count
     if is_late and table is not None and (count is None or table.count not in (None, count)):
-        newer = [_placeless(item) for item in newer]  # the places may be those of another count
+        newer = [_placeless(item) for item in newer]  # the indices may belong to another count
     return replace(update, params=newer), older, agrees
 
 
@@ -239,12 +239,13 @@ def _first_changes(
     births: Mapping[str, float],
     lines: Sequence[Line],
 ) -> list[tuple[str, float]]:
-    """Return when the values of a first table were observed that change now: their rows say it no more.
+    """Return the observation times of first-table values that change now, as their rows lose these times.
 
     Args:
-        session, owner: where the table is.
+        session: the transaction.
+        owner: id of the table.
         before: its rows.
-        births: the names that appear now, and when they were observed first.
+        births: new names with the times of their first observations.
         lines: the changes.
     """
     _, _, known_since = session.described(owner)
@@ -261,14 +262,15 @@ def _first_changes(
 
 @dataclass
 class _Seen:
-    """What is kept of a table, and since when it is known.
+    """The stored state of a table before an update.
 
     Attributes:
-        session, owner: where it is.
-        table: as it was before the update; None where there was none.
+        session: the transaction.
+        owner: id of the table.
+        table: the table; None if there was none.
         rows: its parameters.
-        horizon: unix seconds; what is kept of a later time is of a clock that was set back since.
-        gone: when parameters went last, once that was looked up.
+        horizon: unix seconds; later stored times are from before the clock was set back.
+        gone: times of the last removals by name, loaded on first use.
     """
 
     session: Session
@@ -279,19 +281,19 @@ class _Seen:
     gone: Mapping[str, float] | None = None
 
     def is_news(self, name: str, at: float, *, is_listed: bool = True) -> bool:
-        """Whether nothing later is kept of a parameter than an observation of this time.
+        """Return whether the cache has no later observation of a parameter.
 
         Args:
             name: the parameter.
-            at: the time.
-            is_listed: whether a whole table would have it, if the vehicle has.
+            at: time of the observation, in unix seconds.
+            is_listed: whether a complete table includes the parameter if the vehicle has it.
         """
         row, table = self.rows.get(name), self.table
         if row is not None:
             return row.heard_at <= at or row.heard_at > self.horizon
         if table is None or table.updated_at <= at or table.updated_at > self.horizon:
             return True
-        is_whole = table.complete and table.size >= (table.count or 0)  # a fresh file may have a part of it
+        is_whole = table.complete and table.size >= (table.count or 0)  # a new file may have only a part
         if is_listed and is_whole and table.synced_at is not None and table.synced_at > at:
             return False
         if self.gone is None:
@@ -306,7 +308,7 @@ def _write_past(
     lines: Sequence[Line],
     seen: _Seen,
 ) -> None:
-    """Put lines and overtaken observations into their places in the history, by their times."""
+    """Insert lines and overtaken observations into the history, by time."""
     times = [item.heard_at for item in older] + [line[0] for line in lines]
     if not times:
         return
@@ -324,7 +326,7 @@ def _write_past(
         row = Row.of(item.param, None, False, item.heard_at)
         became = session.last_became(owner, name, since)
         past.observe(name, row, item.by, seen.rows.get(name), ahead=became)
-    for line in lines:  # after the others: up to here it was as the row says
+    for line in lines:  # after the observations, which refer to the rows before these changes
         past.add(line)
     session.add_first_times(owner, past.new_births.items())
     if past.lines == kept:
@@ -339,7 +341,7 @@ def _write_past(
 
 
 def _respectful(update: TableUpdate, table: CachedSummary) -> TableState | None:
-    """What an update says of the table as a whole, unless that is less than what is known."""
+    """Return the table state of an update; None if the stored state has more information."""
     state = update.table
     if state is None or state.complete or update.replace or not table.complete:
         return state

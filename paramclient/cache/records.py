@@ -1,4 +1,4 @@
-"""What goes into the cache and what comes out. All times are unix seconds, given by the caller."""
+"""Records that the cache stores and returns. All times are in unix seconds and given by the caller."""
 
 from __future__ import annotations
 
@@ -29,27 +29,27 @@ __all__ = [
 ]
 
 BY_US: Final = "us"
-"""A change that one of our own writes caused; `us for NAME` where it was told for whom."""
+"""Author of a change by a write of this client; `us for NAME` if the write names a user."""
 BY_VEHICLE: Final = "vehicle"
-"""A change that the vehicle made itself, or that came to light in a download."""
+"""Author of a change by the vehicle, and of a change that a download has shown."""
 
 
 def by_station(system: int, component: int) -> str:
-    """A change that another ground station's write caused: `station 254/190`."""
+    """Return the author of a change by another ground station: `station 254/190`."""
     return f"station {system}/{component}"
 
 
 @dataclass(frozen=True, slots=True)
 class StoredParam:
-    """One parameter to keep.
+    """One parameter to store.
 
     Attributes:
-        param: the parameter; its trust is not kept. An index of None leaves a known index as it is, except
+        param: the parameter; its trust is not stored. An index of None does not change a stored index, except
             in a whole table.
-        heard_at: when the vehicle said so, not after the update's `at`. Of two observations of a parameter
-            the later one counts, whichever is saved first.
-        volatile: whether the vehicle leaves it out of its hash; None leaves what is known.
-        by: who caused the change, should it be one: `BY_US`, `us for NAME`, `BY_VEHICLE` or `by_station(…)`.
+        heard_at: time of the observation, not after the update's `at`. The later of two observations of a
+            parameter counts, independent of the order of writes.
+        volatile: whether the vehicle's hash excludes the parameter; None does not change the stored flag.
+        by: author, if the value is a change: `BY_US`, `us for NAME`, `BY_VEHICLE` or `by_station(…)`.
     """
 
     param: Param
@@ -60,15 +60,15 @@ class StoredParam:
 
 @dataclass(frozen=True, slots=True)
 class TableState:
-    """What is known of a table as a whole.
+    """State of a table as a whole.
 
     Attributes:
-        hash: the hash under which the vehicle would confirm exactly this table; None while unknown.
+        hash: the vehicle's hash of exactly this table; None if unknown.
         count: param_count of the vehicle.
-        complete: every index was heard.
-        volatile_known: which parameters are volatile was proven by computing the hash anew.
-        synced_at: when the table was last proven to be the vehicle's.
-        file_works: whether the vehicle, with this firmware, gives the table as one file; None while unknown.
+        complete: whether every index was received.
+        volatile_known: whether the set of volatile parameters was verified by computing the hash.
+        synced_at: time of the last verification of the table against the vehicle.
+        file_works: whether the vehicle, with this firmware, serves the table as a file; None if unknown.
     """
 
     hash: int | None = None
@@ -81,20 +81,20 @@ class TableState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TableUpdate:
-    """What was learnt of one component's table.
+    """Update of the table of one component.
 
     Attributes:
         identity: the vehicle.
         component: component id.
         autopilot: MAV_AUTOPILOT of this component's heartbeat.
-        at: when this was learnt.
-        table: the state of the table with this update applied. None leaves it, with one exception: a change
-            of what the hash covers takes the hash away.
-        params: what to insert or change, in the order in which it was heard.
+        at: time of the update.
+        table: the state of the table after this update. None does not change it, with one exception: a change
+            of a value that the hash covers removes the hash.
+        params: parameters to insert or change, in the order of reception.
         removed: names that the vehicle no longer has.
-        removed_at: when each of them was found missing; of the others it was at `at`.
-        replace: `params` are the whole table: names that are not in it go.
-        whole_at: when the vehicle was found to have no other names than those; None for `at`.
+        removed_at: times at which names were found missing; `at` for all others.
+        replace: whether `params` are the whole table: other names are removed.
+        whole_at: time at which the vehicle was found to have no other names; None for `at`.
     """
 
     identity: Identity
@@ -109,7 +109,7 @@ class TableUpdate:
     whole_at: float | None = None
 
     def gone_at(self, name: str) -> float:
-        """Return when a name that this update takes away was found missing."""
+        """Return the time at which a name that this update removes was found missing."""
         at = self.removed_at.get(name)
         if at is None:
             at = self.whole_at if self.replace and name not in self.removed else None
@@ -121,12 +121,12 @@ class HistoryEntry:
     """One change of a value.
 
     Attributes:
-        at: when it was heard.
+        at: time at which the change was received.
         component: component id.
         name: the parameter.
-        old: what it was. Its index is None.
-        new: what it became; None where the vehicle no longer has the parameter.
-        by: who caused it, as in `StoredParam.by`.
+        old: the previous value. Its index is None.
+        new: the new value; None if the vehicle no longer has the parameter.
+        by: author, as in `StoredParam.by`.
     """
 
     at: float
@@ -139,17 +139,17 @@ class HistoryEntry:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class SnapshotSummary:
-    """A table as it was set down at a moment, without its parameters.
+    """A snapshot of a table, without its parameters.
 
     Attributes:
-        id: its number in the cache, which no other snapshot ever gets.
-        key: the name under which the vehicle's tables are kept.
+        id: its number in the cache, unique for all time.
+        key: key of the vehicle in the cache.
         component: component id.
-        at: when, to the millisecond.
-        reason: what for, in words.
-        size: parameters in it.
-        hash: the hash under which the vehicle would have confirmed it; None where none was known.
-        complete: it has every parameter that the vehicle had.
+        at: time of the snapshot, to the millisecond.
+        reason: the reason, as text.
+        size: number of parameters.
+        hash: the vehicle's hash of this table; None if unknown.
+        complete: whether it has every parameter that the vehicle had.
     """
 
     id: int
@@ -169,10 +169,10 @@ class SnapshotSummary:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Snapshot(SnapshotSummary):
-    """A table as it was set down at a moment.
+    """A snapshot of a table.
 
     Attributes:
-        params: its parameters, with type and default where they were known, and who the vehicle was then.
+        params: its parameters, with known types and defaults, and the identity of the vehicle at that time.
     """
 
     params: ParamSet = field(hash=False)
@@ -180,10 +180,10 @@ class Snapshot(SnapshotSummary):
 
 @dataclass(frozen=True, slots=True)
 class CacheChange:
-    """A table that another station has written to.
+    """A write of another station to a table.
 
     Attributes:
-        key: the name under which the vehicle's tables are kept.
+        key: key of the vehicle in the cache.
         component: component id.
     """
 
@@ -193,13 +193,13 @@ class CacheChange:
 
 @dataclass(frozen=True, slots=True)
 class CachedVehicle:
-    """A vehicle of which tables are kept.
+    """A vehicle with cached tables.
 
     Attributes:
-        key: the name under which its tables are kept.
-        identity: as it was last seen.
-        first_seen, last_seen: when.
-        components: the ids of the components that have a table.
+        key: its key in the cache.
+        identity: its last known identity.
+        first_seen, last_seen: times of the first and last observation.
+        components: ids of the components with a table.
     """
 
     key: str
@@ -216,16 +216,16 @@ class CachedVehicle:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class CachedSummary:
-    """One component's table, without its parameters.
+    """The cached table of one component, without its parameters.
 
     Attributes:
-        key: the name under which the vehicle's tables are kept.
+        key: key of the vehicle in the cache.
         identity: the vehicle.
         component: component id.
         autopilot: MAV_AUTOPILOT of this component's heartbeat.
-        size: parameters kept.
+        size: number of cached parameters.
         hash, count, complete, volatile_known, synced_at, file_works: as in `TableState`.
-        updated_at: when anything of it was last written.
+        updated_at: time of the last write to the table.
     """
 
     key: str
@@ -243,7 +243,7 @@ class CachedSummary:
 
     @property
     def system(self) -> int:
-        """System id under which the vehicle was last seen."""
+        """The last known system id of the vehicle."""
         return self.identity.system
 
     def __repr__(self) -> str:
@@ -257,14 +257,14 @@ class CachedSummary:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class CachedComponent(CachedSummary):
-    """One component's table as it was last known, usable with no link.
+    """The cached table of one component, usable without a link.
 
     Attributes:
-        params: by name, ordered by index, then name; those without an index last. Trust is CACHED.
-        volatile: the names that the vehicle leaves out of its hash, as far as known.
-        heard_at: by name, when the vehicle last gave the value.
-        left_out: names that an earlier version has kept and no parameter file can hold: they are not in
-            `params`, and go with the next whole table.
+        params: parameters by name, ordered by index, then name; those without an index last. Trust is CACHED.
+        volatile: known names outside the vehicle's hash.
+        heard_at: by name, time of the last observation of the value.
+        left_out: names written by an earlier version that no parameter file can hold. They are not in
+            `params`, and are removed with the next whole table.
     """
 
     params: ParamMap = field(hash=False)
@@ -274,11 +274,11 @@ class CachedComponent(CachedSummary):
     _history: Callable[[str | None, int | None], list[HistoryEntry]] = field(compare=False)
 
     def history(self, name: str | None = None, limit: int | None = None) -> list[HistoryEntry]:
-        """The changes of its values, newest last; none once the table has been removed from the cache.
+        """Return the changes of its values, newest last. Empty after the table was removed from the cache.
 
         Args:
-            name: of this parameter only.
-            limit: the newest so many.
+            name: only changes of this parameter.
+            limit: maximum number of changes, the newest.
 
         Raises:
             CacheError: the cache cannot be read, or is closed.

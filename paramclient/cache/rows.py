@@ -1,4 +1,4 @@
-"""Records to cells and back. Whatever does not look like what was written is damage, not a value."""
+"""Conversion between records and database cells. Cells that cannot have been written raise `Damaged`."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ __all__ = [
 ]
 
 YEAR_10000: Final = 253402300800.0
-"""Unix seconds in which no time that is stored can lie any more."""
+"""Unix seconds at the start of the year 10000, above every stored time."""
+# Python types of a cell, by the letters of `cells`.
 _KINDS: Final[dict[str, tuple[type, ...]]] = {
     "i": (int,),
     "f": (float,),
@@ -41,30 +42,35 @@ _KINDS: Final[dict[str, tuple[type, ...]]] = {
     "S": (str, type(None)),
 }
 _MASK_64: Final = (1 << 64) - 1
+"""Mask of 64 bits, which converts a signed integer of the database to unsigned."""
 _ENDS: Final = tuple(1 << 8 * (ParamType(each).size if 1 <= each <= 10 else 4) for each in range(256))
-"""By type: what the bits of a value are below. Of a type that MAVLink does not define they are the four bytes
-of the message, as they are of a value that is kept raw."""
+"""By type: upper limit of the bits of a value, exclusive. For a type that MAVLink does not define, and for
+raw values, the bits are the four bytes of the message."""
 _TIMES: Final[dict[tuple[object, ...], tuple[int, ...]]] = {}
-"""Where rows of a shape hold times: by the kinds and the types of cells that were found to be right."""
+"""Positions of times in a row, by the kinds and types of its cells, for valid rows so far."""
 _name: Final = itemgetter(0)
-_new = tuple.__new__  # what a named tuple's own constructor ends in, after twice the time
+_new = tuple.__new__  # half the time of a named tuple's own constructor, which ends in this call
 
 
 class Damaged(Exception):
-    """The file does not hold what was written to it. Work may raise this; it never reaches a caller."""
+    """The content of a store is not what was written to it. Internal: callers receive a CacheError."""
 
     kind = "damaged"
 
 
 def cells(row: Sequence[object], kinds: str) -> Any:
-    """Give a row back whose cells are what they should be; else `Damaged`.
+    """Check the types of a row's cells, and return the row.
 
     Args:
-        kinds: a letter for each cell: i integer, f time, s text; in capitals where NULL is possible.
+        row: the cells.
+        kinds: a letter for each cell: i integer, f time, s text; a capital letter if NULL is possible.
+
+    Raises:
+        Damaged: a cell has another type, or is not a valid time.
     """
     shape = (kinds, *map(type, row))
     times = _TIMES.get(shape)
-    if times is None:  # a row like none before; those of a table are all like a few
+    if times is None:  # the first row of this shape; the rows of a table have only a few shapes
         times = _TIMES[shape] = _times(row, kinds)
     for place in times:
         if not 0 <= row[place] < YEAR_10000:  # type: ignore[operator]  # the shape says that it is a float
@@ -73,26 +79,44 @@ def cells(row: Sequence[object], kinds: str) -> Any:
 
 
 def time_cell(at: float) -> float:
-    """A time to be stored: unix seconds, before the year 10000; else UsageError."""
+    """Check and return a time to store.
+
+    Raises:
+        UsageError: the time is not in unix seconds, from 0 to before the year 10000.
+    """
     if not 0 <= at < YEAR_10000:
         raise UsageError(f"{at!r} is not a time in unix seconds")
     return float(at)
 
 
 def identity_cells(identity: Identity) -> tuple[object, ...]:
-    """A vehicle's cells, in the order of the attributes."""
+    """Return the cells of an identity, in the order of its attributes."""
     *described, capabilities = astuple(identity)
     return (*described, signed(capabilities))
 
 
 def read_identity(row: Sequence[object]) -> Identity:
-    """The inverse of `identity_cells`."""
+    """Return the identity of cells from `identity_cells`.
+
+    Raises:
+        Damaged: a cell has a wrong type.
+    """
     identity = Identity(*cells(row, "isSiiisiiii"))
     return replace(identity, capabilities=identity.capabilities & _MASK_64)
 
 
 class Row(NamedTuple):
-    """A parameter's cells, without its name. Two rows are equal when nothing of them needs to be written."""
+    """The cells of a parameter, without its name. Equal rows need no write.
+
+    Attributes:
+        type: number of the MAVLink type.
+        bits: the value's bits, as a signed integer.
+        is_raw: 1 if the value is only known as the four bytes of the message.
+        param_index: index, or None.
+        volatile: 1 if the vehicle's hash excludes the parameter.
+        heard_at: time of the observation, in unix seconds.
+        default_bits: bits of the firmware's default, or None.
+    """
 
     type: int
     bits: int
@@ -104,7 +128,11 @@ class Row(NamedTuple):
 
     @classmethod
     def of(cls, param: Param, index: int | None, volatile: bool, heard_at: float) -> Row:
-        """The cells of a parameter."""
+        """Return the row of a parameter.
+
+        Raises:
+            UsageError: the time is not in unix seconds.
+        """
         number = int(param.type)
         bits = param.bits
         default = None if param.default is None else signed(bits_of(param.default, number))
@@ -123,30 +151,34 @@ class Row(NamedTuple):
 
     @property
     def value(self) -> tuple[int, int, int]:
-        """type, bits, is_raw: what `read_param` takes."""
+        """Type, bits and is_raw, the arguments of `read_param`."""
         return self[:3]
 
     @property
     def hashed(self) -> tuple[int, int, int] | None:
-        """What the vehicle's hash covers of it: its value, or nothing where it is volatile or not in use."""
+        """The value if the vehicle's hash covers it; None if the parameter is volatile or not in use."""
         return None if self.volatile or self.param_index is None else self.value
 
     def same_value(self, other: Row) -> bool:
-        """Whether both hold the same value in the same type (−0 equals 0)."""
+        """Return whether two rows have the same value and type (−0 equals 0)."""
         return (self.type, self.is_raw) == (other.type, other.is_raw) and same_bits(
             self.type, self.bits & _MASK_64, other.bits & _MASK_64
         )
 
 
 def read_rows(found: Iterable[Sequence[object]]) -> dict[str, Row]:
-    """The rows of a table by name, of cells in this order: name, then as in `Row`."""
+    """Return the rows of a table by name, from cells in the order name, then as in `Row`.
+
+    Raises:
+        Damaged: a cell has a wrong type.
+    """
     return {row[0]: _new(Row, row[1:]) for row in (cells(each, "siiiIifI") for each in found)}
 
 
 def checksum(rows: Mapping[str, Row]) -> int:
-    """A CRC-32 of all that is kept of a table's parameters, whatever their order.
+    """Return a CRC-32 of all rows of a table, independent of their order.
 
-    A row without a default counts as it did before there were any.
+    A row without a default gives the checksum of earlier versions, which had no defaults.
     """
     kept = [
         (name, *(row[:-1] if row.default_bits is None else row))
@@ -163,7 +195,11 @@ def read_param(
     index: int | None = None,
     default_bits: int | None = None,
 ) -> Param:
-    """The parameter of a row's `value`; its trust is CACHED."""
+    """Return the parameter of a row's `value`, with trust CACHED.
+
+    Raises:
+        Damaged: the value or the type is not valid.
+    """
     value = _value(number, bits, bool(is_raw))
     default = None if default_bits is None else _value(number, default_bits, False)
     if not 0 <= number <= 255:
@@ -172,12 +208,16 @@ def read_param(
 
 
 def read_params(rows: Mapping[str, Row]) -> Params:
-    """The parameters of a table, as it keeps them; their trust is CACHED."""
+    """Return the parameters of rows, with trust CACHED."""
     return read_cells((name, *row[:4], row.default_bits) for name, row in rows.items())
 
 
 def read_cells(cells_: Iterable[tuple[str, int, int, int, int | None, int | None]]) -> Params:
-    """The same of name, type, bits, is_raw, index and default of each."""
+    """Return the parameters of cells: name, type, bits, is_raw, index and default, with trust CACHED.
+
+    Raises:
+        Damaged: a value, type or index is not valid.
+    """
     params = Params()
     held, defaults = params.held, params.defaults
     for name, number, bits, is_raw, index, default_bits in cells_:
@@ -197,7 +237,11 @@ def read_cells(cells_: Iterable[tuple[str, int, int, int, int | None, int | None
 
 
 def _times(row: Sequence[object], kinds: str) -> tuple[int, ...]:
-    """Where a row holds times; `Damaged` where a cell is not of its kind."""
+    """Return the positions of times in a row.
+
+    Raises:
+        Damaged: a cell has a wrong type.
+    """
     for cell, kind in zip(row, kinds, strict=True):
         if not isinstance(cell, _KINDS[kind]):
             raise Damaged(f"a cell holds {cell!r:.40}")
@@ -213,5 +257,5 @@ def _value(number: int, bits: int, is_raw: bool) -> Value:
 
 
 def signed(number: int) -> int:
-    """A 64-bit unsigned number as SQLite's integers, which are signed, can hold it."""
+    """Return a 64-bit unsigned number as signed, the form of SQLite's integers."""
     return number - (1 << 64) if number >> 63 else number

@@ -1,4 +1,4 @@
-"""The schema of the cache in a file, version after version."""
+"""Schema of the cache in a file, by version."""
 
 from __future__ import annotations
 
@@ -13,11 +13,15 @@ from paramclient.errors import UsageError
 __all__ = ["MIGRATIONS", "Step"]
 
 Step: TypeAlias = tuple[str | Callable[[sqlite3.Connection], None], ...]
-"""What leads from one version to the next: statements, and what statements cannot do."""
+"""Changes from one version to the next: SQL statements, and functions for other changes."""
 
 
 def _pack_tables(connection: sqlite3.Connection) -> None:
-    """Make one blob of each table's parameters; `Damaged` where one is not what was written."""
+    """Convert the parameters of each table to a blob.
+
+    Raises:
+        Damaged: a table has a wrong checksum or invalid cells.
+    """
     for owner, expected in connection.execute("SELECT id, checksum FROM component").fetchall():
         found = connection.execute(
             "SELECT name, type, bits, is_raw, param_index, volatile, heard_at, default_bits FROM param"
@@ -102,7 +106,7 @@ MIGRATIONS: Final[tuple[Step, ...]] = (
         "ALTER TABLE component ADD COLUMN file_works INTEGER",
     ),
     (
-        # Which names a table has got since is not known of one that is older than this: it begins now.
+        # Earlier versions did not record new names, so the known states of their tables begin now.
         "ALTER TABLE component ADD COLUMN known_since REAL",
         """UPDATE component SET known_since = max(
             updated_at,
@@ -138,7 +142,7 @@ MIGRATIONS: Final[tuple[Step, ...]] = (
         "CREATE INDEX history_of_param ON history (owner, name)",
     ),
     (
-        # Beside the component: its row is written to at each save, and would carry the blob along.
+        # A table of its own: the row of the component is rewritten by each save, including a blob in it.
         """CREATE TABLE packed (
             owner INTEGER PRIMARY KEY REFERENCES component (id) ON DELETE CASCADE,
             size INTEGER NOT NULL,
@@ -149,5 +153,5 @@ MIGRATIONS: Final[tuple[Step, ...]] = (
         "DROP TABLE param",
     ),
 )
-"""The changes that lead from each schema version to the next; the version is the number of steps taken. What
-stands here never changes."""
+"""Changes from each schema version to the next. The version is the number of steps executed. Released steps
+never change."""

@@ -1,7 +1,8 @@
-"""Set-ups that run: noted on the disk, so that one whose process has ended can be told of.
+"""Notes about running set-ups on the disk, so that an interrupted set-up can be reported.
 
-Each is a small file in a folder beside the cache, locked by the process at work. The system takes the lock
-away when that process ends, however it ends; a file that nobody has locked is of a set-up that was cut off.
+Each note is a small file in a folder beside the cache, locked by the process that runs the set-up. The
+operating system releases the lock when that process ends; a file without a lock belongs to an interrupted
+set-up.
 """
 
 from __future__ import annotations
@@ -23,31 +24,32 @@ from paramclient.errors import CacheError
 
 __all__ = ["CutOff", "RunningSetup", "SetupNotes"]
 
-MOST_KEPT: Final = 64
-"""Set-ups that were cut off and are remembered, the newest."""
-LONGEST_NOTE: Final = 65_536
-"""Bytes of one file: its first line, and a line for each second of half an hour."""
+INTERRUPTED_MAX: Final = 64
+"""Maximum number of interrupted set-ups that are kept, the newest."""
+NOTE_BYTES_MAX: Final = 65_536
+"""Maximum size of one file in bytes: its first line, and a line for each second of half an hour."""
 NOTE_INTERVAL: Final = 1.0
-"""Seconds between two notes of how far a set-up is: what is noted last may be older by that."""
+"""Seconds between two progress notes of a set-up: the last note may be older by this time."""
 _SUFFIX: Final = ".json"
+"""Suffix of the files."""
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class CutOff:
-    """A set-up that has not come to its end, as the process at work ended before.
+    """An interrupted set-up: its process ended before the set-up did.
 
     Attributes:
-        id: its name.
+        id: its id.
         kind: "apply" or "restore".
-        key: of the vehicle in the cache, or None where it was not known yet.
-        link, system, component: where the vehicle was heard.
-        asked_by: for whom it was done.
-        began: unix seconds.
-        at: when it was last known to run, in unix seconds.
-        done, total: values that were written by then, and that were to be written as far as known.
-        is_told: whether it was told of already.
+        key: key of the vehicle in the cache, or None if it was not known yet.
+        link, system, component: link and ids of the vehicle.
+        asked_by: the user who has requested it.
+        began: start time, in unix seconds.
+        at: last time at which it was known to run, in unix seconds.
+        done, total: values written by then, and known values to write.
+        is_told: whether it was reported already.
     """
 
     id: str
@@ -69,8 +71,8 @@ class RunningSetup:
 
     Args:
         path: the file.
-        descriptor: of the file, locked.
-        clock: unix seconds.
+        descriptor: the locked file descriptor.
+        clock: returns unix seconds.
     """
 
     def __init__(self, path: Path, descriptor: int, clock: Callable[[], float]) -> None:
@@ -82,13 +84,13 @@ class RunningSetup:
         self._far: dict[str, Any] = {}
 
     def note(self, **far: Any) -> None:
-        """Note how far it is (`done`, `total`, `key`), once a second. A power cut may take that."""
+        """Write its progress (`done`, `total`, `key`), at most once a second. A power loss may lose it."""
         self._far = far
         if abs(self._clock() - self._noted_at) >= NOTE_INTERVAL:
             self._write()
 
     def end(self) -> None:
-        """It has come to an end, and needs no note any more."""
+        """Remove the note after the end of the set-up."""
         with suppress(OSError):
             os.close(self._descriptor)
         with suppress(OSError):
@@ -96,7 +98,7 @@ class RunningSetup:
             _sync_folder(self._path.parent)
 
     def cut_off(self) -> None:
-        """It ends before its time, as the process does: leave the note."""
+        """Write the last progress and keep the note: the process ends before the set-up."""
         self._write()
         with suppress(OSError):
             os.fsync(self._descriptor)
@@ -105,18 +107,18 @@ class RunningSetup:
     def _write(self) -> None:
         self._noted_at = self._clock()
         line = _line({**self._far, "at": self._noted_at})
-        if self._length + len(line) > LONGEST_NOTE:
+        if self._length + len(line) > NOTE_BYTES_MAX:
             return
-        with suppress(OSError):  # the first line is there, and that is what counts
+        with suppress(OSError):  # the first line exists, which is enough to report the set-up
             self._length += os.write(self._descriptor, line)
 
 
 class SetupNotes:
-    """The notes of all set-ups that run over a cache, and of those that were cut off. Every call blocks.
+    """The notes of all running and interrupted set-ups of a cache. Every call blocks.
 
     Args:
-        folder: the folder; it is made when something is to be noted.
-        clock: unix seconds.
+        folder: the folder; created with the first note.
+        clock: returns unix seconds.
     """
 
     def __init__(self, folder: Path, *, clock: Callable[[], float] = time.time) -> None:
@@ -125,16 +127,23 @@ class SetupNotes:
 
     @classmethod
     def beside(cls, cache: str | os.PathLike[str]) -> SetupNotes:
-        """Those that belong to a cache: the folder of its name with `.setups` for a suffix."""
+        """Return the notes of a cache: in the folder with its name and the suffix `.setups`."""
         return cls(Path(cache).with_suffix(".setups"))
 
     def begin(
         self, name: str, kind: str, *, link: str, system: int, component: int, asked_by: str, key: str | None
     ) -> RunningSetup:
-        """Note that a set-up begins. When this returns, it is on the disk.
+        """Write a note about a new set-up, and sync it to the disk.
+
+        Args:
+            name: id of the set-up.
+            kind: "apply" or "restore".
+            link, system, component: link and ids of the vehicle.
+            asked_by: the user who has requested it.
+            key: key of the vehicle in the cache, or None.
 
         Raises:
-            CacheError: it cannot be noted.
+            CacheError: the note cannot be written.
         """
         now = self._clock()
         begun = CutOff(name, kind, key, link, system, component, asked_by, now, now)
@@ -153,14 +162,16 @@ class SetupNotes:
                 path.unlink()
                 raise
         except OSError as error:
-            raise CacheError(f"the set-up cannot be noted in {self.folder}: {error.strerror}") from error
+            raise CacheError(
+                f"the note of the set-up cannot be written to {self.folder}: {error.strerror}"
+            ) from error
         return RunningSetup(path, descriptor, self._clock)
 
     def cut_off(self, *, tells: bool = False) -> list[CutOff]:
-        """The set-ups that were cut off, the first one first. Without the folder there are none.
+        """Return the interrupted set-ups, the oldest first; empty if the folder does not exist.
 
         Args:
-            tells: note that they are told of now; those beyond `MOST_KEPT` are forgotten then.
+            tells: mark them as reported, and delete the oldest beyond `INTERRUPTED_MAX`.
         """
         paths: list[Path] = []
         with suppress(FileNotFoundError):
@@ -168,12 +179,12 @@ class SetupNotes:
         read = [self._read(path, tells=tells) for path in paths]
         found = sorted(filter(None, read), key=lambda note: note.at)
         if tells:
-            for note in found[:-MOST_KEPT]:
+            for note in found[:-INTERRUPTED_MAX]:
                 (self.folder / f"{note.id}{_SUFFIX}").unlink(missing_ok=True)
-        return found[-MOST_KEPT:]
+        return found[-INTERRUPTED_MAX:]
 
     def _read(self, path: Path, *, tells: bool) -> CutOff | None:
-        """What a file tells, unless it is of a set-up that runs, or none at all."""
+        """Return the note in a file; None if its set-up is running, or the file is not a note."""
         try:
             descriptor = os.open(path, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0))
         except OSError:
@@ -181,7 +192,7 @@ class SetupNotes:
         try:
             if not stat.S_ISREG(os.fstat(descriptor).st_mode) or not try_to_lock(descriptor):
                 return None
-            note = _parsed(os.read(descriptor, LONGEST_NOTE))
+            note = _parsed(os.read(descriptor, NOTE_BYTES_MAX))
             if note is None or note.id != path.stem:
                 return None
             if tells and not note.is_told:
@@ -195,7 +206,7 @@ class SetupNotes:
 
 
 def _parsed(data: bytes) -> CutOff | None:
-    """The note in a file: its first line, with what later lines say of it; None for anything else."""
+    """Return the note in a file: its first line, updated by later lines; None if it is not a note."""
     told: dict[str, Any] = {}
     kinds = {"began": float, "at": float, "system": int, "component": int, "done": int, "total": int}
     for line in data.split(b"\n")[:-1]:
@@ -221,7 +232,7 @@ def _line(told: dict[str, Any]) -> bytes:
 if sys.platform == "win32":
 
     def _sync_folder(folder: Path) -> None:
-        """Nothing: a folder cannot be opened there."""
+        """Do nothing: Windows cannot open a folder."""
 
 else:
 

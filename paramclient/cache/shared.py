@@ -1,11 +1,10 @@
-"""A cache that stations share: in a database while that can be reached, in a local copy while it cannot.
+"""SharedStore: a cache in a database shared by stations, with a local copy for the time without a connection.
 
-While the database is there, it is what is read and written, and the local copy follows it. When it is lost,
-what is written goes into the local copy, and waits in an outbox there. When it is back, that is done in the
-database, in order, each thing once, before anything else is.
+While the database is connected, reads and writes use it, and the local copy follows. Without a connection,
+reads and writes use the local copy, and writes are queued in its outbox. After the reconnection, queued
+writes are executed in the database first, in order, each exactly once.
 
-A thread of each cache listens to the database: it learns what other stations have written, and finds the
-database again.
+A thread of each cache listens to the database. It receives the writes of other stations, and reconnects.
 """
 
 from __future__ import annotations
@@ -25,13 +24,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 from uuid import uuid4
 
-from paramclient.cache.database_url import Address
-from paramclient.cache.operations import Operation, Remove, SetDown
+from paramclient.cache.database_url import DatabaseAddress
+from paramclient.cache.operations import Operation, Remove, StoreSnapshot
 from paramclient.cache.outbox import Entry, LocalCopy
-from paramclient.cache.postgres import Away, PostgresDatabase, Revisions
+from paramclient.cache.postgres import PostgresDatabase, Revisions, Unavailable
 from paramclient.cache.records import CacheChange, Snapshot
 from paramclient.cache.transaction import Session
-from paramclient.cache.transfer import OWN_NUMBERS, Join, take_whole
+from paramclient.cache.transfer import LOCAL_NUMBERS_MIN, JoinTable, take_whole
 from paramclient.errors import CacheError, UsageError
 
 if TYPE_CHECKING:
@@ -39,11 +38,12 @@ if TYPE_CHECKING:
 
 __all__ = ["SharedStore"]
 
-RETRY_FIRST: Final = 0.1
-RETRY_LAST: Final = 5.0
-"""Seconds until a database that cannot be reached is tried again: the first time, and after many times."""
-BATCH: Final = 50
-"""Operations of the outbox that are done in one transaction."""
+RETRY_INTERVAL_MIN: Final = 0.1
+"""Seconds before the first attempt to reconnect to the database; doubled after each attempt."""
+RETRY_INTERVAL_MAX: Final = 5.0
+"""Maximum seconds between two attempts to reconnect."""
+DELIVERY_BATCH: Final = 50
+"""Number of operations of the outbox in one transaction."""
 
 _log = logging.getLogger("paramclient.cache")
 T = TypeVar("T")
@@ -57,11 +57,11 @@ class SharedStore:
         path: the local copy.
 
     Attributes:
-        path: the same.
-        place: the database, without a password.
+        path: the local copy.
+        place: URL of the database, without password.
     """
 
-    def __init__(self, address: Address, path: Path) -> None:
+    def __init__(self, address: DatabaseAddress, path: Path) -> None:
         self.path = path
         self.place = address.place
         self._link = _Link(address, path)
@@ -69,50 +69,50 @@ class SharedStore:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What went wrong with the local copy and was mended."""
+        """Repaired problems of the local copy: one text for each file that was renamed."""
         return tuple(self._link.local.database.notes)
 
     @property
     def replacements(self) -> int:
-        """None: what a database holds, it holds."""
+        """Always 0: only a file can be replaced."""
         return 0
 
     @property
     def away(self) -> str | None:
-        """Why the local copy is what is read and written at present; None while it is the database."""
+        """Why the local copy is used at present; None while the database is used."""
         return self._link.away
 
     def read(self, work: Callable[[Session], T]) -> T:
-        """Do work that only reads, in one transaction."""
+        """See `Store.read`."""
         return self._link.read(work)
 
     def do(self, operation: Operation[T]) -> T:
-        """Write, in one transaction; what the database cannot do now, it will do once it is back."""
+        """See `Store.do`. Without a connection, the operation is queued for the database."""
         result: T = self._link.do(operation)
         return result
 
     def follow(self, key: str, component: int) -> None:
-        """Have a table in the local copy from now on."""
+        """See `Store.follow`."""
         self._link.follow((key, component))
 
     def subscribe(self, told: Callable[[CacheChange], None]) -> Callable[[], None]:
-        """Be told, in a thread of the cache, what other stations have written; gives what ends that."""
+        """See `Store.subscribe`."""
         return self._link.subscribe(told)
 
     def close(self) -> None:
-        """End the thread, and let go of database and file."""
+        """End the thread, and close the database connections and the file."""
         self._finalizer()
 
 
 class _Link:
-    """What a store has to do with the database, its thread, and the local copy.
+    """Database connection, listener thread and local copy of a store.
 
     Attributes:
-        away: why the database is not used at present.
-        local: the copy.
+        away: why the database is not used at present, or None.
+        local: the local copy.
     """
 
-    def __init__(self, address: Address, path: Path) -> None:
+    def __init__(self, address: DatabaseAddress, path: Path) -> None:
         self.away: str | None = None
         self.local = LocalCopy(path)
         self._address = address
@@ -122,9 +122,9 @@ class _Link:
         self._is_here = False
         self._is_closed = False
         self._has_warned = False
-        self._reaching = threading.Lock()  # who holds it may take the next, not the other way round
-        self._writing = threading.RLock()  # who holds it writes to database, outbox and copy
-        self._state = threading.Lock()  # for a moment, around what follows
+        self._reaching = threading.Lock()  # held while connecting; always acquired before `_writing`
+        self._writing = threading.RLock()  # held during writes to database, outbox and copy
+        self._state = threading.Lock()  # held briefly for access to the following attributes
         self._listener: psycopg.Connection[tuple[Any, ...]] | None = None
         self._thread: threading.Thread | None = None
         self._bell, self._ringer = socket.socketpair()
@@ -133,15 +133,14 @@ class _Link:
         self._wanted: set[tuple[str, int]] = set()
         self._subscribers: list[Callable[[CacheChange], None]] = []
 
-    # what a store does
-
+    # calls of the store
     def read(self, work: Callable[[Session], T]) -> T:
         for is_second in (False, True):
             if not self._meet(at_once=is_second):
                 break
             try:
                 return self._database.read(work)
-            except Away as error:
+            except Unavailable as error:
                 self._lose(error)
         return self.local.read(work)
 
@@ -155,17 +154,19 @@ class _Link:
                     break
                 try:
                     [result], before, after = self._database.write([(operation, self._writer, number)])
-                    if is_second and result is None:  # it may have been done the first time
+                    if is_second and result is None:  # the first attempt may have executed it
                         result = self._database.read(operation.done)
-                except Away as error:
+                except Unavailable as error:
                     self._lose(error)
                 else:
                     return self._copy_done(operation, result, before, after)
-            if isinstance(operation, Remove | Join):
-                raise CacheError(f"{self.away or 'the database is away'}; this has to wait until it is back")
-            if isinstance(operation, SetDown):
+            if isinstance(operation, Remove | JoinTable):
+                raise CacheError(
+                    f"{self.away or 'the database is not connected'}; repeat the call after the reconnection"
+                )
+            if isinstance(operation, StoreSnapshot):
                 shown = self.local.read(operation.resolved)
-                own = OWN_NUMBERS + uuid4().int % OWN_NUMBERS
+                own = LOCAL_NUMBERS_MIN + uuid4().int % LOCAL_NUMBERS_MIN
                 return self.local.spool(_numbered(shown, own), self._writer, number)
             return self.local.spool(operation, self._writer, number)
 
@@ -178,7 +179,7 @@ class _Link:
 
     def subscribe(self, told: Callable[[CacheChange], None]) -> Callable[[], None]:
         self._subscribers.append(told)
-        with suppress(CacheError):  # every other call says so; once it is reached, there may be news
+        with suppress(CacheError):  # other calls report it; the subscription works after a reconnection
             self._meet()
 
         def end() -> None:
@@ -203,13 +204,13 @@ class _Link:
         self._bell.close()
         self._ringer.close()
 
-    # reaching the database
+    # connection to the database
 
     def _meet(self, *, at_once: bool = False) -> bool:
-        """Whether the database is here; tries to reach it where nobody has yet, or where this is wanted.
+        """Return whether the database is connected. Connect on the first call, or if `at_once` is given.
 
         Raises:
-            CacheError: it is closed; or the database was never reached, and there is no copy.
+            CacheError: the cache is closed; or the database was never reached, and there is no local copy.
         """
         if self._is_closed:
             raise CacheError(f"the cache {self._address.place} is closed")
@@ -226,33 +227,35 @@ class _Link:
             finally:
                 self._reaching.release()
         if not self._is_here and not self.local.exists:
-            raise CacheError(f"{self.away}; it was never reached from here, so there is no local copy")
+            raise CacheError(
+                f"{self.away}; there is no local copy, as it was never reached from this computer"
+            )
         return self._is_here
 
     def _reach(self) -> None:
-        """Reach the database and do there what has waited; if that cannot be, `away` says why.
+        """Connect to the database and execute queued operations. On failure, `away` has the reason.
 
         Raises:
-            CacheError: it cannot be used.
+            CacheError: the database cannot be used.
         """
         try:
             listener = self._database.open()
             try:
                 self._begin_copy()
-                with self._writing:  # or what comes could come faster than it goes
+                with self._writing:  # otherwise new operations could be queued faster than executed
                     self._deliver()
                     revisions = self._database.revisions()
                     self._take_up(listener, revisions)
             except BaseException:
                 listener.close()
                 raise
-        except Away as error:
+        except Unavailable as error:
             self._lose(error)
 
     def _take_up(self, listener: psycopg.Connection[tuple[Any, ...]], revisions: Revisions) -> None:
         kept = self._kept()
         if self.away is not None:
-            _log.warning("the database %s is back", self._address.place)
+            _log.warning("the database %s is connected again", self._address.place)
         with self._state:
             before, self._revisions = self._revisions, revisions
             old, self._listener = self._listener, listener
@@ -272,12 +275,12 @@ class _Link:
             self._warn_of_copy(error)
 
     def _deliver(self) -> None:
-        """Do in the database what has waited, in order, until nothing waits.
+        """Execute queued operations in the database, in order, until the queue is empty.
 
-        What waits in a copy that cannot be used goes when it can, the next time that the database is reached.
+        If the local copy cannot be read, this is done after a later reconnection.
         """
         try:
-            while entries := self.local.waiting(BATCH):
+            while entries := self.local.waiting(DELIVERY_BATCH):
                 self._deliver_all(entries)
         except CacheError as error:
             self._warn_of_copy(error)
@@ -291,20 +294,20 @@ class _Link:
                 for entry in entries:
                     self._deliver_all([entry])
                 return
-            _log.warning("the database refuses what was written while it was away: %s", error)
+            _log.warning("the database refuses a write that was queued while it was not connected: %s", error)
             self.local.refuse(entries[0], str(error))
             return
-        # the copies are made anew: others may have written meanwhile
+        # the tables are copied again: other stations may have written meanwhile
         self.local.arrived(entries, [key for each in entries for key in _touched(each.operation, after)])
 
-    def _lose(self, error: Away) -> None:
+    def _lose(self, error: Unavailable) -> None:
         with self._state:
             is_news = self.away is None
             self.away = str(error)
             self._is_here = False
         if is_news:
             copy = self.local
-            meanwhile = f"going on with the local copy {copy.path}" if copy.exists else "trying again"
+            meanwhile = f"using the local copy {copy.path}" if copy.exists else "reconnecting"
             _log.warning("%s; %s", error, meanwhile)
         self._database.close()
         self._ring()
@@ -312,11 +315,11 @@ class _Link:
     # the local copy
 
     def _copy_done(self, operation: Operation[Any], result: Any, before: Revisions, after: Revisions) -> Any:
-        """Do the same in the local copy, where that was up to date; it is made so where it was not."""
+        """Execute an operation in the local copy too. Tables that were stale there are copied again."""
         touched = set(_touched(operation, before | after))
         stale = touched
         try:
-            if not isinstance(operation, Join):
+            if not isinstance(operation, JoinTable):
                 kept = self.local.revisions()
                 number = result.id if isinstance(result, Snapshot) else None
                 self.local.do(operation if number is None else _numbered(operation, number))
@@ -337,7 +340,7 @@ class _Link:
         return result
 
     def _mirror(self) -> None:
-        """Make the copy of every table that is wanted what the database has."""
+        """Copy every requested table from the database to the local copy."""
         while self._is_here and not self._is_closed:
             with self._state:
                 if not self._wanted:
@@ -349,13 +352,13 @@ class _Link:
                     take = partial(take_whole, key=key[0], component=key[1], having=having)
                     whole, revision = self._database.read_with_revision(take, key)
                     self.local.mirror(key, whole, revision)
-            except Away as error:
+            except Unavailable as error:
                 self._lose(error)
-            except (CacheError, UsageError) as error:  # a file cannot keep all that a database can
+            except (CacheError, UsageError) as error:  # a file cannot store every value of a database
                 self._warn_of_copy(error)
 
     def _kept(self) -> Revisions:
-        """Of which tables there is a copy, and of which revision; none where it cannot be read."""
+        """Return the copied revision of each table; empty if the local copy cannot be read."""
         try:
             return self.local.revisions()
         except CacheError as error:
@@ -364,23 +367,23 @@ class _Link:
 
     def _warn_of_copy(self, error: CacheError | UsageError) -> None:
         if not self._has_warned:
-            _log.warning("the local copy is not up to date: %s", error)
+            _log.warning("the local copy of the cache is not up to date: %s", error)
         self._has_warned = True
 
     # the thread
 
     def _listen(self) -> None:
-        pause = RETRY_FIRST
+        pause = RETRY_INTERVAL_MIN
         with selectors.DefaultSelector() as selector:
             selector.register(self._bell, selectors.EVENT_READ)
             while not self._is_closed:
                 if self._is_here and self._listener is not None:
-                    pause = RETRY_FIRST
+                    pause = RETRY_INTERVAL_MIN
                     self._mirror()
                     self._hear(selector, self._listener)
                     continue
                 self._wait(selector, pause)
-                pause = min(2 * pause, RETRY_LAST)
+                pause = min(2 * pause, RETRY_INTERVAL_MAX)
                 if not self._is_closed and not self._is_here and self._reaching.acquire(blocking=False):
                     try:
                         self._reach()
@@ -396,7 +399,7 @@ class _Link:
             self._silence()
 
     def _hear(self, selector: selectors.BaseSelector, listener: psycopg.Connection[tuple[Any, ...]]) -> None:
-        """Wait until the database says something, or somebody here rings; pass on what it says."""
+        """Wait for a notification of the database or a wake-up, and process the notifications."""
         try:
             file = listener.fileno()
             selector.register(file, selectors.EVENT_READ)
@@ -407,10 +410,10 @@ class _Link:
                 selector.unregister(file)
             self._silence()
             told = [_news(each.payload) for each in listener.notifies(timeout=0)]
-        except Exception as error:  # whatever it is, the connection is of no more use
+        except Exception as error:  # after any error, the connection is unusable
             if listener is self._listener and self._is_here and not self._is_closed:
                 text = self._address.without_password(" ".join(str(error).split()))
-                self._lose(Away(f"the database {self._address.place} is gone: {text}"))
+                self._lose(Unavailable(f"the connection to {self._address.place} is lost: {text}"))
             return
         changed = set()
         with self._state:
@@ -450,7 +453,7 @@ def _touched(operation: Operation[Any], known: Revisions) -> Iterator[tuple[str,
 
 
 def _news(payload: str) -> tuple[Any, ...] | None:
-    """What a station has told; None where it was somebody else who did, as anybody in the database can."""
+    """Parse a notification; None if it is not of a station, as any user of the database may send one."""
     try:
         writer, key, component, revision = json.loads(payload)
     except (TypeError, ValueError):
@@ -459,6 +462,6 @@ def _news(payload: str) -> tuple[Any, ...] | None:
     return (writer, key, component, revision) if is_ours else None
 
 
-def _numbered(operation: Operation[Any], number: int) -> SetDown:
-    assert isinstance(operation, SetDown)
+def _numbered(operation: Operation[Any], number: int) -> StoreSnapshot:
+    assert isinstance(operation, StoreSnapshot)
     return replace(operation, number=number)

@@ -1,13 +1,13 @@
-"""Earlier states of a table: snapshots, and what can be told of any other moment.
+"""Earlier states of a table: snapshots, and states computed from the history.
 
-A state is worked backwards from the present table. Each line of history takes back one change. A name leaves
-no line when it appears, so from the moment on when a table was first complete, every new name is noted with
-its time (`birth`). That moment is `known_since`; it moves on as lines of history are dropped. Before it,
-nothing is claimed. Nor is anything of a time that the clock of this computer went through twice, because it
-was set back in between (`setback`). Of a name in the first table, `birth` has when its value there was
-observed, once that has changed.
+A state is computed backwards from the current table; each history line reverts one change. A new name leaves
+no line, so after a table was first complete, every new name is recorded with its time (`birth`). The time of
+the first complete table is `known_since`; it moves forward when history lines are dropped. No state is
+available before it, nor for a period that the clock of this computer has passed twice because it was set back
+(`setback`). For a name of the first table whose value has changed since, `birth` has the observation time of
+its first value.
 
-Each function works inside its caller's transaction.
+Each function runs inside the transaction of its caller.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ __all__ = [
 ]
 
 SNAPSHOTS: Final = 50
-"""Snapshots kept for each table, the newest ones: one is made before each file that is applied, so they are
-weeks of work on one vehicle. One of a thousand parameters takes about 10 kB."""
+"""Maximum number of snapshots of each table, the newest: one is stored before each applied file, so they
+cover weeks of work on one vehicle. A snapshot of 1,000 parameters takes about 10 kB."""
 
 CLOCK_SLACK: Final = 5.0
-"""Seconds that a time may lie before the one written last without the clock having been set back: so long may
-one process wait for another before it writes (`BUSY_TIMEOUT`)."""
+"""Seconds by which a time may be before the last written one although the clock was not set back: a process
+may wait this long for the lock before it writes (`BUSY_TIMEOUT`)."""
 
 
 def watch_clock(session: Session, key: str, component: int, at: float) -> None:
-    """Note it where a table is written to at an earlier time than the last time."""
+    """Record that the clock was set back, if a table is written at an earlier time than before."""
     written_at = session.updated_at(key, component)
     if written_at is not None and written_at > at + CLOCK_SLACK:
         owner = session.owner_of(key, component)
@@ -69,16 +69,22 @@ def store(
     complete: bool,
     number: int | None = None,
 ) -> Snapshot:
-    """Set a table down, and drop the oldest snapshots of it beyond `SNAPSHOTS`.
+    """Store a snapshot of a table, and delete the oldest ones beyond `SNAPSHOTS`.
 
     Args:
-        params: with the identity of the vehicle.
-        number: the one that it was given elsewhere; None for the next one.
+        session: the transaction.
+        owner: id of the table.
+        params: the parameters, with the identity of the vehicle.
+        at: time of the snapshot, in unix seconds.
+        reason: the reason, as text.
+        hash: the vehicle's hash of these parameters, or None.
+        complete: whether these are all parameters of the vehicle.
+        number: number that another store has assigned; None for the next one.
     """
     assert params.identity is not None
     blob = _packed(params.identity, params)
-    text = reason.encode("utf-8", "backslashreplace").decode()  # a file's name need not be UTF-8
-    text = text.replace("\0", "\\x00")  # PostgreSQL's text cannot hold it
+    text = reason.encode("utf-8", "backslashreplace").decode()  # a file name in it may not be UTF-8
+    text = text.replace("\0", "\\x00")  # PostgreSQL's text type does not allow NUL
     row = (kept_time(at), text, len(params), hash, int(complete))
     number = session.add_snapshot(owner, row, blob, _checksum(row, blob), number)
     session.trim_snapshots(owner, SNAPSHOTS)
@@ -86,10 +92,10 @@ def store(
 
 
 def snapshot(session: Session, owner: int, number: int) -> Snapshot:
-    """One snapshot of a table.
+    """Return a snapshot of a table.
 
     Raises:
-        CacheError: there is none of this number, or it is damaged.
+        NotInCache: the table has no snapshot with this number, or it is damaged.
     """
     found = session.snapshot(owner, number)
     if found is None:
@@ -117,22 +123,24 @@ def snapshot(session: Session, owner: int, number: int) -> Snapshot:
 
 
 def kept_time(at: float) -> float:
-    """The time of a snapshot as it is kept: to the millisecond."""
+    """Return the time of a snapshot as it is stored: to the millisecond."""
     return round(time_cell(at), 3)
 
 
 def state_at(
     session: Session, owner: int, identity: Identity, rows: Mapping[str, Row], when: float
 ) -> ParamSet:
-    """A table as it was last known at a moment.
+    """Return a table as it was known at a given time.
 
     Args:
-        identity: the vehicle, as it was last seen.
-        rows: the present table.
+        session: the transaction.
+        owner: id of the table.
+        identity: the last known identity of the vehicle.
+        rows: the current table.
         when: unix seconds.
 
     Raises:
-        CacheError: that cannot be told.
+        NotInCache: the history begins later, or the clock has passed this time twice.
     """
     when = time_cell(when)
     _, number, since = session.described(owner)
@@ -151,7 +159,7 @@ def state_at(
     if twice is not None:
         back, until = twice
         raise NotInCache(
-            f"the state of {who} at {_text(when)} cannot be told: the clock of this computer was set back"
+            f"the state of {who} at {_text(when)} is ambiguous: the clock of this computer was set back"
             f" from {_text(until)} to {_text(back)}{_older(session, owner, when)}"
         )
     first = _first_events_after(session, owner, when)
@@ -164,18 +172,18 @@ def state_at(
     return ParamSet(params, number, identity.system, then, when, f"history of {identity.key}")
 
 
-# The value that the first event after a moment took away: None where there was no such name.
+# The value before the first event after a given time; None if the name did not exist.
 _Taken = tuple[int, int, int] | None
 
 
 def _first_events_after(session: Session, owner: int, when: float) -> dict[str, _Taken]:
-    """By name, what was there before the first thing that happened after a moment."""
+    """Return, by name, the value before the first event after a given time."""
     events: list[tuple[int, int, str, _Taken]] = [
         (line, 0, name, (old_type, old_bits, old_is_raw))
         for line, (_, name, _, old_type, old_bits, old_is_raw, *_) in session.lines(owner, when)
     ]
     for line, name in session.births_after(owner, when):
-        events.append((line, 1, name, None))  # after the line that was the last one then
+        events.append((line, 1, name, None))  # after the last line at that time
     first: dict[str, _Taken] = {}
     for _, _, name, value in sorted(events, key=lambda event: event[:2]):
         first.setdefault(name, value)
@@ -183,7 +191,7 @@ def _first_events_after(session: Session, owner: int, when: float) -> dict[str, 
 
 
 def _older(session: Session, owner: int, when: float) -> str:
-    """What snapshots there are where history does not help: those next to the moment."""
+    """Return the nearest snapshots of a time, for messages."""
     found = session.snapshots_around(owner, when)
     listed = " and ".join(f"snapshot {number} of {_text(at)}" for number, at in found)
     return f"; there is {listed}" if listed else "; there is no snapshot"
@@ -205,7 +213,7 @@ def _checksum(described: Sequence[object], blob: bytes) -> int:
 
 
 def _packed(identity: Identity, params: Mapping[str, WrittenParam]) -> bytes:
-    """Strict JSON, compressed: who the vehicle is, and name, type, value, default of each parameter."""
+    """Encode identity, and name, type, value, default of each parameter, as compressed strict JSON."""
     rows = [written_cells(each) for each in params.values()]
     text = json.dumps([identity_cells(identity), rows], separators=(",", ":"), allow_nan=False)
     return zlib.compress(text.encode("ascii"))
@@ -218,13 +226,13 @@ def _unpacked(blob: bytes) -> tuple[Identity, dict[str, WrittenParam]]:
 
 
 def written_cells(param: WrittenParam) -> tuple[str, int | None, int | str | None, int | str | None]:
-    """A parameter's name, type, value and default, as JSON can hold them."""
+    """Return a parameter's name, type, value and default in JSON types."""
     number = None if param.type is None else int(param.type)
     return param.name, number, _cell(param.value), _cell(param.default)
 
 
 def read_written(cells: Sequence[Any]) -> WrittenParam:
-    """The inverse of `written_cells`."""
+    """Return the parameter of a result of `written_cells`."""
     name, number, value, default = cells
     kind = None if number is None else known_type(number)
     written = _written(value)
@@ -233,7 +241,7 @@ def read_written(cells: Sequence[Any]) -> WrittenParam:
 
 
 def _cell(value: Value | None) -> int | str | None:
-    """A value so that it comes back to the last bit: a float by its bytes, four where a float32 holds it."""
+    """Encode a value without loss: a float by its 8 bytes, or by 4 bytes if a float32 is exact."""
     if value is None or isinstance(value, int):
         return value
     if isinstance(value, bytes):

@@ -1,4 +1,4 @@
-"""The cache in a file: what SQLite says in its own way."""
+"""The cache in a SQLite file."""
 
 from __future__ import annotations
 
@@ -18,25 +18,24 @@ from paramclient.model.params import Params
 
 __all__ = ["SqliteSession", "SqliteStore"]
 
-_NOTHING: Final = checksum({})
-"""The checksum of a table without parameters: it has no row among the packed ones."""
-_DIFFERENT: Final = 16
-"""Sets of names of which it is remembered where each stands: a fleet has a few firmwares. Each set takes a
-hundred kilobytes."""
+_EMPTY_CHECKSUM: Final = checksum({})
+"""Checksum of a table without parameters, which has no packed row."""
+_NAME_SETS_MAX: Final = 16
+"""Maximum number of name sets with cached positions: a fleet has a few firmwares. Each takes 100 kB."""
 
 T = TypeVar("T")
 
 
 class SqliteStore:
-    """A cache in one file of this computer, see `Database`.
+    """A cache in one file of this computer, see `Store` and `Database`.
 
     Args:
-        path: the file, absolute, with links followed.
-        link: the link by which it was named, or None.
+        path: the file, absolute, with resolved symbolic links.
+        link: the symbolic link that was given as path, or None.
 
     Attributes:
-        path: the same.
-        place: the same, for people.
+        path: the file.
+        place: the file, for messages.
     """
 
     def __init__(self, path: Path, *, link: Path | None = None) -> None:
@@ -46,32 +45,32 @@ class SqliteStore:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What went wrong with the file and was mended."""
+        """See `Store.notes`."""
         return tuple(self._database.notes)
 
     @property
     def replacements(self) -> int:
-        """How often a fresh file was made, or another one found in its place."""
+        """See `Store.replacements`."""
         return self._database.replacements
 
     @property
     def away(self) -> None:
-        """None: the file is the cache."""
+        """Always None: a file has no local copy."""
         return
 
     def follow(self, key: str, component: int) -> None:
-        """Nothing: the file has every table."""
+        """Do nothing: the file has every table."""
 
     def subscribe(self, told: Callable[[CacheChange], None]) -> Callable[[], None]:
-        """Nothing: a file tells nobody."""
+        """Do nothing: a file has no notifications."""
         return _nothing
 
     def read(self, work: Callable[[Session], T]) -> T:
-        """Do work that only reads, in one transaction."""
+        """See `Store.read`."""
         return self._database.read(lambda connection: work(SqliteSession(connection)))
 
     def do(self, operation: Operation[T]) -> T:
-        """Write, in one transaction."""
+        """See `Store.do`."""
 
         def work(connection: sqlite3.Connection) -> T:
             return operation.do(SqliteSession(connection))
@@ -84,7 +83,7 @@ class SqliteStore:
 
 
 class SqliteSession(Session):
-    """One transaction on a file. It holds the file's only write lock, where it writes."""
+    """One transaction in a file. A write transaction holds the file's only write lock."""
 
     SIZE: ClassVar[str] = "ifnull((SELECT size FROM packed WHERE owner = c.id), 0)"
 
@@ -104,10 +103,10 @@ class SqliteSession(Session):
     def put_table(self, owner: int, before: Mapping[str, Row] | None, after: Mapping[str, Row]) -> None:
         if not after:
             self._do("DELETE FROM packed WHERE owner = ?", (owner,))
-            self.describe(owner, checksum=_NOTHING)
+            self.describe(owner, checksum=_EMPTY_CHECKSUM)
             return
         row = packed_row(after)
-        # updated where it is: of a blob of the same length only the pages that differ are written
+        # updated in place: for a blob of equal length, only changed pages are written
         self._do(
             "INSERT INTO packed (owner, size, heard_last, params) VALUES (?, ?, ?, ?)"
             " ON CONFLICT (owner) DO UPDATE SET (size, heard_last, params)"
@@ -166,7 +165,11 @@ class SqliteSession(Session):
         return found
 
     def _packed(self, owner: int) -> Packed | None:
-        """A table's parameters, or None where it has none; `Damaged` where they are not what was written."""
+        """Return the parameters of a table, or None if it has none.
+
+        Raises:
+            Damaged: the checksum does not match.
+        """
         [(expected, *row)] = self._all(
             "SELECT checksum, size, heard_last, params FROM component LEFT JOIN packed ON owner = id"
             " WHERE id = ?",
@@ -175,15 +178,15 @@ class SqliteSession(Session):
         blob = row[-1]
         if not isinstance(blob, bytes | None):
             raise Damaged(f"a table is {blob!r:.40}")
-        if expected != (_NOTHING if blob is None else row_checksum(*row)):
+        if expected != (_EMPTY_CHECKSUM if blob is None else row_checksum(*row)):
             raise Damaged("a table is not what was written")
         return None if blob is None else Packed(blob)
 
     def _places(self, packed: Packed) -> Mapping[str, int]:
-        """Where the names of a table stand: in the same places in those of one firmware, as a rule."""
+        """Return the positions of a table's names, which are usually equal for one firmware."""
         found = self._places_of.get(packed.named)
         if found is None:
-            if len(self._places_of) >= _DIFFERENT:
+            if len(self._places_of) >= _NAME_SETS_MAX:
                 self._places_of.clear()
             found = self._places_of[packed.named] = packed.places()
         return found

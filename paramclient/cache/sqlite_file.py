@@ -1,19 +1,19 @@
-"""The file: opened when needed, shared with other processes, and set aside when it cannot be trusted.
+"""Database: a SQLite file that several processes share. A damaged file is renamed and replaced.
 
-SQLite in WAL mode with synchronous=NORMAL. What was committed survives the death of a process at any moment;
-a power cut may take the last transactions, never the file. A durable transaction is committed with
-synchronous=FULL: the log is synchronised with the disk before the call returns, and with it all that was
-committed before (SQLite, "PRAGMA synchronous").
+SQLite runs in WAL mode with synchronous=NORMAL. Committed transactions survive a killed process at any time;
+a power loss may lose the last transactions, but does not damage the file. A durable transaction is committed
+with synchronous=FULL: the log is synced to the disk before the call returns, including all earlier commits
+(SQLite, "PRAGMA synchronous").
 
-The structure of the file is checked when it is opened; each table has a checksum of its own, checked when it
-is read. Only a file that is empty, or a database with our application id, is ever changed or renamed;
-anything else under the path is an error. That is seen before SQLite opens it, which would take up, empty or
-delete any log that stands beside it. Under an open connection, another process may find the file damaged
-and rename it, or somebody may delete it: every operation looks whether its file still stands under the path.
-SQLite does so too before it would touch the `-wal` of the file that came in its place. Opening, creating,
-upgrading and renaming happen under a lock on the folder (`flock`), so that two processes never do it at once.
-The file itself is opened by SQLite alone while any cache of this process has it open: to close another
-descriptor of it would drop SQLite's locks (POSIX, fcntl).
+The structure of the file is checked when it is opened; each table has its own checksum, checked on every
+read. Only an empty file, or a database with the application id of paramclient, is ever changed or renamed;
+any other file under the path is an error. This is checked before SQLite opens the file, because SQLite would
+use, truncate or delete any log beside it. While a connection is open, another process may find the file
+damaged and rename it, or a user may delete it: every operation checks that its file is still the one under
+the path. SQLite checks this too before it writes to the `-wal` of a new file. Opening, creating, upgrading
+and renaming run under a lock on the folder (`flock`), so that two processes never do this at the same time.
+While any cache of this process has the file open, only SQLite opens it: closing another descriptor of it
+would release SQLite's locks (POSIX, fcntl).
 """
 
 from __future__ import annotations
@@ -44,21 +44,24 @@ from paramclient.errors import CacheError
 __all__ = ["APPLICATION_ID", "Database"]
 
 APPLICATION_ID: Final = 0x5041524D
-"""Stands in the file's header and says whose database it is: `PARM`."""
+"""Application id of paramclient in the header of the file: `PARM`."""
 
 _MAGIC: Final = b"SQLite format 3\0"
+"""First bytes of a SQLite database (SQLite, "Database File Format")."""
 _ID_AT: Final = slice(68, 72)
-"""How a database of SQLite begins, and where its application id stands (SQLite, "Database File Format")."""
+"""Position of the application id in a SQLite database (SQLite, "Database File Format")."""
 _LOG_MAGICS: Final = (b"\x37\x7f\x06\x82", b"\x37\x7f\x06\x83")
+"""First bytes of a write-ahead log of SQLite, in either byte order of its checksums."""
+# Bytes of a write-ahead log before its first frame, and of each frame before its page.
 _LOG_HEADER, _FRAME_HEADER = 32, 24
-"""How a write-ahead log of SQLite begins, and the bytes before the first page in it and before each page."""
 _JOURNAL_MAGIC: Final = b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"
-"""How a rollback journal of SQLite begins, once it counts."""
+"""First bytes of a valid rollback journal of SQLite."""
 
-_TRIES: Final = 3
-"""Rounds of one operation: the file may be renamed under it by another process, and be damaged, once each."""
+_ATTEMPTS_MAX: Final = 3
+"""Maximum number of attempts of one operation: another process may rename the file, and the file may be
+damaged, once each."""
 
-# So a place shows itself where no -wal or -shm can be made: a folder is read-only, a disk is full.
+# Error codes if no -wal or -shm can be created: the folder is read-only, or the disk is full.
 _UNWRITABLE: Final = frozenset(
     {
         sqlite3.SQLITE_CANTOPEN,
@@ -68,51 +71,55 @@ _UNWRITABLE: Final = frozenset(
 )
 
 _CLOSES_TO_RENAME: Final = sys.platform == "win32"
-"""Whether no open file can be renamed. What stands in its -wal then goes into the file on closing."""
+"""Whether an open file cannot be renamed, as on Windows. Closing it then moves its -wal into the file."""
 _VFS_WITHOUT_LOCKS: Final = "win32-none" if sys.platform == "win32" else "unix-none"
+"""Name of SQLite's file system layer without locks."""
 
+# Error codes of a damaged file.
 _DAMAGE: Final = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB})
 
 _log = logging.getLogger("paramclient.cache")
 
 _IN_USE: Final[Counter[tuple[int, int]]] = Counter()
-"""How often each file, by device and number, is open in this process: they are known to be caches."""
+"""Number of open connections in this process by file (device, inode). These files are known to be caches."""
 _IN_USE_LOCK: Final = threading.Lock()
+"""Lock for `_IN_USE`."""
 
 T = TypeVar("T")
 Work: TypeAlias = Callable[[sqlite3.Connection], T]
 
 
 class _Newer(Damaged):
-    """The file was written by a later version."""
+    """The file was written by a later version of paramclient."""
 
     kind = "newer"
 
 
 class _Moved(Exception):
-    """The file that was looked at, or written to, no longer stands under the path."""
+    """The checked or written file is no longer the one under the path."""
 
 
 class _Empty(Exception):
-    """The file holds no tables: whoever began it found the disk full."""
+    """The file has no tables: the disk was full when it was created."""
 
 
 class Database:
-    """One SQLite file, opened at the first operation. Safe to use from several threads.
+    """One SQLite file, opened by the first operation. Thread-safe.
 
-    A file that is damaged, or newer than this version, is renamed to say why and when (with its `-wal` and
-    `-shm`), a warning is logged and remembered, and a fresh one takes its place. Nothing is ever deleted. A
-    file that others can write to is made its owner's alone, with a warning, or is an error.
+    A file that is damaged, or newer than this version, is renamed together with its `-wal` and `-shm`; the
+    new name has the reason and the time. A warning is logged and added to `notes`, and a new file is created.
+    No file is ever deleted. A file that other users can write to is restricted to its owner, with a warning;
+    if that fails, it is an error.
 
     Args:
-        path: the file, absolute, with links followed.
-        link: the link by which the file was named, or None: then it has to belong to the user of this
-            process.
+        path: the file, absolute, with resolved symbolic links.
+        link: the symbolic link that was given as path, or None. The target of a link has to belong to the
+            user of this process.
 
     Attributes:
-        path: the same.
+        path: the file.
         notes: the warnings so far.
-        replacements: how often a fresh file was made, or another one than before was found in its place.
+        replacements: number of times that a new file was created, or found in place of the previous one.
     """
 
     def __init__(self, path: Path, *, link: Path | None = None) -> None:
@@ -128,32 +135,33 @@ class Database:
         self._file: tuple[int, int] | None = None
         self._for_once = False
         self._without_locks = False
-        self._is_ours = False  # what is open has our application id
+        self._is_ours = False  # whether the open file has the application id of paramclient
 
     def read(self, work: Work[T]) -> T:
-        """Do work that only reads, in one transaction.
+        """Run a function that only reads, in one transaction, and return its result.
 
-        Creates nothing: without a file, the work finds an empty database. Works on a file, or in a folder,
-        that cannot be written to.
+        It creates no file: without one, the function reads an empty database. The file and the folder may be
+        read-only.
 
         Raises:
-            CacheError: the file cannot be read, or another process holds it for too long.
+            CacheError: the file cannot be read, or another process locks it for more than `BUSY_TIMEOUT`.
         """
         return self._run(work, writing=False)
 
     def write(self, work: Work[T], *, durable: bool = False) -> T:
-        """Do work in one transaction that holds the file's only write lock; all of it happens, or nothing.
+        """Run a function in one transaction with the file's write lock: either all or nothing is written.
 
-        Creates the file (mode 0600) and its folder (0700). The work is done again, from the start, where the
-        file had to be set aside.
+        It creates the file (mode 0600) and its folder (0700). If the file has to be replaced, the function
+        runs again from the start.
 
         Args:
-            work: what is done.
-            durable: return when this, and all that was written before, is on the disk, past a loss of power.
+            work: the function.
+            durable: return only when this and all earlier transactions are synced to the disk, safe from
+                power loss.
 
         Raises:
-            CacheError: the file cannot be written: read-only, disk full, held for too long by another
-                process.
+            CacheError: the file cannot be written: it is read-only, the disk is full, or another process
+                locks it for more than `BUSY_TIMEOUT`.
         """
         return self._run(work, writing=True, durable=durable)
 
@@ -167,7 +175,7 @@ class Database:
         with self._lock:
             if self._closed:
                 raise CacheError(f"the cache {self.path} is closed")
-            for _ in range(_TRIES):
+            for _ in range(_ATTEMPTS_MAX):
                 try:
                     if not writing and self._is_absent():
                         with _fresh(MIGRATIONS) as nothing:
@@ -188,23 +196,25 @@ class Database:
                 except BaseException:
                     self._drop()
                     raise
-            raise CacheError(f"the cache {self.path} is damaged or replaced again and again")
+            raise CacheError(
+                f"the cache {self.path} was damaged or replaced {_ATTEMPTS_MAX} times during one operation"
+            )
 
     def _transact(self, work: Work[T], *, writing: bool, durable: bool) -> T:
-        """One try. Where it fails the connection is left as it is; to close it takes the transaction back."""
+        """Run one attempt. After an error, closing the connection rolls the transaction back."""
         try:
             connection = self._connected(writing=writing)
             if durable:
                 connection.execute("PRAGMA synchronous = FULL")
             connection.execute("BEGIN IMMEDIATE" if writing else "BEGIN")
             result = work(connection)
-            if durable:  # the same version once more: what writes nothing synchronises nothing
+            if durable:  # a transaction without a write would not sync; this writes the unchanged version
                 connection.execute(f"PRAGMA user_version = {len(MIGRATIONS)}")
             connection.execute("COMMIT")
             if durable:
                 connection.execute("PRAGMA synchronous = NORMAL")
         except (sqlite3.ProgrammingError, sqlite3.InterfaceError):
-            raise  # the program's mistake, not the file's
+            raise  # an error of the program, not of the file
         except sqlite3.Error as error:
             raise self._judged(error) from error
         except UnicodeDecodeError as error:
@@ -255,11 +265,11 @@ class Database:
         if not (version or writing):
             raise _Empty
         self._make_private()
-        if not version:  # before there is a log: so the file itself says at any moment whose it is
+        if not version:  # before the first log exists, so that the file itself always has the id
             connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = NORMAL")
-        connection.execute("PRAGMA fullfsync = ON")  # of macOS, whose fsync leaves data in the drive's cache
+        connection.execute("PRAGMA fullfsync = ON")  # for macOS, whose fsync leaves data in the drive's cache
         connection.execute("PRAGMA foreign_keys = ON")
         if version < len(MIGRATIONS) or not self._is_ours:
             connection.execute("BEGIN IMMEDIATE")
@@ -271,10 +281,10 @@ class Database:
         return connection
 
     def _open_without_locks(self) -> sqlite3.Connection:
-        """Open a file beside which no -wal and -shm can, or should, be made.
+        """Open a file without creating -wal and -shm.
 
-        None is in use, so nobody else is writing. Made for a read-only file, they would be read-only too and
-        stay behind.
+        These do not exist, so no other process is writing. If they were created for a read-only file, they
+        would be read-only and remain after closing.
         """
         connection = self._keep(self._connect_without_locks())
         version = self._inspect(connection)
@@ -283,14 +293,14 @@ class Database:
         self._make_private()
         if version < len(MIGRATIONS):
             raise CacheError(
-                f"the cache {self.path} is of an older version and cannot be upgraded where it is"
+                f"the cache {self.path} is of an older version and cannot be upgraded, as it is read-only"
             )
         return connection
 
     def _connect_without_locks(self) -> sqlite3.Connection:
-        """Connect so that nothing is written, not beside the file either."""
+        """Connect without any write to the file or its folder."""
         if _size(self._companion("-wal")):
-            # A killed process left transactions in it. Without locks, SQLite reads it with no -shm.
+            # It has transactions of a killed process. Without locks, SQLite reads it without a -shm.
             connection = self._connect(f"mode=ro&vfs={_VFS_WITHOUT_LOCKS}")
             connection.execute("PRAGMA locking_mode = EXCLUSIVE")
             return connection
@@ -311,10 +321,14 @@ class Database:
         return connection
 
     def _inspect(self, connection: sqlite3.Connection) -> int:
-        """The schema version of the file, 0 for one that is still empty; `Damaged` where it is that.
+        """Return the schema version of the file; 0 for an empty file.
 
-        The integrity check takes a few milliseconds for each megabyte. Without it a flipped bit can make
-        SQLite miss a row that is there, and nothing would tell.
+        The integrity check takes a few milliseconds for each megabyte. Without it, a flipped bit may make
+        SQLite skip an existing row without an error.
+
+        Raises:
+            Damaged: the file is damaged, or of a later version.
+            CacheError: it is a database of another program.
         """
         version = self._version_of(connection)
         if version:
@@ -324,7 +338,7 @@ class Database:
         return version
 
     def _version_of(self, connection: sqlite3.Connection) -> int:
-        """The same by the tables alone. A file without an application id counts as ours by these."""
+        """Return the schema version, without the integrity check; see `_inspect` for errors."""
         [(application,)] = connection.execute("PRAGMA application_id")
         self._is_ours = application == APPLICATION_ID
         [(version,)] = connection.execute("PRAGMA user_version")
@@ -333,7 +347,7 @@ class Database:
         except sqlite3.OperationalError as error:
             if _code(error) != sqlite3.SQLITE_ERROR:
                 raise
-            raise Damaged(str(error)) from error  # the statement cannot be wrong: the header is
+            raise Damaged(str(error)) from error  # the statement is valid, so the header is damaged
         if application in (0, APPLICATION_ID) and not (version or tables):
             return 0
         looks_like_ours = 1 <= version <= len(MIGRATIONS) and _schema_after(MIGRATIONS[:version]) <= tables
@@ -346,7 +360,7 @@ class Database:
         return int(version)
 
     def _judged(self, error: sqlite3.Error) -> Exception:
-        """What an error of SQLite means: damage, or a trouble of the surroundings or of ours."""
+        """Return `Damaged` for an SQLite error of a damaged file, CacheError for another cause."""
         code = _code(error)
         if code is None or code & 0xFF in _DAMAGE:
             return Damaged(str(error))
@@ -355,12 +369,12 @@ class Database:
         return CacheError(f"the cache {self.path} cannot be used: {error}")
 
     def _check_file(self) -> None:
-        """See that the file is a cache, or empty, and note that it is in use.
+        """Check that the file is a cache or empty, and count it as in use.
 
-        It is looked at without SQLite's locks, where nobody in this process has any to lose.
+        Only the first connection of this process checks it: the check would release SQLite's locks of others.
 
         Raises:
-            CacheError: it is something else.
+            CacheError: it is another file.
         """
         assert self._file is not None, "it exists"
         with _IN_USE_LOCK:
@@ -379,7 +393,7 @@ class Database:
             raise self._is_no_cache("file is not a database")
         if application:
             raise self._is_of_another_program(application)
-        # one of an early version has no id: its tables tell, also where they stand in its log alone
+        # a file of an early version has no id: its tables identify it, which may only be in its log
         with closing(self._connect_without_locks()) as connection:
             try:
                 self._version_of(connection)
@@ -387,13 +401,14 @@ class Database:
                 raise self._is_no_cache(error) from error
 
     def _check_alone(self) -> None:
-        """See that where there is no file, or an empty one, nothing of another program stands beside it.
+        """Check that beside an absent or empty file there is no log of another program.
 
-        SQLite would delete it. A cache whose program was killed as it made it has a journal.
+        SQLite would delete it.
+        A cache whose process was killed during its creation has a journal.
 
         Raises:
-            Damaged: it is the log of a cache.
-            CacheError: it is something else.
+            Damaged: there is a log of a cache.
+            CacheError: there is another log.
         """
         if _size(self._companion("-wal")):
             self._check_log()
@@ -407,10 +422,10 @@ class Database:
                 raise self._is_no_cache("there is only a rollback journal")
 
     def _check_log(self) -> None:
-        """See by the first page, if it has that, that a log whose file is gone or empty is of a cache.
+        """Check by the first page in a log without its file that the log belongs to a cache.
 
         Raises:
-            CacheError: nothing shows that.
+            CacheError: the log has no first page with the application id of paramclient.
         """
         with self._companion("-wal").open("rb") as file:
             begins = file.read(_LOG_HEADER)
@@ -424,62 +439,62 @@ class Database:
     def _is_no_cache(self, why: object) -> CacheError:
         text = " ".join(str(why).split())
         return CacheError(
-            f"{self.path} is no cache of paramclient ({text:.200}), and was left as it is; name another file"
+            f"{self.path} is not a cache of paramclient ({text:.200}) and was not changed; name another file"
         )
 
     def _is_of_another_program(self, application: int) -> CacheError:
         return CacheError(
-            f"{self.path} is another program's database (its application id is {application:#x}), and was"
-            " left as it is; name another file"
+            f"{self.path} is a database of another program (its application id is {application:#x}) and was"
+            " not changed; name another file"
         )
 
     def _check_link(self) -> None:
-        """See that a link leads to a file of this user, or is this user's own where there is no file yet.
+        """Check that the target of a symbolic link belongs to this user, or without a target, the link.
 
         Raises:
-            CacheError: it is another user's.
+            CacheError: it belongs to another user.
         """
         if self._link is None:
             return
         status = _status(self.path) or self._link.lstat()
         if not is_own(status):
             raise CacheError(
-                f"{self._link} leads to a file of another user, {self.path}, and is not followed"
+                f"the symbolic link {self._link} leads to a file of another user, {self.path}; name that file"
             )
 
     def _make_private(self) -> None:
-        """Make a file that others can write to its owner's alone, with a warning.
+        """Restrict a file that other users can write to its owner, with a warning.
 
         Raises:
-            CacheError: that is not possible.
+            CacheError: its mode cannot be changed.
         """
         for file in filter(Path.exists, map(self._companion, ("", "-wal", "-shm"))):
             try:
                 mode = make_private(file)
             except FileNotFoundError:
-                continue  # another process has closed the database just now
+                continue  # another process has just closed the database
             except OSError as error:
                 mode = mode_of(file.stat())
                 if mode & OTHERS_WRITE and error.errno != errno.EROFS:
                     raise CacheError(
-                        f"others can write to the cache {file} (mode {mode:o}), and that cannot be ended: "
-                        f"{error.strerror}"
+                        f"other users can write to the cache {file} (mode {mode:o}), and its mode cannot be"
+                        f" changed: {error.strerror}"
                     ) from error
                 continue
             if mode & OTHERS_WRITE and file == self.path:
                 _log.warning(
-                    "others than its owner could write to the cache %s (mode %o); it is mode %o now",
+                    "other users than its owner could write to the cache %s (mode %o); its mode is now %o",
                     *(file, mode, mode & ~OF_OTHERS),
                 )
 
     def _set_aside(self, damage: Damaged) -> None:
         what = f"the cache {self.path} is {damage.kind} ({' '.join(str(damage).split()):.200})"
-        # The file is renamed before it is closed: SQLite then leaves its -wal as it is.
+        # The file is renamed before it is closed, so that SQLite does not change its -wal.
         if _CLOSES_TO_RENAME:
             self._close_connection()
         try:
             if self._without_locks:
-                raise PermissionError("nothing can be written there")
+                raise PermissionError("the file or its folder is read-only")
             with locked(self.path.parent):
                 if self._which() == self._file:
                     kept = self._free_path(damage.kind)
@@ -505,7 +520,7 @@ class Database:
         return not _size(self.path)
 
     def _which(self) -> tuple[int, int] | None:
-        """Which file stands under the path now: a file that took another's place has another number."""
+        """Return device and inode of the file under the path now; a replaced file has another inode."""
         status = _status(self.path)
         return status and (status.st_dev, status.st_ino)
 
@@ -531,7 +546,7 @@ def _end_use(file: tuple[int, int]) -> None:
 
 
 def _nothing() -> None:
-    """What there is to close without a connection."""
+    """Do nothing: there is no connection to close."""
 
 
 def _status(path: Path) -> os.stat_result | None:
@@ -550,7 +565,7 @@ def _size(path: Path) -> int:
 
 
 def _code(error: sqlite3.Error) -> int | None:
-    """SQLite's extended result code; None where its module found text that is not UTF-8."""
+    """Return SQLite's extended result code; None for text that is not UTF-8."""
     code: int | None = getattr(error, "sqlite_errorcode", None)
     return code
 
@@ -564,7 +579,7 @@ def _migrate(connection: sqlite3.Connection, steps: Sequence[Step]) -> None:
 
 
 def _schema_of(connection: sqlite3.Connection) -> frozenset[tuple[str, ...]]:
-    """Every table and index with the statement that made it, without those that SQLite makes for itself."""
+    """Return every table and index with its CREATE statement, without SQLite's internal ones."""
     rows = connection.execute(
         "SELECT type, name, tbl_name, sql FROM sqlite_master"
         " WHERE sql IS NOT NULL AND name NOT GLOB 'sqlite_*'"
@@ -574,7 +589,7 @@ def _schema_of(connection: sqlite3.Connection) -> frozenset[tuple[str, ...]]:
 
 @contextmanager
 def _fresh(steps: tuple[Step, ...]) -> Iterator[sqlite3.Connection]:
-    """An empty database in memory."""
+    """Yield an empty database in memory with these schema steps."""
     with closing(sqlite3.connect(":memory:", isolation_level=None)) as connection:
         _migrate(connection, steps)
         yield connection

@@ -1,4 +1,4 @@
-"""The cache as users and the client see it."""
+"""ParamCache: the public class of the cache."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from types import TracebackType
 import platformdirs
 
 from paramclient.cache import fleet, snapshots, tables
-from paramclient.cache.database_url import Address, is_address
+from paramclient.cache.database_url import DatabaseAddress, is_address
 from paramclient.cache.fleet import FleetDiff
 from paramclient.cache.interface import Store
 from paramclient.cache.lookup import find_vehicle
-from paramclient.cache.operations import Merge, Remove, Save, SetDown
+from paramclient.cache.operations import Merge, Remove, Save, StoreSnapshot
 from paramclient.cache.records import (
     CacheChange,
     CachedComponent,
@@ -37,38 +37,39 @@ __all__ = ["ParamCache", "default_path"]
 
 
 def default_path() -> Path:
-    """Where the cache is kept unless told otherwise: `parameters.sqlite3` in the user's cache folder."""
+    """Return the default path of the cache: `parameters.sqlite3` in the user's cache folder."""
     return platformdirs.user_cache_path("paramclient") / "parameters.sqlite3"
 
 
 class ParamCache:
-    """Tables, identities and history. Usable with no link, by several threads and processes at once.
+    """Cache of parameter tables, vehicle identities, history and snapshots.
 
-    They are in a file, or in a PostgreSQL that many stations share. The file is opened by the first call that
-    needs it. Reading creates nothing. Every call blocks, as a rule
-    for milliseconds, and for a few seconds at most where another process holds the file. What a call has
-    written survives the death of the process at any moment; a power cut may take the last calls, never the
-    file. A file that is damaged, or newer than this version, is set aside with a warning in the log, and a
-    fresh one begins.
+    It is usable without a link, and by several threads and processes at the same time.
 
-    Of a database (`postgresql://USER@HOST/NAME`), the tables that this program has to do with are also in a
-    local copy. While the database cannot be reached, that is what is read and written, `away` says why, and a
-    warning goes to the log. What was written goes to the database once it is back, in order and each change
-    once. Several stations that hear one vehicle write to one table: of each value the later observation
-    counts, and both are in the history. The clocks of the stations have to agree.
+    The cache is a file, or a PostgreSQL database shared by several stations. The file is opened by the first
+    call that needs it. Reading creates no file. Every call blocks, usually for milliseconds, and for up to 5
+    s if another process locks the file. Committed data survives a killed process at any time; a power loss
+    may lose the last calls, but does not damage the file. A file that is damaged, or newer than this version,
+    is renamed with a warning in the log, and a new file is created.
+
+    For a database (`postgresql://USER@HOST/NAME`), the tables that this program uses are also in a local
+    copy. While the database cannot be reached, reads and writes use the local copy, `away` has the reason,
+    and a warning is logged. After the reconnection, queued writes are executed in the database in order, each
+    exactly once. Several stations that receive one vehicle write to one table: the later observation of a
+    value counts, and the history has both. The clocks of the stations have to agree.
 
     Args:
         path: the file; None for `default_path()`; or the URL of a database.
-        local: where the local copy of a database is kept; None for a file in the user's cache folder.
+        local: path of the local copy of a database; None for a file in the user's cache folder.
 
     Attributes:
-        path: the file, absolute; of a database, the local copy.
+        path: the file, absolute; for a database, the local copy.
 
     Raises:
-        UsageError: the URL cannot be read, or psycopg is missing.
-        CacheError: from every method that reads or writes: the file cannot be used (read-only, disk full,
-            held for too long by another process), the database was never reached from here or refuses, or
-            the cache is closed. Nothing was written then.
+        UsageError: the URL is not valid, or psycopg is not installed.
+        CacheError: from every method that reads or writes: the file cannot be used (it is read-only, the disk
+            is full, or another process locks it for more than 5 s), the database was never reached from this
+            computer or refuses the call, or the cache is closed. Nothing was written.
     """
 
     def __init__(
@@ -76,9 +77,9 @@ class ParamCache:
     ) -> None:
         self._store: Store
         if isinstance(path, str) and is_address(path):
-            from paramclient.cache.shared import SharedStore  # loaded only where there is a database
+            from paramclient.cache.shared import SharedStore  # imported only for a database
 
-            address = Address.parse(path)
+            address = DatabaseAddress.parse(path)
             self.path = Path(default_path().with_name(address.name) if local is None else local).resolve()
             self._store = SharedStore(address, self.path)
         else:
@@ -98,82 +99,82 @@ class ParamCache:
         return f"<ParamCache {self.place}>"
 
     def close(self) -> None:
-        """Close the cache; later calls raise CacheError. One that is thrown away closes by itself."""
+        """Close the cache; later calls raise CacheError. Garbage collection closes it too."""
         self._store.close()
 
     @property
     def place(self) -> str:
-        """Where the cache is, for people: the file, or the URL of the database without a password."""
+        """The file, or the URL of the database without password, for messages."""
         return self._store.place
 
     @property
     def away(self) -> str | None:
-        """Why a database is not used at present, but its local copy; None while it is, and for a file."""
+        """Why the local copy is used instead of the database; None while it is used, and for a file."""
         return self._store.away
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What went wrong with the file so far and was mended: one text for each file set aside."""
+        """Repaired problems of the file: one text for each damaged or newer file that was renamed."""
         return self._store.notes
 
     @property
     def replacements(self) -> int:
-        """How often a fresh file was made, or another one found in its place: what was saved is not in it."""
+        """Number of times that a new file was created or found, which lacks earlier writes."""
         return self._store.replacements
 
     def save(
         self, update: TableUpdate | Sequence[TableUpdate], *, clock: Callable[[], float] | None = None
     ) -> None:
-        """Write what was learnt, in one transaction: all of it is kept, or nothing.
+        """Write updates of tables, in one transaction: either all or nothing is written.
 
-        Of two observations of a parameter the later one counts, whichever is saved first; the other one finds
-        its place in the history. A parameter that appears for the first time leaves no line of history, one
-        that goes leaves a line with its last value. −0 and 0 are no change of a value.
+        The later of two observations of a parameter counts, independent of the order of writes; the other one
+        is inserted into the history. A new parameter leaves no history line; a removed one leaves a line with
+        its last value. −0 and 0 are equal values.
 
-        A file is written by the clock of one computer: what it has of a time more than 5 s after the present
-        was written before that clock was set back, and counts as older than what is saved.
+        A file is written by the clock of one computer: a stored time more than 5 s in the future is from
+        before that clock was set back, and counts as older than new observations.
 
         Args:
-            update: what was learnt, or several of these.
-            clock: gives the present, in unix seconds, by the clock that the times were read from. It is asked
-                when the cache is free to be written, from any thread. None: the present is `at`.
+            update: one update, or several.
+            clock: returns the current time in unix seconds, by the clock of the updates. It is called when
+                the write lock is held, from any thread. None: the current time is `at`.
 
         Raises:
-            UsageError: a time that is not in unix seconds.
+            UsageError: a time is not in unix seconds.
         """
         updates = (update,) if isinstance(update, TableUpdate) else tuple(update)
         if updates:
             self._store.do(Save(updates, clock))
 
     def sync(self) -> None:
-        """Return when all that was written so far is on the disk: a loss of power costs nothing of it.
+        """Sync all earlier writes to the disk, safe from power loss.
 
-        It takes as long as the disk does, as a rule some milliseconds. While a database is away, the disk is
-        that of the local copy.
+        It takes the time of a disk sync, usually some milliseconds. While a database is not connected, it
+        syncs the local copy.
         """
         self._store.do(Save((), is_durable=True))
 
     def merge(
         self, updates: Sequence[TableUpdate], *, based_on: Mapping[tuple[str, int], float] | None = None
     ) -> None:
-        """Write what was observed in the past, in one transaction: all of it is kept, or nothing.
+        """Merge earlier observations, such as those of a log, in one transaction.
 
-        What is kept of a later time than an observation stays as it is; the history is completed with what
-        changed before that. To merge the same again changes nothing.
+        Stored values with later observations do not change; earlier changes are added to the history.
+        Repeating a merge changes nothing.
 
         Args:
             updates: as for `save`, in the order of their times.
-            based_on: by key and component, `updated_at` of the kept tables that the updates go on from; the
-                others know nothing of what was kept.
+            based_on: by key and component, `updated_at` of the stored tables on which the updates are based;
+                all other updates are independent of the stored tables.
 
         Raises:
-            UsageError: a time that is not in unix seconds.
+            UsageError: a time is not in unix seconds.
         """
         if updates:
             self._store.do(Merge(updates, based_on or {}))
 
     def load(self, key: str, component: int) -> CachedComponent | None:
-        """The table of a vehicle's component, or None.
+        """Return the table of a vehicle's component; None if there is none.
 
         Args:
             key: `Identity.key`.
@@ -185,19 +186,19 @@ class ParamCache:
         return found
 
     def vehicles(self) -> list[CachedVehicle]:
-        """Every vehicle, the one seen last first."""
+        """Return all vehicles, the last seen first."""
         return self._store.read(lambda session: session.vehicles())
 
     def components(self, vehicle: str | None = None) -> list[CachedSummary]:
-        """Every table, without its parameters, ordered as `vehicles()`, then by component id.
+        """Return all tables without parameters, ordered as `vehicles()`, then by component id.
 
         Args:
-            vehicle: only this one: its system id (`"4"`), `uid:` with at least 6 digits of its hardware id,
-                its hardware id in full, or its key.
+            vehicle: only this vehicle: its system id (`"4"`), `uid:` with at least 6 digits of its hardware
+                id, its full hardware id, or its key.
 
         Raises:
             UnknownVehicle: no vehicle in the cache has this name.
-            AmbiguousVehicle: several vehicles have it.
+            AmbiguousVehicle: several vehicles have this name.
         """
 
         def work(session: Session) -> list[CachedSummary]:
@@ -209,7 +210,7 @@ class ParamCache:
     def component(
         self, vehicle: str | None = None, *, system: int | None = None, component: int = 1
     ) -> CachedComponent:
-        """The one table that fits.
+        """Return the only table that matches.
 
         Args:
             vehicle: as for `components`.
@@ -217,8 +218,8 @@ class ParamCache:
             component: component id; the autopilot's is 1.
 
         Raises:
-            UnknownVehicle: no table fits. `vehicles` and the text say what there is.
-            AmbiguousVehicle: tables of several vehicles fit. `vehicles` and the text list them.
+            UnknownVehicle: no table matches. `vehicles` and the message list the existing ones.
+            AmbiguousVehicle: tables of several vehicles match. `vehicles` and the message list them.
         """
 
         def work(session: Session) -> CachedComponent:
@@ -237,18 +238,20 @@ class ParamCache:
         limit: int | None = None,
         since: float | None = None,
     ) -> list[HistoryEntry]:
-        """The changes of a vehicle's values, newest last. Of each table the newest `HISTORY_LINES` are kept.
+        """Return the changes of a vehicle's values, newest last.
+
+        The cache keeps the newest `HISTORY_LINES` (10,000) of each table.
 
         Args:
             vehicle: as for `components`.
-            component: of this component only.
-            name: of this parameter only.
-            limit: the newest so many.
-            since: those from this time on only, in unix seconds.
+            component: only changes of this component.
+            name: only changes of this parameter.
+            limit: maximum number of changes, the newest.
+            since: only changes from this time on, in unix seconds.
 
         Raises:
             UnknownVehicle: no vehicle in the cache has this name.
-            AmbiguousVehicle: several vehicles have it.
+            AmbiguousVehicle: several vehicles have this name.
         """
 
         return self._store.read(
@@ -256,14 +259,14 @@ class ParamCache:
         )
 
     def snapshot(self, vehicle: str, component: int, *, reason: str, at: float | None = None) -> Snapshot:
-        """Set a table down as it is kept now, so that it can be had again however it changes.
+        """Store a snapshot of a cached table as a restore point, and return it.
 
-        Of each table the newest `SNAPSHOTS` are kept.
+        The cache keeps the newest `SNAPSHOTS` (50) of each table.
 
         Args:
             vehicle: as for `components`.
             component: component id.
-            reason: what for, in words.
+            reason: the reason, as text.
             at: unix seconds; None for now.
 
         Raises:
@@ -273,7 +276,7 @@ class ParamCache:
 
         moment = time.time() if at is None else at
         key, _ = self._store.read(lambda session: self._table(session, vehicle, component))
-        return self._store.do(SetDown(key, component, None, moment, reason))
+        return self._store.do(StoreSnapshot(key, component, None, moment, reason))
 
     def store_snapshot(
         self,
@@ -286,19 +289,19 @@ class ParamCache:
         hash: int | None = None,  # noqa: A002  # the word of the record
         complete: bool = True,
     ) -> Snapshot:
-        """Set down a table that the caller has, as what a vehicle holds at this moment.
+        """Store a snapshot of given parameters, and return it.
 
-        The table that is kept does not change. Of each table the newest `SNAPSHOTS` are kept.
+        The cached table does not change. The cache keeps the newest `SNAPSHOTS` (50) of each table.
 
         Args:
-            vehicle: who it is; one that the cache does not know yet is written down. Or the name of one that
-                it knows, as for `components`.
+            vehicle: identity of the vehicle, which is added to the cache if it is new; or the name of a
+                cached vehicle, as for `components`.
             component: component id.
-            params: names, values, types and defaults are kept, comments and lines are not.
-            reason: what for, in words.
+            params: names, values, types and defaults are stored; comments and lines are not.
+            reason: the reason, as text.
             at: unix seconds; None for now.
-            hash: the hash under which the vehicle would confirm these parameters, where it is known.
-            complete: these are all the parameters that the vehicle has.
+            hash: the vehicle's hash of these parameters, if known.
+            complete: whether these are all parameters of the vehicle.
 
         Raises:
             UnknownVehicle: a name was given, and there is no such table.
@@ -308,29 +311,29 @@ class ParamCache:
         who = vehicle
         if isinstance(vehicle, str):
             who, _ = self._store.read(lambda session: self._table(session, vehicle, component))
-        return self._store.do(SetDown(who, component, params, moment, reason, hash, complete))
+        return self._store.do(StoreSnapshot(who, component, params, moment, reason, hash, complete))
 
     def snapshots(self, vehicle: str, component: int | None = None) -> list[SnapshotSummary]:
-        """The snapshots of a vehicle's tables, newest last.
+        """Return the snapshots of a vehicle's tables, without parameters, newest last.
 
         Args:
             vehicle: as for `components`.
-            component: of this component only.
+            component: only snapshots of this component.
 
         Raises:
             UnknownVehicle: no vehicle in the cache has this name.
-            AmbiguousVehicle: several vehicles have it.
+            AmbiguousVehicle: several vehicles have this name.
         """
         return self._store.read(lambda session: session.snapshots(self._choose(session, vehicle), component))
 
     def state_at(self, vehicle: str, component: int, when: float) -> ParamSet:
-        """A table as it was at a moment.
+        """Return a table as it was at a given time.
 
-        Exact where a snapshot was made then. Else it is worked backwards from the present table over the
-        lines of history, and is what was last known at that moment: a change counts from when it was heard.
-        It reaches back to the moment when the table was first complete, or to the oldest line of history
-        that was dropped (`HISTORY_LINES`) if that is later. Names heard for the first time after `when` are
-        not in it. Defaults and the firmware of the vehicle are only known of snapshots.
+        The result is exact if a snapshot has this time. Otherwise it is computed backwards from the current
+        table with the history lines, and has the last values received before that time. It is available back
+        to the time when the table was first complete, or to the newest dropped history line (`HISTORY_LINES`)
+        if that is later. Names received for the first time after `when` are not included. Only snapshots have
+        defaults and the firmware of the vehicle.
 
         Args:
             vehicle: as for `components`.
@@ -338,12 +341,12 @@ class ParamCache:
             when: a float is a time, in unix seconds; an int is the id of a snapshot.
 
         Raises:
-            UsageError: a time that is not in unix seconds.
+            UsageError: the time is not in unix seconds.
             UnknownVehicle: there is no such table.
             AmbiguousVehicle: several vehicles have this name.
-            CacheError: there is no such snapshot of it, or it is damaged; history does not reach back so far
-                (the text says how far, and which snapshots are next to it), or the clock of this computer
-                went through that moment twice.
+            CacheError: there is no such snapshot of the table, or it is damaged; the history begins later
+                (the message has its beginning, and the nearest snapshots); or the time is ambiguous, because
+                the clock of this computer was set back over it.
         """
 
         def work(session: Session) -> ParamSet:
@@ -357,13 +360,13 @@ class ParamCache:
         return self._store.read(work)
 
     def fleet_diff(self, wanted: Iterable[str] | ParamSet, *, component: int | None = None) -> FleetDiff:
-        """Compare every vehicle in some parameters: which of them differ, and since when.
+        """Compare parameters of all vehicles: which vehicles differ, and since when.
 
-        It takes a fraction of a second for a thousand vehicles and hundreds of parameters.
+        It takes less than a second for 1,000 vehicles and hundreds of parameters.
 
         Args:
-            wanted: the values that all should have; or names, to compare the vehicles with each other.
-                Names may be patterns of the shell: `MC_*`.
+            wanted: the wanted values; or names, to compare the vehicles with each other. Names may be shell
+                patterns: `MC_*`.
             component: component id; None for that of `wanted`, or the autopilot's.
 
         Raises:
@@ -388,34 +391,40 @@ class ParamCache:
         return self._store.read(work)
 
     def subscribe(self, told: Callable[[CacheChange], None]) -> Callable[[], None]:
-        """Have something called when another station has written to a table of the database.
+        """Call a function after each write of another station to a table of the database.
 
-        That is within a second. What was written while the database could not be reached is told when it is
-        back. Of a file nothing is told.
+        The call follows within 1 s. Writes during a lost connection are reported after the reconnection. For
+        a file, the function is never called.
 
         Args:
-            told: is called in a thread of the cache. It should be done soon, and may use the cache.
+            told: called in a thread of the cache, with the table. It should return within milliseconds, and
+                may use the cache.
 
         Returns:
-            What ends it.
+            A function that ends the subscription.
         """
         return self._store.subscribe(told)
 
     def copy_to(
         self, target: ParamCache, *, progress: Callable[[str, int, int], None] | None = None
     ) -> CopyResult:
-        """Bring every table into another cache, with history and snapshots, and see that it is there.
+        """Copy all tables with history and snapshots to another cache, and verify the copy.
 
-        Each table is one transaction, and one of which everything is there already is left alone: ended at
-        any moment, it is begun again in the same way. What the other cache has of a table stays: of each
-        value the later observation counts, and no line of history is there twice.
+        Each table is one transaction, and a table that is already complete in the target is skipped: an
+        interrupted copy can be repeated. Tables in the target are merged: the later observation of a value
+        counts, and no history line is duplicated.
 
         Args:
-            progress: is told of each table: whose it is, its number, and how many there are.
+            target: the other cache.
+            progress: called for each table with the key of the vehicle, the number of the table, and the
+                total.
+
+        Returns:
+            The numbers of tables, parameters, history lines and snapshots.
 
         Raises:
-            UsageError: both are the same.
-            CacheError: one of them cannot be used, its database is away, or something did not arrive.
+            UsageError: both caches are the same.
+            CacheError: a cache cannot be used, its database is not connected, or the verification failed.
         """
         result = copy_store(self._store, target._store, progress)
         for each in (self, target):
@@ -424,15 +433,15 @@ class ParamCache:
         return result
 
     def remove(self, vehicle: str, component: int | None = None) -> int:
-        """Forget a vehicle's tables with their history and snapshots; give the number of tables.
+        """Remove a vehicle's tables with history and snapshots, and return the number of tables.
 
         Args:
             vehicle: as for `components`.
-            component: this component's only.
+            component: only the table of this component.
 
         Raises:
             UnknownVehicle: no vehicle in the cache has this name.
-            AmbiguousVehicle: several vehicles have it.
+            AmbiguousVehicle: several vehicles have this name.
         """
 
         def work(session: Session) -> tuple[str, int]:
@@ -443,7 +452,7 @@ class ParamCache:
         return self._store.do(Remove(key, component, known))
 
     def _table(self, session: Session, vehicle: str, component: int) -> tuple[str, int]:
-        """The key of the vehicle that is meant, and the id of its table."""
+        """Return the key of the only vehicle with this name, and the id of its table."""
         key = self._choose(session, vehicle, component=component)
         owner = session.owner_of(key, component)
         assert owner is not None, "what was chosen exists for the whole transaction"
@@ -463,7 +472,7 @@ class ParamCache:
         system: int | None = None,
         component: int | None = None,
     ) -> str:
-        """Return the key of the only vehicle that fits; see `paramclient.cache.lookup`."""
+        """Return the key of the only vehicle that matches; see `paramclient.cache.lookup`."""
         return find_vehicle(
             session.vehicles(), vehicle, place=self.place, system=system, component=component
         ).key

@@ -1,9 +1,9 @@
-"""Tables: written, compared, read. Each function works inside its caller's transaction.
+"""Tables and their history lines. Each function runs inside the transaction of its caller.
 
-One mechanism writes history: `applied` compares every value that it is given with the one that is stored,
-and where they differ there is a line, written in the same transaction. So no change of a stored value can
-miss its line, and when two processes hear the same change, the second finds nothing to write. Which values
-count is said by `settle` and `merge`.
+Only `applied` creates history lines: it compares every new value with the stored one, and a difference gives
+a line, written in the same transaction. Therefore every change of a stored value has its line, and if two
+processes receive the same change, the second one has nothing to write. `reconcile` and `merge` decide which
+values count.
 """
 
 from __future__ import annotations
@@ -41,20 +41,20 @@ __all__ = [
 ]
 
 HISTORY_LINES: Final = 10_000
-"""Lines of history kept for each table, the newest ones: about a megabyte, and years of tuning by hand. Each
-`save` writes a line for each value that changed, so what a vehicle changes many times a second should be
-gathered before it is saved."""
+"""Maximum number of history lines of each table, the newest: about 1 MB, and years of tuning by hand. Each
+`save` writes a line for each changed value, so values that change many times a second should be collected
+first."""
 
 
 def save(session: Session, updates: Iterable[TableUpdate]) -> None:
-    """Write what was learnt, in the order given: whatever is kept is older."""
+    """Write updates in order. All of them are later than the stored values."""
     for update in updates:
         forget_other_firmware(session, update.identity)
         snapshots.watch_clock(session, update.identity.key, update.component, time_cell(update.at))
         owner = session.make(update)
         before: Mapping[str, Row] = {}
         after = before
-        if update.params or update.removed or update.replace:  # else it is about the table as a whole only
+        if update.params or update.removed or update.replace:  # otherwise it has only the state of the table
             before = session.table(owner)
             after, lines, births = applied(update, before)
             if len(after) != len(before) or after != before:
@@ -76,7 +76,7 @@ def component(
     *,
     history: Callable[[str | None, int | None], list[HistoryEntry]],
 ) -> CachedComponent | None:
-    """One table with its parameters, or None."""
+    """Return a table with its parameters; None if there is none."""
     for owner, summary in session.summaries(key, number):
         params, volatile, heard_at = session.params(owner)
         left_out = tuple(name for name in params.held if not is_portable_name(name))
@@ -95,7 +95,7 @@ def component(
 
 
 def forget_other_firmware(session: Session, identity: Identity) -> None:
-    """Where a vehicle has another firmware than before: drop what was true of that one only."""
+    """If a vehicle has another firmware than before, remove defaults and state of the previous one."""
     for owner in session.of_other_firmware(identity.key, identity.firmware, identity.git_hash):
         before = session.table(owner)
         after = {name: row._replace(default_bits=None) for name, row in before.items()}
@@ -107,12 +107,12 @@ def forget_other_firmware(session: Session, identity: Identity) -> None:
 def applied(
     update: TableUpdate, before: Mapping[str, Row], stays: Collection[str] = ()
 ) -> tuple[Mapping[str, Row], list[Line], Iterable[tuple[str, float]]]:
-    """The rows after an update, the lines of history that it causes, and the new names with their times.
+    """Return the rows after an update, its history lines, and the new names with their times.
 
     Args:
-        update: what is news of it.
-        before: the rows.
-        stays: names that it does not take away.
+        update: the update, without overtaken values.
+        before: the stored rows.
+        stays: names that the update does not remove.
     """
     if not before and isinstance(update.params, HeardParams):
         first = update.params.first_rows()
@@ -144,7 +144,7 @@ def applied(
 
 
 def _news(params: Iterable[StoredParam]) -> Iterable[tuple[str, Row, bool | None, str]]:
-    """What is to be kept: names and rows, whether they are volatile, and who caused the changes."""
+    """Return name, row, volatile flag and author of each parameter."""
     if isinstance(params, HeardParams):
         return params.rows()
     return (
@@ -159,12 +159,12 @@ def _news(params: Iterable[StoredParam]) -> Iterable[tuple[str, Row, bool | None
 
 
 def hashed(rows: Mapping[str, Row]) -> dict[str, tuple[int, int, int]]:
-    """What the vehicle's hash covers of a table."""
+    """Return the values that the vehicle's hash covers, by name."""
     return {name: row.hashed for name, row in rows.items() if row.hashed is not None}
 
 
 def write_lines(session: Session, owner: int, lines: Sequence[Line]) -> None:
-    """Append lines of history, and drop the oldest ones beyond `HISTORY_LINES`."""
+    """Append history lines, and delete the oldest beyond `HISTORY_LINES`."""
     if not lines:
         return
     session.add_lines(owner, lines)
@@ -174,7 +174,7 @@ def write_lines(session: Session, owner: int, lines: Sequence[Line]) -> None:
 
 
 def write_state(session: Session, owner: int, state: TableState) -> None:
-    """Say of a table what is known of it as a whole."""
+    """Write the state of a table as a whole."""
     session.describe(
         owner,
         hash=state.hash,

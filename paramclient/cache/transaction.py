@@ -1,8 +1,7 @@
-"""One transaction on the tables of a cache: rows in, rows out.
+"""Session: one transaction on the tables of a cache.
 
-The statements are SQL that SQLite and PostgreSQL both understand, with `?` for each value. What the two say
-differently is left to `sqlite` and `postgres`. What the rows mean is the business of the rooms above; none of
-them speaks SQL.
+The statements are SQL that both SQLite and PostgreSQL accept, with `?` for each value. `sqlite` and
+`postgres` implement the differences. Other modules interpret the rows and have no SQL.
 """
 
 from __future__ import annotations
@@ -27,10 +26,11 @@ from paramclient.model.params import Params
 __all__ = ["Line", "NumberedLine", "Session"]
 
 Line: TypeAlias = tuple[Any, ...]
-"""A line of history: at, name, by; type, bits, is_raw of the old value, and of the new one, or three None."""
+"""A history line: at, name, by; type, bits, is_raw of the old value, and of the new one, or three None."""
 NumberedLine: TypeAlias = tuple[int, Line]
+"""A history line with its number."""
 
-# In the order of `identity_cells`.
+# Columns of a vehicle, in the order of `identity_cells`.
 _IDENTITY: Final = (
     "system, link, uid, autopilot, vehicle_type, firmware, git_hash,"
     " board, vendor_id, product_id, capabilities"
@@ -43,7 +43,7 @@ class Session(ABC):
     """The tables within one transaction. An `owner` is the id of a component's table in this database.
 
     Attributes:
-        is_shared: several stations write here, each with its own clock and its own view of a vehicle.
+        is_shared: whether several stations write to it, each with its own clock and observations.
     """
 
     is_shared: bool = False
@@ -51,7 +51,7 @@ class Session(ABC):
     # vehicles and their tables
 
     def make(self, update: TableUpdate) -> int:
-        """Write whose table it is; give the id of the table, which is made where there is none."""
+        """Write the vehicle and component of an update, and return the id of the table, which may be new."""
         at = time_cell(update.at)
         key = update.identity.key
         columns = f"{_IDENTITY}, last_seen"
@@ -73,18 +73,18 @@ class Session(ABC):
         return owner
 
     def owner_of(self, key: str, component: int) -> int | None:
-        """The id of a table, or None where there is none."""
+        """Return the id of a table; None if there is none."""
         found = self._all("SELECT id FROM component WHERE vehicle = ? AND component = ?", (key, component))
         return int(found[0][0]) if found else None
 
     def described(self, owner: int) -> tuple[str, int, float | None]:
-        """Whose table it is: key and component id; and since when its states are known."""
+        """Return key and component id of a table, and the time since which its states are known, or None."""
         [row] = self._all("SELECT vehicle, component, known_since FROM component WHERE id = ?", (owner,))
         key, component, since = cells(row, "siF")
         return key, component, since
 
     def vehicles(self, key: str | None = None) -> list[CachedVehicle]:
-        """Every vehicle, the one seen last first; or the one of this key."""
+        """Return all vehicles, the last seen first; or the one with this key."""
         components: dict[str, list[int]] = {}
         which = (key,)
         for row in self._all(
@@ -106,13 +106,13 @@ class Session(ABC):
         return found
 
     def seen(self, key: str, first: float, last: float) -> None:
-        """Say when a vehicle was seen for the first and for the last time."""
+        """Set the first and last time at which a vehicle was seen."""
         self._do("UPDATE vehicle SET first_seen = ?, last_seen = ? WHERE key = ?", (first, last, key))
 
     def summaries(
         self, key: str | None = None, component: int | None = None
     ) -> list[tuple[int, CachedSummary]]:
-        """Tables with their ids, without parameters; of one vehicle or component where given."""
+        """Return tables with their ids, without parameters, optionally of one vehicle or component."""
         rows = self._all(
             f"SELECT id, component, own_autopilot, {self.SIZE}, hash,"
             f" count, complete, volatile_known, synced_at, updated_at, file_works, key, {_IDENTITY}"
@@ -124,7 +124,7 @@ class Session(ABC):
         return [_summary(row) for row in rows]
 
     def updated_at(self, key: str, component: int) -> float | None:
-        """When a table was last written; None where there is none."""
+        """Return the time of the last write to a table; None if there is none."""
         found = self._all(
             "SELECT updated_at FROM component WHERE vehicle = ? AND component = ?", (key, component)
         )
@@ -134,7 +134,7 @@ class Session(ABC):
         return float(at)
 
     def of_other_firmware(self, key: str, firmware: int, git_hash: str) -> list[int]:
-        """The tables of a vehicle, if it had another firmware when it was last seen."""
+        """Return the ids of a vehicle's tables, if its stored firmware differs from this one."""
         found = self._all(
             "SELECT c.id FROM vehicle JOIN component c ON vehicle = key"
             " WHERE key = ? AND (firmware != ? OR git_hash != ?)",
@@ -143,13 +143,13 @@ class Session(ABC):
         return [int(owner) for (owner,) in found]
 
     def describe(self, owner: int, **cells_: object) -> None:
-        """Change what is said of a table as a whole; the names are those of the columns."""
+        """Set columns of a table as a whole, by column name."""
         named = ", ".join(f"{name} = ?" for name in cells_)
         values = (int(cell) if isinstance(cell, bool) else cell for cell in cells_.values())
         self._do(f"UPDATE component SET {named} WHERE id = ?", (*values, owner))
 
     def remove(self, key: str, component: int | None) -> int:
-        """Delete tables with all that belongs to them; give their number."""
+        """Delete tables with all dependent rows. Return their number."""
         removed = self._do(
             "DELETE FROM component WHERE vehicle = ? AND component = coalesce(?, component)", (key, component)
         )
@@ -159,21 +159,21 @@ class Session(ABC):
     # parameters
 
     SIZE: ClassVar[str]
-    """What says in a statement how many parameters the table of `c.id` has."""
+    """SQL expression for the number of parameters of the table `c.id`."""
 
     @abstractmethod
     def table(self, owner: int) -> dict[str, Row]:
-        """A table's parameters by index, then name, those without an index last.
+        """Return the rows of a table by name, ordered by index, then name, those without an index last.
 
         Raises:
-            Damaged: they are not what was written.
+            Damaged: the checksum does not match.
         """
 
     def params(self, owner: int) -> tuple[Params, frozenset[str], dict[str, float]]:
-        """The same as parameters: those, the names of the volatile ones, and when each was heard.
+        """Return the parameters of a table, the names of volatile ones, and the observation times by name.
 
         Raises:
-            Damaged: they are not what was written.
+            Damaged: the checksum does not match.
         """
         rows = self.table(owner)
         volatile = frozenset(name for name, row in rows.items() if row.volatile)
@@ -181,26 +181,27 @@ class Session(ABC):
 
     @abstractmethod
     def put_table(self, owner: int, before: Mapping[str, Row] | None, after: Mapping[str, Row]) -> None:
-        """Make a table's parameters these.
+        """Replace the rows of a table.
 
         Args:
-            before: what it has; None where that is not known, and may not be what was written.
-            after: what it is to have; something else.
+            owner: id of the table.
+            before: the stored rows; None if they are unknown, and possibly damaged.
+            after: the new rows, which differ from `before`.
 
         Raises:
-            UsageError: something that cannot be kept.
+            UsageError: a row cannot be stored.
         """
 
     @abstractmethod
     def heard_last(self, owner: int) -> float:
-        """When any value of a table was heard last; minus infinity where it has none."""
+        """Return the time of the last observation in a table; minus infinity for an empty table."""
 
     # history
 
     def history(
         self, key: str, component: int | None, name: str | None, limit: int | None, since: float | None
     ) -> list[HistoryEntry]:
-        """The lines of a vehicle, newest last."""
+        """Return the history of a vehicle, newest last."""
         end = "" if limit is None or limit < 0 else f" LIMIT {int(limit)}"
         rows = self._all(
             "SELECT at, component, name, by, old_type, old_bits, old_is_raw, new_type, new_bits, new_is_raw"
@@ -212,25 +213,25 @@ class Session(ABC):
         return [_entry(row) for row in reversed(rows)]
 
     def lines(self, owner: int, after: float | None = None) -> list[NumberedLine]:
-        """The lines of a table with their numbers, in order; those of a later time than `after` only."""
+        """Return the history lines of a table in order; with `after`, only those of a later time."""
         if after is None:
             return self._lines("", (owner,))
         return self._lines(" AND at > ?", (owner, after))
 
     def lines_from(self, owner: int, since: float) -> list[NumberedLine]:
-        """The lines from the first one on that is of a later time than `since`, in order."""
+        """Return the history lines in order, starting with the first one of a later time than `since`."""
         where = " AND id >= (SELECT min(id) FROM history WHERE owner = ? AND at > ?)"
         return self._lines(where, (owner, owner, since))
 
     def add_lines(self, owner: int, lines: Sequence[Line]) -> None:
-        """Append lines of history, in this order."""
+        """Append history lines in this order."""
         self._many(
             f"INSERT INTO history (owner, {_LINE}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
             [(owner, *line) for line in lines],
         )
 
     def trim_lines(self, owner: int, keep: int) -> float | None:
-        """Delete all but the newest lines of a table; give the latest time of those that went, if any did."""
+        """Delete all but the newest lines of a table. Return the latest time of the deleted ones, or None."""
         found = self._all(
             f"SELECT id FROM history WHERE owner = ? ORDER BY id DESC LIMIT 1 OFFSET {int(keep)}", (owner,)
         )
@@ -242,12 +243,13 @@ class Session(ABC):
         return float(at)
 
     def replace_lines(self, owner: int, lines: Sequence[tuple[int | None, Line]], *, start: int = 0) -> None:
-        """Put these lines into the place of those that a table has, in this order, under new numbers.
+        """Replace the history lines of a table, in this order, with new numbers.
 
         Args:
-            lines: each with the number that it had, or None for a new one. Names that appeared behind a line
-                go with it.
-            start: the number from which on lines are replaced.
+            owner: id of the table.
+            lines: lines, each with its previous number, or None for a new one. Names that appeared after a
+                line move with it.
+            start: number of the first line to replace.
         """
         [(ahead,)] = self._all(
             "SELECT coalesce(max(id), 0) FROM history WHERE owner = ? AND id < ?", (owner, start)
@@ -255,7 +257,7 @@ class Session(ABC):
         numbers = self._put_lines(owner, [line for _, line in lines], start)
         places = {old: number for number, (old, _) in zip(numbers, lines, strict=True) if old is not None}
         behind = self._all("SELECT DISTINCT line FROM birth WHERE owner = ? AND line >= ?", (owner, start))
-        # from the last one on: a new number is above every old one
+        # in descending order, as every new number is above every old one
         for (line,) in sorted(behind, reverse=True):
             place = max((new for old, new in places.items() if old <= line), default=ahead)
             if place == line:
@@ -268,7 +270,7 @@ class Session(ABC):
             self._do("UPDATE birth SET line = ? WHERE owner = ? AND line = ?", (place, owner, line))
 
     def became(self, owner: int, name: str, after: float, until: float) -> list[tuple[Any, ...]]:
-        """What a parameter became in a time, by its lines: type, bits, is_raw."""
+        """Return the new values of a parameter's lines in a period: type, bits, is_raw."""
         return self._all(
             "SELECT new_type, new_bits, new_is_raw FROM history"
             " WHERE owner = ? AND name = ? AND at > ? AND at <= ?",
@@ -276,7 +278,7 @@ class Session(ABC):
         )
 
     def last_became(self, owner: int, name: str, until: float) -> tuple[Any, ...] | None:
-        """What the last line of a parameter up to a time made of it, as in `became`; None without a line."""
+        """Return the new value of the last line of a parameter up to a time; None without a line."""
         found = self._all(
             "SELECT new_type, new_bits, new_is_raw FROM history"
             " WHERE owner = ? AND name = ? AND at <= ? ORDER BY id DESC LIMIT 1",
@@ -285,32 +287,32 @@ class Session(ABC):
         return found[0] if found else None
 
     def last_line_at(self, owner: int) -> float:
-        """The time of the last line of a table; minus infinity where it has none."""
+        """Return the time of the last line of a table; minus infinity without a line."""
         found = self._all("SELECT at FROM history WHERE owner = ? ORDER BY id DESC LIMIT 1", (owner,))
         return max((float(at) for (at,) in found), default=float("-inf"))
 
     def gone(self, owner: int) -> Mapping[str, float]:
-        """By name, when a parameter went last, of those that did and have left a line."""
+        """Return the time of the last removal of each removed parameter, by name."""
         found = self._all(
             "SELECT name, max(at) FROM history WHERE owner = ? AND new_type IS NULL GROUP BY name", (owner,)
         )
         return dict(cells(row, "sf") for row in found)
 
     def gone_at(self, owner: int, name: str) -> float:
-        """When a name went last, by its lines; minus infinity where it never did."""
+        """Return the time of the last removal of a parameter; minus infinity if it was never removed."""
         [(at,)] = self._all(
             "SELECT max(at) FROM history WHERE owner = ? AND name = ? AND new_type IS NULL", (owner, name)
         )
         return float("-inf") if at is None else float(at)
 
-    # what is known of the past beside the lines
+    # records for earlier states, in addition to the lines
 
     def begin(self, owner: int, at: float) -> None:
-        """The states of a table are known from now on, unless they are already."""
+        """Set the time since which the states of a table are known, unless it is set."""
         self._do("UPDATE component SET known_since = ? WHERE id = ? AND known_since IS NULL", (at, owner))
 
     def forget(self, owner: int, at: float) -> None:
-        """The states of a table are not known any more up to this time."""
+        """Mark the states of a table up to this time as unknown."""
         self._do(
             "UPDATE component SET known_since = CASE WHEN known_since > ? THEN known_since ELSE ? END"
             " WHERE id = ? AND known_since IS NOT NULL",
@@ -324,16 +326,13 @@ class Session(ABC):
             )
 
     def add_births(self, owner: int, births: Iterable[tuple[str, float]]) -> None:
-        """Note names that appeared behind the last line, where the states of the table are known."""
+        """Record new names after the last line, if the states of the table are known."""
         _, _, known_since = self.described(owner)
         if known_since is not None:
             self.add_first_times(owner, births)
 
     def add_first_times(self, owner: int, times: Iterable[tuple[str, float]]) -> None:
-        """Note names and since when they are known, behind the last line.
-
-        The earlier time counts where one is noted there already.
-        """
+        """Record names with their first times, after the last line. The earlier of two times counts."""
         self._many(
             "INSERT INTO birth (owner, name, line, at)"
             " VALUES (?, ?, coalesce((SELECT max(id) FROM history WHERE owner = ?), 0), ?)"
@@ -343,24 +342,24 @@ class Session(ABC):
         )
 
     def first_times(self, owner: int) -> dict[str, float]:
-        """By name, the earliest time that is noted, of those that have one."""
+        """Return the earliest recorded time of each name."""
         found = self._all("SELECT name, min(at) FROM birth WHERE owner = ? GROUP BY name", (owner,))
         return dict(cells(row, "sf") for row in found)
 
     def births(self, owner: int) -> list[tuple[str, int, float]]:
-        """Every name that has appeared, behind which line, and when."""
+        """Return name, number of the preceding line and time of every recorded name."""
         found = self._all("SELECT name, line, at FROM birth WHERE owner = ? ORDER BY line, name", (owner,))
         return [(name, line, at) for name, line, at in (cells(row, "sif") for row in found)]
 
     def setbacks(self, owner: int) -> list[tuple[float, float]]:
-        """The times, from and until, that the clock went through twice."""
+        """Return the periods, from and until, that the clock has passed twice."""
         found = self._all("SELECT since, until FROM setback WHERE owner = ? ORDER BY id", (owner,))
         return [(since, until) for since, until in (cells(row, "ff") for row in found)]
 
     def put_past(
         self, owner: int, lines: Sequence[Line], setbacks: Iterable[tuple[float, float]]
     ) -> Sequence[int]:
-        """Put another past into the place of a table's; give the numbers of the lines."""
+        """Replace history and setbacks of a table. Return the numbers of the lines."""
         for table in ("history", "birth", "setback"):
             self._do(f"DELETE FROM {table} WHERE owner = ?", (owner,))
         for since, until in setbacks:
@@ -368,23 +367,23 @@ class Session(ABC):
         return self._put_lines(owner, lines)
 
     def put_births(self, owner: int, births: Iterable[tuple[str, float, int]]) -> None:
-        """Note names that appeared: when, and behind the line of which number."""
+        """Record new names: name, time, and number of the preceding line."""
         self._many(
             "INSERT INTO birth (owner, name, at, line) VALUES (?, ?, ?, ?)",
             [(owner, *birth) for birth in births],
         )
 
     def births_after(self, owner: int, when: float) -> list[tuple[int, str]]:
-        """The names that appeared after a moment, each with the line that was the last one then."""
+        """Return the names that appeared after a given time, each with the number of the preceding line."""
         found = self._all("SELECT line, name FROM birth WHERE owner = ? AND at > ?", (owner, when))
         return [(line, name) for line, name in (cells(row, "is") for row in found)]
 
     def add_setback(self, owner: int, since: float, until: float) -> None:
-        """Note that the clock went through a time twice."""
+        """Record a period that the clock has passed twice."""
         self._do("INSERT INTO setback (owner, since, until) VALUES (?, ?, ?)", (owner, since, until))
 
     def setback_over(self, owner: int, when: float) -> tuple[float, float] | None:
-        """The time, from and until, that the clock went through twice and that a moment is in, if any."""
+        """Return a period, from and until, that the clock has passed twice and that includes this time."""
         found = self._all(
             "SELECT since, until FROM setback WHERE owner = ? AND since <= ? AND until > ?",
             (owner, when, when),
@@ -394,15 +393,19 @@ class Session(ABC):
     # snapshots
 
     SNAPSHOT_ORDER: ClassVar[str] = "s.id"
+    """SQL columns that order snapshots from old to new."""
 
     def add_snapshot(
         self, owner: int, row: Sequence[object], blob: bytes, crc: int, number: int | None = None
     ) -> int:
-        """Write a snapshot; give its number.
+        """Write a snapshot. Return its number.
 
         Args:
+            owner: id of the table.
             row: at, reason, size, hash, complete.
-            number: the one that it was given elsewhere; None for the next one.
+            blob: encoded parameters.
+            crc: checksum.
+            number: number that another store has assigned; None for the next one.
         """
         given = () if number is None else (number,)
         return self._insert(
@@ -423,11 +426,11 @@ class Session(ABC):
         self._many("DELETE FROM snapshot WHERE id = ?", [(number,) for number in numbers])
 
     def has_snapshot(self, number: int) -> bool:
-        """Whether a snapshot of any table has this number."""
+        """Return whether a snapshot of any table has this number."""
         return bool(self._all("SELECT 1 FROM snapshot WHERE id = ?", (number,)))
 
     def snapshots(self, key: str, component: int | None) -> list[SnapshotSummary]:
-        """The snapshots of a vehicle's tables, newest last."""
+        """Return the snapshots of a vehicle's tables, newest last."""
         rows = self._all(
             f"SELECT {_SUMMARY} FROM snapshot s JOIN component c ON c.id = owner"
             f" WHERE vehicle = ? AND component = coalesce(?, component) ORDER BY {self.SNAPSHOT_ORDER}",
@@ -438,7 +441,7 @@ class Session(ABC):
     def snapshot(
         self, owner: int, number: int
     ) -> tuple[SnapshotSummary, Sequence[object], object, object] | None:
-        """One snapshot: its summary, the row that was written, its parameters and its checksum; or None."""
+        """Return a snapshot: summary, row as written, encoded parameters, checksum; None if there is none."""
         found = self._all(
             f"SELECT {_SUMMARY}, params, s.checksum FROM snapshot s JOIN component c ON c.id = owner"
             " WHERE s.id = ? AND owner = ?",
@@ -450,7 +453,7 @@ class Session(ABC):
         return _snapshot(described), described[3:], blob, expected
 
     def snapshots_around(self, owner: int, when: float) -> list[tuple[int, float]]:
-        """Number and time of the last snapshot that is not later than a moment, and of the first that is."""
+        """Return number and time of the last snapshot up to a given time, and of the first after it."""
         return [
             (number, at)
             for order in ("at <= ? ORDER BY at DESC, id DESC", "at > ? ORDER BY at, id")
@@ -463,14 +466,14 @@ class Session(ABC):
         ]
 
     def snapshot_at(self, owner: int, when: float) -> int | None:
-        """The last snapshot that was made at exactly this time."""
+        """Return the number of the last snapshot with exactly this time, or None."""
         [(number,)] = self._all("SELECT max(id) FROM snapshot WHERE owner = ? AND at = ?", (owner, when))
         return None if number is None else int(number)
 
-    # many vehicles beside each other
+    # fleet comparison
 
     def tables_of(self, component: int) -> list[tuple[int, str, int, bool]]:
-        """The tables of a component: id, key, system, complete; the vehicle seen last first."""
+        """Return the tables of a component: id, key, system, complete; the last seen vehicle first."""
         found = self._all(
             "SELECT c.id, key, system, complete FROM component c JOIN vehicle ON key = vehicle"
             " WHERE component = ? ORDER BY last_seen DESC, key",
@@ -482,44 +485,41 @@ class Session(ABC):
 
     @abstractmethod
     def names_between(self, component: int, first: str, end: str) -> list[str]:
-        """The names from one to below another that any table of a component has."""
+        """Return the names in the tables of a component from `first` to before `end`."""
 
     @abstractmethod
     def holders(self, owners: Sequence[int], names: Sequence[str]) -> Mapping[tuple[Any, ...], list[int]]:
-        """Which of these tables have which of these names with what value: by name, type, bits, is_raw.
-
-        The tables of one value are in no particular order.
-        """
+        """Return the ids of tables by name, type, bits, is_raw of these parameters, in arbitrary order."""
 
     @abstractmethod
     def since(self, named: Mapping[int, Sequence[str]]) -> list[tuple[int, str, str, int, float]]:
-        """What tells since when some parameters of some tables are as they are.
+        """Return times that date the current values of some parameters, by table.
 
-        Rows of owner, name, what, line, at: of "heard", when the value was heard; of "line", the last line
-        of history; of "birth", when the name last appeared, behind which line; of "known" with an empty
-        name, since when the states of the table are known.
+        The rows have owner, name, what, line, at. For "heard", `at` is the last observation of the value; for
+        "line", the last history line; for "birth", the last appearance of the name, after `line`; for "known"
+        with an empty name, the time since which the states of the table are known.
         """
 
-    # the two databases
+    # implemented by each database
 
     @abstractmethod
     def _all(self, sql: str, values: Sequence[object] = ()) -> list[tuple[Any, ...]]:
-        """Do a statement; give every row."""
+        """Execute a statement and return all rows."""
 
     @abstractmethod
     def _do(self, sql: str, values: Sequence[object] = ()) -> int:
-        """Do a statement; give the number of rows that it touched."""
+        """Execute a statement and return the number of affected rows."""
 
     @abstractmethod
     def _many(self, sql: str, rows: Iterable[Sequence[object]]) -> None:
-        """Do a statement for each row, in order."""
+        """Execute a statement for each row, in order."""
 
     @abstractmethod
     def _insert(self, sql: str, values: Sequence[object]) -> int:
-        """Insert a row into a table with an `id`; give that."""
+        """Insert a row into a table with an `id`, and return the id."""
 
     def _put_lines(self, owner: int, lines: Sequence[Line], start: int = 0) -> Sequence[int]:
-        numbers = self._numbers(len(lines))  # above those that go: a birth behind one is told from others
+        numbers = self._numbers(len(lines))  # above the deleted ones, so that births refer to either clearly
         self._do("DELETE FROM history WHERE owner = ? AND id >= ?", (owner, start))
         self._many(
             f"INSERT INTO history (id, owner, {_LINE}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
@@ -533,7 +533,7 @@ class Session(ABC):
 
     @abstractmethod
     def _numbers(self, count: int) -> Sequence[int]:
-        """So many numbers for lines of history, rising, above all that were given."""
+        """Return ascending numbers for new history lines, above all existing ones."""
 
     @property
     def _newest_first(self) -> str:

@@ -1,4 +1,4 @@
-"""Whole tables from one store into another: with their history, their snapshots, and who the vehicle is."""
+"""Copies of whole tables between stores, with history, snapshots and vehicle identity."""
 
 from __future__ import annotations
 
@@ -20,27 +20,28 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CopyResult",
-    "Join",
-    "OWN_NUMBERS",
-    "Shot",
-    "Whole",
+    "JoinTable",
+    "LOCAL_NUMBERS_MIN",
+    "StoredSnapshot",
+    "WholeTable",
     "copy_store",
     "put_shots",
     "put_whole",
     "take_whole",
 ]
 
-OWN_NUMBERS: Final = 1 << 50
-"""From here on, stations give numbers to snapshots themselves, while the database is away; below, it does."""
+LOCAL_NUMBERS_MIN: Final = 1 << 50
+"""Smallest snapshot number that stations assign while the database is not connected. The database assigns
+numbers below it."""
 
 
 @dataclass(frozen=True)
-class Shot:
-    """A snapshot as it is kept.
+class StoredSnapshot:
+    """A snapshot as stored.
 
     Attributes:
         row: at, reason, size, hash, complete.
-        blob: its parameters; None where the taker has them.
+        blob: its encoded parameters; None if the target has them.
         crc: its checksum.
     """
 
@@ -50,12 +51,18 @@ class Shot:
 
 
 @dataclass(frozen=True)
-class Whole:
-    """All that is kept of one table.
+class WholeTable:
+    """All stored data of one table.
 
     Attributes:
-        births: name, time, and how many lines were there when it appeared.
-        shots: the snapshots by number.
+        vehicle: the vehicle.
+        table: its summary.
+        known_since: time since which its states are known, or None.
+        rows: its parameters by name.
+        lines: its history lines, in order.
+        births: name, time, and number of history lines at the appearance of the name.
+        setbacks: periods, from and until, that the clock has passed twice.
+        shots: its snapshots by number.
     """
 
     vehicle: CachedVehicle
@@ -65,10 +72,10 @@ class Whole:
     lines: tuple[Line, ...]
     births: tuple[tuple[str, float, int], ...]
     setbacks: tuple[tuple[float, float], ...]
-    shots: Mapping[int, Shot]
+    shots: Mapping[int, StoredSnapshot]
 
-    def lacks(self, other: Whole) -> str | None:
-        """What another one has that this one does not know, nor anything later; None for nothing."""
+    def lacks(self, other: WholeTable) -> str | None:
+        """Return what this table lacks of another one; None if it has all of it, or later data."""
         for name, row in other.rows.items():
             mine = self.rows.get(name)
             if (mine is None and not self.was_removed(name)) or (
@@ -84,17 +91,18 @@ class Whole:
         return None
 
     def was_removed(self, name: str) -> bool:
+        """Return whether a history line removes a parameter."""
         return any(line[1] == name and line[6] is None for line in self.lines)
 
 
 @dataclass(frozen=True)
 class CopyResult:
-    """What came of copying a cache.
+    """Result of a copy of a cache.
 
     Attributes:
-        tables: that were written.
-        unchanged: tables of which everything was there already.
-        params, lines, snapshots: in all tables of the cache that was copied.
+        tables: number of written tables.
+        unchanged: number of tables that were already complete in the target.
+        params, lines, snapshots: numbers of parameters, history lines and snapshots in the source.
     """
 
     tables: int
@@ -105,10 +113,10 @@ class CopyResult:
 
 
 @dataclass(frozen=True)
-class Join(Operation[None]):
-    """Bring a whole table into a store: beside what it has of it already, of which the later counts."""
+class JoinTable(Operation[None]):
+    """Merge a whole table into a store: the later observation of a value counts."""
 
-    whole: Whole
+    whole: WholeTable
 
     @property
     def tables(self) -> Iterable[tuple[str, int | None]]:
@@ -121,24 +129,26 @@ class Join(Operation[None]):
         mine = set() if there is None else {shot.crc for shot in there.shots.values()}
         for number, shot in self.whole.shots.items():
             if shot.crc not in mine and shot.blob is not None:
-                is_free = number < OWN_NUMBERS and not session.has_snapshot(number)
+                is_free = number < LOCAL_NUMBERS_MIN and not session.has_snapshot(number)
                 session.add_snapshot(owner, shot.row, shot.blob, shot.crc, number if is_free else None)
 
 
 def copy_store(
     source: Store, target: Store, progress: Callable[[str, int, int], None] | None = None
 ) -> CopyResult:
-    """Copy every table of a store into another one, and see that it is there.
+    """Copy every table of a store to another one, and verify the copy.
 
-    Each table is one transaction. What is there already is left alone: ended at any moment, it is begun again
-    in the same way, and goes on.
+    Each table is one transaction. A table that is already complete in the target is skipped: an interrupted
+    copy can be repeated.
 
     Args:
-        progress: is told of each table: whose it is, its number, and how many there are.
+        source: the store to copy.
+        target: the store to write.
+        progress: called for each table with the key of the vehicle, the number of the table, and the total.
 
     Raises:
-        CacheError: one of them cannot be used, or what was written is not what is read back.
-        UsageError: both are the same.
+        CacheError: a store cannot be used, or the verification failed.
+        UsageError: both stores are the same.
     """
     if source.place == target.place:
         raise UsageError(f"{source.place} cannot be copied to itself")
@@ -152,11 +162,11 @@ def copy_store(
         if found is None:
             continue  # it was removed meanwhile
         if _lacking(target, found) is not None:
-            target.do(Join(found))
+            target.do(JoinTable(found))
             lacking = _lacking(target, found)
             if lacking is not None:
                 raise CacheError(
-                    f"{lacking} of {key}, component {component}, did not arrive in {target.place}; copy again"
+                    f"{lacking} of {key}, component {component}, is missing in {target.place}; copy again"
                 )
             written += 1
         params += len(found.rows)
@@ -167,15 +177,18 @@ def copy_store(
 
 def take_whole(
     session: Session, key: str, component: int, having: Collection[int] = frozenset()
-) -> Whole | None:
-    """All that is kept of a table, or None.
+) -> WholeTable | None:
+    """Return all stored data of a table; None if there is none.
 
     Args:
-        having: the numbers of the snapshots that are not needed.
+        session: the transaction.
+        key: key of the vehicle.
+        component: component id.
+        having: numbers of snapshots whose parameters are not needed.
 
     Raises:
-        Damaged: its parameters are not what was written.
-        CacheError: a snapshot is not.
+        Damaged: the parameters are damaged.
+        CacheError: a snapshot is damaged.
     """
     found = session.summaries(key, component)
     if not found:
@@ -196,8 +209,8 @@ def take_whole(
         _, row, blob, crc = kept
         if not isinstance(blob, bytes) or not isinstance(crc, int):
             raise CacheError(f"snapshot {summary.id} of {key}, component {component}, is damaged")
-        shots[summary.id] = Shot(tuple(row), None if summary.id in having else blob, crc)
-    return Whole(
+        shots[summary.id] = StoredSnapshot(tuple(row), None if summary.id in having else blob, crc)
+    return WholeTable(
         vehicle,
         table,
         known_since,
@@ -209,8 +222,8 @@ def take_whole(
     )
 
 
-def put_whole(session: Session, whole: Whole) -> int:
-    """Put a table into a store, without its snapshots, in the place of what that has of it; give its id."""
+def put_whole(session: Session, whole: WholeTable) -> int:
+    """Replace a table in a store, except its snapshots. Return its id."""
     table = whole.table
     known = next(iter(session.vehicles(table.key)), None)
     last = whole.vehicle if known is None or known.last_seen <= whole.vehicle.last_seen else known
@@ -234,8 +247,8 @@ def put_whole(session: Session, whole: Whole) -> int:
     return owner
 
 
-def put_shots(session: Session, owner: int, whole: Whole) -> None:
-    """Make the snapshots of a table those of another store, under the same numbers."""
+def put_shots(session: Session, owner: int, whole: WholeTable) -> None:
+    """Replace the snapshots of a table by those of another store, with equal numbers."""
     there = {each.id for each in session.snapshots(whole.table.key, whole.table.component)}
     session.drop_snapshots(there - whole.shots.keys())
     for number, shot in whole.shots.items():
@@ -243,17 +256,17 @@ def put_shots(session: Session, owner: int, whole: Whole) -> None:
             session.add_snapshot(owner, shot.row, shot.blob, shot.crc, number)
 
 
-def _lacking(target: Store, whole: Whole) -> str | None:
+def _lacking(target: Store, whole: WholeTable) -> str | None:
     key, component = whole.table.key, whole.table.component
     there = target.read(lambda session: take_whole(session, key, component))
     return "everything" if there is None else there.lacks(whole)
 
 
-def _joined(there: Whole, new: Whole) -> Whole:
-    """What two stores have of one table; snapshots apart.
+def _joined(there: WholeTable, new: WholeTable) -> WholeTable:
+    """Return the union of one table of two stores, without snapshots.
 
-    Where one of them has gone on from the other, earlier states can be told as before. Where they have grown
-    apart they cannot, before this moment: two views that knew nothing of each other make no chain.
+    If one of them continues the other, earlier states remain available. If both have changes of their own,
+    earlier states are not available before this merge, as two independent histories form no sequence.
     """
     later = new if there.table.updated_at < new.table.updated_at else there
     rows = dict(there.rows)
@@ -267,7 +280,7 @@ def _joined(there: Whole, new: Whole) -> Whole:
     for whole in (there, new):
         if set(lines) == set(whole.lines) and whole is later:
             return replace(whole, table=table, rows=rows)
-    return Whole(
+    return WholeTable(
         later.vehicle,
         table,
         max(there.table.updated_at, new.table.updated_at),

@@ -19,9 +19,9 @@ __all__ = ["Forwarder"]
 QUEUED_FRAMES_MAX: Final = 1_000
 """Maximum number of frames queued for a slow program; further frames are dropped. A parameter list, which PX4
 sends in bursts, fits."""
-BACKOFF_MIN: Final = 0.5
+PROGRAM_BACKOFF_MIN: Final = 0.5
 """Seconds before the first attempt to reopen the link to the program; doubled after each attempt."""
-BACKOFF_MAX: Final = 5.0
+PROGRAM_BACKOFF_MAX: Final = 5.0
 """Maximum seconds between two attempts to reopen the link to the program."""
 
 logger = logging.getLogger(__name__)
@@ -111,10 +111,10 @@ class Forwarder:
 
     async def _reach(self) -> None:
         """Reopen the link with backoff, without a time limit."""
-        backoff = BACKOFF_MIN
+        backoff = PROGRAM_BACKOFF_MIN
         while not self._is_there:
             await anyio.sleep(backoff)
-            backoff = min(2 * backoff, BACKOFF_MAX)
+            backoff = min(2 * backoff, PROGRAM_BACKOFF_MAX)
             with suppress(LinkError):
                 await self._link.open()
                 self._is_there = True

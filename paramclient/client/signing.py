@@ -17,7 +17,7 @@ __all__ = ["Signing", "key_from_environment", "read_key", "read_private", "refus
 
 KEY_VARIABLE: Final = "PARAMCLIENT_SIGNING_KEY"
 """Environment variable with the key in 64 hexadecimal digits or base64."""
-FILE_VARIABLE: Final = "PARAMCLIENT_SIGNING_KEY_FILE"
+KEY_FILE_VARIABLE: Final = "PARAMCLIENT_SIGNING_KEY_FILE"
 """Environment variable with the path of a key file."""
 PASSPHRASE_VARIABLE: Final = "PARAMCLIENT_SIGNING_PASSPHRASE"
 """Environment variable with a passphrase from which the key is derived."""
@@ -122,7 +122,7 @@ def key_from_environment(environment: Mapping[str, str] = os.environ) -> Signing
     """
     makers = {
         KEY_VARIABLE: SigningKey.from_text,
-        FILE_VARIABLE: read_key,
+        KEY_FILE_VARIABLE: read_key,
         PASSPHRASE_VARIABLE: SigningKey.from_passphrase,
     }
     given = [name for name in makers if environment.get(name)]

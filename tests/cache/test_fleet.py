@@ -164,7 +164,7 @@ def test_names_may_be_patterns(cache: ParamCache) -> None:
 def test_more_names_than_a_statement_takes_are_no_matter(
     cache: ParamCache, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(fleet, "_CHUNK", 3)
+    monkeypatch.setattr(fleet, "_NAMES_PER_STATEMENT", 3)
     cache.save(update(*(stored(f"P{number}", number) for number in range(10)), table=DONE))
     want = wanted(**{f"P{number}": 0 for number in range(10)})
     assert [each.differs for each in cache.fleet_diff(want).names] == [False, *[True] * 9]

@@ -237,7 +237,7 @@ def test_a_claim_takes_no_memory() -> None:
     ],
 )
 def test_what_cannot_be_kept_is_refused(rows: dict[str, Row]) -> None:
-    with pytest.raises(UsageError, match="a table cannot be kept"):
+    with pytest.raises(UsageError, match="the table cannot be stored"):
         pack(rows)
 
 
@@ -252,7 +252,7 @@ def path(tmp_path: Path) -> Path:
 def test_what_cannot_be_kept_is_refused_before_anything_is_written(path: Path, item: Any) -> None:
     with ParamCache(path) as cache:
         cache.save(whole_table(3))
-        with pytest.raises(UsageError, match="a table cannot be kept"):
+        with pytest.raises(UsageError, match="the table cannot be stored"):
             cache.save(update(stored("PARAM_1", 9), item))
         assert values(cache) == {"PARAM_0": 0, "PARAM_1": 1, "PARAM_2": 2}
         assert cache.history(PX4.key) == []
@@ -307,7 +307,7 @@ def test_a_table_can_become_empty_and_have_parameters_again(path: Path) -> None:
 def test_where_names_stand_is_remembered_of_a_few_firmwares(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sqlite, "_DIFFERENT", 2)
+    monkeypatch.setattr(sqlite, "_NAME_SETS_MAX", 2)
     with ParamCache(path) as cache:
         for number in range(5):
             cache.save(update(stored("A", number), stored(f"B{number}", 1), component=number + 1))

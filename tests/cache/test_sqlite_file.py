@@ -312,7 +312,7 @@ def test_a_folder_that_another_program_holds_is_waited_for_but_not_for_ever(
     try:
         fcntl.flock(folder, fcntl.LOCK_EX)
         with ParamCache(path) as cache:
-            with pytest.raises(CacheError, match="another process holds the folder"):
+            with pytest.raises(CacheError, match="another process has locked the folder"):
                 cache.save(whole_table(3))
             fcntl.flock(folder, fcntl.LOCK_UN)
             works(cache)
@@ -515,9 +515,9 @@ def test_another_programs_database_is_left_where_it_is(
     with connect(path) as connection:  # SQLite counts in a table of its own, which is in our files too
         connection.execute(counting)
     content = path.read_bytes()
-    with ParamCache(path) as cache, pytest.raises(CacheError, match="another program's database"):
+    with ParamCache(path) as cache, pytest.raises(CacheError, match="a database of another program"):
         cache.vehicles()
-    with ParamCache(path) as cache, pytest.raises(CacheError, match="another program's database"):
+    with ParamCache(path) as cache, pytest.raises(CacheError, match="a database of another program"):
         cache.save(whole_table(2))
     assert path.read_bytes() == content
     assert set_aside(path) == []
@@ -546,7 +546,7 @@ def test_what_is_no_cache_is_an_error_and_left_as_it_is(
     content = path.read_bytes()
     with ParamCache(path) as cache:
         for use in (cache.vehicles, lambda: cache.save(whole_table(2))):
-            with pytest.raises(CacheError, match="was left as it is; name another file"):
+            with pytest.raises(CacheError, match="was not changed; name another file"):
                 use()
         assert cache.notes == ()
     assert (os.listdir(path.parent), path.read_bytes()) == ([path.name], content)  # noqa: PTH208
@@ -580,7 +580,7 @@ def test_what_stands_beside_a_file_that_is_no_cache_is_left_as_it_is(path: Path,
     before = contents(path.parent)
     with ParamCache(path) as cache:
         for use in (cache.vehicles, lambda: cache.save(whole_table(2))):
-            with pytest.raises(CacheError, match="is no cache of paramclient"):
+            with pytest.raises(CacheError, match="is not a cache of paramclient"):
                 use()
     assert contents(path.parent) == before
 
@@ -590,7 +590,7 @@ def test_the_log_of_another_programs_database_is_left_as_it_is(path: Path) -> No
     assert len(before) == 2
     with ParamCache(path) as cache:
         for use in (cache.vehicles, lambda: cache.save(whole_table(2))):
-            with pytest.raises(CacheError, match="another program's database"):
+            with pytest.raises(CacheError, match="a database of another program"):
                 use()
     assert contents(path.parent) == before
 
@@ -598,7 +598,7 @@ def test_the_log_of_another_programs_database_is_left_as_it_is(path: Path) -> No
 def test_an_empty_file_beside_the_log_of_another_program_is_left_as_it_is(path: Path) -> None:
     before = crashed(path) | {path.name: b""}
     path.write_bytes(b"")
-    with ParamCache(path) as cache, pytest.raises(CacheError, match="is no cache of paramclient"):
+    with ParamCache(path) as cache, pytest.raises(CacheError, match="is not a cache of paramclient"):
         cache.save(whole_table(2))
     assert contents(path.parent) == before
 
@@ -612,7 +612,7 @@ def test_files_that_only_are_named_like_those_of_a_cache_are_left(
     if is_empty:
         path.touch()
     before = contents(path.parent)
-    with ParamCache(path) as cache, pytest.raises(CacheError, match="is no cache of paramclient"):
+    with ParamCache(path) as cache, pytest.raises(CacheError, match="is not a cache of paramclient"):
         cache.save(whole_table(2))
     assert contents(path.parent) == before
 
@@ -621,7 +621,7 @@ def test_files_that_only_are_named_like_those_of_a_cache_are_left(
 def test_a_log_that_is_none_of_sqlite_is_left_as_it_is(path: Path, text: bytes) -> None:
     notes = path.with_name(f"{path.name}-wal")
     notes.write_bytes(text)
-    with ParamCache(path) as cache, pytest.raises(CacheError, match="is no cache of paramclient"):
+    with ParamCache(path) as cache, pytest.raises(CacheError, match="is not a cache of paramclient"):
         cache.save(whole_table(2))
     assert notes.read_bytes() == text
 
@@ -699,8 +699,8 @@ def test_a_file_that_others_can_write_is_made_its_owners_alone(
         assert path.stat().st_mode & 0o777 == 0o600
         works(cache)
     [told] = caplog.messages
-    assert told.startswith(f"others than its owner could write to the cache {path} (mode {mode:o})")
-    assert told.endswith("it is mode 600 now")
+    assert told.startswith(f"other users than its owner could write to the cache {path} (mode {mode:o})")
+    assert told.endswith("its mode is now 600")
 
 
 @pytest.mark.parametrize("may_write", [True, False])
@@ -718,7 +718,7 @@ def test_a_file_that_others_can_write_and_that_cannot_be_mended_is_refused(
     monkeypatch.setattr(sqlite_file, "make_private", refuse)
     with ParamCache(path) as cache:
         if is_refused:
-            with pytest.raises(CacheError, match=rf"others can write to the cache .* \(mode {mode:o}\)"):
+            with pytest.raises(CacheError, match=rf"other users can write to the cache .* \(mode {mode:o}\)"):
                 cache.vehicles()
         else:
             assert len(cache.vehicles()) == 2
@@ -911,7 +911,7 @@ def test_flipped_bits_never_stop_the_cache_nor_cost_the_file(flips: list[tuple[i
         path = Path(folder) / "cache"
         path.write_bytes(content)
         if content[:16] != sound_file()[:16] or content[68:72] != sound_file()[68:72]:
-            with ParamCache(path) as cache, pytest.raises(CacheError, match="was left as it is"):
+            with ParamCache(path) as cache, pytest.raises(CacheError, match="was not changed"):
                 cache.save(whole_table(2))
             assert path.read_bytes() == content
             return
@@ -1034,7 +1034,7 @@ def test_damage_that_does_not_end_is_an_error(path: Path) -> None:
         raise Damaged("no end")
 
     store = Database(path)
-    with pytest.raises(CacheError, match="again and again"):
+    with pytest.raises(CacheError, match="damaged or replaced 3 times"):
         store.write(work)
     store.close()
 

@@ -252,6 +252,6 @@ def test_the_command_leaves_a_file_that_is_no_cache_as_it_is(
     notes.write_text("things to do\n" * 100)
     ended = in_process(capsys, "--cache", str(notes))(*words)
     assert (ended.code, ended.out) == (5, "")
-    assert "notes.txt is no cache of paramclient (file is not a database), and was left as it is" in ended.err
+    assert "notes.txt is not a cache of paramclient (file is not a database) and was not changed" in ended.err
     assert notes.read_text() == "things to do\n" * 100
     assert [*tmp_path.iterdir()] == [notes]

@@ -14,7 +14,7 @@ import anyio
 import pytest
 
 from paramclient.cache import CutOff, SetupNotes
-from paramclient.cache.setups import LONGEST_NOTE, MOST_KEPT, RunningSetup
+from paramclient.cache.setups import INTERRUPTED_MAX, NOTE_BYTES_MAX, RunningSetup
 from paramclient.errors import CacheError
 from paramclient.links import create_link, serve_endpoint
 from paramclient.protocol import wire
@@ -86,18 +86,18 @@ def test_a_note_is_its_owners_alone_and_bounded(notes: SetupNotes, clock: Clock)
     for _ in range(5_000):
         clock.now += 1
         running.note(done=1, total=20, key="uid:1")
-    assert path.stat().st_size <= LONGEST_NOTE
+    assert path.stat().st_size <= NOTE_BYTES_MAX
     died(running)
     assert len(notes.cut_off()) == 1
 
 
 def test_those_cut_off_last_are_kept(notes: SetupNotes, clock: Clock) -> None:
-    for number in range(MOST_KEPT + 5):
+    for number in range(INTERRUPTED_MAX + 5):
         clock.now += 1
         died(begun(notes, f"job{number}"))
     kept = notes.cut_off(tells=True)
-    assert [kept[0].id, kept[-1].id, len(kept)] == ["job5", f"job{MOST_KEPT + 4}", MOST_KEPT]
-    assert len(list(notes.folder.iterdir())) == MOST_KEPT
+    assert [kept[0].id, kept[-1].id, len(kept)] == ["job5", f"job{INTERRUPTED_MAX + 4}", INTERRUPTED_MAX]
+    assert len(list(notes.folder.iterdir())) == INTERRUPTED_MAX
 
 
 @pytest.mark.parametrize(
@@ -118,7 +118,7 @@ def test_a_file_that_is_no_note_tells_nothing(notes: SetupNotes, content: bytes)
 
 def test_where_nothing_can_be_noted_nothing_begins(tmp_path: Path) -> None:
     (tmp_path / "cache.setups").write_text("a file in its place")
-    with pytest.raises(CacheError, match="the set-up cannot be noted in"):
+    with pytest.raises(CacheError, match="the note of the set-up cannot be written to"):
         begun(SetupNotes(tmp_path / "cache.setups"))
 
 
