@@ -1,4 +1,13 @@
-"""Client for MAVLink's parameter protocol, for asyncio and trio programs, with a parameter cache."""
+"""Client for MAVLink's parameter protocol, for asyncio and trio programs, with a parameter cache.
+
+- `client`, `remote`: the client over a link, and over a service.
+- `protocol`, `links`: the sans-I/O core, and the bytes in and out.
+- `cache`, `files`, `metadata`, `logs`, `provision`, `diagnosis`: cached tables, parameter files, units
+  and ranges, telemetry logs, setting up vehicles, the check of a vehicle.
+- `model`, `errors`, `version`: plain data, exceptions, the version.
+- `service`, `documents`, `cli`: the HTTP service, JSON documents, the command line.
+- `sim`, `testing`: simulated vehicles, and fixtures for tests.
+"""
 
 from __future__ import annotations
 

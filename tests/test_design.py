@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 import tomllib
@@ -367,6 +368,13 @@ def test_only_the_service_loads_its_libraries(module: str) -> None:
 @EVERY_MODULE
 def test_every_module_says_what_it_is(module: str) -> None:
     assert ast.get_docstring(source_of(module))
+
+
+@pytest.mark.parametrize("package", [name for name, path in MODULES.items() if path.stem == "__init__"])
+def test_every_package_names_what_is_in_it(package: str) -> None:
+    inside = {name.rpartition(".")[2] for name in MODULES if name.rpartition(".")[0] == package}
+    told = ast.get_docstring(source_of(package)) or ""
+    assert {name for name in inside if not name.startswith("_")} <= set(re.findall(r"`(\w+)`", told))
 
 
 @EVERY_MODULE

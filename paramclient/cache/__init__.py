@@ -7,7 +7,7 @@
 - `lock`: lock on a folder or file.
 - `lookup`: vehicles by system id, hardware id or key.
 - `merge`: merge of earlier observations, such as those of logs.
-- `migrations`: schema of the PostgreSQL database.
+- `postgres_schema`: schema of the PostgreSQL database.
 - `observed_table`: parameters of a live table as rows.
 - `operations`: write operations.
 - `outbox`: local copy of a shared database, with the writes that it has not received yet.
@@ -16,7 +16,7 @@
 - `reconciliation`: new observations reconciled with the stored table and history, by time.
 - `records`: records that the cache stores and returns.
 - `rows`: records as database cells.
-- `schema`: schema of the file.
+- `sqlite_schema`: schema of the file.
 - `setups`: notes about running and interrupted set-ups.
 - `shared`: a shared database with its local copy.
 - `snapshots`: snapshots, and tables at an earlier time.

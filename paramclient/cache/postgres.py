@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
 from uuid import uuid4
 
 from paramclient.cache.database_url import DatabaseAddress
-from paramclient.cache.migrations import CHANNEL, MIGRATIONS, SCHEMA
 from paramclient.cache.operations import Operation
+from paramclient.cache.postgres_schema import CHANNEL, MIGRATIONS, SCHEMA
 from paramclient.cache.rows import Damaged, Row, cells, checksum, read_rows
 from paramclient.cache.transaction import Session
 from paramclient.cache.transfer import LOCAL_NUMBERS_MIN

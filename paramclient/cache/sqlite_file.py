@@ -38,7 +38,7 @@ from typing import Final, TypeAlias, TypeVar
 from paramclient.cache.file_ownership import OF_OTHERS, OTHERS_WRITE, is_own, make_private, mode_of
 from paramclient.cache.lock import BUSY_TIMEOUT, locked
 from paramclient.cache.rows import Damaged
-from paramclient.cache.schema import MIGRATIONS, Step
+from paramclient.cache.sqlite_schema import MIGRATIONS, Step
 from paramclient.errors import CacheError
 
 __all__ = ["APPLICATION_ID", "Database"]

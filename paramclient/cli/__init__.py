@@ -5,7 +5,7 @@
   (apply, verify, restore), `save`, `diff`, `history`, `fleet`, `link`, `check`, `ports`, `signing`, `serve`,
   `token` and `simulate` (sim).
 - `sources`, `targets`: the parameters and the vehicles that an argument names. `moments`: times.
-- `connection`, `options`: an open link with its vehicle; options that several subcommands share.
+- `session`, `options`: an open link with its vehicle; options that several subcommands share.
 - `output`, `param_rows`, `results`, `metadata`, `exit_codes`: tables, JSON, metadata and exit codes.
 """
 

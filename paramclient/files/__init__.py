@@ -1,4 +1,9 @@
-"""Parameter files: formats of QGroundControl, MAVProxy, Mission Planner and PX4, packed files, JSON, YAML."""
+"""Parameter files: formats of QGroundControl, MAVProxy, Mission Planner and PX4, packed files, JSON, YAML.
+
+- `formats`, `param_file`, `disk`: the format of a file, its content, reading and replacing it.
+- `line_formats`, `script`, `param_pck`, `document_format`, `document_schema`: one module for each kind.
+- `text`, `includes`, `yamltext`: lines and bad lines, `@include` lines, YAML with JSON's rules.
+"""
 
 from paramclient.files.disk import read_file, write_file
 from paramclient.files.formats import LARGEST_FILE, dumps, loads

@@ -2,6 +2,10 @@
 
 Link names follow pymavlink, MAVProxy and MAVSDK. `parse_link` parses a name, `create_link` makes the link.
 All links implement `Link`; a program can provide its own implementation.
+
+- `link`, `names`: the interface of links, and their names.
+- `udp`, `tcp`, `serial`, `sim`, `replay`: one module for each kind of link.
+- `ports`, `transport`, `tlog`, `clock_offset`: serial ports, serialx on Windows, logs, arrival times.
 """
 
 from __future__ import annotations

@@ -1,1 +1,4 @@
-"""Telemetry logs as sources of parameters: import into a cache."""
+"""Telemetry logs as sources of parameters: import into a cache.
+
+- `telemetry`: import of telemetry logs.
+"""

@@ -1,6 +1,9 @@
 """Parameter metadata of firmwares: units, ranges, names of values and bits, descriptions.
 
 The metadata is optional. It comes from a file (`read_metadata`) or from the vehicle (`metadata_of`).
+
+- `info`, `metadata_cache`, `download`: the metadata of a firmware, cached files, downloads.
+- `formats`, `ardupilot`, `px4`: detection of the format, and one module for each format.
 """
 
 from __future__ import annotations

@@ -17,6 +17,10 @@ every run has the same outcome. A complete session is a loop::
 
 The vehicles behave as measured on real ones, with the real timing. The docstrings of `PX4Vehicle` and
 `ArduPilotVehicle` describe the differences between the two.
+
+- `px4`, `ardupilot`, `generic`: the vehicles. `vehicle`, `device`: their base classes.
+- `param_table`, `ftp`, `metadata`: parameter tables, the MAVFTP server, metadata files.
+- `air`, `other`: the faulty link, a second ground station.
 """
 
 from __future__ import annotations

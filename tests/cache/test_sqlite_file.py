@@ -29,8 +29,8 @@ from hypothesis import strategies as st
 from paramclient.cache import HISTORY_LINES, ParamCache, lock, sqlite_file
 from paramclient.cache.packed_table import unpack
 from paramclient.cache.rows import Damaged, checksum
-from paramclient.cache.schema import MIGRATIONS
 from paramclient.cache.sqlite_file import APPLICATION_ID, Database
+from paramclient.cache.sqlite_schema import MIGRATIONS
 from paramclient.errors import CacheError, UnknownVehicle
 from paramclient.model.identity import Identity
 from paramclient.model.values import ParamType
