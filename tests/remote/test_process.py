@@ -100,7 +100,7 @@ def test_the_command_over_a_service(
         assert command("diff", url, tmp_path / "all.params").code == 0
         refused = command("link", url)
         assert refused.code != 0
-        assert "does not give the traffic" in refused.err
+        assert "does not report the traffic" in refused.err
         refused = command("get", url, "PARAM_01", "--no-cache")
         assert refused.code != 0
         assert "cache is only for a client with its own link" in refused.err
