@@ -1,7 +1,21 @@
-"""The same calls over a service: `ParamClient("http://HOST:8765")` (see `paramclient serve`).
+"""Client over a service: `ParamClient("http://HOST:8765")` (see `paramclient serve`).
 
-The service has the links and the cache. Here stand a mirror of its tables, which follows its events, and
-calls that become requests; their errors are the same exceptions that the service's own client raised.
+The service has the links and the cache. The client has a mirror of its tables, which follows its events, and
+sends calls as HTTP requests. Errors are the exceptions that the client of the service has raised.
+
+- `bounded`: size and time limits of received data.
+- `client`: `RemoteClient`, a `ParamClient` for services only.
+- `component`: `RemoteComponent`, the implementation of `Component`.
+- `connection`: event stream with reconnection, and requests.
+- `decoding`: JSON documents of a service as records.
+- `http`: HTTP requests and the event stream.
+- `link`: `ServiceLink`, the link object of such a client.
+- `mirror`: copy of one table.
+- `mirrored_component`: state and table of one component.
+- `problems`: problem documents as exceptions.
+- `roster`: all components of a service.
+- `service_address`: address and token of a service.
+- `service_client`: `ServiceClient`, the implementation of `ParamClient`.
 """
 
 from __future__ import annotations
@@ -12,7 +26,7 @@ from paramclient.errors import UsageError
 
 if missing := [name for name in ("httpx", "httpx_sse") if find_spec(name) is None]:
     raise UsageError(
-        f"a service in the place of a link needs {' and '.join(missing)}: pip install 'paramclient[remote]'"
+        f"a client over a service needs {' and '.join(missing)}: pip install 'paramclient[remote]'"
     )
 
 from paramclient.remote.client import RemoteClient

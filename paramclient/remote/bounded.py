@@ -1,4 +1,4 @@
-"""What a service sends, read within bounds: it may be damaged, another program, or one that means harm."""
+"""Size and time limits of data from a service, which may be damaged, of another program, or hostile."""
 
 from __future__ import annotations
 
@@ -7,57 +7,60 @@ import zlib
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
-from httpx_sse._decoders import SSEDecoder  # EventSource, which is offered, reads lines of any length
+from httpx_sse._decoders import SSEDecoder  # the public EventSource reads lines of unlimited length
 
 __all__ = ["EventReader", "Pace", "checked_document", "decoder_of"]
 
-MOST_ANSWER: Final = 32 << 20
-"""Bytes that an answer may have: the largest table there can be takes some 15 million."""
-MOST_EVENT: Final = 4 << 20
-"""Bytes that one event may have: one that names every parameter of the largest table takes two million."""
-MOST_VALUES: Final = 1_000_000
-"""Values that a document may have, names left out: the largest table has 655,350. Each takes up to 0.2 kB."""
-DEEPEST: Final = 32
-"""Lists and objects in each other in a document; those of a service have eight at most."""
-SLOW_PATIENCE: Final = 30.0
-"""Seconds for an answer to come once it has begun, or an event, where it comes slowly."""
-SLOWEST: Final = 1_000
-"""Bytes a second, above which there is more time: a radio of 57600 baud has five times as many."""
+RESPONSE_BYTES_MAX: Final = 32 << 20
+"""Maximum size of a response in bytes: the largest possible table takes 15 million."""
+EVENT_BYTES_MAX: Final = 4 << 20
+"""Maximum size of an event in bytes: one with every parameter name of the largest table takes 2 million."""
+DOCUMENT_VALUES_MAX: Final = 1_000_000
+"""Maximum number of values in a document, without names: the largest table has 655,350. Each takes
+up to 0.2 kB."""
+NESTING_MAX: Final = 32
+"""Maximum nesting of lists and objects in a document: documents of a service have at most 8 levels."""
+RESPONSE_TIMEOUT: Final = 30.0
+"""Timeout in seconds for the rest of a response or event after its first bytes."""
+RESPONSE_RATE_MIN: Final = 1_000
+"""Bytes for which the timeout is extended by 1 s: a radio of 57600 baud transfers five times as many."""
 
 
 def checked_document(data: bytes) -> Any:
-    """JSON within the bounds.
+    """Parse JSON within the limits.
 
     Raises:
-        ValueError: it is none, or beyond them.
+        ValueError: the data is not JSON, or exceeds a limit.
     """
-    if data.count(b",") + data.count(b"[") + data.count(b"{") > MOST_VALUES:
-        raise ValueError(f"a document of more than {MOST_VALUES} values")
+    if data.count(b",") + data.count(b"[") + data.count(b"{") > DOCUMENT_VALUES_MAX:
+        raise ValueError(f"a document of more than {DOCUMENT_VALUES_MAX} values")
     try:
         document = json.loads(data)
     except RecursionError:
-        raise ValueError(f"a document deeper than {DEEPEST}") from None
+        raise ValueError(f"a document deeper than {NESTING_MAX}") from None
     level = [document]
-    for _ in range(DEEPEST):
+    for _ in range(NESTING_MAX):
         level = [each for held in level for each in _held(held) if isinstance(each, dict | list)]
         if not level:
             return document
-    raise ValueError(f"a document deeper than {DEEPEST}")
+    raise ValueError(f"a document deeper than {NESTING_MAX}")
 
 
 def decoder_of(encoding: str) -> Callable[[bytes, int], bytes]:
-    """What decodes the pieces of an answer, each to at most so many bytes; beyond these it gives one more.
+    """Return a decoder of the chunks of a response: a function of a chunk and a maximum size in bytes.
+
+    It returns one byte more than the maximum if the decoded chunk is larger.
 
     Args:
-        encoding: what Content-Encoding says.
+        encoding: value of the header Content-Encoding.
 
     Raises:
-        ValueError: it was not asked for; or, when decoding, it is not what it says.
+        ValueError: the encoding was not requested; or, from the decoder, the data is damaged.
     """
     if encoding in ("", "identity"):
         return lambda data, most: data
     if encoding not in ("gzip", "deflate"):
-        raise ValueError(f"the content encoding {encoding:.40} was not asked for")
+        raise ValueError(f"the content encoding {encoding:.40} was not requested")
     inflater = zlib.decompressobj(zlib.MAX_WBITS | 32)
 
     def decode(data: bytes, most: int) -> bytes:
@@ -70,28 +73,28 @@ def decoder_of(encoding: str) -> Callable[[bytes, int], bytes]:
 
 
 class Pace:
-    """The time in which something that has begun to come has to be there.
+    """Deadline of a response or event that has begun, extended by received bytes.
 
     Args:
-        now: seconds.
+        now: time of the start, in seconds.
     """
 
     def __init__(self, now: float) -> None:
-        self._ends = now + SLOW_PATIENCE
+        self._ends = now + RESPONSE_TIMEOUT
 
     def left(self, size: int, now: float) -> float:
-        """Seconds that are left when so many bytes have come."""
-        return self._ends + size / SLOWEST - now
+        """Return the seconds left after this number of received bytes."""
+        return self._ends + size / RESPONSE_RATE_MIN - now
 
 
 class EventReader:
     """Parses server-sent events (WHATWG HTML, "Server-sent events") of bounded size into the data of each.
 
-    Lines are split here, because those of httpx-sse may grow without end; their fields are read by its
-    decoder. An event without data, or with empty data, is left out.
+    Lines are split here, because httpx-sse has no limit for their length; its decoder parses their fields. An
+    event without data, or with empty data, is skipped.
 
     Attributes:
-        size: bytes of the event that has begun and not ended.
+        size: received bytes of the incomplete event.
     """
 
     def __init__(self) -> None:
@@ -103,7 +106,7 @@ class EventReader:
         """Return the data of the events that end with this chunk.
 
         Raises:
-            ValueError: one is too long.
+            ValueError: an event exceeds `EVENT_BYTES_MAX`.
         """
         events = []
         begin = 0
@@ -118,12 +121,12 @@ class EventReader:
             event = self._decoder.decode(line)
             if event is not None and event.data:
                 events.append(event.data.encode("latin-1"))
-            if self.size > MOST_EVENT:
+            if self.size > EVENT_BYTES_MAX:
                 break
         self._line += chunk[begin:]
         self.size += len(chunk) - begin
-        if self.size > MOST_EVENT:
-            raise ValueError("an event without end")
+        if self.size > EVENT_BYTES_MAX:
+            raise ValueError(f"an event of more than {EVENT_BYTES_MAX} bytes")
         return events
 
 

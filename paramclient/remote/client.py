@@ -17,29 +17,28 @@ __all__ = ["RemoteClient"]
 class RemoteClient(ParamClient):
     """A `ParamClient` for the address of a service only. `ParamClient("http://HOST:8765")` works the same.
 
-    A client over a service differs from one over a link of its own: The service has the links and keeps the
-    cache, so the arguments for both are refused. `params` of a component is a mirror of the service's; while
-    the service cannot be reached, every value in it is *cached*, and calls wait for it as they wait for a
-    link that is away. A write that was under way when the connection broke is not sent again: it raises
-    LinkError, and whether it was done is not known.
+    Differences from a client with its own link: The service has the links and the cache, so the arguments for
+    both are refused. `params` of a component mirrors that of the service. While the service cannot be
+    reached, every value is *cached*, and calls wait as they wait for the reconnection of a link. A write
+    whose connection is lost before the response is not repeated: it raises LinkError, and it is unknown
+    whether the vehicle has the value.
 
-    With several links on the service, the components of all of them are there. Where two links have
-    one with the same ids, it is in `components` only when the address names the link
-    (`http://HOST:8765?link=udpin:0.0.0.0:14550`).
+    `components` has the components of all links of the service. If two links have a component with equal ids,
+    it is only included if the address names the link (`http://HOST:8765?link=udpin:0.0.0.0:14550`).
 
-    `stats` are those of the links, as they were when they were asked for last: on opening, with every
-    `fetch_all` of the client, when a link's state changes, and soon after each look at them.
+    `stats` are those of the links at the last request: on opening, with every `fetch_all` of the client, when
+    the state of a link changes, and within 0.5 s after each access.
 
     Args:
-        link: `http://HOST:PORT` or `https://HOST:PORT`, and `?link=NAME` for one of its links.
-        token: what the service wants to see; None for PARAMCLIENT_TOKEN of the environment.
-        transport: how requests travel; None for sockets.
-        others: those of `ParamClient`, as long as they say nothing.
+        link: `http://HOST:PORT` or `https://HOST:PORT`, with `?link=NAME` for one of its links.
+        token: access token of the service; None for PARAMCLIENT_TOKEN of the environment.
+        transport: HTTP transport; None for sockets.
+        others: other arguments of `ParamClient`, only with their default values.
 
     Raises:
-        UsageError: no such address, or an argument that only a client with a link of its own takes; on
-            entering: the service does not take the token, or has no such link.
-        LinkError: on entering: it cannot be reached, or is no service of paramclient.
+        UsageError: the address is not valid, or an argument is only for a client with its own link. On
+            entering: the service refuses the token, or has no such link.
+        LinkError: on entering: the service cannot be reached, or is not a service of paramclient.
     """
 
     def __init__(

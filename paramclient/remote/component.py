@@ -39,11 +39,11 @@ __all__ = ["RemoteComponent", "Service", "mirrored_of"]
 
 
 class Service(Protocol):
-    """What a component needs of the service that knows it.
+    """Interface of a service for its components.
 
     Attributes:
-        name: the address of the service.
-        connection: whether the service can be reached.
+        name: address of the service.
+        connection: connection to the service.
     """
 
     name: str
@@ -72,14 +72,14 @@ class Service(Protocol):
         """
 
     async def given(self, answer: Answer) -> Component:
-        """Return the component that an answer is about, with its table."""
+        """Return the component of a response, with its table."""
 
 
 class RemoteComponent(Component):
-    """The same as `Component` over a service; see `RemoteClient` for what is different.
+    """A `Component` over a service; see `RemoteClient` for the differences.
 
     Attributes:
-        link_name: the name of its link on the service.
+        link_name: name of its link on the service.
     """
 
     def __init__(self, service: Service, mirrored: MirroredComponent) -> None:
@@ -88,8 +88,7 @@ class RemoteComponent(Component):
         self._service = service
         self._mirrored = mirrored
 
-    # how it stands
-
+    # state
     @property
     def autopilot(self) -> str:
         """See `Component.autopilot`."""
@@ -128,7 +127,7 @@ class RemoteComponent(Component):
 
     @property
     def state(self) -> str:
-        """See `Component.state`. While the service cannot be reached, what is known is *cached*."""
+        """See `Component.state`. While the service cannot be reached, the state is *cached*."""
         state = self._mirrored.state
         if not self._service.connection.is_away or state in ("lost", "new"):
             return state
@@ -168,7 +167,7 @@ class RemoteComponent(Component):
 
     @property
     def silence(self) -> float:
-        """See `Component.silence`; as far as the service has said."""
+        """See `Component.silence`; by the last report of the service."""
         return self._mirrored.silence
 
     @property
@@ -215,8 +214,8 @@ class RemoteComponent(Component):
     ) -> SetResult:
         """See `Component.set`.
 
-        The service puts writes to one name in order, whoever asks for them. Where its answer is lost, the
-        write is not sent again: LinkError then says that it is not known whether it was done.
+        The service executes writes to one name in order, also those of different clients. If its response is
+        lost, the write is not sent again: LinkError reports that it is unknown whether the write was done.
         """
         requested = check_value(value)
         body: dict[str, Any] = {"values": {check_asked_name(name): value_as_sent(requested)}}
@@ -253,7 +252,7 @@ class RemoteComponent(Component):
         timeout: float | None = None,
         progress: Callable[[Progress], None] | None = None,
     ) -> FetchResult:
-        """See `Component.fetch_all`. Programs that fetch at the same time share one download."""
+        """See `Component.fetch_all`. Concurrent fetches of several programs share one download."""
         began = anyio.current_time()
         before = self._mirrored.progress_count
         check_accepted(accept, sample)
@@ -281,7 +280,7 @@ class RemoteComponent(Component):
         await self._service.ask(self._mirrored, "refreshed", {}, timeout, "the values outside the hash")
 
     async def setup_signing(self, key: SigningKey | None, *, link_is_safe: bool = False) -> None:
-        """Refused: a key goes over a link on which nobody else can listen."""
+        """Raise UsageError: SETUP_SIGNING needs the link itself, as it sends the key unencrypted."""
         raise not_given("the set-up of signing")
 
     async def reboot(self, *, system: int | None = None, timeout: float | None = None) -> Component:
@@ -295,9 +294,8 @@ class RemoteComponent(Component):
     def changes(self) -> Changes:
         """See `Component.changes`.
 
-        `by` is "us" for what this program has set, and "us for NAME" for what the service has set for others.
-        What has changed while the service could not be reached comes as changes too, and counts as the
-        vehicle's.
+        `by` is "us" for writes of this program, and "us for NAME" for writes of the service for other users.
+        Changes during a lost connection are delivered after the reconnection, with the vehicle as author.
         """
         changes = Changes()
         self._mirrored.listen(changes)
@@ -307,6 +305,6 @@ class RemoteComponent(Component):
 
 
 def mirrored_of(component: Component) -> MirroredComponent:
-    """Return what a service has told of a component. For the modules of this package."""
+    """Return the mirrored state of a component. For the modules of this package only."""
     assert isinstance(component, RemoteComponent)
     return component._mirrored

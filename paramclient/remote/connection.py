@@ -1,4 +1,4 @@
-"""The line to a service: its events, for as long as it lasts and again when it is back, and calls over it."""
+"""Connection to a service: event stream with reconnection, and requests."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from paramclient.remote.http import Answer, Place, Requests, Unreached
 
 __all__ = ["Connection", "Follower", "telling"]
 
-ANSWERING_TIME: Final = 5.0
-"""Seconds beyond a time limit in which the service, which keeps to that limit itself, has answered."""
+SERVICE_MARGIN: Final = 5.0
+"""Seconds after a timeout in which the response still arrives, as the service applies the timeout itself."""
 
-SHORTEST_LIMIT: Final = 0.001
-LONGEST_LIMIT: Final = 86_400.0
-"""Seconds that a service takes for a time limit."""
+SERVICE_TIMEOUT_MIN: Final = 0.001
+"""Minimum timeout in seconds that a service accepts."""
+SERVICE_TIMEOUT_MAX: Final = 86_400.0
+"""Maximum timeout in seconds that a service accepts."""
 
 T = TypeVar("T")
 
@@ -30,38 +31,38 @@ logger = logging.getLogger(__name__)
 
 
 class Follower(Protocol):
-    """Who is told what happens on the service. None of the calls may block or raise."""
+    """Receiver of the events of a service. Its calls must neither block nor raise."""
 
     def take(self, event: Mapping[str, Any]) -> None:
-        """This has happened."""
+        """Process an event."""
 
     def leave(self) -> None:
-        """The service cannot be reached: what is known of it may be old."""
+        """Mark all data as stale: the connection is lost."""
 
     def resume(self) -> None:
-        """It is reached again, and all that happened meanwhile will be told."""
+        """Continue after a reconnection: all missed events follow."""
 
     def begin_anew(self) -> None:
-        """What happens is told from now on; what was before is to be asked for."""
+        """Start over: earlier events are not available, and the current state has to be requested."""
 
 
 class Connection:
-    """Follows the events of a service, and carries calls to it.
+    """Follows the events of a service, and sends requests to it.
 
-    Like a link that drops, it is made again with back-off; calls wait for that up to `LINK_TIMEOUT` seconds
-    (in `client.link_task`), then they and new ones raise LinkError until it is back.
+    A lost connection is reopened with backoff, as a link is. Calls wait for it for up to `LINK_TIMEOUT` (10
+    s, in `client.link_task`); then they and new calls raise LinkError until the reconnection.
 
     Args:
-        requests: how requests travel.
-        follower: who is told of events.
+        requests: the HTTP requests.
+        follower: receiver of the events.
 
     Attributes:
         is_away: whether the service cannot be reached now.
-        broken: what calls raise now, or None.
-        ended: the same, for good.
-        failed: why it could not be reached at first, or None.
-        place: the last event that has come.
-        news: is set, and replaced, when anything has come, or has changed of the above.
+        broken: the error that calls raise now, or None.
+        ended: the error that all calls raise permanently, or None.
+        failed: the error of the first connection attempt, or None.
+        place: position of the last received event, or None.
+        news: set, and replaced, when events have arrived or an attribute has changed.
     """
 
     def __init__(self, requests: Requests, follower: Follower) -> None:
@@ -77,7 +78,7 @@ class Connection:
         self._scopes: set[anyio.CancelScope] = set()
 
     async def follow(self) -> None:
-        """Take events until cancelled; or until it fails, where the service was never reached."""
+        """Receive events and reconnect, until cancelled. Return if the first connection attempt fails."""
         while True:
             try:
                 await self._listen()
@@ -103,34 +104,34 @@ class Connection:
         link: str | None = None,
         is_write: bool = False,
     ) -> Answer:
-        """Ask the service, and wait for the answer, also while it cannot be reached for a while.
+        """Send a request and wait for the response, also across a reconnection.
 
-        Cancelled, the request is withdrawn.
+        Cancellation closes the request.
 
         Args:
             method, path, body, link: as in `Requests.ask`.
-            awaited: what, in words, for NoReply.
-            timeout: the caller's, in seconds, which the service is told too; None where it shall choose one.
-            waits_for_ever: whether None means to wait for ever.
-            is_write: whether it must not be sent twice.
+            awaited: description of the request, for NoReply.
+            timeout: seconds, also sent to the service; None: the service chooses.
+            waits_for_ever: whether a timeout of None means no limit.
+            is_write: whether the request must not be sent twice.
 
         Raises:
-            NoReply: it cannot be reached, and the time is over.
-            LinkError: it cannot be reached; or the answer to a write was lost.
-            ParamClientError: what the service says.
+            NoReply: the service cannot be reached within the timeout.
+            LinkError: the service cannot be reached, or the response to a write was lost.
+            ParamClientError: the error that the service reports.
         """
         self.check_open()
         began = anyio.current_time()
         deadline = math.inf if timeout is None else began + timeout
         failing_since = math.inf
-        with anyio.CancelScope(deadline=deadline + ANSWERING_TIME) as scope:
+        with anyio.CancelScope(deadline=deadline + SERVICE_MARGIN) as scope:
             self._scopes.add(scope)
             try:
                 while await self._is_reached(deadline):
                     left: dict[str, Any] = {}
                     if timeout is not None:
                         seconds = deadline - anyio.current_time()
-                        left["timeout_s"] = min(max(seconds, SHORTEST_LIMIT), LONGEST_LIMIT)
+                        left["timeout_s"] = min(max(seconds, SERVICE_TIMEOUT_MIN), SERVICE_TIMEOUT_MAX)
                     elif waits_for_ever:
                         left["timeout_s"] = None
                     sent = body if body is None and not left else {**(body or {}), **left}
@@ -141,7 +142,7 @@ class Connection:
                         if is_write and failure.may_be_done:
                             raise self._unknown(awaited, failure) from failure.error.__cause__
                         now = anyio.current_time()
-                        if now - asked_at > link_task.LINK_TIMEOUT:  # it had been reached
+                        if now - asked_at > link_task.LINK_TIMEOUT:  # the request had been connected
                             failing_since = now
                         failing_since = min(failing_since, now)
                         if now - failing_since >= link_task.LINK_TIMEOUT:
@@ -156,7 +157,7 @@ class Connection:
         """Wait until the service has been reached.
 
         Raises:
-            ParamClientError: why it cannot be.
+            ParamClientError: the first connection attempt has failed.
         """
         while self.is_away:
             if self.failed is not None:
@@ -164,10 +165,10 @@ class Connection:
             await self.news.wait()
 
     def check_open(self) -> None:
-        """See that calls can be made.
+        """Check that requests can be sent.
 
         Raises:
-            LinkError: why not.
+            LinkError: the service cannot be reached, or the client is not open.
         """
         if (error := self.ended or self.broken) is not None:
             raise error.with_traceback(None)
@@ -176,20 +177,20 @@ class Connection:
             raise ClientClosed("the client is not open; use it as `async with`", link=name)
 
     def end(self, error: LinkError) -> None:
-        """No call can be answered any more."""
+        """Fail all calls permanently with this error."""
         self.ended = error
         self._fail_calls()
 
     def tell(self) -> None:
-        """There is news for those who wait for `news`."""
+        """Wake the tasks that wait for `news`."""
         news, self.news = self.news, anyio.Event()
         news.set()
 
     async def _listen(self) -> None:
-        """Take events until there are no more.
+        """Receive events until the stream ends.
 
         Raises:
-            Unreached, ParamClientError: why.
+            Unreached, ParamClientError: the reason of its end.
         """
         async with self._requests.events(self.place) as batches:
             async for events in batches:
@@ -210,7 +211,7 @@ class Connection:
 
     def _arrive(self, *, is_resumed: bool) -> None:
         if self._was_there:
-            logger.info("%s: reached again", self._requests.name)
+            logger.info("%s: reconnected", self._requests.name)
         if is_resumed and self._was_there:
             self._follower.resume()
         else:
@@ -220,25 +221,25 @@ class Connection:
         self.broken = None
 
     async def _wait_to_try_again(self, error: ParamClientError) -> None:
-        """After it was lost, or could not be reached again."""
+        """Wait for the next attempt after the connection was lost, or an attempt has failed."""
         now = anyio.current_time()
         if not self.is_away:
-            logger.warning("%s; trying to reach it again", error)
+            logger.warning("%s; reconnecting", error)
             self.is_away = True
-            self._patience_ends = now + link_task.LINK_TIMEOUT
+            self._deadline = now + link_task.LINK_TIMEOUT
             self._backoff = link_task.BACKOFF_MIN
             self._follower.leave()
             self.tell()
-        elif now >= self._patience_ends:
+        elif now >= self._deadline:
             name = self._requests.name
             self.broken = error if isinstance(error, LinkError) else LinkError(str(error), link=name)
             self._fail_calls()
-        patience = self._patience_ends - now
-        await anyio.sleep(min(self._backoff, patience) if patience > 0 else self._backoff)
+        left = self._deadline - now
+        await anyio.sleep(min(self._backoff, left) if left > 0 else self._backoff)
         self._backoff = min(self._backoff * 2, link_task.BACKOFF_MAX)
 
     async def _is_reached(self, deadline: float) -> bool:
-        """Wait until it is; false when the time is over."""
+        """Wait until the service is connected. Return False at the deadline."""
         while self.is_away:
             self.check_open()
             with anyio.move_on_after(deadline - anyio.current_time()) as waiting:
@@ -249,7 +250,7 @@ class Connection:
         return True
 
     def _unknown(self, what: str, failure: Unreached) -> LinkError:
-        return LinkError(f"{failure.error}; whether {what} was done is not known", link=self._requests.name)
+        return LinkError(f"{failure.error}; it is unknown whether {what} was done", link=self._requests.name)
 
     def _fail_calls(self) -> None:
         for scope in self._scopes:
@@ -258,7 +259,7 @@ class Connection:
 
 
 async def telling(work: Callable[[], Awaitable[T]], tell: Callable[[], None] | None) -> T:
-    """Do this, and meanwhile call `tell` from this task about ten times a second, and once at the end."""
+    """Run `work`, and call `tell` from this task about ten times a second, and once at the end."""
     if tell is None:
         return await work()
     done = anyio.Event()
@@ -268,7 +269,7 @@ async def telling(work: Callable[[], Awaitable[T]], tell: Callable[[], None] | N
     async def run() -> None:
         try:
             results.append(await work())
-        except Exception as error:  # raised in here, it would come out in a group
+        except Exception as error:  # the task group would wrap it in an ExceptionGroup
             failures.append(error)
         done.set()
 

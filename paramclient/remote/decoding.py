@@ -1,4 +1,4 @@
-"""The documents of a service back to what the library gives. Nothing of a value is lost on the way."""
+"""Decoding of JSON documents of a service to records of the library, without loss of values."""
 
 from __future__ import annotations
 
@@ -38,32 +38,43 @@ Document = Mapping[str, Any]
 
 _WORDS: Final = {"NaN": float("nan"), "Infinity": float("inf"), "-Infinity": float("-inf")}
 _IDENTITY: Final = {"link": (str,), "git_hash": (str,), "uid": (str, NoneType)}
-"""What those members of an identity are that are no numbers."""
+"""Types of the members of an identity that are not integers."""
 _FLOAT32: Final = struct.Struct("<f")
 
 
 @contextmanager
 def understood(name: str) -> Iterator[None]:
-    """Read documents in here: LinkError, where one is not what it should be."""
+    """Context for decoding documents: errors become LinkError.
+
+    Args:
+        name: name of the link, for messages.
+
+    Raises:
+        LinkError: a document is not valid.
+    """
     try:
         yield
     except ParamClientError:
         raise
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, struct.error) as error:
-        raise LinkError(f"{name} tells what cannot be understood: {error!r}", link=name) from error
+        raise LinkError(f"{name}: a document of the service is not valid: {error!r}", link=name) from error
 
 
 def number_of(told: object) -> Value:
-    """A value as JSON has it: a number, NaN and infinities as words, four raw bytes as `0x…`."""
+    """Return the value of a JSON number; NaN and infinities are strings, four raw bytes a string `0x…`.
+
+    Raises:
+        TypeError, ValueError: the member is not a value.
+    """
     if isinstance(told, str):
         return _WORDS[told] if told in _WORDS else int(told.removeprefix("0x"), 16).to_bytes(4, "little")
     if isinstance(told, bool) or not isinstance(told, int | float):
-        raise TypeError(f"a value is no {type(told).__name__}")
+        raise TypeError(f"a value cannot be of type {type(told).__name__}")
     return told
 
 
 def value_of(told: object, kind: ParamType | int) -> Value:
-    """The same of a type: JSON has the shortest decimal of a float32, and may have 2.0 as 2."""
+    """Return a typed value from JSON, which has the shortest decimal of a float32, and may have 2 for 2.0."""
     value = number_of(told)
     if kind == ParamType.REAL32 and not isinstance(value, bytes):
         rounded: float = _FLOAT32.unpack(_FLOAT32.pack(value))[0]
@@ -72,16 +83,21 @@ def value_of(told: object, kind: ParamType | int) -> Value:
 
 
 def value_as_sent(value: Value) -> object:
-    """A value that is to be written, so that the service takes it for the same."""
+    """Return the JSON form of a value for a write, without loss."""
     if isinstance(value, bytes):
         return {"raw": value.hex()}
-    if isinstance(value, float) and value - value != 0.0:  # JSON knows no such numbers
+    if isinstance(value, float) and value - value != 0.0:  # NaN and infinities, which JSON does not have
         return "NaN" if value != value else "Infinity" if value > 0 else "-Infinity"
     return value
 
 
 def param_of(document: Document, name: str | None = None) -> Param:
-    """A parameter; its name stands in the document, or it is the key under which that stands."""
+    """Return the parameter of a document.
+
+    Args:
+        document: the document.
+        name: param_id; None if it is in the document.
+    """
     named = document["type"]
     kind = ParamType[named] if named in ParamType.__members__ else int(named.removeprefix("TYPE_"))
     bits = int(document["bits"], 16)
@@ -100,17 +116,17 @@ def param_of(document: Document, name: str | None = None) -> Param:
 
 
 def params_of(documents: Mapping[str, Document]) -> dict[str, Param]:
-    """A whole table, in the order in which the service has it."""
+    """Return a whole table, in the order of the service."""
     return {name: param_of(document, name) for name, document in documents.items()}
 
 
 def hash_of(told: str | None) -> int | None:
-    """A PX4 hash."""
+    """Return a PX4 hash, or None."""
     return None if told is None else int(told, 16)
 
 
 def identity_of(document: Document) -> Identity:
-    """Who a vehicle is; what this version does not know is left out."""
+    """Return the identity of a vehicle. Members unknown to this version are ignored."""
     told = {each.name: document[each.name] for each in fields(Identity)}
     for name, value in told.items():
         check_kind(value, *_IDENTITY.get(name, (int,)))
@@ -118,17 +134,17 @@ def identity_of(document: Document) -> Identity:
 
 
 def check_kind(value: object, *kinds: type) -> None:
-    """See that a value is of one of these kinds; a boolean is no number.
+    """Check that a value is of one of these types. A boolean is not a number.
 
     Raises:
-        TypeError: it is not.
+        TypeError: the value has another type.
     """
     if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
-        raise TypeError(f"{value!r:.40} is not what it should be")
+        raise TypeError(f"{value!r:.40} has the wrong type")
 
 
 def progress_of(document: Document) -> Progress:
-    """How far a fetch is."""
+    """Return the progress of a fetch."""
     told = Progress(*(document[each.name] for each in fields(Progress)))
     check_kind(told.received, int)
     check_kind(told.total, int, NoneType)
@@ -138,12 +154,12 @@ def progress_of(document: Document) -> Progress:
 
 
 def fetch_result_of(document: Document, params: Mapping[str, Param], elapsed: float) -> FetchResult:
-    """What a fetch brought.
+    """Return the result of a fetch.
 
     Args:
-        document: all of it but the parameters.
-        params: these, as they are now.
-        elapsed: seconds from the call to the end.
+        document: the result without parameters.
+        params: the current parameters.
+        elapsed: seconds from the call to its end.
     """
     sample = document["sample"]
     return FetchResult(
@@ -166,7 +182,7 @@ def fetch_result_of(document: Document, params: Mapping[str, Param], elapsed: fl
 
 
 def set_result_of(document: Document, requested: Value) -> SetResult:
-    """What became of a value that was asked for."""
+    """Return the result of a write."""
     param = param_of(document["param"])
     return SetResult(
         document["name"],
@@ -180,11 +196,11 @@ def set_result_of(document: Document, requested: Value) -> SetResult:
 
 
 def stats_of(documents: list[Document]) -> ClientStats:
-    """The numbers of several links, added up; of those that are open."""
+    """Return the sums of the counters of several open links."""
     counted = [each.name for each in fields(ClientStats) if each.name != "round_trips"]
     sums: dict[str, Any] = {}
     for name in counted:
-        told = [each[name] for each in documents if each.get(name) is not None]  # an older one counts less
+        told = [each[name] for each in documents if each.get(name) is not None]  # older services have fewer
         sums[name] = sum(told) if told or name not in ("lost", "repeated") else None
     trips = {
         (int(system), int(component)): float(seconds)

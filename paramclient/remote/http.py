@@ -1,4 +1,4 @@
-"""What goes over HTTP to a service and back: requests with their answers, and the stream of events."""
+"""HTTP requests to a service, and its event stream."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import anyio
 import httpx
 
 from paramclient.errors import LinkError, ParamClientError, UsageError
-from paramclient.remote.bounded import MOST_ANSWER, EventReader, Pace, checked_document, decoder_of
+from paramclient.remote.bounded import RESPONSE_BYTES_MAX, EventReader, Pace, checked_document, decoder_of
 from paramclient.remote.decoding import understood
 from paramclient.remote.problems import error_of
 from paramclient.remote.service_address import TOKEN_VARIABLE, ServiceAddress
@@ -25,33 +25,38 @@ from paramclient.version import __version__
 __all__ = ["Answer", "Place", "Requests", "Unreached"]
 
 PREFIX: Final = "/api/v1"
-OPEN_TIMEOUT: Final = 10.0
-"""Seconds for finding a name, connecting over TLS and beginning to answer an event stream."""
-SILENCE: Final = 6.0
-"""Seconds without a word on the event stream after which the service counts as away: it says something every
-two. A vehicle counts as lost after five."""
-HELLO_PATIENCE: Final = 10.0
-"""Seconds for the first event of a stream, which the service sends at once."""
-LONGEST_PLACE: Final = 64
-"""Characters of a place: a run has 16 digits, a number 18 at most."""
-MOST_CONNECTIONS: Final = 200
-"""Requests that are under way at once; further ones wait for their turn."""
-KEEPALIVE: Final = {"TCP_KEEPIDLE": 5, "TCP_KEEPINTVL": 2, "TCP_KEEPCNT": 3}
-"""When the system looks whether a service from which an answer is awaited still is there, in seconds and
-times: a network that has gone says nothing, and an answer may take minutes."""
+"""Path of the API."""
+SERVICE_OPEN_TIMEOUT: Final = 10.0
+"""Timeout in seconds for name resolution and connecting over TLS, and for the headers of an event stream."""
+STREAM_TIMEOUT: Final = 6.0
+"""Seconds without data on the event stream after which the connection counts as lost: the service sends data
+every 2 s. A vehicle counts as lost after 5 s."""
+HELLO_TIMEOUT: Final = 10.0
+"""Timeout in seconds for the first event of a stream, which the service sends immediately."""
+PLACE_LENGTH_MAX: Final = 64
+"""Maximum number of characters of an event position: a run has 16 digits, a number at most 18."""
+PARALLEL_REQUESTS_MAX: Final = 200
+"""Maximum number of requests in flight; further ones wait."""
+KEEPALIVE_OPTIONS: Final = {"TCP_KEEPIDLE": 5, "TCP_KEEPINTVL": 2, "TCP_KEEPCNT": 3}
+"""TCP keepalive, in seconds and probes: it detects a lost network while a response takes minutes."""
 
 
 class Place(NamedTuple):
-    """A place in the list of events of one run of a service."""
+    """Position in the events of one run of a service.
+
+    Attributes:
+        run: id of the run, new with each start of the service.
+        seq: number of the event.
+    """
 
     run: str
     seq: int
 
     @classmethod
     def read(cls, text: str | None) -> Place | None:
-        """What `RUN-SEQ` says; None for anything else."""
+        """Parse `RUN-SEQ`; None for any other text."""
         run, dash, seq = (text or "").rpartition("-")
-        is_one = dash and seq.isdecimal() and len(run) + len(seq) < LONGEST_PLACE
+        is_one = dash and seq.isdecimal() and len(run) + len(seq) < PLACE_LENGTH_MAX
         return cls(run, int(seq)) if is_one else None
 
     def __str__(self) -> str:
@@ -60,11 +65,11 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What a service has answered.
+    """Response of a service.
 
     Attributes:
-        document: as JSON, or None where there is nothing to say.
-        place: what happened up to there is in it, or None where a proxy keeps that to itself.
+        document: the JSON document, or None for an empty response.
+        place: position of the last event that it includes, or None if a proxy removes the header.
     """
 
     document: Any
@@ -72,11 +77,11 @@ class Answer:
 
 
 class Unreached(Exception):
-    """The service gave no answer.
+    """The service has not responded.
 
     Attributes:
         error: the reason.
-        may_be_done: whether the request may have reached it all the same.
+        may_be_done: whether the service may have received the request.
     """
 
     def __init__(self, error: LinkError, *, may_be_done: bool) -> None:
@@ -86,12 +91,12 @@ class Unreached(Exception):
 
 
 class Requests:
-    """The connections to one service.
+    """The HTTP connections to one service.
 
     Args:
-        address: where it is.
-        token: what it wants to see, or None.
-        transport: how requests travel; None for sockets.
+        address: address of the service.
+        token: access token, or None.
+        transport: HTTP transport; None for sockets.
     """
 
     def __init__(
@@ -99,7 +104,7 @@ class Requests:
     ) -> None:
         self.name = address.name
         headers = {"User-Agent": f"paramclient/{__version__}", "Accept-Encoding": "gzip, deflate"}
-        headers["X-Asker"] = f"paramclient {os.getpid()}"  # so that another program's changes are not ours
+        headers["X-Asker"] = f"paramclient {os.getpid()}"  # author of changes, distinct for each program
         if token is not None:
             headers["Authorization"] = f"Bearer {token}"
         self._has_token = token is not None
@@ -109,20 +114,20 @@ class Requests:
         self._http: httpx.AsyncClient | None = None
 
     async def open(self) -> None:
-        """Be ready; nothing is sent yet."""
+        """Create the HTTP client. Nothing is sent yet."""
         transport = self._transport or httpx.AsyncHTTPTransport(
-            limits=httpx.Limits(max_connections=MOST_CONNECTIONS, max_keepalive_connections=20),
+            limits=httpx.Limits(max_connections=PARALLEL_REQUESTS_MAX, max_keepalive_connections=20),
             socket_options=_socket_options(),
         )
         self._http = httpx.AsyncClient(
             headers=self._headers,
             transport=transport,
-            timeout=httpx.Timeout(None, connect=OPEN_TIMEOUT),
+            timeout=httpx.Timeout(None, connect=SERVICE_OPEN_TIMEOUT),
             follow_redirects=False,
         )
 
     async def close(self) -> None:
-        """Leave no connection behind."""
+        """Close all connections."""
         if self._http is not None:
             await self._http.aclose()
 
@@ -133,23 +138,24 @@ class Requests:
         body: Mapping[str, Any] | None = None,
         *,
         link: str | None = None,
-        patience: float | None = None,
+        timeout: float | None = None,
     ) -> Answer:
-        """Send a request and wait for its answer. Cancelled, it is withdrawn.
+        """Send a request and return its response. Cancellation closes the request.
 
         Args:
-            method, path: behind the prefix.
-            body: as JSON, or None for none.
-            link: which link is meant, or None.
-            patience: seconds until the answer begins; None for however long that takes. An answer that has
-                begun has to go on, see `Pace`.
+            method: HTTP method.
+            path: path after the prefix.
+            body: JSON object, or None.
+            link: name of a link of the service, or None.
+            timeout: seconds until the response begins; None for no limit. `Pace` limits the rest.
 
         Raises:
-            Unreached: there was no answer.
-            ParamClientError: that of a problem; LinkError for what is no answer of a service.
+            Unreached: the service has not responded.
+            LinkError: the response is not of a service of paramclient.
+            ParamClientError: the error that the service reports.
         """
         query = {} if link is None else {"link": link}
-        async with self._sent(method, path, body, query, None, patience) as response:
+        async with self._sent(method, path, body, query, None, timeout) as response:
             content = await self._read(response)
             place = Place.read(response.headers.get("X-Seq"))
             if response.is_success and not content:
@@ -161,15 +167,15 @@ class Requests:
 
     @asynccontextmanager
     async def events(self, after: Place | None) -> AsyncIterator[AsyncIterator[list[Any]]]:
-        """The events after a place or from now on, as they come, several at once.
+        """Open the stream of events after a position, or from now on, and yield them in batches.
 
         Raises:
-            Unreached, ParamClientError: as in `ask`; while listening, Unreached when it ends.
+            Unreached, ParamClientError: as in `ask`; Unreached also at the end of the stream.
         """
         headers = {"Accept": "text/event-stream", "Accept-Encoding": "identity"} | (
             {} if after is None else {"Last-Event-ID": str(after)}
         )
-        async with self._sent("GET", "/events", None, {}, headers, OPEN_TIMEOUT) as response:
+        async with self._sent("GET", "/events", None, {}, headers, SERVICE_OPEN_TIMEOUT) as response:
             kind = response.headers.get("Content-Type", "")
             if response.headers.get("Content-Encoding", "identity") != "identity":
                 raise self._foreign()
@@ -182,23 +188,23 @@ class Requests:
         chunks = _pieces(response)
         reader = EventReader()
         now = anyio.current_time()
-        pace, hello_ends = Pace(now), now + HELLO_PATIENCE
+        pace, hello_ends = Pace(now), now + HELLO_TIMEOUT
         while True:
             try:
-                patience = min(SILENCE, pace.left(reader.size, now), hello_ends - now)
-                with anyio.fail_after(patience):
+                timeout = min(STREAM_TIMEOUT, pace.left(reader.size, now), hello_ends - now)
+                with anyio.fail_after(timeout):
                     chunk = await anext(chunks)
                 now = anyio.current_time()
                 events = [checked_document(data) for data in reader.receive(chunk)]
                 if events:
                     hello_ends = math.inf
-                if reader.size <= len(chunk):  # the last event has begun in it
+                if reader.size <= len(chunk):  # the incomplete event has begun in this chunk
                     pace = Pace(now)
                 yield events
             except TimeoutError:
-                raise self._unreached("says nothing any more", None) from None
+                raise self._unreached("the service sends no more events", None) from None
             except StopAsyncIteration:
-                raise self._unreached("has ended the stream of events", None) from None
+                raise self._unreached("the service has ended the event stream", None) from None
             except httpx.TransportError as error:
                 raise self._unreached(_reason(error), error) from error
             except ValueError as error:
@@ -212,7 +218,7 @@ class Requests:
         body: Mapping[str, Any] | None,
         query: Mapping[str, str],
         headers: Mapping[str, str] | None = None,
-        patience: float | None = None,
+        timeout: float | None = None,
     ) -> AsyncIterator[httpx.Response]:
         assert self._http is not None
         request = self._http.build_request(
@@ -224,10 +230,10 @@ class Requests:
             extensions={"trace": _handshake_watch()},
         )
         try:
-            with anyio.fail_after(patience):
+            with anyio.fail_after(timeout):
                 response = await self._http.send(request, stream=True)
         except TimeoutError:
-            raise self._unreached("does not answer", None) from None
+            raise self._unreached("the service does not respond", None) from None
         except (httpx.ConnectError, httpx.ConnectTimeout) as error:
             raise self._unreached(_reason(error), error, may_be_done=False) from error
         except httpx.TransportError as error:
@@ -251,11 +257,13 @@ class Requests:
                 if chunk is None:
                     return bytes(content)
                 received += len(chunk)
-                content += decode(chunk, MOST_ANSWER - len(content))
-                if max(len(content), received) > MOST_ANSWER:
-                    raise LinkError(f"{self.name}: an answer without end", link=self.name)
+                content += decode(chunk, RESPONSE_BYTES_MAX - len(content))
+                if max(len(content), received) > RESPONSE_BYTES_MAX:
+                    raise LinkError(
+                        f"{self.name}: a response of more than {RESPONSE_BYTES_MAX} bytes", link=self.name
+                    )
         except TimeoutError:
-            raise self._unreached("answers too slowly", None) from None
+            raise self._unreached("the response is too slow", None) from None
         except httpx.TransportError as error:
             raise self._unreached(_reason(error), error) from error
         except ValueError as error:
@@ -264,7 +272,7 @@ class Requests:
     def _document(self, response: httpx.Response, content: bytes) -> Any:
         kind = response.headers.get("Content-Type", "").partition(";")[0].strip()
         if response.status_code in (502, 503, 504) and kind != "application/problem+json":
-            raise self._unreached(f"a proxy answers {response.status_code}", None)
+            raise self._unreached(f"a proxy responds with HTTP status {response.status_code}", None)
         if kind not in ("application/json", "application/problem+json"):
             raise self._foreign()
         try:
@@ -273,15 +281,15 @@ class Requests:
             raise self._foreign() from error
 
     def _error(self, response: httpx.Response, problem: Any) -> ParamClientError:
-        """What an answer says that is none of success."""
+        """Return the error of an unsuccessful response."""
         status = response.status_code
         if not isinstance(problem, dict) or status < 400:
             return self._foreign()
         if status == 401:
-            words = "does not take the token" if self._has_token else "wants a token"
-            return UsageError(f"{self.name} {words}; give it with token=… or in {TOKEN_VARIABLE}")
+            words = "refuses the token" if self._has_token else "requires a token"
+            return UsageError(f"{self.name} {words}; pass one with token=… or in {TOKEN_VARIABLE}")
         if problem.get("error") == "ClientClosed" or str(problem.get("type")).endswith(":closing"):
-            raise self._unreached("is closing", None)
+            raise self._unreached("the service is closing", None)
         try:
             with understood(self.name):
                 return error_of(problem, status=status, link=self.name)
@@ -294,24 +302,27 @@ class Requests:
         return Unreached(error, may_be_done=may_be_done)
 
     def _foreign(self) -> LinkError:
-        return LinkError(f"{self.name} answers, but not as a service of paramclient does", link=self.name)
+        return LinkError(f"{self.name} responds, but not as a service of paramclient", link=self.name)
 
 
 def _pieces(response: httpx.Response) -> AsyncIterator[bytes]:
-    """The bytes of an answer as they come; decoded already where the transport has read all of it."""
+    """Return the chunks of a response; already decoded if the transport has read all of it."""
     return response.aiter_bytes() if response.is_stream_consumed else response.aiter_raw()
 
 
 def _socket_options() -> list[tuple[int, int, int]]:
     options = [(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1), (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)]
-    for name, number in KEEPALIVE.items():
+    for name, number in KEEPALIVE_OPTIONS.items():
         if hasattr(socket, name):
             options.append((socket.IPPROTO_TCP, getattr(socket, name), number))
     return options
 
 
 def _handshake_watch() -> Callable[[str, Mapping[str, Any]], Awaitable[None]]:
-    """What closes a connection whose TLS handshake fails: when it is cancelled, httpcore leaves it open."""
+    """Return a trace function that closes a connection after a failed TLS handshake.
+
+    After a cancelled handshake, httpcore leaves the connection open.
+    """
     stream: Any = None
 
     async def trace(event: str, info: Mapping[str, Any]) -> None:
@@ -326,12 +337,12 @@ def _handshake_watch() -> Callable[[str, Mapping[str, Any]], Awaitable[None]]:
 
 
 def _reason(error: Exception) -> str:
-    """Why, in words: the system's where there are any."""
+    """Return the reason of a connection error: the text of the operating system, if there is one."""
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, ssl.SSLCertVerificationError):
             return f"its certificate is not trusted: {cause.verify_message}"
-        if isinstance(cause, ssl.SSLError):  # their numbers are not the system's
+        if isinstance(cause, ssl.SSLError):  # its errno is not one of the operating system
             return f"TLS: {(cause.reason or str(cause)).replace('_', ' ').lower()}"
         if isinstance(cause, OSError) and cause.errno is not None and cause.errno in errno.errorcode:
             return os.strerror(cause.errno).lower()

@@ -1,4 +1,4 @@
-"""What stands in the place of a link where a service has the links."""
+"""ServiceLink: the link object of a client over a service."""
 
 from __future__ import annotations
 
@@ -10,10 +10,14 @@ __all__ = ["ServiceLink"]
 
 
 class ServiceLink:
-    """A name, and no bytes: those go over the links of the service.
+    """The link of a client over a service: only a name. The service has the links with their data.
 
     Attributes:
-        name: the address of the service.
+        name: address of the service.
+        is_stream, reconnects: as in `Link`.
+
+    Raises:
+        UsageError: on `open`, `receive` and `send`.
     """
 
     is_stream = False
@@ -26,19 +30,19 @@ class ServiceLink:
         return f"<ServiceLink {self.name}>"
 
     async def open(self) -> None:
-        """Refused, as all that follow."""
+        """Raise UsageError."""
         self._refuse()
 
     async def receive(self) -> NoReturn:
-        """Refused."""
+        """Raise UsageError."""
         self._refuse()
 
     async def send(self, data: bytes, peer: object) -> None:
-        """Refused."""
+        """Raise UsageError."""
         self._refuse()
 
     async def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing."""
 
     def _refuse(self) -> NoReturn:
         raise not_given("the bytes of its links")

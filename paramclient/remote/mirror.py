@@ -1,4 +1,4 @@
-"""A copy of one component's table that follows the service's. Without input and output."""
+"""Mirror: a copy of one table that follows the table of the service. It has no input and output."""
 
 from __future__ import annotations
 
@@ -9,45 +9,48 @@ from paramclient.model.values import Param, Trust
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.table import NAMES_MAX
 
-__all__ = ["MOST_WAITING", "Mirror"]
+__all__ = ["LOADING_CHANGES_MAX", "Mirror"]
 
-MOST_WAITING: Final = 20_000
-"""Changes that are kept while a table is being loaded; with more it is loaded again instead."""
+LOADING_CHANGES_MAX: Final = 20_000
+"""Maximum number of changes queued while a table is loaded; with more, the table is loaded again."""
 
 
 class Mirror:
-    """What is known here of one table of the service.
+    """A copy of one table of the service.
 
-    A table is loaded whole, and says after which event that was; later events are applied to it in their
-    order, those that come while it is loaded afterwards. While it is not known to be what the service has,
-    every value counts as *cached*, whatever it was before.
+    A table is loaded as a whole, with the number of the last event that it includes; later events are applied
+    in order, and events during the load after it. While the copy may be stale, every value is *cached*.
 
     Attributes:
-        params: what is shown, by name; the object stays the same.
-        is_loaded: whether it is the service's table, as far as events have come.
+        params: the parameters by name; always the same object.
+        is_loaded: whether the copy matches the service up to the last received event.
     """
 
     def __init__(self) -> None:
         self.params: dict[str, Param] = {}
         self.is_loaded = False
-        self._told: dict[str, Param] = {}  # the same with the trust that the service has in it
+        self._told: dict[str, Param] = {}  # the parameters with the trust that the service reports
         self._is_first = True
         self._seq = -1
         self._is_reachable = True
-        self._waiting: list[tuple[int, Change]] | None = None  # None: nobody is loading, or too many
+        self._waiting: list[tuple[int, Change]] | None = None  # None: no load is running, or too many
 
     def begin(self) -> None:
-        """It is asked for now: what happens from here on is kept."""
+        """Start a load: queue changes from now on."""
         self._waiting = []
 
     def load(self, seq: int, params: Mapping[str, Param]) -> list[Change] | None:
-        """Take the whole table as it was after this event.
+        """Replace the table by its state after this event, and apply the queued changes.
+
+        Args:
+            seq: number of the event.
+            params: the table.
 
         Returns:
-            What is different from before, or None where it has to be loaded again.
+            The changes, or None if the table has to be loaded again.
 
         Raises:
-            ValueError: it has more names than there can be.
+            ValueError: the table has more than `MOST_NAMES` names.
         """
         waiting, self._waiting = self._waiting, None
         if waiting is None:
@@ -65,15 +68,19 @@ class Mirror:
         return changes
 
     def take(self, seq: int, change: Change) -> Change | None:
-        """Take one change; give it, if it is one of the value.
+        """Apply a change. Return it if the value has changed.
+
+        Args:
+            seq: number of the event.
+            change: the change.
 
         Raises:
-            ValueError: the table would have more names than there can be.
+            ValueError: the table would have more than `MOST_NAMES` names.
         """
         if not self.is_loaded:
             if self._waiting is not None:
                 self._waiting.append((seq, change))
-                if len(self._waiting) > MOST_WAITING:
+                if len(self._waiting) > LOADING_CHANGES_MAX:
                     self._waiting = None
             return None
         if seq <= self._seq:
@@ -91,24 +98,24 @@ class Mirror:
         return None if old is not None and old.same_value(new) else Change(name, old, new, by)
 
     def confirm(self, param: Param) -> None:
-        """An answer has told of a parameter: its trust counts, where it has the same value here."""
+        """Update the trust of a parameter from a response, if the value is equal."""
         known = self._told.get(param.name)
         if self.is_loaded and self._is_reachable and known is not None and known.same_value(param):
             self._told[param.name] = self.params[param.name] = param
 
     def doubt(self) -> None:
-        """It has to be loaded anew; until then nothing in it is more than cached."""
+        """Mark the copy as stale until the next load: all values are *cached*."""
         self.is_loaded = False
         self._waiting = None
         self._show()
 
     def leave(self) -> None:
-        """The service cannot be reached."""
+        """Mark all values as *cached*: the connection is lost."""
         self._is_reachable = False
         self._show()
 
     def resume(self) -> None:
-        """It is reached again, and what happened meanwhile will be told."""
+        """Restore the trust of the values after a reconnection: missed events follow."""
         self._is_reachable = True
         self._show()
 

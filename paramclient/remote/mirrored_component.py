@@ -1,4 +1,4 @@
-"""What a service has told of one component: its state, its table, and who listens to it."""
+"""MirroredComponent: state, table and subscriptions of one component of a service."""
 
 from __future__ import annotations
 
@@ -25,29 +25,30 @@ from paramclient.remote.mirror import Mirror
 __all__ = ["Key", "MirroredComponent", "key_of"]
 
 Key: TypeAlias = tuple[str, int, int]
-"""The name of a link of the service, and an address on it."""
-NO_AUTOPILOT: Final = ("unknown", "no autopilot")
+"""Name of a link of the service, system id and component id."""
+NOT_AUTOPILOTS: Final = ("unknown", "no autopilot")
+"""Names for `Component.autopilot` that are not autopilots."""
 
 
 class MirroredComponent:
-    """What a service has told of one component, kept in step with its events.
+    """State and table of one component of a service, updated by its events.
 
     Args:
-        document: how it stood.
-        seq: the number of the event after which that was.
-        make: makes the component of users for it.
-        publish: hands an event to those who listen to the client.
+        document: its state.
+        seq: number of the last event included in the document.
+        make: creates its public component.
+        publish: pushes an event to the event streams of the client.
 
     Attributes:
-        key: the name of its link on the service, its system id and its component id.
-        component: what users see of it.
-        document: how it stood when the service said so last.
-        told_at: when that was, by the clock of the event loop.
+        key: name of its link on the service, system id and component id.
+        component: its public component.
+        document: its last received state.
+        told_at: time of the last received state, by the clock of the event loop.
         identity: the identity in the document.
         mirror: its table.
-        is_gone: whether the service does not know it now.
-        seq: the number of the event after which the document was; -1 before any.
-        progress_count: how often the progress of a fetch was told.
+        is_gone: whether the service does not know the component now.
+        seq: number of the last event included in the document; -1 before any.
+        progress_count: number of received progress reports.
     """
 
     def __init__(
@@ -63,7 +64,7 @@ class MirroredComponent:
         self.progress_count = 0
         self.seq = seq
         self._publish_event = publish
-        self._progress = NOTHING_YET
+        self._progress = NO_PROGRESS
         self._subscriptions: weakref.WeakSet[Changes] = weakref.WeakSet()
         self._held: list[Event] = []
         self._is_announced = False
@@ -72,27 +73,27 @@ class MirroredComponent:
 
     @property
     def link_name(self) -> str:
-        """The name of its link on the service."""
+        """Name of its link on the service."""
         return self.key[0]
 
     @property
     def path(self) -> str:
-        """The path of its resource on the service."""
+        """Path of its resource on the service."""
         return f"/components/{self.key[1]}/{self.key[2]}"
 
     @property
     def is_autopilot(self) -> bool:
         """Whether its heartbeat names an autopilot."""
-        return self.document["autopilot"] not in NO_AUTOPILOT and self.identity.vehicle_type != MAV_TYPE_GCS
+        return self.document["autopilot"] not in NOT_AUTOPILOTS and self.identity.vehicle_type != MAV_TYPE_GCS
 
     @property
     def state(self) -> str:
-        """The state of its table, as far as the service has said."""
+        """State of its table, as last reported by the service."""
         return "lost" if self.is_gone else str(self.document["state"])
 
     @property
     def silence(self) -> float:
-        """Seconds since the service has heard it last, as far as the service has said."""
+        """Seconds since its last message to the service, by the last report of the service."""
         return float(self.document["silence_s"]) + anyio.current_time() - self.told_at
 
     def listen(self, changes: Changes) -> None:
@@ -100,17 +101,22 @@ class MirroredComponent:
         self._subscriptions.add(changes)
 
     def progress_since(self, count: int) -> Progress:
-        """How far the fetch is that was told of after so many times."""
-        return self._progress if self.progress_count > count else NOTHING_YET
+        """Return the last progress after this number of reports; no progress if there is none."""
+        return self._progress if self.progress_count > count else NO_PROGRESS
 
     def take_document(self, document: Document, seq: int) -> None:
-        """How it stood when this event had happened."""
+        """Process its state after an event, unless a later one is known."""
         if seq >= self.seq:
             self.seq = seq
             self._read(document)
 
     def take_change(self, event: Document, asker: str) -> None:
-        """A change of a parameter; `asker` is who we are for the service."""
+        """Process a change of a parameter.
+
+        Args:
+            event: the event.
+            asker: name of this client at the service, for changes by its own writes.
+        """
         old, new, by = event["old"], event["new"], str(event["by"])
         change = Change(
             str(event["name"]),
@@ -122,32 +128,32 @@ class MirroredComponent:
             self._publish(made)
 
     def take_progress(self, event: Document) -> None:
-        """How far a fetch is."""
+        """Process a progress report of a fetch."""
         told = progress_of(event)
-        if event.get("done"):  # it has no pace any more
+        if event.get("done"):  # a completed fetch has no rate
             told = replace(told, rate=self._progress.rate)
         self._progress = told
         self.progress_count += 1
 
     def end_progress(self, received: int, count: int) -> None:
-        """A fetch has ended, of which nobody may have told: it was a short one."""
+        """Record the end of a fetch. A short fetch may have had no report."""
         self._progress = Progress(received, count, self._progress.rate, 0.0)
         self.progress_count += 1
 
     def announce(self, event: Event) -> None:
-        """Tell those who listen, as soon as the table is what the event says."""
+        """Publish an event as soon as the table includes its effect."""
         self._held.append(event)
         if self.mirror.is_loaded:
             self.table_was_loaded([])
 
     def announce_first(self) -> None:
-        """Tell those who listen that it is there; once."""
+        """Publish the event Heard, once."""
         if not self._is_announced:
             self._is_announced = True
             self.announce(Heard(self.component))
 
     def table_was_loaded(self, changes: list[Change]) -> None:
-        """Its table is the service's now, with these differences."""
+        """Publish the changes of a loaded table, and the events that have waited for it."""
         for change in changes:
             self._publish(change)
         held, self._held = self._held, []
@@ -155,7 +161,7 @@ class MirroredComponent:
             self._publish_event(event)
 
     def leave(self) -> None:
-        """The service does not know it."""
+        """Mark the component as lost: the service no longer knows it."""
         self.mirror.doubt()
         if self.state != "lost":
             self._held.append(Lost(self.component, self.silence))
@@ -163,7 +169,7 @@ class MirroredComponent:
         self.is_gone = True
 
     def come_back(self, document: Document, seq: int) -> None:
-        """The service knows it, for the first time or again."""
+        """Mark the component as present: the service knows it, for the first time or again."""
         if self.is_gone:
             self.is_gone = False
             self.announce(Found(self.component, self.silence))
@@ -171,13 +177,13 @@ class MirroredComponent:
         self._read(document)
 
     def forget(self) -> None:
-        """It is not waited for any more."""
+        """End all streams of changes with NoReply: the component is no longer followed."""
         _, system, component = self.key
         awaited = f"{system}/{component} (lost)"
         self.end(NoReply(awaited, attempts=0, waited=self.silence))
 
     def end(self, error: ParamClientError | None) -> None:
-        """Nothing more will come: end all streams of changes with this error."""
+        """End all streams of changes with this error."""
         for changes in list(self._subscriptions):
             changes.end(error)
 
@@ -193,10 +199,10 @@ class MirroredComponent:
 
 
 def _check(document: Document) -> None:
-    """See that the members have their kinds that are read when somebody asks for them.
+    """Check the types of the members that are decoded later.
 
     Raises:
-        KeyError, TypeError, ValueError: one has not.
+        KeyError, TypeError, ValueError: a member is missing or has a wrong type.
     """
     for name in ("autopilot", "encoding_reason", "state"):
         check_kind(document[name], str)
@@ -213,9 +219,10 @@ def _check(document: Document) -> None:
         check_kind(last["elapsed_s"], int, float)
 
 
-NOTHING_YET: Final = Progress(0, None, 0.0, None)
+NO_PROGRESS: Final = Progress(0, None, 0.0, None)
+"""Progress of a fetch before the first report."""
 
 
 def key_of(document: Document) -> Key:
-    """Return which component a document is about."""
+    """Return the key of the component in a document."""
     return str(document["link"]), int(document["system"]), int(document["component"])

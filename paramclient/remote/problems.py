@@ -1,4 +1,4 @@
-"""Problem documents (RFC 9457) back to the exceptions that they tell of."""
+"""Decoding of problem documents (RFC 9457) to exceptions."""
 
 from __future__ import annotations
 
@@ -32,29 +32,31 @@ __all__ = ["NotHeard", "error_of"]
 
 Problem = Mapping[str, Any]
 
-LONGEST_DETAIL: Final = 10_000
-"""Characters of an explanation: one that names each bad line of a file has some thousands."""
-_OF_USER: Final = (400, 401, 403, 413, 421, 422)
-"""States of answers (RFC 9110) that say that the request itself cannot be right, whoever else is told so."""
+DETAIL_LENGTH_MAX: Final = 10_000
+"""Maximum number of characters of an explanation: one with each invalid line of a file has some thousands."""
+_REQUEST_ERRORS: Final = (400, 401, 403, 413, 421, 422)
+"""HTTP status codes (RFC 9110) of a request that is not valid or not allowed."""
 
 
 class NotHeard(NoReply):
-    """The service does not know a component, which it may know in a moment: it may have started just now."""
+    """The service does not know a component. It may appear soon if the service has just started."""
 
 
 def error_of(problem: Problem, *, status: int, link: str) -> ParamClientError:
-    """The exception that a problem tells of: the same class, text and attributes.
+    """Return the exception of a problem, with the class, text and attributes of the original.
 
     Args:
         problem: the document.
-        status: of the answer that it came with.
-        link: the name of our client's link, where the problem names none.
+        status: HTTP status code of the response.
+        link: name of the client's link, if the problem has none.
 
     Raises:
-        KeyError, TypeError, ValueError: it is not what it says that it is.
+        KeyError, TypeError, ValueError: the document is not valid.
     """
-    detail = str(problem.get("detail") or problem.get("title") or f"the service answers {status}")
-    detail = detail[:LONGEST_DETAIL]
+    detail = str(
+        problem.get("detail") or problem.get("title") or f"the service responds with status {status}"
+    )
+    detail = detail[:DETAIL_LENGTH_MAX]
     make = _MAKERS.get(str(problem.get("error")))
     if make is not None:
         return make(detail, problem)
@@ -62,7 +64,7 @@ def error_of(problem: Problem, *, status: int, link: str) -> ParamClientError:
         return LinkError(detail, link=str(problem.get("link", link)))
     if str(problem.get("type", "")).endswith(":unknown-component"):
         return NotHeard(detail.rstrip("."), attempts=0, waited=0.0)
-    if status in _OF_USER or str(problem.get("type", "")).endswith(":ambiguous"):
+    if status in _REQUEST_ERRORS or str(problem.get("type", "")).endswith(":ambiguous"):
         return UsageError(detail)
     return LinkError(f"{link}: {detail}", link=link)
 

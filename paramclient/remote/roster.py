@@ -1,4 +1,4 @@
-"""The components on the links of a service, and the mirrors of their tables, kept in step with its events."""
+"""Roster: all components of a service with mirrors of their tables, updated by its events."""
 
 from __future__ import annotations
 
@@ -22,21 +22,20 @@ from paramclient.remote.problems import NotHeard
 
 __all__ = ["Roster"]
 
-COMPONENT_TIMEOUT: Final = 2.5
-"""Seconds for a component to be heard by a service that has started again: it sends a heartbeat a second."""
-CATCHING_UP: Final = 2.0
-"""Seconds for which an answer waits for the events of what it tells; they mostly came before it."""
-UNSURE: Final = ("cached", "contested", "lost")
-"""States that a table comes into when its values are trusted no longer."""
-MOST_GONE: Final = 1_000
-"""Components that the service knows no more and that are the same when it hears them again; of older ones
-nobody is told any more."""
-ANSWER_PATIENCE: Final = 30.0
-"""Seconds until the service begins to give a list or a table, which it has at hand."""
-MOST_COMPONENTS: Final = 4_096
-"""Components that a service may have on all its links."""
-RETRY_PAUSE: Final = 1.0
-"""Seconds until a table is asked for again that could not be loaded."""
+REDISCOVERY_TIMEOUT: Final = 2.5
+"""Timeout in seconds for a component at a restarted service: a component sends a heartbeat once a second."""
+MIRROR_TIMEOUT: Final = 2.0
+"""Timeout in seconds of a response for the events that it includes, which usually arrive before it."""
+UNTRUSTED_STATES: Final = ("cached", "contested", "lost")
+"""States of a table whose values are no longer trusted."""
+REMOVED_COMPONENTS_MAX: Final = 1_000
+"""Maximum number of removed components that are kept for their return. The streams of older ones end."""
+SNAPSHOT_TIMEOUT: Final = 30.0
+"""Timeout in seconds for the start of a list or table, which the service has in memory."""
+SERVICE_COMPONENTS_MAX: Final = 4_096
+"""Maximum number of components of a service on all its links."""
+LOAD_RETRY_INTERVAL: Final = 1.0
+"""Seconds until the next attempt to load a table."""
 
 logger = logging.getLogger(__name__)
 
@@ -44,19 +43,20 @@ logger = logging.getLogger(__name__)
 class Roster:
     """Follows the events of a service; see `Follower`.
 
-    Who is heard and each table are loaded once events come, and again when some of them were lost.
+    The list of components and each table are loaded after the event stream has opened, and again after lost
+    events.
 
     Args:
-        requests: how requests travel.
-        link: the name of the link that is meant, or None for all.
+        requests: the HTTP requests.
+        link: name of the only link to follow, or None for all.
 
     Attributes:
-        name: the address of the service.
-        connection: where events come from.
-        components: all components, by link and address, in the order of the service.
-        subscriptions: who listens to what happens to them.
-        asker: who we are for the service.
-        are_links_stale: is set when something has happened to a link.
+        name: address of the service.
+        connection: connection with the event stream.
+        components: all components, by link and ids, in the order of the service.
+        subscriptions: event streams of the client.
+        asker: name of this client at the service.
+        are_links_stale: set after a change of a link.
     """
 
     def __init__(self, requests: Requests, link: str | None) -> None:
@@ -109,7 +109,7 @@ class Roster:
         """See `Follower`."""
         self._is_list_stale = True
         for mirrored in self.components.values():
-            mirrored.seq = -1  # another run of the service counts from the beginning
+            mirrored.seq = -1  # another run of the service has new event numbers
             mirrored.mirror.resume()
             self._doubt(mirrored)
 
@@ -122,7 +122,7 @@ class Roster:
         mirrored = known or self.meet(event["component_doc"], event["seq"])
         state = mirrored.component.state
         mirrored.take_document(event["component_doc"], event["seq"])
-        if mirrored.component.state != state and mirrored.component.state in UNSURE:
+        if mirrored.component.state != state and mirrored.component.state in UNTRUSTED_STATES:
             self._doubt(mirrored)
         match why:
             case "heard":
@@ -145,17 +145,25 @@ class Roster:
                 mirrored.announce(Rebooted(mirrored.component))
 
     def publish(self, event: Event) -> None:
-        """Tell those who listen."""
+        """Push an event to all streams."""
         for events in list(self.subscriptions):
             events.push(event)
 
     def meet(self, document: Document, seq: int) -> MirroredComponent:
-        """Return the component of a document that tells how it stood after this event; it may be new here."""
+        """Return the component of a document, which is created if it is new.
+
+        Args:
+            document: its state.
+            seq: number of the last event included in the document.
+
+        Raises:
+            ValueError: there are more than `SERVICE_COMPONENTS_MAX` components.
+        """
         key = key_of(document)
         mirrored = self.components.get(key)
         if mirrored is None:
-            if len(self.components) >= MOST_COMPONENTS:
-                raise ValueError(f"more than {MOST_COMPONENTS} components")
+            if len(self.components) >= SERVICE_COMPONENTS_MAX:
+                raise ValueError(f"more than {SERVICE_COMPONENTS_MAX} components")
             mirrored = self._gone.pop(key, None) or MirroredComponent(
                 document, seq, partial(RemoteComponent, self), self.publish
             )
@@ -170,31 +178,39 @@ class Roster:
         self._stale[mirrored.key] = mirrored
 
     def _forget(self, mirrored: MirroredComponent) -> None:
-        """The service does not know it any more, or not yet again: it may have started anew, or its link."""
+        """Remove a component that the service does not know, for example after a restart of the service."""
         key = mirrored.key
         self._stale.pop(key, None)
         if self.components.pop(key, None) is not None:
             mirrored.leave()
             self._gone[key] = mirrored
-            if len(self._gone) > MOST_GONE:
+            if len(self._gone) > REMOVED_COMPONENTS_MAX:
                 self._gone.pop(next(iter(self._gone))).forget()
 
     def same_ids(self, mirrored: MirroredComponent) -> list[MirroredComponent]:
-        """All with its ids, on whatever link."""
+        """Return all components with its ids, on any link."""
         return [each for key, each in self.components.items() if key[1:] == mirrored.key[1:]]
 
-    # what is loaded
-
+    # loading of lists and tables
     async def until_current(
-        self, mirrored: MirroredComponent | None, place: Place | None, *, patience: float | None = CATCHING_UP
+        self,
+        mirrored: MirroredComponent | None,
+        place: Place | None,
+        *,
+        timeout: float | None = MIRROR_TIMEOUT,
     ) -> None:
-        """Wait until what had happened up to a place is in a table, but not for longer than this.
+        """Wait until a table includes the events up to a position.
+
+        Args:
+            mirrored: the component; None returns immediately.
+            place: the position, or None for any.
+            timeout: maximum seconds; the call then returns without an error.
 
         Raises:
             LinkError: the service cannot be reached.
         """
         connection = self.connection
-        with anyio.move_on_after(patience):
+        with anyio.move_on_after(timeout):
             while mirrored is not None:
                 has_come = (
                     place is None
@@ -204,25 +220,25 @@ class Roster:
                 )
                 if has_come and mirrored.mirror.is_loaded:
                     return
-                if mirrored.key in self._stale:  # it is the next to be loaded
+                if mirrored.key in self._stale:  # load this table next
                     self._stale = {mirrored.key: mirrored, **self._stale}
                 await connection.news.wait()
                 connection.check_open()
 
     async def given(self, answer: Answer) -> Component:
-        """Return the component that an answer is about, with its table."""
+        """Return the component of a response, with its table."""
         return (await self.mirror_for(answer)).component
 
-    async def mirror_for(self, answer: Answer, patience: float | None = CATCHING_UP) -> MirroredComponent:
-        """Return what is known of the component that an answer is about, with its table.
+    async def mirror_for(self, answer: Answer, timeout: float | None = MIRROR_TIMEOUT) -> MirroredComponent:
+        """Return the mirrored component of a response, with its table.
 
         Args:
-            answer: its document is that of a component.
-            patience: seconds to wait for the table; None waits until it has come.
+            answer: a response with the document of a component.
+            timeout: seconds to wait for the table; None waits without limit.
         """
         with understood(self.name):
             found = self.meet(answer.document, -1 if answer.place is None else answer.place.seq)
-        await self.until_current(found, answer.place, patience=patience)
+        await self.until_current(found, answer.place, timeout=timeout)
         return found
 
     async def ask(
@@ -253,22 +269,22 @@ class Roster:
             answer = await request(timeout=timeout)
         except NotHeard:
             left = None if timeout is None else began + timeout - anyio.current_time()
-            patience = min(COMPONENT_TIMEOUT, COMPONENT_TIMEOUT if left is None else left)
-            await self._until_heard(mirrored, patience)
+            wait = min(REDISCOVERY_TIMEOUT, REDISCOVERY_TIMEOUT if left is None else left)
+            await self._until_heard(mirrored, wait)
             left = None if timeout is None else began + timeout - anyio.current_time()
             answer = await request(timeout=left)
         await self.until_current(mirrored, answer.place)
         return answer
 
-    async def _until_heard(self, mirrored: MirroredComponent, patience: float) -> None:
+    async def _until_heard(self, mirrored: MirroredComponent, timeout: float) -> None:
         """Wait until the service knows a component again."""
         link, system, component = mirrored.key
         body = {"system": system, "component": component}
         awaited = f"{system}/{component} (lost)"
-        await self.connection.ask("POST", "/find", body, awaited=awaited, timeout=patience, link=link)
+        await self.connection.ask("POST", "/find", body, awaited=awaited, timeout=timeout, link=link)
 
     async def run(self) -> None:
-        """Load what is not known to be the service's, for as long as the client is open."""
+        """Load stale lists and tables, until cancelled."""
         while True:
             news = self.connection.news
             if self.connection.is_away or not (self._stale or self._is_list_stale):
@@ -280,11 +296,15 @@ class Roster:
                 else:
                     await self._load(next(iter(self._stale.values())))
             except (Unreached, ParamClientError) as error:
-                logger.info("%s: a table could not be loaded: %s", self.name, error)
-                await anyio.sleep(RETRY_PAUSE)
+                logger.info("%s: a table could not be loaded, retrying in 1 s: %s", self.name, error)
+                await anyio.sleep(LOAD_RETRY_INTERVAL)
 
     async def load_list(self) -> None:
-        """Who is heard."""
+        """Load the list of components.
+
+        Raises:
+            Unreached, ParamClientError: the list cannot be loaded.
+        """
         self._is_list_stale = False
         try:
             answer = await self._snapshot("/components", None)
@@ -306,11 +326,11 @@ class Roster:
         for key, mirrored in before.items():
             if key not in self.components:
                 self.components[key] = mirrored
-                if mirrored.seq <= seq:  # else it was heard since
+                if mirrored.seq <= seq:  # otherwise it has appeared since
                     self._forget(mirrored)
 
     async def _load(self, mirrored: MirroredComponent) -> None:
-        """The table of one."""
+        """Load the table of a component."""
         mirrored.mirror.begin()
         try:
             answer = await self._snapshot(f"{mirrored.path}/params", mirrored.link_name)
@@ -325,12 +345,16 @@ class Roster:
             self.connection.tell()
 
     async def _snapshot(self, path: str, link: str | None) -> Document:
-        """What is known on the service at one moment, of the run whose events are heard."""
-        asked = await self._requests.ask("GET", path, link=link, patience=ANSWER_PATIENCE)
+        """Request a list or table from the run of the service whose events are followed.
+
+        Raises:
+            Unreached, ParamClientError: the request failed, or the service has restarted.
+        """
+        asked = await self._requests.ask("GET", path, link=link, timeout=SNAPSHOT_TIMEOUT)
         answer: Document = asked.document
         place = self.connection.place
         with understood(self.name):
             is_of_run = place is not None and answer["run"] == place.run
         if not is_of_run:
-            raise LinkError(f"{self.name}: it has started again", link=self.name)
+            raise LinkError(f"{self.name}: the service has restarted", link=self.name)
         return answer

@@ -1,4 +1,4 @@
-"""The address of a service, as users write it, and the token that it wants to see."""
+"""ServiceAddress: address of a service, and its access token."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from paramclient.links import parse_link
 __all__ = ["TOKEN_VARIABLE", "ServiceAddress", "chosen_token"]
 
 TOKEN_VARIABLE: Final = "PARAMCLIENT_TOKEN"
-"""The environment variable that holds the token, for all programs that speak to services."""
+"""Environment variable with the access token, for all clients of services."""
 
 
 @dataclass(frozen=True, slots=True)
 class ServiceAddress:
-    """Where a service is, and which of its links is meant.
+    """Address of a service, optionally with one of its links.
 
     Attributes:
-        base: `http://HOST:PORT`, with the path under which a proxy may have it, and without a last slash.
-        link: the name of one of its links, or None for all of them.
+        base: `http://HOST:PORT`, with the path behind a proxy, and without a trailing slash.
+        link: name of one of its links, or None for all.
     """
 
     base: str
@@ -30,10 +30,10 @@ class ServiceAddress:
 
     @classmethod
     def read(cls, text: str) -> ServiceAddress:
-        """Read `http://HOST:8765` or `https://HOST/path?link=NAME`.
+        """Parse `http://HOST:8765` or `https://HOST/path?link=NAME`.
 
         Raises:
-            UsageError: it is no such address.
+            UsageError: the address is not valid.
         """
         shown = text.strip()
         try:
@@ -42,12 +42,12 @@ class ServiceAddress:
         except ValueError as error:
             raise UsageError(f"address {shown!r}: {error}") from None
         if parts.username is not None or parts.password is not None:
-            # not shown: it may be the token
-            raise UsageError("the address of a service holds no password; give the token with token=")
+            # the message does not include the address: its password may be the token
+            raise UsageError("the address of a service has no password; pass the token with token=")
         if parts.scheme.lower() not in ("http", "https") or not parts.hostname or port == 0:
             raise UsageError(f"address {shown!r}: a service is named http://HOST:PORT")
         if parts.fragment:
-            raise UsageError(f"address {shown!r}: what stands behind # means nothing to a service")
+            raise UsageError(f"address {shown!r}: the address of a service has no part after #; remove it")
         base = urlunsplit((parts.scheme.lower(), parts.netloc.lower(), parts.path.rstrip("/"), "", ""))
         return cls(base, _chosen_link(parts.query, shown))
 
@@ -58,10 +58,10 @@ class ServiceAddress:
 
 
 def chosen_token(token: str | None) -> str | None:
-    """The token that is given, or that of the environment.
+    """Return the given token, or that of the environment; None if there is none.
 
     Raises:
-        UsageError: it has characters that no token has.
+        UsageError: the token is not printable ASCII without spaces.
     """
     chosen = os.environ.get(TOKEN_VARIABLE) if token is None else token
     if not chosen:
@@ -76,9 +76,9 @@ def _chosen_link(query: str, shown: str) -> str | None:
         return None
     pairs = parse_qsl(query, keep_blank_values=True)
     if [key for key, _ in pairs] != ["link"] or not pairs[0][1]:
-        raise UsageError(f"address {shown!r}: behind ? may stand one link=NAME, with %26 for an & in it")
+        raise UsageError(f"address {shown!r}: only one link=NAME may follow the ?, with %26 for an & in it")
     name = pairs[0][1]
     try:
         return parse_link(name).name
     except UsageError:
-        return name  # a link of another program's making: the service knows its name
+        return name  # a link type of another program, whose name only the service knows

@@ -44,14 +44,14 @@ from paramclient.remote.service_address import ServiceAddress, chosen_token
 
 __all__ = ["ServiceClient"]
 
-OPENING_PATIENCE: Final = 10.0
-"""Seconds for a service to say what it has."""
-STATS_PAUSE: Final = 0.5
-"""Seconds between two questions for the numbers of the links, however often they are looked at."""
+OPENING_TIMEOUT: Final = 10.0
+"""Timeout in seconds for connecting to a service and loading its lists."""
+STATS_INTERVAL: Final = 0.5
+"""Minimum seconds between two requests for the counters of the links, however often they are read."""
 
 
 class ServiceClient:
-    """A client whose links and cache are those of a service. See `RemoteClient` for what is different.
+    """A client with the links and the cache of a service. See `RemoteClient` for the differences.
 
     Args:
         link: as in `RemoteClient`.
@@ -59,10 +59,10 @@ class ServiceClient:
         transport: as in `RemoteClient`.
 
     Attributes:
-        cache: None; the service has it.
+        cache: None; the service has the cache.
 
     Raises:
-        UsageError: no such address or token.
+        UsageError: the address or the token is not valid.
     """
 
     def __init__(
@@ -80,11 +80,11 @@ class ServiceClient:
         self._is_entered = False
         self._links: list[Document] = []
 
-    # what is known
+    # state
 
     @property
     def components(self) -> Mapping[Address, Component]:
-        """See `ParamClient.components`; without those whose ids are on several links."""
+        """See `ParamClient.components`; without components whose ids are on several links."""
         return MappingProxyType({at: each.component for at, each in self._unambiguous().items()})
 
     @property
@@ -105,12 +105,12 @@ class ServiceClient:
 
     @property
     def link(self) -> Link:
-        """The address of the service, in the place of a link."""
+        """The address of the service, as a link object without data."""
         return self._service
 
     @property
     def listens_only(self) -> bool:
-        """Whether nothing is ever sent on any of the links."""
+        """Whether the service sends nothing on any of its links."""
         return bool(self._links) and all(each["listens_only"] for each in self._links)
 
     @property
@@ -125,7 +125,7 @@ class ServiceClient:
 
     @property
     def stats(self) -> ClientStats:
-        """What the links of the service have done, as it was when that was asked for last."""
+        """Counters of the links of the service at the last request. An access triggers a new request."""
         self._roster.are_links_stale.set()
         return stats_of([each["stats"] for each in self._links if each["stats"] is not None])
 
@@ -137,10 +137,10 @@ class ServiceClient:
         heard = len(self._roster.components)
         return f"<RemoteClient {self._service.name} {state}, {heard} component{'' if heard == 1 else 's'}>"
 
-    # its life
+    # opening and closing
 
     async def open(self) -> None:
-        """Connect to the service, and load what it has.
+        """Connect to the service, and load its links and components.
 
         Raises:
             UsageError, LinkError: as from entering a `RemoteClient`.
@@ -153,7 +153,7 @@ class ServiceClient:
         await tasks.__aenter__()
         try:
             tasks.start_soon(self._connection.follow, name="paramclient follower of a service")
-            with anyio.fail_after(OPENING_PATIENCE):
+            with anyio.fail_after(OPENING_TIMEOUT):
                 await self._connection.reached()
                 await self._load_links()
                 await self._learn_who_we_are()
@@ -166,12 +166,12 @@ class ServiceClient:
                 raise error.error from error.error.__cause__
             if isinstance(error, TimeoutError) and not isinstance(error, ParamClientError):
                 name = self._service.name
-                raise LinkError(f"{name}: it does not answer", link=name) from None
+                raise LinkError(f"{name}: the service does not respond", link=name) from None
             raise
         self._tasks = tasks
 
     async def close(self, *, failed: bool) -> None:
-        """End every call that waits, and the connections.
+        """End waiting calls and streams, and close the connections.
 
         Args:
             failed: whether the body of the `async with` has raised; it makes no difference.
@@ -190,7 +190,7 @@ class ServiceClient:
         """End the tasks and the connections, also when cancelled."""
         tasks.cancel_scope.cancel()
         try:
-            # not told of the caller's exception: it would come out wrapped in a group
+            # without the caller's exception, which the task group would wrap in an ExceptionGroup
             await tasks.__aexit__(None, None, None)
         finally:
             with anyio.CancelScope(shield=True):
@@ -199,7 +199,7 @@ class ServiceClient:
     # calls
 
     def events(self) -> Events:
-        """See `ParamClient.events`. What an event tells of a table is in `params` by then."""
+        """See `ParamClient.events`. When an event is delivered, `params` includes its effect."""
         events = Events()
         self._subscriptions.add(events)
         if self._connection.ended is not None:
@@ -207,7 +207,7 @@ class ServiceClient:
         return events
 
     def ftp(self, component: Component) -> Ftp:
-        """Refused: files go over the link itself."""
+        """Raise UsageError: MAVFTP needs the link itself."""
         raise not_given("files over MAVFTP")
 
     async def component(
@@ -218,11 +218,12 @@ class ServiceClient:
         peer: str | None = None,
         timeout: float | None = COMPONENT_TIMEOUT,
     ) -> Component:
-        """See `ParamClient.component`. It is waited for also on links that the service cannot open yet.
+        """See `ParamClient.component`. The call also waits for links that the service cannot open yet.
 
         Raises:
-            UsageError: it is on several links, and the address of the service names none of them.
-            NoReply, LinkError: as there.
+            UsageError: the component is on several links, and the address of the service names no link; or a
+                peer is given.
+            NoReply, LinkError: as in `ParamClient.component`.
         """
         _check_peer(peer)
         return await self._found({"system": system, "component": component}, timeout)
@@ -235,11 +236,11 @@ class ServiceClient:
         peer: str | None = None,
         timeout: float | None = COMPONENT_TIMEOUT,
     ) -> Component:
-        """See `ParamClient.only_component`. The vehicles on all links of the service count, or on the one
-        that the address names.
+        """See `ParamClient.only_component`, for the vehicles on all links or on the link in the address.
 
         Raises:
-            AmbiguousVehicle, UsageError, NoReply, LinkError: as there, and as `component`.
+            AmbiguousVehicle: as in `ParamClient.only_component`.
+            UsageError, NoReply, LinkError: as in `component`.
         """
         _check_peer(peer)
         return await self._found({"system": system, "component": component, "only": True}, timeout)
@@ -261,7 +262,7 @@ class ServiceClient:
         if len(same := self._roster.same_ids(found)) > 1:
             links = " and ".join(each.link_name for each in same)
             ids = f"{found.key[1]}/{found.key[2]}"
-            raise UsageError(f"{ids} is on {links} of the service; name one: http://…?link=NAME")
+            raise UsageError(f"{ids} is on {links} of the service; choose one with http://…?link=NAME")
         return found.component
 
     async def successor(
@@ -283,7 +284,7 @@ class ServiceClient:
         timeout: float | None = None,
         progress: Callable[[Mapping[Address, Progress]], None] | None = None,
     ) -> FetchedAll:
-        """See `ParamClient.fetch_all`. Where two links have the same ids, one of them is told."""
+        """See `ParamClient.fetch_all`. If two links have equal ids, the result has one of them."""
         began = anyio.current_time()
         before = {key: each.progress_count for key, each in self._roster.components.items()}
 
@@ -332,24 +333,24 @@ class ServiceClient:
         return FetchedAll(results, silent)
 
     def traffic_report(self) -> NoReturn:
-        """Refused: the links are the service's."""
+        """Raise UsageError: only the service sees the traffic of its links."""
         raise not_given("a report of the traffic")
 
     def signing_report(self) -> NoReturn:
-        """Refused: keys and signatures are the service's."""
+        """Raise UsageError: only the service has keys and signatures."""
         raise not_given("a report of signatures")
 
     async def _learn_who_we_are(self) -> None:
-        with suppress(LinkError):  # a service that keeps that to itself
+        with suppress(LinkError):  # an older service has no such resource
             answer = await self._requests.ask("GET", "/me")
             with understood(self._service.name):
                 self._roster.asker = str(answer.document.get("asker", ""))
 
     async def _load_links(self) -> None:
-        """The links and their numbers.
+        """Load the links and their counters.
 
         Raises:
-            UsageError: the one that is meant is not among them.
+            UsageError: the link in the address does not exist.
         """
         answer = await self._requests.ask("GET", "/links")
         with understood(self._service.name):
@@ -361,7 +362,7 @@ class ServiceClient:
         self._links = links
 
     async def _look_at_links(self) -> None:
-        """The same as far as it goes: these numbers are worth no error."""
+        """Load the links and their counters, and ignore errors."""
         with suppress(Unreached, ParamClientError):
             await self._load_links()
 
@@ -370,7 +371,7 @@ class ServiceClient:
             await self._roster.are_links_stale.wait()
             self._roster.are_links_stale = anyio.Event()
             await self._look_at_links()
-            await anyio.sleep(STATS_PAUSE)
+            await anyio.sleep(STATS_INTERVAL)
 
     def check_open(self) -> None:
         """Check that the service can be asked.
@@ -383,4 +384,4 @@ class ServiceClient:
 
 def _check_peer(peer: str | None) -> None:
     if peer is not None:
-        raise UsageError("peer is for a client with a link of its own; a service keeps no peers apart")
+        raise UsageError("peer is only for a client with its own link; a service does not distinguish peers")

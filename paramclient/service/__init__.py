@@ -3,12 +3,14 @@
 Needs the extra `service`.
 
 - `app`, `server`, `routes`: the application, the server, the routes.
-- `hub`, `link`, `followed_component`, `event_feed`, `jobs`: links and cache, one link, one component, events, jobs.
+- `hub`, `link`, `followed_component`, `event_feed`, `jobs`: links and cache, one link, one component,
+  events, jobs.
 - `access`, `request`, `tokens`, `client_address`, `tls`: access checks of every request.
 - `gate`, `places`, `connections`: connections before TLS, their number, their limits.
-- `quota`, `held_bodies`, `answer_places`, `log_limit`: limits of work, request bodies, responses and log lines.
-- `reading`, `param_sources`, `route_context`, `answering`, `problems`, `metrics`: request bodies, parameters named in
-  requests, what routes share, responses, errors, Prometheus.
+- `quota`, `held_bodies`, `answer_places`, `log_limit`: limits of work, request bodies, responses and log
+  lines.
+- `reading`, `param_sources`, `route_context`, `answering`, `problems`, `metrics`: request bodies,
+  parameters named in requests, what routes share, responses, errors, Prometheus.
 """
 
 from __future__ import annotations

@@ -45,8 +45,8 @@ class ArduPilotVehicle(Vehicle):
     - The response to a set has the type REAL32, independent of the parameter's type, if the value is the
       default, the parameter never had another value, and it belongs to a group: of the real quad's table,
       all but the first 57.
-    - A parameter that switches a group shows it while it is not 0 and hides it at 0: count and indices change.
-      Hidden parameters can be read and set by name.
+    - A parameter that switches a group shows it while it is not 0 and hides it at 0: count and indices
+      change. Hidden parameters can be read and set by name.
     - MAVFTP serves `@PARAM/param.pck` and `files`: one session, 5 requests waiting, bursts limited to a third
       of the link (see `FileServer`). An uploaded param.pck sets parameters without announcing the changes.
     - SYSID_THISMAV takes effect with the next full second, on a Copter after a reboot, without announcement.

@@ -40,7 +40,7 @@ from paramclient.client.client import implementation_of
 from paramclient.metadata import metadata_of
 from paramclient.protocol import wire
 from paramclient.remote import RemoteClient, RemoteComponent
-from paramclient.remote.http import SILENCE
+from paramclient.remote.http import STREAM_TIMEOUT
 from paramclient.remote.service_client import ServiceClient
 from paramclient.service import Hub, Settings, create_app
 from paramclient.service.access import AccessSettings
@@ -340,7 +340,7 @@ async def test_components_on_several_links() -> None:
             await client.component(3)
             await client.component(2)
             assert client.components.keys() == {(2, 1), (3, 1)}
-            with pytest.raises(UsageError, match=r"1/1 is on one and two of the service; name one"):
+            with pytest.raises(UsageError, match=r"1/1 is on one and two of the service; choose one"):
                 await client.component(1)
             assert (await client.fetch_all(2)).results.keys() == {(2, 1)}
         async with a_program(network, link="two") as client:
@@ -492,7 +492,7 @@ async def test_a_network_that_falls_silent_is_noticed() -> None:
         await asyncio.sleep(60.0)
         assert trusts(component) == {Trust.LIVE}, "a service that has nothing to say says that"
         network.is_held = True
-        await asyncio.sleep(SILENCE + 2.1)
+        await asyncio.sleep(STREAM_TIMEOUT + 2.1)
         assert trusts(component) == {Trust.CACHED}
         network.release()
         await asyncio.sleep(2.0)
@@ -529,7 +529,7 @@ async def test_a_service_that_stays_away(caplog: pytest.LogCaptureFixture) -> No
         await asyncio.sleep(link_task.BACKOFF_MAX + 0.1)
         assert (await component.set("PARAM_01", 5)).actual == 5
     told = [each.getMessage() for each in caplog.records if each.name.startswith("paramclient.remote")]
-    assert len([text for text in told if "trying to reach it again" in text]) == 1
+    assert len([text for text in told if "reconnecting" in text]) == 1
 
 
 @swiftly
@@ -544,7 +544,7 @@ async def test_a_write_whose_answer_is_lost_is_not_sent_again() -> None:
         network.cut()
         error = await write
         assert type(error) is LinkError
-        assert "whether PARAM_SET PARAM_01 to 1/1 was done is not known" in str(error)
+        assert "it is unknown whether PARAM_SET PARAM_01 to 1/1 was done" in str(error)
         tap.is_mute = False
         await asyncio.sleep(3.0)
         assert network.asked.count("PATCH /api/v1/components/1/1/params") == 1
@@ -618,15 +618,15 @@ def answering(status: int, body: bytes, kind: str = "text/html", **headers: str)
 @pytest.mark.parametrize(
     ("app", "words"),
     [
-        (answering(200, b"<h1>Router</h1>"), "not as a service of paramclient does"),
-        (answering(404, b"not here"), "not as a service of paramclient does"),
-        (answering(302, b"", location="http://elsewhere/"), "not as a service of paramclient does"),
-        (answering(200, b'{"a": 1}', "application/json"), "not as a service of paramclient does"),
+        (answering(200, b"<h1>Router</h1>"), "not as a service of paramclient"),
+        (answering(404, b"not here"), "not as a service of paramclient"),
+        (answering(302, b"", location="http://elsewhere/"), "not as a service of paramclient"),
+        (answering(200, b'{"a": 1}', "application/json"), "not as a service of paramclient"),
         (answering(404, b'{"detail": "x"}', "application/json"), "127.0.0.1:8765: x"),
-        (answering(200, b"data: 5\n\n", "text/event-stream"), "cannot be understood"),
-        (answering(200, b"data: {x\n\n", "text/event-stream"), "not as a service of paramclient does"),
-        (answering(200, b"", "text/event-stream"), "has ended the stream"),
-        (answering(502, b"bad gateway"), "a proxy answers 502"),
+        (answering(200, b"data: 5\n\n", "text/event-stream"), "document of the service is not valid"),
+        (answering(200, b"data: {x\n\n", "text/event-stream"), "not as a service of paramclient"),
+        (answering(200, b"", "text/event-stream"), "has ended the event stream"),
+        (answering(502, b"bad gateway"), "a proxy responds with HTTP status 502"),
         (None, "connection refused"),
     ],
     ids=["page", "nothing", "elsewhere", "json", "problem", "number", "noise", "end", "proxy", "nobody"],
@@ -646,7 +646,7 @@ async def test_one_that_says_nothing_is_given_up() -> None:
             pass
 
     began = anyio.current_time()
-    with pytest.raises(LinkError, match="does not answer"):
+    with pytest.raises(LinkError, match="does not respond"):
         async with a_program(Network(silent)):
             pass
     assert anyio.current_time() - began < 11.0
@@ -657,7 +657,7 @@ async def test_a_wrong_token_is_told_at_once(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.delenv("PARAMCLIENT_TOKEN", raising=False)
     async with a_hub(generic()) as hub:
         network = Network(create_app(hub, Settings(access=AccessSettings(tokens=tokens()))))
-        for token, words in ((None, "wants a token"), ("nonsense", "does not take the token")):
+        for token, words in ((None, "requires a token"), ("nonsense", "refuses the token")):
             with pytest.raises(UsageError, match=words) as caught:
                 async with a_program(network, token=token):
                     pass

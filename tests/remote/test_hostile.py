@@ -21,10 +21,10 @@ from paramclient.model.values import Param, ParamType, Trust
 from paramclient.protocol.params.change import Change
 from paramclient.remote import RemoteClient, bounded, http, mirror, roster
 from paramclient.remote.bounded import (
-    DEEPEST,
-    MOST_ANSWER,
-    MOST_EVENT,
-    MOST_VALUES,
+    DOCUMENT_VALUES_MAX,
+    EVENT_BYTES_MAX,
+    NESTING_MAX,
+    RESPONSE_BYTES_MAX,
     EventReader,
     checked_document,
     decoder_of,
@@ -141,10 +141,10 @@ def answers_with(
 
 AWAY = [b"HTTP/1.1 307 Away\r\nLocation: /api/v1/events\r\nContent-Length: 0\r\n\r\n"]
 DEEP = b"[" * 100_000
-WIDE = b"[" + b"[]," * MOST_VALUES + b"1]"
+WIDE = b"[" + b"[]," * DOCUMENT_VALUES_MAX + b"1]"
 EVENTS = head("text/event-stream")
 JSON = head("application/json")
-BOMB = gzip.compress(b" " * (MOST_ANSWER + (1 << 20)))
+BOMB = gzip.compress(b" " * (RESPONSE_BYTES_MAX + (1 << 20)))
 HUGE = b'{"links": ' + b"9" * 5_000 + b"}"
 REFUSED = {"error": "Refused", "detail": "x", "system": 1, "component": 1}
 
@@ -156,14 +156,18 @@ REFUSED = {"error": "Refused", "detail": "x", "system": 1, "component": 1}
         ("/events", answers_with(EVENTS, [b"x" * 65_536]), "not as a service"),
         ("/events", answers_with(EVENTS, [b"data: " + b"x" * 60_000 + b"\n"]), "not as a service"),
         ("/events", stream(DEEP), "not as a service"),
-        ("/events", stream(b"[" * (DEEPEST + 1) + b"]" * (DEEPEST + 1)), "not as a service"),
-        ("/events", stream(WIDE[:MOST_EVENT]), "not as a service"),
+        ("/events", stream(b"[" * (NESTING_MAX + 1) + b"]" * (NESTING_MAX + 1)), "not as a service"),
+        ("/events", stream(WIDE[:EVENT_BYTES_MAX]), "not as a service"),
         ("/events", stream(b"\xff\xfe"), "not as a service"),
         ("/events", stream(HUGE), "not as a service"),
-        ("/events", stream(b'{"run": 1, "seq": 1e999, "type": "hello"}'), "cannot be understood"),
+        (
+            "/events",
+            stream(b'{"run": 1, "seq": 1e999, "type": "hello"}'),
+            "document of the service is not valid",
+        ),
         ("/events", [head("text/event-stream", "Content-Encoding: gzip"), BOMB], "not as a service"),
-        ("/events", answers_with(EVENTS, [b": \n\n"], 0.02), "says nothing any more"),
-        ("/events", answers_with(EVENTS, [b":"], 0.02), "says nothing any more"),
+        ("/events", answers_with(EVENTS, [b": \n\n"], 0.02), "sends no more events"),
+        ("/events", answers_with(EVENTS, [b":"], 0.02), "sends no more events"),
         ("/events", answers_with(b"HTTP/1.1 200 OK\r\n", [b"X: y\r\n" * 1_000]), "too long|too large|many"),
         ("/events", answers_with(b"HTTP/1.1 200 OK\r\nX: ", [b"y" * 65_536]), "too long|too large|many"),
         ("/events", AWAY, "not as a service"),
@@ -175,28 +179,36 @@ REFUSED = {"error": "Refused", "detail": "x", "system": 1, "component": 1}
         ("/links", document(DEEP), "not as a service"),
         ("/links", document(WIDE), "not as a service"),
         ("/links", document(HUGE), "not as a service"),
-        ("/links", document(BOMB, "Content-Encoding: gzip"), "without end"),
+        ("/links", document(BOMB, "Content-Encoding: gzip"), "a response of more than"),
         ("/links", document(b"no gzip", "Content-Encoding: gzip"), "not as a service"),
         ("/links", document(b"{}", "Content-Encoding: br"), "not as a service"),
-        ("/links", answers_with(JSON, [b" " * 65_536]), "without end"),
-        ("/links", answers_with(JSON, [b" "], 0.02), "answers too slowly"),
-        ("/links", document({"links": [{"name": "a", "stats": {"bytes_sent": []}}]}), "cannot be understood"),
-        ("/links", document([]), "cannot be understood"),
-        ("/components", document([]), "cannot be understood"),
-        ("/components", document({"run": RUN, "seq": 0}), "cannot be understood"),
-        ("/components", components(*(component(link=str(n)) for n in range(5_000))), "cannot be understood"),
-        ("/components", components(component(count="many")), "cannot be understood"),
-        ("/components", components(component(silence_s=[])), "cannot be understood"),
-        ("/components", components(component(hash="z")), "cannot be understood"),
-        ("/components", components(component(identity={})), "cannot be understood"),
-        ("/components", components(component(last_fetch=5)), "cannot be understood"),
+        ("/links", answers_with(JSON, [b" " * 65_536]), "a response of more than"),
+        ("/links", answers_with(JSON, [b" "], 0.02), "response is too slow"),
+        (
+            "/links",
+            document({"links": [{"name": "a", "stats": {"bytes_sent": []}}]}),
+            "document of the service is not valid",
+        ),
+        ("/links", document([]), "document of the service is not valid"),
+        ("/components", document([]), "document of the service is not valid"),
+        ("/components", document({"run": RUN, "seq": 0}), "document of the service is not valid"),
+        (
+            "/components",
+            components(*(component(link=str(n)) for n in range(5_000))),
+            "document of the service is not valid",
+        ),
+        ("/components", components(component(count="many")), "document of the service is not valid"),
+        ("/components", components(component(silence_s=[])), "document of the service is not valid"),
+        ("/components", components(component(hash="z")), "document of the service is not valid"),
+        ("/components", components(component(identity={})), "document of the service is not valid"),
+        ("/components", components(component(last_fetch=5)), "document of the service is not valid"),
     ],
 )
 async def test_it_ends_in_an_error_when_it_is_opened(
     path: str, sent: Sent, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(http, "HELLO_PATIENCE", 0.3)
-    monkeypatch.setattr(bounded, "SLOW_PATIENCE", 0.3)
+    monkeypatch.setattr(http, "HELLO_TIMEOUT", 0.3)
+    monkeypatch.setattr(bounded, "RESPONSE_TIMEOUT", 0.3)
     with pytest.raises(LinkError, match=words):
         await asyncio.wait_for(opened({path: sent}), 30)
 
@@ -239,7 +251,7 @@ async def test_what_it_answers_in_between_ends_no_program() -> None:
     async with hostile({"/components/1/1/params": refuse}) as url, ParamClient(url) as client:
         await asyncio.sleep(0.2)
         assert list(client.components) == [(1, 1)]
-        with pytest.raises(LinkError, match="cannot be understood"):
+        with pytest.raises(LinkError, match="document of the service is not valid"):
             await client.component(timeout=1)
 
 
@@ -253,7 +265,7 @@ async def test_a_parameter_that_is_none_is_an_error(changed: dict[str, object]) 
     async def read(client: ParamClient) -> None:
         await (await client.component(timeout=5)).get("A", timeout=5)
 
-    with pytest.raises(LinkError, match="cannot be understood"):
+    with pytest.raises(LinkError, match="document of the service is not valid"):
         await opened(dict(answers), read)
 
 
@@ -303,16 +315,19 @@ async def test_memory_stays_bounded() -> None:
 
 
 def test_the_largest_document_within_the_bounds() -> None:
-    assert len(checked_document(b"[" + b'{"a":1},' * (MOST_VALUES // 2 - 1) + b"1]")) == MOST_VALUES // 2
+    assert (
+        len(checked_document(b"[" + b'{"a":1},' * (DOCUMENT_VALUES_MAX // 2 - 1) + b"1]"))
+        == DOCUMENT_VALUES_MAX // 2
+    )
     with pytest.raises(ValueError, match="more than"):
-        checked_document(b"[" + b"1," * MOST_VALUES + b"1]")
+        checked_document(b"[" + b"1," * DOCUMENT_VALUES_MAX + b"1]")
 
 
 def test_depth() -> None:
     for opening, closing in ((b"[", b"]"), (b'{"a":', b"}")):
-        deepest = opening * (DEEPEST - 1) + b"[]" + closing * (DEEPEST - 1)
+        deepest = opening * (NESTING_MAX - 1) + b"[]" + closing * (NESTING_MAX - 1)
         assert checked_document(deepest)
-        for depth in (DEEPEST, 10 * DEEPEST, 100_000):
+        for depth in (NESTING_MAX, 10 * NESTING_MAX, 100_000):
             with pytest.raises(ValueError, match="deeper than"):
                 checked_document(opening * depth + b"[]" + closing * depth)
 
@@ -320,7 +335,7 @@ def test_depth() -> None:
 def test_an_event_that_comes_byte_by_byte_costs_no_more_than_one_at_once() -> None:
     """Each piece is looked at once, however long the line is to which it belongs."""
     reader = EventReader()
-    for _ in range(MOST_EVENT // 8):
+    for _ in range(EVENT_BYTES_MAX // 8):
         reader.receive(b"x")
     assert reader.receive(b"\n\n") == []
     assert reader.size == 0
@@ -328,8 +343,8 @@ def test_an_event_that_comes_byte_by_byte_costs_no_more_than_one_at_once() -> No
 
 def test_an_event_of_many_lines_is_bounded() -> None:
     reader = EventReader()
-    reader.receive(b"data: 1\n" * (MOST_EVENT // 8))
-    with pytest.raises(ValueError, match="without end"):
+    reader.receive(b"data: 1\n" * (EVENT_BYTES_MAX // 8))
+    with pytest.raises(ValueError, match="an event of more than"):
         reader.receive(b"data: 1\n")
 
 
@@ -365,7 +380,7 @@ def test_a_table_grows_no_further_than_that_of_a_service(monkeypatch: pytest.Mon
 
 @pytest.mark.asyncio
 async def test_components_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(roster, "MOST_COMPONENTS", 2)
+    monkeypatch.setattr(roster, "SERVICE_COMPONENTS_MAX", 2)
     events = [HELLO]
     for number in range(1, 6):
         told = {"run": RUN, "seq": number, "at": 0.0, "type": "component", "why": "heard"}

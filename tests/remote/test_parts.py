@@ -40,9 +40,9 @@ from paramclient.client.link_component import LinkComponent
 from paramclient.documents.param import ParamDoc
 from paramclient.model.values import Value, from_bits, type_name
 from paramclient.remote import RemoteComponent
-from paramclient.remote.bounded import MOST_EVENT, EventReader
+from paramclient.remote.bounded import EVENT_BYTES_MAX, EventReader
 from paramclient.remote.decoding import number_of, param_of, value_as_sent
-from paramclient.remote.mirror import MOST_WAITING, Mirror
+from paramclient.remote.mirror import LOADING_CHANGES_MAX, Mirror
 from paramclient.remote.problems import error_of
 from paramclient.remote.service_address import TOKEN_VARIABLE, ServiceAddress, chosen_token
 from paramclient.remote.service_client import ServiceClient
@@ -81,7 +81,7 @@ def test_addresses_of_services(text: str, base: str, link: str | None) -> None:
         ("http://:8765", "http://HOST:PORT"),
         ("http://h:0", "http://HOST:PORT"),
         ("http://h:99999", "out of range"),
-        ("http://h:1#top", "behind #"),
+        ("http://h:1#top", "after #"),
         ("http://h:1?token=x", "link=NAME"),
         ("http://h:1?link=", "link=NAME"),
         ("http://h:1?link=a&link=b", "link=NAME"),
@@ -262,7 +262,9 @@ def test_a_problem_that_no_exception_stands_behind() -> None:
         error = told(kind, status)
         assert type(error) is LinkError
         assert str(error) == "http://h:1: So it is."
-    assert str(error_of({}, status=418, link="http://h:1")) == "http://h:1: the service answers 418"
+    assert (
+        str(error_of({}, status=418, link="http://h:1")) == "http://h:1: the service responds with status 418"
+    )
 
 
 # Events
@@ -284,9 +286,9 @@ def test_events_are_read_however_they_are_cut() -> None:
 
 def test_an_event_without_end() -> None:
     reader = EventReader()
-    for _ in range(MOST_EVENT >> 20):
+    for _ in range(EVENT_BYTES_MAX >> 20):
         reader.receive(b"x" * (1 << 20))
-    with pytest.raises(ValueError, match="without end"):
+    with pytest.raises(ValueError, match="an event of more than"):
         reader.receive(b"x")
 
 
@@ -366,7 +368,7 @@ def test_a_table_that_is_doubted_while_it_is_loaded_is_loaded_again() -> None:
     assert mirror.load(5, {"A": param(5)}) is None
     assert not mirror.is_loaded
     mirror.begin()
-    for seq in range(MOST_WAITING + 1):
+    for seq in range(LOADING_CHANGES_MAX + 1):
         mirror.take(seq, Change("A", None, param(seq)))
     assert mirror.load(5, {"A": param(5)}) is None, "more came meanwhile than is kept"
 

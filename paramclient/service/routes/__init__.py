@@ -1,7 +1,7 @@
 """What the service answers, room by room. A further one is a line here.
 
-- `components`, `params`, `fetches`, `param_files`, `metadata`: components, parameters, fetches and jobs, parameter
-  files, metadata.
+- `components`, `params`, `fetches`, `param_files`, `metadata`: components, parameters, fetches and jobs,
+  parameter files, metadata.
 - `history`, `setup`, `events`, `system`: earlier states, set-ups, the event stream, the service itself.
 """
 
