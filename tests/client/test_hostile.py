@@ -242,7 +242,7 @@ def test_names_that_go_are_told_to_the_cache_up_to_a_bound(monkeypatch: pytest.M
 
 
 def test_a_value_that_flips_is_asked_for_only_so_often(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(value_check, "READS_MAX", 2)
+    monkeypatch.setattr(value_check, "REREADS_MAX", 2)
     session = Simulation()
     beat(session)
     for value in (1.0, 2.0):
