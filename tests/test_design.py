@@ -60,7 +60,7 @@ MAY_IMPORT = {
     "provision.similar_names": set[str](),
     "provision.planning": {"errors", "model", "provision.apply_rules", "provision.similar_names"},
     "provision": SHELL | {"files", "provision.planning", "provision.apply_rules", "provision.similar_names"},
-    "logs": SHELL,
+    "logs": SHELL | {"files"},
     "diagnosis": SHELL | {"metadata"},
     "testing": {"errors", "sim"},
     "documents": SHELL | {"files", "metadata", "provision", "provision.planning", "logs", "diagnosis"},
@@ -315,11 +315,14 @@ def test_only_the_client_chooses_the_remote_one() -> None:
     assert uses == {"paramclient.client.client"}
 
 
-def test_only_the_wire_knows_pymavlink() -> None:
+def test_only_the_wire_and_the_reader_of_dataflash_logs_use_pymavlink() -> None:
     uses = {
         (module, each.module) for module in MODULES for each in imports_of(module) if each.top == "pymavlink"
     }
-    assert uses == {("paramclient.protocol.wire.frames", "pymavlink.dialects.v20")}
+    assert uses == {
+        ("paramclient.protocol.wire.frames", "pymavlink.dialects.v20"),
+        ("paramclient.logs.dataflash", "pymavlink.DFReader"),
+    }
 
 
 @pytest.mark.parametrize("module", [module for module in MODULES if is_pure(module)])

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Final
 
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.output import print_document, print_table, printable, report, say
 from paramclient.files import ParamFile
 from paramclient.files.param_file import address
-from paramclient.model.comparison import same_value
+from paramclient.model.comparison import non_defaults
 from paramclient.model.identity import autopilot_name
 from paramclient.model.notation import time_text
 from paramclient.model.paramset import ParamSet, WrittenParam
@@ -23,7 +22,9 @@ def show_file(file: ParamFile, component: int | None, *, changed: bool, json: bo
     """Print the parameters of a file; see `paramclient show`."""
     sets = file.sets if component is None else [file.choose(component)]
     if changed:
-        shown = [_changed(each) for each in sets if any(param.default is not None for param in each.values())]
+        shown = [
+            non_defaults(each) for each in sets if any(param.default is not None for param in each.values())
+        ]
     else:
         shown = [*sets]
     if json:
@@ -82,16 +83,6 @@ def _print_set(params: ParamSet, *, changed: bool) -> None:
         right="value default",
     )
     say(printable(f"{described(params)}{', those that differ from their default' if changed else ''}"))
-
-
-def _changed(params: ParamSet) -> ParamSet:
-    """Return the parameters whose value differs from the firmware's default."""
-    differing = {
-        name: param
-        for name, param in params.items()
-        if param.default is not None and not same_value(param, replace(param, value=param.default))
-    }
-    return replace(params, params=differing)
 
 
 def _text(value: Value, param: WrittenParam) -> str:

@@ -1,8 +1,8 @@
-"""The subcommand save: writes the parameters of a vehicle, or its cached ones, to a file."""
+"""The subcommand save: writes the parameters of a vehicle, the cache, a log or a file to a file."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -15,13 +15,12 @@ from paramclient.cli.offline import tables_of
 from paramclient.cli.options import CacheOptions, LinkOptions
 from paramclient.cli.output import print_document, printable, progress_bar, report, say
 from paramclient.cli.session import Session, connect
-from paramclient.cli.sources import check_link, collect_confirmed, names_vehicle
+from paramclient.cli.sources import check_link, choose, collect_confirmed, is_file, names_vehicle, open_file
 from paramclient.client.component import Component
 from paramclient.errors import UsageError
 from paramclient.files import FileForm, write_file
 from paramclient.files.param_file import AUTOPILOT, address, form_of_name
 from paramclient.model.paramset import ParamSet
-from paramclient.model.values import Param
 from paramclient.protocol.params.fetch_result import FetchResult
 from paramclient.provision.vehicle_params import cached_param_set, select_non_defaults
 
@@ -48,8 +47,9 @@ async def save(
     not known.
 
     Args:
-        where: The link, such as udpin:0.0.0.0:14550 or sim:px4; or a vehicle in the cache: its system id, its
-            hardware id in full, uid: and at least 6 digits of it, or its key.
+        where: The link, such as udpin:0.0.0.0:14550 or sim:px4; an on-board log (.bin, .ulg), for the values
+            at its end, or another parameter file; or a vehicle in the cache: its system id, its hardware id
+            in full, uid: and at least 6 digits of it, or its key.
         file: The file. Its ending determines the file format: .params, .parm, .param, .pck, .json, .yaml.
         form: The file format, if the ending does not determine it.
         changed: Write only parameters that differ from the firmware's defaults.
@@ -61,7 +61,11 @@ async def save(
         raise UsageError("start scripts of PX4 cannot be written, only read; choose another file format")
     if all_ and options.component is not None:
         raise UsageError("--all and --component exclude each other")
-    if names_vehicle(where):
+    if is_file(where):
+        if refresh:
+            raise UsageError(f"--refresh needs a link; {where!r} is a file")
+        sets, faults = _from_file(where, options, all_=all_, changed=changed)
+    elif names_vehicle(where):
         if refresh:
             raise UsageError(f"--refresh needs a link; {where!r} is a vehicle in the cache")
         sets, faults = _from_cache(where, options, all_=all_, changed=changed)
@@ -95,7 +99,7 @@ async def _from_link(
                     f"{result.count} parameters were not received"
                 )
             else:
-                faults += _add(sets, found.set, found.params, changed=changed)
+                faults += _add(sets, found.set, changed=changed)
     return sets, faults
 
 
@@ -117,6 +121,19 @@ async def _fetch(
     fetched = [(client.components[each], everything.results[each]) for each in sorted(everything.results)]
     silent = [f"{each[0]}/{each[1]}: {everything.silent[each]}" for each in sorted(everything.silent)]
     return fetched, silent
+
+
+def _from_file(
+    path: str, options: LinkOptions, *, all_: bool, changed: bool
+) -> tuple[list[ParamSet], list[str]]:
+    """Return the parameters of a file or an on-board log, and sentences on sets without changes."""
+    file = open_file(path)
+    chosen = file.sets if all_ else [choose(file, options.component, options.system)]
+    sets: list[ParamSet] = []
+    faults: list[str] = []
+    for each in chosen:
+        faults += _add(sets, each, changed=changed)
+    return sets, faults
 
 
 def _from_cache(
@@ -145,14 +162,14 @@ def _from_cache(
                 f"{table.size}{of} parameters are in the cache"
             )
             continue
-        faults += _add(sets, cached_param_set(table), table.params.values(), changed=changed)
+        faults += _add(sets, cached_param_set(table), changed=changed)
     return sets, faults
 
 
-def _add(sets: list[ParamSet], whole: ParamSet, params: Iterable[Param], *, changed: bool) -> Sequence[str]:
+def _add(sets: list[ParamSet], whole: ParamSet, *, changed: bool) -> Sequence[str]:
     """Add a set, or with `changed` its non-default parameters; return the sentences on a failure."""
     try:
-        sets.append(select_non_defaults(whole, params) if changed else whole)
+        sets.append(select_non_defaults(whole) if changed else whole)
     except UsageError as error:
         return [f"{address(whole)}: {error}"]
     return []

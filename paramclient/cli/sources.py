@@ -30,6 +30,7 @@ from paramclient.files import ParamFile, read_file
 from paramclient.files.param_file import AUTOPILOT
 from paramclient.links import FORMS, parse_link
 from paramclient.links.names import names_service
+from paramclient.logs.onboard import is_onboard_log, read_onboard_log
 from paramclient.model.paramset import ParamSet
 from paramclient.protocol.params.fetch_result import FetchResult
 from paramclient.provision.vehicle_params import FetchedSet, collect_set, incomplete_error, load_cached_set
@@ -47,7 +48,7 @@ __all__ = [
 ]
 
 SOURCES: Final = f"""\
-  FILE                a parameter file that exists
+  FILE                a parameter file, or an on-board log (.bin, .ulg), that exists
   cache:VEHICLE       last known of a vehicle: its system id, its hardware id in full, uid: and at least 6
                       digits of it, or its key; without cache: where it can be nothing else, as 1, uid:000200
 {FORMS}"""
@@ -158,12 +159,17 @@ async def collect_confirmed(
 
 
 def open_file(path: str) -> ParamFile:
-    """Read a parameter file, and report its notes on stderr.
+    """Read a parameter file or the values at the end of an on-board log, and report the notes on stderr.
 
     Raises:
         FileError: the file cannot be read.
+        UsageError: the log needs a library that is not installed.
     """
-    file = read_file(path)
+    if is_onboard_log(path):
+        log = read_onboard_log(path)
+        file = ParamFile((log.at_end(),), log.form, path, notes=log.notes)
+    else:
+        file = read_file(path)
     for note in file.notes:
         report(f"{path}: {note}")
     return file

@@ -15,6 +15,7 @@ __all__ = [
     "AUTOPILOT",
     "ENDINGS",
     "FileForm",
+    "LogForm",
     "ParamFile",
     "TooManyParams",
     "address",
@@ -45,6 +46,15 @@ class FileForm(StrEnum):
     """paramclient's own format as YAML, for editing by hand. Reading it needs PyYAML."""
 
 
+class LogForm(StrEnum):
+    """Formats of on-board logs, which `paramclient.logs` reads. None of them can be written."""
+
+    DATAFLASH = "dataflash"
+    """ArduPilot, `.bin`."""
+    ULOG = "ulog"
+    """PX4, `.ulg`."""
+
+
 ENDINGS: Final = {
     ".params": FileForm.QGC,
     ".parm": FileForm.PARM,
@@ -71,7 +81,7 @@ class ParamFile:
     """
 
     sets: tuple[ParamSet, ...]
-    form: FileForm
+    form: FileForm | LogForm
     source: str = ""
     header: tuple[str, ...] = ()
     footer: tuple[str, ...] = ()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from paramclient.errors import UsageError
@@ -15,7 +15,16 @@ from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.patterns import NameChoice
 from paramclient.model.values import ParamType, Value, bits_of, from_bits, same_bits
 
-__all__ = ["Comparison", "Difference", "Moved", "Standing", "compare", "defaults_of", "same_value"]
+__all__ = [
+    "Comparison",
+    "Difference",
+    "Moved",
+    "Standing",
+    "compare",
+    "defaults_of",
+    "non_defaults",
+    "same_value",
+]
 
 
 class Standing(StrEnum):
@@ -155,6 +164,16 @@ def compare(
     if names is not None:
         chosen = _chosen(chosen, [names] if isinstance(names, str) else names)
     return Comparison(left, right, base, tuple(_hold(name, left, right, base) for name in sorted(chosen)))
+
+
+def non_defaults(params: ParamSet) -> ParamSet:
+    """Return the parameters that differ from the firmware's defaults, as far as these are known."""
+    differing = {
+        name: param
+        for name, param in params.items()
+        if param.default is not None and not same_value(param, replace(param, value=param.default))
+    }
+    return replace(params, params=differing)
 
 
 def same_value(left: WrittenParam, right: WrittenParam) -> bool:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING, Final
 
 from paramclient.errors import NoReply, NotInCache, UnknownVehicle, UsageError, VehicleError
+from paramclient.model.comparison import non_defaults
 from paramclient.model.params import copy_params
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Param, Trust
@@ -214,19 +215,15 @@ def load_state_before_apply(cache: ParamCache, key: str, component: int) -> Para
     return cache.state_at(key, component, snapshots[-1].id)
 
 
-def select_non_defaults(whole: ParamSet, params: Iterable[Param]) -> ParamSet:
+def select_non_defaults(whole: ParamSet) -> ParamSet:
     """Return the parameters of a set that differ from the firmware's defaults.
-
-    Args:
-        whole: the set.
-        params: the same parameters as `Param` objects of the table.
 
     Raises:
         UsageError: the defaults are not known, or no parameter differs.
     """
     if not any(param.default is not None for param in whole.values()):
         raise UsageError(NO_DEFAULTS)
-    names = [param.name for param in params if param.is_changed]
-    if not names:
+    found = non_defaults(whole)
+    if not found:
         raise UsageError("no parameter differs from its default")
-    return replace(whole, params={name: whole[name] for name in names})
+    return found

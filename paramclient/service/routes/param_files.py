@@ -79,9 +79,7 @@ async def file(
             found = await known_set(target, hub.aside)
         else:
             found = await fetch_set(target.component, source=f"link {target.line.name}", run=hub.aside)
-        chosen = (
-            await hub.aside(lambda: select_non_defaults(found.set, found.params)) if changed else found.set
-        )
+        chosen = await hub.aside(lambda: select_non_defaults(found.set)) if changed else found.set
         return await attachment(hub, chosen, form)
 
     return await answered(request, work, target)

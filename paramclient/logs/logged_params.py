@@ -1,0 +1,91 @@
+"""OnboardLog: the parameters of one flight as an autopilot recorded them, with their changes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from paramclient.files.param_file import LogForm
+from paramclient.model.identity import Identity
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.values import Value
+
+__all__ = ["LoggedChange", "OnboardLog", "log_link"]
+
+
+@dataclass(frozen=True, slots=True)
+class LoggedChange:
+    """A value that was recorded after the initial ones.
+
+    Attributes:
+        time: seconds since the boot of the autopilot.
+        name: param_id.
+        value: the new value.
+    """
+
+    time: float
+    name: str
+    value: Value
+
+
+@dataclass(frozen=True, slots=True)
+class OnboardLog:
+    """The parameters of an on-board log.
+
+    Attributes:
+        source: the file's name, as given.
+        form: the log format.
+        identity: the vehicle, as far as the log describes it.
+        initial: the parameters at the beginning of the log, by name.
+        changes: the later values, in the order of the log.
+        began: when the initial parameters were recorded, in seconds since boot.
+        ended: the last time that was read, in seconds since boot.
+        boot_time: the Unix time of the boot in seconds, or None if the log has no time of a GPS receiver.
+        notes: remarks for the user, in sentences: damaged parts.
+    """
+
+    source: str
+    form: LogForm
+    identity: Identity
+    initial: Mapping[str, WrittenParam]
+    changes: tuple[LoggedChange, ...] = ()
+    began: float = 0.0
+    ended: float = 0.0
+    boot_time: float | None = None
+    notes: tuple[str, ...] = ()
+
+    def at_start(self) -> ParamSet:
+        """Return the parameters at the beginning of the log."""
+        return self._set(self.initial, self.began)
+
+    def at_end(self) -> ParamSet:
+        """Return the parameters at the end of the log: the initial ones with all changes."""
+        params = dict(self.initial)
+        for change in self.changes:
+            known = params.get(change.name)
+            params[change.name] = (
+                WrittenParam(change.name, change.value)
+                if known is None
+                else replace(known, value=change.value)
+            )
+        return self._set(params, self.ended)
+
+    def unix_time(self, time: float) -> float | None:
+        """Return the Unix time of a time since boot, in seconds; None if the log has no clock."""
+        return None if self.boot_time is None else self.boot_time + time
+
+    def _set(self, params: Mapping[str, WrittenParam], time: float) -> ParamSet:
+        return ParamSet(
+            params,
+            component=1,
+            system=self.identity.system or None,
+            identity=self.identity,
+            at=self.unix_time(time),
+            source=self.source,
+        )
+
+
+def log_link(path: str) -> str:
+    """Return the link name of a log, which is part of the identity of a vehicle without a hardware id."""
+    return f"log:{os.path.realpath(path)}"
