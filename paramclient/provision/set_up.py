@@ -16,11 +16,10 @@ from paramclient.provision.execution import ApplyRun
 from paramclient.provision.inspection import wait_for_identity
 from paramclient.provision.planning import ParamInfo, Plan
 from paramclient.provision.results import ApplyProgress, ApplyResult
+from paramclient.provision.vehicle_params import BEFORE_APPLY
 
-__all__ = ["BEFORE_APPLY", "BEFORE_RESTORE", "apply", "restore", "restore_categories"]
+__all__ = ["BEFORE_RESTORE", "apply", "restore", "restore_categories"]
 
-BEFORE_APPLY: Final = "before apply"
-"""The reason of the snapshot that `apply` stores before its first write."""
 BEFORE_RESTORE: Final = "before restore"
 """The reason of the snapshot that `restore` stores before its first write."""
 

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 from typing import TYPE_CHECKING, Final
 
@@ -15,7 +16,6 @@ from paramclient.model.params import copy_params
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Param, Trust
 from paramclient.provision.runner import Runner, run_here
-from paramclient.provision.set_up import BEFORE_APPLY
 
 if TYPE_CHECKING:
     from paramclient.cache import CachedComponent, ParamCache
@@ -23,8 +23,10 @@ if TYPE_CHECKING:
     from paramclient.protocol.params.fetch_result import FetchResult, Progress
 
 __all__ = [
+    "BEFORE_APPLY",
     "NO_DEFAULTS",
     "FetchedSet",
+    "set_maker",
     "load_state_before_apply",
     "load_cached_set",
     "select_non_defaults",
@@ -35,6 +37,8 @@ __all__ = [
     "fetch_set",
 ]
 
+BEFORE_APPLY: Final = "before apply"
+"""The reason of the snapshot that `apply` stores before its first write."""
 REFRESH_TIMEOUT: Final = 10.0
 """Seconds to wait for the values that the vehicle's hash does not cover."""
 NAMES_SHOWN_MAX: Final = 20
@@ -59,6 +63,25 @@ class FetchedSet:
     set: ParamSet
     params: Sequence[Param]
     missing: Sequence[str]
+
+
+def set_maker(component: Component, source: str) -> Callable[[Iterable[Param]], ParamSet]:
+    """Return a function that turns parameters of a component into a set.
+
+    The set has the identity and the time of this call. The function may be called in a worker thread.
+
+    Args:
+        component: the component.
+        source: the origin of the set, in words.
+    """
+    return partial(
+        ParamSet.of,
+        component=component.component,
+        system=component.system,
+        identity=component.identity,
+        at=time.time(),
+        source=source,
+    )
 
 
 async def collect_set(
@@ -88,7 +111,7 @@ async def collect_set(
     with suppress(NoReply):  # values that were not read again are reported as missing below
         await component.refreshed(timeout=min(REFRESH_TIMEOUT, math.inf if timeout is None else timeout))
     table = copy_params(component.params)
-    system, number, identity, at = component.system, component.component, component.identity, time.time()
+    to_set = set_maker(component, source)
 
     def make_set() -> FetchedSet:
         params = list(table.values())
@@ -99,8 +122,7 @@ async def collect_set(
             if param.trust is Trust.CACHED and param.index is not None
         }
         missing = [stale.get(index, f"index {index}") for index in sorted({*result.missing, *stale})]
-        found = ParamSet.of(known, component=number, system=system, identity=identity, at=at, source=source)
-        return FetchedSet(found, known, missing)
+        return FetchedSet(to_set(known), known, missing)
 
     return await run(make_set)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import binascii
-import time
 from codecs import BOM_UTF8
 from collections.abc import Callable
 from datetime import datetime
@@ -29,6 +28,7 @@ from paramclient.provision.vehicle_params import (
     fetch_set,
     load_cached_set,
     load_state_before_apply,
+    set_maker,
 )
 from paramclient.service.problems import ServiceError
 from paramclient.service.reading import check_lines, check_pieces
@@ -356,7 +356,7 @@ async def known_set(target: Followed, run: Runner) -> FetchedSet:
     """
     component = target.component
     table, count = copy_params(component.params), component.count
-    system, number, identity, at = component.system, component.component, component.identity, time.time()
+    to_set = set_maker(component, f"link {target.line.name}")
 
     def take() -> FetchedSet:
         params = list(table.values())
@@ -366,9 +366,7 @@ async def known_set(target: Followed, run: Runner) -> FetchedSet:
             told = f"{listed - unsure} of {'?' if count is None else count}"
             what = f"{told} parameters were heard or confirmed in this session; fetch them first."
             raise ServiceError(409, "incomplete", what)
-        source = f"link {target.line.name}"
-        found = ParamSet.of(params, component=number, system=system, identity=identity, at=at, source=source)
-        return FetchedSet(found, params, ())
+        return FetchedSet(to_set(params), params, ())
 
     return await run(take)
 
