@@ -140,6 +140,7 @@ class ComponentMachine:
         vehicle: the address part that all components of a vehicle share: the system, with `peer` also the
             peer.
         version: the MAVLink version of its frames.
+        context: the facts about it that its machines share.
         who: its identity and encoding.
         table: its parameters.
         round_trip: round-trip time and loss of its responses.
@@ -191,6 +192,7 @@ class ComponentMachine:
         self.vehicle: tuple[int, Peer] = (system, peer)
         self.version = 1
         context = Context(target, send, own, trace=trace, may_send=not upkeep.listens_only)
+        self.context = context
         self.round_trip = context.round_trip
         self.who = Identification(context, link, encoding)
         self.table = Table(self.who.encoding, room)
@@ -273,7 +275,7 @@ class ComponentMachine:
     def may_be_written(self) -> bool:
         """Whether it is certain which vehicle receives a write, and in which encoding."""
         home = self.peers.home
-        is_open = any(each.who.was_away or each.peers.is_rival(home) for each in self._autopilots())
+        is_open = any(each.context.may_be_another or each.peers.is_rival(home) for each in self._autopilots())
         return self.who.may_be_written and not is_open
 
     @property

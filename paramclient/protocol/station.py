@@ -451,7 +451,7 @@ class Station:
         if autopilot is not machine and autopilot.peers.is_rival(machine.peers.home):
             return True
         is_lost = autopilot is not machine and autopilot.presence.is_lost
-        return is_lost or autopilot.who.was_away
+        return is_lost or autopilot.context.may_be_another
 
     def autopilot_of(self, system: int, peer: Peer = None) -> ComponentMachine | None:
         """Return the component of a system that is its autopilot: the usual id first.

@@ -59,7 +59,7 @@ class Succession:
         ):
             return False
         identity = found.identity
-        if found.who.was_away or (self._identity.uid is not None and identity.uid is None):
+        if found.context.may_be_another or (self._identity.uid is not None and identity.uid is None):
             self._ask_again(found, now)
             return False
         if not self._identity.is_same_vehicle(identity):

@@ -134,16 +134,6 @@ class Identification(Machine):
         self._derive()
 
     @property
-    def was_away(self) -> bool:
-        """Whether another vehicle may have taken its place since the identification, or has and is being
-        identified."""
-        return self._context.may_be_another
-
-    @was_away.setter
-    def was_away(self, was_away: bool) -> None:
-        self._context.may_be_another = was_away
-
-    @property
     def has_parameters(self) -> bool:
         """Whether it may have parameters: it is not a ground station."""
         return self.vehicle_type != MAV_TYPE_GCS
@@ -187,12 +177,12 @@ class Identification(Machine):
     def is_unconfirmed(self) -> bool:
         """Whether another vehicle may have taken its place, and its identity was requested without
         success."""
-        return self.was_away and not self._context.is_identifying and self._may_ask
+        return self._context.may_be_another and not self._context.is_identifying and self._may_ask
 
     @property
     def may_be_written(self) -> bool:
         """Whether it is certain which vehicle receives a write, and in which encoding."""
-        return self.encoding_is_certain and not self.was_away
+        return self.encoding_is_certain and not self._context.may_be_another
 
     @property
     def has_spoken(self) -> bool:
@@ -231,8 +221,8 @@ class Identification(Machine):
     def doubt(self, now: float) -> None:
         """Request the identity again: the component was lost, or has rebooted."""
         if self.has_parameters:
-            is_open = self._may_ask and (self.settled or self.was_away)
-            self.was_away = self.identity.uid is not None or is_open
+            is_open = self._may_ask and (self.settled or self._context.may_be_another)
+            self._context.may_be_another = self.identity.uid is not None or is_open
             self._was_doubted = self._was_doubted or self.settled
             self.attempts = 0
             self.doubted_at = now
@@ -249,7 +239,7 @@ class Identification(Machine):
         self.autopilot = self.vehicle_type = self.capabilities = None
         self._beat_awaited_until = math.inf
         self._derive()
-        self.was_away = True
+        self._context.may_be_another = True
         self._was_doubted = False
         self.attempts = 0
         self.doubted_at = now
@@ -265,7 +255,7 @@ class Identification(Machine):
         was_unconfirmed = self.is_unconfirmed
         if self._context.is_identifying:
             self._round_trip.answered(self._asked_at, now, self.attempts)
-        self._context.is_identifying = self.was_away = False
+        self._context.is_identifying = self._context.may_be_another = False
         system, _ = self._target
         before = self.identity
         self.identity = Identity.from_version(
@@ -352,7 +342,7 @@ class Identification(Machine):
         if self.attempts >= self._tries and now >= self._asks_until:
             self._context.is_identifying = False
             self.settled = True
-            self.was_away = self.was_away and self.identity.uid is not None
+            self._context.may_be_another = self._context.may_be_another and self.identity.uid is not None
             return
         was_refused = self._denied_at < math.inf
         self.attempts += 1

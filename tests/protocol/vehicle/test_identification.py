@@ -52,7 +52,8 @@ class Desk:
     def __init__(self, chosen: Encoding | None = None) -> None:
         self.sent: list[Message] = []
         self.trip = RoundTrip()
-        self.who = Identification(Context((1, 1), self.sent.append, round_trip=self.trip), "udpin:x", chosen)
+        self.context = Context((1, 1), self.sent.append, round_trip=self.trip)
+        self.who = Identification(self.context, "udpin:x", chosen)
 
     def beat(self, heartbeat: Heartbeat, now: float = 0.0) -> None:
         self.who.heartbeat(heartbeat)
@@ -314,4 +315,4 @@ def test_one_that_was_away_is_asked_for_five_seconds_and_not_more_than_once_a_se
     assert desk.who.is_unconfirmed, "it has not said that it is the same"
     assert not desk.who.may_be_written
     desk.who.version(AutopilotVersion(0, uid=7), 60.0)
-    assert not is_so(desk.who.was_away)
+    assert not is_so(desk.context.may_be_another)
