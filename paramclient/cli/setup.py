@@ -82,7 +82,7 @@ _OPTIONS: Final = LinkOptions()
 
 async def apply(
     url: str,
-    source: str,
+    file: str,
     /,
     *,
     include: Include = (),
@@ -110,7 +110,7 @@ async def apply(
 
     Args:
         url: The link, such as udpin:0.0.0.0:14550, or sim:ardupilot for a simulated vehicle.
-        source: A parameter file; or a vehicle in the cache, as cache:VEHICLE.
+        file: A parameter file; or a vehicle in the cache, as cache:VEHICLE.
         include: Include a category that is left out by default (identity, hardware, calibration, measured,
             counter, action, read-only, out-of-range), or a name or pattern such as "COMPASS_OFS*". May be
             given several times.
@@ -121,7 +121,7 @@ async def apply(
         durable: End only when the values and their history are on the disk and survive a power loss.
         backup: A new file for the vehicle's state before; its ending determines the file format. {uid} and
             {system} in the name are replaced by the vehicle's ids.
-        over: A file whose parameters replace and extend those of SOURCE, with {uid} or {system} in its name
+        over: A file whose parameters replace and extend those of FILE, with {uid} or {system} in its name
             for the vehicle's ids.
         all_vehicles: Set up all vehicles on the link, concurrently.
         expect: With --all, wait for this number of vehicles, and fail with fewer.
@@ -134,7 +134,7 @@ async def apply(
     check_pattern("--overlay", over, all_vehicles=all_vehicles)
     check_pattern("--backup", backup, all_vehicles=all_vehicles)
     chosen = from_file(metadata)
-    values = Source(source, over, options, only=True)
+    values = Source(file, over, options, only=True)
     await values.open()
     async with targets(url, options, all_vehicles=all_vehicles, expect=expect, only=True) as found:
         wanted = await values.wanted(found.vehicles)
@@ -175,7 +175,7 @@ async def apply(
 
 async def verify(
     url: str,
-    source: str,
+    file: str,
     /,
     *,
     include: Include = (),
@@ -193,9 +193,9 @@ async def verify(
 
     Args:
         url: The link.
-        source: A parameter file; or a vehicle in the cache, as cache:VEHICLE.
+        file: A parameter file; or a vehicle in the cache, as cache:VEHICLE.
         include: Include a category that is left out by default, or a name or pattern, as with apply.
-        over: A file whose parameters replace and extend those of SOURCE, with {uid} or {system} in its name
+        over: A file whose parameters replace and extend those of FILE, with {uid} or {system} in its name
             for the vehicle's ids.
         all_vehicles: Compare all vehicles on the link, concurrently.
         expect: With --all, wait for this number of vehicles, and fail with fewer.
@@ -205,7 +205,7 @@ async def verify(
     """
     check_pattern("--overlay", over, all_vehicles=all_vehicles)
     chosen = from_file(metadata)
-    values = Source(source, over, options, only=False)
+    values = Source(file, over, options, only=False)
     await values.open()
     async with targets(url, options, all_vehicles=all_vehicles, expect=expect, only=False) as found:
         wanted = await values.wanted(found.vehicles)

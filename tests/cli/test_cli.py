@@ -1362,6 +1362,14 @@ def test_help_has_examples(command: Command, arguments: Sequence[str]) -> None:
         assert command().out == helped.out
 
 
+@pytest.mark.parametrize("name", ["apply", "verify"])
+def test_the_help_names_the_arguments_as_in_the_usage(name: str, command: Command) -> None:
+    helped = command(name, "--help").out
+    assert helped.startswith(f"Usage: paramclient {name} [OPTIONS] URL FILE\n")
+    assert re.search(r"\bFILE +A parameter file;", helped)
+    assert "SOURCE" not in helped
+
+
 # Output
 
 
