@@ -22,7 +22,7 @@ from paramclient.cache import tables
 from paramclient.cache.merge import SAME_CHANGE_MAX
 from paramclient.cache.observed_table import HeardParams
 from paramclient.cache.records import BY_VEHICLE, CachedSummary, StoredParam, TableState, TableUpdate
-from paramclient.cache.rows import Row, time_cell
+from paramclient.cache.rows import Row, read_param, time_cell
 from paramclient.cache.snapshots import CLOCK_SLACK
 from paramclient.cache.tables import (
     applied,
@@ -212,8 +212,8 @@ def _divided(
     agrees = True
     overtaken: dict[str, float] = {}  # older observations of these names are overtaken too
     for item in update.params:
-        name, is_listed = item.param.name, item.param.index is not None
-        if not seen.is_news(name, item.heard_at, is_listed=is_listed):
+        name = item.param.name
+        if not seen.is_news(name, item.heard_at):
             overtaken[name] = max(item.heard_at, overtaken.get(name, -math.inf))
     for item in update.params:
         name = item.param.name
@@ -222,10 +222,15 @@ def _divided(
             continue
         row = seen.rows.get(name)
         older.append(item)
-        if row is not None and row.same_value(Row.of(item.param, None, False, item.heard_at)):
+        if row is None:
+            agrees = agrees and item.param.index is None  # a list and its hash do not cover the others
+        elif row.same_value(Row.of(item.param, None, False, item.heard_at)):
             newer.append(replace(item, heard_at=row.heard_at))  # its index may have been unknown
         else:
             agrees = False
+            if row.param_index is None and item.param.index is not None:
+                stored = read_param(name, *row.value, item.param.index, row.default_bits)
+                newer.append(replace(item, param=stored, heard_at=row.heard_at))
     count = None if update.table is None else update.table.count
     if is_late and table is not None and (count is None or table.count not in (None, count)):
         newer = [_placeless(item) for item in newer]  # the indices may belong to another count
@@ -280,13 +285,12 @@ class _Seen:
     horizon: float
     gone: Mapping[str, float] | None = None
 
-    def is_news(self, name: str, at: float, *, is_listed: bool = True) -> bool:
+    def is_news(self, name: str, at: float) -> bool:
         """Return whether the cache has no later observation of a parameter.
 
         Args:
             name: the parameter.
             at: time of the observation, in unix seconds.
-            is_listed: whether a complete table includes the parameter if the vehicle has it.
         """
         row, table = self.rows.get(name), self.table
         if row is not None:
@@ -294,7 +298,7 @@ class _Seen:
         if table is None or table.updated_at <= at or table.updated_at > self.horizon:
             return True
         is_whole = table.complete and table.size >= (table.count or 0)  # a new file may have only a part
-        if is_listed and is_whole and table.synced_at is not None and table.synced_at > at:
+        if is_whole and table.synced_at is not None and table.synced_at > at:
             return False
         if self.gone is None:
             self.gone = self.session.gone(self.owner)
