@@ -222,6 +222,56 @@ def test_no_two_modules_share_a_name_but_counterparts() -> None:
     assert all(len(places) == len(set(places)) for places in rooms.values())
 
 
+SAME_NAME_CONSTANTS = {"MIGRATIONS": "the schema of each store"}
+"""Constants of one name with different values, and the reason."""
+
+SAME_NAME_CLASSES = {
+    "ParamInfo": "the metadata of a parameter, and what a plan needs of it (a Protocol)",
+    "ParamSet": "a set of parameters for users, and the message PARAM_SET",
+}
+"""Classes of one name, and the reason."""
+
+
+def names_with_several_contents(public: Iterator[tuple[str, str]]) -> set[str]:
+    contents: dict[str, set[str]] = {}
+    for name, content in public:
+        if not is_private(name):
+            contents.setdefault(name, set()).add(content)
+    return {name for name, found in contents.items() if len(found) > 1}
+
+
+def statements_outside_the_service() -> Iterator[tuple[str, ast.stmt]]:
+    for module in MODULES:
+        if room_of(module).split(".")[0] != SERVICE:
+            yield from ((module, node) for node in source_of(module).body)
+
+
+def constants() -> Iterator[tuple[str, str]]:
+    """The name and the value of each constant."""
+    for _, node in statements_outside_the_service():
+        match node:
+            case (
+                ast.AnnAssign(target=ast.Name(id=name), value=ast.expr() as value)
+                | ast.Assign(targets=[ast.Name(id=name)], value=value)
+            ) if name.isupper():
+                yield name, ast.unparse(value)
+
+
+def classes() -> Iterator[tuple[str, str]]:
+    """The name and the module of each class."""
+    for module, node in statements_outside_the_service():
+        if isinstance(node, ast.ClassDef):
+            yield node.name, module
+
+
+def test_no_two_constants_of_one_name_have_different_values() -> None:
+    assert names_with_several_contents(constants()) == SAME_NAME_CONSTANTS.keys()
+
+
+def test_no_two_classes_share_a_name_but_counterparts() -> None:
+    assert names_with_several_contents(classes()) == SAME_NAME_CLASSES.keys()
+
+
 NAMEDTUPLE_METHODS = {"_replace", "_asdict", "_fields"}
 """Names that begin with an underscore and are public nevertheless, so that no field can have them."""
 

@@ -9,7 +9,7 @@ from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from paramclient.cache.operations import Merge, Operation, Save, StoreSnapshot
+from paramclient.cache.operations import Merge, Save, StoreOperation, StoreSnapshot
 from paramclient.cache.records import StoredParam, TableState, TableUpdate
 from paramclient.cache.rows import Damaged, Row, identity_cells, read_identity, read_param
 from paramclient.cache.snapshots import read_written, written_cells
@@ -19,7 +19,7 @@ from paramclient.cache.transaction import Session
 from paramclient.cache.transfer import WholeTable, put_shots, put_whole
 from paramclient.model.paramset import ParamSet
 
-__all__ = ["Entry", "LocalCopy", "packed", "unpacked"]
+__all__ = ["QueuedOperation", "LocalCopy", "packed", "unpacked"]
 
 # Tables of the local copy beside those of a cache file: the outbox, and the copied revision of each table.
 _TABLES: Final = (
@@ -42,7 +42,7 @@ _Key = tuple[str, int]
 
 
 @dataclass(frozen=True)
-class Entry:
+class QueuedOperation:
     """A queued operation.
 
     Attributes:
@@ -54,7 +54,7 @@ class Entry:
     id: int
     writer: str
     number: int
-    operation: Operation[object]
+    operation: StoreOperation[object]
 
 
 class LocalCopy:
@@ -83,11 +83,11 @@ class LocalCopy:
         """Run a function that only reads, in one transaction, and return its result."""
         return self.database.read(lambda connection: work(SqliteSession(connection, is_shared=True)))
 
-    def do(self, operation: Operation[T]) -> T:
+    def do(self, operation: StoreOperation[T]) -> T:
         """Execute an operation that the database has executed."""
         return self._write(operation.do)
 
-    def spool(self, operation: Operation[T], writer: str, number: int) -> T:
+    def spool(self, operation: StoreOperation[T], writer: str, number: int) -> T:
         """Execute an operation and queue it for the database, in one transaction."""
 
         def work(session: SqliteSession) -> T:
@@ -100,22 +100,22 @@ class LocalCopy:
 
         return self._write(work, durable=operation.is_durable)
 
-    def waiting(self, limit: int) -> list[Entry]:
+    def waiting(self, limit: int) -> list[QueuedOperation]:
         """Return queued operations, the oldest first, without those that the database has refused."""
 
-        def work(session: SqliteSession) -> list[Entry]:
+        def work(session: SqliteSession) -> list[QueuedOperation]:
             found = session.connection.execute(
                 "SELECT id, writer, number, operation FROM outbox WHERE refused IS NULL ORDER BY id LIMIT ?",
                 (limit,),
             )
             return [
-                Entry(place, writer, number, unpacked(operation))
+                QueuedOperation(place, writer, number, unpacked(operation))
                 for place, writer, number, operation in found.fetchall()
             ]
 
         return self._write(work) if self.exists else []
 
-    def arrived(self, entries: Sequence[Entry], tables: Iterable[_Key]) -> None:
+    def arrived(self, entries: Sequence[QueuedOperation], tables: Iterable[_Key]) -> None:
         """Remove executed operations from the queue, and mark these tables as stale."""
 
         def work(session: SqliteSession) -> None:
@@ -125,7 +125,7 @@ class LocalCopy:
 
         self._write(work)
 
-    def refuse(self, entry: Entry, why: str) -> None:
+    def refuse(self, entry: QueuedOperation, why: str) -> None:
         """Mark an operation as refused by the database. It stays in the file."""
         self._write(
             lambda session: session.connection.execute(
@@ -184,7 +184,7 @@ class LocalCopy:
         return self.database.write(whole, durable=durable)
 
 
-def packed(operation: Operation[object]) -> bytes:
+def packed(operation: StoreOperation[object]) -> bytes:
     """Serialize an operation for the outbox.
 
     Raises:
@@ -208,7 +208,7 @@ def packed(operation: Operation[object]) -> bytes:
     return zlib.compress(json.dumps(data, separators=(",", ":")).encode("utf-8", "surrogatepass"))
 
 
-def unpacked(data: object) -> Operation[object]:
+def unpacked(data: object) -> StoreOperation[object]:
     """Deserialize a result of `packed`.
 
     Raises:

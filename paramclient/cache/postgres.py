@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
 from uuid import uuid4
 
 from paramclient.cache.database_url import DatabaseAddress
-from paramclient.cache.operations import Operation
+from paramclient.cache.operations import StoreOperation
 from paramclient.cache.postgres_schema import CHANNEL, MIGRATIONS, SCHEMA
 from paramclient.cache.rows import Damaged, Row, cells, checksum, read_rows
 from paramclient.cache.transaction import Session
@@ -138,7 +138,7 @@ class PostgresDatabase:
             return work(PostgresSession(connection)), _revisions(connection, [table[0]]).get(table)
 
     def write(
-        self, operations: Sequence[tuple[Operation[Any], str, int]]
+        self, operations: Sequence[tuple[StoreOperation[Any], str, int]]
     ) -> tuple[list[Any], Revisions, Revisions]:
         """Execute operations in one transaction, each exactly once.
 
@@ -172,7 +172,7 @@ class PostgresDatabase:
             return _revisions(connection, None)
 
     def _write(
-        self, operations: Sequence[tuple[Operation[Any], str, int]]
+        self, operations: Sequence[tuple[StoreOperation[Any], str, int]]
     ) -> tuple[list[Any], Revisions, Revisions]:
         tables = {table for operation, _, _ in operations for table in operation.tables}
         keys = sorted({key for key, _ in tables})

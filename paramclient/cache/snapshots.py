@@ -46,7 +46,7 @@ cover weeks of work on one vehicle. A snapshot of 1,000 parameters takes about 1
 
 CLOCK_SLACK: Final = 5.0
 """Seconds by which a time may be before the last written one although the clock was not set back: a process
-may wait this long for the lock before it writes (`BUSY_TIMEOUT`)."""
+may wait this long for the lock before it writes (`LOCK_WAIT_MAX`)."""
 
 
 def watch_clock(session: Session, key: str, component: int, at: float) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Final, TypeVar
 
-from paramclient.cache.operations import Operation
+from paramclient.cache.operations import StoreOperation
 from paramclient.cache.packed_table import Packed, packed_row, row_checksum
 from paramclient.cache.records import CacheChange
 from paramclient.cache.rows import Damaged, Row, cells, checksum
@@ -69,7 +69,7 @@ class SqliteStore:
         """See `Store.read`."""
         return self._database.read(lambda connection: work(SqliteSession(connection)))
 
-    def do(self, operation: Operation[T]) -> T:
+    def do(self, operation: StoreOperation[T]) -> T:
         """See `Store.do`."""
 
         def work(connection: sqlite3.Connection) -> T:

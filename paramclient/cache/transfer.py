@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from paramclient.cache.operations import Operation
+from paramclient.cache.operations import StoreOperation
 from paramclient.cache.records import CachedSummary, CachedVehicle, TableState, TableUpdate
 from paramclient.cache.rows import Row
 from paramclient.cache.snapshots import SNAPSHOTS
@@ -113,7 +113,7 @@ class CopyResult:
 
 
 @dataclass(frozen=True)
-class JoinTable(Operation[None]):
+class JoinTable(StoreOperation[None]):
     """Merge a whole table into a store: the later observation of a value counts."""
 
     whole: WholeTable

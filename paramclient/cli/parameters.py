@@ -38,7 +38,7 @@ from paramclient.cli.output import (
     report,
     say,
 )
-from paramclient.cli.session import Session, connect
+from paramclient.cli.session import CommandSession, connect
 from paramclient.client.arguments import SETTLE_MAX
 from paramclient.client.events import (
     Contested,
@@ -292,7 +292,7 @@ class _Fetched:
     request, or a sample confirms the table, it is included and named in `cached`.
     """
 
-    session: Session
+    session: CommandSession
     result: FetchResult
     params: list[Param]
     missing: list[int]
@@ -301,7 +301,7 @@ class _Fetched:
     bytes_sent: int
 
     @classmethod
-    def of(cls, session: Session, result: FetchResult, policy: Policy) -> _Fetched:
+    def of(cls, session: CommandSession, result: FetchResult, policy: Policy) -> _Fetched:
         """Select the parameters of a fetch under a policy."""
         params = by_index(session.component.params.values())
         cached = [param for param in params if param.trust is Trust.CACHED]
@@ -356,7 +356,7 @@ class _Fetched:
 
 
 async def _fetch_all(
-    session: Session, *, refresh: bool = False, accept: str = "verified", sample: int = SAMPLE_SIZE
+    session: CommandSession, *, refresh: bool = False, accept: str = "verified", sample: int = SAMPLE_SIZE
 ) -> FetchResult:
     with progress_bar(f"fetching {session.label}") as progress:
         return await session.component.fetch_all(
@@ -396,7 +396,9 @@ def _cells(param: Param) -> tuple[object, ...]:
     return param.name, format_value(param.value, param.type), type_name(param.type), param.index
 
 
-async def _get_all(session: Session, names: Sequence[str]) -> tuple[list[Param], dict[str, ParamClientError]]:
+async def _get_all(
+    session: CommandSession, names: Sequence[str]
+) -> tuple[list[Param], dict[str, ParamClientError]]:
     """Read several parameters concurrently; return parameters and errors in the order of the names."""
     found: dict[str, Param] = {}
     errors: dict[str, ParamClientError] = {}
@@ -475,7 +477,9 @@ class _Written:
         return self.name, format_value(self.requested, ParamType.REAL64), actual, self.status
 
 
-async def _write(session: Session, name: str, value: int | float, *, force: bool, durable: bool) -> _Written:
+async def _write(
+    session: CommandSession, name: str, value: int | float, *, force: bool, durable: bool
+) -> _Written:
     left = session.deadline.left()
     try:
         done = await session.component.set(name, value, timeout=left, force=force, durable=durable)
@@ -501,7 +505,7 @@ async def _write(session: Session, name: str, value: int | float, *, force: bool
     )
 
 
-async def _read_again(session: Session, written: _Written) -> _Written:
+async def _read_again(session: CommandSession, written: _Written) -> _Written:
     """Read a written value again; return the outcome with the present value."""
     if written.param is None:
         return written
@@ -519,7 +523,7 @@ async def _read_again(session: Session, written: _Written) -> _Written:
 
 
 async def _print_changes_and_events(
-    session: Session,
+    session: CommandSession,
     changes: Changes,
     events: Events,
     known: set[str] | None,

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from paramclient.documents.setup import ApplyResultDoc, InterruptedDoc, PlanDoc, VerifiedDoc
 
 __all__ = [
-    "Vehicle",
+    "NamedVehicle",
     "applied_code",
     "applied_doc",
     "interrupted_doc",
@@ -43,7 +43,7 @@ RESULT_NAMES_MAX: Final = 10
 
 
 @dataclass(frozen=True, slots=True)
-class Vehicle:
+class NamedVehicle:
     """A vehicle as the output names it.
 
     Attributes:
@@ -64,7 +64,7 @@ Cells: TypeAlias = list[object]
 # Results
 
 
-def show_applied(results: Mapping[Vehicle, ApplyResult], *, full: bool) -> None:
+def show_applied(results: Mapping[NamedVehicle, ApplyResult], *, full: bool) -> None:
     """Print one table of the outcome for each value, and a line for each vehicle on stderr."""
     _print(
         ["name", "before", "wanted", "now", "status", "reason"],
@@ -84,7 +84,7 @@ def show_applied(results: Mapping[Vehicle, ApplyResult], *, full: bool) -> None:
             report(f"{vehicle.label}: {result.error}; run it again to continue")
 
 
-def show_interrupted(rows: Mapping[Vehicle, Sequence[ApplyRow]]) -> None:
+def show_interrupted(rows: Mapping[NamedVehicle, Sequence[ApplyRow]]) -> None:
     """Print the outcome for each value before Ctrl-C ended the command."""
     _print(
         ["name", "before", "wanted", "now", "status", "reason"],
@@ -104,14 +104,14 @@ def applied_code(result: ApplyResult) -> ExitCode:
     return ExitCode.INCOMPLETE if result.error is None else max(ExitCode.INCOMPLETE, code_of(result.error))
 
 
-def applied_doc(vehicle: Vehicle, result: ApplyResult, *, full: bool) -> ApplyResultDoc:
+def applied_doc(vehicle: NamedVehicle, result: ApplyResult, *, full: bool) -> ApplyResultDoc:
     """Return the JSON document of the result for one vehicle; unchanged values only if `full`."""
     from paramclient.documents.setup import ApplyResultDoc  # only here: loads pydantic
 
     return ApplyResultDoc.of(result, system=vehicle.system, component=vehicle.component, full=full)
 
 
-def interrupted_doc(vehicle: Vehicle, rows: Iterable[ApplyRow]) -> InterruptedDoc:
+def interrupted_doc(vehicle: NamedVehicle, rows: Iterable[ApplyRow]) -> InterruptedDoc:
     """Return the JSON document of a set-up that Ctrl-C ended."""
     from paramclient.documents.setup import InterruptedDoc  # only here: loads pydantic
 
@@ -132,7 +132,7 @@ def _applied_cells(row: ApplyRow) -> Cells:
 # Plans
 
 
-def show_planned(plans: Mapping[Vehicle, Plan], *, reboot: bool, full: bool) -> None:
+def show_planned(plans: Mapping[NamedVehicle, Plan], *, reboot: bool, full: bool) -> None:
     """Print the values that would be sent, in their order, and the reasons for all others."""
     _print(
         ["stage", "name", "before", "wanted", "status", "reason"],
@@ -156,7 +156,7 @@ def planned_code(plan: Plan, *, skip_invalid: bool) -> ExitCode:
     return ExitCode.INCOMPLETE if is_missing else ExitCode.DONE
 
 
-def planned_doc(vehicle: Vehicle, plan: Plan, *, full: bool) -> PlanDoc:
+def planned_doc(vehicle: NamedVehicle, plan: Plan, *, full: bool) -> PlanDoc:
     """Return the JSON document of the plan for one vehicle."""
     from paramclient.documents.setup import PlanDoc  # only here: loads pydantic
 
@@ -196,7 +196,7 @@ def _is_notable(row: PlanRow) -> bool:
 # Comparisons
 
 
-def show_verified(plans: Mapping[Vehicle, Plan], *, full: bool) -> None:
+def show_verified(plans: Mapping[NamedVehicle, Plan], *, full: bool) -> None:
     """Print the parameters that differ; all parameters if `full`."""
     _print(
         ["name", "wanted", "now", "is", "reason"],
@@ -218,7 +218,7 @@ def met_code(plan: Plan) -> ExitCode:
     return ExitCode.DONE if plan.is_met else ExitCode.DIFFERENT
 
 
-def verified_doc(vehicle: Vehicle, plan: Plan, *, full: bool) -> VerifiedDoc:
+def verified_doc(vehicle: NamedVehicle, plan: Plan, *, full: bool) -> VerifiedDoc:
     """Return the JSON document of the comparison of one vehicle."""
     from paramclient.documents.setup import VerifiedDoc  # only here: loads pydantic
 
@@ -266,7 +266,9 @@ _STANDING_STYLES: Final = {"same": "", "different": "yellow", "missing": "red", 
 """Styles of rich for each comparison; the keys are in the order of the summary."""
 
 
-def _print(columns: Sequence[str], tables: Mapping[Vehicle, Iterable[Cells]], *, right: str = "") -> None:
+def _print(
+    columns: Sequence[str], tables: Mapping[NamedVehicle, Iterable[Cells]], *, right: str = ""
+) -> None:
     """Print one table for all vehicles; with several, the first column names the vehicle."""
     is_one = len(tables) == 1
     rows = [

@@ -14,7 +14,7 @@ from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.offline import tables_of
 from paramclient.cli.options import CacheOptions, LinkOptions
 from paramclient.cli.output import print_document, printable, progress_bar, report, say
-from paramclient.cli.session import Session, connect
+from paramclient.cli.session import CommandSession, connect
 from paramclient.cli.sources import check_link, collect_confirmed, names_vehicle
 from paramclient.client.component import Component
 from paramclient.errors import UsageError
@@ -100,7 +100,7 @@ async def _from_link(
 
 
 async def _fetch(
-    session: Session, *, all_: bool, refresh: bool
+    session: CommandSession, *, all_: bool, refresh: bool
 ) -> tuple[list[tuple[Component, FetchResult]], list[str]]:
     """Return the components to save with the results of their fetches, and sentences on silent ones."""
     deadline = session.deadline

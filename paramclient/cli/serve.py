@@ -22,7 +22,7 @@ from paramclient.errors import UsageError
 
 __all__ = ["serve"]
 
-LIBRARIES: Final = ("fastapi", "prometheus_client", "uvicorn", "websockets")
+SERVICE_LIBRARIES: Final = ("fastapi", "prometheus_client", "uvicorn", "websockets")
 """Libraries that the extra `service` installs."""
 FREEZE_INTERVAL: Final = 1.0
 """Seconds between two checks of the number of followed components."""
@@ -81,7 +81,7 @@ async def serve(
         tls_key: The key file of the certificate (PEM).
         verbose: Log each step on stderr.
     """
-    if missing := [name for name in LIBRARIES if find_spec(name) is None]:
+    if missing := [name for name in SERVICE_LIBRARIES if find_spec(name) is None]:
         raise UsageError(f"serving needs {' and '.join(missing)}: pip install 'paramclient[service]'")
     from paramclient import service  # only here: needs the extra
 

@@ -20,7 +20,7 @@ from paramclient.links import LinkKind, ReplayLink, parse_link
 from paramclient.links.names import names_service
 from paramclient.protocol.params.fetch_result import Policy
 
-__all__ = ["Deadline", "Session", "connect", "listen"]
+__all__ = ["Deadline", "CommandSession", "connect", "listen"]
 
 VEHICLE_TIMEOUT: Final = 10.0
 """Seconds to wait for the first heartbeat of a vehicle, without --timeout."""
@@ -48,7 +48,7 @@ class Deadline:
 
 
 @dataclass(frozen=True, slots=True)
-class Session:
+class CommandSession:
     """An open client, and the component that the command works on."""
 
     client: ParamClient
@@ -104,7 +104,7 @@ async def connect(
     policy: Policy = Policy.AUTO,
     is_live: bool = False,
     only: bool = False,
-) -> AsyncIterator[Session]:
+) -> AsyncIterator[CommandSession]:
     """Open a link and wait for the component that the options name.
 
     Args:
@@ -137,7 +137,7 @@ async def connect(
         timeout = VEHICLE_TIMEOUT if options.timeout is None else deadline.left()
         find = client.only_component if only else client.component
         component = await find(options.system, options.component, peer=options.peer, timeout=timeout)
-        yield Session(client, component, deadline, options)
+        yield CommandSession(client, component, deadline, options)
 
 
 def listen(

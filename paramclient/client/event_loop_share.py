@@ -22,7 +22,7 @@ BACKLOG_VALIDITY: Final = 0.02
 BURST_LISTS_MAX: Final = 24
 """Lists arriving in bursts on all links together, above which no link starts a second one: 24 lists use all
 CPU time of the program."""
-RECHECK_INTERVAL: Final = 0.01
+SHARE_CHECK_INTERVAL: Final = 0.01
 """Seconds until a link that waits for other links checks them again."""
 
 

@@ -11,7 +11,7 @@ from typing import Final
 import anyio
 import anyio.lowlevel
 
-from paramclient.client.arguments import PROGRESS_INTERVAL
+from paramclient.client.arguments import PROGRESS_CALL_INTERVAL
 from paramclient.client.link_component import TIMEOUT_NOTE
 from paramclient.client.local import LocalComponent
 from paramclient.errors import CacheError, ContestedAddress, NoReply
@@ -120,7 +120,7 @@ class FetchTogether:
                 is_worth_it = self.is_worth_waiting(now, listen_until=listen_until, hear_until=hear_until)
                 if now >= until or not is_worth_it:
                     return self.outcome(now, waited=now - began)
-                await self.news(min(PROGRESS_INTERVAL, until - now))
+                await self.news(min(PROGRESS_CALL_INTERVAL, until - now))
                 if progress is not None:
                     progress(self.progress(anyio.current_time()))
         finally:

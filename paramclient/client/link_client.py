@@ -60,7 +60,7 @@ from paramclient.protocol.wire import SigningKey, SigningReport
 if TYPE_CHECKING:
     from paramclient.sim import Endpoint
 
-__all__ = ["LinkClient", "LinkOptions"]
+__all__ = ["LinkClient", "ClientOptions"]
 
 LISTENING_TIME: Final = 1.2
 """Seconds after opening in which every component has sent a message: each sends a heartbeat once a second."""
@@ -75,7 +75,7 @@ protocol_logger = logging.getLogger("paramclient.protocol")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LinkOptions:
+class ClientOptions:
     """The arguments of `ParamClient` for a link of its own, with their defaults."""
 
     cache: ParamCache | str | os.PathLike[str] | bool | None = None
@@ -116,7 +116,7 @@ class LinkClient(LocalClient):
         UsageError: as from `ParamClient`.
     """
 
-    def __init__(self, link: str | Link | Endpoint, options: LinkOptions) -> None:
+    def __init__(self, link: str | Link | Endpoint, options: ClientOptions) -> None:
         for number in (options.system, options.component):
             if not 1 <= number <= 255:
                 raise UsageError(f"the client's system and component ids must be 1 to 255, not {number}")

@@ -15,7 +15,7 @@ import anyio.lowlevel
 
 from paramclient.client.event_loop_share import (
     BACKLOG_DATAGRAMS_MIN,
-    RECHECK_INTERVAL,
+    SHARE_CHECK_INTERVAL,
     TURN_DATAGRAMS_MIN,
     TURN_MAX,
     EventLoopShare,
@@ -283,7 +283,7 @@ class LinkTask:
             if is_behind:
                 due = now + TURN_MAX
             elif most_lists < math.inf:  # a queued list reports a deadline, but may not start yet
-                due = max(due, now + RECHECK_INTERVAL)
+                due = max(due, now + SHARE_CHECK_INTERVAL)
             self._suspend.expect(due)
             self._due = due
             wait = due - now

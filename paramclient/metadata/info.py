@@ -18,7 +18,7 @@ from paramclient.model.values import ParamType, Value, format_value, shortest_fl
 
 __all__ = ["Metadata", "ParamInfo", "number_of"]
 
-NAMES_LISTED_MAX: Final = 12
+CHOICES_LISTED_MAX: Final = 12
 """Names that an error lists; of more names it lists the closest ones, so that the error stays readable."""
 BITS_MAX: Final = 64
 """Bits of the widest type."""
@@ -283,7 +283,7 @@ def _choice(sentence: str, named: Mapping[Key, str], text: str) -> str:
     """Return the end of an error with all names, or with those close to a text if there are many."""
     if not named:
         return ", and its values have no names"
-    if len(named) <= NAMES_LISTED_MAX:
+    if len(named) <= CHOICES_LISTED_MAX:
         return f"{sentence}: {', '.join(f'{name} ({number})' for number, name in named.items())}"
     folded = {_folded(name): name for name in named.values()}
     nearest = [folded[each] for each in difflib.get_close_matches(_folded(text), folded, n=3, cutoff=0.5)]

@@ -276,7 +276,7 @@ def test_who_writes_holds_the_file_before_he_reads_what_is_there(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path.write_bytes(sound_file())
-    monkeypatch.setattr(sqlite_file, "BUSY_TIMEOUT", 0.05)
+    monkeypatch.setattr(sqlite_file, "LOCK_WAIT_MAX", 0.05)
     ours, theirs = Database(path), Database(path)
 
     def work(_: sqlite3.Connection) -> None:
@@ -292,7 +292,7 @@ def test_who_writes_holds_the_file_before_he_reads_what_is_there(
 def test_a_program_that_holds_the_file_for_too_long_is_an_error_and_no_hindrance_to_reading(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sqlite_file, "BUSY_TIMEOUT", 0.05)
+    monkeypatch.setattr(sqlite_file, "LOCK_WAIT_MAX", 0.05)
     with ParamCache(path) as cache, connect(path) as other:
         cache.save(whole_table(3))
         other.execute("BEGIN IMMEDIATE")
@@ -307,7 +307,7 @@ def test_a_program_that_holds_the_file_for_too_long_is_an_error_and_no_hindrance
 def test_a_folder_that_another_program_holds_is_waited_for_but_not_for_ever(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lock, "BUSY_TIMEOUT", 0.05)
+    monkeypatch.setattr(lock, "LOCK_WAIT_MAX", 0.05)
     folder = os.open(path.parent, os.O_RDONLY)
     try:
         fcntl.flock(folder, fcntl.LOCK_EX)
@@ -1263,7 +1263,7 @@ def test_no_descriptor_is_left_open(path: Path, monkeypatch: pytest.MonkeyPatch)
         gc.collect()
         return len(list(Path("/proc/self/fd").iterdir()))
 
-    monkeypatch.setattr(sqlite_file, "BUSY_TIMEOUT", 0.0)
+    monkeypatch.setattr(sqlite_file, "LOCK_WAIT_MAX", 0.0)
     before = descriptors()
     for _ in range(3):
         path.write_bytes(rubbish(100))

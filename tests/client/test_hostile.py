@@ -426,7 +426,7 @@ async def test_one_that_is_another_vehicle_each_time_fills_no_cache(
         for number in range(4):
             liar.say(AutopilotVersion(16, uid=number + 1))
             liar.say(param_value(f"V{number}"))
-            await anyio.sleep(LOST_AFTER + 2 * cache_writer.FLUSH_INTERVAL)  # till then it may be two
+            await anyio.sleep(LOST_AFTER + 2 * cache_writer.CACHE_FLUSH_INTERVAL)  # till then it may be two
             assert len(local_client(client).cache_writer._bringing) <= 1
     with ParamCache(path) as cache:
         systems = [each.identity.system for each in cache.vehicles()]

@@ -521,7 +521,7 @@ class Portions(ParamCache):
 async def test_what_is_new_is_written_in_portions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No transaction begins another table when it has enough: to gather one takes the loop's time."""
     monkeypatch.setattr(cache_writer, "TRANSACTION_PARAMS", 200)
-    monkeypatch.setattr(cache_writer, "FLUSH_INTERVAL", 1000.0)  # everything on closing
+    monkeypatch.setattr(cache_writer, "CACHE_FLUSH_INTERVAL", 1000.0)  # everything on closing
     vehicles = [small(system) for system in range(1, 8)]
     cache = Portions(tmp_path / "cache.sqlite3")
     with cache:

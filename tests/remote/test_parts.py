@@ -44,7 +44,7 @@ from paramclient.remote.bounded import EVENT_BYTES_MAX, EventReader
 from paramclient.remote.decoding import number_of, param_of, value_as_sent
 from paramclient.remote.mirror import LOADING_CHANGES_MAX, Mirror
 from paramclient.remote.problems import error_of
-from paramclient.remote.service_address import TOKEN_VARIABLE, ServiceAddress, chosen_token
+from paramclient.remote.service_address import CLIENT_TOKEN_VARIABLE, ServiceAddress, chosen_token
 from paramclient.remote.service_client import ServiceClient
 
 WHOM: dict[str, Any] = {"system": 1, "component": 1}
@@ -119,9 +119,9 @@ def test_arguments_that_say_nothing_are_not() -> None:
 
 
 def test_a_token_is_given_or_stands_in_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
+    monkeypatch.delenv(CLIENT_TOKEN_VARIABLE, raising=False)
     assert chosen_token(None) is None
-    monkeypatch.setenv(TOKEN_VARIABLE, "from-there")
+    monkeypatch.setenv(CLIENT_TOKEN_VARIABLE, "from-there")
     assert chosen_token(None) == "from-there"
     assert chosen_token("given") == "given"
     for bad in ("two words", "line\nbreak", "grün"):

@@ -15,7 +15,7 @@ from paramclient.protocol.requests.round_trip import RoundTrip
 
 __all__ = ["Repeated", "repeated_names"]
 
-NAMES_LISTED_MAX: Final = 5
+DUPLICATES_LISTED_MAX: Final = 5
 """Names that a note lists one by one."""
 READ_DELAY_MIN: Final = 0.3
 """Seconds until the names are read, at least: late responses to reads by index carry them too."""
@@ -88,9 +88,13 @@ class Repeated(Operation[None]):
         """A note for the user."""
         told = [
             f"{name} (indices {', '.join(map(str, places))})"
-            for name, places in list(self.names.items())[:NAMES_LISTED_MAX]
+            for name, places in list(self.names.items())[:DUPLICATES_LISTED_MAX]
         ]
-        more = f" and {len(self.names) - NAMES_LISTED_MAX} more" if len(self.names) > NAMES_LISTED_MAX else ""
+        more = (
+            f" and {len(self.names) - DUPLICATES_LISTED_MAX} more"
+            if len(self.names) > DUPLICATES_LISTED_MAX
+            else ""
+        )
         return (
             f"Several parameters share a name, as where names are cut at 16 bytes: {', '.join(told)}{more}. "
             "The table holds the one that the vehicle answers with when it is asked by name; "

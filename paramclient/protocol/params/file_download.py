@@ -20,7 +20,7 @@ from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.scheduler import Seen, Turns
 from paramclient.protocol.wire import PARAMETERS_MAX, ParamValue
 
-__all__ = ["PARAMETER_FILE", "PackFetch"]
+__all__ = ["PARAMETER_FILE", "WITH_DEFAULTS", "PackFetch"]
 
 PARAMETER_FILE: Final = "@PARAM/param.pck"
 """The parameter file of ArduPilot 4.1 and later, and of PX4 after 1.17."""

@@ -37,7 +37,7 @@ IDENTIFICATION_TIME: Final = sum(IDENTITY_REQUEST_PAUSES)
 """Seconds until a further peer must have shown its identity where no request can be sent."""
 REVIEW_INTERVAL: Final = 0.25
 """Seconds between two reviews of the peers of a component with several."""
-RECHECK_INTERVAL: Final = 1.0
+CONTEST_CHECK_INTERVAL: Final = 1.0
 """Seconds between two requests for the hardware id of a peer that has just sent two different ones."""
 UID_GRACE: Final = 0.25
 """Seconds in which the peer with the address may still send its hardware id after another one was faster:
@@ -447,7 +447,7 @@ class ComponentPeers:
 
     def _ask_again(self, claim: Claim, now: float) -> None:
         """Request the hardware id of the peer with the address, which has just sent two."""
-        if self._may_ask and now >= claim.asked_at + RECHECK_INTERVAL:
+        if self._may_ask and now >= claim.asked_at + CONTEST_CHECK_INTERVAL:
             claim.asked_at = now
             self._request(claim, AUTOPILOT_VERSION_ID)
 

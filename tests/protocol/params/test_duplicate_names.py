@@ -10,8 +10,8 @@ import pytest
 from paramclient import ParamClient
 from paramclient.model.values import ParamType
 from paramclient.protocol.params.duplicate_names import (
+    DUPLICATES_LISTED_MAX,
     EQUAL_RESPONSES_MIN,
-    NAMES_LISTED_MAX,
     RESPONSE_PAUSE,
     RESPONSES_MAX,
     Repeated,
@@ -182,7 +182,7 @@ def test_a_name_that_is_not_answered_leaves_it_open() -> None:
 
 
 def test_the_note_names_a_few() -> None:
-    names = {f"N{number}": (number, number + 100) for number in range(NAMES_LISTED_MAX + 2)}
+    names = {f"N{number}": (number, number + 100) for number in range(DUPLICATES_LISTED_MAX + 2)}
     note = Repeated(names, RoundTrip(), Desk().reads, Table(), 0.0).note
     assert "N0 (indices 0, 100)" in note
     assert "N4 (indices 4, 104) and 2 more" in note
