@@ -27,6 +27,7 @@ from paramclient.cli.output import (
 from paramclient.cli.session import VEHICLE_TIMEOUT, Deadline, listen
 from paramclient.diagnosis import Finding, Severity, VehicleReport, check_vehicle, findings_of
 from paramclient.errors import UsageError
+from paramclient.model.wording import first_of
 from paramclient.version import __version__
 
 if TYPE_CHECKING:
@@ -193,10 +194,8 @@ def _service_rows(report: VehicleReport) -> Iterator[tuple[str, str]]:
     if files is None:
         yield "MAVFTP", none
     else:
-        yield (
-            "MAVFTP",
-            f"served{_entries(files.entries or ())}" if files.is_serving else f"not served: {files.error}",
-        )
+        entries = f": {first_of(files.entries, ENTRIES_SHOWN_MAX)}" if files.entries else ""
+        yield "MAVFTP", f"served{entries}" if files.is_serving else f"not served: {files.error}"
         if files.size is not None and files.elapsed is not None:
             yield (
                 "parameter file",
@@ -214,14 +213,6 @@ def _service_rows(report: VehicleReport) -> Iterator[tuple[str, str]]:
         after = "not answered" if found.after is None else f"{found.after:08x}"
         holds = f"the same after {found.seconds:.1f} s" if found.after == found.before else f"then {after}"
         yield "hash", f"{found.before:08x}, {holds}"
-
-
-def _entries(names: tuple[str, ...]) -> str:
-    """Return the names in the root directory, abbreviated."""
-    if not names:
-        return ""
-    more = len(names) - ENTRIES_SHOWN_MAX
-    return f": {', '.join(names[:ENTRIES_SHOWN_MAX])}{f' and {more} more' if more > 0 else ''}"
 
 
 # JSON and Markdown

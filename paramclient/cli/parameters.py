@@ -56,6 +56,7 @@ from paramclient.errors import CacheError, NoReply, ParamClientError, UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.notation import hash_text, time_text
 from paramclient.model.values import Param, ParamType, Trust, Value, check_name, format_value, type_name
+from paramclient.model.wording import first_of
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.fetch_result import FetchResult, Policy
 from paramclient.protocol.params.sampling import SAMPLE_SIZE, Sample
@@ -378,9 +379,7 @@ def _confidence(sample: Sample) -> str:
 
 
 def _index_text(indices: Sequence[int]) -> str:
-    shown = ", ".join(map(str, indices[:INDICES_SHOWN_MAX]))
-    more = len(indices) - INDICES_SHOWN_MAX
-    return f"ind{'ex' if len(indices) == 1 else 'ices'} {shown}{f' and {more} more' if more > 0 else ''}"
+    return f"{'index' if len(indices) == 1 else 'indices'} {first_of(indices, INDICES_SHOWN_MAX)}"
 
 
 _ASSUMED_CHANGES: Final = (1, 10, 100)

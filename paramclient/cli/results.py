@@ -10,6 +10,7 @@ from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.output import Coloured, print_table, printable, report, say
 from paramclient.model.notation import typed
 from paramclient.model.values import Value, format_value
+from paramclient.model.wording import counted, first_of
 from paramclient.provision import (
     MISSING,
     ApplyResult,
@@ -78,7 +79,7 @@ def show_applied(results: Mapping[NamedVehicle, ApplyResult], *, full: bool) -> 
         if (result.system, result.component) != (vehicle.system, vehicle.component):
             say(f"{vehicle.system}/{vehicle.component} is {result.system}/{result.component} now")
         if result.reboot_required:
-            names = _listed(result.reboot_required)
+            names = first_of(result.reboot_required, RESULT_NAMES_MAX)
             say(printable(f"{vehicle.label}: takes effect after a reboot: {names}"))
         if result.error is not None:
             report(f"{vehicle.label}: {result.error}; run it again to continue")
@@ -92,7 +93,7 @@ def show_interrupted(rows: Mapping[NamedVehicle, Sequence[ApplyRow]]) -> None:
     )
     unproven = sum(row.status is ApplyStatus.UNPROVEN for each in rows.values() for row in each)
     say(
-        f"interrupted: {_number(unproven, 'value')} acknowledged, not proven, and others may be in flight; "
+        f"interrupted: {counted(unproven, 'value')} acknowledged, not proven, and others may be in flight; "
         "run it again to continue"
     )
 
@@ -142,7 +143,7 @@ def show_planned(plans: Mapping[NamedVehicle, Plan], *, reboot: bool, full: bool
     for vehicle, plan in plans.items():
         say(printable(f"{vehicle.label}: {_counted(plan.counts, PlanStatus, _PLAN_WORDS)}; nothing was sent"))
         if plan.reboot_for and not reboot:
-            names = _listed(plan.reboot_for)
+            names = first_of(plan.reboot_for, RESULT_NAMES_MAX)
             say(printable(f"{vehicle.label}: would take effect after a reboot: {names}"))
 
 
@@ -295,12 +296,3 @@ def _like(row: ApplyRow | PlanRow) -> str:
 def _counted(counts: Mapping[Any, int], kinds: Iterable[Any], words: Mapping[Any, str] | None = None) -> str:
     counted = [f"{counts[kind]} {(words or {}).get(kind, kind)}" for kind in kinds if counts.get(kind)]
     return ", ".join(counted) or "nothing to set"
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = len(names) - RESULT_NAMES_MAX
-    return ", ".join(names[:RESULT_NAMES_MAX]) + (f" and {more} more" if more > 0 else "")
-
-
-def _number(count: int, noun: str) -> str:
-    return f"{count} {noun}{'' if count == 1 else 's'}"

@@ -22,6 +22,7 @@ from paramclient.files import FileForm, write_file
 from paramclient.files.param_file import AUTOPILOT, address, form_of_name
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Param
+from paramclient.model.wording import counted
 from paramclient.protocol.params.fetch_result import FetchResult
 from paramclient.provision.vehicle_params import cached_param_set, select_non_defaults
 
@@ -164,7 +165,5 @@ def _show(file: Path, form: FileForm, sets: Sequence[ParamSet], *, as_json: bool
 
         print_document(SavedDoc.of(str(file), form, sets))
         return
-    held = ", ".join(
-        f"{len(each)} parameter{'' if len(each) == 1 else 's'} of {address(each)}" for each in sets
-    )
+    held = ", ".join(f"{counted(len(each), 'parameter')} of {address(each)}" for each in sets)
     say(printable(f"{held} written to {file} ({form})"))

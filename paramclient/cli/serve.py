@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import gc
-import signal
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from importlib.util import find_spec
 from pathlib import Path
-from types import FrameType
 from typing import Annotated, Final
 
 import anyio
@@ -18,6 +15,7 @@ from cyclopts import Parameter
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import Id, SigningOptions
 from paramclient.cli.output import print_line
+from paramclient.cli.signals import on_end_signal
 from paramclient.errors import UsageError
 
 __all__ = ["serve"]
@@ -29,8 +27,6 @@ FREEZE_INTERVAL: Final = 1.0
 COLLECTED_COMPONENTS_MAX: Final = 32
 """Number of components that full garbage collections may examine: 5 ms."""
 _UNSIGNED: Final = SigningOptions()
-_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
-"""Signals that stop the service in an orderly way."""
 
 
 async def serve(
@@ -114,7 +110,8 @@ async def serve(
         gc.freeze()  # as at the start of the command: a full collection takes as long as ten requests
         print_line(f"serving on {url}")
 
-    with _stopping() as stop:
+    stop = anyio.Event()
+    with on_end_signal(lambda _: stop.set()):
         collections = Collections()
         sparing = asyncio.create_task(collections.run(lambda: hub.followed))
         try:
@@ -158,24 +155,3 @@ class Collections:
 
 def _full_collections() -> int:
     return int(gc.get_stats()[2]["collections"])
-
-
-@contextmanager
-def _stopping() -> Iterator[anyio.Event]:
-    """Yield an event that SIGINT or SIGTERM sets. A second signal ends the process immediately."""
-    loop = asyncio.get_running_loop()
-    stop = anyio.Event()
-    before = {number: signal.getsignal(number) for number in _SIGNALS}
-
-    def end(_: int, __: FrameType | None) -> None:
-        for each in _SIGNALS:
-            signal.signal(each, signal.SIG_DFL)
-        loop.call_soon_threadsafe(stop.set)
-
-    for number in _SIGNALS:
-        signal.signal(number, end)
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

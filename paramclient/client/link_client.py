@@ -59,6 +59,7 @@ from paramclient.protocol.wire import SigningKey, SigningReport
 
 if TYPE_CHECKING:
     from paramclient.sim import Endpoint
+from paramclient.model.wording import counted
 
 __all__ = ["LinkClient", "ClientOptions"]
 
@@ -210,8 +211,7 @@ class LinkClient(LocalClient):
     def __repr__(self) -> str:
         state = "away" if self.link_task.is_away else "open"
         state = "closed" if self._tasks is None or self.link_task.ended is not None else state
-        heard = len(self._components)
-        return f"<ParamClient {self._link.name} {state}, {heard} component{'' if heard == 1 else 's'}>"
+        return f"<ParamClient {self._link.name} {state}, {counted(len(self._components), 'component')}>"
 
     async def open(self) -> None:
         """Open the link and the cache, and start the tasks.

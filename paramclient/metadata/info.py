@@ -15,6 +15,7 @@ from typing import Final, TypeVar
 
 from paramclient.errors import UsageError
 from paramclient.model.values import ParamType, Value, format_value, shortest_float
+from paramclient.model.wording import counted
 
 __all__ = ["Metadata", "ParamInfo", "number_of"]
 
@@ -244,7 +245,7 @@ class Metadata(Mapping[str, ParamInfo]):
 
     def __repr__(self) -> str:
         origin = f" from {self.source}" if self.source else ""
-        return f"<Metadata of {len(self)} {'param' if len(self) == 1 else 'params'}{origin}>"
+        return f"<Metadata of {counted(len(self), 'param')}{origin}>"
 
 
 def number_of(text: str) -> int | float | None:

@@ -8,13 +8,13 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice
 from typing import TYPE_CHECKING, Final
 
 from paramclient.errors import NoReply, NotInCache, UnknownVehicle, UsageError, VehicleError
 from paramclient.model.params import copy_params
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Param, Trust
+from paramclient.model.wording import first_of
 from paramclient.provision.runner import Runner, run_here
 
 if TYPE_CHECKING:
@@ -154,12 +154,10 @@ async def fetch_set(
 
 def incomplete_error(component: Component, missing: Sequence[str]) -> VehicleError:
     """Return the error for a component some of whose parameters were not received."""
-    shown = ", ".join(islice(missing, NAMES_SHOWN_MAX))
-    more = len(missing) - NAMES_SHOWN_MAX
     vehicle = f"{component.system}/{component.component} {component.autopilot}"
-    rest = f" and {more} more" if more > 0 else ""
+    names = first_of(missing, NAMES_SHOWN_MAX)
     return VehicleError(
-        f"{vehicle} on {component.identity.link} is incomplete: {shown}{rest} did not come",
+        f"{vehicle} on {component.identity.link} is incomplete: {names} did not come",
         system=component.system,
         component=component.component,
     )
@@ -205,12 +203,10 @@ def load_cached_set(
 
 def left_out_note(table: CachedComponent) -> str:
     """Return the sentence about names of a cached table that are left out of a set."""
-    shown = ", ".join(map(repr, table.left_out[:NAMES_SHOWN_MAX]))
-    more = len(table.left_out) - NAMES_SHOWN_MAX
-    rest = f" and {more} more" if more > 0 else ""
+    names = first_of([*map(repr, table.left_out)], NAMES_SHOWN_MAX)
     return (
         f"{table.system}/{table.component} ({table.key}): left out, as no parameter file can hold the name: "
-        f"{shown}{rest}; the next full fetch takes it out of the cache"
+        f"{names}; the next full fetch takes it out of the cache"
     )
 
 
