@@ -18,10 +18,12 @@ import anyio
 import httpx
 import pytest
 from fastapi import FastAPI
+from fastapi.dependencies import utils as dependency_utils
 
 from paramclient.client.fetch_all import STARTED_FETCHES_MAX, FetchTogether
 from paramclient.documents.component import ComponentsDoc
 from paramclient.documents.diff import DiffDoc
+from paramclient.documents.document import Document
 from paramclient.documents.job import JobsDoc
 from paramclient.errors import FileError, UsageError
 from paramclient.files import document_schema, dumps, formats, line_formats, loads, script
@@ -253,6 +255,34 @@ async def test_what_a_vehicle_has_is_within_all_limits() -> None:
         bits = {"values": {name: {"bits": "40d00000"} for name in LARGE}}
         compared = await browser.post(f"{C}/diff", json={"wanted": bits, "full": True})
         assert len(compared.json()["params"]) == len(LARGE)
+
+
+# The first requests
+
+
+@swiftly
+async def test_the_first_requests_build_neither_handlers_nor_models(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To build those of one router takes 30 ms and more, in which nobody else is served."""
+    built: list[str] = []
+    analyze = dependency_utils.get_typed_signature
+
+    def get_typed_signature(call: Callable[..., Any]) -> Any:
+        built.append(repr(call))
+        return analyze(call)
+
+    async with service(GenericVehicle(table=TABLE)) as (_, browser):
+        monkeypatch.setattr(dependency_utils, "get_typed_signature", get_typed_signature)
+        documents = Document.__subclasses__()
+        for document in documents:
+            documents += document.__subclasses__()
+        assert len(documents) > 50
+        assert all(document.__pydantic_complete__ for document in documents)
+        await fetched(browser)
+        for path in ("components", "jobs", "links", "metadata", "history", "nothing", f"{C[8:]}/params"):
+            await browser.get(f"/api/v1/{path}")
+        assert not built
+        create_app(Hub([], cache=False))
+        assert built, "this is how FastAPI builds them"
 
 
 # Errors, one by one
