@@ -135,9 +135,7 @@ def _build_routes(app: FastAPI) -> None:
     """
     anywhere = {"type": "http", "method": "GET", "path": "/", "root_path": "", "headers": []}
     for route in app.routes:
-        route.matches(
-            dict(anywhere)
-        )  # an included router builds its routes when it compares a path with them
+        route.matches(dict(anywhere))  # an included router builds its routes for a comparison
     build_documents()
 
 

@@ -20,7 +20,7 @@ import pytest
 from fastapi import FastAPI
 from fastapi.dependencies import utils as dependency_utils
 
-from paramclient.client.fetch_all import STARTED_FETCHES_MAX, FetchTogether
+from paramclient.client.fetch_all import ENDED_FETCHES_MAX, STARTED_FETCHES_MAX, FetchTogether
 from paramclient.documents.component import ComponentsDoc
 from paramclient.documents.diff import DiffDoc
 from paramclient.documents.document import Document
@@ -584,11 +584,15 @@ async def test_events_are_written_out_few_at_a_time() -> None:
 
 
 @swiftly
-async def test_fetches_of_many_are_begun_few_at_a_time() -> None:
+async def test_fetches_of_many_are_begun_and_ended_few_at_a_time() -> None:
     class Station:
         def begin_fetches(self, machines: list[Any], now: float, *, refresh: bool) -> list[Any]:
             turns.note()
             return [SimpleNamespace(done=False) for _ in machines]
+
+    def end_fetch(fetch: Any, now: float) -> None:
+        ends.note()
+        ended.append(next(address for address, each in together._fetches.items() if each is fetch))
 
     def component(system: int) -> Any:
         machine = SimpleNamespace(
@@ -596,6 +600,7 @@ async def test_fetches_of_many_are_begun_few_at_a_time() -> None:
             presence=SimpleNamespace(is_lost=False),
             peers=SimpleNamespace(contest=None),
             fetch=None,
+            end_fetch=end_fetch,
             system=system,
             vehicle=(system, None),
             address=(system, 1),
@@ -604,8 +609,11 @@ async def test_fetches_of_many_are_begun_few_at_a_time() -> None:
 
     components = {(system, 1): component(system) for system in range(1, 251)}
     station: Any = Station()
+    station.components = {address: each.machine for address, each in components.items()}
     together = FetchTogether(station, components, system=None, refresh=False)
-    turns = Turns()
+    turns, ends = Turns(), Turns()
+    ended: list[tuple[int, int]] = []
+    woken: list[Any] = []
     checks = 0
 
     def check() -> None:
@@ -614,12 +622,17 @@ async def test_fetches_of_many_are_begun_few_at_a_time() -> None:
         if len(together._fetches) == 250:
             raise EOFError
 
-    together._end = lambda now: together._fetches.clear()  # type: ignore[method-assign]
-    closed: Any = None
+    async def closed(machine: Any) -> None:
+        pass
+
     bounds = {"until": 9e9, "hear_until": 0.0, "listen_until": 0.0}
     with pytest.raises(EOFError):
-        await together.run(check, lambda: None, closed, **bounds, progress=None)
+        await together.run(check, woken.append, closed, **bounds, progress=None)
     assert turns.most == STARTED_FETCHES_MAX
+    assert ends.most == ENDED_FETCHES_MAX
+    assert ended == list(reversed(components)), "none that waits for its turn gets it now"
+    machines = [each.machine for each in components.values()]
+    assert woken == [*machines, *reversed(machines)], "no others are looked at"
     assert checks == 1 + math.ceil(250 / STARTED_FETCHES_MAX)
 
 
