@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import gc
-from collections.abc import Callable, Iterable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Final
@@ -22,10 +21,6 @@ __all__ = ["serve"]
 
 SERVICE_LIBRARIES: Final = ("fastapi", "prometheus_client", "uvicorn", "websockets")
 """Libraries that the extra `service` installs."""
-FREEZE_INTERVAL: Final = 1.0
-"""Seconds between two checks of the number of followed components."""
-COLLECTED_COMPONENTS_MAX: Final = 32
-"""Number of components that full garbage collections may examine: 5 ms."""
 _UNSIGNED: Final = SigningOptions()
 
 
@@ -80,6 +75,7 @@ async def serve(
     if missing := [name for name in SERVICE_LIBRARIES if find_spec(name) is None]:
         raise UsageError(f"serving needs {' and '.join(missing)}: pip install 'paramclient[service]'")
     from paramclient import service  # only here: needs the extra
+    from paramclient.service.garbage_collection import ComponentFreezer
 
     if no_cache and cache is not None:
         raise UsageError("--cache and --no-cache exclude each other")
@@ -112,46 +108,9 @@ async def serve(
 
     stop = anyio.Event()
     with on_end_signal(lambda _: stop.set()):
-        collections = Collections()
-        sparing = asyncio.create_task(collections.run(lambda: hub.followed))
+        freezing = asyncio.create_task(ComponentFreezer().run(lambda: hub.followed))
         try:
             await service.serve(hub, settings, listening=listening, stop=stop, listens=listens)
         finally:
-            sparing.cancel()
+            freezing.cancel()
     return ExitCode.DONE
-
-
-class Collections:
-    """Keeps full collections of garbage short: they need not go through components that are followed.
-
-    Those of 1,000 components take 0.2 s, in which nothing else runs. When components have been forgotten, all
-    is collected again before they are left out once more.
-    """
-
-    def __init__(self) -> None:
-        self._spared: set[object] = set()
-        self._collected_at: int | None = None
-
-    async def run(self, followed: Callable[[], Iterable[object]]) -> None:
-        """Look every `FREEZE_INTERVAL` at which components there are; until cancelled."""
-        while True:
-            await anyio.sleep(FREEZE_INTERVAL)
-            self.look(set(followed()))
-
-    def look(self, followed: set[object]) -> None:
-        """Leave components out, or collect what has become of them."""
-        if len(self._spared - followed) >= COLLECTED_COMPONENTS_MAX:
-            gc.unfreeze()
-            self._spared = set()
-            self._collected_at = _full_collections()
-        elif (
-            len(followed - self._spared) >= COLLECTED_COMPONENTS_MAX
-            and self._collected_at != _full_collections()
-        ):
-            gc.freeze()
-            self._spared = followed
-            self._collected_at = None
-
-
-def _full_collections() -> int:
-    return int(gc.get_stats()[2]["collections"])

@@ -132,7 +132,6 @@ class LinkTask:
         self._held_up_at = -math.inf  # last time at which the sender ran late by more than `READ_GAP_MIN`
         self._unseen = 0.0  # seconds of suspend since the last read that the loop's clock has left out
         self._is_taking = False  # whether the reader processes data, or waits for its turn to do so
-        self._asked = True  # whether any component may have new requests
         self._suspend = SuspendDetector()
         self._reading, self._sending = anyio.Lock(), anyio.Lock()
 
@@ -167,7 +166,7 @@ class LinkTask:
             is_news = not chunks
             if not chunks:
                 self._station.over(now)
-                self._asked = True
+                self._station.touch_all()
             share.came(self, len(chunks))
             self._behind_since = (
                 math.inf if len(chunks) < BACKLOG_DATAGRAMS_MIN else min(self._behind_since, now)
@@ -258,14 +257,12 @@ class LinkTask:
             self._look_at_the_clock(now)
             self._suspend.expect(math.inf)  # a slow link may block the sender
             self._due = math.inf
-            everyone = self._asked
             is_behind = self._is_behind(now)
             bursts, awaited = station.bursts(now)
             most_lists = 1 if is_behind else share.most_lists(self, bursts, now, awaited=awaited)
             if not is_behind or now >= self._behind_since + TIMEOUT_DELAY_MAX:
-                self._asked = False
                 is_crowded = share.is_busy_without(self)
-                station.tick(now, everyone=everyone, most_lists=most_lists, is_crowded=is_crowded)
+                station.tick(now, everyone=False, most_lists=most_lists, is_crowded=is_crowded)
             self._dispatch()
             to_send = station.data_to_send()
             if to_send:
@@ -275,9 +272,8 @@ class LinkTask:
             for _ in range(min(len(self._of_others), FORWARDED_PER_TURN)):
                 await self._transmit(self._of_others.popleft(), None)
             if self._of_others:
-                self._asked |= everyone  # their deadlines have not been evaluated
                 continue
-            due = station.next_deadline(everyone=everyone)
+            due = station.next_deadline(everyone=False)
             now = anyio.current_time()
             is_behind = self._is_behind(now)
             if is_behind:
@@ -308,7 +304,7 @@ class LinkTask:
     def wake(self, machine: ComponentMachine | None = None) -> None:
         """Run the sender: this component, or any, has something to send or another deadline."""
         if machine is None:
-            self._asked = True
+            self._station.touch_all()
         else:
             self._station.touch(machine)
         self._something_to_send.set()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from typing import Final, NamedTuple, Protocol
 
 from paramclient.protocol.requests.pacing import Share
@@ -113,7 +112,7 @@ class Turns:
         self._is_crowded = False  # whether other links have lists too
         self._lone: Stream | None = None  # the last list that ran alone
         self._lone_at = -math.inf  # when that was
-        self._waiting: deque[Stream] = deque()
+        self._waiting: dict[Stream, None] = {}
         self._running: dict[Stream, Seen] = {}  # with their statistics when the newest began to arrive
         self._newest: set[Stream] = set()
         self._marked_at: float | None = None  # when that was
@@ -144,7 +143,7 @@ class Turns:
         if not self._waiting and self._room() > 0:
             self._begin(stream, now)
         else:
-            self._waiting.append(stream)
+            self._waiting[stream] = None
 
     def has_begun(self, stream: Stream) -> None:
         """Record a list that was requested without a turn."""
@@ -162,8 +161,7 @@ class Turns:
             is_cut: whether the list went silent before its end.
         """
         if self._running.pop(stream, None) is None:
-            if stream in self._waiting:
-                self._waiting.remove(stream)
+            self._waiting.pop(stream, None)
             return
         self._newest.discard(stream)
         self._paces.pop(stream, None)
@@ -205,7 +203,9 @@ class Turns:
         begins = min(self._room(), len(self._waiting))
         begins = int(min(begins, most - self._active()))
         for _ in range(begins):
-            self._begin(self._waiting.popleft(), now)
+            stream = next(iter(self._waiting))
+            del self._waiting[stream]
+            self._begin(stream, now)
         return begins > 0
 
     def next_deadline(self) -> float:

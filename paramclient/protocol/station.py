@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from heapq import heapify, heappop, heappush
+from itertools import islice
 from typing import Final
 
 from paramclient.errors import LinkError, UsageError
@@ -69,6 +70,8 @@ COMPONENTS_MAX: Final = 1_000
 component without parameters."""
 TICKED_COMPONENTS_MAX: Final = 64
 """Components handled in one `tick`, which takes a few milliseconds. For more, `tick` is due again at once."""
+EXAMINED_COMPONENTS_MAX: Final = 128
+"""Components whose deadlines are evaluated in one `tick`: 3 ms. For more, `tick` is due again at once."""
 STALE_DEADLINES_MAX: Final = 8
 """Stale deadlines for each component that the heap may hold before it is rebuilt."""
 REMOVAL_SEARCH_INTERVAL: Final = 0.5
@@ -164,6 +167,7 @@ class Station:
         self._signer: Signer | None = None
         self._is_watched = counts_traffic  # one check in the hot path for both
         self.verifier: Verifier | None = None
+        self._ticked_at = -math.inf
         self._heartbeat_at = math.inf if self.listens_only else -math.inf
         self._is_paused = False
         self._turns = Turns()
@@ -172,6 +176,7 @@ class Station:
         self._last_waiting: ComponentMachine | None = None
         self._last_busy: ComponentMachine | None = None
         self._touched: dict[ComponentMachine, None] = {}  # with a deadline other than the noted one
+        self._held: dict[ComponentMachine, None] = {}  # with a write that waits for another component
         self._deadlines: dict[ComponentMachine, float] = {}  # as noted
         self._order: list[tuple[float, Address]] = []  # a heap of these, some of them stale
         self._room = Room()
@@ -239,7 +244,7 @@ class Station:
         if self._is_stream and not data:
             for machine in self.components.values():
                 machine.peers.left(peer, now)
-            self._touch_all(self.components.values())
+            self.touch_all()
         is_seeking = self._awaits_autopilot or (self._looks_for_others and self.verifier is None)
         if is_seeking and self._request_heartbeat(data, peer, now):
             return True
@@ -262,6 +267,10 @@ class Station:
         if self.components.get(machine.address) is machine:
             self._touched[machine] = None
 
+    def touch_all(self) -> None:
+        """Note that requests of any component may have begun or ended."""
+        self._touch(self.components.values())
+
     def overhear(self, data: bytes, now: float) -> None:
         """Process a frame that another program sends to the vehicles over this link: it may be a
         PARAM_SET."""
@@ -276,7 +285,8 @@ class Station:
         """Do what is due: our heartbeat, and the timeouts of up to `TICKED_COMPONENTS_MAX` components.
 
         Without `everyone`, only components with a new message, touched ones, or those with a due deadline are
-        handled: a larger share of the link's bandwidth is then used a little later. No list begins beside
+        handled, at most `EXAMINED_COMPONENTS_MAX`: a larger share of the link's bandwidth is then used a
+        little later. No list begins beside
         `most_lists` others. With `is_crowded`, lists of other links run as well. In a log nothing is due
         except the end of unfinished exchanges of other stations.
         """
@@ -285,6 +295,7 @@ class Station:
             return
         if self._is_paused:
             return
+        self._ticked_at = now
         if self._signer is not None:
             self._signer.advance(now)
         if self._heartbeat_at <= now:
@@ -293,9 +304,15 @@ class Station:
             self._transmit(beat, None, 2)
         if not everyone:
             while self._order and self._order[0][0] <= now:
-                self._touched[self.components[heappop(self._order)[1]]] = None
+                due = self.components[heappop(self._order)[1]]
+                self._touched[due] = None
+                self._deadlines[due] = math.inf  # stale, so that it is noted again
+        if everyone:
+            examined = list(self.components.values())
+        else:
+            examined = list(dict.fromkeys([*self._held, *self._next_touched()]))
         done = 0
-        for machine in list(self.components.values() if everyone else self._touched):
+        for machine in examined:
             is_due = machine.next_deadline() <= now
             if is_due and done == TICKED_COMPONENTS_MAX:
                 self._deadlines[machine] = math.inf  # stale, so that it is noted again
@@ -306,7 +323,7 @@ class Station:
                 continue
             self._touched[machine] = None
         if self._turns.tick(now, most=most_lists, is_crowded=is_crowded):
-            self._touch_all(self.components.values())
+            self.touch_all()
         if self.traffic is not None:
             self.traffic.sent(self.bytes_sent, now)
 
@@ -318,19 +335,26 @@ class Station:
         if self._is_paused or self.is_log:
             return math.inf
         if everyone:
-            self._touch_all(self.components.values())
+            self.touch_all()
         deadlines, order = self._deadlines, self._order
-        for machine in self._touched:
+        examined = list(self._touched) if everyone else self._next_touched()
+        for machine in dict.fromkeys([*self._held, *examined]):
+            self._touched.pop(machine, None)
             deadline = machine.next_deadline()
             if deadline != deadlines.get(machine):
                 deadlines[machine] = deadline
                 heappush(order, (deadline, machine.address))
-        self._touched = {each: None for each in self._touched if each.writes.is_held}  # until another message
+            if machine.writes.is_held:  # until another message
+                self._held[machine] = None
+            else:
+                self._held.pop(machine, None)
         if len(order) > STALE_DEADLINES_MAX * (len(deadlines) + 1):
             self._order = order = sorted((at, each.address) for each, at in deadlines.items())
         while order and deadlines[self.components[order[0][1]]] != order[0][0]:
             heappop(order)
         first = order[0][0] if order else math.inf
+        if self._touched:
+            first = min(first, self._ticked_at)
         return min(self._heartbeat_at, self._turns.next_deadline(), first)
 
     def data_to_send(self) -> list[tuple[bytes, Peer | None]]:
@@ -363,7 +387,7 @@ class Station:
         if not self.listens_only:
             self._heartbeat_at = now
         self._turns.resume(now)
-        self._touch_all(self.components.values())
+        self.touch_all()
         for machine in self.components.values():
             machine.resume(now)
 
@@ -526,7 +550,10 @@ class Station:
                 return [machine.begin_fetch(now, refresh=refresh, listed=True) for machine in machines]
         return [machine.begin_fetch(now, refresh=refresh) for machine in machines]
 
-    def _touch_all(self, machines: Iterable[ComponentMachine]) -> None:
+    def _next_touched(self) -> list[ComponentMachine]:
+        return list(islice(self._touched, EXAMINED_COMPONENTS_MAX))
+
+    def _touch(self, machines: Iterable[ComponentMachine]) -> None:
         self._touched.update(dict.fromkeys(machines))
 
     def _tick_log(self, now: float) -> None:
@@ -616,7 +643,7 @@ class Station:
         machine = self.components.get(address) or self._meet(sender, peer, message, now)
         if machine is None:
             return
-        self._touch_all(self._of_vehicle[machine.vehicle])  # it matters to all of them
+        self._touch(self._of_vehicle[machine.vehicle])  # it matters to all of them
         if not machine.who.has_parameters:
             machine.peers.follow(peer)
         elif not machine.peers.hears(message, peer, now):
@@ -720,6 +747,7 @@ class Station:
             del self._of_vehicle[machine.vehicle]
         self._clock_sampling.close(address)
         self._touched.pop(machine, None)
+        self._held.pop(machine, None)
         self._deadlines.pop(machine, None)
         self._last_waiting = self._last_busy = None
         self._order = [each for each in self._order if each[1] != address]

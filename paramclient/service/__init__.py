@@ -9,6 +9,7 @@ Needs the extra `service`.
 - `gate`, `places`, `connections`: connections before TLS, their number, their limits.
 - `quota`, `held_bodies`, `answer_places`, `log_limit`: limits of work, request bodies, responses and log
   lines.
+- `garbage_collection`: what full garbage collections of a process that serves skip.
 - `reading`, `param_sources`, `route_context`, `answering`, `problems`, `metrics`: request bodies,
   parameters named in requests, what routes share, responses, errors, Prometheus.
 """

@@ -14,6 +14,7 @@ import anyio
 from fastapi import FastAPI, Request, Response, WebSocket
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from paramclient.documents.document import build_documents
 from paramclient.service import problems
 from paramclient.service.access import AccessMiddleware, AccessSettings
 from paramclient.service.event_feed import COMPACT
@@ -63,6 +64,7 @@ def create_app(hub: Hub, settings: Settings | None = None) -> ASGIApp:
     _add_files(app, "page", index="/", prefix="/page/")
     _add_files(app, "reference", index="/docs", prefix="/docs/")
     app.add_api_websocket_route("/{path:path}", _nothing_there)
+    _build_routes(app)
     access = Settings().access if settings is None else settings.access
     return AccessMiddleware(_Stamped(_WithHeads(app), hub), access)
 
@@ -124,6 +126,17 @@ class _Stamped:
 async def _nothing_there(socket: WebSocket) -> None:
     """A WebSocket elsewhere is told so like any other request; without a route it would be a bare 403."""
     raise ServiceError(404, "not-found", "There is nothing at this address.")
+
+
+def _build_routes(app: FastAPI) -> None:
+    """Build the handlers of all routes, and the models of all documents.
+
+    FastAPI and pydantic build them on first use, which takes up to 60 ms in the first request to a router.
+    """
+    anywhere = {"type": "http", "method": "GET", "path": "/", "root_path": "", "headers": []}
+    for route in app.routes:
+        route.matches(dict(anywhere))  # an included router builds its routes for a comparison
+    build_documents()
 
 
 def _add_openapi(app: FastAPI, hub: Hub) -> None:

@@ -90,7 +90,7 @@ class Happened:
     system: int | None
     component: int | None
     at: float
-    members: Callable[[], str]
+    members: dict[str, Any] | Callable[[], str]
     text: str = ""
 
 
@@ -160,8 +160,7 @@ class Feed:
             link, system, component: whom it is about.
         """
         self.seq += 1
-        write = members if callable(members) else _writer(members)
-        self._events.append(Happened(self.seq, kind, link, system, component, self._clock(), write))
+        self._events.append(Happened(self.seq, kind, link, system, component, self._clock(), members))
         self._something.set()
         return self.seq
 
@@ -201,8 +200,11 @@ class Feed:
                 },
                 separators=COMPACT,
             )
-            more = event.members()
-            event.members = _written
+            members, event.members = event.members, {}
+            if callable(members):
+                more = members()
+            else:
+                more = json.dumps(members, allow_nan=False, separators=COMPACT)[1:-1]
             event.text = f"{head[:-1]},{more}}}" if more else head
         return event.text
 
@@ -287,11 +289,3 @@ class Listener:
         at = round(self._feed._clock(), 3)
         told = {"run": self.place.run, "seq": self.place.seq, "at": at, "type": kind, **members}
         return json.dumps(told, separators=COMPACT)
-
-
-def _written() -> str:
-    raise AssertionError("an event is written out once")
-
-
-def _writer(members: dict[str, Any]) -> Callable[[], str]:
-    return lambda: json.dumps(members, allow_nan=False, separators=COMPACT)[1:-1]

@@ -39,7 +39,7 @@ LOOK_INTERVAL: Final = 0.2
 """Seconds between two looks at what nobody tells of: states, progress."""
 LOOKS_AT_VALUES: Final = 5
 """Of so many looks one goes through all values too."""
-LOOKED_AT_ONCE: Final = 64
+LOOKED_AT_ONCE: Final = 16
 """Components that are looked at before the event loop comes round: 3 ms where each has something to tell."""
 
 logger = logging.getLogger(__name__)

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import inspect
 import math
 import time
+import weakref
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import anyio
 import anyio.lowlevel
@@ -19,7 +24,9 @@ from paramclient.cache import CachedComponent, TableUpdate
 from paramclient.client import cache_writer, event_loop_share, link_task
 from paramclient.client.cache_writer import DOWNLOAD_INTERVAL, NEW_SHARE_MIN
 from paramclient.client.event_loop_share import TURN_MAX
+from paramclient.client.fetch_all import FetchTogether
 from paramclient.client.link_task import HELD_UP_MIN, TIMEOUT_DELAY_MAX, LinkTask
+from paramclient.errors import NoReply
 from paramclient.links import Peer
 from paramclient.model.values import ParamType
 from paramclient.protocol import station as station_room
@@ -118,6 +125,67 @@ def test_what_is_due_of_many_at_once_is_done_in_parts() -> None:
         assert len(lost) <= station_room.TICKED_COMPONENTS_MAX
     assert all(machine.presence.is_lost for machine in station.components.values())
     assert ticks >= MANY / station_room.TICKED_COMPONENTS_MAX
+
+
+def test_deadlines_of_many_are_evaluated_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    station = Station(link="x", is_stream=False)
+    for system in range(1, MANY + 1):
+        hear(station, system, 0.0)
+    station.tick(0.0)
+    while station.next_deadline() <= 0.0:
+        station.tick(0.0)
+    evaluated: list[ComponentMachine] = []
+    next_deadline = ComponentMachine.next_deadline
+
+    def evaluate(machine: ComponentMachine) -> float:
+        evaluated.append(machine)
+        return next_deadline(machine)
+
+    monkeypatch.setattr(station_room, "EXAMINED_COMPONENTS_MAX", MANY // 5)
+    monkeypatch.setattr(ComponentMachine, "next_deadline", evaluate)
+    station.touch_all()
+    for part in range(1, 6):
+        station.tick(0.0, everyone=False)
+        due = station.next_deadline(everyone=False)
+        assert (due <= 0.0) is (part < 5), "it is due again at once until all have been evaluated"
+        assert len(evaluated) == 2 * part * (MANY // 5)
+    assert set(evaluated) == set(station.components.values())
+    assert due == station.next_deadline()
+
+
+def test_a_fetch_that_is_given_back_is_freed_without_a_garbage_collection() -> None:
+    station = Station(link="x", is_stream=False)
+    hear(station, 1, 0.0)
+    machine = station.components[1, 1]
+    gc.collect()
+    gc.disable()
+    try:
+        fetch = machine.begin_fetch(0.0)
+        left = [weakref.ref(each) for each in (fetch, fetch.download, fetch._hash_read)]
+        assert all(each() is not None for each in left)
+        machine.end_fetch(fetch, 1.0)
+        del fetch
+        assert [each() for each in left] == [None, None, None]
+    finally:
+        gc.enable()
+
+
+@swiftly
+async def test_the_errors_of_silent_components_hold_no_calls() -> None:
+    station: Any = SimpleNamespace()
+    together = FetchTogether(station, {}, system=None, refresh=False)
+    for system in range(1, 4):
+        fetch: Any = SimpleNamespace(error=None if system > 1 else NoReply("x", attempts=1, waited=1.0))
+        fetch.result = SimpleNamespace(complete=True) if system == 3 else None
+        fetch.partial = partial(_raise, NoReply("y", attempts=1, waited=1.0))
+        together._fetches[system, 1] = fetch
+    outcome = await together.outcome(0.0, waited=1.0)
+    assert outcome.results.keys() == {(3, 1)}
+    assert [error.__traceback__ for error in outcome.silent.values()] == [None, None]
+
+
+def _raise(error: Exception, *_: object) -> None:
+    raise error
 
 
 def test_who_was_forgotten_leaves_no_deadline_to_whoever_comes_in_its_place(

@@ -18,10 +18,12 @@ import anyio
 import httpx
 import pytest
 from fastapi import FastAPI
+from fastapi.dependencies import utils as dependency_utils
 
-from paramclient.client.fetch_all import STARTED_FETCHES_MAX, FetchTogether
+from paramclient.client.fetch_all import ENDED_FETCHES_MAX, STARTED_FETCHES_MAX, FetchTogether
 from paramclient.documents.component import ComponentsDoc
 from paramclient.documents.diff import DiffDoc
+from paramclient.documents.document import Document
 from paramclient.documents.job import JobsDoc
 from paramclient.errors import FileError, UsageError
 from paramclient.files import document_schema, dumps, formats, line_formats, loads, script
@@ -253,6 +255,34 @@ async def test_what_a_vehicle_has_is_within_all_limits() -> None:
         bits = {"values": {name: {"bits": "40d00000"} for name in LARGE}}
         compared = await browser.post(f"{C}/diff", json={"wanted": bits, "full": True})
         assert len(compared.json()["params"]) == len(LARGE)
+
+
+# The first requests
+
+
+@swiftly
+async def test_the_first_requests_build_neither_handlers_nor_models(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To build those of one router takes 30 ms and more, in which nobody else is served."""
+    built: list[str] = []
+    analyze = dependency_utils.get_typed_signature
+
+    def get_typed_signature(call: Callable[..., Any]) -> Any:
+        built.append(repr(call))
+        return analyze(call)
+
+    async with service(GenericVehicle(table=TABLE)) as (_, browser):
+        monkeypatch.setattr(dependency_utils, "get_typed_signature", get_typed_signature)
+        documents = Document.__subclasses__()
+        for document in documents:
+            documents += document.__subclasses__()
+        assert len(documents) > 50
+        assert all(document.__pydantic_complete__ for document in documents)
+        await fetched(browser)
+        for path in ("components", "jobs", "links", "metadata", "history", "nothing", f"{C[8:]}/params"):
+            await browser.get(f"/api/v1/{path}")
+        assert not built
+        create_app(Hub([], cache=False))
+        assert built, "this is how FastAPI builds them"
 
 
 # Errors, one by one
@@ -554,11 +584,15 @@ async def test_events_are_written_out_few_at_a_time() -> None:
 
 
 @swiftly
-async def test_fetches_of_many_are_begun_few_at_a_time() -> None:
+async def test_fetches_of_many_are_begun_and_ended_few_at_a_time() -> None:
     class Station:
         def begin_fetches(self, machines: list[Any], now: float, *, refresh: bool) -> list[Any]:
             turns.note()
             return [SimpleNamespace(done=False) for _ in machines]
+
+    def end_fetch(fetch: Any, now: float) -> None:
+        ends.note()
+        ended.append(next(address for address, each in together._fetches.items() if each is fetch))
 
     def component(system: int) -> Any:
         machine = SimpleNamespace(
@@ -566,6 +600,7 @@ async def test_fetches_of_many_are_begun_few_at_a_time() -> None:
             presence=SimpleNamespace(is_lost=False),
             peers=SimpleNamespace(contest=None),
             fetch=None,
+            end_fetch=end_fetch,
             system=system,
             vehicle=(system, None),
             address=(system, 1),
@@ -574,8 +609,11 @@ async def test_fetches_of_many_are_begun_few_at_a_time() -> None:
 
     components = {(system, 1): component(system) for system in range(1, 251)}
     station: Any = Station()
+    station.components = {address: each.machine for address, each in components.items()}
     together = FetchTogether(station, components, system=None, refresh=False)
-    turns = Turns()
+    turns, ends = Turns(), Turns()
+    ended: list[tuple[int, int]] = []
+    woken: list[Any] = []
     checks = 0
 
     def check() -> None:
@@ -584,12 +622,17 @@ async def test_fetches_of_many_are_begun_few_at_a_time() -> None:
         if len(together._fetches) == 250:
             raise EOFError
 
-    together._end = lambda now: together._fetches.clear()  # type: ignore[method-assign]
-    closed: Any = None
+    async def closed(machine: Any) -> None:
+        pass
+
     bounds = {"until": 9e9, "hear_until": 0.0, "listen_until": 0.0}
     with pytest.raises(EOFError):
-        await together.run(check, lambda: None, closed, **bounds, progress=None)
+        await together.run(check, woken.append, closed, **bounds, progress=None)
     assert turns.most == STARTED_FETCHES_MAX
+    assert ends.most == ENDED_FETCHES_MAX
+    assert ended == list(reversed(components)), "none that waits for its turn gets it now"
+    machines = [each.machine for each in components.values()]
+    assert woken == [*machines, *reversed(machines)], "no others are looked at"
     assert checks == 1 + math.ceil(250 / STARTED_FETCHES_MAX)
 
 

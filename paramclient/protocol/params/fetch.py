@@ -766,3 +766,4 @@ class Fetch(Operation[FetchResult]):
         download, self.download = self.download, None
         if download is not None:
             download.cancel()
+            download.drop_callbacks()

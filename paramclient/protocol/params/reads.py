@@ -190,8 +190,10 @@ class Reads(Machine):
     def release(self, read: Read) -> None:
         """Give a read back. The last holder drops it."""
         read.holders -= 1
-        if read.holders <= 0 and self._open.get(read.key) is read:
-            self._drop(read)
+        if read.holders <= 0:
+            read.drop_callbacks()
+            if self._open.get(read.key) is read:
+                self._drop(read)
 
     def heard(self, message: ParamValue, now: float) -> None:
         """Process a PARAM_VALUE of the component, after the table has stored it."""

@@ -324,15 +324,15 @@ class _Recently:
 
     def __init__(self) -> None:
         self.total = 0
-        self._slices: deque[list[int]] = deque(maxlen=round(RATE_WINDOW / SLICE))  # number of the slice, sum
+        # number of the slice, sum; the garbage collector visits no tuples of numbers
+        self._slices: deque[tuple[int, int]] = deque(maxlen=round(RATE_WINDOW / SLICE))
 
     def add(self, now: float, amount: int) -> None:
         self.total += amount
         number = int(now / SLICE)
         if self._slices and self._slices[-1][0] == number:
-            self._slices[-1][1] += amount
-        else:
-            self._slices.append([number, amount])
+            amount += self._slices.pop()[1]
+        self._slices.append((number, amount))
 
     def of_late(self, now: float) -> int:
         first = _first_slice(now)
