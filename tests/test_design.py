@@ -222,7 +222,7 @@ def test_no_two_modules_share_a_name_but_counterparts() -> None:
     assert all(len(places) == len(set(places)) for places in rooms.values())
 
 
-NAMEDTUPLE_METHODS = {"_replace", "_asdict", "_fields"}
+NAMEDTUPLE_METHODS = {"_make", "_replace", "_asdict", "_fields"}
 """Names that begin with an underscore and are public nevertheless, so that no field can have them."""
 
 
