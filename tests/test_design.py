@@ -272,7 +272,7 @@ def test_no_two_classes_share_a_name_but_counterparts() -> None:
     assert names_with_several_contents(classes()) == SAME_NAME_CLASSES.keys()
 
 
-NAMEDTUPLE_METHODS = {"_replace", "_asdict", "_fields"}
+NAMEDTUPLE_METHODS = {"_make", "_replace", "_asdict", "_fields"}
 """Names that begin with an underscore and are public nevertheless, so that no field can have them."""
 
 

@@ -11,7 +11,6 @@ from paramclient.cache import snapshots
 from paramclient.cache.merge import merge
 from paramclient.cache.reconciliation import reconcile
 from paramclient.cache.records import Snapshot, TableUpdate
-from paramclient.cache.rows import read_param
 from paramclient.cache.transaction import Session
 from paramclient.errors import NotInCache
 from paramclient.model.identity import Identity
@@ -191,9 +190,5 @@ class Remove(StoreOperation[int]):
 
 
 def _kept(session: Session, owner: int) -> ParamSet:
-    rows = session.table(owner)
-    return ParamSet.of(
-        read_param(name, *row.value, row.param_index, row.default_bits)
-        for name, row in rows.items()
-        if is_portable_name(name)
-    )
+    rows = session.table(owner).values()
+    return ParamSet.of(row.param for row in rows if is_portable_name(row.name))

@@ -9,12 +9,13 @@ from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+from paramclient.cache.cells import Damaged, identity_cells, read_identity
 from paramclient.cache.operations import Merge, Save, StoreOperation, StoreSnapshot
-from paramclient.cache.records import StoredParam, TableState, TableUpdate
-from paramclient.cache.rows import Damaged, Row, identity_cells, read_identity, read_param
+from paramclient.cache.records import TableState, TableUpdate
 from paramclient.cache.snapshots import read_written, written_cells
 from paramclient.cache.sqlite import SqliteSession
 from paramclient.cache.sqlite_file import Database
+from paramclient.cache.stored_param import COLUMN_NAMES, StoredParam
 from paramclient.cache.transaction import Session
 from paramclient.cache.transfer import WholeTable, put_shots, put_whole
 from paramclient.model.paramset import ParamSet
@@ -37,6 +38,13 @@ _TABLES: Final = (
         PRIMARY KEY (vehicle, component)
     )""",
 )
+_FIRST: Final = (
+    *("name", "type", "bits", "is_raw", "param_index", "default_bits"),
+    *("heard_at", "volatile", "by"),
+)
+_LATER: Final = tuple(name for name in COLUMN_NAMES if name not in _FIRST)
+_ITEM: Final = (*_FIRST, *_LATER)
+"""Fields of a queued parameter, in order: those of the first version, then later columns."""
 T = TypeVar("T")
 _Key = tuple[str, int]
 
@@ -264,11 +272,13 @@ def _update(data: list[Any]) -> TableUpdate:
 
 
 def _item_cells(item: StoredParam) -> list[Any]:
-    param = item.param
-    row = Row.of(param, param.index, False, item.heard_at)
-    return [param.name, *row.value, param.index, row.default_bits, item.heard_at, item.volatile, item.by]
+    return [getattr(item, name) for name in _ITEM]
 
 
 def _item(data: list[Any]) -> StoredParam:
-    name, number, bits, is_raw, index, default, heard_at, volatile, by = data
-    return StoredParam(read_param(name, number, bits, is_raw, index, default), heard_at, volatile, by)
+    found = dict(zip(_ITEM, data, strict=False))  # earlier versions have fewer
+    item = StoredParam._make(map(found.get, StoredParam._fields))
+    volatile = None if item.volatile is None else bool(item.volatile)
+    later: dict[str, Any] = {name: found.get(name) for name in _LATER}
+    checked = StoredParam(item.param, item.heard_at, volatile, item.by)
+    return checked._replace(**later)

@@ -20,8 +20,9 @@ from dataclasses import fields, replace
 from datetime import UTC, datetime
 from typing import Any, Final
 
+from paramclient.cache.cells import Damaged, identity_cells, read_identity, time_cell
 from paramclient.cache.records import Snapshot
-from paramclient.cache.rows import Damaged, Row, identity_cells, read_identity, read_param, time_cell
+from paramclient.cache.stored_param import StoredParam, read_param
 from paramclient.cache.transaction import Session
 from paramclient.errors import NotInCache
 from paramclient.model.identity import Identity
@@ -128,7 +129,7 @@ def kept_time(at: float) -> float:
 
 
 def state_at(
-    session: Session, owner: int, identity: Identity, rows: Mapping[str, Row], when: float
+    session: Session, owner: int, identity: Identity, rows: Mapping[str, StoredParam], when: float
 ) -> ParamSet:
     """Return a table as it was known at a given time.
 

@@ -35,9 +35,9 @@ from itertools import chain, count
 from pathlib import Path
 from typing import Final, TypeAlias, TypeVar
 
+from paramclient.cache.cells import Damaged
 from paramclient.cache.file_ownership import OF_OTHERS, OTHERS_WRITE, is_own, make_private, mode_of
 from paramclient.cache.lock import LOCK_WAIT_MAX, locked
-from paramclient.cache.rows import Damaged
 from paramclient.cache.sqlite_schema import MIGRATIONS, Step
 from paramclient.errors import CacheError
 

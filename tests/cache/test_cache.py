@@ -695,8 +695,8 @@ class Model:
                     param = replace(param, index=old.param.index)
                 if not (old.param.type == param.type and same_bits(param.type, old.param.bits, param.bits)):
                     self.lines.append((name, old.param.bits, param.bits, item.by))
-            volatile = bool(old and old.volatile) if item.volatile is None else item.volatile
-            self.params[name] = replace(item, param=param, volatile=volatile)
+            volatile = bool(old and old.volatile if item.volatile is None else item.volatile)
+            self.params[name] = StoredParam(param, item.heard_at, volatile, item.by)
         self.lines += [(name, item.param.bits, None, BY_VEHICLE) for name, item in gone.items()]
         is_less = state is not None and not state.complete and self.state.complete and not whole
         counts: tuple[int | None, ...] = (self.state.count,) if params else (self.state.count, None)
@@ -763,7 +763,7 @@ class CacheMachine(RuleBasedStateMachine):
     def save(self, by: int, updates: list[Any]) -> None:
         batch = []
         for (identity, component), drawn, removed, whole, state in updates:
-            params = [replace(item, heard_at=self.now + item.heard_at) for item in drawn]
+            params = [item._replace(heard_at=self.now + item.heard_at) for item in drawn]
             params.sort(key=lambda item: item.heard_at)
             self.now += 1.0
             batch.append(

@@ -26,11 +26,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from paramclient.cache import HISTORY_LINES, ParamCache, lock, sqlite_file
+from paramclient.cache import HISTORY_LINES, ParamCache, StoredParam, lock, sqlite_file
+from paramclient.cache.cells import Damaged
 from paramclient.cache.packed_table import unpack
-from paramclient.cache.rows import Damaged, checksum
 from paramclient.cache.sqlite_file import APPLICATION_ID, Database
 from paramclient.cache.sqlite_schema import MIGRATIONS
+from paramclient.cache.stored_param import checksum
 from paramclient.errors import CacheError, UnknownVehicle
 from paramclient.model.identity import Identity
 from paramclient.model.values import ParamType
@@ -125,7 +126,7 @@ def make_older(path: Path, version: int) -> None:
             connection.executemany(
                 "INSERT INTO param (owner, name, type, bits, is_raw, param_index, volatile, heard_at,"
                 " default_bits) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
-                [(owner, name, *row) for name, row in rows.items()],
+                [(owner, *row[:8]) for row in rows.values()],
             )
             connection.execute("UPDATE component SET checksum = ? WHERE id = ?", (checksum(rows), owner))
         connection.execute("DROP TABLE packed")
@@ -822,7 +823,7 @@ def test_a_file_from_before_tables_were_packed_keeps_every_cell(path: Path, vers
         stored("NAN", 0x7FA00001, ParamType.REAL32, index=1),
         stored("RAW", 0xFFFFFFFF, 77, index=32767, is_raw=True),
         stored("A", 3, index=1),
-        replace(odd, param=replace(odd.param, default=-5)),
+        StoredParam(replace(odd.param, default=-5), odd.heard_at),
     ]
     with ParamCache(path) as cache:
         cache.save(update(*cells))

@@ -30,7 +30,6 @@ from paramclient.cache.database_url import DatabaseAddress
 from paramclient.cache.operations import Save
 from paramclient.cache.outbox import LocalCopy
 from paramclient.cache.postgres import PostgresDatabase, PostgresSession, Unavailable
-from paramclient.cache.rows import Row
 from paramclient.cache.shared import SharedStore, _Link
 from paramclient.cache.transaction import Line, Session
 from paramclient.cache.transfer import take_whole
@@ -323,7 +322,7 @@ def test_whatever_two_programs_write_to_a_database_was_so(path: str, tmp_path: P
     )
 
 
-def kept_of(updates: Iterable[TableUpdate]) -> tuple[Mapping[str, Row], Sequence[Line]]:
+def kept_of(updates: Iterable[TableUpdate]) -> tuple[Mapping[str, StoredParam], Sequence[Line]]:
     """What becomes of a whole table by these."""
     with TemporaryDirectory() as folder:
         copy = LocalCopy(Path(folder) / "copy")
