@@ -432,6 +432,14 @@ async def large_table(rows: list[Row], quick: bool) -> None:
                 with service.watched():
                     status, answer = await service.ask(method, path, body, token(READER))
                     assert status == 200, answer
+            service.attack = f"{len(table):,} parameters: 6 diff at once"
+            with service.watched(late=LATE):
+                asked_at_once = [
+                    service.ask("POST", f"{C}/diff", as_json(values, known=True), token(READER))
+                    for _ in range(6)
+                ]
+                statuses = [status for status, _ in await asyncio.gather(*asked_at_once)]
+                service.note("not answered", 0, sum(status != 200 for status in statuses), "times")
             await many_answers(service, len(table))
     finally:
         far_end.cancel()

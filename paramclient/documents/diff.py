@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from pydantic import Field
@@ -102,6 +103,29 @@ class DiffDoc(Document):
             left, right, base: the metadata of each side, or None.
             everything: include names that do not differ.
         """
+        head = cls.without_params(outcome)
+        return head.model_copy(
+            update={"params": dict(cls.rows(outcome, left, right, base, everything=everything))}
+        )
+
+    @classmethod
+    def rows(
+        cls,
+        outcome: Comparison,
+        left: Metadata | None = None,
+        right: Metadata | None = None,
+        base: Metadata | None = None,
+        *,
+        everything: bool = False,
+    ) -> Iterator[tuple[str, DifferenceDoc]]:
+        """Yield the members of `params`, each created when it is needed; see `of`."""
+        for entry in outcome.entries:
+            if everything or entry.is_news:
+                yield entry.name, DifferenceDoc.of(entry, left, right, base)
+
+    @classmethod
+    def without_params(cls, outcome: Comparison) -> DiffDoc:
+        """Return the document of a `Comparison` with an empty `params`."""
         return cls(
             same=outcome.is_same,
             left=OriginDoc.of(outcome.left),
@@ -109,9 +133,5 @@ class DiffDoc(Document):
             base=None if outcome.base is None else OriginDoc.of(outcome.base),
             counts={standing: outcome.counts[standing] for standing in Standing},
             moves=None if outcome.base is None else {moved: outcome.moves[moved] for moved in Moved},
-            params={
-                entry.name: DifferenceDoc.of(entry, left, right, base)
-                for entry in outcome.entries
-                if everything or entry.is_news
-            },
+            params={},
         )

@@ -35,24 +35,29 @@ async def document_answer(aside: Aside, make: Callable[[], Document], *, status:
     return Response(await aside(lambda: written_out(make())), status, media_type=JSON)
 
 
-def written_out(document: Document, **entries: Iterable[Document]) -> bytes:
+def written_out(document: Document, **entries: Iterable[Document | tuple[str, Document]]) -> bytes:
     """A document as JSON, as `model_dump_json` gives it.
 
     That would keep the interpreter for as long as it takes, which is long for thousands of entries.
 
     Args:
         document: what to write.
-        entries: by the name of a member that is a list, what stands in it in place of what the document has;
-            each is made, written and forgotten before the next one.
+        entries: by the name of a member that is a list or an object, its entries in place of those of the
+            document, those of an object with their names; each is made, written and forgotten before the
+            next one.
     """
     return ("{" + ",".join(filter(None, _members(document, entries))) + "}").encode()
 
 
-def _members(document: Document, entries: dict[str, Iterable[Document]]) -> Iterator[str]:
+def _members(
+    document: Document, entries: dict[str, Iterable[Document | tuple[str, Document]]]
+) -> Iterator[str]:
     for name, field in type(document).model_fields.items():
         key = json.dumps(field.serialization_alias or name)
         if name in entries:
-            yield f"{key}:[{','.join([each.model_dump_json() for each in entries[name]])}]"
+            is_object = isinstance(getattr(document, name), dict)
+            texts = ",".join(map(_entry, entries[name]))
+            yield f"{key}:{{{texts}}}" if is_object else f"{key}:[{texts}]"
             continue
         content = getattr(document, name)
         if isinstance(content, dict) and len(content) > LONG_MEMBER:
@@ -62,6 +67,13 @@ def _members(document: Document, entries: dict[str, Iterable[Document]]) -> Iter
             yield f"{key}:[{','.join(map(_json, content))}]"
         else:
             yield document.model_dump_json(include={name})[1:-1]
+
+
+def _entry(entry: Document | tuple[str, Document]) -> str:
+    if isinstance(entry, Document):
+        return entry.model_dump_json()
+    name, document = entry
+    return f"{json.dumps(name)}:{document.model_dump_json()}"
 
 
 def _json(content: Any) -> str:

@@ -9,6 +9,7 @@ import json
 import math
 import threading
 import tracemalloc
+import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
@@ -22,7 +23,7 @@ from fastapi.dependencies import utils as dependency_utils
 
 from paramclient.client.fetch_all import ENDED_FETCHES_MAX, STARTED_FETCHES_MAX, FetchTogether
 from paramclient.documents.component import ComponentsDoc
-from paramclient.documents.diff import DiffDoc
+from paramclient.documents.diff import DiffDoc, DifferenceDoc
 from paramclient.documents.document import Document
 from paramclient.documents.job import JobsDoc
 from paramclient.errors import FileError, UsageError
@@ -255,6 +256,29 @@ async def test_what_a_vehicle_has_is_within_all_limits() -> None:
         bits = {"values": {name: {"bits": "40d00000"} for name in LARGE}}
         compared = await browser.post(f"{C}/diff", json={"wanted": bits, "full": True})
         assert len(compared.json()["params"]) == len(LARGE)
+
+
+@swiftly
+async def test_the_rows_of_a_comparison_are_written_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Thousands at once make full garbage collections long, in which no thread runs."""
+    most, made = 0, weakref.WeakSet[DifferenceDoc]()
+    create = DifferenceDoc.of
+
+    def of(*args: Any) -> DifferenceDoc:
+        nonlocal most
+        document = create(*args)
+        made.add(document)
+        most = max(most, len(made))
+        return document
+
+    async with service(GenericVehicle(table=TABLE)) as (_, browser):
+        await fetched(browser)
+        body = {"wanted": {"values": VALUES}, "known": True}
+        expected = (await browser.post(f"{C}/diff", json=body)).json()["params"]
+        assert len(expected) == len(TABLE)
+        monkeypatch.setattr(DifferenceDoc, "of", of)
+        assert (await browser.post(f"{C}/diff", json=body)).json()["params"] == expected
+    assert 1 <= most <= 2
 
 
 # The first requests

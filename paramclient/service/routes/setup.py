@@ -21,7 +21,7 @@ from paramclient.model.paramset import ParamSet
 from paramclient.provision import ApplyProgress, ApplyResult, ApplyRow, Plan, apply, overlay, prepare, restore
 from paramclient.provision.set_up import restore_categories
 from paramclient.provision.vehicle_params import NO_DEFAULTS, FetchedSet, fetch_set
-from paramclient.service.answering import document_answer
+from paramclient.service.answering import JSON, document_answer, written_out
 from paramclient.service.followed_component import Followed
 from paramclient.service.hub import Hub
 from paramclient.service.jobs import Job, Kind
@@ -233,11 +233,13 @@ async def _diff(hub: Hub, target: Followed, body: Compared) -> Response:
     sets = [left, right] if base is None else [left, right, base]
     found = [*await _described(hub, target, sets), None][:3]
 
-    def document() -> DiffDoc:
+    def write() -> bytes:
+        """Compare and write row by row: a full garbage collection of all rows would block every thread."""
         outcome = compare(left, right, base=base, names=body.only or None)
-        return DiffDoc.of(outcome, *found, everything=body.full)
+        rows = DiffDoc.rows(outcome, *found, everything=body.full)
+        return written_out(DiffDoc.without_params(outcome), params=rows)
 
-    return await document_answer(hub.read_aside, document)
+    return Response(await hub.read_aside(write), media_type=JSON)
 
 
 async def _present(hub: Hub, target: Followed, body: Compared) -> ParamSet:
