@@ -15,7 +15,6 @@ import anyio.lowlevel
 
 from paramclient.client.loop_scheduler import (
     BACKLOG_DATAGRAMS_MIN,
-    TURN_DATAGRAMS_MIN,
     TURN_MAX,
     LoopScheduler,
 )
@@ -170,7 +169,7 @@ class LinkTask:
             )
             self._read_at = math.inf
             rest = zip(chunks, moments, strict=True)
-            if len(chunks) >= TURN_DATAGRAMS_MIN or (loop.has_others and self._station.is_waiting):
+            if loop.needs_turns(len(chunks), self._station.scheduler):
                 self._is_taking = True
                 is_news |= await self._take_turns(rest, loop)
                 self._is_taking = False

@@ -57,10 +57,14 @@ class LoopScheduler:
         """Register a reader."""
         self._readers.add(reader)
 
-    @property
-    def has_others(self) -> bool:
-        """Whether more than one reader is registered."""
-        return len(self._readers) > 1
+    def needs_turns(self, datagrams: int, scheduler: Scheduler) -> bool:
+        """Return whether a reader processes its datagrams in turns: they are many, or there are other links.
+
+        Args:
+            datagrams: number of datagrams of one read.
+            scheduler: the scheduler of the link.
+        """
+        return datagrams >= TURN_DATAGRAMS_MIN or (len(self._readers) > 1 and scheduler.is_waiting)
 
     def came(self, reader: object, datagrams: int) -> None:
         """Record the number of datagrams of one read. The reader calls `taken` after processing them."""
