@@ -86,7 +86,7 @@ class FetchTogether:
     async def run(
         self,
         check: Callable[[], None],
-        wake: Callable[[ComponentMachine], None],
+        wake: Callable[[], None],
         closed: Callable[[ComponentMachine], Awaitable[None]],
         *,
         until: float,
@@ -100,7 +100,7 @@ class FetchTogether:
 
         Args:
             check: raises an error if the link failed or the client was closed; called in each iteration.
-            wake: runs the sender for a component.
+            wake: runs the sender.
             closed: waits until the unused file session of a component is closed on board.
             until: deadline; at this time the partial results are returned.
             hear_until, listen_until: as in `is_worth_waiting`.
@@ -132,7 +132,7 @@ class FetchTogether:
                 if machine is not None:  # the station may have forgotten it since
                     await closed(machine)
 
-    def join(self, now: float, wake: Callable[[ComponentMachine], None]) -> bool:
+    def join(self, now: float, wake: Callable[[], None]) -> bool:
         """Start the fetches of components whose cached table is loaded. Return whether any was due.
 
         It starts at most `STARTED_FETCHES_MAX` fetches, but all components of one vehicle together.
@@ -160,7 +160,7 @@ class FetchTogether:
             for machine, fetch in zip(machines, begun, strict=True):
                 address = machine.address
                 self._fetches[address] = self._unanswered[address] = fetch
-                wake(machine)
+                wake()
         return bool(ready)
 
     def is_worth_waiting(self, now: float, *, listen_until: float, hear_until: float) -> bool:
@@ -245,12 +245,12 @@ class FetchTogether:
             raise NoReply(f"the parameters of {whose}", attempts=attempts, waited=waited)
         return FetchedAll(results, silent)
 
-    async def _end(self, wake: Callable[[ComponentMachine], None]) -> None:
+    async def _end(self, wake: Callable[[], None]) -> None:
         """Release all fetches, the last ones first: those without a turn must not get one that ends."""
         for number, (address, fetch) in enumerate(reversed(self._fetches.items()), 1):
             machine = self._station.components[address]
             machine.end_fetch(fetch, anyio.current_time())
-            wake(machine)
+            wake()
             if not number % ENDED_FETCHES_MAX:
                 await anyio.lowlevel.checkpoint()
 

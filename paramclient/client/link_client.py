@@ -507,9 +507,9 @@ class LinkClient(LocalClient):
             ):
                 self._read_cache(component)
 
-    def wake(self, machine: ComponentMachine | None = None) -> None:
+    def wake(self) -> None:
         """See `LocalClient.wake`."""
-        self.link_task.wake(machine)
+        self.link_task.wake()
 
     # end of the link
 
@@ -587,7 +587,7 @@ class LinkClient(LocalClient):
         def tell(now: float) -> None:
             carrier.tell()
 
-        self.wake(machine)
+        self.wake()
         while files.is_closing and not (carrier.is_away or carrier.ended or machine.presence.is_lost):
             if tell not in files.on_closed:
                 files.on_closed.append(tell)

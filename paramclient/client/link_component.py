@@ -311,7 +311,7 @@ class LinkComponent(LocalComponent):
 
     def wake(self) -> None:
         """See `LocalComponent.wake`."""
-        self.client.wake(self.machine)
+        self.client.wake()
 
     def is_cache_due(self, now: float) -> bool:
         """See `LocalComponent.is_cache_due`."""

@@ -38,7 +38,7 @@ from paramclient.protocol.params.volatile_values import Refresh
 from paramclient.protocol.params.writes import Write, Writes
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
-from paramclient.protocol.scheduler import Turns
+from paramclient.protocol.scheduler import Scheduler
 from paramclient.protocol.stats.trace import Trace, silent
 from paramclient.protocol.vehicle.boot_time_requests import ClockRequests
 from paramclient.protocol.vehicle.claims import Claim, Verdict
@@ -125,13 +125,11 @@ class ComponentMachine:
         send_to: takes each message for one of its peers; None where there is only one.
         encoding: the user's choice of its encoding, or None.
         upkeep: what is done for its table without a request of the user.
-        is_link_busy: whether any request is in flight on the link.
-        vehicle: returns all components of its vehicle.
-        another: called when another vehicle has taken the system id; by default `become_another`.
+        companions: the components of its vehicle, to which it adds itself; None for a vehicle with one.
         read_clock: enables `boot_clock` calls with clocks from its telemetry for a while; see
             `ClockSampling`.
         peer: its peer, where components are told apart by peer; otherwise None.
-        turns: the turns of lists on the link; None for a link with one component.
+        scheduler: the scheduler of the link; None for a link with one component.
         room: the name count shared by the tables of the link; None likewise.
         trace: receives each step.
 
@@ -175,12 +173,10 @@ class ComponentMachine:
         send_to: Callable[[Message, Peer], None] | None = None,
         encoding: Encoding | None = None,
         upkeep: Upkeep | None = None,
-        is_link_busy: Callable[[], bool] = lambda: False,
-        vehicle: Callable[[], Iterable[ComponentMachine]] = lambda: (),
-        another: Callable[[float], None] | None = None,
+        companions: list[ComponentMachine] | None = None,
         read_clock: Callable[[float], None] = lambda now: None,
         peer: Peer | None = None,
-        turns: Turns | None = None,
+        scheduler: Scheduler | None = None,
         room: Room | None = None,
         trace: Trace = silent,
     ) -> None:
@@ -191,13 +187,20 @@ class ComponentMachine:
         self.address: Address = target if peer is None else PeerAddress(system, component, peer)
         self.vehicle: tuple[int, Peer] = (system, peer)
         self.version = 1
-        context = Context(target, send, own, trace=trace, may_send=not upkeep.listens_only)
+        scheduler = Scheduler() if scheduler is None else scheduler
+        self._scheduler = scheduler
+        self.reschedule = scheduler.reporter(self)
+        context = Context(
+            *(target, self._send, own),
+            trace=trace,
+            may_send=not upkeep.listens_only,
+            reschedule=self.reschedule,
+        )
         self.context = context
         self.round_trip = context.round_trip
         self.who = Identification(context, link, encoding)
         self.table = Table(self.who.encoding, room)
-        self.turns = Turns() if turns is None else turns
-        self.reads = Reads(context, self.table, self.turns.share)
+        self.reads = Reads(context, self.table, scheduler.turns.share)
         self.writes = Writes(context, self.reads, self.table, permission=self)
         self.presence = Presence()
         self.peers = ComponentPeers(target, self, may_ask=context.may_send)
@@ -218,7 +221,7 @@ class ComponentMachine:
             context,
             self.reads,
             self.table,
-            self.turns,
+            scheduler.turns,
             self.files,
             changed=self._moved,
             doubt=self._doubt_identity,
@@ -231,13 +234,13 @@ class ComponentMachine:
         self._value_heard = self.reads.heard if overheard is None else overheard.heard
         self._own = own
         self._observer = observer
+        self._transmit = send
         self._send_to = send_to or (lambda message, peer: send(message))
         self._policy = upkeep.policy
-        self._is_link_busy = is_link_busy
         self._listens_only = upkeep.listens_only
-        self._another = another or self.become_another
         self._read_clock = read_clock
-        self._vehicle = vehicle
+        self._companions: list[ComponentMachine] = [] if companions is None else companions
+        self._companions.append(self)
         self._known_as: str | None = None  # the key of the reported identity
         self.tells_changes = True
         self.has_moved = False
@@ -286,7 +289,7 @@ class ComponentMachine:
     @property
     def is_link_busy(self) -> bool:
         """Whether any request is in flight on the link."""
-        return self._is_link_busy()
+        return self._scheduler.is_busy
 
     @property
     def state(self) -> str:
@@ -305,7 +308,7 @@ class ComponentMachine:
 
     def _autopilots(self) -> Iterator[ComponentMachine]:
         """Yield the autopilot of its vehicle, where that is another component."""
-        return (each for each in self._vehicle() if each is not self and each.who.is_autopilot)
+        return (each for each in self._companions if each is not self and each.who.is_autopilot)
 
     @property
     def is_restarting(self) -> bool:
@@ -320,6 +323,11 @@ class ComponentMachine:
     def read_clock(self, now: float) -> None:
         """Have clocks in its telemetry read for a while."""
         self._read_clock(now)
+
+    def _send(self, message: Message) -> None:
+        """Send a message to the component: its response has a deadline."""
+        self.reschedule()
+        self._transmit(message)
 
     def send_to(self, message: Message, peer: Peer) -> None:
         """Send a message to one of its peers."""
@@ -399,7 +407,7 @@ class ComponentMachine:
         elif isinstance(message, AutopilotVersion):
             before = self.who.firmware
             if self.who.version(message, now):
-                self._another(now)
+                self._vehicle_replaced(now)
             elif before not in (None, self.who.firmware):
                 self.fetches.updated(now)
         elif isinstance(message, ParamError):
@@ -517,6 +525,7 @@ class ComponentMachine:
 
     def boot_clock(self, message_id: int, boot_ms: int, now: float) -> None:
         """Process `time_boot_ms` of a telemetry message."""
+        self.reschedule()
         self._clock_told(self.presence.boot_clock(message_id, boot_ms, now), now)
 
     def _clock_told(self, has_restarted: bool, now: float) -> None:
@@ -563,6 +572,7 @@ class ComponentMachine:
 
     def foreign_set(self, name: str, raw: bytes, station: str, now: float) -> None:
         """Record another station's PARAM_SET to this component, with the 4 bytes of its value."""
+        self.reschedule()
         if not is_portable_name(name):
             self.table.leave_out(name)
             return
@@ -570,6 +580,7 @@ class ComponentMachine:
 
     def foreign_file_request(self, message: FileTransfer, station: tuple[int, int], now: float) -> None:
         """Process another station's request for a file of this component."""
+        self.reschedule()
         self.files.foreign_at = now
         if self.fetches.overheard is not None:
             self.fetches.overheard.file.request_heard(message, station, now)
@@ -696,11 +707,13 @@ class ComponentMachine:
         if not self.restarts.is_under_way:
             self.check_present(f"the restart of {self.system}/{self.component}", now)
         self._read_clock(now)
+        self.reschedule()
         self.start_values.stop()
         return self.restarts.begin(now, returns=returns)
 
     def end_restart(self, restart: Restart, now: float) -> None:
         """Give a reboot back. The last holder ends it; whether the command takes effect is then unknown."""
+        self.reschedule()
         self.restarts.end(restart, now)
 
     def begin_fetch(
@@ -728,6 +741,7 @@ class ComponentMachine:
             NoReply: the component is lost, and no fetch is in progress. Nothing was sent.
         """
         self.check_uncontested()
+        self.reschedule()
         if self.fetch is None and self._policy is not Policy.CACHE_ONLY:
             self.check_present(f"the parameters of {self.system}/{self.component}", now)
         return self.fetches.begin(
@@ -736,6 +750,7 @@ class ComponentMachine:
 
     def end_fetch(self, fetch: Fetch, now: float) -> None:
         """Give a fetch back. The last holder cancels it."""
+        self.reschedule()
         self.fetches.end(fetch, now)
 
     def spelling(self, name: str) -> str:
@@ -809,7 +824,7 @@ class ComponentMachine:
         """Forget the autopilot's other components after a contest: their messages may be of either
         vehicle."""
         if self.who.is_autopilot:
-            for each in self._vehicle():
+            for each in self._companions:
                 if each is not self and each.who.has_parameters:
                     each.fail_all(error, now)
                     each.become_another(now)
@@ -820,9 +835,14 @@ class ComponentMachine:
         is_autopilot = self.who.is_autopilot
         self.who.forget(now)
         if is_autopilot:
-            self._another(now)
+            self._vehicle_replaced(now)
         else:
             self.become_another(now)
+
+    def _vehicle_replaced(self, now: float) -> None:
+        """Forget all components of the system id: another vehicle uses it."""
+        for each in self._companions:
+            each.become_another(now)
 
     def _take_claim(self, claim: Claim, now: float) -> None:
         """Process what a peer has sent before its messages counted."""
@@ -856,6 +876,7 @@ class ComponentMachine:
 
     def resume(self, now: float) -> None:
         """Repeat all requests in flight: the link is back."""
+        self.reschedule()
         self.round_trip.heard_at = now
         if not self.presence.is_lost:
             if self.presence.was_away(silence := self.presence.heard(now)):
@@ -869,11 +890,13 @@ class ComponentMachine:
 
     def fail_all(self, error: ParamClientError, now: float) -> None:
         """End every operation with the error: the link has ended, or the address is contested."""
+        self.reschedule()
         for machine in reversed(self._machines):
             machine.fail_all(error, now)
 
     def become_another(self, now: float) -> None:
         """Forget everything: another vehicle uses the system id."""
+        self.reschedule()
         self._report(self.table.forget())
         self._observer.replaced(self)
         self.sync.forget()
@@ -895,6 +918,7 @@ class ComponentMachine:
 
     def _heard(self, now: float, version: int) -> None:
         """Process the arrival of any message."""
+        self.reschedule()
         presence = self.presence
         silence = presence.heard(now)
         self.round_trip.heard_at = now
@@ -981,14 +1005,17 @@ class ComponentMachine:
             self._observer.identified(self)
             if self.who.is_autopilot:
                 self.clock_requests.want_baseline(now)
+        for each in self._companions:
+            if each.writes.queues:
+                each._follow_permission(now)
+
+    def _follow_permission(self, now: float) -> None:
+        """Continue the writes, or end them with an error where the identity of the vehicle, or of its
+        autopilot, was requested without success."""
+        self.reschedule()
         if self.writes.is_held and self.may_be_written:
             self.writes.proceed(now)
-        elif self.writes.queues:
-            self._fail_unconfirmed(now)
-
-    def _fail_unconfirmed(self, now: float) -> None:
-        """End writes with an error: the identity of the vehicle, or of its autopilot, was requested without
-        success."""
+            return
         for each in (self, *self._autopilots()):
             if each.who.is_unconfirmed:
                 what = f"{each.system}/{each.component} has not said since it was away which vehicle it is"

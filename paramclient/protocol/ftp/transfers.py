@@ -240,6 +240,7 @@ class FileTransfers(Machine):
             now: the time.
             is_served: whether the component may have a server; otherwise no response is awaited.
         """
+        self._context.reschedule()
         if job in self._waiting:
             self._waiting.remove(job)
         elif job is self._job and not job.done:

@@ -134,6 +134,7 @@ class Reads(Machine):
         self._target = context.target
         self._round_trip = context.round_trip
         self._send = context.send
+        self._reschedule = context.reschedule
         self._table = table
         self._trace = context.trace
         self.asked = self.retries = 0
@@ -184,6 +185,7 @@ class Reads(Machine):
             self._patient.remove(read)
             self._urgent.append(read)
         read.holders += 1
+        self._reschedule()
         self._send_waiting(now, may_copy=False)  # other reads may begin at the same moment
         return read
 
@@ -193,6 +195,7 @@ class Reads(Machine):
         if read.holders <= 0:
             read.drop_callbacks()
             if self._open.get(read.key) is read:
+                self._reschedule()
                 self._drop(read)
 
     def heard(self, message: ParamValue, now: float) -> None:

@@ -29,6 +29,7 @@ class Context:
         round_trip: the measured round-trip time and packet loss.
         trace: takes a line for each step.
         may_send: whether requests may be sent to it; false for listen-only links.
+        reschedule: called when a deadline may have changed although no message was received or sent.
         autopilot: MAV_AUTOPILOT of its heartbeat, None before the first one. Set by `Identification`.
         is_identifying: whether AUTOPILOT_VERSION is requested. Set by `Identification`.
         may_be_another: whether another vehicle may have taken its place since the identification, or has, and
@@ -48,6 +49,7 @@ class Context:
     round_trip: RoundTrip = field(default_factory=RoundTrip)
     trace: Trace = silent
     may_send: bool = True
+    reschedule: Callable[[], None] = lambda: None
     autopilot: int | None = None
     is_identifying: bool = False
     may_be_another: bool = False

@@ -96,6 +96,10 @@ class Host(Protocol):
         """Whether its identity is settled and not being requested."""
 
     @abstractmethod
+    def reschedule(self) -> None:
+        """Take that `next_deadline` has changed."""
+
+    @abstractmethod
     def read_clock(self, now: float) -> None:
         """Have clocks in telemetry read for a while."""
 
@@ -216,6 +220,7 @@ class ComponentPeers:
             self.home = self.speaker = NO_PEER
             self.has_left = True
             self._look_at = min(self._look_at, now)
+            self._host.reschedule()
 
     def forget(self) -> None:
         """Forget all peers: the link is down, and comes back with other peers."""
@@ -261,6 +266,7 @@ class ComponentPeers:
                 return None
             claim = self._others[peer] = Claim(peer, now)
             self._look_at = now
+            self._host.reschedule()
         claim.heard_at = now
         return claim
 
@@ -288,6 +294,7 @@ class ComponentPeers:
         self._decide(difference, now)
         is_settled = not self._others and not self.is_unclear
         self._look_at = math.inf if is_settled else now + REVIEW_INTERVAL
+        self._host.reschedule()
 
     def _judge(self, claim: Claim, now: float) -> str:
         """Compare a further peer with the one that has the address; return the difference as text."""
