@@ -142,6 +142,7 @@ class ComponentMachine:
         version: the MAVLink version of its frames.
         who: its identity and encoding.
         table: its parameters.
+        retry: when its requests count as lost.
         round_trip: round-trip time and loss of its responses.
         presence: whether its messages are received.
         peers: the peers that send with its address, and whether several vehicles do.
@@ -191,6 +192,7 @@ class ComponentMachine:
         self.vehicle: tuple[int, Peer] = (system, peer)
         self.version = 1
         context = Context(target, send, own, trace=trace, may_send=not upkeep.listens_only)
+        self.retry = context.retry
         self.round_trip = context.round_trip
         self.who = Identification(context, link, encoding)
         self.table = Table(self.who.encoding, room)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
+from paramclient.protocol.requests.retry import RetryPolicy
 from paramclient.protocol.requests.round_trip import RoundTrip
 from paramclient.protocol.stats.trace import Trace, silent
 from paramclient.protocol.wire import MAV_AUTOPILOT_ARDUPILOTMEGA, MAV_AUTOPILOT_PX4, Message
@@ -26,7 +27,7 @@ class Context:
         target: system and component.
         send: takes each message for the component, in order.
         own: system and component that requests are sent as.
-        round_trip: the measured round-trip time and packet loss.
+        retry: when its requests count as lost, and when they are given up.
         trace: takes a line for each step.
         may_send: whether requests may be sent to it; false for listen-only links.
         autopilot: MAV_AUTOPILOT of its heartbeat, None before the first one. Set by `Identification`.
@@ -45,7 +46,7 @@ class Context:
     target: tuple[int, int]
     send: Callable[[Message], None]
     own: tuple[int, int] = OWN_ADDRESS
-    round_trip: RoundTrip = field(default_factory=RoundTrip)
+    retry: RetryPolicy = field(default_factory=RetryPolicy)
     trace: Trace = silent
     may_send: bool = True
     autopilot: int | None = None
@@ -57,6 +58,11 @@ class Context:
     has_hash: bool | None = None
     is_writing: bool = False
     is_fetching: bool = False
+
+    @property
+    def round_trip(self) -> RoundTrip:
+        """The measured round-trip time and packet loss."""
+        return self.retry.round_trip
 
     @property
     def is_px4(self) -> bool:

@@ -11,13 +11,11 @@ from paramclient.errors import CommandRefused, CommandResult, NoReply
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
+from paramclient.protocol.requests.retry import CommandAttempts
 from paramclient.protocol.wire import CommandAck, CommandLong
 
 __all__ = ["Command", "Commands"]
 
-PROGRESS_TIMEOUT: Final = 10.0
-"""Seconds for which "in progress" is valid: a component repeats it while it works on a command, and then
-reports the result (MAVLink guide, "Command Protocol": the timeout restarts with each)."""
 CONFIRMATIONS_MAX: Final = 255
 """The largest value of the field that counts repetitions."""
 
@@ -28,19 +26,21 @@ class Command(Operation[None]):
     Attributes:
         number: MAV_CMD.
         params: its seven parameters.
-        repeats: whether it is repeated automatically while it is not acknowledged.
-        attempts: how often it was sent.
-        sent_at: when it was sent last.
+        request: its attempts.
     """
 
-    def __init__(self, number: int, params: tuple[float, ...], repeats: bool, begun_at: float) -> None:
+    def __init__(
+        self, number: int, params: tuple[float, ...], request: CommandAttempts, begun_at: float
+    ) -> None:
         super().__init__(begun_at)
         self.number = number
         self.params = params
-        self.repeats = repeats
-        self.attempts = 0
-        self.sent_at = math.inf
-        self.progress_at: float | None = None
+        self.request = request
+
+    @property
+    def attempts(self) -> int:
+        """How often it was sent."""
+        return self.request.count
 
 
 class Commands(Machine):
@@ -51,19 +51,13 @@ class Commands(Machine):
     timeout, with `confirmation` counted up, as often as a read would be.
 
     Args:
-        target: the component.
-        own: our system and component: acknowledgements to other addresses are ignored.
-        round_trip: the component's.
-        send: takes each message.
+        context: the component's. Acknowledgements to other stations are ignored.
     """
 
-    def __init__(
-        self,
-        context: Context,
-    ) -> None:
+    def __init__(self, context: Context) -> None:
         self._target = context.target
         self._addressees = (context.own, (0, 0))  # MAVLink 1 and older firmware name no addressee
-        self._round_trip = context.round_trip
+        self._policy = context.retry
         self._send = context.send
         self._queues: dict[int, deque[Command]] = {}
 
@@ -80,7 +74,8 @@ class Commands(Machine):
             repeats: whether to repeat it automatically while it is not acknowledged; otherwise only `repeat`
                 does.
         """
-        command = Command(number, (*params, *[0.0] * (7 - len(params))), repeats, now)
+        request = CommandAttempts(self._policy, repeats=repeats)
+        command = Command(number, (*params, *[0.0] * (7 - len(params))), request, now)
         queue = self._queues.setdefault(number, deque())
         queue.append(command)
         if len(queue) == 1:
@@ -90,8 +85,7 @@ class Commands(Machine):
     def repeat(self, command: Command, now: float) -> None:
         """Send a command in progress once more."""
         confirmation = min(command.attempts, CONFIRMATIONS_MAX)
-        command.attempts += 1
-        command.sent_at = now
+        command.request.sent(now)
         self._send(CommandLong(*self._target, command.number, command.params, confirmation))
 
     def cancel(self, command: Command, now: float) -> None:
@@ -106,10 +100,9 @@ class Commands(Machine):
         if queue is None or (message.target_system, message.target_component) not in self._addressees:
             return
         command = queue[0]
-        if command.progress_at is None:
-            self._round_trip.answered(command.sent_at, now, command.attempts)
+        command.request.answered(now)
         if message.result == CommandResult.IN_PROGRESS:
-            command.progress_at = now
+            command.request.progress_at = now
             return
         self._leave(command, now)
         if message.result == CommandResult.ACCEPTED:
@@ -121,25 +114,24 @@ class Commands(Machine):
         """Repeat or give up unacknowledged commands."""
         for queue in list(self._queues.values()):
             command = queue[0]
-            if self._due(command) > now:
+            if command.request.due_at > now:
                 continue
-            if command.progress_at is None:
-                self._round_trip.timed_out(command.attempts)
-                if not self._round_trip.is_hopeless(command.attempts, now):
-                    self.repeat(command, now)
-                    continue
-            self._leave(command, now)
-            command.fail(self._no_reply(command, now), now)
+            command.request.timed_out()
+            if command.request.is_hopeless(now):
+                self._leave(command, now)
+                command.fail(self._no_reply(command, now), now)
+            else:
+                self.repeat(command, now)
 
     def next_deadline(self) -> float:
         """Return when `tick` is due, or infinity."""
-        return min((self._due(queue[0]) for queue in self._queues.values()), default=math.inf)
+        return min((queue[0].request.due_at for queue in self._queues.values()), default=math.inf)
 
     def resume(self, now: float) -> None:
         """Repeat commands in progress: the link is back."""
         for queue in self._queues.values():
-            if queue[0].repeats:
-                queue[0].attempts -= 1
+            if queue[0].request.repeats:
+                queue[0].request.uncount()
                 self.repeat(queue[0], now)
 
     def lose(self, now: float, why: str = " (lost)") -> None:
@@ -149,11 +141,6 @@ class Commands(Machine):
     def fail_all(self, error: Exception, now: float) -> None:
         """End all commands with the error."""
         self._end_all(lambda command: error, now)
-
-    def _due(self, command: Command) -> float:
-        if command.progress_at is not None:
-            return command.progress_at + PROGRESS_TIMEOUT
-        return command.sent_at + self._round_trip.timeout if command.repeats else math.inf
 
     def _leave(self, command: Command, now: float) -> None:
         queue = self._queues[command.number]

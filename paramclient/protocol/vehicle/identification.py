@@ -10,6 +10,7 @@ from paramclient.model.identity import Identity
 from paramclient.model.values import Encoding
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
+from paramclient.protocol.requests.retry import VersionAttempts
 from paramclient.protocol.wire import (
     AUTOPILOT_VERSION_ID,
     CAPABILITY_FTP,
@@ -36,25 +37,11 @@ PX4_WITH_FILE: Final = 0x01120000
 ARDUPILOT_WITH_DEFAULTS: Final = 0x04040000
 """flight_sw_version of the first ArduPilot of which every build adds the defaults to that file: 4.4. They
 were added during the development of 4.3."""
-VERSION_ATTEMPTS: Final = 4
-"""Requests for AUTOPILOT_VERSION where nothing is known of the link, or after a refusal; many components
-(cameras, radios) never send one."""
 HEARTBEAT_WAIT: Final = 3.0
 """Seconds for which the encoding stays open after a version without encoding bits and before a heartbeat:
 autopilots send one every second."""
 ENCODING_CAPABILITIES: Final = CAPABILITY_PARAM_ENCODE_BYTEWISE | CAPABILITY_PARAM_ENCODE_C_CAST
 """The capability bits that tell the encoding."""
-VERSION_DELAY: Final = 0.1
-"""Seconds between the acknowledgement of the request and AUTOPILOT_VERSION; later, it counts as lost."""
-DOUBT_TIME_MIN: Final = 5.0
-"""Seconds, at least, for which a component that has sent it before is asked again: it may be booting."""
-DOUBT_REQUEST_INTERVAL: Final = 1.0
-"""Seconds between two requests after the usual number of them."""
-LATER_REQUEST_INTERVAL: Final = 5.0
-"""Seconds between two requests to a component that has sent its hardware id before and did not in that time,
-while it is not lost: its radio may have received nothing."""
-
-
 _COMMANDS: Final = (
     (MAV_CMD_REQUEST_MESSAGE, float(AUTOPILOT_VERSION_ID)),
     (MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, 1.0),
@@ -96,7 +83,6 @@ class Identification(Machine):
     Attributes:
         identity: the vehicle's identity; without a hardware id until AUTOPILOT_VERSION is received.
         known_at: when the version was received; minus infinity before.
-        attempts: requests since the identity was open.
         doubted_at: since when the identity is in doubt; minus infinity before the first doubt.
         settled: whether `identity` is as complete as it gets: the version was received, or never will be.
         autopilot, vehicle_type: of the heartbeat; None before the first.
@@ -111,7 +97,7 @@ class Identification(Machine):
     ) -> None:
         self._context = context
         self._target = context.target
-        self._round_trip = context.round_trip
+        self._version_request = VersionAttempts(context.retry)
         self._send = context.send
         self._chosen = chosen
         self._may_ask = context.may_send
@@ -121,17 +107,17 @@ class Identification(Machine):
         self.autopilot: int | None = None
         self.vehicle_type: int | None = None
         self.capabilities: int | None = None
-        self.attempts = 0
         self.doubted_at = -math.inf
-        self._asked_at = -math.inf
-        self._asks_until = -math.inf  # regardless of the number of requests
-        self._denied_at = math.inf  # when the last of the commands was refused
-        self._lost_at = math.inf  # when the acknowledged response counts as lost
         self._beat_awaited_until = math.inf  # while a heartbeat may still tell the encoding
         self._heard_at = -math.inf
         self._was_doubted = False  # since the last version
         self.encoding, self.encoding_reason = judge_encoding(chosen, None, None)
         self._derive()
+
+    @property
+    def attempts(self) -> int:
+        """Requests since the identity was open."""
+        return self._version_request.count
 
     @property
     def was_away(self) -> bool:
@@ -234,10 +220,10 @@ class Identification(Machine):
             is_open = self._may_ask and (self.settled or self.was_away)
             self.was_away = self.identity.uid is not None or is_open
             self._was_doubted = self._was_doubted or self.settled
-            self.attempts = 0
+            self._version_request.restart()
             self.doubted_at = now
             if self.identity.uid is not None:
-                self._asks_until = now + DOUBT_TIME_MIN
+                self._version_request.insist(now)
             self._ask(now)
 
     def forget(self, now: float) -> None:
@@ -251,9 +237,9 @@ class Identification(Machine):
         self._derive()
         self.was_away = True
         self._was_doubted = False
-        self.attempts = 0
+        self._version_request.restart()
         self.doubted_at = now
-        self._asks_until = now + DOUBT_TIME_MIN
+        self._version_request.insist(now)
         self._ask(now)
 
     def version(self, message: AutopilotVersion, now: float) -> bool:
@@ -264,7 +250,7 @@ class Identification(Machine):
         """
         was_unconfirmed = self.is_unconfirmed
         if self._context.is_identifying:
-            self._round_trip.answered(self._asked_at, now, self.attempts)
+            self._version_request.answered(now)
         self._context.is_identifying = self.was_away = False
         system, _ = self._target
         before = self.identity
@@ -296,7 +282,7 @@ class Identification(Machine):
     def ask_again(self, now: float) -> None:
         """Request the identity again, if it was ever received: another vehicle may have taken the address."""
         if self.identity.uid is not None and not self._context.is_identifying:
-            self.attempts = 0
+            self._version_request.restart()
             self._ask(now)
 
     def lose(self, now: float) -> None:
@@ -312,9 +298,9 @@ class Identification(Machine):
         asked = (MAV_CMD_REQUEST_MESSAGE, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES)
         if self._context.is_identifying and message.command in asked:
             if message.result != MAV_RESULT_ACCEPTED:
-                self._denied_at = now
+                self._version_request.denied(now)
             else:
-                self._lost_at = min(self._lost_at, now + VERSION_DELAY)
+                self._version_request.accepted(now)
 
     def tick(self, now: float) -> None:
         """Repeat the request, or give up."""
@@ -329,44 +315,35 @@ class Identification(Machine):
 
     def _next_request_at(self) -> float:
         """Return when to repeat the request, or infinity; it depends on the measured round trip."""
+        request = self._version_request
         if self.is_unconfirmed:
-            return self._asked_at + LATER_REQUEST_INTERVAL if self._heard_at > self._asked_at else math.inf
-        if not self._context.is_identifying:
-            return math.inf
-        pause = self._round_trip.repeat_timeout(self.attempts)
-        if self.attempts >= self._tries and self._asked_at < self._asks_until:
-            pause = max(pause, DOUBT_REQUEST_INTERVAL)
-        return min(self._denied_at, self._lost_at, self._asked_at + pause)
-
-    @property
-    def _tries(self) -> int:
-        is_blind = self._round_trip.smoothed is None or self._denied_at < math.inf
-        return VERSION_ATTEMPTS if is_blind else self._round_trip.tries
+            return request.later_at if self._heard_at > request.sent_at else math.inf
+        return request.due_at if self._context.is_identifying else math.inf
 
     def _ask(self, now: float) -> None:
         if not self._may_ask:
             return
+        request = self._version_request
         if self.is_unconfirmed and self.attempts:
-            self._request(now, _COMMANDS)
+            request.sent_later(now)
+            self._request(_COMMANDS)
             return
-        if self.attempts >= self._tries and now >= self._asks_until:
+        if request.is_hopeless(now):
             self._context.is_identifying = False
             self.settled = True
             self.was_away = self.was_away and self.identity.uid is not None
             return
-        was_refused = self._denied_at < math.inf
-        self.attempts += 1
+        was_refused = request.is_denied
+        request.sent(now)
         self._context.is_identifying = True
         ways: tuple[tuple[int, float], ...] = _COMMANDS
         if was_refused:
             ways = (_COMMANDS[(self.attempts + 1) % 2],)
         elif self.attempts == 1:
             ways = _COMMANDS[:1]
-        self._request(now, ways)  # after silence both: a request or its response may have been lost
+        self._request(ways)  # after silence both: a request or its response may have been lost
 
-    def _request(self, now: float, ways: tuple[tuple[int, float], ...]) -> None:
-        self._asked_at = now
-        self._denied_at = self._lost_at = math.inf
+    def _request(self, ways: tuple[tuple[int, float], ...]) -> None:
         for command, first in ways:
             self._send(CommandLong(*self._target, command, (first, *[0.0] * 6)))
 

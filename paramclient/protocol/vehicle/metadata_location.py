@@ -13,6 +13,7 @@ from paramclient.errors import CommandResult, NoReply
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
+from paramclient.protocol.requests.retry import Attempts
 from paramclient.protocol.wire import (
     COMPONENT_METADATA_ID,
     MAV_CMD_REQUEST_MESSAGE,
@@ -54,10 +55,10 @@ class Descriptions(Machine):
         self._context = context
         self._target = context.target
         self._own = context.own
-        self._round_trip = context.round_trip
+        self._policy = context.retry
+        self._request = Attempts(context.retry)
         self._send = context.send
         self._asks: list[DescriptionAsk] = []
-        self._asked_at = -math.inf
 
     @property
     def is_asking(self) -> bool:
@@ -70,9 +71,9 @@ class Descriptions(Machine):
         self._asks.append(ask)
         self._context.is_locating_metadata = True
         if len(self._asks) == 1:
-            self._request(now)
-        else:
-            ask.attempts = self._asks[0].attempts
+            self._request = Attempts(self._policy)
+            self._transmit(now)
+        ask.attempts = self._request.count
         return ask
 
     def release(self, ask: DescriptionAsk) -> None:
@@ -84,7 +85,7 @@ class Descriptions(Machine):
     def heard(self, message: ComponentMetadata, now: float) -> None:
         """Process COMPONENT_METADATA; an empty address means none."""
         if self._asks:
-            self._round_trip.answered(self._asked_at, now, self._asks[0].attempts)
+            self._request.answered(now)
             self._finish(message if message.uri else None, now)
 
     def acknowledged(self, message: CommandAck, now: float) -> None:
@@ -92,23 +93,22 @@ class Descriptions(Machine):
         is_ours = (message.target_system, message.target_component) in (self._own, (0, 0))
         is_meant = message.command == MAV_CMD_REQUEST_MESSAGE and is_ours and not self._context.is_identifying
         if self._asks and is_meant and message.result in NOT_SUPPORTED:
-            self._round_trip.answered(self._asked_at, now, self._asks[0].attempts)
+            self._request.answered(now)
             self._finish(None, now)
 
     def tick(self, now: float) -> None:
         """Repeat the request, or give up."""
         if self.next_deadline() > now:
             return
-        first = self._asks[0]
-        self._round_trip.timed_out(first.attempts)
-        if self._round_trip.is_hopeless(first.attempts, now):
+        self._request.timed_out()
+        if self._request.is_hopeless(now):
             self._give_up("", now)
         else:
-            self._request(now)
+            self._transmit(now)
 
     def next_deadline(self) -> float:
         """Return when `tick` is due, or infinity."""
-        return self._asked_at + self._round_trip.timeout if self._asks else math.inf
+        return self._request.due_at if self._asks else math.inf
 
     def lose(self, now: float) -> None:
         """End the request with NoReply: the component is lost."""
@@ -117,7 +117,7 @@ class Descriptions(Machine):
     def resume(self, now: float) -> None:
         """Repeat the request: the link is back."""
         if self._asks:
-            self._request(now)
+            self._transmit(now)
 
     def fail_all(self, error: Exception, now: float) -> None:
         """End the request with the error."""
@@ -133,10 +133,10 @@ class Descriptions(Machine):
         for ask in asks:
             ask.fail(NoReply(what, attempts=ask.attempts, waited=now - ask.begun_at), now)
 
-    def _request(self, now: float) -> None:
-        self._asked_at = now
+    def _transmit(self, now: float) -> None:
+        self._request.sent(now)
         for ask in self._asks:
-            ask.attempts += 1
+            ask.attempts = self._request.count
         first = (float(COMPONENT_METADATA_ID), *[0.0] * 6)
         self._send(CommandLong(*self._target, MAV_CMD_REQUEST_MESSAGE, first))
 

@@ -9,14 +9,14 @@ import pytest
 
 from paramclient.model.values import Encoding
 from paramclient.protocol.requests.context import Context
-from paramclient.protocol.requests.round_trip import FIRST_TIMEOUT, RoundTrip
-from paramclient.protocol.vehicle.identification import (
+from paramclient.protocol.requests.retry import (
     DOUBT_REQUEST_INTERVAL,
     DOUBT_TIME_MIN,
+    FIRST_TIMEOUT,
     VERSION_ATTEMPTS,
-    Identification,
-    judge_encoding,
+    RetryPolicy,
 )
+from paramclient.protocol.vehicle.identification import Identification, judge_encoding
 from paramclient.protocol.wire import (
     AUTOPILOT_VERSION_ID,
     CAPABILITY_PARAM_ENCODE_BYTEWISE,
@@ -51,8 +51,9 @@ class Desk:
 
     def __init__(self, chosen: Encoding | None = None) -> None:
         self.sent: list[Message] = []
-        self.trip = RoundTrip()
-        self.who = Identification(Context((1, 1), self.sent.append, round_trip=self.trip), "udpin:x", chosen)
+        self.retry = RetryPolicy()
+        self.trip = self.retry.round_trip
+        self.who = Identification(Context((1, 1), self.sent.append, retry=self.retry), "udpin:x", chosen)
 
     def beat(self, heartbeat: Heartbeat, now: float = 0.0) -> None:
         self.who.heartbeat(heartbeat)
@@ -299,7 +300,7 @@ def test_an_answer_that_never_comes_again_leaves_what_is_known() -> None:
 def test_one_that_was_away_is_asked_for_five_seconds_and_not_more_than_once_a_second_in_the_end() -> None:
     desk = settled(7)
     for _ in range(50):
-        desk.trip.answered(0.0, 0.02, 1)  # a quick link, on which five tries take half a second
+        desk.retry.answered(0.0, 0.02, 1)  # a quick link, on which five tries take half a second
     desk.who.doubt(30.0)
     times = [30.0]
     while (deadline := desk.who.next_deadline()) < math.inf:
@@ -307,7 +308,7 @@ def test_one_that_was_away_is_asked_for_five_seconds_and_not_more_than_once_a_se
         assert not desk.who.may_be_written
         times.append(deadline)
         desk.who.tick(deadline)
-    usual = desk.trip.tries
+    usual = desk.retry.tries
     assert times[-1] >= 30.0 + DOUBT_TIME_MIN
     assert all(after - before >= DOUBT_REQUEST_INTERVAL for before, after in pairwise(times[usual - 1 : -1]))
     assert len(times) <= usual + DOUBT_TIME_MIN / DOUBT_REQUEST_INTERVAL + 2
