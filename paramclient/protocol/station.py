@@ -26,6 +26,7 @@ from paramclient.protocol.scheduler import Turns
 from paramclient.protocol.stats.trace import Told, Trace, silent
 from paramclient.protocol.stats.traffic import Traffic
 from paramclient.protocol.vehicle.boot_time_sampling import ClockSampling
+from paramclient.protocol.vehicle.commands import message_requests
 from paramclient.protocol.vehicle.peers import NO_PEER
 from paramclient.protocol.wire import (
     AUTOPILOT_COMPONENT,
@@ -34,11 +35,9 @@ from paramclient.protocol.wire import (
     COMP_ID_MISSIONPLANNER,
     HEARTBEAT_ID,
     MAV_AUTOPILOT_INVALID,
-    MAV_CMD_REQUEST_MESSAGE,
     MAV_STATE_ACTIVE,
     MAV_TYPE_GCS,
     PARAM_VALUE_ID,
-    CommandLong,
     FileTransfer,
     Frame,
     Framer,
@@ -571,9 +570,8 @@ class Station:
                 if self._awaits_autopilot:
                     self._heartbeat_requests += 1
                     self._awaits_autopilot = self._heartbeat_requests < HEARTBEAT_REQUESTS.count
-                request = (float(HEARTBEAT_ID), *[0.0] * 6)
-                command = CommandLong(frame.system, frame.component, MAV_CMD_REQUEST_MESSAGE, request)
-                self._transmit(command, peer, frame.version)
+                for message in message_requests(address, HEARTBEAT_ID):
+                    self._transmit(message, peer, frame.version)
                 return True
         return False
 

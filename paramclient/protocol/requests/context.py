@@ -37,7 +37,8 @@ class Context:
         serves_file: whether it serves its table as a file over MAVFTP, as far as known. Set by
             `Identification`.
         adds_defaults: whether it is known to serve that file with defaults. Set by `Identification`.
-        is_locating_metadata: whether COMPONENT_METADATA is requested. Set by `Descriptions`.
+        is_requesting_message: whether a message is requested, so that an acknowledgement is awaited. Set by
+            `MessageRequests`.
         has_hash: whether it has a `_HASH_CHECK`; None while unknown. Set by `Sync`.
         is_writing: whether a write is in progress. Set by `Writes`.
         is_fetching: whether a fetch is in progress. Set by `Fetches`.
@@ -54,7 +55,7 @@ class Context:
     may_be_another: bool = False
     serves_file: bool = False
     adds_defaults: bool = False
-    is_locating_metadata: bool = False
+    is_requesting_message: bool = False
     has_hash: bool | None = None
     is_writing: bool = False
     is_fetching: bool = False

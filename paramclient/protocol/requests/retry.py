@@ -3,9 +3,9 @@
 `RetryPolicy` has the timeouts of one component, by its measured round trip and packet loss. Each kind of
 request has a class of its own, whose objects count the attempts of one request:
 
-- `Attempts`: COMPONENT_METADATA, and the rule that the others refine.
+- `Attempts`: the rule that the others refine.
 - `WriteAttempts`: PARAM_SET.
-- `CommandAttempts`: COMMAND_LONG. `VersionAttempts`: AUTOPILOT_VERSION.
+- `CommandAttempts`: COMMAND_LONG. `MessageAttempts`, `VersionAttempts`: MAV_CMD_REQUEST_MESSAGE.
 - `ReadAttempts`, `ReadRetries`: PARAM_REQUEST_READ. `NameRetries`: the search for names.
 - `ListAttempts`: PARAM_REQUEST_LIST.
 - `FileAttempts`, `BurstAttempts`, `BlockRetries`: MAVFTP. `OpenRetries`: the parameter file.
@@ -53,6 +53,7 @@ __all__ = [
     "CommandAttempts",
     "FileAttempts",
     "ListAttempts",
+    "MessageAttempts",
     "NameRetries",
     "OpenRetries",
     "ReadAttempts",
@@ -388,7 +389,7 @@ class CommandAttempts(Attempts):
         return self.count >= REBOOT_COMMANDS_MAX
 
 
-# AUTOPILOT_VERSION
+# MAV_CMD_REQUEST_MESSAGE
 
 VERSION_ATTEMPTS: Final = 4
 """Requests for AUTOPILOT_VERSION where nothing is known of the link, or after a refusal; many components
@@ -404,12 +405,25 @@ LATER_REQUEST_INTERVAL: Final = 5.0
 while it is not lost: its radio may have received nothing."""
 
 
-class VersionAttempts(Attempts):
-    """The requests for AUTOPILOT_VERSION since the identity was open.
+class MessageAttempts(Attempts):
+    """The attempts of one MAV_CMD_REQUEST_MESSAGE: for COMPONENT_METADATA, or by a rule of its own."""
 
-    Attributes:
-        is_denied: whether the last request was refused.
-    """
+    __slots__ = ()
+
+    def denied(self, now: float) -> None:
+        """Record a refusal."""
+
+    def accepted(self, now: float) -> None:
+        """Record an acknowledgement."""
+
+    @property
+    def is_denied(self) -> bool:
+        """Whether the last request was refused, so that another command is to be used."""
+        return False
+
+
+class VersionAttempts(MessageAttempts):
+    """The requests for AUTOPILOT_VERSION since the identity was open."""
 
     __slots__ = ("_denied_at", "_lost_at", "_until")
 
@@ -444,6 +458,9 @@ class VersionAttempts(Attempts):
     def accepted(self, now: float) -> None:
         """Record an acknowledgement: the version follows at once, or was lost."""
         self._lost_at = min(self._lost_at, now + VERSION_DELAY)
+
+    def timed_out(self) -> None:
+        """Record nothing: a component that never sends its version says nothing of the link."""
 
     @property
     def is_denied(self) -> bool:

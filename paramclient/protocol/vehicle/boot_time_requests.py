@@ -7,12 +7,9 @@ import math
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.retry import BASELINE_DELAY, CLOCK_FOLLOW_DELAY, ClockSchedule
+from paramclient.protocol.vehicle.commands import MessageRequests
 from paramclient.protocol.vehicle.presence import Presence
-from paramclient.protocol.wire import (
-    MAV_CMD_REQUEST_MESSAGE,
-    SYSTEM_TIME_ID,
-    CommandLong,
-)
+from paramclient.protocol.wire import SYSTEM_TIME_ID
 
 __all__ = ["ClockRequests"]
 
@@ -25,19 +22,19 @@ class ClockRequests(Machine):
     COMMAND_ACK names MAV_CMD_REQUEST_MESSAGE and not the message.
 
     Args:
-        context: the component's.
+        context, messages: the component's.
         presence: the component's; its `clock_at` says when its clock was received.
     """
 
     def __init__(
         self,
         context: Context,
+        messages: MessageRequests,
         presence: Presence,
     ) -> None:
         self._context = context
-        self._target = context.target
+        self._messages = messages
         self._presence = presence
-        self._send = context.send
         self._wanted_after = -math.inf  # wanted: a clock received after this
         self._schedule = ClockSchedule()
         self._request_at = math.inf
@@ -89,13 +86,11 @@ class ClockRequests(Machine):
         if is_baseline and (self._presence.is_lost or self._presence.is_overdue(now)):
             return
         if now - self._presence.clock_at >= pace:  # otherwise its clock is received anyway
-            first = (float(SYSTEM_TIME_ID), *[0.0] * 6)
-            self._send(CommandLong(*self._target, MAV_CMD_REQUEST_MESSAGE, first))
+            self._messages.send(SYSTEM_TIME_ID)
 
     def next_deadline(self) -> float:
         """Return when `tick` is due, or infinity."""
-        is_requesting = self._context.is_identifying or self._context.is_locating_metadata
-        return math.inf if is_requesting else self._request_at
+        return math.inf if self._context.is_requesting_message else self._request_at
 
     def _begin(self, wanted_after: float, schedule: ClockSchedule) -> None:
         if self._context.may_send:

@@ -11,6 +11,7 @@ from paramclient.model.values import Encoding
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.retry import VersionAttempts
+from paramclient.protocol.vehicle.commands import MessageRequest, MessageRequests
 from paramclient.protocol.wire import (
     AUTOPILOT_VERSION_ID,
     CAPABILITY_FTP,
@@ -19,13 +20,8 @@ from paramclient.protocol.wire import (
     MAV_AUTOPILOT_ARDUPILOTMEGA,
     MAV_AUTOPILOT_INVALID,
     MAV_AUTOPILOT_PX4,
-    MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
-    MAV_CMD_REQUEST_MESSAGE,
-    MAV_RESULT_ACCEPTED,
     MAV_TYPE_GCS,
     AutopilotVersion,
-    CommandAck,
-    CommandLong,
     Heartbeat,
     HighLatency2,
 )
@@ -42,11 +38,6 @@ HEARTBEAT_WAIT: Final = 3.0
 autopilots send one every second."""
 ENCODING_CAPABILITIES: Final = CAPABILITY_PARAM_ENCODE_BYTEWISE | CAPABILITY_PARAM_ENCODE_C_CAST
 """The capability bits that tell the encoding."""
-_COMMANDS: Final = (
-    (MAV_CMD_REQUEST_MESSAGE, float(AUTOPILOT_VERSION_ID)),
-    (MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, 1.0),
-)
-"""The commands that request AUTOPILOT_VERSION, and their first parameters."""
 
 
 def judge_encoding(
@@ -80,6 +71,11 @@ def judge_encoding(
 class Identification(Machine):
     """Follows a component's heartbeat, requests its AUTOPILOT_VERSION, and derives identity and encoding.
 
+    Args:
+        context, messages: the component's.
+        link: the link's name.
+        chosen: the encoding that the user has chosen, or None.
+
     Attributes:
         identity: the vehicle's identity; without a hardware id until AUTOPILOT_VERSION is received.
         known_at: when the version was received; minus infinity before.
@@ -92,13 +88,15 @@ class Identification(Machine):
     def __init__(
         self,
         context: Context,
+        messages: MessageRequests,
         link: str,
         chosen: Encoding | None,
     ) -> None:
         self._context = context
         self._target = context.target
-        self._version_request = VersionAttempts(context.retry)
-        self._send = context.send
+        self._messages = messages
+        self._attempts = VersionAttempts(context.retry)
+        self._request: MessageRequest | None = None
         self._chosen = chosen
         self._may_ask = context.may_send
         self.identity = Identity(context.target[0], link)
@@ -117,7 +115,7 @@ class Identification(Machine):
     @property
     def attempts(self) -> int:
         """Requests since the identity was open."""
-        return self._version_request.count
+        return self._attempts.count
 
     @property
     def was_away(self) -> bool:
@@ -220,10 +218,9 @@ class Identification(Machine):
             is_open = self._may_ask and (self.settled or self.was_away)
             self.was_away = self.identity.uid is not None or is_open
             self._was_doubted = self._was_doubted or self.settled
-            self._version_request.restart()
             self.doubted_at = now
             if self.identity.uid is not None:
-                self._version_request.insist(now)
+                self._attempts.insist(now)
             self._ask(now)
 
     def forget(self, now: float) -> None:
@@ -237,9 +234,8 @@ class Identification(Machine):
         self._derive()
         self.was_away = True
         self._was_doubted = False
-        self._version_request.restart()
         self.doubted_at = now
-        self._version_request.insist(now)
+        self._attempts.insist(now)
         self._ask(now)
 
     def version(self, message: AutopilotVersion, now: float) -> bool:
@@ -249,8 +245,7 @@ class Identification(Machine):
         replaced, and with any after a time in which the identity was in doubt.
         """
         was_unconfirmed = self.is_unconfirmed
-        if self._context.is_identifying:
-            self._version_request.answered(now)
+        self._messages.received(AUTOPILOT_VERSION_ID, now)
         self._context.is_identifying = self.was_away = False
         system, _ = self._target
         before = self.identity
@@ -282,70 +277,46 @@ class Identification(Machine):
     def ask_again(self, now: float) -> None:
         """Request the identity again, if it was ever received: another vehicle may have taken the address."""
         if self.identity.uid is not None and not self._context.is_identifying:
-            self._version_request.restart()
             self._ask(now)
 
     def lose(self, now: float) -> None:
         """Stop requests to an identified component until it is heard again; other requests continue."""
-        if self.settled:
+        if self.settled and self._request is not None:
+            self._messages.end(self._request)
             self._context.is_identifying = False
 
-    def acknowledged(self, message: CommandAck, now: float) -> None:
-        """Process a COMMAND_ACK: after a refusal the other command is sent at once.
-
-        An accepted request is followed by the version at once, or the version was lost.
-        """
-        asked = (MAV_CMD_REQUEST_MESSAGE, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES)
-        if self._context.is_identifying and message.command in asked:
-            if message.result != MAV_RESULT_ACCEPTED:
-                self._version_request.denied(now)
-            else:
-                self._version_request.accepted(now)
-
     def tick(self, now: float) -> None:
-        """Repeat the request, or give up."""
+        """Request the identity later once more, and stop waiting for a heartbeat."""
         if self._beat_awaited_until <= now:
             self._beat_awaited_until = math.inf
-        if self._next_request_at() <= now:
-            self._ask(now)
+        if self._later_at <= now:
+            self._attempts.sent_later(now)
+            self._messages.send(AUTOPILOT_VERSION_ID)
 
     def next_deadline(self) -> float:
         """Return when `tick` is due, or infinity."""
-        return min(self._next_request_at(), self._beat_awaited_until)
+        return min(self._later_at, self._beat_awaited_until)
 
-    def _next_request_at(self) -> float:
-        """Return when to repeat the request, or infinity; it depends on the measured round trip."""
-        request = self._version_request
-        if self.is_unconfirmed:
-            return request.later_at if self._heard_at > request.sent_at else math.inf
-        return request.due_at if self._context.is_identifying else math.inf
+    @property
+    def _later_at(self) -> float:
+        """When to request the identity after it was requested without success, or infinity."""
+        is_due = self.is_unconfirmed and self._heard_at > self._attempts.sent_at
+        return self._attempts.later_at if is_due else math.inf
 
     def _ask(self, now: float) -> None:
-        if not self._may_ask:
-            return
-        request = self._version_request
-        if self.is_unconfirmed and self.attempts:
-            request.sent_later(now)
-            self._request(_COMMANDS)
-            return
-        if request.is_hopeless(now):
-            self._context.is_identifying = False
+        """Begin to request the identity, or begin again."""
+        self._attempts.restart()
+        if self._may_ask:
+            self._context.is_identifying = True
+            request = self._request = self._messages.begin(AUTOPILOT_VERSION_ID, self._attempts, now)
+            request.on_done.append(self._ended)
+
+    def _ended(self) -> None:
+        """Process the end of the request: the version was received, or never will be."""
+        self._context.is_identifying = False
+        if self._request is not None and self._request.error is not None:
             self.settled = True
             self.was_away = self.was_away and self.identity.uid is not None
-            return
-        was_refused = request.is_denied
-        request.sent(now)
-        self._context.is_identifying = True
-        ways: tuple[tuple[int, float], ...] = _COMMANDS
-        if was_refused:
-            ways = (_COMMANDS[(self.attempts + 1) % 2],)
-        elif self.attempts == 1:
-            ways = _COMMANDS[:1]
-        self._request(ways)  # after silence both: a request or its response may have been lost
-
-    def _request(self, ways: tuple[tuple[int, float], ...]) -> None:
-        for command, first in ways:
-            self._send(CommandLong(*self._target, command, (first, *[0.0] * 6)))
 
     def _derive(self) -> None:
         """Derive encoding and identity from what the component has sent."""

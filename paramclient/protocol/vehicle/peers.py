@@ -11,13 +11,11 @@ from paramclient.errors import ContestedAddress
 from paramclient.protocol.addresses import Peer
 from paramclient.protocol.requests.retry import PEER_RECHECKS, PEER_REQUESTS
 from paramclient.protocol.vehicle.claims import Claim, Verdict, compare, compare_in_turn
+from paramclient.protocol.vehicle.commands import message_requests
 from paramclient.protocol.vehicle.presence import LOST_AFTER, Presence
 from paramclient.protocol.wire import (
     AUTOPILOT_VERSION_ID,
-    MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
-    MAV_CMD_REQUEST_MESSAGE,
     SYSTEM_TIME_ID,
-    CommandLong,
     Message,
 )
 
@@ -425,10 +423,7 @@ class ComponentPeers:
         """Request identity and boot time from a peer."""
         claim.asked_at = now
         if claim.uid.current is None:
-            self._request(claim, AUTOPILOT_VERSION_ID)
-            if claim.asks > 1:
-                ask = CommandLong(*self._target, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, (1.0, *[0.0] * 6))
-                self._host.send_to(ask, claim.peer)
+            self._request(claim, AUTOPILOT_VERSION_ID, also_otherwise=claim.asks > 1)
         self._request(claim, SYSTEM_TIME_ID)
 
     def _ask_again(self, claim: Claim, now: float) -> None:
@@ -437,9 +432,11 @@ class ComponentPeers:
             claim.asked_at = now
             self._request(claim, AUTOPILOT_VERSION_ID)
 
-    def _request(self, claim: Claim, message_id: int) -> None:
-        command = CommandLong(*self._target, MAV_CMD_REQUEST_MESSAGE, (float(message_id), *[0.0] * 6))
-        self._host.send_to(command, claim.peer)
+    def _request(self, claim: Claim, message_id: int, *, also_otherwise: bool = False) -> None:
+        """Request a message from a peer, also with the other commands for it if that is wanted."""
+        ways = message_requests(self._target, message_id)
+        for message in ways if also_otherwise else ways[:1]:
+            self._host.send_to(message, claim.peer)
 
 
 def _preference(claim: Claim) -> tuple[bool, float]:

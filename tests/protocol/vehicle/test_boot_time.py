@@ -23,6 +23,7 @@ from paramclient.protocol.requests.retry import (
 from paramclient.protocol.station import Station
 from paramclient.protocol.vehicle.boot_time_requests import ClockRequests
 from paramclient.protocol.vehicle.boot_time_sampling import SAMPLE_TIME, ClockSampling
+from paramclient.protocol.vehicle.commands import MessageRequests
 from paramclient.protocol.vehicle.presence import Presence
 from paramclient.protocol.wire import (
     MAV_AUTOPILOT_ARDUPILOTMEGA,
@@ -68,7 +69,7 @@ class Requests:
             self.sent.append(self.now)
 
         self.context = Context((1, 1), send, may_send=may_send)
-        self.requests = ClockRequests(self.context, self.presence)
+        self.requests = ClockRequests(self.context, MessageRequests(self.context), self.presence)
 
     def run(self, until: float) -> list[float]:
         """Give the requests that are sent until then."""
@@ -143,10 +144,10 @@ def test_after_the_command_to_restart_it_is_asked_until_it_is_back() -> None:
 
 def test_another_message_that_is_requested_goes_first() -> None:
     desk = Requests()
-    desk.context.is_identifying = True
+    desk.context.is_requesting_message = True
     desk.requests.want(desk.now)
     assert desk.run(1.0) == []
-    desk.context.is_identifying = False
+    desk.context.is_requesting_message = False
     assert desk.run(1.1) == [1.0]
 
 
