@@ -298,6 +298,8 @@ class Writes(Machine):
         """Verify, repeat and give up writes; nothing while writes are not permitted."""
         if not self._permission.may_be_written:
             return
+        # all by one timeout: the first of them may change it
+        overdue = {queue[0] for queue in self.queues.values() if queue[0].request.due_at <= now}
         for queue in list(self.queues.values()):
             if not queue:
                 continue
@@ -305,7 +307,7 @@ class Writes(Machine):
             if write.verify_at <= now:  # also for a watched write at the end of that time
                 write.verify_at = math.inf
                 self._read(write, now)
-            elif self._awaits_answer(write) and not write.is_answered and write.request.due_at <= now:
+            elif write in overdue and self._awaits_answer(write) and not write.is_answered:
                 write.request.timed_out()
                 if write.request.is_hopeless(now):
                     # reads in between have shown that nothing was applied
