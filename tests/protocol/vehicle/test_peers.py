@@ -12,7 +12,7 @@ from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ComponentContested, ComponentReplaced, ComponentUncontested, Event
 from paramclient.protocol.params.sync import Upkeep
-from paramclient.protocol.requests.retry import PEER_REQUESTS
+from paramclient.protocol.requests.retry import PEER_REQUESTS, PEER_REQUESTS_MAX
 from paramclient.protocol.station import Station
 from paramclient.protocol.vehicle import peers as room
 from paramclient.protocol.vehicle.presence import LOST_AFTER
@@ -237,7 +237,7 @@ def test_heartbeats_at_20_hz_divert_no_request() -> None:
     net.run(PEER_REQUESTS.duration)
     assert net.kinds() == ["Contested"]
     asked = [each for each in forger.heard if isinstance(each, CommandLong)]
-    assert len(asked) <= 3 * PEER_REQUESTS.count
+    assert len(asked) <= 3 * PEER_REQUESTS_MAX
     assert net.machine.table.params["P"].value == 1.0
 
 
