@@ -365,6 +365,32 @@ def test_only_the_client_chooses_the_remote_one() -> None:
     assert uses == {"paramclient.client.client"}
 
 
+RETRY_WORDS = re.compile(r"ATTEMPTS|RETRY|BACKOFF|COPIES")
+
+
+def constants_of(module: str) -> set[str]:
+    return {
+        node.target.id
+        for node in source_of(module).body
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)
+    }
+
+
+def test_to_change_a_retry_rule_is_to_change_one_module() -> None:
+    """The scheduler repeats no requests: it tries again to run more lists in parallel."""
+    core = {module for module in MODULES if module.startswith("paramclient.protocol.")}
+    rules = {module for module in core if any(map(RETRY_WORDS.search, constants_of(module)))}
+    assert rules - {"paramclient.protocol.scheduler"} == {"paramclient.protocol.requests.retry"}
+
+
+def test_one_module_requests_messages() -> None:
+    core = {module for module in MODULES if module.startswith("paramclient.protocol.")}
+    uses = {
+        module for module in core for each in imports_of(module) if "MAV_CMD_REQUEST_MESSAGE" in each.names
+    }
+    assert uses - {"paramclient.protocol.wire"} == {"paramclient.protocol.vehicle.commands"}
+
+
 def test_only_the_wire_knows_pymavlink() -> None:
     uses = {
         (module, each.module) for module in MODULES for each in imports_of(module) if each.top == "pymavlink"

@@ -578,7 +578,7 @@ class LinkClient(LocalClient):
     async def wait_until_files_closed(self, machine: ComponentMachine) -> None:
         """See `LocalClient.wait_until_files_closed`. During a burst, vehicles ignore the request."""
         if machine.files.is_closing and self.link_task.broken is None:
-            with anyio.move_on_after(machine.round_trip.prompt_timeout):
+            with anyio.move_on_after(machine.retry.prompt_timeout):
                 await self._wait_until_closed(machine)
 
     async def _wait_until_closed(self, machine: ComponentMachine) -> None:

@@ -42,7 +42,7 @@ from paramclient.protocol.scheduler import Scheduler
 from paramclient.protocol.stats.trace import Trace, silent
 from paramclient.protocol.vehicle.boot_time_requests import ClockRequests
 from paramclient.protocol.vehicle.claims import Claim, Verdict
-from paramclient.protocol.vehicle.commands import Commands
+from paramclient.protocol.vehicle.commands import Commands, MessageRequests
 from paramclient.protocol.vehicle.identification import Identification
 from paramclient.protocol.vehicle.metadata_location import Descriptions
 from paramclient.protocol.vehicle.peers import NO_PEER, ComponentPeers, Contest
@@ -141,6 +141,7 @@ class ComponentMachine:
         context: the facts about it that its machines share.
         who: its identity and encoding.
         table: its parameters.
+        retry: when its requests count as lost.
         round_trip: round-trip time and loss of its responses.
         presence: whether its messages are received.
         peers: the peers that send with its address, and whether several vehicles do.
@@ -150,6 +151,7 @@ class ComponentMachine:
         descriptions: the location of its metadata.
         name_searches: the searches for names that may not exist.
         commands: its commands.
+        messages: the messages that are requested from it.
         clock_requests: the requests for its time since boot.
         start_values: the reads of values that it measures at each boot.
         restarts: its reboot on command.
@@ -197,8 +199,10 @@ class ComponentMachine:
             reschedule=self.reschedule,
         )
         self.context = context
+        self.retry = context.retry
         self.round_trip = context.round_trip
-        self.who = Identification(context, link, encoding)
+        self.messages = MessageRequests(context)
+        self.who = Identification(context, self.messages, link, encoding)
         self.table = Table(self.who.encoding, room)
         self.reads = Reads(context, self.table, scheduler.turns.share)
         self.writes = Writes(context, self.reads, self.table, permission=self)
@@ -209,9 +213,9 @@ class ComponentMachine:
         self.sync = Sync(
             context, self.reads, self.table, upkeep, check_pace, self.presence, self.files, host=self
         )
-        self.descriptions = Descriptions(context)
+        self.descriptions = Descriptions(context, self.messages)
         self.commands = Commands(context)
-        self.clock_requests = ClockRequests(context, self.presence)
+        self.clock_requests = ClockRequests(context, self.messages, self.presence)
         self.start_values = StartValues(context, self.reads, self.table, self.sync)
         self.restarts = Restarts(
             context, self.commands, self.who, self.presence, self.clock_requests, self._restart_noticed
@@ -250,8 +254,8 @@ class ComponentMachine:
         self.writes.left_open = self._authors.foreign_set
         self._machines: tuple[Machine, ...] = (
             *(self.reads, self.name_searches, self.sync, self.writes, self.files, self.commands),
-            *(self.restarts, self.fetches, self.who, self.descriptions, self.clock_requests),
-            *(self.start_values, self.rereads),
+            *(self.restarts, self.fetches, self.messages, self.who, self.descriptions),
+            *(self.clock_requests, self.start_values, self.rereads),
         )
         """Each machine stands behind those that it uses or calls. They end in reverse order: a machine does
         not take the end of another one for a result, and is not called after its own end."""
@@ -418,8 +422,7 @@ class ComponentMachine:
                 self.reads.refused(message, now)
                 self.name_searches.refused(message, now)
         elif isinstance(message, CommandAck):
-            self.who.acknowledged(message, now)
-            self.descriptions.acknowledged(message, now)
+            self.messages.acknowledged(message, now)
             self.commands.acknowledged(message, now)
         elif isinstance(message, StatusText):
             denied = _WRITE_DENIED.search(message.text)

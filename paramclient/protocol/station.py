@@ -20,10 +20,12 @@ from paramclient.protocol.params.list_download import present_of
 from paramclient.protocol.params.passive_file import acknowledges_open, opens_parameter_file
 from paramclient.protocol.params.sync import Upkeep
 from paramclient.protocol.params.table import Room
+from paramclient.protocol.requests.retry import HEARTBEAT_REQUESTS
 from paramclient.protocol.scheduler import Scheduler
 from paramclient.protocol.stats.trace import Told, Trace, silent
 from paramclient.protocol.stats.traffic import Traffic
 from paramclient.protocol.vehicle.boot_time_sampling import ClockSampling
+from paramclient.protocol.vehicle.commands import message_requests
 from paramclient.protocol.vehicle.peers import NO_PEER
 from paramclient.protocol.wire import (
     AUTOPILOT_COMPONENT,
@@ -32,11 +34,9 @@ from paramclient.protocol.wire import (
     COMP_ID_MISSIONPLANNER,
     HEARTBEAT_ID,
     MAV_AUTOPILOT_INVALID,
-    MAV_CMD_REQUEST_MESSAGE,
     MAV_STATE_ACTIVE,
     MAV_TYPE_GCS,
     PARAM_VALUE_ID,
-    CommandLong,
     FileTransfer,
     Frame,
     Framer,
@@ -68,10 +68,6 @@ COMPONENTS_MAX: Final = 1_000
 component without parameters."""
 REMOVAL_SEARCH_INTERVAL: Final = 0.5
 """Seconds between two searches for a component to forget, where there was none: each looks at all."""
-HEARTBEAT_REQUEST_INTERVAL: Final = 0.25
-"""Seconds between two requests for the heartbeat of a vehicle that has sent other messages only."""
-HEARTBEAT_REQUESTS_MAX: Final = 8
-"""Such requests on one link: two heartbeats are due in the 2 s that they take."""
 STREAM_PEERS_MAX: Final = 256
 """Stream peers with an incomplete frame."""
 EARLY_REQUESTS_MAX: Final = 32
@@ -490,7 +486,7 @@ class Station:
         and ArduPilot). This is done until the first autopilot is found, and while others are searched:
         otherwise the regular heartbeats are enough.
         """
-        if self._is_paused or now < self._heartbeat_requested_at + HEARTBEAT_REQUEST_INTERVAL:
+        if self._is_paused or now < self._heartbeat_requested_at + HEARTBEAT_REQUESTS.later:
             return False
         for frame in Framer(stream=False).receive(data):
             address = (frame.system, frame.component)
@@ -500,10 +496,9 @@ class Station:
                 self._heartbeat_requested_at = now
                 if self._awaits_autopilot:
                     self._heartbeat_requests += 1
-                    self._awaits_autopilot = self._heartbeat_requests < HEARTBEAT_REQUESTS_MAX
-                request = (float(HEARTBEAT_ID), *[0.0] * 6)
-                command = CommandLong(frame.system, frame.component, MAV_CMD_REQUEST_MESSAGE, request)
-                self._transmit(command, peer, frame.version)
+                    self._awaits_autopilot = self._heartbeat_requests < HEARTBEAT_REQUESTS.count
+                for message in message_requests(address, HEARTBEAT_ID):
+                    self._transmit(message, peer, frame.version)
                 return True
         return False
 

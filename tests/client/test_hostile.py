@@ -40,7 +40,7 @@ from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.change_origin import Authors
 from paramclient.protocol.params.sync import Upkeep
 from paramclient.protocol.params.table import Room, Table
-from paramclient.protocol.requests.round_trip import INITIAL_TIMEOUT
+from paramclient.protocol.requests.retry import INITIAL_TIMEOUT
 from paramclient.protocol.station import Station
 from paramclient.protocol.stats import traffic as traffic_room
 from paramclient.protocol.vehicle.presence import LOST_AFTER
@@ -300,7 +300,7 @@ def test_what_is_remembered_of_the_reads_of_a_file_is_so_much_and_no_more() -> N
         job._give_up(number)
     for _ in range(3 * reading_room.BURSTS_MAX):
         job._burst(session.now)
-        job._burst_attempts = 0
+        job._burst_attempts.restart()
     assert len(job._late) == reading_room.LATE_READS_MAX
     assert len(job._bursts) == reading_room.BURSTS_MAX
 

@@ -24,8 +24,16 @@ from paramclient.model.values import crc32_px4
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import EventMaker
 from paramclient.protocol.requests.context import Context
+from paramclient.protocol.requests.retry import VersionAttempts
+from paramclient.protocol.vehicle.commands import MessageRequests
 from paramclient.protocol.vehicle.metadata_location import Descriptions
-from paramclient.protocol.wire import CommandAck, CommandLong, ComponentMetadata, FileTransfer
+from paramclient.protocol.wire import (
+    AUTOPILOT_VERSION_ID,
+    CommandAck,
+    CommandLong,
+    ComponentMetadata,
+    FileTransfer,
+)
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle
 from paramclient.sim.metadata import GENERAL_FILE, METADATA_FILE
 from tests.shell import (
@@ -414,7 +422,8 @@ class Asked:
     def __init__(self) -> None:
         self.sent: list[Any] = []
         self.context = Context((1, 1), self.sent.append)
-        self.machine = Descriptions(self.context)
+        self.messages = MessageRequests(self.context)
+        self.machine = Descriptions(self.context, self.messages)
 
 
 def test_the_request_and_its_responses() -> None:
@@ -424,7 +433,7 @@ def test_the_request_and_its_responses() -> None:
     asked.machine.heard(ComponentMetadata("mftp://a", 7), 0.1)
     assert ask.result == ComponentMetadata("mftp://a", 7)
     asked.machine.heard(ComponentMetadata("mftp://b", 8), 0.2)  # unsolicited
-    assert asked.machine.next_deadline() == float("inf")
+    assert asked.messages.next_deadline() == float("inf")
     ask = asked.machine.ask(1.0)
     asked.machine.heard(ComponentMetadata("", 0), 1.1)
     assert ask.done
@@ -437,20 +446,20 @@ def test_the_request_and_its_responses() -> None:
 def test_refusals_end_the_request(result: int, is_answer: bool) -> None:
     asked = Asked()
     ask = asked.machine.ask(0.0)
-    asked.machine.acknowledged(CommandAck(512, result, 255, 190), 0.1)
+    asked.messages.acknowledged(CommandAck(512, result, 255, 190), 0.1)
     assert ask.done is is_answer
 
 
 def test_the_refusal_of_another_request_is_ignored() -> None:
     asked = Asked()
     ask = asked.machine.ask(0.0)
-    asked.machine.acknowledged(CommandAck(511, 3, 255, 190), 0.1)
-    asked.machine.acknowledged(CommandAck(512, 3, 254, 190), 0.1)  # another station's
-    asked.context.is_identifying = True
-    asked.machine.acknowledged(CommandAck(512, 3, 255, 190), 0.1)  # may belong to AUTOPILOT_VERSION
+    asked.messages.acknowledged(CommandAck(511, 3, 255, 190), 0.1)
+    asked.messages.acknowledged(CommandAck(512, 3, 254, 190), 0.1)  # another station's
+    version = asked.messages.begin(AUTOPILOT_VERSION_ID, VersionAttempts(asked.context.retry), 0.1)
+    asked.messages.acknowledged(CommandAck(512, 3, 255, 190), 0.1)  # may belong to AUTOPILOT_VERSION
     assert not ask.done
-    asked.context.is_identifying = False
-    asked.machine.acknowledged(CommandAck(512, 3), 0.1)  # MAVLink 1 has no target in COMMAND_ACK
+    asked.messages.end(version)
+    asked.messages.acknowledged(CommandAck(512, 3), 0.1)  # MAVLink 1 has no target in COMMAND_ACK
     assert ask.done
 
 
@@ -460,14 +469,14 @@ def test_the_request_is_repeated_until_it_is_given_up() -> None:
     late = asked.machine.ask(0.5)
     now = 0.0
     while not ask.done:
-        now = asked.machine.next_deadline()
+        now = asked.messages.next_deadline()
         assert now < 100.0
-        asked.machine.tick(now)
+        asked.messages.tick(now)
     assert isinstance(ask.error, NoReply)
     assert isinstance(late.error, NoReply)
     assert len(asked.sent) == ask.attempts >= 5
     assert "COMPONENT_METADATA of 1/1" in str(ask.error)
-    asked.machine.tick(now + 1)
+    asked.messages.tick(now + 1)
     asked.machine.release(ask)
 
 

@@ -11,7 +11,7 @@ from typing import Final
 from paramclient.protocol.params.reads import Read, Reads
 from paramclient.protocol.params.table import Table
 from paramclient.protocol.requests.operation import Operation
-from paramclient.protocol.requests.round_trip import RoundTrip
+from paramclient.protocol.requests.retry import RetryPolicy
 
 __all__ = ["Repeated", "repeated_names"]
 
@@ -51,14 +51,14 @@ class Repeated(Operation[None]):
 
     Args:
         names: as of `repeated_names`.
-        round_trip, reads, table: the component's.
+        policy, reads, table: the component's.
         now: the time.
     """
 
     def __init__(
         self,
         names: Mapping[str, tuple[int, ...]],
-        round_trip: RoundTrip,
+        policy: RetryPolicy,
         reads: Reads,
         table: Table,
         now: float,
@@ -69,7 +69,7 @@ class Repeated(Operation[None]):
         self._table = table
         self._open: dict[str, Read] = {}
         self._answers: dict[str, list[int]] = {}
-        first_at = now + max(round_trip.timeout, READ_DELAY_MIN)
+        first_at = now + max(policy.timeout, READ_DELAY_MIN)
         self._ask_at = dict.fromkeys(sorted(names.keys() | table.passed_over.keys()), first_at)
         table.passed_over.clear()
 

@@ -17,6 +17,7 @@ from paramclient.protocol.params.fetch_result import Progress
 from paramclient.protocol.params.table import Table
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.operation import Operation
+from paramclient.protocol.requests.retry import FILE_READS_MAX
 from paramclient.protocol.scheduler import Seen, Turns
 from paramclient.protocol.wire import PARAMETERS_MAX, ParamValue
 
@@ -29,9 +30,6 @@ WITH_DEFAULTS: Final = "?withdefaults=1"
 file."""
 FILE_SILENCE_TIMEOUT: Final = 2.0
 """Seconds of silence after which the file no longer delays the lists of other components."""
-FILE_READS_MAX: Final = 2
-"""Reads of a file that turns out to be invalid or stale: it is generated for each reader, and a gap that is
-filled later may contain newer values of another length."""
 
 
 class PackFetch(Operation[None]):

@@ -21,12 +21,12 @@ from paramclient.protocol.events import (
     ParamChanged,
     TableResynced,
 )
-from paramclient.protocol.params.fetch import FETCH_RESTARTS_MAX
 from paramclient.protocol.params.fetch_result import Policy
 from paramclient.protocol.params.reads import Read
 from paramclient.protocol.params.sync import GAP_CHECK_INTERVAL, WATCH_INTERVAL, SyncState, Upkeep
 from paramclient.protocol.params.sync_interval import RESERVE_SHARE
 from paramclient.protocol.params.writes import Write
+from paramclient.protocol.requests.retry import FETCH_RESTARTS_MAX
 from paramclient.protocol.station import Station
 from paramclient.protocol.vehicle.presence import LOST_AFTER
 from paramclient.protocol.wire import (
