@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import json as json_module
+import json
 import platform
 import sys
 from collections.abc import Iterable, Iterator
 from importlib.metadata import version
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Annotated, Final
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING, Final
 
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.options import Id, Seconds, SigningOptions
+from paramclient.cli.options import Id, Seconds, TrafficOptions
 from paramclient.cli.output import (
     Coloured,
     milliseconds,
@@ -39,7 +37,7 @@ CHECK_TIMEOUT: Final = 60.0
 """Seconds for the whole measurement without --timeout: a list at 57600 baud takes 35."""
 ENTRIES_SHOWN_MAX: Final = 8
 """Files and directories that a row names, so that it stays one line; it gives the number of further ones."""
-_UNSIGNED: Final = SigningOptions()
+_DEFAULTS: Final = TrafficOptions()
 _COLOURS: Final = {Severity.PROBLEM: "red", Severity.SLOW: "yellow", Severity.NOTE: ""}
 """Styles of rich for each severity."""
 
@@ -51,11 +49,8 @@ async def check(
     system: Id = None,
     component: Id = None,
     timeout: Seconds = None,
-    json: bool = False,
     report: Path | None = None,
-    tlog: Path | None = None,
-    verbose: Annotated[bool, Parameter(name=("--verbose", "-v"))] = False,
-    options: SigningOptions = _UNSIGNED,
+    options: TrafficOptions = _DEFAULTS,
 ) -> int:
     """Measure a vehicle and its link: identity, services and their speed. Report slow or unusual results.
 
@@ -67,15 +62,12 @@ async def check(
         system: The system to measure, 1 to 255. Default: the first one heard.
         component: The component to measure, 1 to 255. Default: the autopilot.
         timeout: Timeout for the whole measurement in seconds. Default: 60.
-        json: Print JSON.
         report: Also write the result to this new file, to attach it to an issue.
-        tlog: Record all frames of the link, received and sent, in this new telemetry log.
-        verbose: Log each step on stderr.
     """
     if report is not None:
         _check_is_new(report)
     deadline = Deadline(CHECK_TIMEOUT if timeout is None else timeout)
-    async with listen(url, options.signing, tlog=tlog) as client:
+    async with listen(url, options) as client:
         if client.listens_only:
             raise UsageError(f"{client.link.name} is a log: check needs a link to a vehicle")
         heartbeat_timeout = VEHICLE_TIMEOUT if timeout is None else deadline.left()
@@ -86,13 +78,13 @@ async def check(
             client, vehicle, timeout=left, progress=_show_progress if sys.stderr.isatty() else None
         )
     findings = findings_of(measured)
-    if json or report is not None:
+    if options.json or report is not None:
         document = _document(measured, findings)
-        if json:
+        if options.json:
             print_document(document)
         if report is not None:
             _write(report, measured, findings, document)
-    if not json:
+    if not options.json:
         print_table(("what", "measured"), _rows(measured))
         print_line("")
         if findings:
@@ -253,7 +245,7 @@ def _write(path: Path, report: VehicleReport, findings: list[Finding], document:
         "## All figures",
         "",
         "```json",
-        json_module.dumps(document.as_json(), indent=2, allow_nan=False),
+        json.dumps(document.as_json(), indent=2, allow_nan=False),
         "```",
         "",
     ]

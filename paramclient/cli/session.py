@@ -6,15 +6,13 @@ import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Final
 
 import anyio
 
-from paramclient.cli.options import LinkOptions
+from paramclient.cli.options import LinkOptions, TrafficOptions
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
-from paramclient.client.signing import Signing
 from paramclient.errors import AmbiguousVehicle, UsageError
 from paramclient.links import LinkKind, ReplayLink, parse_link
 from paramclient.links.names import names_service
@@ -140,9 +138,7 @@ async def connect(
         yield CommandSession(client, component, deadline, options)
 
 
-def listen(
-    url: str, signing: Signing | None = None, *, listen_only: bool = False, tlog: Path | None = None
-) -> ParamClient:
+def listen(url: str, options: TrafficOptions, *, listen_only: bool = False) -> ParamClient:
     """Return a client that counts all traffic, and neither reads nor writes a cache.
 
     Raises:
@@ -153,7 +149,14 @@ def listen(
             f"{url} is a service, which does not report the traffic of its links; run the command with the "
             "link itself"
         )
-    return ParamClient(url, cache=False, traffic=True, signing=signing, listen_only=listen_only, tlog=tlog)
+    return ParamClient(
+        url,
+        cache=False,
+        traffic=True,
+        signing=options.signing,
+        listen_only=listen_only,
+        tlog=options.tlog,
+    )
 
 
 def _difference(found: Component, chosen: Component) -> str:
