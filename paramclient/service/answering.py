@@ -3,36 +3,34 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Awaitable, Callable, Iterable, Iterator
-from typing import Any, Final, TypeAlias
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, Final
 
 from fastapi import Response
 
 from paramclient.documents.document import Document
+from paramclient.provision.runner import Runner
 from paramclient.service.event_feed import COMPACT
 
-__all__ = ["JSON", "Aside", "document_answer", "written_out"]
+__all__ = ["JSON", "document_answer", "written_out"]
 
 JSON: Final = "application/json"
 LONG_MEMBER: Final = 64
 """Entries of a member that is written out as a whole; those of a longer one are written one by one."""
 
-Aside: TypeAlias = Callable[[Callable[[], bytes]], Awaitable[bytes]]
-"""Does something in a thread, such as `Hub.aside`."""
 
-
-async def document_answer(aside: Aside, make: Callable[[], Document], *, status: int = 200) -> Response:
+async def document_answer(run: Runner, make: Callable[[], Document], *, status: int = 200) -> Response:
     """An answer with a document.
 
     Args:
-        aside: does what takes long in a thread.
+        run: runs what takes long, such as `Hub.aside`.
         make: makes the document, there.
         status: HTTP's number.
 
     Raises:
         Exception: whatever `make` raises.
     """
-    return Response(await aside(lambda: written_out(make())), status, media_type=JSON)
+    return Response(await run(lambda: written_out(make())), status, media_type=JSON)
 
 
 def written_out(document: Document, **entries: Iterable[Document]) -> bytes:
