@@ -7,8 +7,7 @@ Needs the extra `service`.
   events, jobs.
 - `access`, `request`, `tokens`, `client_address`, `tls`: access checks of every request.
 - `gate`, `places`, `connections`: connections before TLS, their number, their limits.
-- `quota`, `held_bodies`, `answer_places`, `log_limit`: limits of work, request bodies, responses and log
-  lines.
+- `quota`, `held_bodies`, `log_limit`: limits of requests in progress, request bodies and log lines.
 - `reading`, `param_sources`, `route_context`, `answering`, `problems`, `metrics`: request bodies,
   parameters named in requests, what routes share, responses, errors, Prometheus.
 """

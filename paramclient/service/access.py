@@ -20,16 +20,16 @@ import anyio
 
 from paramclient.errors import UsageError
 from paramclient.protocol.params.change_origin import ASKER_LENGTH_MAX
-from paramclient.service.answer_places import (
-    POSTED_MAX,
-    POSTED_OF_ONE,
-    READ_MAX,
-    READ_OF_ONE,
-    AnswerPlaces,
-)
 from paramclient.service.client_address import is_in, is_loopback, network
 from paramclient.service.held_bodies import HeldBodies, HeldBody
 from paramclient.service.log_limit import LogLimit
+from paramclient.service.quota import (
+    LARGE_GETS_MAX,
+    LARGE_GETS_OF_HOLDER_MAX,
+    LARGE_POSTS_MAX,
+    LARGE_POSTS_OF_HOLDER_MAX,
+    Quota,
+)
 from paramclient.service.request import (
     ASK,
     HOST,
@@ -139,8 +139,12 @@ class AccessMiddleware:
         self._proxies = tuple(map(network, settings.proxies))
         self._limit = LogLimit(clock)
         self._bodies = HeldBodies()
-        self._answers_to_get = AnswerPlaces(READ_MAX, READ_OF_ONE)
-        self._answers_to_post = AnswerPlaces(POSTED_MAX, POSTED_OF_ONE)
+        self._large_gets = Quota(
+            "large responses", most=LARGE_GETS_MAX, most_of_holder=LARGE_GETS_OF_HOLDER_MAX
+        )
+        self._large_posts = Quota(
+            "large responses", most=LARGE_POSTS_MAX, most_of_holder=LARGE_POSTS_OF_HOLDER_MAX
+        )
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket"):
@@ -182,8 +186,8 @@ class AccessMiddleware:
             if not request.has_large_answer:
                 await self._app(scope, receive, answer.send)
                 return
-            places = self._answers_to_post if request.method == "POST" else self._answers_to_get
-            async with places.take(state["quota"]):  # until all of it is sent
+            quota = self._large_posts if request.method == "POST" else self._large_gets
+            async with quota.wait(state["quota"]):  # until the whole response is sent
                 await self._app(scope, receive, answer.send)
 
     # Where it comes from

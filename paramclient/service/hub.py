@@ -34,7 +34,7 @@ from paramclient.service.followed_component import Followed
 from paramclient.service.jobs import Job, Jobs
 from paramclient.service.link import Line
 from paramclient.service.problems import ServiceError
-from paramclient.service.quota import LONG_REQUESTS_MAX, LONG_REQUESTS_OF_ONE, Quota
+from paramclient.service.quota import LONG_REQUESTS_MAX, LONG_REQUESTS_OF_HOLDER_MAX, Quota
 
 if TYPE_CHECKING:
     from paramclient.cache import CutOff, ParamCache, RunningSetup
@@ -95,7 +95,7 @@ class Hub:
         self._worker = Worker("paramclient service")
         self._reader = Worker("paramclient files")
         self.long_requests = Quota(
-            "requests that take long", most=LONG_REQUESTS_MAX, most_of_one=LONG_REQUESTS_OF_ONE
+            "long requests", most=LONG_REQUESTS_MAX, most_of_holder=LONG_REQUESTS_OF_HOLDER_MAX
         )
         self._closing = anyio.Event()
         self._setups = None if self.cache is None else SetupNotes.beside(self.cache.path)

@@ -25,7 +25,7 @@ from paramclient.model.values import ParamType
 from paramclient.protocol import wire
 from paramclient.service import AccessSettings, Hub, Settings, Tokens, create_app
 from paramclient.service.param_sources import LARGEST_UPLOAD
-from paramclient.service.quota import LONG_REQUESTS_OF_ONE
+from paramclient.service.quota import LONG_REQUESTS_OF_HOLDER_MAX
 from paramclient.service.reading import LONGEST_LINE
 from paramclient.service.routes.param_files import attachment
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
@@ -543,9 +543,9 @@ async def test_files_are_read_one_after_the_other_and_not_without_end() -> None:
             answers.append(answer.status_code)
 
         async with anyio.create_task_group() as tasks:
-            for _ in range(LONG_REQUESTS_OF_ONE + 3):
+            for _ in range(LONG_REQUESTS_OF_HOLDER_MAX + 3):
                 tasks.start_soon(upload)
-        assert sorted(answers) == [200] * LONG_REQUESTS_OF_ONE + [429] * 3
+        assert sorted(answers) == [200] * LONG_REQUESTS_OF_HOLDER_MAX + [429] * 3
 
 
 @swiftly

@@ -41,11 +41,9 @@ from paramclient.service import (
     answering,
     create_app,
     jobs,
-    quota,
 )
 from paramclient.service import hub as hub_room
 from paramclient.service.access import AccessMiddleware
-from paramclient.service.answer_places import READ_OF_ONE, AnswerPlaces
 from paramclient.service.answering import written_out
 from paramclient.service.event_feed import MOST_AT_ONCE
 from paramclient.service.link import LOOKED_AT_ONCE
@@ -57,7 +55,7 @@ from paramclient.service.param_sources import (
     read_upload,
 )
 from paramclient.service.problems import ServiceError
-from paramclient.service.quota import LONG_REQUESTS_OF_ONE
+from paramclient.service.quota import LARGE_GETS_OF_HOLDER_MAX, LONG_REQUESTS_OF_HOLDER_MAX, Quota
 from paramclient.service.reading import LONGEST_LINE, LONGEST_NUMBER, MOST_PIECES
 from paramclient.service.route_context import answered
 from paramclient.service.routes import params as params_room
@@ -451,22 +449,22 @@ async def test_plans_have_a_quota_for_each_holder_and_for_all(monkeypatch: pytes
             answers.append((await client.post(f"{C}/plan", json=body)).status_code)
 
         async with anyio.create_task_group() as tasks:
-            for _ in range(LONG_REQUESTS_OF_ONE):
+            for _ in range(LONG_REQUESTS_OF_HOLDER_MAX):
                 tasks.start_soon(ask, browser)
             await anyio.sleep(0.5)
             assert not answers, "they wait for the vehicle"
             for path in ("plan", "diff", "verify"):
                 told = problem(await browser.post(f"{C}/{path}", json=body), 429, "too-many")
-                assert told["most"] == LONG_REQUESTS_OF_ONE
+                assert told["most"] == LONG_REQUESTS_OF_HOLDER_MAX
             dry = {**body, "dry_run": True}
             problem(await browser.post(f"{C}/apply", json=dry), 429, "too-many")
             problem(await browser.post("/api/v1/files", content=b"A 1\n", headers=A_FILE), 429, "too-many")
             read = await other.post("/api/v1/files", content=b"A 1\n", headers=A_FILE)
             assert read.status_code == 200
             assert (await browser.get(f"{C}/params")).status_code == 200
-            monkeypatch.setattr(hub, "long_requests", quota.Quota("requests", most=0, most_of_one=1))
+            monkeypatch.setattr(hub, "long_requests", Quota("requests", most=0, most_of_holder=1))
             problem(await other.post("/api/v1/files", content=b"A 1\n", headers=A_FILE), 429, "too-many")
-        assert answers == [504] * LONG_REQUESTS_OF_ONE
+        assert answers == [504] * LONG_REQUESTS_OF_HOLDER_MAX
 
 
 @swiftly
@@ -736,7 +734,7 @@ async def test_large_answers_wait_for_each_other_until_they_are_sent() -> None:
     async with service(GenericVehicle(table=LARGE)) as (_, browser):
         await fetched(browser)
         async with contextlib.AsyncExitStack() as stack:
-            for _ in range(READ_OF_ONE):
+            for _ in range(LARGE_GETS_OF_HOLDER_MAX):
                 request = browser.stream("GET", f"{C}/params")
                 assert (await stack.enter_async_context(request)).status_code == 200  # and takes nothing
             answers: list[httpx.Response] = []
@@ -758,13 +756,13 @@ async def test_large_answers_wait_for_each_other_until_they_are_sent() -> None:
 
 
 @swiftly
-async def test_places_for_answers_are_of_a_holder_and_of_all() -> None:
-    places = AnswerPlaces(3, 2)
+async def test_a_quota_limits_each_holder_and_all_together() -> None:
+    quota = Quota("requests", most=3, most_of_holder=2)
     held: list[str] = []
     may_leave = anyio.Event()
 
     async def answer(holder: str) -> None:
-        async with places.take(holder):
+        async with quota.wait(holder):
             held.append(holder)
             await may_leave.wait()
 
@@ -775,7 +773,7 @@ async def test_places_for_answers_are_of_a_holder_and_of_all() -> None:
         assert held == ["a", "a", "b"]
         may_leave.set()
     assert sorted(held) == ["a", "a", "a", "b", "b"]
-    assert not places._of_holders
+    assert not len(quota)
 
 
 @pytest.mark.asyncio
