@@ -585,7 +585,7 @@ def test_who_listens_is_told_where_they_are(sight: Sight) -> None:
     expect(row).to_have_attribute("aria-selected", "true")
     expect(row).to_have_attribute("aria-rowindex", "3")
     unnamed = sight.page.evaluate(
-        """() => [...document.querySelectorAll("button, input, select, a, dialog, nav, aside")]
+        """() => [...document.querySelectorAll("button, input, select, a, dialog, nav, run_in_thread")]
             .filter((each) => each.checkVisibility())
             .filter((each) => !(each.textContent.trim() || each.ariaLabel || each.labels?.length
                 || each.getAttribute("aria-labelledby")))

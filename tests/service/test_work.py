@@ -38,26 +38,26 @@ from paramclient.service import (
     Hub,
     Settings,
     Tokens,
-    answering,
     create_app,
     jobs,
+    responses,
 )
 from paramclient.service import hub as hub_room
 from paramclient.service.access import AccessMiddleware
-from paramclient.service.answering import written_out
-from paramclient.service.event_feed import MOST_AT_ONCE
-from paramclient.service.link import LOOKED_AT_ONCE
+from paramclient.service.event_feed import BATCH_EVENTS_MAX
+from paramclient.service.link import COMPONENTS_PER_TURN
 from paramclient.service.param_sources import (
-    LARGEST_UPLOAD,
-    MOST_NAMES,
-    MOST_PATTERNS,
-    MOST_VALUES,
-    read_upload,
+    PARAM_FILE_BYTES_MAX,
+    PATTERNS_MAX,
+    REQUEST_NAMES_MAX,
+    REQUEST_VALUES_MAX,
+    parse_upload,
 )
 from paramclient.service.problems import ServiceError
 from paramclient.service.quota import LARGE_GETS_OF_HOLDER_MAX, LONG_REQUESTS_OF_HOLDER_MAX, Quota
-from paramclient.service.reading import LONGEST_LINE, LONGEST_NUMBER, MOST_PIECES
-from paramclient.service.route_context import answered
+from paramclient.service.request_body import DIGITS_MAX, LINE_BYTES_MAX, SEPARATORS_MAX
+from paramclient.service.responses import encode_document
+from paramclient.service.route_context import run_until_disconnect
 from paramclient.service.routes import params as params_room
 from paramclient.service.routes import setup as setup_room
 from paramclient.sim import GenericVehicle
@@ -144,28 +144,31 @@ def test_names_and_patterns_choose_as_the_shell_does() -> None:
 @swiftly
 async def test_a_request_has_few_patterns_and_many_names(monkeypatch: pytest.MonkeyPatch) -> None:
     many = [f"A*{number}" for number in range(10_000)]
-    few = ["ABC_*", *[f"*{number % 40:02}" for number in range(MOST_PATTERNS - 1)]]
+    few = ["ABC_*", *[f"*{number % 40:02}" for number in range(PATTERNS_MAX - 1)]]
     async with service(GenericVehicle(table=TABLE)) as (_, browser):
         await fetched(browser)
         for path, member in (("diff", "only"), ("plan", "only"), ("plan", "include"), ("verify", "include")):
             body = {"wanted": {"values": VALUES}, member: many}
             told = problem(await browser.post(f"{C}/{path}", json=body), 422, "invalid-request")
-            assert f"at most {MOST_PATTERNS} of them may be patterns" in told["detail"]
+            assert f"at most {PATTERNS_MAX} of the names may be patterns" in told["detail"]
             body = {"wanted": {"values": VALUES}, member: [*few, *TABLE]}
             assert (await browser.post(f"{C}/{path}", json=body)).status_code == 200
-        body = {"wanted": {"values": VALUES}, "only": [f"A{number}" for number in range(MOST_NAMES + 1)]}
+        body = {
+            "wanted": {"values": VALUES},
+            "only": [f"A{number}" for number in range(REQUEST_NAMES_MAX + 1)],
+        }
         told = problem(await browser.post(f"{C}/diff", json=body), 422, "invalid-request")
-        assert str(MOST_NAMES) in told["detail"]
+        assert str(REQUEST_NAMES_MAX) in told["detail"]
         told = problem(
             await browser.post("/api/v1/fleet/diff", json={"names": many[:500]}), 422, "invalid-request"
         )
-        assert f"at most {MOST_PATTERNS}" in told["detail"]
+        assert f"at most {PATTERNS_MAX}" in told["detail"]
 
         with threads_of(monkeypatch, (params_room, "NameChoice")) as seen:
             answer = await browser.get(f"{C}/params", params={"names": few})
             assert answer.json()["params"].keys() == TABLE.keys()
         assert seen == {"NameChoice": {"paramclient service"}}
-        query = {"names": many[: MOST_PATTERNS + 1]}
+        query = {"names": many[: PATTERNS_MAX + 1]}
         problem(await browser.get(f"{C}/params", params=query), 422, "invalid-request")
 
 
@@ -190,7 +193,7 @@ async def test_what_has_too_many_values_is_not_parsed(
         with threads_of(monkeypatch, (json, "loads")) as seen:
             answer = await browser.post(f"{C}/diff", content=body, headers=A_JSON)
         assert seen == {"loads": set()}
-        assert problem(answer, 413, "too-large")["most"] == MOST_PIECES
+        assert problem(answer, 413, "too-large")["most"] == SEPARATORS_MAX
 
 
 FILES: list[tuple[str, bytes]] = [
@@ -205,36 +208,36 @@ FILES: list[tuple[str, bytes]] = [
 @swiftly
 async def test_a_file_with_too_many_values_is_not_read(name: str, data: bytes) -> None:
     """As it is, and in a body: with line ends and brackets it is the file that has too many."""
-    assert len(data) <= LARGEST_UPLOAD
+    assert len(data) <= PARAM_FILE_BYTES_MAX
     coded = {"file": {"name": name, "base64": base64.b64encode(data).decode()}}
     async with service(GenericVehicle(table=TABLE)) as (_, browser):
         await fetched(browser)
         with peak() as used:
             answer = await browser.post(f"/api/v1/files?name={name}", content=data, headers=A_FILE)
-            assert problem(answer, 413, "too-large")["most"] == MOST_PIECES
+            assert problem(answer, 413, "too-large")["most"] == SEPARATORS_MAX
             answer = await browser.post(f"{C}/plan", json={"wanted": coded})
-            assert problem(answer, 413, "too-large")["most"] == MOST_PIECES
+            assert problem(answer, 413, "too-large")["most"] == SEPARATORS_MAX
             assert used() < 40
 
 
 @swiftly
 async def test_nobody_wants_more_values_than_a_vehicle_has() -> None:
     unknown = {f"U{number}": number for number in range(60_000)}
-    text = "".join(f"U{number} 1\n" for number in range(MOST_VALUES + 1))
+    text = "".join(f"U{number} 1\n" for number in range(REQUEST_VALUES_MAX + 1))
     vehicle = Tap(GenericVehicle(table=TABLE))
     async with service(vehicle) as (_, browser):
         await fetched(browser)
         vehicle.heard.clear()
         answer = await browser.post(f"{C}/plan", json={"wanted": {"values": unknown}})
-        assert problem(answer, 413, "too-large")["most"] == MOST_PIECES
-        few = dict(list(unknown.items())[: MOST_VALUES + 1])
+        assert problem(answer, 413, "too-large")["most"] == SEPARATORS_MAX
+        few = dict(list(unknown.items())[: REQUEST_VALUES_MAX + 1])
         answer = await browser.post(f"{C}/plan", json={"wanted": {"values": few}})
-        assert str(MOST_VALUES) in problem(answer, 422, "invalid-request")["detail"]
+        assert str(REQUEST_VALUES_MAX) in problem(answer, 422, "invalid-request")["detail"]
         for path in ("plan", "verify", "diff"):
             told = problem(await browser.post(f"{C}/{path}", json={"wanted": a_file(text)}), 413, "too-large")
-            assert told["most"] == MOST_VALUES
+            assert told["most"] == REQUEST_VALUES_MAX
         answer = await browser.post("/api/v1/files?name=a.parm", content=text.encode(), headers=A_FILE)
-        assert problem(answer, 413, "too-large")["most"] == MOST_VALUES
+        assert problem(answer, 413, "too-large")["most"] == REQUEST_VALUES_MAX
         assert not vehicle.heard, "the vehicle is asked for none of them"
 
 
@@ -338,7 +341,7 @@ def test_a_document_in_yaml_takes_as_much_memory_as_its_values() -> None:
 async def test_what_takes_long_is_done_in_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     text = f"# {'long ' * 1_000}\n" + "".join(f"{name},{value}\n" for name, value in VALUES.items())
     calls = (
-        *((json, "loads"), (setup_room, "compare"), (answering, "written_out")),
+        *((json, "loads"), (setup_room, "compare"), (responses, "encode_document")),
         *((inspection, "plan"), (NameChoice, "choose")),
     )
     async with service(GenericVehicle(table=TABLE)) as (_, browser):
@@ -388,9 +391,12 @@ def test_a_document_is_written_as_pydantic_writes_it() -> None:
 
     for count in (0, 3, 500):
         document = DiffDoc.of(compare_room.compare(of(count, 0.5), of(count + 1, 1.5)), everything=True)
-        assert written_out(document) == document.model_dump_json().encode()
-    assert written_out(JobsDoc(jobs=[])) == b'{"jobs":[]}'
-    assert written_out(ComponentsDoc(run="a", seq=1, components=[])) == b'{"run":"a","seq":1,"components":[]}'
+        assert encode_document(document) == document.model_dump_json().encode()
+    assert encode_document(JobsDoc(jobs=[])) == b'{"jobs":[]}'
+    assert (
+        encode_document(ComponentsDoc(run="a", seq=1, components=[]))
+        == b'{"run":"a","seq":1,"components":[]}'
+    )
 
 
 # Quotas
@@ -421,14 +427,14 @@ async def test_jobs_have_a_quota_for_each_holder() -> None:
         statuses = [
             (await browser.post(f"{C}/fetch", json=body, headers=BEN)).status_code for _ in range(256)
         ]
-        assert statuses == [202] * jobs.MOST_OF_ONE + [429] * (256 - jobs.MOST_OF_ONE)
+        assert statuses == [202] * jobs.HOLDER_JOBS_MAX + [429] * (256 - jobs.HOLDER_JOBS_MAX)
         told = problem(await browser.post(f"{C}/fetch", json=body, headers=BEN), 429, "too-many")
-        assert told["most"] == jobs.MOST_OF_ONE
+        assert told["most"] == jobs.HOLDER_JOBS_MAX
         others = await browser.post(f"{C}/fetch", json=body, headers=ANNA)
         assert others.status_code == 202
-        hub.begin_fetch(hub.find(1, 1), "service")
+        hub.start_fetch(hub.find_component(1, 1), "service")
         listed = (await browser.get("/api/v1/jobs", headers=ANNA)).json()["jobs"]
-        assert len(listed) == jobs.MOST_OF_ONE + 2
+        assert len(listed) == jobs.HOLDER_JOBS_MAX + 2
         own = next(job["id"] for job in listed if job["asked_by"].startswith("ben"))
         await browser.delete(f"/api/v1/jobs/{own}", headers=BEN)
         await until(lambda: hub.jobs.find(own).state == "cancelled")
@@ -484,7 +490,7 @@ async def test_a_list_of_jobs_has_no_long_results() -> None:
     async with service(GenericVehicle(table=LARGE)) as (_, browser):
         await fetched(browser)
         answer = await browser.post(f"{C}/apply", json={"wanted": {"values": LARGE}, "full": True})
-        assert len(answer.json()["params"]) == len(LARGE) > jobs.LISTED_MAX
+        assert len(answer.json()["params"]) == len(LARGE) > jobs.LISTED_ENTRIES_MAX
         [_, last] = (await browser.get("/api/v1/jobs")).json()["jobs"]
         whole = (await browser.get(f"/api/v1/jobs/{last['id']}")).json()
         assert whole["result"] == answer.json()
@@ -512,7 +518,7 @@ class Turns:
 
 @swiftly
 async def test_a_table_is_read_a_part_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    table = {f"ABC_P{number:04}": float(number) for number in range(3 * params_room.AT_ONCE)}
+    table = {f"ABC_P{number:04}": float(number) for number in range(3 * params_room.PARAMS_PER_TURN)}
     async with service(GenericVehicle(table=table)) as (_, browser):
         await fetched(browser)
         turns = Turns()
@@ -530,7 +536,7 @@ async def test_a_table_is_read_a_part_at_a_time(monkeypatch: pytest.MonkeyPatch)
         ):
             answer = await browser.get(f"{C}/params{query}")
             assert list(answer.json()["params"]) == list(table)[:count]
-        assert params_room.AT_ONCE / 2 < turns.most <= params_room.AT_ONCE
+        assert params_room.PARAMS_PER_TURN / 2 < turns.most <= params_room.PARAMS_PER_TURN
 
 
 @swiftly
@@ -548,7 +554,7 @@ async def test_events_are_written_out_few_at_a_time() -> None:
             async for line in stream.aiter_lines():
                 if line.endswith("-1000"):
                     break
-        assert turns.most == MOST_AT_ONCE
+        assert turns.most == BATCH_EVENTS_MAX
 
 
 @swiftly
@@ -594,7 +600,7 @@ async def test_fetches_of_many_are_begun_few_at_a_time() -> None:
 @swiftly
 async def test_many_components_are_looked_at_few_at_a_time() -> None:
     turns = Turns()
-    looked: Any = SimpleNamespace(look=turns.note)
+    looked: Any = SimpleNamespace(publish_changes=turns.note)
 
     async def receive() -> dict[str, str]:
         await anyio.sleep(9)
@@ -605,8 +611,8 @@ async def test_many_components_are_looked_at_few_at_a_time() -> None:
     async def work() -> int:
         return 7
 
-    assert await answered(request, work, *[looked] * 1_000) == 7
-    assert turns.most == LOOKED_AT_ONCE
+    assert await run_until_disconnect(request, work, *[looked] * 1_000) == 7
+    assert turns.most == COMPONENTS_PER_TURN
 
 
 ESCAPES = b'a: "' + b"\\x41" * 20_000 + b'"\n'
@@ -615,10 +621,10 @@ ESCAPES = b'a: "' + b"\\x41" * 20_000 + b'"\n'
 @pytest.mark.parametrize(
     ("name", "data", "most"),
     [
-        ("a.parm", b"P1 " + b"1" * 100_000, LONGEST_LINE),
-        ("a.yaml", ESCAPES, LONGEST_LINE),
-        ("a.yaml", b"paramclient: 1\rsets: {" + b"a: b, " * 5_000 + b"}", LONGEST_LINE),
-        ("a.params", b"1\t1\tA\t1\t9\r" * 60_001, MOST_PIECES),
+        ("a.parm", b"P1 " + b"1" * 100_000, LINE_BYTES_MAX),
+        ("a.yaml", ESCAPES, LINE_BYTES_MAX),
+        ("a.yaml", b"paramclient: 1\rsets: {" + b"a: b, " * 5_000 + b"}", LINE_BYTES_MAX),
+        ("a.params", b"1\t1\tA\t1\t9\r" * 60_001, SEPARATORS_MAX),
     ],
 )
 @swiftly
@@ -635,7 +641,7 @@ async def test_a_file_without_lines_may_be_long() -> None:
     coarse = {name: WrittenParam(name, value, ParamType.REAL32) for name, value in LARGE.items()}
     packed = dumps(ParamSet(coarse), form="pck")
     assert b"\n" not in document
-    assert min(len(document), len(packed)) > LONGEST_LINE
+    assert min(len(document), len(packed)) > LINE_BYTES_MAX
     async with service() as (_, browser):
         for name, data in (("a.json", document), ("", b"\xef\xbb\xbf \n" + document), ("a.pck", packed)):
             answer = await browser.post(f"/api/v1/files?name={name}", content=data, headers=A_FILE)
@@ -656,7 +662,7 @@ def test_in_a_document_of_one_line_no_comment_is_sought(monkeypatch: pytest.Monk
     assert not sought
 
 
-@pytest.mark.parametrize("number", ["9" * 4_300, "9" * (LONGEST_NUMBER + 1), "0." + "3" * 200])
+@pytest.mark.parametrize("number", ["9" * 4_300, "9" * (DIGITS_MAX + 1), "0." + "3" * 200])
 @swiftly
 async def test_a_body_with_endless_numbers_is_not_parsed(
     number: str, monkeypatch: pytest.MonkeyPatch
@@ -665,7 +671,7 @@ async def test_a_body_with_endless_numbers_is_not_parsed(
         with threads_of(monkeypatch, (json, "loads")) as seen:
             answer = await browser.post("/api/v1/find", content=f'{{"system":{number}}}', headers=A_JSON)
         assert seen == {"loads": set()}
-        assert problem(answer, 413, "too-large")["most"] == LONGEST_NUMBER
+        assert problem(answer, 413, "too-large")["most"] == DIGITS_MAX
         answer = await browser.post("/api/v1/find", content=f'{{"system":{"9" * 128}}}', headers=A_JSON)
         assert answer.status_code == 422
 
@@ -698,12 +704,12 @@ def test_a_file_with_too_many_parameters_is_not_read_to_its_end(
         loads(data, params_max=1_000)
     assert made <= 1_001
     with pytest.raises(ServiceError, match="10,000"):
-        read_upload(data, "", None)
+        parse_upload(data, "", None)
 
 
 @pytest.mark.asyncio
 async def test_the_end_of_the_service_waits_for_nothing_that_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hub_room, "READING_PATIENCE", 0.1)
+    monkeypatch.setattr(hub_room, "FILE_WORK_TIMEOUT", 0.1)
     begun: list[int] = []
     may_end = threading.Event()
     problems: list[str] = []
@@ -714,7 +720,7 @@ async def test_the_end_of_the_service_waits_for_nothing_that_is_read(monkeypatch
 
     async def ask(hub: Hub) -> None:
         with pytest.raises(ServiceError) as caught:
-            await hub.read_aside(work)
+            await hub.run_in_file_thread(work)
         problems.append(caught.value.kind)
 
     async with anyio.create_task_group() as tasks:
