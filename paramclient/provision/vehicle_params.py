@@ -187,8 +187,8 @@ def left_out_note(table: CachedComponent) -> str:
     more = len(table.left_out) - NAMES_SHOWN_MAX
     rest = f" and {more} more" if more > 0 else ""
     return (
-        f"{table.system}/{table.component} ({table.key}): left out, as no parameter file can hold the name: "
-        f"{shown}{rest}; the next full fetch takes it out of the cache"
+        f"{table.system}/{table.component} ({table.key}): skipped, because no parameter file can contain the "
+        f"name: {shown}{rest}; the next full fetch removes it from the cache"
     )
 
 
