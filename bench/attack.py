@@ -75,8 +75,8 @@ ENDED: Final = 3.0
 
 LAUNCH: Final = """
 import asyncio.base_events, asyncio.events, json, os, signal, sys, time
-from paramclient.service import places
-places.is_loopback = lambda address: address == "127.0.0.1"
+from paramclient.service import connection_slots
+connection_slots.is_loopback = lambda address: address == "127.0.0.1"
 longest, late, run = 0.0, 0.0, asyncio.events.Handle._run
 def timed(handle):
     global longest

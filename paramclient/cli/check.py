@@ -123,7 +123,7 @@ def _rows(report: VehicleReport) -> Iterator[tuple[str, str]]:
     yield from _link_rows(report)
     yield from _service_rows(report)
     stations = ", ".join(f"{each.system}/{each.component}" for each in report.link.stations)
-    yield "other stations", stations or "none heard"
+    yield "other stations", stations or "none"
     if report.link.autopilots:
         named = ", ".join(f"{system}/{component}" for system, component in report.link.autopilots)
         yield "other autopilots", named
@@ -139,7 +139,7 @@ def _vehicle(report: VehicleReport) -> str:
 def _identity_rows(report: VehicleReport) -> Iterator[tuple[str, str]]:
     identity = report.identity
     if not report.has_version:
-        yield "firmware", "unknown: AUTOPILOT_VERSION was not answered"
+        yield "firmware", "unknown: no AUTOPILOT_VERSION received"
         return
     number = identity.firmware
     git_hash = f", commit {identity.git_hash}" if identity.git_hash.strip("0") else ""
@@ -151,7 +151,7 @@ def _identity_rows(report: VehicleReport) -> Iterator[tuple[str, str]]:
 def _link_rows(report: VehicleReport) -> Iterator[tuple[str, str]]:
     link = report.link
     signed = ", signed" if link.signed else ""
-    yield "protocol", f"MAVLink {link.mavlink}{signed}" if link.mavlink else "no frame came"
+    yield "protocol", f"MAVLink {link.mavlink}{signed}" if link.mavlink else "no frame received"
     trips = link.round_trips
     if trips:
         spread = f"{milliseconds(trips[0])} to {milliseconds(trips[-1])}"
@@ -168,7 +168,7 @@ def _service_rows(report: VehicleReport) -> Iterator[tuple[str, str]]:
     if reads is None:
         yield "single reads", none
     elif reads.single is None:
-        yield "single reads", "not answered"
+        yield "single reads", "no response"
     else:
         rate = f", {reads.rate:.0f} per second with {reads.in_flight} at once" if reads.rate else ""
         repeats = reads.requests - reads.in_flight
@@ -195,14 +195,14 @@ def _service_rows(report: VehicleReport) -> Iterator[tuple[str, str]]:
             )
         else:
             yield "parameter file", files.error or "none"
-        yield "defaults", "in the parameter file" if files.defaults else "not told by the vehicle"
-    yield "descriptions", report.descriptions or "not told by the vehicle"
+        yield "defaults", "in the parameter file" if files.defaults else "not provided by the vehicle"
+    yield "descriptions", report.descriptions or "not provided by the vehicle"
     if found is None:
         yield "hash", none
     elif found.before is None:
         yield "hash", found.error or "none"
     else:
-        after = "not answered" if found.after is None else f"{found.after:08x}"
+        after = "no response" if found.after is None else f"{found.after:08x}"
         holds = f"the same after {found.seconds:.1f} s" if found.after == found.before else f"then {after}"
         yield "hash", f"{found.before:08x}, {holds}"
 

@@ -360,7 +360,7 @@ class LinkClient(LocalClient):
             return self._components[machine.address]
         wanted = address_in_words(system, component, peer) + refused_in_words(self.signing_report())
         if choice.due < math.inf:
-            wanted += f", and {LOOK_TIME} s more to see that it is the only one"
+            wanted += f", then {LOOK_TIME} s without another vehicle"
 
         raise NoReply(wanted, attempts=0, waited=anyio.current_time() - began)
 

@@ -771,7 +771,7 @@ class ComponentMachine:
         """
         if self._listens_only:
             raise UsageError(
-                f"{what} cannot be asked for where nothing is sent; what has been heard is in `params`"
+                f"{what} cannot be requested: the client only listens. Received values are in `params`"
             )
         self.check_uncontested()
         if self.presence.is_lost:
@@ -813,7 +813,7 @@ class ComponentMachine:
         if is_same:
             self._doubt()
             self.who.doubt(now)
-            what = f"the components of system {self.system}: it is being asked which vehicle it is"
+            what = f"the components of system {self.system}: the vehicle is being identified"
             self._forget_companions(NoReply(what, attempts=0, waited=0.0), now)
         else:
             self._replaced(now)
@@ -908,9 +908,9 @@ class ComponentMachine:
         self._checks.clear()
         self._known_as = None
         self.restarts.another(now)
-        self.commands.lose(now, ": another vehicle answers there now")
+        self.commands.lose(now, ": another vehicle has this address now")
         self.name_searches.lose(now)
-        what = f"writes to {self.system}/{self.component}: another vehicle answers there now"
+        what = f"writes to {self.system}/{self.component}: another vehicle has this address now"
         self.writes.fail_all(NoReply(what, attempts=0, waited=0.0), now)
         if self.fetch is not None:
             self.fetch.restart(now)

@@ -422,7 +422,7 @@ class Station:
             UsageError: the policy forbids it, or nothing is sent at all.
         """
         if refresh and self.listens_only:
-            raise UsageError("nothing can be downloaded where nothing is sent, so not with refresh")
+            raise UsageError("refresh needs a download, and the client only listens")
         if refresh and self.policy is not Policy.AUTO:
             raise UsageError(f"the policy is {self.policy}: nothing may be downloaded, so not with refresh")
 

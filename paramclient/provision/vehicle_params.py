@@ -205,8 +205,8 @@ def left_out_note(table: CachedComponent) -> str:
     """Return the sentence about names of a cached table that are left out of a set."""
     names = first_of([*map(repr, table.left_out)], NAMES_SHOWN_MAX)
     return (
-        f"{table.system}/{table.component} ({table.key}): left out, as no parameter file can hold the name: "
-        f"{names}; the next full fetch takes it out of the cache"
+        f"{table.system}/{table.component} ({table.key}): skipped, because no parameter file can contain the "
+        f"name: {names}; the next full fetch removes it from the cache"
     )
 
 

@@ -1416,7 +1416,7 @@ def test_text_from_the_wire_is_escaped(
         assert (outcome.out + outcome.err).replace("\n", "").isprintable()
         assert (outcome.out + outcome.err).isascii()
     assert fetched.code == 1
-    assert "no parameter file can hold the name" in fetched.err
+    assert "no parameter file can contain this name" in fetched.err
     fetched = command("fetch", url, "--json", "--cache", cache)
     assert list(fetched.json["params"]) == ["[red]B[/red]"]
     assert fetched.out.replace("\n", "").isprintable()

@@ -219,7 +219,7 @@ def test_the_output_is_a_table(live_command: Command, put: Put) -> None:
     assert rows["hardware id"] == ["0000001234567890"]
     assert rows["list"][0].startswith("903 of 903 in ")
     assert rows["hash"][0].startswith("cf579589, the same after ")
-    assert rows["other stations"] == ["none heard"]
+    assert rows["other stations"] == ["none"]
     assert rows["note"]
 
 

@@ -86,7 +86,7 @@ class Repeated(Operation[None]):
     @property
     def note(self) -> str:
         """A note for the user."""
-        told = [
+        listed = [
             f"{name} (indices {', '.join(map(str, places))})"
             for name, places in list(self.names.items())[:DUPLICATES_LISTED_MAX]
         ]
@@ -96,9 +96,9 @@ class Repeated(Operation[None]):
             else ""
         )
         return (
-            f"Several parameters share a name, as where names are cut at 16 bytes: {', '.join(told)}{more}. "
-            "The table holds the one that the vehicle answers with when it is asked by name; "
-            "the others can be read by index only."
+            f"Several parameters have one name, such as one cut to 16 bytes: {', '.join(listed)}{more}. "
+            "The table has the one that the vehicle returns for a read by name; "
+            "the others can only be read by index."
         )
 
     def cancel(self) -> None:

@@ -355,7 +355,7 @@ class Reads(Machine):
         what = name if name is not None else f"parameter {index}"
         if self._seems_unknown(read):
             return UnknownParameter(
-                f"{system}/{component} has no {what}: it keeps silent on it and answers other reads",
+                f"{system}/{component} has no {what}: it does not respond to it, and responds to other reads",
                 system=system,
                 component=component,
                 name=name,

@@ -106,7 +106,7 @@ class Upkeep:
         """
         if listen_only or is_log:
             if interval or policy != Policy.AUTO:
-                raise UsageError("watch_interval and policy are for clients that ask; here nothing is sent")
+                raise UsageError("watch_interval and policy need requests, and the client only listens")
             return cls(policy=Policy.CACHE_ONLY, listens_only=True, is_log=is_log)
         try:
             policy = Policy(policy)

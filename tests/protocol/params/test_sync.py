@@ -1028,7 +1028,7 @@ def test_hash_only_says_when_the_hash_is_another_one() -> None:
     world.run(1.0)
     result = world.fetch()
     assert (result.source, result.hash, result.params["P07"].value) == ("cache", None, 7)
-    assert "did not confirm" in result.notes[0]
+    assert "does not match" in result.notes[0]
     machine = world.machine
     assert state(world) is SyncState.UNSYNCED, "it is known not to agree"
     assert trusts(machine) == {Trust.CACHED}
