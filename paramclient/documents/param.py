@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from paramclient.documents.document import Document, Maybe, Scalar
 from paramclient.model.notation import bits_text, bits_written, parse_value, value_json, value_written
@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from paramclient.model.paramset import WrittenParam
 
 __all__ = ["DescribedDoc", "GotDoc", "InfoDoc", "InfosDoc", "ParamDoc", "WrittenParamDoc"]
+
+_TYPES: Final = dict(ParamType.__members__)
+"""The types by name."""
 
 
 class InfoDoc(Document):
@@ -121,12 +124,13 @@ class ParamDoc(Document):
         Raises:
             ArithmeticError, LookupError, TypeError, ValueError: a member is not valid.
         """
-        named = self.type
-        kind = ParamType[named] if named in ParamType.__members__ else int(named.removeprefix("TYPE_"))
+        known = _TYPES.get(self.type)
+        kind = int(self.type.removeprefix("TYPE_")) if known is None else known
         bits = int(self.bits, 16)
+        is_raw = isinstance(self.value, str) and self.value.startswith("0x")
         return Param(
             name,
-            from_bits(bits, kind, is_raw=str(self.value).startswith("0x")),
+            from_bits(bits, kind, is_raw=is_raw),
             kind,
             self.index,
             bits,
