@@ -54,7 +54,7 @@ MAY_IMPORT = {
     "cache": {"errors", "model"},
     "files": {"errors", "model", "protocol.ftp.param_pck"},
     "client": SHELL | {"remote", "sim"},
-    "remote": SHELL,
+    "remote": SHELL | {"documents"},
     "metadata": SHELL,
     "provision.apply_rules": {"errors", "model"},
     "provision.similar_names": set[str](),

@@ -5,6 +5,7 @@ Cells that cannot have been written raise `Damaged`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import astuple, replace
 from typing import Any, Final
@@ -16,6 +17,7 @@ __all__ = [
     "Damaged",
     "MASK_64",
     "YEAR_10000",
+    "are_times",
     "cells",
     "identity_cells",
     "read_identity",
@@ -64,6 +66,11 @@ def cells(row: Sequence[object], kinds: str) -> Any:
         if not 0 <= row[place] < YEAR_10000:  # type: ignore[operator]  # the shape says that it is a float
             raise Damaged(f"a cell holds {row[place]!r:.40}")
     return row
+
+
+def are_times(times: Sequence[float]) -> bool:
+    """Return whether all of these are times to store, in a few calls."""
+    return not times or (min(times) >= 0 and max(times) < YEAR_10000 and math.isfinite(sum(times)))
 
 
 def time_cell(at: float) -> float:

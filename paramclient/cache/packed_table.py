@@ -17,15 +17,15 @@ is allocated for its claimed size.
 
 from __future__ import annotations
 
-import math
 import struct
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
+from itertools import chain
 from operator import itemgetter, lt
 from typing import Any, Final, NamedTuple, TypeVar
 
-from paramclient.cache.cells import YEAR_10000, Damaged
+from paramclient.cache.cells import YEAR_10000, Damaged, are_times
 from paramclient.cache.stored_param import COLUMN_NAMES, COLUMNS, StoredParam, StoredTable
 from paramclient.errors import UsageError
 
@@ -115,7 +115,7 @@ def pack(rows: Mapping[str, StoredParam]) -> bytes:
         in_order = itemgetter(*_order(columns["name"], indices))
         columns = {name: in_order(cells) for name, cells in columns.items()}
     layout = _layout(optional)
-    texts = [text for name in layout.texts for text in columns[name]]
+    texts: list[str] = list(chain.from_iterable(columns[name] for name in layout.texts))
     joined = "".join(texts)
     between = next(number for number in range(_CHARACTERS) if chr(number) not in joined)
     try:
@@ -270,6 +270,6 @@ def _checked(times: S) -> S:
     Raises:
         Damaged: a cell is not a valid time.
     """
-    if times and not (min(times) >= 0 and max(times) < YEAR_10000 and math.isfinite(sum(times))):
+    if not are_times(times):
         raise Damaged(f"a cell holds {next(at for at in times if not 0 <= at < YEAR_10000)!r}")
     return times

@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Final
 
 from paramclient.cache import snapshots
-from paramclient.cache.cells import time_cell
+from paramclient.cache.cells import are_times, time_cell
 from paramclient.cache.observed_table import HeardParams
 from paramclient.cache.records import CachedComponent, HistoryEntry, TableState, TableUpdate
 from paramclient.cache.stored_param import BY_VEHICLE, StoredParam
@@ -124,8 +124,10 @@ def check_times(update: TableUpdate) -> None:
     Raises:
         UsageError: a time is not in unix seconds.
     """
-    for _, at in heard_times(update.params):
-        time_cell(at)
+    times = [at for _, at in heard_times(update.params)]
+    if not are_times(times):
+        for at in times:
+            time_cell(at)
 
 
 def heard_times(params: Sequence[StoredParam]) -> Iterable[tuple[str, float]]:

@@ -7,38 +7,16 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from paramclient.documents.document import Document, Maybe, Scalar
+from paramclient.documents.document import Document, Maybe
+from paramclient.documents.param import WrittenParamDoc
 from paramclient.documents.paramset import OriginDoc
 from paramclient.model.comparison import Moved, Standing
-from paramclient.model.notation import bits_written, value_written
-from paramclient.model.values import type_name
 
 if TYPE_CHECKING:
     from paramclient.metadata import Metadata
     from paramclient.model.comparison import Comparison, Difference
-    from paramclient.model.paramset import WrittenParam
 
-__all__ = ["ComparedDoc", "DiffDoc", "DifferenceDoc"]
-
-
-class ComparedDoc(Document):
-    """The value of one side; `text` is its meaning in a word, if known."""
-
-    value: Scalar
-    type: str | None
-    bits: str | None
-    text: Maybe[str] = None
-
-    @classmethod
-    def of(cls, param: WrittenParam, metadata: Metadata | None = None) -> ComparedDoc:
-        """Return the document of a parameter of one side, with the metadata of that side."""
-        info = None if metadata is None else metadata.find(param.name)
-        return cls(
-            value=value_written(param.value, param),
-            type=None if param.type is None else type_name(param.type),
-            bits=bits_written(param),
-            text=None if info is None else info.text(param.value) or None,
-        )
+__all__ = ["DiffDoc", "DifferenceDoc"]
 
 
 class DifferenceDoc(Document):
@@ -47,9 +25,9 @@ class DifferenceDoc(Document):
     standing: Standing = Field(validation_alias="is", serialization_alias="is")
     types_differ: bool
     rounding: bool
-    left: ComparedDoc | None
-    right: ComparedDoc | None
-    base: ComparedDoc | None
+    left: WrittenParamDoc | None
+    right: WrittenParamDoc | None
+    base: WrittenParamDoc | None
     moved: Moved | None
     units: Maybe[str] = None
 
@@ -67,9 +45,9 @@ class DifferenceDoc(Document):
             standing=entry.standing,
             types_differ=entry.types_differ,
             rounding=entry.is_rounding,
-            left=None if entry.left is None else ComparedDoc.of(entry.left, left),
-            right=None if entry.right is None else ComparedDoc.of(entry.right, right),
-            base=None if entry.base is None else ComparedDoc.of(entry.base, base),
+            left=None if entry.left is None else WrittenParamDoc.compared(entry.left, left),
+            right=None if entry.right is None else WrittenParamDoc.compared(entry.right, right),
+            base=None if entry.base is None else WrittenParamDoc.compared(entry.base, base),
             moved=entry.moved,
             units=next((info.units for info in infos if info is not None and info.units), None),
         )

@@ -13,12 +13,11 @@ from paramclient.client.component import Component
 from paramclient.client.local import local
 from paramclient.client.subscription import Changes
 from paramclient.documents.component import ComponentDoc, ProgressDoc
+from paramclient.documents.param import ParamDoc
 from paramclient.errors import NoReply, ParamClientError
-from paramclient.model.notation import bits_text, value_json
 from paramclient.model.params import as_params, held_of
-from paramclient.model.values import Param, Trust, type_name
+from paramclient.model.values import Param, Trust
 from paramclient.protocol.params.change import Change
-from paramclient.service.event_feed import COMPACT_SEPARATORS
 
 if TYPE_CHECKING:
     from paramclient.metadata import Metadata
@@ -274,22 +273,8 @@ class _ChangeForwarder(Changes):
 
 
 def param_json(param: Param, heard_at: float | None) -> str:
-    """Return the JSON of `ParamDoc.kept`, ten times as fast."""
-    default = param.default
-    document: dict[str, Any] = {
-        "name": param.name,
-        "value": value_json(param.value, param.type),
-        "type": type_name(param.type),
-        "index": param.index,
-        "bits": bits_text(param),
-    }
-    if default is not None:
-        document["default"] = value_json(default, param.type)
-        document["is_default"] = not param.is_changed
-    document["trust"] = param.trust.value
-    if heard_at is not None:
-        document["heard_at"] = heard_at
-    return json.dumps(document, allow_nan=False, separators=COMPACT_SEPARATORS)
+    """Return a parameter as JSON."""
+    return ParamDoc.kept(param, heard_at=heard_at).model_dump_json()
 
 
 def _now() -> float:

@@ -22,7 +22,7 @@ from paramclient.errors import ParamClientError, UnknownParameter, UsageError
 from paramclient.model.params import copy_params
 from paramclient.model.patterns import NameChoice
 from paramclient.model.values import Param
-from paramclient.service.followed_component import FollowedComponent, param_json
+from paramclient.service.followed_component import FollowedComponent
 from paramclient.service.param_sources import PATTERNS_MAX, REQUEST_VALUES_MAX
 from paramclient.service.problems import problem_of
 from paramclient.service.request_body import BodyRoute
@@ -39,7 +39,7 @@ from paramclient.service.route_context import (
 )
 
 if TYPE_CHECKING:
-    from paramclient.metadata import Metadata
+    from paramclient.metadata import Metadata, ParamInfo
 
 __all__ = ["router"]
 
@@ -219,8 +219,11 @@ def _text_with_metadata(target: FollowedComponent, param: Param) -> str:
     info = None if target.metadata is None else target.metadata.get(param.name)
     if info is None:
         return target.json_of(param)
-    document = ParamDoc.kept(param, info, heard_at=target.heard_at(param.name), whole=True)
-    return document.model_dump_json()
+    return _described(param, info, target.heard_at(param.name))
+
+
+def _described(param: Param, info: ParamInfo | None, heard_at: float | None) -> str:
+    return ParamDoc.kept(param, info, heard_at=heard_at, whole=True).model_dump_json()
 
 
 def _named(known: Iterable[str], names: list[str]) -> list[str]:
@@ -253,12 +256,7 @@ def _texts_with_metadata(
 ) -> str:
     """Return the members of a JSON object with descriptions, in any thread."""
     return ",".join(
-        f"{json.dumps(each.name)}:"
-        + (
-            param_json(each, heard_at[each.name])
-            if (info := metadata.get(each.name)) is None
-            else ParamDoc.kept(each, info, heard_at=heard_at[each.name], whole=True).model_dump_json()
-        )
+        f"{json.dumps(each.name)}:{_described(each, metadata.get(each.name), heard_at[each.name])}"
         for each in params
     )
 
