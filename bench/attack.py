@@ -75,8 +75,8 @@ ENDED: Final = 3.0
 
 LAUNCH: Final = """
 import asyncio.base_events, asyncio.events, json, os, signal, sys, time
-from paramclient.service import places
-places.is_loopback = lambda address: address == "127.0.0.1"
+from paramclient.service import connection_slots
+connection_slots.is_loopback = lambda address: address == "127.0.0.1"
 longest, late, run = 0.0, 0.0, asyncio.events.Handle._run
 def timed(handle):
     global longest
@@ -432,6 +432,14 @@ async def large_table(rows: list[Row], quick: bool) -> None:
                 with service.watched():
                     status, answer = await service.ask(method, path, body, token(READER))
                     assert status == 200, answer
+            service.attack = f"{len(table):,} parameters: 6 diff at once"
+            with service.watched(late=LATE):
+                asked_at_once = [
+                    service.ask("POST", f"{C}/diff", as_json(values, known=True), token(READER))
+                    for _ in range(6)
+                ]
+                statuses = [status for status, _ in await asyncio.gather(*asked_at_once)]
+                service.note("not answered", 0, sum(status != 200 for status in statuses), "times")
             await many_answers(service, len(table))
     finally:
         far_end.cancel()
@@ -459,6 +467,56 @@ async def many_answers(service: Service, size: int) -> None:
                 one.connect((HERE, service.port))
                 one.sendall(data)
             await asyncio.sleep(1.5 if count == 1 else 4)
+
+
+async def many_components(rows: list[Row], quick: bool) -> None:
+    """Clause 7: requests of a reader for the maximum number of components, which one sender makes up."""
+    count = 100 if quick else 1_000
+    with socket.socket(type=socket.SOCK_DGRAM) as free:
+        free.bind((HERE, 0))
+        port = free.getsockname()[1]
+    async with serving(rows, f"udpin:{HERE}:{port}", "--no-cache", "--no-fetch") as service:
+        beating = asyncio.create_task(beat(port, count))
+        try:
+            deadline = time.monotonic() + PATIENCE
+            known = 0
+            while known < count and time.monotonic() < deadline:
+                await asyncio.sleep(0.5)
+                _, answer = await service.ask("GET", "/api/v1/components", b"", token(READER))
+                known = len(json.loads(answer)["components"])
+            assert known == count, known
+            for path in ("/api/v1/components", "/api/v1/vehicles", "/api/v1/state"):
+                service.attack = f"{count:,} components: GET {path}"
+                with service.watched(late=LATE):
+                    status, answer = await service.ask("GET", path, b"", token(READER))
+                    service.note("not answered", 0, status != 200, "times")
+            for at_once in (1, 4):
+                service.attack = f"{count:,} components: 5 times {at_once} POST /api/v1/fetch"
+                with service.watched():
+                    for _ in range(5):
+                        asked = [
+                            service.ask("POST", "/api/v1/fetch", b'{"timeout_s": 1}', token(READER))
+                            for _ in range(at_once)
+                        ]
+                        statuses = [status for status, _ in await asyncio.gather(*asked)]
+                        unexpected = sum(status != 504 for status in statuses)
+                        assert not unexpected, statuses
+        finally:
+            beating.cancel()
+
+
+async def beat(port: int, count: int) -> None:
+    """Send the heartbeats of many components to a UDP port, each once a second; until cancelled."""
+    frames = []
+    for number in range(count):
+        mav = common.MAVLink(None, 1 + number % 250, 1 + number // 250)
+        frames.append(mav.heartbeat_encode(2, 12, 81, 0, 4).pack(mav))
+    with socket.socket(type=socket.SOCK_DGRAM) as peer:
+        while True:
+            for number, frame in enumerate(frames):
+                peer.sendto(frame, (HERE, port))
+                if not number % 25:
+                    await asyncio.sleep(25 / count)
 
 
 async def slices(service: Service, quick: bool) -> None:
@@ -757,6 +815,7 @@ async def attack(quick: bool, only: str) -> list[Row]:
         "handshakes without TLS": lambda: on_service(handshakes, *bare),
         "requests": lambda: on_service(requests, *sim),
         "large table": lambda: large_table(rows, quick),
+        "many components": lambda: many_components(rows, quick),
         "slices": lambda: on_service(slices, *sim),
         "parsing": lambda: on_service(parsing, *sim),
         "guesses": lambda: on_service(guesses, *bare, "--trusted-proxy", ELSEWHERE),

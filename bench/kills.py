@@ -42,7 +42,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 import anyio
 
 from paramclient import ParamCache, ParamClient, service
-from paramclient.client.cache_writer import FLUSH_INTERVAL
+from paramclient.client.cache_writer import CACHE_FLUSH_INTERVAL
 from paramclient.sim import PX4Vehicle
 from tests.postgres import PROGRAMS, Server, database_on, server
 
@@ -255,7 +255,7 @@ class Rounds:
             age = killed_at - each.at
             if is_there:
                 continue
-            if each.durable or age > FLUSH_INTERVAL + self._slack:
+            if each.durable or age > CACHE_FLUSH_INTERVAL + self._slack:
                 found.lost.append(f"{kind} {number}: {each}, {age:.3f} s before the kill")
             else:
                 found.oldest = max(found.oldest, age)

@@ -21,8 +21,8 @@ from unittest import mock
 
 from fuzz.draw import Draw
 from paramclient.cache import ParamCache, StoredParam, TableState, TableUpdate
+from paramclient.cache.cells import Damaged
 from paramclient.cache.packed_table import pack, row_checksum, unpack
-from paramclient.cache.rows import Damaged
 from paramclient.errors import CacheError, UnknownVehicle
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param, ParamType, Trust

@@ -11,7 +11,7 @@ from typing import Final, NoReturn
 
 __all__ = ["main"]
 
-LIBRARIES: Final = ("cyclopts", "rich")
+COMMAND_LIBRARIES: Final = ("cyclopts", "rich")
 """Libraries that the extra `cli` installs."""
 SIGPIPE: Final = 13
 """Number of the signal, for the exit code. Windows has no SIGPIPE but uses the same exit code."""
@@ -23,7 +23,7 @@ def main() -> NoReturn:
     Exits with 130 after Ctrl-C, 143 after SIGTERM and 141 when the output's reader has closed it, like
     programs killed by these signals; `paramclient.cli.exit_codes` lists the other codes.
     """
-    if missing := [name for name in LIBRARIES if find_spec(name) is None]:
+    if missing := [name for name in COMMAND_LIBRARIES if find_spec(name) is None]:
         print(
             f"paramclient: the command needs {' and '.join(missing)}: pip install 'paramclient[cli]'",
             file=sys.stderr,

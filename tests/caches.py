@@ -60,6 +60,20 @@ def stored(
     return StoredParam(param, at, volatile, by)
 
 
+def cells(
+    name: str,
+    type: int,  # noqa: A002  # the attribute's name
+    bits: int,
+    is_raw: int,
+    index: int | None,
+    volatile: int,
+    at: float,
+    default_bits: int | None = None,
+) -> StoredParam:
+    """One stored parameter, given by its cells."""
+    return StoredParam._make((name, type, bits, is_raw, index, volatile, at, default_bits, ""))
+
+
 def update(*params: StoredParam, identity: Identity = PX4, component: int = 1, **more: Any) -> TableUpdate:
     """What was learnt at NOW."""
     more = {"autopilot": 12, "at": NOW} | more

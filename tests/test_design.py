@@ -54,7 +54,7 @@ MAY_IMPORT = {
     "cache": {"errors", "model"},
     "files": {"errors", "model", "protocol.ftp.param_pck"},
     "client": SHELL | {"remote", "sim"},
-    "remote": SHELL,
+    "remote": SHELL | {"documents"},
     "metadata": SHELL,
     "provision.apply_rules": {"errors", "model"},
     "provision.similar_names": set[str](),
@@ -222,7 +222,57 @@ def test_no_two_modules_share_a_name_but_counterparts() -> None:
     assert all(len(places) == len(set(places)) for places in rooms.values())
 
 
-NAMEDTUPLE_METHODS = {"_replace", "_asdict", "_fields"}
+SAME_NAME_CONSTANTS = {"MIGRATIONS": "the schema of each store"}
+"""Constants of one name with different values, and the reason."""
+
+SAME_NAME_CLASSES = {
+    "ParamInfo": "the metadata of a parameter, and what a plan needs of it (a Protocol)",
+    "ParamSet": "a set of parameters for users, and the message PARAM_SET",
+}
+"""Classes of one name, and the reason."""
+
+
+def names_with_several_contents(public: Iterator[tuple[str, str]]) -> set[str]:
+    contents: dict[str, set[str]] = {}
+    for name, content in public:
+        if not is_private(name):
+            contents.setdefault(name, set()).add(content)
+    return {name for name, found in contents.items() if len(found) > 1}
+
+
+def statements_outside_the_service() -> Iterator[tuple[str, ast.stmt]]:
+    for module in MODULES:
+        if room_of(module).split(".")[0] != SERVICE:
+            yield from ((module, node) for node in source_of(module).body)
+
+
+def constants() -> Iterator[tuple[str, str]]:
+    """The name and the value of each constant."""
+    for _, node in statements_outside_the_service():
+        match node:
+            case (
+                ast.AnnAssign(target=ast.Name(id=name), value=ast.expr() as value)
+                | ast.Assign(targets=[ast.Name(id=name)], value=value)
+            ) if name.isupper():
+                yield name, ast.unparse(value)
+
+
+def classes() -> Iterator[tuple[str, str]]:
+    """The name and the module of each class."""
+    for module, node in statements_outside_the_service():
+        if isinstance(node, ast.ClassDef):
+            yield node.name, module
+
+
+def test_no_two_constants_of_one_name_have_different_values() -> None:
+    assert names_with_several_contents(constants()) == SAME_NAME_CONSTANTS.keys()
+
+
+def test_no_two_classes_share_a_name_but_counterparts() -> None:
+    assert names_with_several_contents(classes()) == SAME_NAME_CLASSES.keys()
+
+
+NAMEDTUPLE_METHODS = {"_make", "_replace", "_asdict", "_fields"}
 """Names that begin with an underscore and are public nevertheless, so that no field can have them."""
 
 
@@ -313,6 +363,32 @@ def test_only_the_client_chooses_the_remote_one() -> None:
         if room_of(target).startswith("remote") and not room_of(module).startswith("remote")
     }
     assert uses == {"paramclient.client.client"}
+
+
+RETRY_WORDS = re.compile(r"ATTEMPTS|RETRY|BACKOFF|COPIES")
+
+
+def constants_of(module: str) -> set[str]:
+    return {
+        node.target.id
+        for node in source_of(module).body
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)
+    }
+
+
+def test_to_change_a_retry_rule_is_to_change_one_module() -> None:
+    """The scheduler repeats no requests: it tries again to run more lists in parallel."""
+    core = {module for module in MODULES if module.startswith("paramclient.protocol.")}
+    rules = {module for module in core if any(map(RETRY_WORDS.search, constants_of(module)))}
+    assert rules - {"paramclient.protocol.scheduler"} == {"paramclient.protocol.requests.retry"}
+
+
+def test_one_module_requests_messages() -> None:
+    core = {module for module in MODULES if module.startswith("paramclient.protocol.")}
+    uses = {
+        module for module in core for each in imports_of(module) if "MAV_CMD_REQUEST_MESSAGE" in each.names
+    }
+    assert uses - {"paramclient.protocol.wire"} == {"paramclient.protocol.vehicle.commands"}
 
 
 def test_only_the_wire_and_the_reader_of_dataflash_logs_use_pymavlink() -> None:

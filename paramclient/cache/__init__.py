@@ -1,5 +1,6 @@
 """Parameter cache: tables, vehicle identities, history and snapshots, in a file or a shared database.
 
+- `cells`: database cells: checks of their types, times and identities.
 - `database_url`: URL of a PostgreSQL database.
 - `file_ownership`: owner and access rights of files.
 - `fleet`: comparison of parameters across vehicles.
@@ -8,14 +9,13 @@
 - `lookup`: vehicles by system id, hardware id or key.
 - `merge`: merge of earlier observations, such as those of logs.
 - `postgres_schema`: schema of the PostgreSQL database.
-- `observed_table`: parameters of a live table as rows.
+- `observed_table`: parameters of a live table as observations.
 - `operations`: write operations.
 - `outbox`: local copy of a shared database, with the writes that it has not received yet.
 - `packed_table`: a table as one binary blob.
 - `postgres`: PostgreSQL database.
 - `reconciliation`: new observations reconciled with the stored table and history, by time.
 - `records`: records that the cache stores and returns.
-- `rows`: records as database cells.
 - `sqlite_schema`: schema of the file.
 - `setups`: notes about running and interrupted set-ups.
 - `shared`: a shared database with its local copy.
@@ -23,6 +23,7 @@
 - `sqlite`: SQLite transactions.
 - `sqlite_file`: the SQLite file: opening, checks, replacement of a damaged one.
 - `store`: `ParamCache`, the public class.
+- `stored_param`: the stored form of a parameter, and its columns in both databases.
 - `tables`: tables and their history.
 - `transaction`: `Session`, one transaction in SQL.
 - `transfer`: copies of tables between stores.
@@ -34,7 +35,6 @@ from paramclient.cache.fleet import FleetDiff, FleetValue, FleetVehicle, Holder,
 from paramclient.cache.observed_table import HeardParams, UnixTimes
 from paramclient.cache.records import (
     BY_US,
-    BY_VEHICLE,
     CacheChange,
     CachedComponent,
     CachedSummary,
@@ -42,7 +42,6 @@ from paramclient.cache.records import (
     HistoryEntry,
     Snapshot,
     SnapshotSummary,
-    StoredParam,
     TableState,
     TableUpdate,
     by_station,
@@ -50,6 +49,7 @@ from paramclient.cache.records import (
 from paramclient.cache.setups import CutOff, RunningSetup, SetupNotes
 from paramclient.cache.snapshots import CLOCK_SLACK, SNAPSHOTS
 from paramclient.cache.store import ParamCache, default_path
+from paramclient.cache.stored_param import BY_VEHICLE, StoredParam
 from paramclient.cache.tables import HISTORY_LINES
 from paramclient.cache.transfer import CopyResult
 

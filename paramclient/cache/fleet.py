@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from typing import Final, TypeAlias
 
-from paramclient.cache.rows import cells, read_param
+from paramclient.cache.cells import cells
+from paramclient.cache.stored_param import read_param
 from paramclient.cache.transaction import Session
 from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import Param, same_bits

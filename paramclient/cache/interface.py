@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-from paramclient.cache.operations import Operation
+from paramclient.cache.operations import StoreOperation
 from paramclient.cache.records import CacheChange
 from paramclient.cache.transaction import Session
 
@@ -47,7 +47,7 @@ class Store(Protocol):
         """
         ...
 
-    def do(self, operation: Operation[T]) -> T:
+    def do(self, operation: StoreOperation[T]) -> T:
         """Run a write operation in one transaction and return its result: either all or nothing is written.
 
         Raises:

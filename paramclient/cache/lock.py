@@ -12,9 +12,9 @@ from typing import Final
 
 from paramclient.errors import CacheError
 
-__all__ = ["BUSY_TIMEOUT", "locked", "try_to_lock"]
+__all__ = ["LOCK_WAIT_MAX", "locked", "try_to_lock"]
 
-BUSY_TIMEOUT: Final = 5.0
+LOCK_WAIT_MAX: Final = 5.0
 """Timeout in seconds for a lock of another process. Transactions take milliseconds; a process that holds a
 lock for longer is blocked."""
 
@@ -30,14 +30,14 @@ def locked(folder: Path) -> Iterator[None]:
 
     Raises:
         OSError: the folder does not exist.
-        CacheError: another process holds the lock for longer than `BUSY_TIMEOUT`.
+        CacheError: another process holds the lock for longer than `LOCK_WAIT_MAX`.
     """
     descriptor = _open(folder)
     try:
-        deadline = time.monotonic() + BUSY_TIMEOUT
+        deadline = time.monotonic() + LOCK_WAIT_MAX
         while not try_to_lock(descriptor):
             if time.monotonic() > deadline:
-                raise CacheError(f"another process has locked the folder {folder} for {BUSY_TIMEOUT:g} s")
+                raise CacheError(f"another process has locked the folder {folder} for {LOCK_WAIT_MAX:g} s")
             time.sleep(_LOCK_POLL)
         yield
     finally:

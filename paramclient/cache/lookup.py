@@ -23,7 +23,7 @@ __all__ = ["find_vehicle", "is_vehicle_name"]
 PREFIX_DIGITS_MIN: Final = 6
 """Hexadecimal digits that the beginning of a hardware id has at least: fewer fit by accident, as those of a
 system id do."""
-LISTED_MAX: Final = 50
+VEHICLES_LISTED_MAX: Final = 50
 """Vehicles that an error message lists. A station with more has `paramclient cache list`."""
 
 _SYSTEM_ID: Final = re.compile(r"[0-9]{1,3}")
@@ -116,6 +116,6 @@ def _number(vehicles: Sequence[CachedVehicle]) -> str:
 
 def _listed(vehicles: Sequence[CachedVehicle]) -> str:
     """Return a line for each vehicle."""
-    lines = [f"\n  {known}" for known in vehicles[:LISTED_MAX]]
+    lines = [f"\n  {known}" for known in vehicles[:VEHICLES_LISTED_MAX]]
     more = len(vehicles) - len(lines)
     return "".join(lines) + (f"\n  and {more} more; `paramclient cache list` shows all" if more else "")

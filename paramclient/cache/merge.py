@@ -6,9 +6,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from paramclient.cache.records import BY_VEHICLE, CachedSummary, CachedVehicle, StoredParam, TableUpdate
-from paramclient.cache.rows import Row
-from paramclient.cache.tables import HISTORY_LINES, applied, hashed, save
+from paramclient.cache.records import CachedSummary, CachedVehicle, TableUpdate
+from paramclient.cache.stored_param import BY_VEHICLE, StoredParam
+from paramclient.cache.tables import HISTORY_LINES, applied, check_times, hashed, save
 from paramclient.cache.transaction import Line, Session
 
 __all__ = ["merge"]
@@ -26,6 +26,7 @@ def merge(
     """Write earlier updates, in the order of their times; see `ParamCache.merge`."""
     tables: dict[tuple[str, int], _Past] = {}
     for update in updates:
+        check_times(update)
         key = (update.identity.key, update.component)
         past = tables.get(key)
         if past is None:
@@ -71,7 +72,7 @@ class _Past:
         self.goes_on = goes_on or update.replace
         if not self.goes_on:
             update = replace(update, table=None)
-        self.catch_up(item.param.name for item in update.params)
+        self.catch_up(item.name for item in update.params)
         self._save(update, vehicle)
 
     def catch_up(self, names: Iterable[str]) -> None:
@@ -81,11 +82,10 @@ class _Past:
             return
         kept = self.session.table(self.owner)
         for item in found:
-            name = item.param.name
-            old, new = _row(item), kept.get(name)
-            if new is None or old.same_value(new) or self._lines(name, item.heard_at, new.heard_at):
+            new = kept.get(item.name)
+            if new is None or item.same_value(new) or self._lines(item.name, item.heard_at, new.heard_at):
                 continue
-            self.lines.append((new.heard_at, name, BY_VEHICLE, *old.value, *new.value))
+            self.lines.append((new.heard_at, item.name, BY_VEHICLE, *item.value, *new.value))
 
     def finish(self) -> None:
         """Insert the new history lines by time, and trim the history."""
@@ -120,22 +120,22 @@ class _Past:
         before = self.session.table(self.owner)
         whole_at = table.synced_at if table.complete and table.synced_at is not None else float("-inf")
         later: list[StoredParam] = []
-        heard = {item.param.name for item in update.params}
+        heard = {item.name for item in update.params}
         for name in set(self.overtaken) - heard if update.replace else update.removed:
             self.overtaken.pop(name, None)  # a later value of this name is another parameter
         for item in update.params:
-            name = item.param.name
+            name = item.name
             row = before.get(name)
             gone_at = self.session.gone_at(self.owner, name) if row is None else row.heard_at
             if (max(whole_at, gone_at) if row is None else gone_at) < item.heard_at:
                 # its index may belong to another count
-                later.append(replace(item, param=replace(item.param, index=None)))
+                later.append(item._replace(param_index=None))
                 continue
             before_it = self.overtaken.get(name)
             self.overtaken[name] = item
             if row is not None and before_it is not None:
                 self.lines += self._line(before_it, item)
-        self.catch_up(item.param.name for item in later)
+        self.catch_up(item.name for item in later)
         after, changes, births = applied(replace(update, params=later, removed=(), replace=False), before)
         if after != before:
             self.session.put_table(self.owner, before, after)
@@ -144,16 +144,13 @@ class _Past:
         self.session.add_births(self.owner, births)
         self.lines += changes
 
-    def _line(self, old_item: StoredParam, item: StoredParam) -> Iterator[Line]:
+    def _line(self, old: StoredParam, new: StoredParam) -> Iterator[Line]:
         """Yield the history line of a change between two observations, unless it exists."""
-        old, new = _row(old_item), _row(item)
         if old.same_value(new):
             return
-        around = self._lines(
-            item.param.name, item.heard_at - SAME_CHANGE_MAX, item.heard_at + SAME_CHANGE_MAX
-        )
+        around = self._lines(new.name, new.heard_at - SAME_CHANGE_MAX, new.heard_at + SAME_CHANGE_MAX)
         if new.value not in around:
-            yield (item.heard_at, item.param.name, item.by, *old.value, *new.value)
+            yield (new.heard_at, new.name, new.by, *old.value, *new.value)
 
     def _lines(self, name: str, after: float, until: float) -> list[Line]:
         """Return the new values of a parameter in a period, from its history lines."""
@@ -168,7 +165,3 @@ def _standing(
     key = update.identity.key
     vehicle = next(iter(session.vehicles(key)), None)
     return vehicle, next(iter(session.summaries(key, update.component)), None)
-
-
-def _row(item: StoredParam) -> Row:
-    return Row.of(item.param, None, False, item.heard_at)

@@ -1,18 +1,17 @@
-"""Parameters of a live table as records and rows of the cache."""
+"""Parameters of a live table as observations to store."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, overload
+from functools import cached_property
+from typing import overload
 
-from paramclient.cache.records import BY_VEHICLE, StoredParam
-from paramclient.cache.rows import Row, signed, time_cell
-from paramclient.model.params import NOWHERE, Params, iter_unpack_fields, unpack_fields
-from paramclient.model.values import bits_of
+from paramclient.cache.stored_param import StoredParam, StoredTable
+from paramclient.model.params import Params
 
-__all__ = ["FirstRows", "HeardParams", "UnixTimes"]
+__all__ = ["HeardParams", "UnixTimes"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +49,7 @@ class UnixTimes:
 class HeardParams(Sequence[StoredParam]):
     """Parameters of a live table to store. Each `StoredParam` is created on access.
 
-    A write of a whole table creates none: the cells of its rows come from the packed values of the table.
+    A write of a whole table creates none: its columns come from the packed values of the table.
 
     Args:
         params: a copy of the table's parameters, with the times of the observations.
@@ -74,7 +73,6 @@ class HeardParams(Sequence[StoredParam]):
         self._volatile = volatile
         self._by = by
         self._overwritten = overwritten
-        self._current_times: list[float] | None = None
 
     def __len__(self) -> int:
         return len(self._overwritten) + len(self._params)
@@ -90,95 +88,21 @@ class HeardParams(Sequence[StoredParam]):
 
     def __iter__(self) -> Iterator[StoredParam]:
         yield from self._overwritten
-        for (name, param), at in zip(self._params.items(), self._heard_at(), strict=True):
-            is_volatile = None if self._volatile is None else name in self._volatile
-            yield StoredParam(param, at, is_volatile, self._by.get(name, BY_VEHICLE))
+        yield from self._table.observations(self._by, with_volatile=self._volatile is not None)
 
     def heard_at(self) -> Iterator[tuple[str, float]]:
         """Yield the name and the unix time of each parameter, without creating records."""
         for item in self._overwritten:
-            yield item.param.name, item.heard_at
-        yield from zip(self._params.held, self._heard_at(), strict=True)
+            yield item.name, item.heard_at
+        yield from zip(self._params.held, self._table.column("heard_at"), strict=True)
 
-    def _heard_at(self) -> list[float]:
-        """Return the unix times of the table's parameters, in table order."""
-        if self._current_times is None:
-            times, moments, held = self._times, self._params.moments, self._params.held
-            present = times.at - times.ahead
-            self._current_times = times.of_all([moments.get(name, present) for name in held])
-        return self._current_times
+    def first_table(self) -> StoredTable | None:
+        """Return the first stored parameters of a table; None if a name may occur twice, or there is none."""
+        return self._table if self._params and not self._overwritten else None
 
-    def rows(self) -> Iterator[tuple[str, Row, bool | None, str]]:
-        """Yield the name, the row, the volatile flag and the author of each parameter."""
-        for item in self._overwritten:
-            param = item.param
-            row = Row.of(param, param.index, bool(item.volatile), item.heard_at)
-            yield param.name, row, item.volatile, item.by
-        for name, row in self._rows().items():
-            is_volatile = None if self._volatile is None else bool(row.volatile)
-            yield name, row, is_volatile, self._by.get(name, BY_VEHICLE)
-
-    def first_rows(self) -> FirstRows | None:
-        """Return the rows for a table without rows; None if a name may occur twice, or there is no row."""
-        return self._rows() if self._params and not self._overwritten else None
-
-    def _rows(self) -> FirstRows:
-        times = self._heard_at()
-        for at in (min(times), max(times)) if times else ():
-            time_cell(at)
-        return FirstRows(self._params, self._volatile or frozenset(), times)
-
-
-class FirstRows(Mapping[str, Row]):
-    """Rows of a live table's parameters. Each row is created on access.
-
-    `columns` returns all columns in a few calls, without an object for each row: the objects of several
-    tables at the same time would trigger full garbage collections.
-
-    Args:
-        params: at least one parameter.
-        volatile: names outside the vehicle's hash.
-        heard_at: unix times of the observations, in the order of the parameters.
-    """
-
-    def __init__(self, params: Params, volatile: frozenset[str], heard_at: Sequence[float]) -> None:
-        self._params = params
-        self._volatile = volatile
-        self._heard_at = heard_at
-        self._by_name: dict[str, float] | None = None
-
-    def __len__(self) -> int:
-        return len(self._params)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._params)
-
-    def __getitem__(self, name: str) -> Row:
-        bits, number, is_raw, _, place = unpack_fields(self._params.held[name])
-        default = self._params.defaults.get(name)
-        initial = None if default is None else signed(bits_of(default, number))
-        index = None if place == NOWHERE else place
-        is_volatile = int(name in self._volatile)
-        if self._by_name is None:
-            self._by_name = dict(zip(self._params.held, self._heard_at, strict=True))
-        return Row(number, signed(bits), is_raw, index, is_volatile, self._by_name[name], initial)
-
-    def columns(self) -> tuple[Sequence[str], list[Sequence[Any]]]:
-        """Return the names, and the columns of all rows in the order of `Row`."""
-        held, defaults = self._params.held, self._params.defaults
-        bits, types, is_raw, _, places = zip(*iter_unpack_fields(b"".join(held.values())), strict=True)
-        initial: Sequence[int | None] = (None,) * len(held)
-        if defaults:
-            initial = [
-                signed(bits_of(defaults[name], number)) if name in defaults else None
-                for name, number in zip(held, types, strict=True)
-            ]
-        return tuple(held), [
-            types,
-            [signed(each) for each in bits] if max(bits) >> 63 else bits,
-            is_raw,
-            [None if place == NOWHERE else place for place in places] if NOWHERE in places else places,
-            bytes(map(self._volatile.__contains__, held)),
-            self._heard_at,
-            initial,
-        ]
+    @cached_property
+    def _table(self) -> StoredTable:
+        times, moments, held = self._times, self._params.moments, self._params.held
+        present = times.at - times.ahead
+        heard_at = times.of_all([moments.get(name, present) for name in held])
+        return StoredTable.of_live(self._params, self._volatile or frozenset(), heard_at)

@@ -11,19 +11,18 @@ from paramclient.cache import snapshots
 from paramclient.cache.merge import merge
 from paramclient.cache.reconciliation import reconcile
 from paramclient.cache.records import Snapshot, TableUpdate
-from paramclient.cache.rows import read_param
 from paramclient.cache.transaction import Session
 from paramclient.errors import NotInCache
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import is_portable_name
 
-__all__ = ["Merge", "Operation", "Remove", "Save", "StoreSnapshot"]
+__all__ = ["Merge", "StoreOperation", "Remove", "Save", "StoreSnapshot"]
 
 T_co = TypeVar("T_co", covariant=True)
 
 
-class Operation(ABC, Generic[T_co]):
+class StoreOperation(ABC, Generic[T_co]):
     """A write to a cache, executed completely or not at all.
 
     Attributes:
@@ -47,14 +46,14 @@ class Operation(ABC, Generic[T_co]):
 
 
 @dataclass(frozen=True)
-class Save(Operation[None]):
+class Save(StoreOperation[None]):
     """Write updates of tables, see `ParamCache.save`.
 
     Attributes:
         updates: the updates, in order of execution.
         clock: returns the current time by the clock of the updates; None uses `at` of each update, which also
             counts for a delayed execution.
-        is_durable: as in `Operation`; without updates it applies to all earlier writes.
+        is_durable: as in `StoreOperation`; without updates it applies to all earlier writes.
     """
 
     updates: Sequence[TableUpdate]
@@ -70,7 +69,7 @@ class Save(Operation[None]):
 
 
 @dataclass(frozen=True)
-class Merge(Operation[None]):
+class Merge(StoreOperation[None]):
     """Merge earlier updates, see `ParamCache.merge`.
 
     Attributes:
@@ -90,7 +89,7 @@ class Merge(Operation[None]):
 
 
 @dataclass(frozen=True)
-class StoreSnapshot(Operation[Snapshot]):
+class StoreSnapshot(StoreOperation[Snapshot]):
     """Store a snapshot, see `ParamCache.store_snapshot`.
 
     Attributes:
@@ -165,7 +164,7 @@ class StoreSnapshot(Operation[Snapshot]):
 
 
 @dataclass(frozen=True)
-class Remove(Operation[int]):
+class Remove(StoreOperation[int]):
     """Remove tables, see `ParamCache.remove`.
 
     Attributes:
@@ -191,9 +190,5 @@ class Remove(Operation[int]):
 
 
 def _kept(session: Session, owner: int) -> ParamSet:
-    rows = session.table(owner)
-    return ParamSet.of(
-        read_param(name, *row.value, row.param_index, row.default_bits)
-        for name, row in rows.items()
-        if is_portable_name(name)
-    )
+    rows = session.table(owner).values()
+    return ParamSet.of(row.param for row in rows if is_portable_name(row.name))

@@ -9,17 +9,18 @@ from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from paramclient.cache.operations import Merge, Operation, Save, StoreSnapshot
-from paramclient.cache.records import StoredParam, TableState, TableUpdate
-from paramclient.cache.rows import Damaged, Row, identity_cells, read_identity, read_param
+from paramclient.cache.cells import Damaged, identity_cells, read_identity
+from paramclient.cache.operations import Merge, Save, StoreOperation, StoreSnapshot
+from paramclient.cache.records import TableState, TableUpdate
 from paramclient.cache.snapshots import read_written, written_cells
 from paramclient.cache.sqlite import SqliteSession
 from paramclient.cache.sqlite_file import Database
+from paramclient.cache.stored_param import COLUMN_NAMES, StoredParam
 from paramclient.cache.transaction import Session
 from paramclient.cache.transfer import WholeTable, put_shots, put_whole
 from paramclient.model.paramset import ParamSet
 
-__all__ = ["Entry", "LocalCopy", "packed", "unpacked"]
+__all__ = ["QueuedOperation", "LocalCopy", "packed", "unpacked"]
 
 # Tables of the local copy beside those of a cache file: the outbox, and the copied revision of each table.
 _TABLES: Final = (
@@ -37,12 +38,19 @@ _TABLES: Final = (
         PRIMARY KEY (vehicle, component)
     )""",
 )
+_FIRST: Final = (
+    *("name", "type", "bits", "is_raw", "param_index", "default_bits"),
+    *("heard_at", "volatile", "by"),
+)
+_LATER: Final = tuple(name for name in COLUMN_NAMES if name not in _FIRST)
+_ITEM: Final = (*_FIRST, *_LATER)
+"""Fields of a queued parameter, in order: those of the first version, then later columns."""
 T = TypeVar("T")
 _Key = tuple[str, int]
 
 
 @dataclass(frozen=True)
-class Entry:
+class QueuedOperation:
     """A queued operation.
 
     Attributes:
@@ -54,7 +62,7 @@ class Entry:
     id: int
     writer: str
     number: int
-    operation: Operation[object]
+    operation: StoreOperation[object]
 
 
 class LocalCopy:
@@ -83,11 +91,11 @@ class LocalCopy:
         """Run a function that only reads, in one transaction, and return its result."""
         return self.database.read(lambda connection: work(SqliteSession(connection, is_shared=True)))
 
-    def do(self, operation: Operation[T]) -> T:
+    def do(self, operation: StoreOperation[T]) -> T:
         """Execute an operation that the database has executed."""
         return self._write(operation.do)
 
-    def spool(self, operation: Operation[T], writer: str, number: int) -> T:
+    def spool(self, operation: StoreOperation[T], writer: str, number: int) -> T:
         """Execute an operation and queue it for the database, in one transaction."""
 
         def work(session: SqliteSession) -> T:
@@ -100,22 +108,22 @@ class LocalCopy:
 
         return self._write(work, durable=operation.is_durable)
 
-    def waiting(self, limit: int) -> list[Entry]:
+    def waiting(self, limit: int) -> list[QueuedOperation]:
         """Return queued operations, the oldest first, without those that the database has refused."""
 
-        def work(session: SqliteSession) -> list[Entry]:
+        def work(session: SqliteSession) -> list[QueuedOperation]:
             found = session.connection.execute(
                 "SELECT id, writer, number, operation FROM outbox WHERE refused IS NULL ORDER BY id LIMIT ?",
                 (limit,),
             )
             return [
-                Entry(place, writer, number, unpacked(operation))
+                QueuedOperation(place, writer, number, unpacked(operation))
                 for place, writer, number, operation in found.fetchall()
             ]
 
         return self._write(work) if self.exists else []
 
-    def arrived(self, entries: Sequence[Entry], tables: Iterable[_Key]) -> None:
+    def arrived(self, entries: Sequence[QueuedOperation], tables: Iterable[_Key]) -> None:
         """Remove executed operations from the queue, and mark these tables as stale."""
 
         def work(session: SqliteSession) -> None:
@@ -125,7 +133,7 @@ class LocalCopy:
 
         self._write(work)
 
-    def refuse(self, entry: Entry, why: str) -> None:
+    def refuse(self, entry: QueuedOperation, why: str) -> None:
         """Mark an operation as refused by the database. It stays in the file."""
         self._write(
             lambda session: session.connection.execute(
@@ -184,7 +192,7 @@ class LocalCopy:
         return self.database.write(whole, durable=durable)
 
 
-def packed(operation: Operation[object]) -> bytes:
+def packed(operation: StoreOperation[object]) -> bytes:
     """Serialize an operation for the outbox.
 
     Raises:
@@ -208,7 +216,7 @@ def packed(operation: Operation[object]) -> bytes:
     return zlib.compress(json.dumps(data, separators=(",", ":")).encode("utf-8", "surrogatepass"))
 
 
-def unpacked(data: object) -> Operation[object]:
+def unpacked(data: object) -> StoreOperation[object]:
     """Deserialize a result of `packed`.
 
     Raises:
@@ -264,11 +272,13 @@ def _update(data: list[Any]) -> TableUpdate:
 
 
 def _item_cells(item: StoredParam) -> list[Any]:
-    param = item.param
-    row = Row.of(param, param.index, False, item.heard_at)
-    return [param.name, *row.value, param.index, row.default_bits, item.heard_at, item.volatile, item.by]
+    return [getattr(item, name) for name in _ITEM]
 
 
 def _item(data: list[Any]) -> StoredParam:
-    name, number, bits, is_raw, index, default, heard_at, volatile, by = data
-    return StoredParam(read_param(name, number, bits, is_raw, index, default), heard_at, volatile, by)
+    found = dict(zip(_ITEM, data, strict=False))  # earlier versions have fewer
+    item = StoredParam._make(map(found.get, StoredParam._fields))
+    volatile = None if item.volatile is None else bool(item.volatile)
+    later: dict[str, Any] = {name: found.get(name) for name in _LATER}
+    checked = StoredParam(item.param, item.heard_at, volatile, item.by)
+    return checked._replace(**later)

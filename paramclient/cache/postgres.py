@@ -16,10 +16,18 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
 from uuid import uuid4
 
+from paramclient.cache.cells import Damaged, cells
 from paramclient.cache.database_url import DatabaseAddress
-from paramclient.cache.operations import Operation
+from paramclient.cache.operations import StoreOperation
 from paramclient.cache.postgres_schema import CHANNEL, MIGRATIONS, SCHEMA
-from paramclient.cache.rows import Damaged, Row, cells, checksum, read_rows
+from paramclient.cache.stored_param import (
+    COLUMN_NAMES,
+    COLUMNS,
+    StoredParam,
+    StoredTable,
+    checksum,
+    read_rows,
+)
 from paramclient.cache.transaction import Session
 from paramclient.cache.transfer import LOCAL_NUMBERS_MIN
 from paramclient.errors import CacheError, UsageError
@@ -138,7 +146,7 @@ class PostgresDatabase:
             return work(PostgresSession(connection)), _revisions(connection, [table[0]]).get(table)
 
     def write(
-        self, operations: Sequence[tuple[Operation[Any], str, int]]
+        self, operations: Sequence[tuple[StoreOperation[Any], str, int]]
     ) -> tuple[list[Any], Revisions, Revisions]:
         """Execute operations in one transaction, each exactly once.
 
@@ -172,7 +180,7 @@ class PostgresDatabase:
             return _revisions(connection, None)
 
     def _write(
-        self, operations: Sequence[tuple[Operation[Any], str, int]]
+        self, operations: Sequence[tuple[StoreOperation[Any], str, int]]
     ) -> tuple[list[Any], Revisions, Revisions]:
         tables = {table for operation, _, _ in operations for table in operation.tables}
         keys = sorted({key for key, _ in tables})
@@ -269,14 +277,19 @@ class PostgresSession(Session):
     def __init__(self, connection: psycopg.Connection[tuple[Any, ...]]) -> None:
         self.connection = connection
 
-    def table(self, owner: int) -> dict[str, Row]:
+    def columns(self, owner: int) -> StoredTable:
+        return StoredTable.of(self.table(owner))
+
+    def table(self, owner: int) -> dict[str, StoredParam]:
         rows = self._rows(owner)
         [(expected,)] = self._all("SELECT checksum FROM component WHERE id = ?", (owner,))
         if checksum(rows) != expected:
             raise Damaged("a table is not what was written")
         return rows
 
-    def put_table(self, owner: int, before: Mapping[str, Row] | None, after: Mapping[str, Row]) -> None:
+    def put_table(
+        self, owner: int, before: Mapping[str, StoredParam] | None, after: Mapping[str, StoredParam]
+    ) -> None:
         if before is None:
             before = self._rows(owner)
         gone = list(before.keys() - after.keys())
@@ -289,27 +302,18 @@ class PostgresSession(Session):
         [(at,)] = self._all("SELECT max(heard_at) FROM param WHERE owner = ?", (owner,))
         return float("-inf") if at is None else float(at)
 
-    def _rows(self, owner: int) -> dict[str, Row]:
+    def _rows(self, owner: int) -> dict[str, StoredParam]:
         return read_rows(
             self._all(
-                "SELECT name, type, bits, is_raw, param_index, volatile, heard_at, default_bits FROM param"
+                f"SELECT {', '.join(COLUMN_NAMES)} FROM param"
                 " WHERE owner = ? ORDER BY param_index IS NULL, param_index, name",
                 (owner,),
             )
         )
 
-    def _put_rows(self, owner: int, rows: Mapping[str, Row]) -> None:
-        if not rows:
-            return
-        columns = [list(column) for column in zip(*((name, *row) for name, row in rows.items()), strict=True)]
-        named = Row._fields
-        self.connection.execute(
-            f"INSERT INTO param (owner, name, {', '.join(named)}) SELECT %s, * FROM unnest(%s::text[],"
-            " %s::smallint[], %s::bigint[], %s::smallint[], %s::integer[], %s::smallint[],"
-            " %s::double precision[], %s::bigint[]) ON CONFLICT (owner, name) DO UPDATE"
-            f" SET ({', '.join(named)}) = ({', '.join(f'excluded.{name}' for name in named)})",
-            (owner, *columns),
-        )
+    def _put_rows(self, owner: int, rows: Mapping[str, StoredParam]) -> None:
+        if rows:
+            self.connection.execute(_PUT_ROWS, (owner, *map(list, StoredTable.of(rows).columns)))
 
     def add_snapshot(
         self, owner: int, row: Sequence[object], blob: bytes, crc: int, number: int | None = None
@@ -385,6 +389,12 @@ class PostgresSession(Session):
         return sorted(number for (number,) in found)
 
 
+_PUT_ROWS: Final = (
+    f"INSERT INTO param (owner, {', '.join(COLUMN_NAMES)})"
+    f" SELECT %s, * FROM unnest({', '.join(f'%s::{column.sql}[]' for column in COLUMNS)})"
+    f" ON CONFLICT (owner, name) DO UPDATE SET ({', '.join(COLUMN_NAMES)})"
+    f" = ({', '.join(f'excluded.{name}' for name in COLUMN_NAMES)})"
+).encode()
 _LAST: Final = (
     "SELECT DISTINCT ON (owner, name) owner, name, {1}, at FROM {0} WHERE {{}} ORDER BY owner, name, {1} DESC"
 )

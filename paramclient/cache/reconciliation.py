@@ -15,19 +15,21 @@ independent of its time.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from paramclient.cache import tables
+from paramclient.cache.cells import time_cell
 from paramclient.cache.merge import SAME_CHANGE_MAX
-from paramclient.cache.observed_table import HeardParams
-from paramclient.cache.records import BY_VEHICLE, CachedSummary, StoredParam, TableState, TableUpdate
-from paramclient.cache.rows import Row, time_cell
+from paramclient.cache.records import CachedSummary, TableState, TableUpdate
 from paramclient.cache.snapshots import CLOCK_SLACK
+from paramclient.cache.stored_param import BY_VEHICLE, StoredParam
 from paramclient.cache.tables import (
     applied,
+    check_times,
     forget_other_firmware,
     hashed,
+    heard_times,
     write_lines,
     write_state,
 )
@@ -45,6 +47,7 @@ def reconcile(session: Session, updates: Iterable[TableUpdate], present: float |
         present: current time by the clock of the updates, in unix seconds; None uses `at` of each update.
     """
     for update in updates:
+        check_times(update)
         _reconcile(session, update, max(time_cell(update.at), 0.0 if present is None else present))
 
 
@@ -66,18 +69,16 @@ class Past:
     new_births: dict[str, float] = field(default_factory=dict)
 
     def observe(
-        self, name: str, seen: Row, by: str, kept: Row | None, *, ahead: Sequence[int | None] | None = None
+        self, seen: StoredParam, kept: StoredParam | None, *, ahead: Sequence[int | None] | None = None
     ) -> None:
         """Insert an observation of a parameter that was observed again later.
 
         Args:
-            name: the parameter.
-            seen: the value and its time.
-            by: author, if the observation is a change.
-            kept: the stored row, observed later; None if the table has no such name.
+            seen: the observation.
+            kept: the stored parameter, observed later; None if the table has no such name.
             ahead: new value of its last line before `lines`; None if there is none.
         """
-        at = seen.heard_at
+        name, at, by = seen.name, seen.heard_at, seen.by
         place = next((n for n, (_, line) in enumerate(self.lines) if line[1] == name and line[0] > at), None)
         for _, line in self.lines[:place]:
             if line[1] == name:
@@ -100,14 +101,14 @@ class Past:
             return
         number, (later, _, later_by, *values) = self.lines[place]
         old, new = tuple(values[:3]), tuple(values[3:])
-        if _same(seen, old) or has_come_back:  # the time at which it became `old` is not known
+        if seen.has_value(old) or has_come_back:  # the time at which it became `old` is not known
             return
         born = self._born(name)
         if born is not None and at < born <= later and not is_known:  # it was `old` at `born`
             self.new_births[name] = at
             self._insert((born, name, BY_VEHICLE, *seen.value, *old), before=place)
             return
-        if _same(seen, new):
+        if seen.has_value(new):
             if later - at > SAME_CHANGE_MAX:  # the change was earlier than recorded
                 del self.lines[place]
                 self._insert((at, name, by, *old, *new))
@@ -150,7 +151,7 @@ def _reconcile(session: Session, update: TableUpdate, present: float) -> None:
         elif table.updated_at > at:
             is_late = True
             session.describe(owner, updated_at=table.updated_at)
-    before: Mapping[str, Row] = {}
+    before: Mapping[str, StoredParam] = {}
     after = before
     agrees = is_whole = True
     if update.params or update.removed or update.replace:  # otherwise it has only the state of the table
@@ -175,7 +176,7 @@ def _reconcile(session: Session, update: TableUpdate, present: float) -> None:
 
 def _write_values(
     session: Session, owner: int, update: TableUpdate, seen: _Seen, *, is_late: bool
-) -> tuple[Mapping[str, Row], bool, bool]:
+) -> tuple[Mapping[str, StoredParam], bool, bool]:
     """Write the values of an update.
 
     Returns:
@@ -186,13 +187,13 @@ def _write_values(
     part = update
     older: Sequence[StoredParam] = ()
     agrees = True
-    if seen.table is not None and not all(seen.is_news(name, at) for name, at in _times(update.params)):
+    if seen.table is not None and not all(seen.is_news(name, at) for name, at in heard_times(update.params)):
         part, older, agrees = _divided(update, seen, is_late=is_late)
     gone: Collection[str] = update.removed
     if update.replace:
-        gone = before.keys() - {name for name, _ in _times(update.params)} if before else ()
+        gone = before.keys() - {name for name, _ in heard_times(update.params)} if before else ()
     stays = {name for name in gone if name in before and not seen.is_news(name, update.gone_at(name))}
-    after, lines, births = applied(part, before, stays.union(item.param.name for item in older))
+    after, lines, births = applied(part, before, stays.union(item.name for item in older))
     if len(after) != len(before) or after != before:
         session.put_table(owner, before, after)
     session.add_births(owner, births)
@@ -212,30 +213,35 @@ def _divided(
     agrees = True
     overtaken: dict[str, float] = {}  # older observations of these names are overtaken too
     for item in update.params:
-        name, is_listed = item.param.name, item.param.index is not None
-        if not seen.is_news(name, item.heard_at, is_listed=is_listed):
+        name = item.name
+        if not seen.is_news(name, item.heard_at):
             overtaken[name] = max(item.heard_at, overtaken.get(name, -math.inf))
     for item in update.params:
-        name = item.param.name
+        name = item.name
         if item.heard_at > overtaken.get(name, -math.inf):
             newer.append(item)
             continue
         row = seen.rows.get(name)
         older.append(item)
-        if row is not None and row.same_value(Row.of(item.param, None, False, item.heard_at)):
-            newer.append(replace(item, heard_at=row.heard_at))  # its index may have been unknown
+        if row is None:
+            agrees = agrees and item.param_index is None  # a list and its hash do not cover the others
+        elif row.same_value(item):
+            newer.append(item._replace(heard_at=row.heard_at))  # its index may have been unknown
         else:
             agrees = False
+            if row.param_index is None and item.param_index is not None:
+                held = row._replace(param_index=item.param_index, volatile=item.volatile, by=item.by)
+                newer.append(held)
     count = None if update.table is None else update.table.count
     if is_late and table is not None and (count is None or table.count not in (None, count)):
-        newer = [_placeless(item) for item in newer]  # the indices may belong to another count
+        newer = [item._replace(param_index=None) for item in newer]  # the indices may belong to another count
     return replace(update, params=newer), older, agrees
 
 
 def _first_changes(
     session: Session,
     owner: int,
-    before: Mapping[str, Row],
+    before: Mapping[str, StoredParam],
     births: Mapping[str, float],
     lines: Sequence[Line],
 ) -> list[tuple[str, float]]:
@@ -276,17 +282,16 @@ class _Seen:
     session: Session
     owner: int
     table: CachedSummary | None
-    rows: Mapping[str, Row]
+    rows: Mapping[str, StoredParam]
     horizon: float
     gone: Mapping[str, float] | None = None
 
-    def is_news(self, name: str, at: float, *, is_listed: bool = True) -> bool:
+    def is_news(self, name: str, at: float) -> bool:
         """Return whether the cache has no later observation of a parameter.
 
         Args:
             name: the parameter.
             at: time of the observation, in unix seconds.
-            is_listed: whether a complete table includes the parameter if the vehicle has it.
         """
         row, table = self.rows.get(name), self.table
         if row is not None:
@@ -294,7 +299,7 @@ class _Seen:
         if table is None or table.updated_at <= at or table.updated_at > self.horizon:
             return True
         is_whole = table.complete and table.size >= (table.count or 0)  # a new file may have only a part
-        if is_listed and is_whole and table.synced_at is not None and table.synced_at > at:
+        if is_whole and table.synced_at is not None and table.synced_at > at:
             return False
         if self.gone is None:
             self.gone = self.session.gone(self.owner)
@@ -322,10 +327,8 @@ def _write_past(
     kept = kept[ahead:]
     past = Past(list(kept), known_since, session.first_times(owner))
     for item in older:
-        name = item.param.name
-        row = Row.of(item.param, None, False, item.heard_at)
-        became = session.last_became(owner, name, since)
-        past.observe(name, row, item.by, seen.rows.get(name), ahead=became)
+        became = session.last_became(owner, item.name, since)
+        past.observe(item, seen.rows.get(item.name), ahead=became)
     for line in lines:  # after the observations, which refer to the rows before these changes
         past.add(line)
     session.add_first_times(owner, past.new_births.items())
@@ -349,22 +352,5 @@ def _respectful(update: TableUpdate, table: CachedSummary) -> TableState | None:
     return None if has_heard_less else state
 
 
-def _times(params: Sequence[StoredParam]) -> Iterator[tuple[str, float]]:
-    if isinstance(params, HeardParams):
-        return params.heard_at()
-    return ((item.param.name, item.heard_at) for item in params)
-
-
 def _time_of(line: Line) -> float:
     return float(line[0])
-
-
-def _placeless(item: StoredParam) -> StoredParam:
-    return replace(item, param=replace(item.param, index=None))
-
-
-def _same(row: Row, value: Sequence[int | None]) -> bool:
-    number, bits, is_raw = value
-    if number is None or bits is None or is_raw is None:
-        return False
-    return row.same_value(Row(number, bits, is_raw, None, 0, 0.0))

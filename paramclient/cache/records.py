@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
+from itertools import compress
+from types import MappingProxyType
 from typing import Final
 
+from paramclient.cache.stored_param import StoredParam, StoredTable
 from paramclient.model.identity import Identity, autopilot_name
 from paramclient.model.params import ParamMap
 from paramclient.model.paramset import ParamSet
-from paramclient.model.values import Param
+from paramclient.model.values import Param, is_portable_name
 
 __all__ = [
     "BY_US",
-    "BY_VEHICLE",
     "CacheChange",
     "CachedComponent",
     "CachedSummary",
@@ -22,7 +24,6 @@ __all__ = [
     "HistoryEntry",
     "Snapshot",
     "SnapshotSummary",
-    "StoredParam",
     "TableState",
     "TableUpdate",
     "by_station",
@@ -30,32 +31,11 @@ __all__ = [
 
 BY_US: Final = "us"
 """Author of a change by a write of this client; `us for NAME` if the write names a user."""
-BY_VEHICLE: Final = "vehicle"
-"""Author of a change by the vehicle, and of a change that a download has shown."""
 
 
 def by_station(system: int, component: int) -> str:
     """Return the author of a change by another ground station: `station 254/190`."""
     return f"station {system}/{component}"
-
-
-@dataclass(frozen=True, slots=True)
-class StoredParam:
-    """One parameter to store.
-
-    Attributes:
-        param: the parameter; its trust is not stored. An index of None does not change a stored index, except
-            in a whole table.
-        heard_at: time of the observation, not after the update's `at`. The later of two observations of a
-            parameter counts, independent of the order of writes.
-        volatile: whether the vehicle's hash excludes the parameter; None does not change the stored flag.
-        by: author, if the value is a change: `BY_US`, `us for NAME`, `BY_VEHICLE` or `by_station(…)`.
-    """
-
-    param: Param
-    heard_at: float
-    volatile: bool | None = None
-    by: str = BY_VEHICLE
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +106,7 @@ class HistoryEntry:
         name: the parameter.
         old: the previous value. Its index is None.
         new: the new value; None if the vehicle no longer has the parameter.
-        by: author, as in `StoredParam.by`.
+        by: author, as in `StoredParam`.
     """
 
     at: float
@@ -272,6 +252,32 @@ class CachedComponent(CachedSummary):
     heard_at: Mapping[str, float] = field(hash=False)
     left_out: tuple[str, ...]
     _history: Callable[[str | None, int | None], list[HistoryEntry]] = field(compare=False)
+
+    @classmethod
+    def of(
+        cls,
+        summary: CachedSummary,
+        table: StoredTable,
+        *,
+        history: Callable[[str | None, int | None], list[HistoryEntry]],
+    ) -> CachedComponent:
+        """Return a table as it is stored.
+
+        Raises:
+            Damaged: a parameter is not valid.
+        """
+        params = table.params()
+        left_out = tuple(name for name in params.held if not is_portable_name(name))
+        for name in left_out:
+            del params[name]
+        return cls(
+            **{each.name: getattr(summary, each.name) for each in fields(summary)},
+            params=ParamMap(params),
+            volatile=frozenset(compress(table, table.column("volatile"))),
+            heard_at=MappingProxyType(dict(zip(table, table.column("heard_at"), strict=True))),
+            left_out=left_out,
+            _history=history,
+        )
 
     def history(self, name: str | None = None, limit: int | None = None) -> list[HistoryEntry]:
         """Return the changes of its values, newest last. Empty after the table was removed from the cache.

@@ -25,8 +25,8 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 from uuid import uuid4
 
 from paramclient.cache.database_url import DatabaseAddress
-from paramclient.cache.operations import Operation, Remove, StoreSnapshot
-from paramclient.cache.outbox import Entry, LocalCopy
+from paramclient.cache.operations import Remove, StoreOperation, StoreSnapshot
+from paramclient.cache.outbox import LocalCopy, QueuedOperation
 from paramclient.cache.postgres import PostgresDatabase, Revisions, Unavailable
 from paramclient.cache.records import CacheChange, Snapshot
 from paramclient.cache.transaction import Session
@@ -86,7 +86,7 @@ class SharedStore:
         """See `Store.read`."""
         return self._link.read(work)
 
-    def do(self, operation: Operation[T]) -> T:
+    def do(self, operation: StoreOperation[T]) -> T:
         """See `Store.do`. Without a connection, the operation is queued for the database."""
         result: T = self._link.do(operation)
         return result
@@ -144,7 +144,7 @@ class _Link:
                 self._lose(error)
         return self.local.read(work)
 
-    def do(self, operation: Operation[Any]) -> Any:
+    def do(self, operation: StoreOperation[Any]) -> Any:
         self._meet()
         with self._writing:
             self._number += 1
@@ -285,7 +285,7 @@ class _Link:
         except CacheError as error:
             self._warn_of_copy(error)
 
-    def _deliver_all(self, entries: Sequence[Entry]) -> None:
+    def _deliver_all(self, entries: Sequence[QueuedOperation]) -> None:
         try:
             operations = [(each.operation, each.writer, each.number) for each in entries]
             _, _, after = self._database.write(operations)
@@ -314,7 +314,9 @@ class _Link:
 
     # the local copy
 
-    def _copy_done(self, operation: Operation[Any], result: Any, before: Revisions, after: Revisions) -> Any:
+    def _copy_done(
+        self, operation: StoreOperation[Any], result: Any, before: Revisions, after: Revisions
+    ) -> Any:
         """Execute an operation in the local copy too. Tables that were stale there are copied again."""
         touched = set(_touched(operation, before | after))
         stale = touched
@@ -444,7 +446,7 @@ class _Link:
             self._bell.recv(4096)
 
 
-def _touched(operation: Operation[Any], known: Revisions) -> Iterator[tuple[str, int]]:
+def _touched(operation: StoreOperation[Any], known: Revisions) -> Iterator[tuple[str, int]]:
     for key, component in operation.tables:
         if component is not None:
             yield key, component
@@ -462,6 +464,6 @@ def _news(payload: str) -> tuple[Any, ...] | None:
     return (writer, key, component, revision) if is_ours else None
 
 
-def _numbered(operation: Operation[Any], number: int) -> StoreSnapshot:
+def _numbered(operation: StoreOperation[Any], number: int) -> StoreSnapshot:
     assert isinstance(operation, StoreSnapshot)
     return replace(operation, number=number)

@@ -20,8 +20,9 @@ from dataclasses import fields, replace
 from datetime import UTC, datetime
 from typing import Any, Final
 
+from paramclient.cache.cells import Damaged, identity_cells, read_identity, time_cell
 from paramclient.cache.records import Snapshot
-from paramclient.cache.rows import Damaged, Row, identity_cells, read_identity, read_param, time_cell
+from paramclient.cache.stored_param import StoredParam, read_param
 from paramclient.cache.transaction import Session
 from paramclient.errors import NotInCache
 from paramclient.model.identity import Identity
@@ -46,7 +47,7 @@ cover weeks of work on one vehicle. A snapshot of 1,000 parameters takes about 1
 
 CLOCK_SLACK: Final = 5.0
 """Seconds by which a time may be before the last written one although the clock was not set back: a process
-may wait this long for the lock before it writes (`BUSY_TIMEOUT`)."""
+may wait this long for the lock before it writes (`LOCK_WAIT_MAX`)."""
 
 
 def watch_clock(session: Session, key: str, component: int, at: float) -> None:
@@ -128,7 +129,7 @@ def kept_time(at: float) -> float:
 
 
 def state_at(
-    session: Session, owner: int, identity: Identity, rows: Mapping[str, Row], when: float
+    session: Session, owner: int, identity: Identity, rows: Mapping[str, StoredParam], when: float
 ) -> ParamSet:
     """Return a table as it was known at a given time.
 

@@ -8,13 +8,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Final, TypeVar
 
-from paramclient.cache.operations import Operation
+from paramclient.cache.cells import Damaged, cells
+from paramclient.cache.operations import StoreOperation
 from paramclient.cache.packed_table import Packed, packed_row, row_checksum
 from paramclient.cache.records import CacheChange
-from paramclient.cache.rows import Damaged, Row, cells, checksum
 from paramclient.cache.sqlite_file import Database
+from paramclient.cache.stored_param import StoredParam, StoredTable, checksum
 from paramclient.cache.transaction import Session
-from paramclient.model.params import Params
 
 __all__ = ["SqliteSession", "SqliteStore"]
 
@@ -69,7 +69,7 @@ class SqliteStore:
         """See `Store.read`."""
         return self._database.read(lambda connection: work(SqliteSession(connection)))
 
-    def do(self, operation: Operation[T]) -> T:
+    def do(self, operation: StoreOperation[T]) -> T:
         """See `Store.do`."""
 
         def work(connection: sqlite3.Connection) -> T:
@@ -92,15 +92,16 @@ class SqliteSession(Session):
         self.is_shared = is_shared
         self._places_of: dict[bytes, Mapping[str, int]] = {}
 
-    def table(self, owner: int) -> dict[str, Row]:
+    def columns(self, owner: int) -> StoredTable:
         packed = self._packed(owner)
-        return {} if packed is None else packed.rows()
+        return StoredTable.of({}) if packed is None else packed.table()
 
-    def params(self, owner: int) -> tuple[Params, frozenset[str], dict[str, float]]:
-        packed = self._packed(owner)
-        return (Params(), frozenset(), {}) if packed is None else packed.params()
+    def table(self, owner: int) -> dict[str, StoredParam]:
+        return self.columns(owner).rows()
 
-    def put_table(self, owner: int, before: Mapping[str, Row] | None, after: Mapping[str, Row]) -> None:
+    def put_table(
+        self, owner: int, before: Mapping[str, StoredParam] | None, after: Mapping[str, StoredParam]
+    ) -> None:
         if not after:
             self._do("DELETE FROM packed WHERE owner = ?", (owner,))
             self.describe(owner, checksum=_EMPTY_CHECKSUM)

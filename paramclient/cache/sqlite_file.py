@@ -35,9 +35,9 @@ from itertools import chain, count
 from pathlib import Path
 from typing import Final, TypeAlias, TypeVar
 
+from paramclient.cache.cells import Damaged
 from paramclient.cache.file_ownership import OF_OTHERS, OTHERS_WRITE, is_own, make_private, mode_of
-from paramclient.cache.lock import BUSY_TIMEOUT, locked
-from paramclient.cache.rows import Damaged
+from paramclient.cache.lock import LOCK_WAIT_MAX, locked
 from paramclient.cache.sqlite_schema import MIGRATIONS, Step
 from paramclient.errors import CacheError
 
@@ -144,7 +144,7 @@ class Database:
         read-only.
 
         Raises:
-            CacheError: the file cannot be read, or another process locks it for more than `BUSY_TIMEOUT`.
+            CacheError: the file cannot be read, or another process locks it for more than `LOCK_WAIT_MAX`.
         """
         return self._run(work, writing=False)
 
@@ -161,7 +161,7 @@ class Database:
 
         Raises:
             CacheError: the file cannot be written: it is read-only, the disk is full, or another process
-                locks it for more than `BUSY_TIMEOUT`.
+                locks it for more than `LOCK_WAIT_MAX`.
         """
         return self._run(work, writing=True, durable=durable)
 
@@ -310,7 +310,7 @@ class Database:
         return sqlite3.connect(
             f"{self.path.as_uri()}?{how}",
             uri=True,
-            timeout=BUSY_TIMEOUT,
+            timeout=LOCK_WAIT_MAX,
             isolation_level=None,
             check_same_thread=False,
         )

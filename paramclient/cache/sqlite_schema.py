@@ -6,8 +6,9 @@ import sqlite3
 from collections.abc import Callable
 from typing import Final, TypeAlias
 
+from paramclient.cache.cells import Damaged
 from paramclient.cache.packed_table import packed_row, row_checksum
-from paramclient.cache.rows import Damaged, checksum, read_rows
+from paramclient.cache.stored_param import checksum, read_rows
 from paramclient.errors import UsageError
 
 __all__ = ["MIGRATIONS", "Step"]

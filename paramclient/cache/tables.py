@@ -9,32 +9,24 @@ values count.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import fields
-from types import MappingProxyType
 from typing import Final
 
 from paramclient.cache import snapshots
+from paramclient.cache.cells import are_times, time_cell
 from paramclient.cache.observed_table import HeardParams
-from paramclient.cache.records import (
-    BY_VEHICLE,
-    CachedComponent,
-    HistoryEntry,
-    StoredParam,
-    TableState,
-    TableUpdate,
-)
-from paramclient.cache.rows import Row, time_cell
+from paramclient.cache.records import CachedComponent, HistoryEntry, TableState, TableUpdate
+from paramclient.cache.stored_param import BY_VEHICLE, StoredParam
 from paramclient.cache.transaction import Line, Session
 from paramclient.model.identity import Identity
-from paramclient.model.params import ParamMap
-from paramclient.model.values import is_portable_name
 
 __all__ = [
     "HISTORY_LINES",
     "applied",
+    "check_times",
     "component",
     "forget_other_firmware",
     "hashed",
+    "heard_times",
     "save",
     "write_lines",
     "write_state",
@@ -52,7 +44,7 @@ def save(session: Session, updates: Iterable[TableUpdate]) -> None:
         forget_other_firmware(session, update.identity)
         snapshots.watch_clock(session, update.identity.key, update.component, time_cell(update.at))
         owner = session.make(update)
-        before: Mapping[str, Row] = {}
+        before: Mapping[str, StoredParam] = {}
         after = before
         if update.params or update.removed or update.replace:  # otherwise it has only the state of the table
             before = session.table(owner)
@@ -78,19 +70,7 @@ def component(
 ) -> CachedComponent | None:
     """Return a table with its parameters; None if there is none."""
     for owner, summary in session.summaries(key, number):
-        params, volatile, heard_at = session.params(owner)
-        left_out = tuple(name for name in params.held if not is_portable_name(name))
-        for name in left_out:
-            del params.held[name]
-            params.defaults.pop(name, None)
-        return CachedComponent(
-            **{field.name: getattr(summary, field.name) for field in fields(summary)},
-            params=ParamMap(params),
-            left_out=left_out,
-            volatile=volatile,
-            heard_at=MappingProxyType(heard_at),
-            _history=history,
-        )
+        return CachedComponent.of(summary, session.columns(owner), history=history)
     return None
 
 
@@ -105,8 +85,8 @@ def forget_other_firmware(session: Session, identity: Identity) -> None:
 
 
 def applied(
-    update: TableUpdate, before: Mapping[str, Row], stays: Collection[str] = ()
-) -> tuple[Mapping[str, Row], list[Line], Iterable[tuple[str, float]]]:
+    update: TableUpdate, before: Mapping[str, StoredParam], stays: Collection[str] = ()
+) -> tuple[Mapping[str, StoredParam], list[Line], Iterable[tuple[str, float]]]:
     """Return the rows after an update, its history lines, and the new names with their times.
 
     Args:
@@ -115,50 +95,49 @@ def applied(
         stays: names that the update does not remove.
     """
     if not before and isinstance(update.params, HeardParams):
-        first = update.params.first_rows()
+        first = update.params.first_table()
         if first is not None:
-            return first, [], ((name, first[name].heard_at) for name in first)
+            return first, [], zip(first, first.column("heard_at"), strict=True)
     after = dict(before)
     births: list[tuple[str, float]] = []
-    news = list(_news(update.params))
-    heard = {name for name, *_ in news}
+    news = list(update.params)
+    heard = {item.name for item in news}
     lines: list[Line] = [
         (update.gone_at(name), name, BY_VEHICLE, *after.pop(name).value, None, None, None)
         for name in dict.fromkeys(before if update.replace else update.removed)
         if name in before and name not in heard and name not in stays
     ]
-    for name, new, volatile, by in news:
+    for item in news:
+        name = item.name
         old = after.get(name)
+        after[name] = item.stored_over(old, keeps_index=not update.replace)
         if old is None:
-            after[name] = new
-            births.append((name, new.heard_at))
-            continue
-        if new.param_index is None and not update.replace:
-            new = new._replace(param_index=old.param_index)
-        if volatile is None:
-            new = new._replace(volatile=old.volatile)
-        after[name] = new
-        if not old.same_value(new):
-            lines.append((new.heard_at, name, by, *old.value, *new.value))
+            births.append((name, item.heard_at))
+        elif not old.same_value(item):
+            lines.append((item.heard_at, name, item.by, *old.value, *item.value))
     return after, lines, births
 
 
-def _news(params: Iterable[StoredParam]) -> Iterable[tuple[str, Row, bool | None, str]]:
-    """Return name, row, volatile flag and author of each parameter."""
+def check_times(update: TableUpdate) -> None:
+    """Check the times of all observations of an update.
+
+    Raises:
+        UsageError: a time is not in unix seconds.
+    """
+    times = [at for _, at in heard_times(update.params)]
+    if not are_times(times):
+        for at in times:
+            time_cell(at)
+
+
+def heard_times(params: Sequence[StoredParam]) -> Iterable[tuple[str, float]]:
+    """Return the names and times of observations."""
     if isinstance(params, HeardParams):
-        return params.rows()
-    return (
-        (
-            item.param.name,
-            Row.of(item.param, item.param.index, bool(item.volatile), item.heard_at),
-            item.volatile,
-            item.by,
-        )
-        for item in params
-    )
+        return params.heard_at()
+    return ((item.name, item.heard_at) for item in params)
 
 
-def hashed(rows: Mapping[str, Row]) -> dict[str, tuple[int, int, int]]:
+def hashed(rows: Mapping[str, StoredParam]) -> dict[str, tuple[int, int, int]]:
     """Return the values that the vehicle's hash covers, by name."""
     return {name: row.hashed for name, row in rows.items() if row.hashed is not None}
 

@@ -10,18 +10,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar, Final, TypeAlias
 
+from paramclient.cache.cells import cells, identity_cells, read_identity, time_cell
 from paramclient.cache.records import CachedSummary, CachedVehicle, HistoryEntry, SnapshotSummary, TableUpdate
-from paramclient.cache.rows import (
-    Row,
-    cells,
-    checksum,
-    identity_cells,
-    read_identity,
-    read_param,
-    read_params,
-    time_cell,
-)
-from paramclient.model.params import Params
+from paramclient.cache.stored_param import StoredParam, StoredTable, checksum, read_param
 
 __all__ = ["Line", "NumberedLine", "Session"]
 
@@ -162,25 +153,25 @@ class Session(ABC):
     """SQL expression for the number of parameters of the table `c.id`."""
 
     @abstractmethod
-    def table(self, owner: int) -> dict[str, Row]:
-        """Return the rows of a table by name, ordered by index, then name, those without an index last.
+    def columns(self, owner: int) -> StoredTable:
+        """Return the parameters of a table by column, ordered by index, then name; without an index last.
 
         Raises:
             Damaged: the checksum does not match.
         """
-
-    def params(self, owner: int) -> tuple[Params, frozenset[str], dict[str, float]]:
-        """Return the parameters of a table, the names of volatile ones, and the observation times by name.
-
-        Raises:
-            Damaged: the checksum does not match.
-        """
-        rows = self.table(owner)
-        volatile = frozenset(name for name, row in rows.items() if row.volatile)
-        return read_params(rows), volatile, {name: row.heard_at for name, row in rows.items()}
 
     @abstractmethod
-    def put_table(self, owner: int, before: Mapping[str, Row] | None, after: Mapping[str, Row]) -> None:
+    def table(self, owner: int) -> dict[str, StoredParam]:
+        """Return the parameters of a table by name, in the order of `columns`.
+
+        Raises:
+            Damaged: the checksum does not match.
+        """
+
+    @abstractmethod
+    def put_table(
+        self, owner: int, before: Mapping[str, StoredParam] | None, after: Mapping[str, StoredParam]
+    ) -> None:
         """Replace the rows of a table.
 
         Args:

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from paramclient.cache.operations import Operation
+from paramclient.cache.operations import StoreOperation
 from paramclient.cache.records import CachedSummary, CachedVehicle, TableState, TableUpdate
-from paramclient.cache.rows import Row
 from paramclient.cache.snapshots import SNAPSHOTS
+from paramclient.cache.stored_param import StoredParam
 from paramclient.cache.tables import HISTORY_LINES, hashed, write_state
 from paramclient.cache.transaction import Line, Session
 from paramclient.errors import CacheError, UsageError
@@ -68,7 +68,7 @@ class WholeTable:
     vehicle: CachedVehicle
     table: CachedSummary
     known_since: float | None
-    rows: Mapping[str, Row]
+    rows: Mapping[str, StoredParam]
     lines: tuple[Line, ...]
     births: tuple[tuple[str, float, int], ...]
     setbacks: tuple[tuple[float, float], ...]
@@ -113,7 +113,7 @@ class CopyResult:
 
 
 @dataclass(frozen=True)
-class JoinTable(Operation[None]):
+class JoinTable(StoreOperation[None]):
     """Merge a whole table into a store: the later observation of a value counts."""
 
     whole: WholeTable

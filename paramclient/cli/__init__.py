@@ -7,6 +7,7 @@
 - `sources`, `targets`: the parameters and the vehicles that an argument names. `moments`: times.
 - `session`, `options`: an open link with its vehicle; options that several subcommands share.
 - `output`, `param_rows`, `results`, `metadata`, `exit_codes`: tables, JSON, metadata and exit codes.
+- `signals`: SIGINT and SIGTERM.
 """
 
 from __future__ import annotations

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import asyncio
 import inspect
 import logging
-import signal
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
-from types import FrameType
 from typing import Final
 
 import anyio
@@ -17,6 +14,7 @@ from cyclopts import App, CycloptsError, Parameter
 
 from paramclient.cli.exit_codes import ExitCode, code_of, text_of
 from paramclient.cli.output import printable, report, say
+from paramclient.cli.signals import on_end_signal
 from paramclient.errors import ParamClientError
 from paramclient.version import __version__
 
@@ -67,34 +65,17 @@ def _load(app: App) -> None:
         _load(app[name])
 
 
-_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
-"""Signals that end a command in an orderly way."""
-
-
 async def _until_signal(work: Callable[[], Awaitable[int | None]]) -> int | None:
-    """Await `work` and return its exit code; on a signal, cancel it and return 128 plus the signal number.
-
-    A second signal ends the process immediately.
-    """
-    loop = asyncio.get_running_loop()
-    before = {number: signal.getsignal(number) for number in _SIGNALS}
+    """Await `work` and return its exit code; on a signal, cancel it and return 128 plus the signal number."""
     received: list[int] = []
-
     with anyio.CancelScope() as scope:
 
-        def end(number: int, _: FrameType | None) -> None:
+        def end(number: int) -> None:
             received.append(number)
-            for each in _SIGNALS:
-                signal.signal(each, signal.SIG_DFL)
-            loop.call_soon_threadsafe(scope.cancel)
+            scope.cancel()
 
-        for number in _SIGNALS:
-            signal.signal(number, end)  # not by the event loop, which has no signal handlers on Windows
-        try:
+        with on_end_signal(end):
             return await work()
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
     return 128 + received[0]
 
 
@@ -185,156 +166,147 @@ _fleet: Final = App(
     help_epilogue=_examples("fleet diff BAT1_N_CELLS 'COM_ARM_*'", "fleet diff quad.params"),
 )
 
-# By name: a subcommand loads only its own modules, which halves the time until it opens its link.
 
-_app.command(
-    "paramclient.cli.parameters:fetch",
-    name="fetch",
-    help_epilogue=_examples(
-        "fetch udpin:0.0.0.0:14550", "fetch sim:px4 --json", "fetch tcp:127.0.0.1:5760 --system 3"
-    ),
+def _add(group: App, function: str, *examples: str, arguments: str | None = None) -> None:
+    """Add a subcommand, named like its function without the group and a trailing underscore.
+
+    The function is named and not imported: a subcommand loads only its own modules, which halves the time
+    until it opens its link.
+
+    Args:
+        group: the group, or the whole command line.
+        function: module of `paramclient.cli`, and function.
+        examples: arguments of the examples in the help.
+        arguments: the arguments in the usage line, if they are not the function's names.
+    """
+    name = function.partition(":")[2].removesuffix("_").removeprefix(f"{group.name[0]}_")
+    words = name if group is _app else f"{group.name[0]} {name}"
+    group.command(
+        f"paramclient.cli.{function}",
+        name=name,
+        usage=None if arguments is None else f"Usage: paramclient {words} [OPTIONS] {arguments}",
+        help_epilogue=_examples(*(f"{words} {each}".rstrip() for each in examples)) if examples else None,
+    )
+
+
+_add(
+    _app,
+    "parameters:fetch",
+    "udpin:0.0.0.0:14550",
+    "sim:px4 --json",
+    "tcp:127.0.0.1:5760 --system 3",
 )
-_app.command(
-    "paramclient.cli.parameters:get",
-    name="get",
-    usage="Usage: paramclient get [OPTIONS] URL NAME [NAME...]",
-    help_epilogue=_examples("get udpin:0.0.0.0:14550 MC_ROLL_P MC_PITCH_P", "get sim:ardupilot RTL_ALT"),
+_add(
+    _app,
+    "parameters:get",
+    "udpin:0.0.0.0:14550 MC_ROLL_P MC_PITCH_P",
+    "sim:ardupilot RTL_ALT",
+    arguments="URL NAME [NAME...]",
 )
-_app.command(
-    "paramclient.cli.parameters:set_",
-    name="set",
-    usage="Usage: paramclient set [OPTIONS] URL NAME VALUE|NAME=VALUE [NAME VALUE|NAME=VALUE...]",
-    help_epilogue=_examples(
-        "set udpin:0.0.0.0:14550 MC_ROLL_P 6.5 MC_PITCH_P 6.5",
-        "set udpin:0.0.0.0:14550 FLTMODE1=Loiter --metadata apm.pdef.xml",
-    ),
+_add(
+    _app,
+    "parameters:set_",
+    "udpin:0.0.0.0:14550 MC_ROLL_P 6.5 MC_PITCH_P 6.5",
+    "udpin:0.0.0.0:14550 FLTMODE1=Loiter --metadata apm.pdef.xml",
+    arguments="URL NAME VALUE|NAME=VALUE [NAME VALUE|NAME=VALUE...]",
 )
-_app.command(
-    "paramclient.cli.parameters:watch",
-    name="watch",
-    usage="Usage: paramclient watch [OPTIONS] URL [NAME...]",
-    help_epilogue=_examples("watch udpin:0.0.0.0:14550", "watch udpin:0.0.0.0:14550 MC_ROLL_P --json"),
+_add(
+    _app,
+    "parameters:watch",
+    "udpin:0.0.0.0:14550",
+    "udpin:0.0.0.0:14550 MC_ROLL_P --json",
+    arguments="URL [NAME...]",
 )
-_app.command(
-    "paramclient.cli.link:link",
-    name="link",
-    help_epilogue=_examples("link udpin:0.0.0.0:14550", "link udpin:0.0.0.0:14550 --seconds 10 --json"),
+_add(_app, "link:link", "udpin:0.0.0.0:14550", "udpin:0.0.0.0:14550 --seconds 10 --json")
+_add(
+    _app,
+    "check:check",
+    "udpin:0.0.0.0:14550",
+    "serial:/dev/ttyUSB0:57600 --report check.md",
+    "sim:px4 --json",
 )
-_app.command(
-    "paramclient.cli.check:check",
-    name="check",
-    help_epilogue=_examples(
-        "check udpin:0.0.0.0:14550",
-        "check serial:/dev/ttyUSB0:57600 --report check.md",
-        "check sim:px4 --json",
-    ),
+_add(
+    _app,
+    "offline:show",
+    *("", "1", "1 MC_ROLL_P", "00020000 --json", "quad.params"),
+    arguments="[FILE|VEHICLE [NAME...]]",
 )
-_app.command(
-    "paramclient.cli.offline:show",
-    name="show",
-    usage="Usage: paramclient show [OPTIONS] [FILE|VEHICLE [NAME...]]",
-    help_epilogue=_examples("show", "show 1", "show 1 MC_ROLL_P", "show 00020000 --json", "show quad.params"),
+_add(
+    _app,
+    "diff:diff",
+    "before.params after.params",
+    "quad.param udpin:0.0.0.0:14550 --only 'MC_*'",
+    "1 2 --base defaults",
+    arguments="A B",
 )
-_app.command(
-    "paramclient.cli.diff:diff",
-    name="diff",
-    usage="Usage: paramclient diff [OPTIONS] A B",
-    help_epilogue=_examples(
-        "diff before.params after.params",
-        "diff quad.param udpin:0.0.0.0:14550 --only 'MC_*'",
-        "diff 1 2 --base defaults",
-    ),
-)
-_app.command(
-    "paramclient.cli.history:history",
-    name="history",
-    usage="Usage: paramclient history [OPTIONS] VEHICLE [NAME]",
-    help_epilogue=_examples("history 1 MC_ROLL_P", "history 1 --since '2h ago'", "history 1 --snapshots"),
+_add(
+    _app,
+    "history:history",
+    *("1 MC_ROLL_P", "1 --since '2h ago'", "1 --snapshots"),
+    arguments="VEHICLE [NAME]",
 )
 _app.command(_fleet)
-_app.command(
-    "paramclient.cli.save:save",
-    name="save",
-    usage="Usage: paramclient save [OPTIONS] URL|VEHICLE FILE",
-    help_epilogue=_examples(
-        "save udpin:0.0.0.0:14550 quad.yaml",
-        "save sim:ardupilot tuned.param --changed",
-        "save 1 before.params --all",
-    ),
+_add(
+    _app,
+    "save:save",
+    "udpin:0.0.0.0:14550 quad.yaml",
+    "sim:ardupilot tuned.param --changed",
+    "1 before.params --all",
+    arguments="URL|VEHICLE FILE",
 )
-_app.command(
-    "paramclient.cli.setup:apply",
-    name="apply",
-    usage="Usage: paramclient apply [OPTIONS] URL FILE",
-    help_epilogue=_examples(
-        "apply udpin:0.0.0.0:14550 quad.params --dry-run",
-        "apply udpin:0.0.0.0:14550 quad.params --reboot --backup before.yaml",
-        "apply udpin:0.0.0.0:14550 fleet.param --all --overlay 'own/{system}.param'",
-        "apply sim:ardupilot copter.param",
-    ),
+_add(
+    _app,
+    "setup:apply",
+    "udpin:0.0.0.0:14550 quad.params --dry-run",
+    "udpin:0.0.0.0:14550 quad.params --reboot --backup before.yaml",
+    "udpin:0.0.0.0:14550 fleet.param --all --overlay 'own/{system}.param'",
+    "sim:ardupilot copter.param",
+    arguments="URL FILE",
 )
-_app.command(
-    "paramclient.cli.setup:verify",
-    name="verify",
-    usage="Usage: paramclient verify [OPTIONS] URL FILE",
-    help_epilogue=_examples(
-        "verify udpin:0.0.0.0:14550 quad.params", "verify udpin:0.0.0.0:14550 fleet.param --all --expect 5"
-    ),
+_add(
+    _app,
+    "setup:verify",
+    "udpin:0.0.0.0:14550 quad.params",
+    "udpin:0.0.0.0:14550 fleet.param --all --expect 5",
+    arguments="URL FILE",
 )
-_app.command(
-    "paramclient.cli.setup:restore",
-    name="restore",
-    usage="Usage: paramclient restore [OPTIONS] URL [WHEN|FILE]",
-    help_epilogue=_examples(
-        "restore udpin:0.0.0.0:14550 --dry-run",
-        "restore udpin:0.0.0.0:14550 '2h ago'",
-        "restore udpin:0.0.0.0:14550 before.yaml",
-    ),
+_add(
+    _app,
+    "setup:restore",
+    "udpin:0.0.0.0:14550 --dry-run",
+    "udpin:0.0.0.0:14550 '2h ago'",
+    "udpin:0.0.0.0:14550 before.yaml",
+    arguments="URL [WHEN|FILE]",
 )
-_app.command(
-    "paramclient.cli.logs:import_",
-    name="import",
-    usage="Usage: paramclient import [OPTIONS] FILE [FILE...]",
-    help_epilogue=_examples("import flight.tlog", "import logs/*.tlog --json"),
+_add(_app, "logs:import_", "flight.tlog", "logs/*.tlog --json", arguments="FILE [FILE...]")
+_add(
+    _app,
+    "serve:serve",
+    "udpin:0.0.0.0:14550",
+    "serial:/dev/ttyACM0:57600 udpin:0.0.0.0:14550 --listen 127.0.0.1:0",
+    arguments="LINK [LINK...]",
 )
-_app.command(
-    "paramclient.cli.serve:serve",
-    name="serve",
-    usage="Usage: paramclient serve [OPTIONS] LINK [LINK...]",
-    help_epilogue=_examples(
-        "serve udpin:0.0.0.0:14550",
-        "serve serial:/dev/ttyACM0:57600 udpin:0.0.0.0:14550 --listen 127.0.0.1:0",
-    ),
-)
-_app.command(
-    "paramclient.cli.token:token",
-    name="token",
-    help_epilogue=_examples("token anna --file tokens", "token wall-display --file tokens --read"),
-)
+_add(_app, "token:token", "anna --file tokens", "wall-display --file tokens --read")
 _app.command(_cache)
-_app.command("paramclient.cli.ports:ports", name="ports", help_epilogue=_examples("ports", "ports --json"))
-_app.command(
-    "paramclient.cli.simulate:sim",
-    name="sim",
-    help_epilogue=_examples(
-        "sim px4 --link udpout:127.0.0.1:14550 --loss 0.05 --seed 1", "sim ardupilot --link udpin:127.0.0.1:0"
-    ),
+_add(_app, "ports:ports", "", "--json")
+_add(
+    _app,
+    "simulate:sim",
+    "px4 --link udpout:127.0.0.1:14550 --loss 0.05 --seed 1",
+    "ardupilot --link udpin:127.0.0.1:0",
 )
 _app.command(_signing)
-_signing.command("paramclient.cli.signing:setup", name="setup")
-_signing.command("paramclient.cli.signing:disable", name="disable")
-_cache.command("paramclient.cli.offline:cache_list", name="list")
-_cache.command(
-    "paramclient.cli.history:history",
-    name="history",
-    usage="Usage: paramclient cache history [OPTIONS] VEHICLE [NAME]",
-)
-_cache.command("paramclient.cli.offline:cache_path", name="path")
-_cache.command("paramclient.cli.offline:cache_remove", name="remove")
-_cache.command("paramclient.cli.offline:cache_copy", name="copy")
-_fleet.command(
-    "paramclient.cli.fleet:fleet_diff",
-    name="diff",
-    usage="Usage: paramclient fleet diff [OPTIONS] NAME...|FILE",
-    help_epilogue=_examples("fleet diff BAT1_N_CELLS 'COM_ARM_*'", "fleet diff quad.params --json"),
+_add(_signing, "signing:setup")
+_add(_signing, "signing:disable")
+_add(_cache, "offline:cache_list")
+_add(_cache, "history:history", arguments="VEHICLE [NAME]")
+_add(_cache, "offline:cache_path")
+_add(_cache, "offline:cache_remove")
+_add(_cache, "offline:cache_copy")
+_add(
+    _fleet,
+    "fleet:fleet_diff",
+    "BAT1_N_CELLS 'COM_ARM_*'",
+    "quad.params --json",
+    arguments="NAME...|FILE",
 )

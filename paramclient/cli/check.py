@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import json as json_module
+import json
 import platform
 import sys
 from collections.abc import Iterable, Iterator
 from importlib.metadata import version
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Annotated, Final
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING, Final
 
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.options import Id, Seconds, SigningOptions
+from paramclient.cli.options import Id, Seconds, TrafficOptions
 from paramclient.cli.output import (
     Coloured,
     milliseconds,
@@ -27,6 +25,7 @@ from paramclient.cli.output import (
 from paramclient.cli.session import VEHICLE_TIMEOUT, Deadline, listen
 from paramclient.diagnosis import Finding, Severity, VehicleReport, check_vehicle, findings_of
 from paramclient.errors import UsageError
+from paramclient.model.wording import first_of
 from paramclient.version import __version__
 
 if TYPE_CHECKING:
@@ -38,7 +37,7 @@ CHECK_TIMEOUT: Final = 60.0
 """Seconds for the whole measurement without --timeout: a list at 57600 baud takes 35."""
 ENTRIES_SHOWN_MAX: Final = 8
 """Files and directories that a row names, so that it stays one line; it gives the number of further ones."""
-_UNSIGNED: Final = SigningOptions()
+_DEFAULTS: Final = TrafficOptions()
 _COLOURS: Final = {Severity.PROBLEM: "red", Severity.SLOW: "yellow", Severity.NOTE: ""}
 """Styles of rich for each severity."""
 
@@ -50,11 +49,8 @@ async def check(
     system: Id = None,
     component: Id = None,
     timeout: Seconds = None,
-    json: bool = False,
     report: Path | None = None,
-    tlog: Path | None = None,
-    verbose: Annotated[bool, Parameter(name=("--verbose", "-v"))] = False,
-    options: SigningOptions = _UNSIGNED,
+    options: TrafficOptions = _DEFAULTS,
 ) -> int:
     """Measure a vehicle and its link: identity, services and their speed. Report slow or unusual results.
 
@@ -66,15 +62,12 @@ async def check(
         system: The system to measure, 1 to 255. Default: the first one heard.
         component: The component to measure, 1 to 255. Default: the autopilot.
         timeout: Timeout for the whole measurement in seconds. Default: 60.
-        json: Print JSON.
         report: Also write the result to this new file, to attach it to an issue.
-        tlog: Record all frames of the link, received and sent, in this new telemetry log.
-        verbose: Log each step on stderr.
     """
     if report is not None:
         _check_is_new(report)
     deadline = Deadline(CHECK_TIMEOUT if timeout is None else timeout)
-    async with listen(url, options.signing, tlog=tlog) as client:
+    async with listen(url, options) as client:
         if client.listens_only:
             raise UsageError(f"{client.link.name} is a log: check needs a link to a vehicle")
         heartbeat_timeout = VEHICLE_TIMEOUT if timeout is None else deadline.left()
@@ -85,13 +78,13 @@ async def check(
             client, vehicle, timeout=left, progress=_show_progress if sys.stderr.isatty() else None
         )
     findings = findings_of(measured)
-    if json or report is not None:
+    if options.json or report is not None:
         document = _document(measured, findings)
-        if json:
+        if options.json:
             print_document(document)
         if report is not None:
             _write(report, measured, findings, document)
-    if not json:
+    if not options.json:
         print_table(("what", "measured"), _rows(measured))
         print_line("")
         if findings:
@@ -130,7 +123,7 @@ def _rows(report: VehicleReport) -> Iterator[tuple[str, str]]:
     yield from _link_rows(report)
     yield from _service_rows(report)
     stations = ", ".join(f"{each.system}/{each.component}" for each in report.link.stations)
-    yield "other stations", stations or "none heard"
+    yield "other stations", stations or "none"
     if report.link.autopilots:
         named = ", ".join(f"{system}/{component}" for system, component in report.link.autopilots)
         yield "other autopilots", named
@@ -146,7 +139,7 @@ def _vehicle(report: VehicleReport) -> str:
 def _identity_rows(report: VehicleReport) -> Iterator[tuple[str, str]]:
     identity = report.identity
     if not report.has_version:
-        yield "firmware", "unknown: AUTOPILOT_VERSION was not answered"
+        yield "firmware", "unknown: no AUTOPILOT_VERSION received"
         return
     number = identity.firmware
     git_hash = f", commit {identity.git_hash}" if identity.git_hash.strip("0") else ""
@@ -158,7 +151,7 @@ def _identity_rows(report: VehicleReport) -> Iterator[tuple[str, str]]:
 def _link_rows(report: VehicleReport) -> Iterator[tuple[str, str]]:
     link = report.link
     signed = ", signed" if link.signed else ""
-    yield "protocol", f"MAVLink {link.mavlink}{signed}" if link.mavlink else "no frame came"
+    yield "protocol", f"MAVLink {link.mavlink}{signed}" if link.mavlink else "no frame received"
     trips = link.round_trips
     if trips:
         spread = f"{milliseconds(trips[0])} to {milliseconds(trips[-1])}"
@@ -175,7 +168,7 @@ def _service_rows(report: VehicleReport) -> Iterator[tuple[str, str]]:
     if reads is None:
         yield "single reads", none
     elif reads.single is None:
-        yield "single reads", "not answered"
+        yield "single reads", "no response"
     else:
         rate = f", {reads.rate:.0f} per second with {reads.in_flight} at once" if reads.rate else ""
         repeats = reads.requests - reads.in_flight
@@ -193,10 +186,8 @@ def _service_rows(report: VehicleReport) -> Iterator[tuple[str, str]]:
     if files is None:
         yield "MAVFTP", none
     else:
-        yield (
-            "MAVFTP",
-            f"served{_entries(files.entries or ())}" if files.is_serving else f"not served: {files.error}",
-        )
+        entries = f": {first_of(files.entries, ENTRIES_SHOWN_MAX)}" if files.entries else ""
+        yield "MAVFTP", f"served{entries}" if files.is_serving else f"not served: {files.error}"
         if files.size is not None and files.elapsed is not None:
             yield (
                 "parameter file",
@@ -204,24 +195,16 @@ def _service_rows(report: VehicleReport) -> Iterator[tuple[str, str]]:
             )
         else:
             yield "parameter file", files.error or "none"
-        yield "defaults", "in the parameter file" if files.defaults else "not told by the vehicle"
-    yield "descriptions", report.descriptions or "not told by the vehicle"
+        yield "defaults", "in the parameter file" if files.defaults else "not provided by the vehicle"
+    yield "descriptions", report.descriptions or "not provided by the vehicle"
     if found is None:
         yield "hash", none
     elif found.before is None:
         yield "hash", found.error or "none"
     else:
-        after = "not answered" if found.after is None else f"{found.after:08x}"
+        after = "no response" if found.after is None else f"{found.after:08x}"
         holds = f"the same after {found.seconds:.1f} s" if found.after == found.before else f"then {after}"
         yield "hash", f"{found.before:08x}, {holds}"
-
-
-def _entries(names: tuple[str, ...]) -> str:
-    """Return the names in the root directory, abbreviated."""
-    if not names:
-        return ""
-    more = len(names) - ENTRIES_SHOWN_MAX
-    return f": {', '.join(names[:ENTRIES_SHOWN_MAX])}{f' and {more} more' if more > 0 else ''}"
 
 
 # JSON and Markdown
@@ -262,7 +245,7 @@ def _write(path: Path, report: VehicleReport, findings: list[Finding], document:
         "## All figures",
         "",
         "```json",
-        json_module.dumps(document.as_json(), indent=2, allow_nan=False),
+        json.dumps(document.as_json(), indent=2, allow_nan=False),
         "```",
         "",
     ]

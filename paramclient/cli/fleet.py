@@ -14,6 +14,7 @@ from paramclient.errors import UsageError
 from paramclient.model.notation import time_text
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import Param, ParamType, check_name, format_value
+from paramclient.model.wording import counted
 
 __all__ = ["fleet_diff"]
 
@@ -69,8 +70,8 @@ def _print(found: FleetDiff) -> None:
     if rows:
         print_table(["name", "value", "vehicles", "since", "vehicle"], rows, right="value vehicles")
     count = sum(each.differs for each in found.names)
-    some = f"{count} of {_number(len(found.names), 'parameter')}" if count else "no parameter"
-    say(f"{some} {'differ' if count > 1 else 'differs'} among {_number(len(found.vehicles), 'vehicle')}")
+    some = f"{count} of {counted(len(found.names), 'parameter')}" if count else "no parameter"
+    say(f"{some} {'differ' if count > 1 else 'differs'} among {counted(len(found.vehicles), 'vehicle')}")
 
 
 def _rows(each: NameSpread, vehicles: int) -> Iterator[tuple[object, ...]]:
@@ -113,7 +114,3 @@ def _written(wanted: WrittenParam) -> str:
 
 def _value(param: Param) -> str:
     return format_value(param.value, param.type)
-
-
-def _number(count: int, noun: str) -> str:
-    return f"{count} {noun}{'' if count == 1 else 's'}"

@@ -5,14 +5,12 @@ from __future__ import annotations
 import sys
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import suppress
-from pathlib import Path
-from typing import Annotated, Final
+from typing import Final
 
 import anyio
-from cyclopts import Parameter
 
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.options import Seconds, SigningOptions
+from paramclient.cli.options import Seconds, TrafficOptions
 from paramclient.cli.output import live_view, milliseconds, print_document, print_line, print_table
 from paramclient.cli.session import Deadline, listen
 from paramclient.client.client import ParamClient
@@ -35,7 +33,7 @@ MEASURE_DELAY: Final = 2.0
 MEASURE_INTERVAL: Final = 4.0
 """Seconds between two reads that measure the round trip: request and response together take less of the link
 than the heartbeats of this client."""
-_UNSIGNED: Final = SigningOptions()
+_DEFAULTS: Final = TrafficOptions()
 NO_AUTOPILOT: Final = ("unknown", autopilot_name(MAV_AUTOPILOT_INVALID))
 """Autopilot names of components that have no parameters to read."""
 
@@ -45,11 +43,8 @@ async def link(
     /,
     *,
     seconds: Seconds = None,
-    json: bool = False,
     listen_only: bool = False,
-    tlog: Path | None = None,
-    verbose: Annotated[bool, Parameter(name=("--verbose", "-v"))] = False,
-    options: SigningOptions = _UNSIGNED,
+    options: TrafficOptions = _DEFAULTS,
 ) -> int:
     """Print the components on a link, their message rates and the packet loss.
 
@@ -59,19 +54,16 @@ async def link(
     Args:
         url: The link, such as udpin:0.0.0.0:14550, tcp:HOST:PORT or sim:px4.
         seconds: Time to listen in seconds.
-        json: Print JSON.
         listen_only: Send nothing. The round trip is not measured then.
-        tlog: Record all frames of the link, received and sent, in this new telemetry log.
-        verbose: Log each step on stderr.
     """
-    is_live = sys.stdout.isatty() and not json
+    is_live = sys.stdout.isatty() and not options.json
     limit = seconds if is_live or seconds is not None else LINK_LISTENING_TIME
-    async with listen(url, options.signing, listen_only=listen_only, tlog=tlog) as client:
+    async with listen(url, options, listen_only=listen_only) as client:
         report = await _run_with_measurements(client, _show if is_live else _listen, limit)
     if not report.frames:
         noise = f" (but {report.bytes_received:,} other bytes)" if report.bytes_received else ""
         raise NoReply(f"anything on {client.link.name}{noise}", attempts=0, waited=report.seconds)
-    if json:
+    if options.json:
         from paramclient.documents.traffic import TrafficDoc  # only here: loads pydantic
 
         trips = {(each.system, each.component): _round_trip(client, each) for each in report.components}

@@ -14,7 +14,7 @@ from cyclopts import Parameter
 from paramclient.cache import CachedComponent, ParamCache
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import print_line, printable, say
-from paramclient.cli.session import Session
+from paramclient.cli.session import CommandSession
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata, MetadataStore, ParamInfo, metadata_of, read_metadata
 from paramclient.metadata.info import number_of
@@ -63,7 +63,9 @@ def from_file(choice: str | None, *, offline: bool = False) -> Metadata | None:
     return None if choice in (None, VEHICLE) else read_metadata(choice)
 
 
-async def known_of_session(session: Session, choice: str | None, *, must: bool = False) -> Metadata | None:
+async def known_of_session(
+    session: CommandSession, choice: str | None, *, must: bool = False
+) -> Metadata | None:
     """Return the metadata of the vehicle, or None.
 
     Downloads it from the vehicle if --metadata is `vehicle`, or with `must`, as for values that are written.

@@ -38,6 +38,7 @@ from paramclient.metadata import Metadata
 from paramclient.model.identity import autopilot_name
 from paramclient.model.notation import hash_text, time_or_none, time_text
 from paramclient.model.values import Param, check_name, format_value, type_name
+from paramclient.model.wording import counted
 from paramclient.provision.vehicle_params import NO_DEFAULTS, left_out_note
 
 if TYPE_CHECKING:
@@ -144,7 +145,7 @@ def cache_remove(vehicle: str, /, *, component: Id = None, options: CacheOptions
 
         print_document(RemovedDoc(key=key, removed=removed))
     else:
-        print_line(f"removed {removed} {'table' if removed == 1 else 'tables'} of {key}")
+        print_line(f"removed {counted(removed, 'table')} of {key}")
     return ExitCode.DONE
 
 
@@ -174,10 +175,10 @@ def cache_copy(source: str, target: str, /, *, json: bool = False) -> ExitCode:
 
         print_document(CopiedDoc(path=place, **asdict(done)))
     else:
-        of = "table" if done.tables == 1 else "tables"
         print_line(
-            f"copied {done.tables} {of} to {printable(place)}, {done.unchanged} were there already; in all"
-            f" {done.params} parameters, {done.lines} lines of history, {done.snapshots} snapshots, verified"
+            f"copied {counted(done.tables, 'table')} to {printable(place)}, {done.unchanged} were there "
+            f"already; in all {done.params} parameters, {done.lines} lines of history, {done.snapshots} "
+            "snapshots, verified"
         )
     return ExitCode.DONE
 

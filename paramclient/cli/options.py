@@ -17,7 +17,7 @@ from paramclient.errors import UsageError
 from paramclient.model.values import Encoding
 from paramclient.protocol.wire import SigningKey, SigningPolicy
 
-__all__ = ["CacheOptions", "Id", "KeyOptions", "LinkOptions", "Seconds", "SigningOptions"]
+__all__ = ["CacheOptions", "Id", "KeyOptions", "LinkOptions", "Seconds", "SigningOptions", "TrafficOptions"]
 
 Id: TypeAlias = Annotated[int | None, Parameter(validator=Number(gte=1, lte=255))]
 """A system or component id."""
@@ -96,11 +96,23 @@ class SigningOptions(KeyOptions):
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True, slots=True)
-class LinkOptions(SigningOptions):
-    """Options of subcommands that communicate with a vehicle."""
+class TrafficOptions(SigningOptions):
+    """Options of subcommands that open a link."""
 
     json: bool = False
     """Print JSON."""
+
+    verbose: Annotated[bool, Parameter(name=("--verbose", "-v"))] = False
+    """Log each step on stderr."""
+
+    tlog: Path | None = None
+    """Record all frames of the link, received and sent, in this new telemetry log."""
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True, slots=True)
+class LinkOptions(TrafficOptions):
+    """Options of subcommands that communicate with a vehicle."""
 
     system: Id = None
     """System id of the vehicle, 1 to 255. Default: the first one heard; for writes, the only one heard."""
@@ -131,12 +143,6 @@ class LinkOptions(SigningOptions):
 
     forward: str | None = None
     """Share the vehicle's link with one other program over this link, such as udpout:127.0.0.1:14551."""
-
-    verbose: Annotated[bool, Parameter(name=("--verbose", "-v"))] = False
-    """Log each step on stderr."""
-
-    tlog: Path | None = None
-    """Record all frames of the link, received and sent, in this new telemetry log."""
 
     @property
     def place(self) -> str | bool:

@@ -13,6 +13,7 @@ from paramclient.model.identity import autopilot_name
 from paramclient.model.notation import time_text
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, Value, format_value, type_name
+from paramclient.model.wording import counted
 from paramclient.provision.vehicle_params import NO_DEFAULTS
 
 __all__ = ["described", "show_file", "value_text"]
@@ -48,7 +49,7 @@ def described(params: ParamSet) -> str:
         f"from {params.source}" if params.source else "",
     ]
     at = "" if params.at is None else f", {time_text(params.at)}"
-    return " ".join(filter(None, [_counted(len(params)), *origin])) + at
+    return " ".join(filter(None, [counted(len(params), "parameter"), *origin])) + at
 
 
 def value_text(param: WrittenParam) -> str:
@@ -87,7 +88,3 @@ def _print_set(params: ParamSet, *, changed: bool) -> None:
 
 def _text(value: Value, param: WrittenParam) -> str:
     return format_value(value, ParamType.REAL32 if param.type is None else param.type)
-
-
-def _counted(number: int) -> str:
-    return f"{number} {'parameter' if number == 1 else 'parameters'}"

@@ -38,7 +38,7 @@ from paramclient.cli.output import (
     report,
     say,
 )
-from paramclient.cli.session import Session, connect
+from paramclient.cli.session import CommandSession, connect
 from paramclient.client.arguments import SETTLE_MAX
 from paramclient.client.events import (
     Contested,
@@ -56,6 +56,7 @@ from paramclient.errors import CacheError, NoReply, ParamClientError, UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.notation import hash_text, time_text
 from paramclient.model.values import Param, ParamType, Trust, Value, check_name, format_value, type_name
+from paramclient.model.wording import first_of
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.fetch_result import FetchResult, Policy
 from paramclient.protocol.params.sampling import SAMPLE_SIZE, Sample
@@ -292,7 +293,7 @@ class _Fetched:
     request, or a sample confirms the table, it is included and named in `cached`.
     """
 
-    session: Session
+    session: CommandSession
     result: FetchResult
     params: list[Param]
     missing: list[int]
@@ -301,7 +302,7 @@ class _Fetched:
     bytes_sent: int
 
     @classmethod
-    def of(cls, session: Session, result: FetchResult, policy: Policy) -> _Fetched:
+    def of(cls, session: CommandSession, result: FetchResult, policy: Policy) -> _Fetched:
         """Select the parameters of a fetch under a policy."""
         params = by_index(session.component.params.values())
         cached = [param for param in params if param.trust is Trust.CACHED]
@@ -356,7 +357,7 @@ class _Fetched:
 
 
 async def _fetch_all(
-    session: Session, *, refresh: bool = False, accept: str = "verified", sample: int = SAMPLE_SIZE
+    session: CommandSession, *, refresh: bool = False, accept: str = "verified", sample: int = SAMPLE_SIZE
 ) -> FetchResult:
     with progress_bar(f"fetching {session.label}") as progress:
         return await session.component.fetch_all(
@@ -378,9 +379,7 @@ def _confidence(sample: Sample) -> str:
 
 
 def _index_text(indices: Sequence[int]) -> str:
-    shown = ", ".join(map(str, indices[:INDICES_SHOWN_MAX]))
-    more = len(indices) - INDICES_SHOWN_MAX
-    return f"ind{'ex' if len(indices) == 1 else 'ices'} {shown}{f' and {more} more' if more > 0 else ''}"
+    return f"{'index' if len(indices) == 1 else 'indices'} {first_of(indices, INDICES_SHOWN_MAX)}"
 
 
 _ASSUMED_CHANGES: Final = (1, 10, 100)
@@ -396,7 +395,9 @@ def _cells(param: Param) -> tuple[object, ...]:
     return param.name, format_value(param.value, param.type), type_name(param.type), param.index
 
 
-async def _get_all(session: Session, names: Sequence[str]) -> tuple[list[Param], dict[str, ParamClientError]]:
+async def _get_all(
+    session: CommandSession, names: Sequence[str]
+) -> tuple[list[Param], dict[str, ParamClientError]]:
     """Read several parameters concurrently; return parameters and errors in the order of the names."""
     found: dict[str, Param] = {}
     errors: dict[str, ParamClientError] = {}
@@ -475,7 +476,9 @@ class _Written:
         return self.name, format_value(self.requested, ParamType.REAL64), actual, self.status
 
 
-async def _write(session: Session, name: str, value: int | float, *, force: bool, durable: bool) -> _Written:
+async def _write(
+    session: CommandSession, name: str, value: int | float, *, force: bool, durable: bool
+) -> _Written:
     left = session.deadline.left()
     try:
         done = await session.component.set(name, value, timeout=left, force=force, durable=durable)
@@ -501,7 +504,7 @@ async def _write(session: Session, name: str, value: int | float, *, force: bool
     )
 
 
-async def _read_again(session: Session, written: _Written) -> _Written:
+async def _read_again(session: CommandSession, written: _Written) -> _Written:
     """Read a written value again; return the outcome with the present value."""
     if written.param is None:
         return written
@@ -519,7 +522,7 @@ async def _read_again(session: Session, written: _Written) -> _Written:
 
 
 async def _print_changes_and_events(
-    session: Session,
+    session: CommandSession,
     changes: Changes,
     events: Events,
     known: set[str] | None,

@@ -10,6 +10,7 @@ from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.output import Coloured, print_table, printable, report, say
 from paramclient.model.notation import typed
 from paramclient.model.values import Value, format_value
+from paramclient.model.wording import counted, first_of
 from paramclient.provision import (
     MISSING,
     ApplyResult,
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from paramclient.documents.setup import ApplyResultDoc, InterruptedDoc, PlanDoc, VerifiedDoc
 
 __all__ = [
-    "Vehicle",
+    "NamedVehicle",
     "applied_code",
     "applied_doc",
     "interrupted_doc",
@@ -43,7 +44,7 @@ RESULT_NAMES_MAX: Final = 10
 
 
 @dataclass(frozen=True, slots=True)
-class Vehicle:
+class NamedVehicle:
     """A vehicle as the output names it.
 
     Attributes:
@@ -64,7 +65,7 @@ Cells: TypeAlias = list[object]
 # Results
 
 
-def show_applied(results: Mapping[Vehicle, ApplyResult], *, full: bool) -> None:
+def show_applied(results: Mapping[NamedVehicle, ApplyResult], *, full: bool) -> None:
     """Print one table of the outcome for each value, and a line for each vehicle on stderr."""
     _print(
         ["name", "before", "wanted", "now", "status", "reason"],
@@ -78,13 +79,13 @@ def show_applied(results: Mapping[Vehicle, ApplyResult], *, full: bool) -> None:
         if (result.system, result.component) != (vehicle.system, vehicle.component):
             say(f"{vehicle.system}/{vehicle.component} is {result.system}/{result.component} now")
         if result.reboot_required:
-            names = _listed(result.reboot_required)
+            names = first_of(result.reboot_required, RESULT_NAMES_MAX)
             say(printable(f"{vehicle.label}: takes effect after a reboot: {names}"))
         if result.error is not None:
             report(f"{vehicle.label}: {result.error}; run it again to continue")
 
 
-def show_interrupted(rows: Mapping[Vehicle, Sequence[ApplyRow]]) -> None:
+def show_interrupted(rows: Mapping[NamedVehicle, Sequence[ApplyRow]]) -> None:
     """Print the outcome for each value before Ctrl-C ended the command."""
     _print(
         ["name", "before", "wanted", "now", "status", "reason"],
@@ -92,7 +93,7 @@ def show_interrupted(rows: Mapping[Vehicle, Sequence[ApplyRow]]) -> None:
     )
     unproven = sum(row.status is ApplyStatus.UNPROVEN for each in rows.values() for row in each)
     say(
-        f"interrupted: {_number(unproven, 'value')} acknowledged, not proven, and others may be in flight; "
+        f"interrupted: {counted(unproven, 'value')} acknowledged, not proven, and others may be in flight; "
         "run it again to continue"
     )
 
@@ -104,14 +105,14 @@ def applied_code(result: ApplyResult) -> ExitCode:
     return ExitCode.INCOMPLETE if result.error is None else max(ExitCode.INCOMPLETE, code_of(result.error))
 
 
-def applied_doc(vehicle: Vehicle, result: ApplyResult, *, full: bool) -> ApplyResultDoc:
+def applied_doc(vehicle: NamedVehicle, result: ApplyResult, *, full: bool) -> ApplyResultDoc:
     """Return the JSON document of the result for one vehicle; unchanged values only if `full`."""
     from paramclient.documents.setup import ApplyResultDoc  # only here: loads pydantic
 
     return ApplyResultDoc.of(result, system=vehicle.system, component=vehicle.component, full=full)
 
 
-def interrupted_doc(vehicle: Vehicle, rows: Iterable[ApplyRow]) -> InterruptedDoc:
+def interrupted_doc(vehicle: NamedVehicle, rows: Iterable[ApplyRow]) -> InterruptedDoc:
     """Return the JSON document of a set-up that Ctrl-C ended."""
     from paramclient.documents.setup import InterruptedDoc  # only here: loads pydantic
 
@@ -132,7 +133,7 @@ def _applied_cells(row: ApplyRow) -> Cells:
 # Plans
 
 
-def show_planned(plans: Mapping[Vehicle, Plan], *, reboot: bool, full: bool) -> None:
+def show_planned(plans: Mapping[NamedVehicle, Plan], *, reboot: bool, full: bool) -> None:
     """Print the values that would be sent, in their order, and the reasons for all others."""
     _print(
         ["stage", "name", "before", "wanted", "status", "reason"],
@@ -142,7 +143,7 @@ def show_planned(plans: Mapping[Vehicle, Plan], *, reboot: bool, full: bool) -> 
     for vehicle, plan in plans.items():
         say(printable(f"{vehicle.label}: {_counted(plan.counts, PlanStatus, _PLAN_WORDS)}; nothing was sent"))
         if plan.reboot_for and not reboot:
-            names = _listed(plan.reboot_for)
+            names = first_of(plan.reboot_for, RESULT_NAMES_MAX)
             say(printable(f"{vehicle.label}: would take effect after a reboot: {names}"))
 
 
@@ -156,7 +157,7 @@ def planned_code(plan: Plan, *, skip_invalid: bool) -> ExitCode:
     return ExitCode.INCOMPLETE if is_missing else ExitCode.DONE
 
 
-def planned_doc(vehicle: Vehicle, plan: Plan, *, full: bool) -> PlanDoc:
+def planned_doc(vehicle: NamedVehicle, plan: Plan, *, full: bool) -> PlanDoc:
     """Return the JSON document of the plan for one vehicle."""
     from paramclient.documents.setup import PlanDoc  # only here: loads pydantic
 
@@ -196,7 +197,7 @@ def _is_notable(row: PlanRow) -> bool:
 # Comparisons
 
 
-def show_verified(plans: Mapping[Vehicle, Plan], *, full: bool) -> None:
+def show_verified(plans: Mapping[NamedVehicle, Plan], *, full: bool) -> None:
     """Print the parameters that differ; all parameters if `full`."""
     _print(
         ["name", "wanted", "now", "is", "reason"],
@@ -218,7 +219,7 @@ def met_code(plan: Plan) -> ExitCode:
     return ExitCode.DONE if plan.is_met else ExitCode.DIFFERENT
 
 
-def verified_doc(vehicle: Vehicle, plan: Plan, *, full: bool) -> VerifiedDoc:
+def verified_doc(vehicle: NamedVehicle, plan: Plan, *, full: bool) -> VerifiedDoc:
     """Return the JSON document of the comparison of one vehicle."""
     from paramclient.documents.setup import VerifiedDoc  # only here: loads pydantic
 
@@ -266,7 +267,9 @@ _STANDING_STYLES: Final = {"same": "", "different": "yellow", "missing": "red", 
 """Styles of rich for each comparison; the keys are in the order of the summary."""
 
 
-def _print(columns: Sequence[str], tables: Mapping[Vehicle, Iterable[Cells]], *, right: str = "") -> None:
+def _print(
+    columns: Sequence[str], tables: Mapping[NamedVehicle, Iterable[Cells]], *, right: str = ""
+) -> None:
     """Print one table for all vehicles; with several, the first column names the vehicle."""
     is_one = len(tables) == 1
     rows = [
@@ -293,12 +296,3 @@ def _like(row: ApplyRow | PlanRow) -> str:
 def _counted(counts: Mapping[Any, int], kinds: Iterable[Any], words: Mapping[Any, str] | None = None) -> str:
     counted = [f"{counts[kind]} {(words or {}).get(kind, kind)}" for kind in kinds if counts.get(kind)]
     return ", ".join(counted) or "nothing to set"
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = len(names) - RESULT_NAMES_MAX
-    return ", ".join(names[:RESULT_NAMES_MAX]) + (f" and {more} more" if more > 0 else "")
-
-
-def _number(count: int, noun: str) -> str:
-    return f"{count} {noun}{'' if count == 1 else 's'}"

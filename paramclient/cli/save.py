@@ -14,13 +14,14 @@ from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.offline import tables_of
 from paramclient.cli.options import CacheOptions, LinkOptions
 from paramclient.cli.output import print_document, printable, progress_bar, report, say
-from paramclient.cli.session import Session, connect
+from paramclient.cli.session import CommandSession, connect
 from paramclient.cli.sources import check_link, choose, collect_confirmed, is_file, names_vehicle, open_file
 from paramclient.client.component import Component
 from paramclient.errors import UsageError
 from paramclient.files import FileForm, write_file
 from paramclient.files.param_file import AUTOPILOT, address, form_of_name
 from paramclient.model.paramset import ParamSet
+from paramclient.model.wording import counted
 from paramclient.protocol.params.fetch_result import FetchResult
 from paramclient.provision.vehicle_params import cached_param_set, select_non_defaults
 
@@ -104,7 +105,7 @@ async def _from_link(
 
 
 async def _fetch(
-    session: Session, *, all_: bool, refresh: bool
+    session: CommandSession, *, all_: bool, refresh: bool
 ) -> tuple[list[tuple[Component, FetchResult]], list[str]]:
     """Return the components to save with the results of their fetches, and sentences on silent ones."""
     deadline = session.deadline
@@ -181,7 +182,5 @@ def _show(file: Path, form: FileForm, sets: Sequence[ParamSet], *, as_json: bool
 
         print_document(SavedDoc.of(str(file), form, sets))
         return
-    held = ", ".join(
-        f"{len(each)} parameter{'' if len(each) == 1 else 's'} of {address(each)}" for each in sets
-    )
+    held = ", ".join(f"{counted(len(each), 'parameter')} of {address(each)}" for each in sets)
     say(printable(f"{held} written to {file} ({form})"))

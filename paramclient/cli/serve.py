@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import gc
-import signal
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from types import FrameType
 from typing import Annotated, Final
 
 import anyio
@@ -18,19 +14,14 @@ from cyclopts import Parameter
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import Id, SigningOptions
 from paramclient.cli.output import print_line
+from paramclient.cli.signals import on_end_signal
 from paramclient.errors import UsageError
 
 __all__ = ["serve"]
 
-LIBRARIES: Final = ("fastapi", "prometheus_client", "uvicorn", "websockets")
+SERVICE_LIBRARIES: Final = ("fastapi", "prometheus_client", "uvicorn", "websockets")
 """Libraries that the extra `service` installs."""
-FREEZE_INTERVAL: Final = 1.0
-"""Seconds between two checks of the number of followed components."""
-COLLECTED_COMPONENTS_MAX: Final = 32
-"""Number of components that full garbage collections may examine: 5 ms."""
 _UNSIGNED: Final = SigningOptions()
-_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
-"""Signals that stop the service in an orderly way."""
 
 
 async def serve(
@@ -81,9 +72,10 @@ async def serve(
         tls_key: The key file of the certificate (PEM).
         verbose: Log each step on stderr.
     """
-    if missing := [name for name in LIBRARIES if find_spec(name) is None]:
+    if missing := [name for name in SERVICE_LIBRARIES if find_spec(name) is None]:
         raise UsageError(f"serving needs {' and '.join(missing)}: pip install 'paramclient[service]'")
     from paramclient import service  # only here: needs the extra
+    from paramclient.service.garbage_collection import ComponentFreezer
 
     if no_cache and cache is not None:
         raise UsageError("--cache and --no-cache exclude each other")
@@ -114,68 +106,11 @@ async def serve(
         gc.freeze()  # as at the start of the command: a full collection takes as long as ten requests
         print_line(f"serving on {url}")
 
-    with _stopping() as stop:
-        collections = Collections()
-        sparing = asyncio.create_task(collections.run(lambda: hub.followed))
+    stop = anyio.Event()
+    with on_end_signal(lambda _: stop.set()):
+        freezing = asyncio.create_task(ComponentFreezer().run(lambda: hub.followed))
         try:
             await service.serve(hub, settings, listening=listening, stop=stop, listens=listens)
         finally:
-            sparing.cancel()
+            freezing.cancel()
     return ExitCode.DONE
-
-
-class Collections:
-    """Keeps full collections of garbage short: they need not go through components that are followed.
-
-    Those of 1,000 components take 0.2 s, in which nothing else runs. When components have been forgotten, all
-    is collected again before they are left out once more.
-    """
-
-    def __init__(self) -> None:
-        self._spared: set[object] = set()
-        self._collected_at: int | None = None
-
-    async def run(self, followed: Callable[[], Iterable[object]]) -> None:
-        """Look every `FREEZE_INTERVAL` at which components there are; until cancelled."""
-        while True:
-            await anyio.sleep(FREEZE_INTERVAL)
-            self.look(set(followed()))
-
-    def look(self, followed: set[object]) -> None:
-        """Leave components out, or collect what has become of them."""
-        if len(self._spared - followed) >= COLLECTED_COMPONENTS_MAX:
-            gc.unfreeze()
-            self._spared = set()
-            self._collected_at = _full_collections()
-        elif (
-            len(followed - self._spared) >= COLLECTED_COMPONENTS_MAX
-            and self._collected_at != _full_collections()
-        ):
-            gc.freeze()
-            self._spared = followed
-            self._collected_at = None
-
-
-def _full_collections() -> int:
-    return int(gc.get_stats()[2]["collections"])
-
-
-@contextmanager
-def _stopping() -> Iterator[anyio.Event]:
-    """Yield an event that SIGINT or SIGTERM sets. A second signal ends the process immediately."""
-    loop = asyncio.get_running_loop()
-    stop = anyio.Event()
-    before = {number: signal.getsignal(number) for number in _SIGNALS}
-
-    def end(_: int, __: FrameType | None) -> None:
-        for each in _SIGNALS:
-            signal.signal(each, signal.SIG_DFL)
-        loop.call_soon_threadsafe(stop.set)
-
-    for number in _SIGNALS:
-        signal.signal(number, end)
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -6,21 +6,19 @@ import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Final
 
 import anyio
 
-from paramclient.cli.options import LinkOptions
+from paramclient.cli.options import LinkOptions, TrafficOptions
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
-from paramclient.client.signing import Signing
 from paramclient.errors import AmbiguousVehicle, UsageError
 from paramclient.links import LinkKind, ReplayLink, parse_link
 from paramclient.links.names import names_service
 from paramclient.protocol.params.fetch_result import Policy
 
-__all__ = ["Deadline", "Session", "connect", "listen"]
+__all__ = ["Deadline", "CommandSession", "connect", "listen"]
 
 VEHICLE_TIMEOUT: Final = 10.0
 """Seconds to wait for the first heartbeat of a vehicle, without --timeout."""
@@ -48,7 +46,7 @@ class Deadline:
 
 
 @dataclass(frozen=True, slots=True)
-class Session:
+class CommandSession:
     """An open client, and the component that the command works on."""
 
     client: ParamClient
@@ -104,7 +102,7 @@ async def connect(
     policy: Policy = Policy.AUTO,
     is_live: bool = False,
     only: bool = False,
-) -> AsyncIterator[Session]:
+) -> AsyncIterator[CommandSession]:
     """Open a link and wait for the component that the options name.
 
     Args:
@@ -137,12 +135,10 @@ async def connect(
         timeout = VEHICLE_TIMEOUT if options.timeout is None else deadline.left()
         find = client.only_component if only else client.component
         component = await find(options.system, options.component, peer=options.peer, timeout=timeout)
-        yield Session(client, component, deadline, options)
+        yield CommandSession(client, component, deadline, options)
 
 
-def listen(
-    url: str, signing: Signing | None = None, *, listen_only: bool = False, tlog: Path | None = None
-) -> ParamClient:
+def listen(url: str, options: TrafficOptions, *, listen_only: bool = False) -> ParamClient:
     """Return a client that counts all traffic, and neither reads nor writes a cache.
 
     Raises:
@@ -153,7 +149,14 @@ def listen(
             f"{url} is a service, which does not report the traffic of its links; run the command with the "
             "link itself"
         )
-    return ParamClient(url, cache=False, traffic=True, signing=signing, listen_only=listen_only, tlog=tlog)
+    return ParamClient(
+        url,
+        cache=False,
+        traffic=True,
+        signing=options.signing,
+        listen_only=listen_only,
+        tlog=options.tlog,
+    )
 
 
 def _difference(found: Component, chosen: Component) -> str:

@@ -23,7 +23,7 @@ from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import print_document, printable, progress_bar, report, say
 from paramclient.cli.param_rows import described
 from paramclient.cli.results import (
-    Vehicle,
+    NamedVehicle,
     applied_code,
     applied_doc,
     interrupted_doc,
@@ -82,7 +82,7 @@ _OPTIONS: Final = LinkOptions()
 
 async def apply(
     url: str,
-    source: str,
+    file: str,
     /,
     *,
     include: Include = (),
@@ -110,7 +110,7 @@ async def apply(
 
     Args:
         url: The link, such as udpin:0.0.0.0:14550, or sim:ardupilot for a simulated vehicle.
-        source: A parameter file; or a vehicle in the cache, as cache:VEHICLE.
+        file: A parameter file; or a vehicle in the cache, as cache:VEHICLE.
         include: Include a category that is left out by default (identity, hardware, calibration, measured,
             counter, action, read-only, out-of-range), or a name or pattern such as "COMPASS_OFS*". May be
             given several times.
@@ -121,7 +121,7 @@ async def apply(
         durable: End only when the values and their history are on the disk and survive a power loss.
         backup: A new file for the vehicle's state before; its ending determines the file format. {uid} and
             {system} in the name are replaced by the vehicle's ids.
-        over: A file whose parameters replace and extend those of SOURCE, with {uid} or {system} in its name
+        over: A file whose parameters replace and extend those of FILE, with {uid} or {system} in its name
             for the vehicle's ids.
         all_vehicles: Set up all vehicles on the link, concurrently.
         expect: With --all, wait for this number of vehicles, and fail with fewer.
@@ -134,7 +134,7 @@ async def apply(
     check_pattern("--overlay", over, all_vehicles=all_vehicles)
     check_pattern("--backup", backup, all_vehicles=all_vehicles)
     chosen = from_file(metadata)
-    values = Source(source, over, options, only=True)
+    values = Source(file, over, options, only=True)
     await values.open()
     async with targets(url, options, all_vehicles=all_vehicles, expect=expect, only=True) as found:
         wanted = await values.wanted(found.vehicles)
@@ -142,7 +142,7 @@ async def apply(
         backups = await _backups(backup, found.vehicles)
         show = _Output(found, as_json=options.json, is_fleet=all_vehicles, full=full)
 
-        async def plans() -> tuple[dict[Vehicle, Plan], dict[Vehicle, ParamClientError]]:
+        async def plans() -> tuple[dict[NamedVehicle, Plan], dict[NamedVehicle, ParamClientError]]:
             compared = verify_all(found.vehicles, wanted, include=include, info=info, force=force)
             fleet = await _within(found, compared)
             return show.by_vehicle(fleet.results), show.by_vehicle(fleet.errors)
@@ -175,7 +175,7 @@ async def apply(
 
 async def verify(
     url: str,
-    source: str,
+    file: str,
     /,
     *,
     include: Include = (),
@@ -193,9 +193,9 @@ async def verify(
 
     Args:
         url: The link.
-        source: A parameter file; or a vehicle in the cache, as cache:VEHICLE.
+        file: A parameter file; or a vehicle in the cache, as cache:VEHICLE.
         include: Include a category that is left out by default, or a name or pattern, as with apply.
-        over: A file whose parameters replace and extend those of SOURCE, with {uid} or {system} in its name
+        over: A file whose parameters replace and extend those of FILE, with {uid} or {system} in its name
             for the vehicle's ids.
         all_vehicles: Compare all vehicles on the link, concurrently.
         expect: With --all, wait for this number of vehicles, and fail with fewer.
@@ -205,7 +205,7 @@ async def verify(
     """
     check_pattern("--overlay", over, all_vehicles=all_vehicles)
     chosen = from_file(metadata)
-    values = Source(source, over, options, only=False)
+    values = Source(file, over, options, only=False)
     await values.open()
     async with targets(url, options, all_vehicles=all_vehicles, expect=expect, only=False) as found:
         wanted = await values.wanted(found.vehicles)
@@ -257,7 +257,7 @@ async def restore(
         show = _Output(found, as_json=options.json, is_fleet=False, full=full)
         address = (vehicle.system, vehicle.component)
 
-        async def plans() -> tuple[dict[Vehicle, Plan], dict[Vehicle, ParamClientError]]:
+        async def plans() -> tuple[dict[NamedVehicle, Plan], dict[NamedVehicle, ParamClientError]]:
             whole = (*await restore_categories(vehicle, state), *include)
             fleet = await _within(found, verify_all([vehicle], state, include=whole, info=info, force=force))
             return show.by_vehicle(fleet.results), show.by_vehicle(fleet.errors)
@@ -367,7 +367,11 @@ def _can_confirm(options: LinkOptions) -> bool:
 
 
 async def _confirm(
-    plans: Mapping[Vehicle, Plan], errors: Mapping[Vehicle, ParamClientError], *, reboot: bool, full: bool
+    plans: Mapping[NamedVehicle, Plan],
+    errors: Mapping[NamedVehicle, ParamClientError],
+    *,
+    reboot: bool,
+    full: bool,
 ) -> bool:
     """Show the changes and ask for confirmation. Return true without a question if there are none."""
     for vehicle, error in errors.items():
@@ -394,21 +398,21 @@ class _Output:
 
     def __init__(self, found: Targets, *, as_json: bool, is_fleet: bool, full: bool) -> None:
         self._vehicles = {
-            (each.system, each.component): Vehicle(each.system, each.component, describe(each))
+            (each.system, each.component): NamedVehicle(each.system, each.component, describe(each))
             for each in found.vehicles
         }
         self._as_json = as_json
         self._is_fleet = is_fleet
         self._full = full
 
-    def by_vehicle(self, results: Mapping[Address, Found]) -> dict[Vehicle, Found]:
+    def by_vehicle(self, results: Mapping[Address, Found]) -> dict[NamedVehicle, Found]:
         """Return results by vehicle instead of by address."""
         return {self._vehicles[address]: result for address, result in results.items()}
 
     def planned(
         self,
-        plans: Mapping[Vehicle, Plan],
-        errors: Mapping[Vehicle, ParamClientError],
+        plans: Mapping[NamedVehicle, Plan],
+        errors: Mapping[NamedVehicle, ParamClientError],
         *,
         reboot: bool,
         skip_invalid: bool,
@@ -423,14 +427,16 @@ class _Output:
         )
 
     def applied(
-        self, results: Mapping[Vehicle, ApplyResult], errors: Mapping[Vehicle, ParamClientError]
+        self, results: Mapping[NamedVehicle, ApplyResult], errors: Mapping[NamedVehicle, ParamClientError]
     ) -> ExitCode:
         """Print the results of `apply` or `restore`; return the exit code."""
         return self._print(
             results, errors, lambda: show_applied(results, full=self._full), applied_doc, applied_code
         )
 
-    def verified(self, plans: Mapping[Vehicle, Plan], errors: Mapping[Vehicle, ParamClientError]) -> ExitCode:
+    def verified(
+        self, plans: Mapping[NamedVehicle, Plan], errors: Mapping[NamedVehicle, ParamClientError]
+    ) -> ExitCode:
         """Print comparisons; return the exit code."""
         return self._print(
             plans, errors, lambda: show_verified(plans, full=self._full), verified_doc, met_code
@@ -439,8 +445,8 @@ class _Output:
     @contextmanager
     def progress_until_interrupted(self, title: str) -> Iterator[Callable[[Component, ApplyProgress], None]]:
         """Yield a function that draws the progress; on cancellation, print the outcomes so far."""
-        rows: dict[Vehicle, dict[str, ApplyRow]] = {}
-        steps: dict[Vehicle, tuple[int, int]] = {}
+        rows: dict[NamedVehicle, dict[str, ApplyRow]] = {}
+        steps: dict[NamedVehicle, tuple[int, int]] = {}
         began = 0.0
         try:
             with progress_bar(title) as draw:
@@ -471,8 +477,8 @@ class _Output:
 
     def _print(
         self,
-        results: Mapping[Vehicle, Result],
-        errors: Mapping[Vehicle, ParamClientError],
+        results: Mapping[NamedVehicle, Result],
+        errors: Mapping[NamedVehicle, ParamClientError],
         show: Callable[[], None],
         as_document: Callable[..., SetUpDoc],
         code: Callable[[Result], ExitCode],
@@ -495,7 +501,7 @@ class _Output:
         return max(codes, default=ExitCode.DONE)
 
     def _print_documents(
-        self, documents: Sequence[SetUpDoc], errors: Mapping[Vehicle, ParamClientError] | None = None
+        self, documents: Sequence[SetUpDoc], errors: Mapping[NamedVehicle, ParamClientError] | None = None
     ) -> None:
         if not self._is_fleet:
             print_document(documents[0])

@@ -30,7 +30,7 @@ PROOF_TIMEOUT: Final = 10.0
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True, slots=True)
-class VehicleOptions(KeyOptions):
+class SigningTarget(KeyOptions):
     """The vehicle, and the safety of the link. The texts below the fields are their help."""
 
     link_is_safe: bool = False
@@ -52,11 +52,11 @@ class VehicleOptions(KeyOptions):
     """Log each step on stderr, without the key."""
 
 
-_DEFAULTS: Final = VehicleOptions()
+_DEFAULTS: Final = SigningTarget()
 
 
 def setup(
-    url: str, /, *, present_key: Path | None = None, options: VehicleOptions = _DEFAULTS
+    url: str, /, *, present_key: Path | None = None, options: SigningTarget = _DEFAULTS
 ) -> Callable[[], Awaitable[int]]:
     """Set the signing key of a vehicle, and verify that the vehicle signs with it.
 
@@ -76,7 +76,7 @@ def setup(
     return partial(_setup, url, options, key, present)
 
 
-def disable(url: str, /, *, options: VehicleOptions = _DEFAULTS) -> Callable[[], Awaitable[int]]:
+def disable(url: str, /, *, options: SigningTarget = _DEFAULTS) -> Callable[[], Awaitable[int]]:
     """Remove the signing key of a vehicle, and verify that it neither signs nor requires signed frames.
 
     The present key (--signing-key, --signing-passphrase or the environment) is needed if the vehicle requires
@@ -90,7 +90,7 @@ def disable(url: str, /, *, options: VehicleOptions = _DEFAULTS) -> Callable[[],
     return partial(_disable, url, options, key)
 
 
-def _confirm(options: VehicleOptions, consequence: str) -> None:
+def _confirm(options: SigningTarget, consequence: str) -> None:
     """Ask whether the link is safe, unless --link-is-safe is given.
 
     Raises:
@@ -110,7 +110,7 @@ def _confirm(options: VehicleOptions, consequence: str) -> None:
         raise UsageError("nothing was sent")
 
 
-async def _setup(url: str, options: VehicleOptions, key: SigningKey, present: SigningKey | None) -> int:
+async def _setup(url: str, options: SigningTarget, key: SigningKey, present: SigningKey | None) -> int:
     deadline = Deadline(options.timeout)
     link = create_link(url)
     address = await _send(link, options, deadline, key, present)
@@ -124,7 +124,7 @@ async def _setup(url: str, options: VehicleOptions, key: SigningKey, present: Si
     return ExitCode.DONE
 
 
-async def _disable(url: str, options: VehicleOptions, key: SigningKey | None) -> int:
+async def _disable(url: str, options: SigningTarget, key: SigningKey | None) -> int:
     deadline = Deadline(options.timeout)
     link = create_link(url)
     address = await _send(link, options, deadline, None, key)
@@ -140,7 +140,7 @@ async def _disable(url: str, options: VehicleOptions, key: SigningKey | None) ->
 
 async def _send(
     link: Link,
-    options: VehicleOptions,
+    options: SigningTarget,
     deadline: Deadline,
     key: SigningKey | None,
     present: SigningKey | None,
@@ -180,7 +180,7 @@ def _refused(address: tuple[int, int], failure: str) -> VehicleError:
     return VehicleError(f"{system}/{component} {failure}", system=system, component=component)
 
 
-def _show(options: VehicleOptions, vehicle: Component, key: SigningKey | None) -> None:
+def _show(options: SigningTarget, vehicle: Component, key: SigningKey | None) -> None:
     if options.json:
         from paramclient.documents.command_output import SignsDoc  # only here: loads pydantic
 

@@ -22,12 +22,12 @@ if TYPE_CHECKING:
     from paramclient.sim import OtherStation, Vehicle
     from paramclient.sim.vehicle import VehicleOptions
 
-__all__ = ["Faults", "VehicleFaults", "sim"]
+__all__ = ["FaultOptions", "VehicleFaults", "sim"]
 
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Faults:
+class FaultOptions:
     """Faults of the link, as `Air.symmetric` takes them. The texts below the fields are their help."""
 
     loss: float = 0.0
@@ -124,7 +124,7 @@ class VehicleFaults:
         ]
 
 
-_NO_FAULTS: Final = Faults()
+_NO_FAULTS: Final = FaultOptions()
 _NO_VEHICLE_FAULTS: Final = VehicleFaults()
 _Id = Annotated[int, Parameter(validator=Number(gte=1, lte=255))]
 """A system or component id."""
@@ -141,7 +141,7 @@ async def sim(
     signing_key: Path | None = None,
     usb: bool = False,
     vehicle_faults: VehicleFaults = _NO_VEHICLE_FAULTS,
-    faults: Faults = _NO_FAULTS,
+    faults: FaultOptions = _NO_FAULTS,
 ) -> None:
     """Run a simulated vehicle for other programs, until Ctrl-C.
 

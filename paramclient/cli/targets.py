@@ -11,7 +11,7 @@ from typing import Final, TypeAlias
 import anyio
 
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.session import VEHICLE_TIMEOUT, Deadline, Session, connect
+from paramclient.cli.session import VEHICLE_TIMEOUT, CommandSession, Deadline, connect
 from paramclient.cli.sources import choose, is_file, open_file, resolve
 from paramclient.client.client import ParamClient, implementation_of
 from paramclient.client.component import Component
@@ -53,7 +53,7 @@ class Targets:
         all_vehicles: whether these are all vehicles on the link (--all).
     """
 
-    session: Session
+    session: CommandSession
     vehicles: list[Component]
     all_vehicles: bool
 
@@ -68,7 +68,7 @@ class Targets:
         return self.session.deadline
 
     async def check_only(self) -> None:
-        """See `Session.check_only`; does nothing with --all, which names every vehicle."""
+        """See `CommandSession.check_only`; does nothing with --all, which names every vehicle."""
         if not self.all_vehicles:
             await self.session.check_only()
 

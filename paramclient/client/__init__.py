@@ -4,7 +4,7 @@
 - `cache_writer`: writes parameter tables to the cache.
 - `client`: `ParamClient`, the public class.
 - `component`: `Component`, the public interface of one component.
-- `event_loop_share`: CPU time and list downloads shared among the links of one event loop.
+- `loop_scheduler`: CPU time and list downloads shared among the links of one event loop.
 - `events`: public events and their stream.
 - `fetch_all`: fetches of several components in parallel.
 - `files`: MAVFTP calls.

@@ -10,7 +10,7 @@ from paramclient.protocol.wire import PARAMETERS_MAX
 
 __all__ = [
     "COMPONENT_TIMEOUT",
-    "PROGRESS_INTERVAL",
+    "PROGRESS_CALL_INTERVAL",
     "SETTLE_MAX",
     "address_in_words",
     "check_accepted",
@@ -21,7 +21,7 @@ __all__ = [
 
 COMPONENT_TIMEOUT: Final = 10.0
 """Default timeout in seconds for the first component on a link."""
-PROGRESS_INTERVAL: Final = 0.1
+PROGRESS_CALL_INTERVAL: Final = 0.1
 """Seconds between two calls of a progress callback."""
 SETTLE_MAX: Final = 60.0
 """Maximum `settle` in seconds: further writes to the same name wait for it."""

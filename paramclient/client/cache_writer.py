@@ -38,17 +38,17 @@ from paramclient.protocol.params.table import Observation
 
 __all__ = ["WriteThrough", "choose_cache"]
 
-FLUSH_INTERVAL: Final = 0.25
+CACHE_FLUSH_INTERVAL: Final = 0.25
 """Seconds from a change to its commit, unless the computer is overloaded: changes are collected for this
 time, less the duration of the last commit. A download takes several batches."""
 COMMIT_RESERVE: Final = 0.04
-"""Seconds of `FLUSH_INTERVAL` reserved for a commit that takes longer than the last one."""
+"""Seconds of `CACHE_FLUSH_INTERVAL` reserved for a commit that takes longer than the last one."""
 DOWNLOAD_INTERVAL: Final = 10.0
 """Seconds for which the values of a running fetch are collected, if more than `UNBATCHED_FETCHES_MAX` run.
 Most fetches end sooner, so that each table is written once; writing it in parts takes several times as long.
 A killed process loses at most these values of a download."""
 UNBATCHED_FETCHES_MAX: Final = 8
-"""Number of running fetches up to which their values are written every `FLUSH_INTERVAL`."""
+"""Number of running fetches up to which their values are written every `CACHE_FLUSH_INTERVAL`."""
 NEW_SHARE_MIN: Final = 0.5
 """Minimum share of new values in a table of a running fetch before a part of it is written: a part takes as
 long as the whole table."""
@@ -247,7 +247,7 @@ class WriteThrough:
         """Write new values in batches, until cancelled."""
         while True:
             await self._something_to_write.wait()
-            pause = FLUSH_INTERVAL - COMMIT_RESERVE - min(self._commit_time, FLUSH_INTERVAL / 2)
+            pause = CACHE_FLUSH_INTERVAL - COMMIT_RESERVE - min(self._commit_time, CACHE_FLUSH_INTERVAL / 2)
             await anyio.sleep_until(self._waiting_since + pause)
             self._something_to_write = anyio.Event()
             begun_at = anyio.current_time()

@@ -21,7 +21,7 @@ from paramclient.client.component import Component
 from paramclient.client.events import Events
 from paramclient.client.fetch_all import FetchedAll
 from paramclient.client.files import Ftp
-from paramclient.client.link_client import LinkClient, LinkOptions
+from paramclient.client.link_client import ClientOptions, LinkClient
 from paramclient.client.local import LocalClient, not_given
 from paramclient.client.signing import Signing
 from paramclient.client.stats import ClientStats
@@ -118,7 +118,7 @@ class ParamClient:
         token: str | None = None,
         split_peers: bool = False,
     ) -> None:
-        options = LinkOptions(
+        options = ClientOptions(
             cache=cache,
             system=system,
             component=component,

@@ -59,8 +59,9 @@ from paramclient.protocol.wire import SigningKey, SigningReport
 
 if TYPE_CHECKING:
     from paramclient.sim import Endpoint
+from paramclient.model.wording import counted
 
-__all__ = ["LinkClient", "LinkOptions"]
+__all__ = ["LinkClient", "ClientOptions"]
 
 LISTENING_TIME: Final = 1.2
 """Seconds after opening in which every component has sent a message: each sends a heartbeat once a second."""
@@ -75,7 +76,7 @@ protocol_logger = logging.getLogger("paramclient.protocol")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LinkOptions:
+class ClientOptions:
     """The arguments of `ParamClient` for a link of its own, with their defaults."""
 
     cache: ParamCache | str | os.PathLike[str] | bool | None = None
@@ -116,7 +117,7 @@ class LinkClient(LocalClient):
         UsageError: as from `ParamClient`.
     """
 
-    def __init__(self, link: str | Link | Endpoint, options: LinkOptions) -> None:
+    def __init__(self, link: str | Link | Endpoint, options: ClientOptions) -> None:
         for number in (options.system, options.component):
             if not 1 <= number <= 255:
                 raise UsageError(f"the client's system and component ids must be 1 to 255, not {number}")
@@ -210,8 +211,7 @@ class LinkClient(LocalClient):
     def __repr__(self) -> str:
         state = "away" if self.link_task.is_away else "open"
         state = "closed" if self._tasks is None or self.link_task.ended is not None else state
-        heard = len(self._components)
-        return f"<ParamClient {self._link.name} {state}, {heard} component{'' if heard == 1 else 's'}>"
+        return f"<ParamClient {self._link.name} {state}, {counted(len(self._components), 'component')}>"
 
     async def open(self) -> None:
         """Open the link and the cache, and start the tasks.
@@ -360,7 +360,7 @@ class LinkClient(LocalClient):
             return self._components[machine.address]
         wanted = address_in_words(system, component, peer) + refused_in_words(self.signing_report())
         if choice.due < math.inf:
-            wanted += f", and {LOOK_TIME} s more to see that it is the only one"
+            wanted += f", then {LOOK_TIME} s without another vehicle"
 
         raise NoReply(wanted, attempts=0, waited=anyio.current_time() - began)
 
@@ -507,9 +507,9 @@ class LinkClient(LocalClient):
             ):
                 self._read_cache(component)
 
-    def wake(self, machine: ComponentMachine | None = None) -> None:
+    def wake(self) -> None:
         """See `LocalClient.wake`."""
-        self.link_task.wake(machine)
+        self.link_task.wake()
 
     # end of the link
 
@@ -578,7 +578,7 @@ class LinkClient(LocalClient):
     async def wait_until_files_closed(self, machine: ComponentMachine) -> None:
         """See `LocalClient.wait_until_files_closed`. During a burst, vehicles ignore the request."""
         if machine.files.is_closing and self.link_task.broken is None:
-            with anyio.move_on_after(machine.round_trip.prompt_timeout):
+            with anyio.move_on_after(machine.retry.prompt_timeout):
                 await self._wait_until_closed(machine)
 
     async def _wait_until_closed(self, machine: ComponentMachine) -> None:
@@ -587,7 +587,7 @@ class LinkClient(LocalClient):
         def tell(now: float) -> None:
             carrier.tell()
 
-        self.wake(machine)
+        self.wake()
         while files.is_closing and not (carrier.is_away or carrier.ended or machine.presence.is_lost):
             if tell not in files.on_closed:
                 files.on_closed.append(tell)

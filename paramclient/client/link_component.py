@@ -12,7 +12,7 @@ from typing import SupportsFloat, SupportsIndex, TypeVar
 import anyio
 
 from paramclient.client.arguments import (
-    PROGRESS_INTERVAL,
+    PROGRESS_CALL_INTERVAL,
     address_in_words,
     check_accepted,
     check_asked,
@@ -311,7 +311,7 @@ class LinkComponent(LocalComponent):
 
     def wake(self) -> None:
         """See `LocalComponent.wake`."""
-        self.client.wake(self.machine)
+        self.client.wake()
 
     def is_cache_due(self, now: float) -> bool:
         """See `LocalComponent.is_cache_due`."""
@@ -409,7 +409,7 @@ class LinkComponent(LocalComponent):
         try:
             with anyio.move_on_after(timeout):
                 while not operation.done:
-                    with anyio.move_on_after(None if progress is None else PROGRESS_INTERVAL):
+                    with anyio.move_on_after(None if progress is None else PROGRESS_CALL_INTERVAL):
                         await ended.wait()
                     if progress is not None:
                         progress()
@@ -433,7 +433,7 @@ class LinkComponent(LocalComponent):
                 now = anyio.current_time()
                 if deadline is not None and now >= deadline:
                     return fetch.partial(now, TIMEOUT_NOTE)
-                until = now + PROGRESS_INTERVAL if progress is not None else None
+                until = now + PROGRESS_CALL_INTERVAL if progress is not None else None
                 if deadline is not None:
                     until = deadline if until is None else min(until, deadline)
                 with anyio.move_on_after(None if until is None else until - now):

@@ -13,17 +13,14 @@ from typing import Final, Protocol
 import anyio
 import anyio.lowlevel
 
-from paramclient.client.event_loop_share import (
+from paramclient.client.loop_scheduler import (
     BACKLOG_DATAGRAMS_MIN,
-    RECHECK_INTERVAL,
-    TURN_DATAGRAMS_MIN,
     TURN_MAX,
-    EventLoopShare,
+    LoopScheduler,
 )
 from paramclient.client.suspend_detection import SuspendDetector
 from paramclient.errors import LinkError
 from paramclient.links import Link, Peer
-from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.station import Station
 
 __all__ = ["LinkTask", "Tap"]
@@ -132,21 +129,20 @@ class LinkTask:
         self._held_up_at = -math.inf  # last time at which the sender ran late by more than `READ_GAP_MIN`
         self._unseen = 0.0  # seconds of suspend since the last read that the loop's clock has left out
         self._is_taking = False  # whether the reader processes data, or waits for its turn to do so
-        self._asked = True  # whether any component may have new requests
         self._suspend = SuspendDetector()
         self._reading, self._sending = anyio.Lock(), anyio.Lock()
 
     async def read(self) -> None:
         """Receive data and reconnect, until the link fails permanently or cancellation."""
-        share = EventLoopShare.of_this_loop()
+        loop = LoopScheduler.of_this_loop()
         async with self._reading:
-            share.joined(self)
+            loop.joined(self)
             try:
-                await self._read(share)
+                await self._read(loop)
             finally:
-                share.left(self)
+                loop.left(self)
 
-    async def _read(self, share: EventLoopShare) -> None:
+    async def _read(self, loop: LoopScheduler) -> None:
         self._is_taking, self._behind_since = False, math.inf
         before = drained_at = anyio.current_time()
         while True:
@@ -167,20 +163,19 @@ class LinkTask:
             is_news = not chunks
             if not chunks:
                 self._station.over(now)
-                self._asked = True
-            share.came(self, len(chunks))
+            loop.came(self, len(chunks))
             self._behind_since = (
                 math.inf if len(chunks) < BACKLOG_DATAGRAMS_MIN else min(self._behind_since, now)
             )
             self._read_at = math.inf
             rest = zip(chunks, moments, strict=True)
-            if len(chunks) >= TURN_DATAGRAMS_MIN or (share.has_others and self._station.is_waiting):
+            if loop.needs_turns(len(chunks), self._station.scheduler):
                 self._is_taking = True
-                is_news |= await self._take_turns(rest, share)
+                is_news |= await self._take_turns(rest, loop)
                 self._is_taking = False
             is_news |= self._take(rest, math.inf)
             now = self._read_at = anyio.current_time()
-            share.taken(self, now)
+            loop.taken(self, now)
             if is_news:
                 self._dispatch()
                 self.tell()
@@ -211,12 +206,12 @@ class LinkTask:
         return [now - longest if is_late else now] * count
 
     async def _take_turns(
-        self, chunks: Iterator[tuple[tuple[Peer, bytes], float]], share: EventLoopShare
+        self, chunks: Iterator[tuple[tuple[Peer, bytes], float]], loop: LoopScheduler
     ) -> bool:
         """Process received data in turns with other tasks and links. Return whether there are new events."""
         is_news = is_done = False
         while not is_done:
-            async with share.turn:
+            async with loop.turn:
                 turn_ends = time.perf_counter() + TURN_MAX
                 is_news |= self._take(chunks, turn_ends)
                 is_done = time.perf_counter() < turn_ends
@@ -243,14 +238,14 @@ class LinkTask:
 
     async def send(self) -> None:
         """Send frames of the core and run its deadlines, until calls fail permanently or cancellation."""
-        share = EventLoopShare.of_this_loop()
+        loop = LoopScheduler.of_this_loop()
         async with self._sending:
             try:
-                await self._send(share)
+                await self._send(loop)
             finally:
-                share.left(self)
+                loop.left(self)
 
-    async def _send(self, share: EventLoopShare) -> None:
+    async def _send(self, loop: LoopScheduler) -> None:
         station = self._station
         while self.ended is None:
             self._something_to_send = anyio.Event()
@@ -258,14 +253,10 @@ class LinkTask:
             self._look_at_the_clock(now)
             self._suspend.expect(math.inf)  # a slow link may block the sender
             self._due = math.inf
-            everyone = self._asked
             is_behind = self._is_behind(now)
-            bursts, awaited = station.bursts(now)
-            most_lists = 1 if is_behind else share.most_lists(self, bursts, now, awaited=awaited)
             if not is_behind or now >= self._behind_since + TIMEOUT_DELAY_MAX:
-                self._asked = False
-                is_crowded = share.is_busy_without(self)
-                station.tick(now, everyone=everyone, most_lists=most_lists, is_crowded=is_crowded)
+                loop.limit_lists(self, station.scheduler, now, is_behind=is_behind)
+                station.tick(now)
             self._dispatch()
             to_send = station.data_to_send()
             if to_send:
@@ -275,15 +266,12 @@ class LinkTask:
             for _ in range(min(len(self._of_others), FORWARDED_PER_TURN)):
                 await self._transmit(self._of_others.popleft(), None)
             if self._of_others:
-                self._asked |= everyone  # their deadlines have not been evaluated
                 continue
-            due = station.next_deadline(everyone=everyone)
+            due = station.next_deadline()
             now = anyio.current_time()
             is_behind = self._is_behind(now)
             if is_behind:
                 due = now + TURN_MAX
-            elif most_lists < math.inf:  # a queued list reports a deadline, but may not start yet
-                due = max(due, now + RECHECK_INTERVAL)
             self._suspend.expect(due)
             self._due = due
             wait = due - now
@@ -305,12 +293,8 @@ class LinkTask:
             self._station.overhear(frame, anyio.current_time())
             self._something_to_send.set()
 
-    def wake(self, machine: ComponentMachine | None = None) -> None:
-        """Run the sender: this component, or any, has something to send or another deadline."""
-        if machine is None:
-            self._asked = True
-        else:
-            self._station.touch(machine)
+    def wake(self) -> None:
+        """Run the sender: something is to be sent, or a deadline has changed."""
         self._something_to_send.set()
 
     def tell(self) -> None:

@@ -71,8 +71,8 @@ class LocalClient(Protocol):
             LinkError: the link failed, or the client is not open.
         """
 
-    def wake(self, machine: ComponentMachine | None = None) -> None:
-        """Run the sender: a component, or any, has something to send or another deadline."""
+    def wake(self) -> None:
+        """Run the sender: something is to be sent, or a deadline has changed."""
 
     async def wait_until_files_closed(self, machine: ComponentMachine) -> None:
         """Wait at most one round trip until the file session that a component closes is closed on board."""
@@ -99,7 +99,7 @@ class LocalComponent(Component):
 
     @abstractmethod
     def wake(self) -> None:
-        """Run the sender: this component has something to send or another deadline."""
+        """Run the sender: something is to be sent, or a deadline has changed."""
 
     @abstractmethod
     def is_cache_due(self, now: float) -> bool:

@@ -21,7 +21,7 @@ from paramclient.protocol.wire import bears_key, unsign_frame
 
 __all__ = ["Capture"]
 
-FLUSH_INTERVAL: Final = 0.25
+RECORDING_FLUSH_INTERVAL: Final = 0.25
 """Seconds between two writes to the file: a killed process loses the frames of at most this time."""
 UNWRITTEN_BYTES_MAX: Final = 16 * 1024 * 1024
 """Maximum number of bytes queued for the disk: 10 seconds of a link with 100 Mbit/s, an hour of a radio. A
@@ -94,7 +94,7 @@ class Capture:
         while not self._has_failed:
             await self._something_to_write.wait()
             self._something_to_write = anyio.Event()
-            await anyio.sleep(FLUSH_INTERVAL)
+            await anyio.sleep(RECORDING_FLUSH_INTERVAL)
             await self._flush()
 
     async def close(self) -> None:

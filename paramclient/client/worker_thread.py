@@ -17,7 +17,7 @@ __all__ = ["Worker"]
 
 Result = TypeVar("Result")
 
-ENDING_INTERVAL: Final = 0.01
+THREAD_END_INTERVAL: Final = 0.01
 """Seconds between two looks whether a thread has ended."""
 
 
@@ -74,7 +74,7 @@ class Worker:
         self._end()
         with anyio.move_on_after(within, shield=True):
             while thread.is_alive():  # noqa: ASYNC110 - a thread tells nobody
-                await anyio.sleep(ENDING_INTERVAL)
+                await anyio.sleep(THREAD_END_INTERVAL)
         for call in list(self._waiting):
             call.give_up(error())
 

@@ -10,10 +10,10 @@ from paramclient.diagnosis.measure import check_vehicle
 from paramclient.diagnosis.report import (
     FileService,
     HashService,
+    HeardStation,
     LinkReport,
     ListService,
     ReadService,
-    Station,
     VehicleReport,
 )
 
@@ -25,7 +25,7 @@ __all__ = [
     "ListService",
     "ReadService",
     "Severity",
-    "Station",
+    "HeardStation",
     "VehicleReport",
     "check_vehicle",
     "findings_of",

@@ -15,10 +15,10 @@ from paramclient.client.local import LocalComponent, local
 from paramclient.diagnosis.report import (
     FileService,
     HashService,
+    HeardStation,
     LinkReport,
     ListService,
     ReadService,
-    Station,
     VehicleReport,
 )
 from paramclient.errors import (
@@ -33,6 +33,7 @@ from paramclient.errors import (
 from paramclient.metadata.download import announced_metadata
 from paramclient.protocol.ftp import param_pck
 from paramclient.protocol.params.fetch_result import Progress
+from paramclient.protocol.params.file_download import PARAMETER_FILE, WITH_DEFAULTS
 from paramclient.protocol.stats.traffic import ComponentTraffic
 from paramclient.protocol.wire import (
     AUTOPILOT_VERSION_ID,
@@ -47,13 +48,11 @@ from paramclient.protocol.wire import (
 
 __all__ = ["check_vehicle"]
 
-PARAMETER_FILE: Final = "@PARAM/param.pck?withdefaults=1"
-"""MAVFTP path of the packed parameter file, with the firmware's defaults."""
 DIAGNOSIS_LISTENING_TIME: Final = 2.2
 """Seconds in which every component is heard twice, as each sends a heartbeat once a second."""
 VERSION_TIMEOUT: Final = 3.0
 """Seconds for AUTOPILOT_VERSION: four attempts at the initial timeout."""
-RESPONSE_TIMEOUT: Final = 3.0
+MEASURE_TIMEOUT: Final = 3.0
 """Seconds for one small request: longer than any measured round trip with repeats."""
 ROUND_TRIP_COUNT: Final = 10
 """Number of round trips that are measured: enough for a median and a maximum."""
@@ -161,7 +160,7 @@ class _Diagnosis:
 
     async def _within(self, measure: Callable[[], Awaitable[Result]]) -> Result | None:
         """Return the result of a measurement; None if no time is left for it."""
-        return await measure() if self._left(RESPONSE_TIMEOUT) > 0 else None
+        return await measure() if self._left(MEASURE_TIMEOUT) > 0 else None
 
     async def _wait_for_identity(self) -> None:
         """Wait until AUTOPILOT_VERSION was received or finally refused, at most `VERSION_TIMEOUT`."""
@@ -174,7 +173,7 @@ class _Diagnosis:
         component, machine = self._component, self._local.machine
         round_trips: list[float] = []
         for _ in range(ROUND_TRIP_COUNT):
-            left = self._left(RESPONSE_TIMEOUT)
+            left = self._left(MEASURE_TIMEOUT)
             if not left:
                 break
             began = anyio.current_time()
@@ -202,7 +201,7 @@ class _Diagnosis:
         if self._local.machine.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA:
             return "ArduPilot has no parameter hash"
         try:
-            param = await self._component.get(HASH_CHECK, timeout=self._left(RESPONSE_TIMEOUT))
+            param = await self._component.get(HASH_CHECK, timeout=self._left(MEASURE_TIMEOUT))
         except (NoReply, VehicleError) as error:
             return str(error)
         return param.bits
@@ -240,7 +239,7 @@ class _Diagnosis:
 
     async def _is_answered(self, index: int) -> bool:
         try:
-            await self._component.get(index, timeout=self._left(RESPONSE_TIMEOUT))
+            await self._component.get(index, timeout=self._left(MEASURE_TIMEOUT))
         except (NoReply, VehicleError):
             return False
         return True
@@ -256,7 +255,7 @@ class _Diagnosis:
                 arrivals.append((anyio.current_time(), state.received))
 
         # the vehicle sends the whole list even if later measurements have begun
-        deadline = max(began, self._deadline - RESPONSE_TIMEOUT)
+        deadline = max(began, self._deadline - MEASURE_TIMEOUT)
         try:
             fetch = machine.begin_fetch(began, refresh=True, by_list=True)
             try:
@@ -296,7 +295,7 @@ class _Diagnosis:
         is_serving = False
         try:
             began = anyio.current_time()
-            data = await ftp.read(PARAMETER_FILE, timeout=self._left(float("inf")))
+            data = await ftp.read(PARAMETER_FILE + WITH_DEFAULTS, timeout=self._left(float("inf")))
             elapsed = anyio.current_time() - began
             is_serving = True
             size = len(data)
@@ -310,7 +309,7 @@ class _Diagnosis:
             error = str(failure)
         if is_serving:
             try:
-                listed = await ftp.list("/", timeout=self._left(RESPONSE_TIMEOUT))
+                listed = await ftp.list("/", timeout=self._left(MEASURE_TIMEOUT))
                 named = (each for each in listed if each.name not in (".", ".."))  # ArduPilot lists both
                 entries = tuple(sorted(each.name + "/" * each.is_directory for each in named))
             except (NoReply, VehicleError):
@@ -319,7 +318,7 @@ class _Diagnosis:
 
     async def _find_descriptions(self) -> str | None:
         try:
-            announced = await announced_metadata(self._component, self._left(RESPONSE_TIMEOUT))
+            announced = await announced_metadata(self._component, self._left(MEASURE_TIMEOUT))
         except (NoReply, VehicleError):
             return None
         return None if announced is None else announced.uri
@@ -361,7 +360,7 @@ class _Diagnosis:
                 if (each.system, each.component) != address and _is_autopilot(each)
             ),
             stations=tuple(
-                Station(each.system, each.component, (each.system, each.component) == own)
+                HeardStation(each.system, each.component, (each.system, each.component) == own)
                 for each in report.components
                 if each.heartbeat is not None and each.heartbeat.type == MAV_TYPE_GCS
             ),

@@ -13,13 +13,13 @@ __all__ = [
     "LinkReport",
     "ListService",
     "ReadService",
-    "Station",
+    "HeardStation",
     "VehicleReport",
 ]
 
 
 @dataclass(frozen=True, slots=True)
-class Station:
+class HeardStation:
     """Another ground station, detected by its heartbeats.
 
     Attributes:
@@ -76,7 +76,7 @@ class LinkReport:
     mavlink: int
     signed: int
     autopilots: tuple[tuple[int, int], ...]
-    stations: tuple[Station, ...]
+    stations: tuple[HeardStation, ...]
     radio_free: int | None
 
 

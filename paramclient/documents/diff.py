@@ -2,42 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from paramclient.documents.document import Document, Maybe, Scalar
+from paramclient.documents.document import Document, Maybe
+from paramclient.documents.param import WrittenParamDoc
 from paramclient.documents.paramset import OriginDoc
 from paramclient.model.comparison import Moved, Standing
-from paramclient.model.notation import bits_written, value_written
-from paramclient.model.values import type_name
 
 if TYPE_CHECKING:
     from paramclient.metadata import Metadata
     from paramclient.model.comparison import Comparison, Difference
-    from paramclient.model.paramset import WrittenParam
 
-__all__ = ["ComparedDoc", "DiffDoc", "DifferenceDoc"]
-
-
-class ComparedDoc(Document):
-    """The value of one side; `text` is its meaning in a word, if known."""
-
-    value: Scalar
-    type: str | None
-    bits: str | None
-    text: Maybe[str] = None
-
-    @classmethod
-    def of(cls, param: WrittenParam, metadata: Metadata | None = None) -> ComparedDoc:
-        """Return the document of a parameter of one side, with the metadata of that side."""
-        info = None if metadata is None else metadata.find(param.name)
-        return cls(
-            value=value_written(param.value, param),
-            type=None if param.type is None else type_name(param.type),
-            bits=bits_written(param),
-            text=None if info is None else info.text(param.value) or None,
-        )
+__all__ = ["DiffDoc", "DifferenceDoc"]
 
 
 class DifferenceDoc(Document):
@@ -46,9 +25,9 @@ class DifferenceDoc(Document):
     standing: Standing = Field(validation_alias="is", serialization_alias="is")
     types_differ: bool
     rounding: bool
-    left: ComparedDoc | None
-    right: ComparedDoc | None
-    base: ComparedDoc | None
+    left: WrittenParamDoc | None
+    right: WrittenParamDoc | None
+    base: WrittenParamDoc | None
     moved: Moved | None
     units: Maybe[str] = None
 
@@ -66,9 +45,9 @@ class DifferenceDoc(Document):
             standing=entry.standing,
             types_differ=entry.types_differ,
             rounding=entry.is_rounding,
-            left=None if entry.left is None else ComparedDoc.of(entry.left, left),
-            right=None if entry.right is None else ComparedDoc.of(entry.right, right),
-            base=None if entry.base is None else ComparedDoc.of(entry.base, base),
+            left=None if entry.left is None else WrittenParamDoc.compared(entry.left, left),
+            right=None if entry.right is None else WrittenParamDoc.compared(entry.right, right),
+            base=None if entry.base is None else WrittenParamDoc.compared(entry.base, base),
             moved=entry.moved,
             units=next((info.units for info in infos if info is not None and info.units), None),
         )
@@ -102,6 +81,29 @@ class DiffDoc(Document):
             left, right, base: the metadata of each side, or None.
             everything: include names that do not differ.
         """
+        head = cls.without_params(outcome)
+        return head.model_copy(
+            update={"params": dict(cls.rows(outcome, left, right, base, everything=everything))}
+        )
+
+    @classmethod
+    def rows(
+        cls,
+        outcome: Comparison,
+        left: Metadata | None = None,
+        right: Metadata | None = None,
+        base: Metadata | None = None,
+        *,
+        everything: bool = False,
+    ) -> Iterator[tuple[str, DifferenceDoc]]:
+        """Yield the members of `params`, each created when it is needed; see `of`."""
+        for entry in outcome.entries:
+            if everything or entry.is_news:
+                yield entry.name, DifferenceDoc.of(entry, left, right, base)
+
+    @classmethod
+    def without_params(cls, outcome: Comparison) -> DiffDoc:
+        """Return the document of a `Comparison` with an empty `params`."""
         return cls(
             same=outcome.is_same,
             left=OriginDoc.of(outcome.left),
@@ -109,9 +111,5 @@ class DiffDoc(Document):
             base=None if outcome.base is None else OriginDoc.of(outcome.base),
             counts={standing: outcome.counts[standing] for standing in Standing},
             moves=None if outcome.base is None else {moved: outcome.moves[moved] for moved in Moved},
-            params={
-                entry.name: DifferenceDoc.of(entry, left, right, base)
-                for entry in outcome.entries
-                if everything or entry.is_news
-            },
+            params={},
         )

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, WrapValidator, model_validato
 
 from paramclient.model.notation import Scalar
 
-__all__ = ["Body", "Document", "InParts", "Maybe", "Scalar", "limit_unknown_members"]
+__all__ = ["Body", "Document", "InParts", "Maybe", "Scalar", "build_documents", "limit_unknown_members"]
 
 T = TypeVar("T")
 
@@ -42,6 +42,18 @@ class Document(BaseModel):
     def as_json(self) -> dict[str, Any]:
         """Return the document as objects that `json.dumps` accepts."""
         return self.model_dump(mode="json")
+
+
+def build_documents() -> None:
+    """Build the validators and serializers of all documents, in place of each at its first use.
+
+    pydantic takes up to 5 ms for one and lets no other thread run meanwhile.
+    """
+    waiting: list[type[Document]] = [Document]
+    while waiting:
+        model = waiting.pop()
+        model.model_rebuild()
+        waiting += model.__subclasses__()
 
 
 class Body(BaseModel):

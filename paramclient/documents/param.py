@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final
 
 from paramclient.documents.document import Document, Maybe, Scalar
-from paramclient.model.notation import bits_text, bits_written, value_json, value_written
-from paramclient.model.values import Param, ParamType, format_value, type_name
+from paramclient.model.notation import bits_text, bits_written, parse_value, value_json, value_written
+from paramclient.model.values import Param, ParamType, Trust, format_value, from_bits, type_name
 
 if TYPE_CHECKING:
     from paramclient.errors import ParamClientError
@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from paramclient.model.paramset import WrittenParam
 
 __all__ = ["DescribedDoc", "GotDoc", "InfoDoc", "InfosDoc", "ParamDoc", "WrittenParamDoc"]
+
+_TYPES: Final = dict(ParamType.__members__)
+"""The types by name."""
 
 
 class InfoDoc(Document):
@@ -87,16 +90,7 @@ class ParamDoc(Document):
             info: its metadata, or None.
             whole: whether to include all metadata.
         """
-        return cls(
-            value=value_json(param.value, param.type),
-            type=type_name(param.type),
-            index=param.index,
-            bits=bits_text(param),
-            default=None if param.default is None else value_json(param.default, param.type),
-            text=None if info is None else info.text(param.value) or None,
-            units=None if info is None else info.units or None,
-            metadata=InfoDoc.of(info) if info is not None and whole else None,
-        )
+        return cls(**_members(param, info, whole=whole))
 
     @classmethod
     def kept(
@@ -113,20 +107,43 @@ class ParamDoc(Document):
             param, info, whole: as in `of`.
             heard_at: unix time in seconds at which the value was received, or None.
         """
-        return cls.of(param, info, whole=whole).model_copy(
-            update={
-                "name": param.name,
-                "is_default": None if param.default is None else not param.is_changed,
-                "trust": param.trust.value,
-                "heard_at": heard_at,
-            }
+        return cls(
+            name=param.name,
+            is_default=None if param.default is None else not param.is_changed,
+            trust=param.trust.value,
+            heard_at=heard_at,
+            **_members(param, info, whole=whole),
+        )
+
+    def param(self, name: str) -> Param:
+        """Return the parameter, without loss; without trust in the document, it is *cached*.
+
+        Args:
+            name: param_id.
+
+        Raises:
+            ArithmeticError, LookupError, TypeError, ValueError: a member is not valid.
+        """
+        known = _TYPES.get(self.type)
+        kind = int(self.type.removeprefix("TYPE_")) if known is None else known
+        bits = int(self.bits, 16)
+        is_raw = isinstance(self.value, str) and self.value.startswith("0x")
+        return Param(
+            name,
+            from_bits(bits, kind, is_raw=is_raw),
+            kind,
+            self.index,
+            bits,
+            Trust.CACHED if self.trust is None else Trust(self.trust),
+            None if self.default is None else parse_value(self.default, kind),
         )
 
 
 class WrittenParamDoc(Document):
-    """A parameter of a file; its name is the key of the document.
+    """A parameter of a file or of another set; its name is the key of the document.
 
-    Without a type, `value` is the number as the file has it, and `bits` is null.
+    Without a type, `value` is the number as the file has it, and `bits` is null. In a comparison, `text` is
+    the meaning of the value in a word, if known, and `default` and `comment` are left out.
     """
 
     value: Scalar
@@ -134,6 +151,7 @@ class WrittenParamDoc(Document):
     bits: str | None
     default: Maybe[Scalar] = None
     comment: Maybe[str] = None
+    text: Maybe[str] = None
 
     @classmethod
     def of(cls, param: WrittenParam) -> WrittenParamDoc:
@@ -145,6 +163,13 @@ class WrittenParamDoc(Document):
             default=None if param.default is None else value_written(param.default, param),
             comment=param.comment or None,
         )
+
+    @classmethod
+    def compared(cls, param: WrittenParam, metadata: Metadata | None = None) -> WrittenParamDoc:
+        """Return the document of a parameter of one side of a comparison, with the metadata of that side."""
+        info = None if metadata is None else metadata.find(param.name)
+        text = None if info is None else info.text(param.value) or None
+        return cls.of(param).model_copy(update={"default": None, "comment": None, "text": text})
 
 
 class GotDoc(Document):
@@ -190,6 +215,23 @@ class DescribedDoc(Document):
 
     count: int
     source: str
+
+
+def _members(param: Param, info: ParamInfo | None, *, whole: bool) -> dict[str, Any]:
+    """Return the members of every `ParamDoc`."""
+    members: dict[str, Any] = {
+        "value": value_json(param.value, param.type),
+        "type": type_name(param.type),
+        "index": param.index,
+        "bits": bits_text(param),
+    }
+    if param.default is not None:
+        members["default"] = value_json(param.default, param.type)
+    if info is not None:
+        members |= {"text": info.text(param.value) or None, "units": info.units or None}
+        if whole:
+            members["metadata"] = InfoDoc.of(info)
+    return members
 
 
 def _number(number: int | float | None) -> Scalar | None:

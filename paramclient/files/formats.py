@@ -14,6 +14,7 @@ from paramclient.files.text import decode_text, lines_of, time_of
 from paramclient.model.identity import autopilot_name
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import check_name
+from paramclient.model.wording import counted
 
 __all__ = ["LARGEST_FILE", "Content", "dumps", "loads"]
 
@@ -163,8 +164,7 @@ def _header_lines(params: ParamSet) -> Iterator[str]:
     """Generate a description of a set, for the header of a file."""
     who = params.identity
     kind = "" if who is None else f", {autopilot_name(who.autopilot)}"
-    parameters = "parameter" if len(params) == 1 else "parameters"
-    yield f"{len(params)} {parameters} of system/component {address(params)}{kind}"
+    yield f"{counted(len(params), 'parameter')} of system/component {address(params)}{kind}"
     if who is not None:
         commit = f", commit {who.git_hash}" if who.git_hash else ""
         version = ".".join(str(who.firmware >> shift & 0xFF) for shift in (24, 16, 8))

@@ -17,7 +17,7 @@ from paramclient.files.text import decode_text
 
 __all__ = ["Include", "Includes"]
 
-DEPTH_MAX: Final = 8
+INCLUDE_DEPTH_MAX: Final = 8
 """Largest depth of nested `@include` lines, so that a chain of files ends."""
 FILES_MAX: Final = 64
 """Files that one file may include in total. Two lines in each of a few files could include thousands."""
@@ -100,7 +100,7 @@ class Includes:
             raise UsageError(f"it lies outside of {top}; only files below that folder can be included")
         if real in self.chain:
             raise UsageError("the files include each other (circular @include)")
-        if len(self.chain) > DEPTH_MAX:
-            raise UsageError(f"@include is nested more than {DEPTH_MAX} files deep")
+        if len(self.chain) > INCLUDE_DEPTH_MAX:
+            raise UsageError(f"@include is nested more than {INCLUDE_DEPTH_MAX} files deep")
         if self.budget.files == 0:
             raise UsageError(f"more than {FILES_MAX} files are included")

@@ -21,8 +21,8 @@ from paramclient.files.includes import Includes
 from paramclient.files.param_file import AUTOPILOT, FileForm, ParamFile, TooManyParams
 from paramclient.files.text import (
     Builder,
-    Line,
     Problems,
+    TextLine,
     as_type,
     comment_lines,
     excerpt,
@@ -132,7 +132,7 @@ def _read_lines(
     """Add the parameters of one file to `lines`, and its bad lines to `problems`."""
     expected = "NAME,VALUE" if form is FileForm.MISSION_PLANNER else "NAME VALUE"
 
-    def include(line: Line, path: str) -> None:
+    def include(line: TextLine, path: str) -> None:
         try:
             if includes is None:
                 raise UsageError("only a file on disk can include another file")
@@ -149,7 +149,7 @@ def _read_lines(
         except UsageError as error:
             problems.add(line.number, f"@include with a file that can be read ({error})", excerpt(line.text))
 
-    def take(line: Line, comment: str) -> None:
+    def take(line: TextLine, comment: str) -> None:
         place = f"{problems.source}:{line.number}" if is_included else f"line {line.number}"
         if match := _include(line.text):
             include(line, match[1])
@@ -215,7 +215,7 @@ def read_qgc(text: str, source: str, params_max: int | None = None) -> ParamFile
     """
     builder = Builder(Problems(source), params_max)
 
-    def take(line: Line, comment: str) -> None:
+    def take(line: TextLine, comment: str) -> None:
         columns = _blanks.split(line.text)
         if len(columns) != 5:
             builder.problems.add(line.number, _QGC_ROW, excerpt(line.text))
@@ -250,7 +250,7 @@ def write_qgc(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
 
 
 def _read_commented_lines(
-    text: str, take: Callable[[Line, str], None]
+    text: str, take: Callable[[TextLine, str], None]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Call `take` for each line with content, with its comments; return header and footer.
 

@@ -13,7 +13,7 @@ from typing import Final
 
 from paramclient.errors import UsageError
 from paramclient.files.param_file import FileForm, ParamFile, TooManyParams
-from paramclient.files.text import Builder, Line, Problems, excerpt, lines_of, parse_number
+from paramclient.files.text import Builder, Problems, TextLine, excerpt, lines_of, parse_number
 from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import check_name
 
@@ -117,7 +117,7 @@ class _Flow:
             self._left = self._left or words[0] in _LEAVING
 
 
-def _param(line: Line, comment: str) -> tuple[WrittenParam, bool]:
+def _param(line: TextLine, comment: str) -> tuple[WrittenParam, bool]:
     """Return the parameter that a line sets, and whether the line is a `set-default`."""
     match = _sets(line.text)
     if match is None:

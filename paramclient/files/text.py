@@ -19,7 +19,7 @@ from paramclient.model.values import ParamType, Value, bits_of, format_value, fr
 __all__ = [
     "COMMENT_START",
     "Builder",
-    "Line",
+    "TextLine",
     "Problems",
     "as_type",
     "comment_lines",
@@ -56,7 +56,7 @@ _control: Final = re.compile(r"[\x00-\x08\x0e-\x1f\x7f]")
 _PLAIN_NAN: Final = struct.pack("<d", math.nan)
 
 
-class Line(NamedTuple):
+class TextLine(NamedTuple):
     """One line: its content, and its comment without the comment character (None without a comment)."""
 
     number: int
@@ -217,15 +217,15 @@ def decode_text(data: bytes, source: str) -> str:
     return text
 
 
-def lines_of(text: str, mark: re.Pattern[str] = COMMENT_START) -> Iterator[Line]:
+def lines_of(text: str, mark: re.Pattern[str] = COMMENT_START) -> Iterator[TextLine]:
     """Generate all lines, empty ones included, with the comments that `mark` starts."""
     for number, line in enumerate(_split(text), start=1):
         found = mark.search(line)
         if found is None:
-            yield Line(number, line.strip(" \t"), None)
+            yield TextLine(number, line.strip(" \t"), None)
         else:
             comment = line[found.end() :].rstrip()
-            yield Line(number, line[: found.start()].strip(" \t"), comment.removeprefix(" "))
+            yield TextLine(number, line[: found.start()].strip(" \t"), comment.removeprefix(" "))
 
 
 def comment_lines(comments: Iterable[str]) -> Iterator[str]:

@@ -12,7 +12,7 @@ from paramclient.files.text import excerpt
 
 __all__ = ["InvalidYaml", "load"]
 
-NESTING_MAX: Final = 20
+YAML_NESTING_MAX: Final = 20
 """Levels of nesting; a document has six, and the parser recurses for each level."""
 
 
@@ -48,7 +48,7 @@ def load(text: str) -> Any:
 def _content(events: Iterator[Any]) -> Any:
     """Return the content of the only document.
 
-    Rejects aliases, anchors, tags, and nesting deeper than `NESTING_MAX`.
+    Rejects aliases, anchors, tags, and nesting deeper than `YAML_NESTING_MAX`.
     """
     whole: list[Any] = []
     above: list[_Collection] = [_Collection(whole)]
@@ -69,8 +69,8 @@ def _content(events: Iterator[Any]) -> Any:
                 if isinstance(event, yaml.ScalarEvent):
                     above[-1].add(event, _scalar(event))
                     continue
-                if len(above) > NESTING_MAX:
-                    raise _error_at(event, f"found more than {NESTING_MAX} levels")
+                if len(above) > YAML_NESTING_MAX:
+                    raise _error_at(event, f"found more than {YAML_NESTING_MAX} levels")
                 inner = _Collection({} if isinstance(event, yaml.MappingStartEvent) else [])
                 above[-1].add(event, inner.content)
                 above.append(inner)

@@ -38,7 +38,7 @@ if sys.platform != "win32":
 if TYPE_CHECKING:
     import serialx
 
-__all__ = ["Device", "SerialLink", "need_serialx"]
+__all__ = ["SerialDevice", "SerialLink", "need_serialx"]
 
 T = TypeVar("T")
 
@@ -59,7 +59,7 @@ CLOSE_TIMEOUT: Final = 2.0
 """Seconds that closing waits for a driver. Unsent bytes are dropped before, so it rarely has to wait."""
 
 
-class Device(NamedTuple):
+class SerialDevice(NamedTuple):
     """A serial port as a peer. The number changes with each opening, so that half a frame received before
     unplugging is not continued with later bytes."""
 
@@ -92,7 +92,7 @@ class SerialLink:
         self.device = spec.host
         self.baud = spec.port
         self._port: _Port | None = None
-        self._far = Device(0, spec.host)
+        self._far = SerialDevice(0, spec.host)
         self._openings = 0
         self._end: tuple[str, OSError | None] = ("closed", None)
 

@@ -16,7 +16,7 @@ import anyio.lowlevel
 from paramclient.links.link import OPEN_TIMEOUT, Address, Peer, SocketLink, claim, close_socket, reason
 from paramclient.links.names import LinkSpec
 
-__all__ = ["Connection", "TcpIn", "TcpOut"]
+__all__ = ["TcpConnection", "TcpIn", "TcpOut"]
 
 SEND_TIMEOUT: Final = 5.0
 """Seconds that a peer may leave the send buffer full before its connection counts as dropped."""
@@ -32,7 +32,7 @@ READ_SIZE: Final = 65536
 """Bytes that are read from one connection before the next one is read."""
 
 
-class Connection(NamedTuple):
+class TcpConnection(NamedTuple):
     """A TCP connection as a peer. The number distinguishes several connections of the same address."""
 
     number: int
@@ -48,7 +48,7 @@ class TcpOut(SocketLink):
 
     def __init__(self, spec: LinkSpec) -> None:
         super().__init__(spec)
-        self._far = Connection(0, spec.host, spec.port)
+        self._far = TcpConnection(0, spec.host, spec.port)
 
     async def receive(self) -> list[tuple[Peer, bytes]]:
         """See `Link.receive`: one chunk of up to `READ_SIZE` bytes."""
@@ -200,7 +200,7 @@ class TcpIn(SocketLink):
             return
         _set_up(client)
         self._accepted += 1
-        peer = Connection(self._accepted, host, port)
+        peer = TcpConnection(self._accepted, host, port)
         self._clients[peer] = client
         selector.register(client, selectors.EVENT_READ, peer)
 

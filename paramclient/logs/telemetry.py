@@ -13,7 +13,7 @@ import anyio
 import anyio.lowlevel
 
 from paramclient.cache import CachedComponent, ParamCache, TableUpdate
-from paramclient.client.cache_writer import FLUSH_INTERVAL, WriteThrough
+from paramclient.client.cache_writer import CACHE_FLUSH_INTERVAL, WriteThrough
 from paramclient.links.tlog import Record, open_log, read_records
 from paramclient.model.identity import Identity
 from paramclient.protocol.component import ComponentMachine
@@ -126,7 +126,7 @@ class _Import:
                     station.tick(record.at)  # operations that time out in a pause end before it
                     await self._follow()
                     await writer.flush()
-                    flush_at = record.at + FLUSH_INTERVAL
+                    flush_at = record.at + CACHE_FLUSH_INTERVAL
                 self._at = max(self._at, record.at)  # a clock that was set back does not turn back the time
                 station.receive(record.data, LOG_PEER, self._at)
                 await self._follow()

@@ -23,7 +23,7 @@ from paramclient.metadata.px4 import PARAMS_MAX, error_text, whole
 
 __all__ = ["read_json", "read_xml"]
 
-DEPTH_MAX: Final = 16
+GROUP_DEPTH_MAX: Final = 16
 """Levels of elements; the files have six."""
 
 
@@ -184,8 +184,8 @@ class _XmlReader:
         self._depth += 1
         if self._depth == 1 and tag != "paramfile":
             raise self._error(f"begins with <{tag}>, not with <paramfile> as ArduPilot's files")
-        if self._depth > DEPTH_MAX:
-            raise self._error(f"has more than {DEPTH_MAX} levels")
+        if self._depth > GROUP_DEPTH_MAX:
+            raise self._error(f"has more than {GROUP_DEPTH_MAX} levels")
         row = self._row
         if tag == "parameters":
             self._group = attributes.get("name", "")

@@ -15,10 +15,11 @@ from typing import Final, TypeVar
 
 from paramclient.errors import UsageError
 from paramclient.model.values import ParamType, Value, format_value, shortest_float
+from paramclient.model.wording import counted
 
 __all__ = ["Metadata", "ParamInfo", "number_of"]
 
-NAMES_LISTED_MAX: Final = 12
+CHOICES_LISTED_MAX: Final = 12
 """Names that an error lists; of more names it lists the closest ones, so that the error stays readable."""
 BITS_MAX: Final = 64
 """Bits of the widest type."""
@@ -244,7 +245,7 @@ class Metadata(Mapping[str, ParamInfo]):
 
     def __repr__(self) -> str:
         origin = f" from {self.source}" if self.source else ""
-        return f"<Metadata of {len(self)} {'param' if len(self) == 1 else 'params'}{origin}>"
+        return f"<Metadata of {counted(len(self), 'param')}{origin}>"
 
 
 def number_of(text: str) -> int | float | None:
@@ -283,7 +284,7 @@ def _choice(sentence: str, named: Mapping[Key, str], text: str) -> str:
     """Return the end of an error with all names, or with those close to a text if there are many."""
     if not named:
         return ", and its values have no names"
-    if len(named) <= NAMES_LISTED_MAX:
+    if len(named) <= CHOICES_LISTED_MAX:
         return f"{sentence}: {', '.join(f'{name} ({number})' for number, name in named.items())}"
     folded = {_folded(name): name for name in named.values()}
     nearest = [folded[each] for each in difflib.get_close_matches(_folded(text), folded, n=3, cutoff=0.5)]

@@ -13,6 +13,7 @@ from collections.abc import ItemsView, Iterable, Iterator, Mapping, MutableMappi
 from typing import Final, TypeAlias
 
 from paramclient.model.values import Param, Trust, Value, from_bits, known_type, same_bits
+from paramclient.model.wording import counted
 
 __all__ = [
     "CACHED",
@@ -257,4 +258,4 @@ class ParamMap(Mapping[str, Param]):
 
     def __repr__(self) -> str:
         count = len(self._params)
-        return f"<ParamMap {count} {'param' if count == 1 else 'params'}>"
+        return f"<ParamMap {counted(count, 'param')}>"

@@ -9,6 +9,7 @@ from paramclient.errors import UsageError
 from paramclient.model.identity import Identity
 from paramclient.model.patterns import NameChoice
 from paramclient.model.values import Param, ParamType, Value, bits_of, format_value, same_bits
+from paramclient.model.wording import counted
 
 __all__ = ["ParamSet", "WrittenParam"]
 
@@ -129,6 +130,5 @@ class ParamSet(Mapping[str, WrittenParam]):
         return len(self.params)
 
     def __repr__(self) -> str:
-        count = len(self.params)
         origin = f" from {self.source}" if self.source else ""
-        return f"<ParamSet {count} {'param' if count == 1 else 'params'}{origin}>"
+        return f"<ParamSet {counted(len(self.params), 'param')}{origin}>"

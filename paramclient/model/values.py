@@ -407,9 +407,9 @@ def shortest_float(value: float) -> float:
     same = _FLOAT32.pack(value)
     value = _FLOAT32.unpack(same)[0]
     # Floats are denser below a power of two: the middle of the rounding interval is slightly above value.
-    middle = value * (1 + 2**-26) if abs(math.frexp(value)[0]) == 0.5 else value
+    points = (value, value * (1 + 2**-26)) if abs(math.frexp(value)[0]) == 0.5 else (value,)
     for digits in range(6 if abs(value) >= _FLOAT32_NORMAL else 1, 9):
-        for point in (value, middle):
+        for point in points:
             candidate = float(f"{point:.{digits}g}")
             if abs(candidate) < _FLOAT32_END and _FLOAT32.pack(candidate) == same:
                 return candidate

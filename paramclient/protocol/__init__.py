@@ -3,7 +3,7 @@
 `station`: one link: components, our heartbeat, routing of messages.
 `component`: one component: its state and its machines.
 `events`: events of the components.
-`scheduler`: turns of the list downloads of many components.
+`scheduler`: many components on one link: which are due, and whose lists run.
 `addresses`: addresses of components and peers.
 `vehicle_selection`: the only vehicle that an incomplete address fits.
 `system_id_change`: the search for a vehicle under a new system id.

@@ -38,11 +38,11 @@ from paramclient.protocol.params.volatile_values import Refresh
 from paramclient.protocol.params.writes import Write, Writes
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
-from paramclient.protocol.scheduler import Turns
+from paramclient.protocol.scheduler import Scheduler
 from paramclient.protocol.stats.trace import Trace, silent
 from paramclient.protocol.vehicle.boot_time_requests import ClockRequests
 from paramclient.protocol.vehicle.claims import Claim, Verdict
-from paramclient.protocol.vehicle.commands import Commands
+from paramclient.protocol.vehicle.commands import Commands, MessageRequests
 from paramclient.protocol.vehicle.identification import Identification
 from paramclient.protocol.vehicle.metadata_location import Descriptions
 from paramclient.protocol.vehicle.peers import NO_PEER, ComponentPeers, Contest
@@ -125,13 +125,11 @@ class ComponentMachine:
         send_to: takes each message for one of its peers; None where there is only one.
         encoding: the user's choice of its encoding, or None.
         upkeep: what is done for its table without a request of the user.
-        is_link_busy: whether any request is in flight on the link.
-        vehicle: returns all components of its vehicle.
-        another: called when another vehicle has taken the system id; by default `become_another`.
+        companions: the components of its vehicle, to which it adds itself; None for a vehicle with one.
         read_clock: enables `boot_clock` calls with clocks from its telemetry for a while; see
             `ClockSampling`.
         peer: its peer, where components are told apart by peer; otherwise None.
-        turns: the turns of lists on the link; None for a link with one component.
+        scheduler: the scheduler of the link; None for a link with one component.
         room: the name count shared by the tables of the link; None likewise.
         trace: receives each step.
 
@@ -140,8 +138,10 @@ class ComponentMachine:
         vehicle: the address part that all components of a vehicle share: the system, with `peer` also the
             peer.
         version: the MAVLink version of its frames.
+        context: the facts about it that its machines share.
         who: its identity and encoding.
         table: its parameters.
+        retry: when its requests count as lost.
         round_trip: round-trip time and loss of its responses.
         presence: whether its messages are received.
         peers: the peers that send with its address, and whether several vehicles do.
@@ -151,6 +151,7 @@ class ComponentMachine:
         descriptions: the location of its metadata.
         name_searches: the searches for names that may not exist.
         commands: its commands.
+        messages: the messages that are requested from it.
         clock_requests: the requests for its time since boot.
         start_values: the reads of values that it measures at each boot.
         restarts: its reboot on command.
@@ -174,12 +175,10 @@ class ComponentMachine:
         send_to: Callable[[Message, Peer], None] | None = None,
         encoding: Encoding | None = None,
         upkeep: Upkeep | None = None,
-        is_link_busy: Callable[[], bool] = lambda: False,
-        vehicle: Callable[[], Iterable[ComponentMachine]] = lambda: (),
-        another: Callable[[float], None] | None = None,
+        companions: list[ComponentMachine] | None = None,
         read_clock: Callable[[float], None] = lambda now: None,
         peer: Peer | None = None,
-        turns: Turns | None = None,
+        scheduler: Scheduler | None = None,
         room: Room | None = None,
         trace: Trace = silent,
     ) -> None:
@@ -190,12 +189,22 @@ class ComponentMachine:
         self.address: Address = target if peer is None else PeerAddress(system, component, peer)
         self.vehicle: tuple[int, Peer] = (system, peer)
         self.version = 1
-        context = Context(target, send, own, trace=trace, may_send=not upkeep.listens_only)
+        scheduler = Scheduler() if scheduler is None else scheduler
+        self._scheduler = scheduler
+        self.reschedule = scheduler.reporter(self)
+        context = Context(
+            *(target, self._send, own),
+            trace=trace,
+            may_send=not upkeep.listens_only,
+            reschedule=self.reschedule,
+        )
+        self.context = context
+        self.retry = context.retry
         self.round_trip = context.round_trip
-        self.who = Identification(context, link, encoding)
+        self.messages = MessageRequests(context)
+        self.who = Identification(context, self.messages, link, encoding)
         self.table = Table(self.who.encoding, room)
-        self.turns = Turns() if turns is None else turns
-        self.reads = Reads(context, self.table, self.turns.share)
+        self.reads = Reads(context, self.table, scheduler.turns.share)
         self.writes = Writes(context, self.reads, self.table, permission=self)
         self.presence = Presence()
         self.peers = ComponentPeers(target, self, may_ask=context.may_send)
@@ -204,9 +213,9 @@ class ComponentMachine:
         self.sync = Sync(
             context, self.reads, self.table, upkeep, check_pace, self.presence, self.files, host=self
         )
-        self.descriptions = Descriptions(context)
+        self.descriptions = Descriptions(context, self.messages)
         self.commands = Commands(context)
-        self.clock_requests = ClockRequests(context, self.presence)
+        self.clock_requests = ClockRequests(context, self.messages, self.presence)
         self.start_values = StartValues(context, self.reads, self.table, self.sync)
         self.restarts = Restarts(
             context, self.commands, self.who, self.presence, self.clock_requests, self._restart_noticed
@@ -216,7 +225,7 @@ class ComponentMachine:
             context,
             self.reads,
             self.table,
-            self.turns,
+            scheduler.turns,
             self.files,
             changed=self._moved,
             doubt=self._doubt_identity,
@@ -229,13 +238,13 @@ class ComponentMachine:
         self._value_heard = self.reads.heard if overheard is None else overheard.heard
         self._own = own
         self._observer = observer
+        self._transmit = send
         self._send_to = send_to or (lambda message, peer: send(message))
         self._policy = upkeep.policy
-        self._is_link_busy = is_link_busy
         self._listens_only = upkeep.listens_only
-        self._another = another or self.become_another
         self._read_clock = read_clock
-        self._vehicle = vehicle
+        self._companions: list[ComponentMachine] = [] if companions is None else companions
+        self._companions.append(self)
         self._known_as: str | None = None  # the key of the reported identity
         self.tells_changes = True
         self.has_moved = False
@@ -245,8 +254,8 @@ class ComponentMachine:
         self.writes.left_open = self._authors.foreign_set
         self._machines: tuple[Machine, ...] = (
             *(self.reads, self.name_searches, self.sync, self.writes, self.files, self.commands),
-            *(self.restarts, self.fetches, self.who, self.descriptions, self.clock_requests),
-            *(self.start_values, self.rereads),
+            *(self.restarts, self.fetches, self.messages, self.who, self.descriptions),
+            *(self.clock_requests, self.start_values, self.rereads),
         )
         """Each machine stands behind those that it uses or calls. They end in reverse order: a machine does
         not take the end of another one for a result, and is not called after its own end."""
@@ -273,7 +282,7 @@ class ComponentMachine:
     def may_be_written(self) -> bool:
         """Whether it is certain which vehicle receives a write, and in which encoding."""
         home = self.peers.home
-        is_open = any(each.who.was_away or each.peers.is_rival(home) for each in self._autopilots())
+        is_open = any(each.context.may_be_another or each.peers.is_rival(home) for each in self._autopilots())
         return self.who.may_be_written and not is_open
 
     @property
@@ -284,7 +293,7 @@ class ComponentMachine:
     @property
     def is_link_busy(self) -> bool:
         """Whether any request is in flight on the link."""
-        return self._is_link_busy()
+        return self._scheduler.is_busy
 
     @property
     def state(self) -> str:
@@ -303,7 +312,7 @@ class ComponentMachine:
 
     def _autopilots(self) -> Iterator[ComponentMachine]:
         """Yield the autopilot of its vehicle, where that is another component."""
-        return (each for each in self._vehicle() if each is not self and each.who.is_autopilot)
+        return (each for each in self._companions if each is not self and each.who.is_autopilot)
 
     @property
     def is_restarting(self) -> bool:
@@ -318,6 +327,11 @@ class ComponentMachine:
     def read_clock(self, now: float) -> None:
         """Have clocks in its telemetry read for a while."""
         self._read_clock(now)
+
+    def _send(self, message: Message) -> None:
+        """Send a message to the component: its response has a deadline."""
+        self.reschedule()
+        self._transmit(message)
 
     def send_to(self, message: Message, peer: Peer) -> None:
         """Send a message to one of its peers."""
@@ -397,7 +411,7 @@ class ComponentMachine:
         elif isinstance(message, AutopilotVersion):
             before = self.who.firmware
             if self.who.version(message, now):
-                self._another(now)
+                self._vehicle_replaced(now)
             elif before not in (None, self.who.firmware):
                 self.fetches.updated(now)
         elif isinstance(message, ParamError):
@@ -408,8 +422,7 @@ class ComponentMachine:
                 self.reads.refused(message, now)
                 self.name_searches.refused(message, now)
         elif isinstance(message, CommandAck):
-            self.who.acknowledged(message, now)
-            self.descriptions.acknowledged(message, now)
+            self.messages.acknowledged(message, now)
             self.commands.acknowledged(message, now)
         elif isinstance(message, StatusText):
             denied = _WRITE_DENIED.search(message.text)
@@ -515,6 +528,7 @@ class ComponentMachine:
 
     def boot_clock(self, message_id: int, boot_ms: int, now: float) -> None:
         """Process `time_boot_ms` of a telemetry message."""
+        self.reschedule()
         self._clock_told(self.presence.boot_clock(message_id, boot_ms, now), now)
 
     def _clock_told(self, has_restarted: bool, now: float) -> None:
@@ -561,6 +575,7 @@ class ComponentMachine:
 
     def foreign_set(self, name: str, raw: bytes, station: str, now: float) -> None:
         """Record another station's PARAM_SET to this component, with the 4 bytes of its value."""
+        self.reschedule()
         if not is_portable_name(name):
             self.table.leave_out(name)
             return
@@ -568,6 +583,7 @@ class ComponentMachine:
 
     def foreign_file_request(self, message: FileTransfer, station: tuple[int, int], now: float) -> None:
         """Process another station's request for a file of this component."""
+        self.reschedule()
         self.files.foreign_at = now
         if self.fetches.overheard is not None:
             self.fetches.overheard.file.request_heard(message, station, now)
@@ -694,11 +710,13 @@ class ComponentMachine:
         if not self.restarts.is_under_way:
             self.check_present(f"the restart of {self.system}/{self.component}", now)
         self._read_clock(now)
+        self.reschedule()
         self.start_values.stop()
         return self.restarts.begin(now, returns=returns)
 
     def end_restart(self, restart: Restart, now: float) -> None:
         """Give a reboot back. The last holder ends it; whether the command takes effect is then unknown."""
+        self.reschedule()
         self.restarts.end(restart, now)
 
     def begin_fetch(
@@ -726,6 +744,7 @@ class ComponentMachine:
             NoReply: the component is lost, and no fetch is in progress. Nothing was sent.
         """
         self.check_uncontested()
+        self.reschedule()
         if self.fetch is None and self._policy is not Policy.CACHE_ONLY:
             self.check_present(f"the parameters of {self.system}/{self.component}", now)
         return self.fetches.begin(
@@ -734,6 +753,7 @@ class ComponentMachine:
 
     def end_fetch(self, fetch: Fetch, now: float) -> None:
         """Give a fetch back. The last holder cancels it."""
+        self.reschedule()
         self.fetches.end(fetch, now)
 
     def spelling(self, name: str) -> str:
@@ -751,7 +771,7 @@ class ComponentMachine:
         """
         if self._listens_only:
             raise UsageError(
-                f"{what} cannot be asked for where nothing is sent; what has been heard is in `params`"
+                f"{what} cannot be requested: the client only listens. Received values are in `params`"
             )
         self.check_uncontested()
         if self.presence.is_lost:
@@ -793,7 +813,7 @@ class ComponentMachine:
         if is_same:
             self._doubt()
             self.who.doubt(now)
-            what = f"the components of system {self.system}: it is being asked which vehicle it is"
+            what = f"the components of system {self.system}: the vehicle is being identified"
             self._forget_companions(NoReply(what, attempts=0, waited=0.0), now)
         else:
             self._replaced(now)
@@ -807,7 +827,7 @@ class ComponentMachine:
         """Forget the autopilot's other components after a contest: their messages may be of either
         vehicle."""
         if self.who.is_autopilot:
-            for each in self._vehicle():
+            for each in self._companions:
                 if each is not self and each.who.has_parameters:
                     each.fail_all(error, now)
                     each.become_another(now)
@@ -818,9 +838,14 @@ class ComponentMachine:
         is_autopilot = self.who.is_autopilot
         self.who.forget(now)
         if is_autopilot:
-            self._another(now)
+            self._vehicle_replaced(now)
         else:
             self.become_another(now)
+
+    def _vehicle_replaced(self, now: float) -> None:
+        """Forget all components of the system id: another vehicle uses it."""
+        for each in self._companions:
+            each.become_another(now)
 
     def _take_claim(self, claim: Claim, now: float) -> None:
         """Process what a peer has sent before its messages counted."""
@@ -854,6 +879,7 @@ class ComponentMachine:
 
     def resume(self, now: float) -> None:
         """Repeat all requests in flight: the link is back."""
+        self.reschedule()
         self.round_trip.heard_at = now
         if not self.presence.is_lost:
             if self.presence.was_away(silence := self.presence.heard(now)):
@@ -867,11 +893,13 @@ class ComponentMachine:
 
     def fail_all(self, error: ParamClientError, now: float) -> None:
         """End every operation with the error: the link has ended, or the address is contested."""
+        self.reschedule()
         for machine in reversed(self._machines):
             machine.fail_all(error, now)
 
     def become_another(self, now: float) -> None:
         """Forget everything: another vehicle uses the system id."""
+        self.reschedule()
         self._report(self.table.forget())
         self._observer.replaced(self)
         self.sync.forget()
@@ -880,9 +908,9 @@ class ComponentMachine:
         self._checks.clear()
         self._known_as = None
         self.restarts.another(now)
-        self.commands.lose(now, ": another vehicle answers there now")
+        self.commands.lose(now, ": another vehicle has this address now")
         self.name_searches.lose(now)
-        what = f"writes to {self.system}/{self.component}: another vehicle answers there now"
+        what = f"writes to {self.system}/{self.component}: another vehicle has this address now"
         self.writes.fail_all(NoReply(what, attempts=0, waited=0.0), now)
         if self.fetch is not None:
             self.fetch.restart(now)
@@ -893,6 +921,7 @@ class ComponentMachine:
 
     def _heard(self, now: float, version: int) -> None:
         """Process the arrival of any message."""
+        self.reschedule()
         presence = self.presence
         silence = presence.heard(now)
         self.round_trip.heard_at = now
@@ -979,14 +1008,17 @@ class ComponentMachine:
             self._observer.identified(self)
             if self.who.is_autopilot:
                 self.clock_requests.want_baseline(now)
+        for each in self._companions:
+            if each.writes.queues:
+                each._follow_permission(now)
+
+    def _follow_permission(self, now: float) -> None:
+        """Continue the writes, or end them with an error where the identity of the vehicle, or of its
+        autopilot, was requested without success."""
+        self.reschedule()
         if self.writes.is_held and self.may_be_written:
             self.writes.proceed(now)
-        elif self.writes.queues:
-            self._fail_unconfirmed(now)
-
-    def _fail_unconfirmed(self, now: float) -> None:
-        """End writes with an error: the identity of the vehicle, or of its autopilot, was requested without
-        success."""
+            return
         for each in (self, *self._autopilots()):
             if each.who.is_unconfirmed:
                 what = f"{each.system}/{each.component} has not said since it was away which vehicle it is"

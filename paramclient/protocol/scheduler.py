@@ -1,14 +1,26 @@
-"""Turns: which list downloads of one link run in parallel, by the bandwidth that they show."""
+"""Scheduler: which of the many components of a link are handled when, and which of their lists run."""
 
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections.abc import Callable
+from functools import partial
+from heapq import heapify, heappop, heappush
+from itertools import islice
 from typing import Final, NamedTuple, Protocol
 
 from paramclient.protocol.requests.pacing import Share
 
-__all__ = ["Seen", "Stream", "Turns"]
+__all__ = ["Scheduled", "Scheduler", "Seen", "Stream", "Turns"]
+
+TICKED_COMPONENTS_MAX: Final = 64
+"""Components handled in one `tick`, which takes a few milliseconds. For more, `tick` is due again at once."""
+EXAMINED_COMPONENTS_MAX: Final = 128
+"""Components whose deadlines are evaluated in one call: 3 ms. For more, `tick` is due again at once."""
+STALE_DEADLINES_MAX: Final = 8
+"""Stale deadlines for each component that the heap may hold before it is rebuilt."""
+LIMIT_RECHECK_INTERVAL: Final = 0.01
+"""Seconds between two attempts to begin a list while the event loop limits the number of lists."""
 
 JUDGED_VALUES_MIN: Final = 20
 """Values of a new list after which its effect on the others is judged."""
@@ -113,7 +125,7 @@ class Turns:
         self._is_crowded = False  # whether other links have lists too
         self._lone: Stream | None = None  # the last list that ran alone
         self._lone_at = -math.inf  # when that was
-        self._waiting: deque[Stream] = deque()
+        self._waiting: dict[Stream, None] = {}
         self._running: dict[Stream, Seen] = {}  # with their statistics when the newest began to arrive
         self._newest: set[Stream] = set()
         self._marked_at: float | None = None  # when that was
@@ -144,7 +156,7 @@ class Turns:
         if not self._waiting and self._room() > 0:
             self._begin(stream, now)
         else:
-            self._waiting.append(stream)
+            self._waiting[stream] = None
 
     def has_begun(self, stream: Stream) -> None:
         """Record a list that was requested without a turn."""
@@ -162,8 +174,7 @@ class Turns:
             is_cut: whether the list went silent before its end.
         """
         if self._running.pop(stream, None) is None:
-            if stream in self._waiting:
-                self._waiting.remove(stream)
+            self._waiting.pop(stream, None)
             return
         self._newest.discard(stream)
         self._paces.pop(stream, None)
@@ -205,7 +216,9 @@ class Turns:
         begins = min(self._room(), len(self._waiting))
         begins = int(min(begins, most - self._active()))
         for _ in range(begins):
-            self._begin(self._waiting.popleft(), now)
+            stream = next(iter(self._waiting))
+            del self._waiting[stream]
+            self._begin(stream, now)
         return begins > 0
 
     def next_deadline(self) -> float:
@@ -325,3 +338,146 @@ class Turns:
 
 
 _NOTHING = Seen(0, 0, 0.0, False)
+
+
+class Scheduled(Protocol):
+    """A component, as far as the scheduler knows it.
+
+    Attributes:
+        is_waiting: whether anything is in progress.
+        is_busy: whether anything is in progress that a check would delay.
+    """
+
+    @property
+    def is_waiting(self) -> bool: ...
+
+    @property
+    def is_busy(self) -> bool: ...
+
+    def tick(self, now: float) -> None:
+        """Do what is due."""
+
+    def next_deadline(self) -> float:
+        """Return when `tick` is due, or infinity."""
+
+
+class Scheduler:
+    """Handles the components of one link that are due, and none of the others.
+
+    With many components, to look at the deadlines of all of them takes most of the time. The scheduler
+    therefore keeps the deadline of each. A component reports with its `reporter` that its deadline may have
+    changed: it has received or sent a message, or a caller's operation has begun or ended. A larger share of
+    the link's bandwidth, when other components have ended their requests, is used from its next deadline on.
+
+    Attributes:
+        turns: the turns of the lists.
+        lists_max: the limit of parallel lists by the event-loop latency. Set by the shell.
+        is_crowded: whether lists of other links share the event loop. Set by the shell.
+    """
+
+    def __init__(self) -> None:
+        self.turns = Turns()
+        self.lists_max = math.inf
+        self.is_crowded = False
+        self._now = -math.inf
+        self._numbers: dict[Scheduled, int] = {}
+        self._components: dict[int, Scheduled] = {}  # by number
+        self._deadlines: dict[int, float] = {}  # by number, if not infinite
+        self._order: list[tuple[float, int]] = []  # a heap of these, some of them stale
+        self._last_number = 0
+        self._changed: dict[Scheduled, None] = {}
+        self._last_waiting: Scheduled | None = None
+        self._last_busy: Scheduled | None = None
+
+    def add(self, component: Scheduled) -> None:
+        """Handle a component from now on."""
+        self._last_number += 1
+        self._numbers[component] = self._last_number
+        self._components[self._last_number] = component
+        self._changed[component] = None
+
+    def remove(self, component: Scheduled) -> None:
+        """Forget a component."""
+        number = self._numbers.pop(component)
+        del self._components[number]
+        self._deadlines.pop(number, None)
+        self._last_waiting = self._last_busy = None
+
+    def reporter(self, component: Scheduled) -> Callable[[], None]:
+        """Return the function with which a component reports that its deadline may have changed.
+
+        It is called for each message, and therefore takes the least time possible.
+        """
+        return partial(self._changed.__setitem__, component, None)
+
+    def reschedule_all(self) -> None:
+        """Note that any deadline may have changed."""
+        self._changed.update(dict.fromkeys(self._numbers))
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether any component waits for anything."""
+        last = self._last_waiting
+        if last is None or not last.is_waiting:  # mostly still the same one
+            self._last_waiting = next((each for each in self._numbers if each.is_waiting), None)
+        return self._last_waiting is not None
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether anything is in progress on the link that a check would delay."""
+        last = self._last_busy
+        if last is None or not last.is_busy:
+            self._last_busy = next((each for each in self._numbers if each.is_busy), None)
+        return self._last_busy is not None
+
+    def tick(self, now: float) -> None:
+        """Handle up to `TICKED_COMPONENTS_MAX` due components, and begin the lists whose turn it is."""
+        self._now = now
+        self._note_changed()
+        for component in self._take_due(now):
+            component.tick(now)
+            self._changed[component] = None
+        if self.turns.tick(now, most=self.lists_max, is_crowded=self.is_crowded):
+            self.reschedule_all()
+
+    def next_deadline(self) -> float:
+        """Return when `tick` is due, or infinity."""
+        self._note_changed()
+        if self._changed:
+            return self._now
+        order = self._order
+        while order and self._deadlines.get(order[0][1]) != order[0][0]:
+            heappop(order)
+        lists = self.turns.next_deadline()
+        if self.lists_max < math.inf:  # a waiting list has a deadline, but may not begin yet
+            lists = max(lists, self._now + LIMIT_RECHECK_INTERVAL)
+        return min(lists, order[0][0]) if order else lists
+
+    def _note_changed(self) -> None:
+        """Note the deadlines of components that have reported a change, at most `EXAMINED_COMPONENTS_MAX`."""
+        changed = list(islice(self._changed, EXAMINED_COMPONENTS_MAX))
+        deadlines, order = self._deadlines, self._order
+        for component in changed:
+            del self._changed[component]
+            number = self._numbers.get(component)
+            if number is None:
+                continue  # removed
+            deadline = component.next_deadline()
+            if deadline == math.inf:
+                deadlines.pop(number, None)
+            elif deadline != deadlines.get(number):
+                deadlines[number] = deadline
+                heappush(order, (deadline, number))
+        if len(order) > STALE_DEADLINES_MAX * (len(deadlines) + 1):
+            order[:] = ((at, number) for number, at in deadlines.items())
+            heapify(order)
+
+    def _take_due(self, now: float) -> list[Scheduled]:
+        """Return the components that are due, at most `TICKED_COMPONENTS_MAX`, without their deadlines."""
+        due: list[int] = []
+        while self._order and self._order[0][0] <= now and len(due) < TICKED_COMPONENTS_MAX:
+            at, number = heappop(self._order)
+            if self._deadlines.get(number) == at:
+                del self._deadlines[number]
+                due.append(number)
+        return [self._components[number] for number in sorted(due)]

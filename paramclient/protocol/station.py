@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from heapq import heapify, heappop, heappush
 from typing import Final
 
 from paramclient.errors import LinkError, UsageError
@@ -21,10 +20,12 @@ from paramclient.protocol.params.list_download import present_of
 from paramclient.protocol.params.passive_file import acknowledges_open, opens_parameter_file
 from paramclient.protocol.params.sync import Upkeep
 from paramclient.protocol.params.table import Room
-from paramclient.protocol.scheduler import Turns
+from paramclient.protocol.requests.retry import HEARTBEAT_REQUESTS
+from paramclient.protocol.scheduler import Scheduler
 from paramclient.protocol.stats.trace import Told, Trace, silent
 from paramclient.protocol.stats.traffic import Traffic
 from paramclient.protocol.vehicle.boot_time_sampling import ClockSampling
+from paramclient.protocol.vehicle.commands import message_requests
 from paramclient.protocol.vehicle.peers import NO_PEER
 from paramclient.protocol.wire import (
     AUTOPILOT_COMPONENT,
@@ -33,11 +34,9 @@ from paramclient.protocol.wire import (
     COMP_ID_MISSIONPLANNER,
     HEARTBEAT_ID,
     MAV_AUTOPILOT_INVALID,
-    MAV_CMD_REQUEST_MESSAGE,
     MAV_STATE_ACTIVE,
     MAV_TYPE_GCS,
     PARAM_VALUE_ID,
-    CommandLong,
     FileTransfer,
     Frame,
     Framer,
@@ -67,16 +66,8 @@ NO_ADDRESS: Final = (0, 0)
 COMPONENTS_MAX: Final = 1_000
 """Components followed on one link: more than 250 systems with a few each. Further ones replace a lost
 component without parameters."""
-TICKED_COMPONENTS_MAX: Final = 64
-"""Components handled in one `tick`, which takes a few milliseconds. For more, `tick` is due again at once."""
-STALE_DEADLINES_MAX: Final = 8
-"""Stale deadlines for each component that the heap may hold before it is rebuilt."""
 REMOVAL_SEARCH_INTERVAL: Final = 0.5
 """Seconds between two searches for a component to forget, where there was none: each looks at all."""
-HEARTBEAT_REQUEST_INTERVAL: Final = 0.25
-"""Seconds between two requests for the heartbeat of a vehicle that has sent other messages only."""
-HEARTBEAT_REQUESTS_MAX: Final = 8
-"""Such requests on one link: two heartbeats are due in the 2 s that they take."""
 STREAM_PEERS_MAX: Final = 256
 """Stream peers with an incomplete frame."""
 EARLY_REQUESTS_MAX: Final = 32
@@ -97,9 +88,7 @@ class Station:
     """Turns received bytes into tables and responses, and requests into bytes to send.
 
     Call `receive` with received bytes and `tick` at `next_deadline`, send what `data_to_send` returns, and
-    handle `events`. `tick` and `next_deadline` look at every component, as requests may have been made of
-    any. With many components that is most of the time; a caller that passes the components of its requests to
-    `touch` may skip the others.
+    handle `events`. After an operation of a component has begun or ended, `next_deadline` may be earlier.
 
     Args:
         link: the link's canonical name.
@@ -122,6 +111,7 @@ class Station:
         is_log: whether the link is a log, which ends: then timeouts do not apply, and no component is lost.
         is_over: whether nothing more is received, as at the end of a log.
         verifier: verifies signatures; None without a key: signatures are then ignored.
+        scheduler: handles the components that are due.
     """
 
     def __init__(
@@ -164,16 +154,12 @@ class Station:
         self._signer: Signer | None = None
         self._is_watched = counts_traffic  # one check in the hot path for both
         self.verifier: Verifier | None = None
+        self._ticked_at = -math.inf
         self._heartbeat_at = math.inf if self.listens_only else -math.inf
         self._is_paused = False
-        self._turns = Turns()
+        self.scheduler = Scheduler()
         self._splits = split_peers
         self._of_vehicle: dict[tuple[int, Peer], list[ComponentMachine]] = {}
-        self._last_waiting: ComponentMachine | None = None
-        self._last_busy: ComponentMachine | None = None
-        self._touched: dict[ComponentMachine, None] = {}  # with a deadline other than the noted one
-        self._deadlines: dict[ComponentMachine, float] = {}  # as noted
-        self._order: list[tuple[float, Address]] = []  # a heap of these, some of them stale
         self._room = Room()
         self._early_requests: deque[tuple[FileTransfer, Address]] = deque(maxlen=EARLY_REQUESTS_MAX)
         self._full_until = -math.inf
@@ -228,7 +214,6 @@ class Station:
                     peers.heard_at = now
                 elif not self._takes(machine, peer, now):
                     continue
-                self._touched[machine] = None
                 machine.receive_value(decode_param_value(payload), now, version, moment)
             elif number in _TELEMETRY_CLOCKS:
                 clocks += 1
@@ -239,7 +224,6 @@ class Station:
         if self._is_stream and not data:
             for machine in self.components.values():
                 machine.peers.left(peer, now)
-            self._touch_all(self.components.values())
         is_seeking = self._awaits_autopilot or (self._looks_for_others and self.verifier is None)
         if is_seeking and self._request_heartbeat(data, peer, now):
             return True
@@ -257,11 +241,6 @@ class Station:
         finally:
             self._looks_for_others -= 1
 
-    def touch(self, machine: ComponentMachine) -> None:
-        """Note that requests of a component have begun or ended."""
-        if self.components.get(machine.address) is machine:
-            self._touched[machine] = None
-
     def overhear(self, data: bytes, now: float) -> None:
         """Process a frame that another program sends to the vehicles over this link: it may be a
         PARAM_SET."""
@@ -270,68 +249,32 @@ class Station:
             if isinstance(message, ParamSet):
                 self._receive_foreign_set(message, (frame.system, frame.component), now)
 
-    def tick(
-        self, now: float, *, everyone: bool = True, most_lists: float = math.inf, is_crowded: bool = False
-    ) -> None:
-        """Do what is due: our heartbeat, and the timeouts of up to `TICKED_COMPONENTS_MAX` components.
+    def tick(self, now: float) -> None:
+        """Do what is due: our heartbeat, and the timeouts of components.
 
-        Without `everyone`, only components with a new message, touched ones, or those with a due deadline are
-        handled: a larger share of the link's bandwidth is then used a little later. No list begins beside
-        `most_lists` others. With `is_crowded`, lists of other links run as well. In a log nothing is due
-        except the end of unfinished exchanges of other stations.
+        In a log nothing is due except the end of unfinished exchanges of other stations.
         """
         if self.is_log:
             self._tick_log(now)
             return
         if self._is_paused:
             return
+        self._ticked_at = now
         if self._signer is not None:
             self._signer.advance(now)
         if self._heartbeat_at <= now:
             self._heartbeat_at = now + HEARTBEAT_INTERVAL
             beat = Heartbeat(MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, system_status=MAV_STATE_ACTIVE)
             self._transmit(beat, None, 2)
-        if not everyone:
-            while self._order and self._order[0][0] <= now:
-                self._touched[self.components[heappop(self._order)[1]]] = None
-        done = 0
-        for machine in list(self.components.values() if everyone else self._touched):
-            is_due = machine.next_deadline() <= now
-            if is_due and done == TICKED_COMPONENTS_MAX:
-                self._deadlines[machine] = math.inf  # stale, so that it is noted again
-            elif is_due or machine.writes.is_held:  # waits for a message of another component
-                machine.tick(now)
-                done += is_due
-            else:
-                continue
-            self._touched[machine] = None
-        if self._turns.tick(now, most=most_lists, is_crowded=is_crowded):
-            self._touch_all(self.components.values())
+        self.scheduler.tick(now)
         if self.traffic is not None:
             self.traffic.sent(self.bytes_sent, now)
 
-    def next_deadline(self, *, everyone: bool = True) -> float:
-        """Return when `tick` is due, or infinity while the link is down, and in a log.
-
-        `everyone` is as in `tick`.
-        """
+    def next_deadline(self) -> float:
+        """Return when `tick` is due, or infinity while the link is down, and in a log."""
         if self._is_paused or self.is_log:
             return math.inf
-        if everyone:
-            self._touch_all(self.components.values())
-        deadlines, order = self._deadlines, self._order
-        for machine in self._touched:
-            deadline = machine.next_deadline()
-            if deadline != deadlines.get(machine):
-                deadlines[machine] = deadline
-                heappush(order, (deadline, machine.address))
-        self._touched = {each: None for each in self._touched if each.writes.is_held}  # until another message
-        if len(order) > STALE_DEADLINES_MAX * (len(deadlines) + 1):
-            self._order = order = sorted((at, each.address) for each, at in deadlines.items())
-        while order and deadlines[self.components[order[0][1]]] != order[0][0]:
-            heappop(order)
-        first = order[0][0] if order else math.inf
-        return min(self._heartbeat_at, self._turns.next_deadline(), first)
+        return min(self._heartbeat_at, self.scheduler.next_deadline())
 
     def data_to_send(self) -> list[tuple[bytes, Peer | None]]:
         """Return the frames to send, in order, each with its peer; None means all."""
@@ -362,8 +305,7 @@ class Station:
         self.listening_since = now
         if not self.listens_only:
             self._heartbeat_at = now
-        self._turns.resume(now)
-        self._touch_all(self.components.values())
+        self.scheduler.turns.resume(now)
         for machine in self.components.values():
             machine.resume(now)
 
@@ -407,26 +349,10 @@ class Station:
         """Messages that were ignored because their peer may be another vehicle."""
         return self._foreign + sum(machine.peers.foreign for machine in self.components.values())
 
-    def bursts(self, now: float) -> tuple[int, int]:
-        """Return the number of lists in bursts, as on a link faster than the program, and of those about to
-        start."""
-        return self._turns.bursts, self._turns.awaited(now)
-
     @property
     def is_waiting(self) -> bool:
         """Whether any component waits for anything."""
-        last = self._last_waiting
-        if last is None or not last.is_waiting:  # mostly still the same one
-            self._last_waiting = next((each for each in self.components.values() if each.is_waiting), None)
-        return self._last_waiting is not None
-
-    @property
-    def _is_busy(self) -> bool:
-        """Whether any operation is in progress that a check would delay."""
-        last = self._last_busy
-        if last is None or not last.is_busy:
-            self._last_busy = next((each for each in self.components.values() if each.is_busy), None)
-        return self._last_busy is not None
+        return self.scheduler.is_waiting
 
     def fail_all(self, error: LinkError, now: float) -> None:
         """End all operations with the error: the link has ended."""
@@ -451,7 +377,7 @@ class Station:
         if autopilot is not machine and autopilot.peers.is_rival(machine.peers.home):
             return True
         is_lost = autopilot is not machine and autopilot.presence.is_lost
-        return is_lost or autopilot.who.was_away
+        return is_lost or autopilot.context.may_be_another
 
     def autopilot_of(self, system: int, peer: Peer = None) -> ComponentMachine | None:
         """Return the component of a system that is its autopilot: the usual id first.
@@ -496,7 +422,7 @@ class Station:
             UsageError: the policy forbids it, or nothing is sent at all.
         """
         if refresh and self.listens_only:
-            raise UsageError("nothing can be downloaded where nothing is sent, so not with refresh")
+            raise UsageError("refresh needs a download, and the client only listens")
         if refresh and self.policy is not Policy.AUTO:
             raise UsageError(f"the policy is {self.policy}: nothing may be downloaded, so not with refresh")
 
@@ -508,7 +434,7 @@ class Station:
         The list is requested once for all components if they are all known ones of the system, none of them
         has a table worth resuming, a fetch in progress or a file to serve, and no other list runs.
         """
-        is_new = self._turns.is_free and not any(
+        is_new = self.scheduler.turns.is_free and not any(
             machine.fetch is not None or machine.following.is_running(now) for machine in machines
         )
         may_list = self.policy is Policy.AUTO
@@ -525,9 +451,6 @@ class Station:
                 self._send(ParamRequestList(system, COMP_ID_ALL), machines[0].address, version)
                 return [machine.begin_fetch(now, refresh=refresh, listed=True) for machine in machines]
         return [machine.begin_fetch(now, refresh=refresh) for machine in machines]
-
-    def _touch_all(self, machines: Iterable[ComponentMachine]) -> None:
-        self._touched.update(dict.fromkeys(machines))
 
     def _tick_log(self, now: float) -> None:
         for machine in self.components.values():
@@ -563,7 +486,7 @@ class Station:
         and ArduPilot). This is done until the first autopilot is found, and while others are searched:
         otherwise the regular heartbeats are enough.
         """
-        if self._is_paused or now < self._heartbeat_requested_at + HEARTBEAT_REQUEST_INTERVAL:
+        if self._is_paused or now < self._heartbeat_requested_at + HEARTBEAT_REQUESTS.later:
             return False
         for frame in Framer(stream=False).receive(data):
             address = (frame.system, frame.component)
@@ -573,10 +496,9 @@ class Station:
                 self._heartbeat_requested_at = now
                 if self._awaits_autopilot:
                     self._heartbeat_requests += 1
-                    self._awaits_autopilot = self._heartbeat_requests < HEARTBEAT_REQUESTS_MAX
-                request = (float(HEARTBEAT_ID), *[0.0] * 6)
-                command = CommandLong(frame.system, frame.component, MAV_CMD_REQUEST_MESSAGE, request)
-                self._transmit(command, peer, frame.version)
+                    self._awaits_autopilot = self._heartbeat_requests < HEARTBEAT_REQUESTS.count
+                for message in message_requests(address, HEARTBEAT_ID):
+                    self._transmit(message, peer, frame.version)
                 return True
         return False
 
@@ -616,7 +538,6 @@ class Station:
         machine = self.components.get(address) or self._meet(sender, peer, message, now)
         if machine is None:
             return
-        self._touch_all(self._of_vehicle[machine.vehicle])  # it matters to all of them
         if not machine.who.has_parameters:
             machine.peers.follow(peer)
         elif not machine.peers.hears(message, peer, now):
@@ -634,7 +555,6 @@ class Station:
     ) -> None:
         """Process the time since boot in a telemetry frame. Trailing zeros may be cut off."""
         at = _TELEMETRY_CLOCKS[number]
-        self._touched[machine] = None
         boot_ms = int.from_bytes(payload[at : at + 4], "little")
         if machine.who.has_parameters and not machine.peers.hears_clock(number, boot_ms, peer, now):
             return
@@ -660,8 +580,6 @@ class Station:
         machine: ComponentMachine | None = None
 
         def send(message: Message) -> None:
-            if machine is not None:
-                self.touch(machine)
             self._send(message, address, 2 if machine is None else machine.version)
 
         def send_to(message: Message, peer: Peer) -> None:
@@ -677,17 +595,15 @@ class Station:
             send_to=send_to,
             encoding=self._encoding,
             upkeep=self._upkeep,
-            is_link_busy=lambda: self._is_busy,
-            vehicle=lambda: self._of_vehicle.get(vehicle, ()),
-            another=lambda now: self._become_another(vehicle, now),
+            companions=self._of_vehicle.setdefault(vehicle, []),
             read_clock=lambda now: self._clock_sampling.open(address, now),
             peer=peer if self._splits else None,
-            turns=self._turns,
+            scheduler=self.scheduler,
             room=self._room,
             trace=self._trace,
         )
         self.components[address] = machine
-        self._of_vehicle.setdefault(vehicle, []).append(machine)
+        self.scheduler.add(machine)
         self._reporter.heard(machine)
         for request, station in self._early_requests:
             if _is_for(request, sender):
@@ -719,26 +635,16 @@ class Station:
         if not self._of_vehicle[machine.vehicle]:
             del self._of_vehicle[machine.vehicle]
         self._clock_sampling.close(address)
-        self._touched.pop(machine, None)
-        self._deadlines.pop(machine, None)
-        self._last_waiting = self._last_busy = None
-        self._order = [each for each in self._order if each[1] != address]
-        heapify(self._order)
+        self.scheduler.remove(machine)
         machine.reads.pace.idle()
         self._foreign += machine.peers.foreign
         self._reporter.forgotten(machine)
-
-    def _become_another(self, vehicle: tuple[int, Peer], now: float) -> None:
-        """Reset all components of a system id: another vehicle uses it."""
-        for machine in self._of_vehicle[vehicle]:
-            machine.become_another(now)
 
     def _receive_foreign_set(self, message: ParamSet, sender: Address, now: float) -> None:
         station = f"station {sender[0]}/{sender[1]}"
         for machine in self.components.values():
             is_target = message.target_component in (machine.component, COMP_ID_ALL)
             if is_target and message.target_system in (machine.system, 0):
-                self._touched[machine] = None
                 machine.foreign_set(message.param_id, message.raw, station, now)
 
     def _receive_foreign_file_request(self, message: FileTransfer, sender: Address, now: float) -> None:
@@ -749,7 +655,6 @@ class Station:
         machines = self.components.values() if self._splits else self._of_vehicle.get((target[0], None), ())
         for machine in machines:
             if machine.system == target[0] and message.target_component in (machine.component, COMP_ID_ALL):
-                self._touched[machine] = None
                 machine.foreign_file_request(message, sender, now)
 
     def _is_awaited_file(self, message: Message, sender: Address) -> bool:
@@ -763,7 +668,6 @@ class Station:
         if not machine.who.has_parameters:
             machine.peers.follow(peer)
             return True
-        self._touched[machine] = None
         return machine.peers.takes(peer, now)
 
     def _peer_of(self, address: Address) -> Peer | None:

@@ -8,13 +8,12 @@ from typing import Final
 
 from paramclient.errors import AnotherVehicle
 from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.requests.retry import SUCCESSOR_REQUESTS
 
 __all__ = ["SEARCH_INTERVAL", "Succession"]
 
 SEARCH_INTERVAL: Final = 0.5
 """Seconds until the next look when no message was received."""
-IDENTITY_REQUEST_INTERVAL: Final = 2.0
-"""Seconds between two identity requests to a candidate without a response."""
 OLD_ID_SILENCE_MIN: Final = 3.0
 """Seconds by which a vehicle without a hardware id of its own must have been silent under the old system id,
 while it is heard under the new one: two heartbeats did not come."""
@@ -59,7 +58,7 @@ class Succession:
         ):
             return False
         identity = found.identity
-        if found.who.was_away or (self._identity.uid is not None and identity.uid is None):
+        if found.context.may_be_another or (self._identity.uid is not None and identity.uid is None):
             self._ask_again(found, now)
             return False
         if not self._identity.is_same_vehicle(identity):
@@ -69,5 +68,5 @@ class Succession:
 
     def _ask_again(self, found: ComponentMachine, now: float) -> None:
         if now >= self._ask_at:
-            self._ask_at = now + IDENTITY_REQUEST_INTERVAL
+            self._ask_at = now + SUCCESSOR_REQUESTS.later
             found.who.doubt(now)

@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import anyio
@@ -53,7 +53,7 @@ from paramclient.provision.planning import (
 )
 from paramclient.provision.results import ApplyProgress, ApplyResult, ApplyRow, ApplyStatus
 
-__all__ = ["ApplyRun"]
+__all__ = ["ApplyOptions", "ApplyRun"]
 
 CONCURRENT_WRITES_MAX: Final = 10
 """Writes in flight at a time: the number of reads that ArduPilot's queue holds without dropping any."""
@@ -77,13 +77,38 @@ changes it after a reboot, as ArduCopter does. ArduPlane and Rover change it wit
 4.6-dev)."""
 
 
-class ApplyRun:
-    """One run of `apply` or `restore`; the arguments are those of `apply`.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ApplyOptions:
+    """The arguments of `apply` and `restore`, see there.
 
-    Args:
+    Attributes:
         reason: the reason of the snapshot of the state before the first write.
         skips_read_only: skip a parameter that the vehicle refuses as read-only, rather than report it as
             refused.
+    """
+
+    include: tuple[str, ...]
+    info: Mapping[str, ParamInfo] | None
+    reboot: bool
+    allow_armed: bool
+    skip_invalid: bool
+    force: bool
+    durable: bool = False
+    backup: str | os.PathLike[str] | None
+    asker: str | None
+    progress: Callable[[ApplyProgress], None] | None
+    before_writing: Callable[[], Awaitable[object]] | None
+    reason: str
+    skips_read_only: bool = False
+
+
+class ApplyRun:
+    """One run of `apply` or `restore`.
+
+    Args:
+        component: the vehicle.
+        wanted: the wanted parameters, or a plan.
+        options: the other arguments of the call.
 
     Attributes:
         inspection: the latest inspection of the vehicle.
@@ -97,46 +122,20 @@ class ApplyRun:
     plan: Plan
     _first_identity: Identity
 
-    def __init__(
-        self,
-        component: Component,
-        wanted: ParamSet | Plan,
-        *,
-        include: tuple[str, ...],
-        info: Mapping[str, ParamInfo] | None,
-        reboot: bool,
-        allow_armed: bool,
-        skip_invalid: bool,
-        force: bool,
-        durable: bool = False,
-        backup: str | os.PathLike[str] | None,
-        asker: str | None,
-        progress: Callable[[ApplyProgress], None] | None,
-        before_writing: Callable[[], Awaitable[object]] | None,
-        reason: str,
-        skips_read_only: bool = False,
-    ) -> None:
+    def __init__(self, component: Component, wanted: ParamSet | Plan, options: ApplyOptions) -> None:
+        check_asker(options.asker)
         self._component = component
         self._plan_identity: Identity | None = None
         if isinstance(wanted, Plan):
             self._plan_identity = wanted.identity
-            include = (*wanted.include, *include)
-            force = force or wanted.force
+            options = replace(
+                options,
+                include=(*wanted.include, *options.include),
+                force=options.force or wanted.force,
+            )
             wanted = wanted.wanted
         self._wanted = wanted
-        self._include = include
-        self._info = info
-        self._reboot = reboot
-        self._allow_armed = allow_armed
-        self._skip_invalid = skip_invalid
-        self._force = force
-        self._durable = durable
-        self._backup = backup
-        self._asker = check_asker(asker)
-        self._progress = progress
-        self._before_writing = before_writing
-        self._reason = reason
-        self._skips_read_only = skips_read_only
+        self._options = options
         self._rules = rules_for("")
         self._began = anyio.current_time()
         self.rows: dict[str, ApplyRow] = {}
@@ -157,10 +156,10 @@ class ApplyRun:
 
     async def prepare(self) -> None:
         """Inspect the vehicle, plan, and store its state. A failure is raised before the first write."""
-        if self._durable and local(self._component).client.cache is None:
+        if self._options.durable and local(self._component).client.cache is None:
             raise UsageError("durable needs a cache, and the client keeps none")
         check_component(self._wanted, self._component.component)
-        plan({}, self._wanted, include=self._include, autopilot=self._component.autopilot)
+        plan({}, self._wanted, include=self._options.include, autopilot=self._component.autopilot)
         await wait_for_identity(self._component)
         self._rules = rules_for(self._component.autopilot)
         planned, own = self._plan_identity, self._component.identity
@@ -171,11 +170,11 @@ class ApplyRun:
         self._first, self._first_plan = self.inspection, self.plan
         self._first_identity = self._component.identity
         invalid = {row.name: row.reason for row in self.plan.of(PlanStatus.INVALID)}
-        if invalid and not self._skip_invalid:
+        if invalid and not self._options.skip_invalid:
             raise InvalidParameters(invalid)
         self._check_resets()
-        if self._before_writing is not None:
-            await self._before_writing()
+        if self._options.before_writing is not None:
+            await self._options.before_writing()
         await self._store_state()
 
     async def write_and_verify(self) -> None:
@@ -199,7 +198,7 @@ class ApplyRun:
                     await self._verify()
                 else:
                     break
-            if self._durable and self.sent:
+            if self._options.durable and self.sent:
                 vehicle = local(self._component)
                 await vehicle.client.cache_writer.write_durably(vehicle.machine)
         except ParamClientError as error:
@@ -249,7 +248,7 @@ class ApplyRun:
             steps = tuple(step for step in stage.steps if self._may_write(step.name))
             if steps:
                 stages.append(replace(stage, steps=steps))
-                if (stage.reveals and may_appear) or (stage.reboot_first and self._reboot):
+                if (stage.reveals and may_appear) or (stage.reboot_first and self._options.reboot):
                     break
         return stages
 
@@ -259,7 +258,7 @@ class ApplyRun:
 
     def _must_reboot(self, done: list[Stage]) -> bool:
         """Return whether the vehicle must reboot after the stages that are done."""
-        if not self._reboot:
+        if not self._options.reboot:
             return False
         if done:
             return done[-1].reboot_first and bool(self._reboot_for)
@@ -327,7 +326,12 @@ class ApplyRun:
     def _replan(self) -> None:
         """Plan again from the latest inspection."""
         self.plan = plan_for(
-            self._component, self.inspection.table, self._wanted, self._include, self._info, force=self._force
+            self._component,
+            self.inspection.table,
+            self._wanted,
+            self._options.include,
+            self._options.info,
+            force=self._options.force,
         )
 
     async def _write_stage(self, stage: Stage) -> None:
@@ -359,11 +363,13 @@ class ApplyRun:
         self._is_verified = False
         self.sent.add(step.name)
         try:
-            done = await self._component.set(step.name, step.value, force=self._force, asker=self._asker)
+            done = await self._component.set(
+                step.name, step.value, force=self._options.force, asker=self._options.asker
+            )
         except (VehicleError, UsageError) as error:
             self._unanswered = 0
             is_read_only = isinstance(error, Refused) and error.code == ParamErrorCode.READ_ONLY
-            if is_read_only and self._skips_read_only:
+            if is_read_only and self._options.skips_read_only:
                 reason = "left out: the vehicle reports that it is read-only"
                 self._record(step, ApplyStatus.SKIPPED, step.before, reason, READ_ONLY)
             else:
@@ -452,7 +458,7 @@ class ApplyRun:
         """
         component = self._component
         with suppress(ParamClientError):
-            await component.set(step.name, step.value, asker=self._asker)
+            await component.set(step.name, step.value, asker=self._options.asker)
             acknowledged_at = anyio.current_time()
             while local(component).machine.presence.beat_at < acknowledged_at + SYSTEM_CHANGE_DELAY:  # noqa: ASYNC110 - no event
                 await anyio.sleep(POLL_INTERVAL)
@@ -498,7 +504,7 @@ class ApplyRun:
         Raises:
             VehicleArmed: a component is armed, or the armed state is unknown.
         """
-        if self._allow_armed:
+        if self._options.allow_armed:
             return
         component = self._component
         with anyio.move_on_after(ARMED_STATE_TIMEOUT):
@@ -524,7 +530,7 @@ class ApplyRun:
             UsageError: one of them is to be set without `reboot`.
         """
         for step in self.plan.steps:
-            if self._is_action(step.name) and self._rules.resets(step.name) and not self._reboot:
+            if self._is_action(step.name) and self._rules.resets(step.name) and not self._options.reboot:
                 raise UsageError(
                     f"{step.name} resets other parameters to their defaults at the next start of the "
                     "vehicle; it can only be set with reboot=True"
@@ -533,7 +539,7 @@ class ApplyRun:
     async def _store_state(self) -> None:
         """Store the vehicle's state: in the backup file, and in the cache if the plan has steps."""
         client, component, inspection = local(self._component).client, self._component, self.inspection
-        if (path := self._backup) is not None:
+        if (path := self._options.backup) is not None:
             from paramclient.files import write_file
 
             await client.cache_writer.aside(lambda: write_file(path, inspection.table))
@@ -545,7 +551,7 @@ class ApplyRun:
                     component.identity,
                     component.component,
                     inspection.table,
-                    reason=self._reason,
+                    reason=self._options.reason,
                     hash=inspection.hash,
                     complete=inspection.complete,
                 )
@@ -581,10 +587,10 @@ class ApplyRun:
         return None if held is None else held.value
 
     def _report(self, phase: str, row: ApplyRow | None = None) -> None:
-        if self._progress is not None:
+        if self._options.progress is not None:
             done = self.rows.keys() | self.written.keys()
             left = 0 if self._first is None else sum(step.name not in done for step in self.plan.steps)
-            self._progress(ApplyProgress(phase, len(done), len(done) + left, row))
+            self._options.progress(ApplyProgress(phase, len(done), len(done) + left, row))
 
     def _final_row(self, planned: PlanRow) -> ApplyRow:
         """Return the row of a parameter at the end of the run."""

@@ -22,6 +22,7 @@ from paramclient.protocol.wire import HASH_CHECK
 from paramclient.provision.apply_rules import rules_for
 from paramclient.provision.planning import ParamInfo, Plan, check_component, plan
 from paramclient.provision.runner import Runner, run_here
+from paramclient.provision.vehicle_params import set_maker
 
 __all__ = [
     "POLL_INTERVAL",
@@ -140,17 +141,10 @@ async def inspect(
     table, is_whole, absent_names, given_up, to_read = await run(select)
     requested, unreported = await _read_names(component, to_read, given_up)
     found, unknown = shown | requested, absent_names.difference(table) | unreported
-    system, number, identity, at = component.system, component.component, component.identity, time.time()
+    to_set = set_maker(component, f"vehicle {component.system}/{component.component}")
 
     def make_set() -> ParamSet:
-        return ParamSet.of(
-            (param for name, param in (table | found).items() if name not in unknown),
-            component=number,
-            system=system,
-            identity=identity,
-            at=at,
-            source=f"vehicle {system}/{number}",
-        )
+        return to_set(param for name, param in (table | found).items() if name not in unknown)
 
     return Inspection(
         await run(make_set),

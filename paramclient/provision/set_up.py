@@ -12,15 +12,14 @@ from paramclient.client.component import Component
 from paramclient.errors import UsageError
 from paramclient.model.paramset import ParamSet
 from paramclient.provision.apply_rules import OUT_OF_RANGE
-from paramclient.provision.execution import ApplyRun
+from paramclient.provision.execution import ApplyOptions, ApplyRun
 from paramclient.provision.inspection import wait_for_identity
 from paramclient.provision.planning import ParamInfo, Plan
 from paramclient.provision.results import ApplyProgress, ApplyResult
+from paramclient.provision.vehicle_params import BEFORE_APPLY
 
-__all__ = ["BEFORE_APPLY", "BEFORE_RESTORE", "apply", "restore", "restore_categories"]
+__all__ = ["BEFORE_RESTORE", "apply", "restore", "restore_categories"]
 
-BEFORE_APPLY: Final = "before apply"
-"""The reason of the snapshot that `apply` stores before its first write."""
 BEFORE_RESTORE: Final = "before restore"
 """The reason of the snapshot that `restore` stores before its first write."""
 
@@ -89,9 +88,7 @@ async def apply(
         NoReply: the vehicle did not answer before the first write.
         LinkError: the link failed, or the client was closed, before the first write.
     """
-    run = ApplyRun(
-        component,
-        wanted,
+    options = ApplyOptions(
         include=(include,) if isinstance(include, str) else tuple(include),
         info=info,
         reboot=reboot,
@@ -105,7 +102,7 @@ async def apply(
         before_writing=before_writing,
         reason=BEFORE_APPLY,
     )
-    return await _run(run, timeout)
+    return await _run(ApplyRun(component, wanted, options), timeout)
 
 
 async def restore(
@@ -141,9 +138,7 @@ async def restore(
         ParamClientError: as from `apply`.
     """
     given = (include,) if isinstance(include, str) else tuple(include)
-    run = ApplyRun(
-        component,
-        state,
+    options = ApplyOptions(
         include=(*await restore_categories(component, state), *given),
         info=info,
         reboot=reboot,
@@ -157,7 +152,7 @@ async def restore(
         reason=BEFORE_RESTORE,
         skips_read_only=True,
     )
-    return await _run(run, timeout)
+    return await _run(ApplyRun(component, state, options), timeout)
 
 
 async def restore_categories(component: Component, state: ParamSet) -> tuple[str, ...]:

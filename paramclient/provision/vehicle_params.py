@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import islice
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from paramclient.errors import NoReply, NotInCache, UnknownVehicle, UsageError, VehicleError
@@ -15,8 +15,8 @@ from paramclient.model.comparison import non_defaults
 from paramclient.model.params import copy_params
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Param, Trust
+from paramclient.model.wording import first_of
 from paramclient.provision.runner import Runner, run_here
-from paramclient.provision.set_up import BEFORE_APPLY
 
 if TYPE_CHECKING:
     from paramclient.cache import CachedComponent, ParamCache
@@ -24,8 +24,10 @@ if TYPE_CHECKING:
     from paramclient.protocol.params.fetch_result import FetchResult, Progress
 
 __all__ = [
+    "BEFORE_APPLY",
     "NO_DEFAULTS",
     "FetchedSet",
+    "set_maker",
     "load_state_before_apply",
     "load_cached_set",
     "select_non_defaults",
@@ -36,6 +38,8 @@ __all__ = [
     "fetch_set",
 ]
 
+BEFORE_APPLY: Final = "before apply"
+"""The reason of the snapshot that `apply` stores before its first write."""
 REFRESH_TIMEOUT: Final = 10.0
 """Seconds to wait for the values that the vehicle's hash does not cover."""
 NAMES_SHOWN_MAX: Final = 20
@@ -60,6 +64,25 @@ class FetchedSet:
     set: ParamSet
     params: Sequence[Param]
     missing: Sequence[str]
+
+
+def set_maker(component: Component, source: str) -> Callable[[Iterable[Param]], ParamSet]:
+    """Return a function that turns parameters of a component into a set.
+
+    The set has the identity and the time of this call. The function may be called in a worker thread.
+
+    Args:
+        component: the component.
+        source: the origin of the set, in words.
+    """
+    return partial(
+        ParamSet.of,
+        component=component.component,
+        system=component.system,
+        identity=component.identity,
+        at=time.time(),
+        source=source,
+    )
 
 
 async def collect_set(
@@ -89,7 +112,7 @@ async def collect_set(
     with suppress(NoReply):  # values that were not read again are reported as missing below
         await component.refreshed(timeout=min(REFRESH_TIMEOUT, math.inf if timeout is None else timeout))
     table = copy_params(component.params)
-    system, number, identity, at = component.system, component.component, component.identity, time.time()
+    to_set = set_maker(component, source)
 
     def make_set() -> FetchedSet:
         params = list(table.values())
@@ -100,8 +123,7 @@ async def collect_set(
             if param.trust is Trust.CACHED and param.index is not None
         }
         missing = [stale.get(index, f"index {index}") for index in sorted({*result.missing, *stale})]
-        found = ParamSet.of(known, component=number, system=system, identity=identity, at=at, source=source)
-        return FetchedSet(found, known, missing)
+        return FetchedSet(to_set(known), known, missing)
 
     return await run(make_set)
 
@@ -133,12 +155,10 @@ async def fetch_set(
 
 def incomplete_error(component: Component, missing: Sequence[str]) -> VehicleError:
     """Return the error for a component some of whose parameters were not received."""
-    shown = ", ".join(islice(missing, NAMES_SHOWN_MAX))
-    more = len(missing) - NAMES_SHOWN_MAX
     vehicle = f"{component.system}/{component.component} {component.autopilot}"
-    rest = f" and {more} more" if more > 0 else ""
+    names = first_of(missing, NAMES_SHOWN_MAX)
     return VehicleError(
-        f"{vehicle} on {component.identity.link} is incomplete: {shown}{rest} did not come",
+        f"{vehicle} on {component.identity.link} is incomplete: {names} did not come",
         system=component.system,
         component=component.component,
     )
@@ -184,12 +204,10 @@ def load_cached_set(
 
 def left_out_note(table: CachedComponent) -> str:
     """Return the sentence about names of a cached table that are left out of a set."""
-    shown = ", ".join(map(repr, table.left_out[:NAMES_SHOWN_MAX]))
-    more = len(table.left_out) - NAMES_SHOWN_MAX
-    rest = f" and {more} more" if more > 0 else ""
+    names = first_of([*map(repr, table.left_out)], NAMES_SHOWN_MAX)
     return (
-        f"{table.system}/{table.component} ({table.key}): left out, as no parameter file can hold the name: "
-        f"{shown}{rest}; the next full fetch takes it out of the cache"
+        f"{table.system}/{table.component} ({table.key}): skipped, because no parameter file can contain the "
+        f"name: {names}; the next full fetch removes it from the cache"
     )
 
 

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from httpx_sse._decoders import SSEDecoder  # the public EventSource reads lines of unlimited length
 
-__all__ = ["EventReader", "Pace", "checked_document", "decoder_of"]
+__all__ = ["EventReader", "ResponseDeadline", "checked_document", "decoder_of"]
 
 RESPONSE_BYTES_MAX: Final = 32 << 20
 """Maximum size of a response in bytes: the largest possible table takes 15 million."""
@@ -18,7 +18,7 @@ EVENT_BYTES_MAX: Final = 4 << 20
 DOCUMENT_VALUES_MAX: Final = 1_000_000
 """Maximum number of values in a document, without names: the largest table has 655,350. Each takes
 up to 0.2 kB."""
-NESTING_MAX: Final = 32
+JSON_NESTING_MAX: Final = 32
 """Maximum nesting of lists and objects in a document: documents of a service have at most 8 levels."""
 RESPONSE_TIMEOUT: Final = 30.0
 """Timeout in seconds for the rest of a response or event after its first bytes."""
@@ -37,13 +37,13 @@ def checked_document(data: bytes) -> Any:
     try:
         document = json.loads(data)
     except RecursionError:
-        raise ValueError(f"a document deeper than {NESTING_MAX}") from None
+        raise ValueError(f"a document deeper than {JSON_NESTING_MAX}") from None
     level = [document]
-    for _ in range(NESTING_MAX):
+    for _ in range(JSON_NESTING_MAX):
         level = [each for held in level for each in _held(held) if isinstance(each, dict | list)]
         if not level:
             return document
-    raise ValueError(f"a document deeper than {NESTING_MAX}")
+    raise ValueError(f"a document deeper than {JSON_NESTING_MAX}")
 
 
 def decoder_of(encoding: str) -> Callable[[bytes, int], bytes]:
@@ -72,7 +72,7 @@ def decoder_of(encoding: str) -> Callable[[bytes, int], bytes]:
     return decode
 
 
-class Pace:
+class ResponseDeadline:
     """Deadline of a response or event that has begun, extended by received bytes.
 
     Args:

@@ -7,7 +7,7 @@ from typing import Any
 import httpx
 
 from paramclient.client.client import ParamClient
-from paramclient.client.link_client import LinkOptions
+from paramclient.client.link_client import ClientOptions
 from paramclient.links import Link
 from paramclient.remote.service_client import ServiceClient
 
@@ -49,6 +49,6 @@ class RemoteClient(ParamClient):
         transport: httpx.AsyncBaseTransport | None = None,
         **others: Any,
     ) -> None:
-        LinkOptions(**others).check_unset()
+        ClientOptions(**others).check_unset()
         self._implementation = ServiceClient(str(link), token=token, transport=transport)
         self.cache = self._implementation.cache

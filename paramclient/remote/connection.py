@@ -10,7 +10,7 @@ from typing import Any, Final, Protocol, TypeVar
 import anyio
 
 from paramclient.client import link_task
-from paramclient.client.arguments import PROGRESS_INTERVAL
+from paramclient.client.arguments import PROGRESS_CALL_INTERVAL
 from paramclient.errors import ClientClosed, LinkError, NoReply, ParamClientError
 from paramclient.remote.decoding import understood
 from paramclient.remote.http import Answer, Place, Requests, Unreached
@@ -277,7 +277,7 @@ async def telling(work: Callable[[], Awaitable[T]], tell: Callable[[], None] | N
         tasks.start_soon(run)
         try:
             while not done.is_set():
-                with anyio.move_on_after(PROGRESS_INTERVAL):
+                with anyio.move_on_after(PROGRESS_CALL_INTERVAL):
                     await done.wait()
                 if not failures:
                     tell()

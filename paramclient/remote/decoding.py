@@ -10,9 +10,11 @@ from types import NoneType
 from typing import Any, Final
 
 from paramclient.client.stats import ClientStats
+from paramclient.documents.param import ParamDoc
 from paramclient.errors import LinkError, ParamClientError
 from paramclient.model.identity import Identity
-from paramclient.model.values import Param, ParamType, Trust, Value, from_bits
+from paramclient.model.notation import parse_value
+from paramclient.model.values import Param, Value
 from paramclient.protocol.params.fetch_result import FetchResult, Progress
 from paramclient.protocol.params.sampling import Sample
 from paramclient.protocol.params.writes import SetResult
@@ -23,7 +25,6 @@ __all__ = [
     "fetch_result_of",
     "hash_of",
     "identity_of",
-    "number_of",
     "param_of",
     "params_of",
     "progress_of",
@@ -31,15 +32,12 @@ __all__ = [
     "stats_of",
     "understood",
     "value_as_sent",
-    "value_of",
 ]
 
 Document = Mapping[str, Any]
 
-_WORDS: Final = {"NaN": float("nan"), "Infinity": float("inf"), "-Infinity": float("-inf")}
 _IDENTITY: Final = {"link": (str,), "git_hash": (str,), "uid": (str, NoneType)}
 """Types of the members of an identity that are not integers."""
-_FLOAT32: Final = struct.Struct("<f")
 
 
 @contextmanager
@@ -60,28 +58,6 @@ def understood(name: str) -> Iterator[None]:
         raise LinkError(f"{name}: a document of the service is not valid: {error!r}", link=name) from error
 
 
-def number_of(told: object) -> Value:
-    """Return the value of a JSON number; NaN and infinities are strings, four raw bytes a string `0x…`.
-
-    Raises:
-        TypeError, ValueError: the member is not a value.
-    """
-    if isinstance(told, str):
-        return _WORDS[told] if told in _WORDS else int(told.removeprefix("0x"), 16).to_bytes(4, "little")
-    if isinstance(told, bool) or not isinstance(told, int | float):
-        raise TypeError(f"a value cannot be of type {type(told).__name__}")
-    return told
-
-
-def value_of(told: object, kind: ParamType | int) -> Value:
-    """Return a typed value from JSON, which has the shortest decimal of a float32, and may have 2 for 2.0."""
-    value = number_of(told)
-    if kind == ParamType.REAL32 and not isinstance(value, bytes):
-        rounded: float = _FLOAT32.unpack(_FLOAT32.pack(value))[0]
-        return rounded
-    return float(value) if kind == ParamType.REAL64 and isinstance(value, int) else value
-
-
 def value_as_sent(value: Value) -> object:
     """Return the JSON form of a value for a write, without loss."""
     if isinstance(value, bytes):
@@ -98,21 +74,11 @@ def param_of(document: Document, name: str | None = None) -> Param:
         document: the document.
         name: param_id; None if it is in the document.
     """
-    named = document["type"]
-    kind = ParamType[named] if named in ParamType.__members__ else int(named.removeprefix("TYPE_"))
-    bits = int(document["bits"], 16)
-    index, default = document["index"], document.get("default")
-    name = document["name"] if name is None else name
+    found = ParamDoc.model_validate(document)
+    name = found.name if name is None else name
     check_kind(name, str)
-    return Param(
-        name,
-        from_bits(bits, kind, is_raw=str(document["value"]).startswith("0x")),
-        kind,
-        None if index is None else int(index),
-        bits,
-        Trust(document.get("trust", Trust.CACHED)),
-        None if default is None else value_of(default, kind),
-    )
+    assert name is not None
+    return found.param(name)
 
 
 def params_of(documents: Mapping[str, Document]) -> dict[str, Param]:
@@ -188,7 +154,7 @@ def set_result_of(document: Document, requested: Value) -> SetResult:
         document["name"],
         document["status"],
         requested,
-        value_of(document["actual"], param.type),
+        parse_value(document["actual"], param.type),
         param,
         document["attempts"],
         document.get("note", ""),

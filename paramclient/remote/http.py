@@ -16,10 +16,16 @@ import anyio
 import httpx
 
 from paramclient.errors import LinkError, ParamClientError, UsageError
-from paramclient.remote.bounded import RESPONSE_BYTES_MAX, EventReader, Pace, checked_document, decoder_of
+from paramclient.remote.bounded import (
+    RESPONSE_BYTES_MAX,
+    EventReader,
+    ResponseDeadline,
+    checked_document,
+    decoder_of,
+)
 from paramclient.remote.decoding import understood
 from paramclient.remote.problems import error_of
-from paramclient.remote.service_address import TOKEN_VARIABLE, ServiceAddress
+from paramclient.remote.service_address import CLIENT_TOKEN_VARIABLE, ServiceAddress
 from paramclient.version import __version__
 
 __all__ = ["Answer", "Place", "Requests", "Unreached"]
@@ -147,7 +153,7 @@ class Requests:
             path: path after the prefix.
             body: JSON object, or None.
             link: name of a link of the service, or None.
-            timeout: seconds until the response begins; None for no limit. `Pace` limits the rest.
+            timeout: seconds until the response begins; None for no limit. `ResponseDeadline` limits the rest.
 
         Raises:
             Unreached: the service has not responded.
@@ -188,7 +194,7 @@ class Requests:
         chunks = _pieces(response)
         reader = EventReader()
         now = anyio.current_time()
-        pace, hello_ends = Pace(now), now + HELLO_TIMEOUT
+        pace, hello_ends = ResponseDeadline(now), now + HELLO_TIMEOUT
         while True:
             try:
                 timeout = min(STREAM_TIMEOUT, pace.left(reader.size, now), hello_ends - now)
@@ -199,7 +205,7 @@ class Requests:
                 if events:
                     hello_ends = math.inf
                 if reader.size <= len(chunk):  # the incomplete event has begun in this chunk
-                    pace = Pace(now)
+                    pace = ResponseDeadline(now)
                 yield events
             except TimeoutError:
                 raise self._unreached("the service sends no more events", None) from None
@@ -246,7 +252,7 @@ class Requests:
 
     async def _read(self, response: httpx.Response) -> bytes:
         content = bytearray()
-        pace, received = Pace(anyio.current_time()), 0
+        pace, received = ResponseDeadline(anyio.current_time()), 0
         chunks = _pieces(response)
         encoding = "" if response.is_stream_consumed else response.headers.get("Content-Encoding", "")
         try:
@@ -287,7 +293,7 @@ class Requests:
             return self._foreign()
         if status == 401:
             words = "refuses the token" if self._has_token else "requires a token"
-            return UsageError(f"{self.name} {words}; pass one with token=… or in {TOKEN_VARIABLE}")
+            return UsageError(f"{self.name} {words}; pass one with token=… or in {CLIENT_TOKEN_VARIABLE}")
         if problem.get("error") == "ClientClosed" or str(problem.get("type")).endswith(":closing"):
             raise self._unreached("the service is closing", None)
         try:

@@ -26,7 +26,7 @@ from paramclient.errors import (
     ValueNotApplied,
     VehicleArmed,
 )
-from paramclient.remote.decoding import number_of
+from paramclient.model.notation import parse_number
 
 __all__ = ["NotHeard", "error_of"]
 
@@ -95,8 +95,8 @@ def _not_applied(detail: str, problem: Problem) -> ValueNotApplied:
         system=int(problem["system"]),
         component=int(problem["component"]),
         name=str(problem["name"]),
-        requested=number_of(problem["requested"]),
-        actual=number_of(problem["actual"]),
+        requested=parse_number(problem["requested"]),
+        actual=parse_number(problem["actual"]),
     )
 
 

@@ -10,9 +10,9 @@ from urllib.parse import parse_qsl, urlsplit, urlunsplit
 from paramclient.errors import UsageError
 from paramclient.links import parse_link
 
-__all__ = ["TOKEN_VARIABLE", "ServiceAddress", "chosen_token"]
+__all__ = ["CLIENT_TOKEN_VARIABLE", "ServiceAddress", "chosen_token"]
 
-TOKEN_VARIABLE: Final = "PARAMCLIENT_TOKEN"
+CLIENT_TOKEN_VARIABLE: Final = "PARAMCLIENT_TOKEN"
 """Environment variable with the access token, for all clients of services."""
 
 
@@ -63,7 +63,7 @@ def chosen_token(token: str | None) -> str | None:
     Raises:
         UsageError: the token is not printable ASCII without spaces.
     """
-    chosen = os.environ.get(TOKEN_VARIABLE) if token is None else token
+    chosen = os.environ.get(CLIENT_TOKEN_VARIABLE) if token is None else token
     if not chosen:
         return None
     if not (chosen.isascii() and chosen.isprintable() and " " not in chosen):

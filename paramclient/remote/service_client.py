@@ -225,8 +225,7 @@ class ServiceClient:
                 peer is given.
             NoReply, LinkError: as in `ParamClient.component`.
         """
-        _check_peer(peer)
-        return await self._found({"system": system, "component": component}, timeout)
+        return await self._find(system, component, peer, timeout)
 
     async def only_component(
         self,
@@ -242,17 +241,22 @@ class ServiceClient:
             AmbiguousVehicle: as in `ParamClient.only_component`.
             UsageError, NoReply, LinkError: as in `component`.
         """
-        _check_peer(peer)
-        return await self._found({"system": system, "component": component, "only": True}, timeout)
+        return await self._find(system, component, peer, timeout, only=True)
 
-    async def _found(self, sought: Document, timeout: float | None) -> Component:
-        """Return the component that the service finds."""
+    async def _find(
+        self, system: int | None, component: int | None, peer: str | None, timeout: float | None, **how: bool
+    ) -> Component:
+        """Return the component that the service finds; `how` has further members of the request."""
+        if peer is not None:
+            raise UsageError(
+                "peer is only for a client with its own link; a service does not distinguish peers"
+            )
         began = anyio.current_time()
         answer = await self._connection.ask(
             "POST",
             "/find",
-            sought,
-            awaited=address_in_words(sought["system"], sought["component"]),
+            {"system": system, "component": component, **how},
+            awaited=address_in_words(system, component),
             timeout=timeout,
             waits_for_ever=True,
             link=self._chosen,
@@ -380,8 +384,3 @@ class ServiceClient:
             LinkError: the service cannot be reached, or the client is not open.
         """
         self._connection.check_open()
-
-
-def _check_peer(peer: str | None) -> None:
-    if peer is not None:
-        raise UsageError("peer is only for a client with its own link; a service does not distinguish peers")

@@ -6,11 +6,11 @@ Needs the extra `service`.
 - `hub`, `link`, `followed_component`, `event_feed`, `jobs`: links and cache, one link, one component,
   events, jobs.
 - `access`, `request`, `tokens`, `client_address`, `tls`: access checks of every request.
-- `gate`, `places`, `connections`: connections before TLS, their number, their limits.
-- `quota`, `held_bodies`, `answer_places`, `log_limit`: limits of work, request bodies, responses and log
-  lines.
-- `reading`, `param_sources`, `route_context`, `answering`, `problems`, `metrics`: request bodies,
-  parameters named in requests, what routes share, responses, errors, Prometheus.
+- `acceptor`, `connection_slots`, `connections`: connections before TLS, their number, their limits.
+- `quota`, `body_memory`, `log_limit`: limits of requests in progress, request bodies and log lines.
+- `garbage_collection`: components that full garbage collections of a serving process skip.
+- `request_body`, `param_sources`, `route_context`, `responses`, `problems`, `metrics`: request bodies,
+  parameter sets named in requests, shared parts of routes, responses, errors, Prometheus.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""Who may do what: every request passes here before anything else sees it.
+"""Access checks of every request: host, origin, token or session, role, size of the body.
 
-Pure ASGI, and independent of the framework behind it. What is let through has in `scope["state"]` who asks
-(`asker`, `name`), what that one may do (`role`, `read_only`), and neither token nor cookie in its headers.
+An ASGI middleware in front of the application. The application finds the author of the request (`asker`,
+`name`), its permissions (`role`, `read_only`) and the holder of its quota (`quota`) in `scope["state"]`.
+Tokens and cookies are removed from its headers.
 """
 
 from __future__ import annotations
@@ -20,26 +21,33 @@ import anyio
 
 from paramclient.errors import UsageError
 from paramclient.protocol.params.change_origin import ASKER_LENGTH_MAX
-from paramclient.service.answer_places import (
-    POSTED_MAX,
-    POSTED_OF_ONE,
-    READ_MAX,
-    READ_OF_ONE,
-    AnswerPlaces,
-)
-from paramclient.service.client_address import is_in, is_loopback, network
-from paramclient.service.held_bodies import HeldBodies, HeldBody
+from paramclient.service.body_memory import BodyMemory, BodyReservation
+from paramclient.service.client_address import is_in_networks, is_loopback, parse_network
 from paramclient.service.log_limit import LogLimit
+from paramclient.service.quota import (
+    LARGE_GETS_MAX,
+    LARGE_GETS_OF_HOLDER_MAX,
+    LARGE_POSTS_MAX,
+    LARGE_POSTS_OF_HOLDER_MAX,
+    Quota,
+)
 from paramclient.service.request import (
-    ASK,
-    HOST,
-    LARGEST_DESCRIPTION,
+    BEARER_CHALLENGE,
+    HOST_PATTERN,
+    METADATA_BYTES_MAX,
     SESSION_PATH,
-    Denied,
     Request,
+    RequestDenied,
     Scope,
 )
-from paramclient.service.tokens import GUESS_DELAY, SESSION_AGE, Guesses, Holder, Sessions, Tokens
+from paramclient.service.tokens import (
+    SESSION_LIFETIME,
+    WRONG_TOKEN_DELAY,
+    Holder,
+    Sessions,
+    Tokens,
+    WrongTokens,
+)
 
 __all__ = ["AccessMiddleware", "AccessSettings", "may_write"]
 
@@ -50,44 +58,50 @@ Receive: TypeAlias = Callable[[], Awaitable[Message]]
 Send: TypeAlias = Callable[[Message], Awaitable[None]]
 App: TypeAlias = Callable[[Scope, Receive, Send], Awaitable[None]]
 
-LONGEST_SESSION: Final = 1_024
-"""Bytes of the body that begins a session: all that those without a token may send."""
-BODY_PATIENCE: Final = 60.0
-"""Seconds for a body to come."""
-SENT_AT_ONCE: Final = 65_536
-"""Bytes of an answer that are handed to the connection at once: it keeps what the client has not taken."""
-LONGEST_CLIENT: Final = 64
-"""Characters in which a client says what it is, in X-Asker."""
+SESSION_BODY_BYTES_MAX: Final = 1_024
+"""Maximum size in bytes of a body that starts a session: the only body accepted without a token."""
+BODY_TIMEOUT: Final = 60.0
+"""Timeout in seconds for receiving a body."""
+SEND_CHUNK_BYTES: Final = 65_536
+"""Maximum number of bytes of a response passed to the connection at once: the connection buffers unsent
+bytes."""
+CLIENT_NAME_LENGTH_MAX: Final = 64
+"""Maximum number of characters of the header X-Asker."""
 
 API_POLICY: Final = "default-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; sandbox"
+"""Content-Security-Policy of responses of the API."""
 PAGE_POLICY: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
+"""Content-Security-Policy of the web page and the API reference."""
 ALLOWED_METHODS: Final = "GET, HEAD, POST, PUT, PATCH, DELETE"
+"""Methods that pages of allowed origins may use."""
 ALLOWED_HEADERS: Final = "Authorization, Content-Type, Last-Event-ID, X-Asker"
-SHOWN_HEADERS: Final = "Content-Disposition, Location, Retry-After, X-Seq"
+"""Headers that pages of allowed origins may send."""
+EXPOSED_HEADERS: Final = "Content-Disposition, Location, Retry-After, X-Seq"
+"""Response headers that pages of allowed origins may read."""
 PREFLIGHT_AGE: Final = 600
-"""Seconds for which a browser need not ask again."""
+"""Seconds for which a browser caches the response to a preflight request."""
 
 
 @dataclass(frozen=True, slots=True)
 class AccessSettings:
-    """Who is let in.
+    """Settings of the access checks.
 
     Attributes:
-        listen: the address or name that is listened at.
-        tokens: who has one; None only where nobody but this machine can connect.
-        hosts: names by which the service may be called, beside this machine's loopback names, and addresses.
-        origins: pages elsewhere that may use it from a browser, such as `https://station.example`; without
-            tokens they may read only.
-        proxies: addresses and networks of proxies, whose X-Forwarded-For or Forwarded says who asks. Tokens
-            are needed then: everyone who can reach the proxy comes from its address.
-        read_only: nobody may change anything.
-        max_body: bytes of one body, where `Request.longest_body` allows as many.
+        listen: address or host name of the listening socket.
+        tokens: valid tokens; None is allowed only if the service listens on a loopback address.
+        hosts: host names accepted in Host, besides `localhost`, loopback addresses and `listen`.
+        origins: origins of foreign pages that may use the API, such as `https://station.example`; without
+            tokens they may only read.
+        proxies: addresses and networks of trusted proxies, whose X-Forwarded-For or Forwarded names the
+            client. Require tokens, because every client of the proxy has the proxy's address.
+        read_only: rejects every change.
+        max_body: maximum size in bytes of any body; `Request.body_bytes_max` applies too.
 
     Raises:
-        UsageError: it would be open to others without a token, or something in it cannot be.
+        UsageError: other computers could connect without a token, or a host, origin or proxy is invalid.
     """
 
     listen: str = "127.0.0.1"
@@ -96,37 +110,37 @@ class AccessSettings:
     origins: Collection[str] = ()
     proxies: Collection[str] = ()
     read_only: bool = False
-    max_body: int = LARGEST_DESCRIPTION
+    max_body: int = METADATA_BYTES_MAX
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hosts", frozenset(map(_host_name, self.hosts)))
         object.__setattr__(self, "origins", frozenset(map(_origin, self.origins)))
-        object.__setattr__(self, "proxies", frozenset(str(network(each)) for each in self.proxies))
+        object.__setattr__(self, "proxies", frozenset(str(parse_network(each)) for each in self.proxies))
         if self.tokens is None and self.proxies:
             raise UsageError(
-                "behind a proxy the service would let everyone who reaches that change parameters: it needs "
-                "a token. Make one with `paramclient token NAME --file FILE` and start with --token-file FILE"
+                "behind a proxy, every client of the proxy could change parameters: the service needs a "
+                "token. Create one with `paramclient token NAME --file FILE` and start with --token-file FILE"
             )
-        beyond = [name for name in (self.listen, *sorted(self.hosts)) if not _is_only_here(name)]
-        if self.tokens is None and beyond:
+        exposed = [name for name in (self.listen, *sorted(self.hosts)) if not _is_loopback_only(name)]
+        if self.tokens is None and exposed:
             raise UsageError(
-                f"as {beyond[0]} the service would let everyone on the network change parameters: it needs a "
-                "token. Make one with `paramclient token NAME --file FILE` and start with --token-file FILE, "
-                "or listen at 127.0.0.1 alone"
+                f"with {exposed[0]}, everyone on the network could change parameters: the service needs a "
+                "token. Create one with `paramclient token NAME --file FILE` and start with "
+                "--token-file FILE, or listen on 127.0.0.1 only"
             )
 
     def is_proxy(self, address: str) -> bool:
-        """Whether an address is that of a proxy that is trusted."""
-        return is_in(address, map(network, self.proxies))
+        """Return whether an address belongs to a trusted proxy."""
+        return is_in_networks(address, map(parse_network, self.proxies))
 
 
 class AccessMiddleware:
-    """An ASGI application in front of another one.
+    """Checks each request before it reaches an ASGI application.
 
     Args:
-        app: the other one.
-        settings: who is let in.
-        clock: seconds, that only go forward.
+        app: the application.
+        settings: what the checks allow.
+        clock: returns monotonic time in seconds.
     """
 
     def __init__(
@@ -135,65 +149,75 @@ class AccessMiddleware:
         self._app = app
         self._settings = settings
         self._sessions = Sessions(clock)
-        self._guesses = Guesses(clock)
-        self._proxies = tuple(map(network, settings.proxies))
-        self._limit = LogLimit(clock)
-        self._bodies = HeldBodies()
-        self._answers_to_get = AnswerPlaces(READ_MAX, READ_OF_ONE)
-        self._answers_to_post = AnswerPlaces(POSTED_MAX, POSTED_OF_ONE)
+        self._wrong_tokens = WrongTokens(clock)
+        self._proxies = tuple(map(parse_network, settings.proxies))
+        self._log_limit = LogLimit(clock)
+        self._bodies = BodyMemory()
+        self._large_gets = Quota(
+            "large responses", most=LARGE_GETS_MAX, most_of_holder=LARGE_GETS_OF_HOLDER_MAX
+        )
+        self._large_posts = Quota(
+            "large responses", most=LARGE_POSTS_MAX, most_of_holder=LARGE_POSTS_OF_HOLDER_MAX
+        )
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
         request = Request(scope, self._proxies)
-        answer = _Answer(request, send, varies=bool(self._settings.origins))
+        response = _Response(request, send, varies=bool(self._settings.origins))
         try:
-            await self._let_in(request, receive, answer)
-        except Denied as denied:
-            await answer.refuse(denied, receive)
+            await self._handle_request(request, receive, response)
+        except RequestDenied as denied:
+            await response.refuse(denied, receive)
 
-    async def _let_in(self, request: Request, receive: Receive, answer: _Answer) -> None:
-        request.check_shape()
-        request.take_forwarded()
+    async def _handle_request(self, request: Request, receive: Receive, response: _Response) -> None:
+        request.check_format()
+        request.apply_forwarded_headers()
         self._check_host(request)
         self._check_origin(request)
-        answer.origin = request.origin if request.origin in self._settings.origins else None
+        response.origin = request.origin if request.origin in self._settings.origins else None
         if request.is_preflight:
-            await answer.preflight()
+            await response.preflight()
             return
-        holder = await self._holder(request)
+        holder = await self._authenticate(request)
         if request.path == SESSION_PATH and request.method in ("POST", "DELETE"):
-            await self._session(request, receive, answer, holder)
+            await self._session(request, receive, response, holder)
             return
         self._check_role(request, holder)
         state = request.scope.setdefault("state", {})
-        state["asker"] = _asker(request, holder if self._settings.tokens is not None else None)
+        state["asker"] = _author_of(request, holder if self._settings.tokens is not None else None)
         state["name"] = None if holder is None else holder.name
         state["role"] = None if holder is None else holder.role
         state["read_only"] = self._settings.read_only
-        state["quota"] = _quota(request, holder if self._settings.tokens is not None else None)
-        scope = {**request.scope, "headers": [each for each in request.headers if each[0] not in _SECRET]}
+        state["quota"] = _quota_holder(request, holder if self._settings.tokens is not None else None)
+        scope = {
+            **request.scope,
+            "headers": [each for each in request.headers if each[0] not in _SECRET_HEADERS],
+        }
         with self._bodies.hold(state["quota"]) as held:
             if request.has_body:
-                request.check_content()
-                most = min(request.longest_body, self._settings.max_body)
-                receive = _after(await self._body(request, receive, most, held), receive)
-            if not request.has_large_answer:
-                await self._app(scope, receive, answer.send)
+                request.check_content_type()
+                most = min(request.body_bytes_max, self._settings.max_body)
+                receive = _with_body(await self._read_body(request, receive, most, held), receive)
+            if not request.has_large_response:
+                await self._app(scope, receive, response.send)
                 return
-            places = self._answers_to_post if request.method == "POST" else self._answers_to_get
-            async with places.take(state["quota"]):  # until all of it is sent
-                await self._app(scope, receive, answer.send)
+            quota = self._large_posts if request.method == "POST" else self._large_gets
+            async with quota.wait(state["quota"]):  # until the whole response is sent
+                await self._app(scope, receive, response.send)
 
-    # Where it comes from
+    # Host and origin
 
     def _check_host(self, request: Request) -> None:
-        """The service is called by a name of its own: another one may be led here by its owner's DNS.
+        """Reject requests with a foreign host name, which DNS rebinding could direct to this service.
 
-        Starlette's TrustedHostMiddleware is not equal, as it matches names only, not ranges of addresses
-        or names with a final dot, and refuses with 400 in plain text, also on a WebSocket whose server
-        cannot send a response.
+        Starlette's TrustedHostMiddleware is not equivalent: it matches only names, not address ranges or
+        names with a final dot, and rejects with 400 in plain text, also on a WebSocket whose server cannot
+        send a response.
+
+        Raises:
+            RequestDenied: 421, the host name is not allowed.
         """
         name = request.host_name
         if name in _LOOPBACK_NAMES or name in self._settings.hosts or name == self._settings.listen.lower():
@@ -202,25 +226,30 @@ class AccessMiddleware:
             address = ip_address(name)
         except ValueError:
             pass
-        else:  # an address is no name that could be led elsewhere
-            if address.is_loopback or not _is_only_here(self._settings.listen):
+        else:  # DNS cannot redirect an address
+            if address.is_loopback or not _is_loopback_only(self._settings.listen):
                 return
-        raise Denied(
+        raise RequestDenied(
             421,
             "foreign-host",
-            "This service does not go by the name in Host; `paramclient serve --host NAME` allows another.",
+            "The host name in Host is not allowed. Allow it with `paramclient serve --host NAME`.",
         )
 
     def _check_origin(self, request: Request) -> None:
-        """No page of somebody else uses the browser of one who may do more than that page."""
+        """Reject requests from pages of foreign origins, which would use the permissions of the browser's
+        user.
+
+        Raises:
+            RequestDenied: 403, the origin is not allowed.
+        """
         origin = request.origin
         if origin is not None:
             if origin in self._settings.origins or origin == request.own_origin:
                 return
-            raise Denied(
+            raise RequestDenied(
                 403,
                 "foreign-origin",
-                "Pages from elsewhere may not use this service; those that may are named with "
+                "Pages of this origin may not use the service. Allow it with "
                 "`paramclient serve --allow-origin ORIGIN`.",
             )
         site = request.header(b"sec-fetch-site")
@@ -231,103 +260,130 @@ class AccessMiddleware:
             request.header(b"sec-fetch-dest"),
         ) == (b"navigate", b"document")
         if not is_followed_link:
-            raise Denied(403, "foreign-origin", "Pages from elsewhere may not use this service.")
+            raise RequestDenied(403, "foreign-origin", "Pages of other sites may not use the service.")
 
-    # Who it is
+    # Authentication and permissions
 
-    async def _holder(self, request: Request) -> Holder | None:
-        """Whose token or session came with it; None for nobody's, where that is enough."""
+    async def _authenticate(self, request: Request) -> Holder | None:
+        """Return the holder of the token or session; None for a public request without one.
+
+        Raises:
+            RequestDenied: 401, the token or session is missing or invalid; 429, too many wrong tokens.
+        """
         tokens = self._settings.tokens
         if tokens is None:
             is_foreign = request.origin is not None and request.origin != request.own_origin
             return _FOREIGN if is_foreign else _LOCAL
         token = request.token
         if token is not None:
-            return await self._holder_of(token, request.address, tokens)
+            return await self._authenticate_token(token, request.address, tokens)
         cookie = request.cookie
         holder = None if cookie is None else self._sessions.holder(cookie)
         if holder is None and not request.is_public:
-            raise Denied(401, "unauthenticated", "This service is open to those who have a token.", ASK)
+            raise RequestDenied(
+                401,
+                "unauthenticated",
+                "This service requires a token: send `Authorization: Bearer TOKEN`.",
+                BEARER_CHALLENGE,
+            )
         return holder
 
-    async def _holder_of(self, token: bytes, address: str, tokens: Tokens) -> Holder:
-        """Whose token this is; late where many wrong ones have come from the same address.
+    async def _authenticate_token(self, token: bytes, address: str, tokens: Tokens) -> Holder:
+        """Return the holder of a token, with a delay after many wrong tokens from its address.
 
-        A right one is late too, else a guess that is not answered at once would be known to be wrong. It is
-        never refused: the address may be that of a proxy with others behind it.
+        The delay applies to valid tokens too: otherwise a missing response would reveal a wrong token. Valid
+        tokens are never rejected, because other clients of a proxy share its address.
+
+        Raises:
+            RequestDenied: 401, the token is invalid; 429, after many wrong tokens from this address.
         """
-        if is_late := self._guesses.wait(address) > 0:
-            await anyio.sleep(GUESS_DELAY)
+        if is_late := self._wrong_tokens.wait(address) > 0:
+            await anyio.sleep(WRONG_TOKEN_DELAY)
         holder = tokens.holder(token)
         if holder is not None:
             return holder
-        if self._guesses.add(address, token):
-            self._limit.tell(logger, "guesses", f"many wrong tokens have come from {address}")
+        if self._wrong_tokens.add(address, token):
+            self._log_limit.log(logger, "guesses", f"many wrong tokens from {address}")
         if is_late:
-            wait = max(1, math.ceil(self._guesses.wait(address)))
-            raise Denied(
+            wait = max(1, math.ceil(self._wrong_tokens.wait(address)))
+            raise RequestDenied(
                 429,
                 "too-many-guesses",
-                f"Too many wrong tokens have come from this address; for {wait} s all of its tokens wait.",
+                f"Too many wrong tokens from this address. Its tokens are checked with delay for {wait} s.",
                 [(b"retry-after", str(wait).encode())],
             )
-        raise Denied(401, "unauthenticated", "The service does not know this token.", ASK)
+        raise RequestDenied(
+            401, "unauthenticated", "The token is not valid for this service.", BEARER_CHALLENGE
+        )
 
     def _check_role(self, request: Request, holder: Holder | None) -> None:
-        if not request.changes:
+        """Reject a change without permission to write."""
+        if not request.is_change:
             return
         if self._settings.read_only:
-            raise Denied(403, "read-only", "This service was started with --read-only; nothing is changed.")
+            raise RequestDenied(
+                403, "read-only", "The service was started with --read-only and changes nothing."
+            )
         if holder is _FOREIGN:
-            raise Denied(
+            raise RequestDenied(
                 403,
                 "forbidden",
-                "Without tokens a page from elsewhere may read only; start the service with --token-file.",
+                "Without tokens, pages of other origins may only read. Start the service with --token-file.",
             )
         if holder is None or holder.role != "write":
-            raise Denied(403, "forbidden", "This token allows to read only.")
+            raise RequestDenied(403, "forbidden", "This token only allows reading.")
 
     async def _session(
-        self, request: Request, receive: Receive, answer: _Answer, holder: Holder | None
+        self, request: Request, receive: Receive, response: _Response, holder: Holder | None
     ) -> None:
-        """Begin or end the session of a browser."""
+        """Start or end the session of a browser."""
         if request.has_body or request.method == "POST":
-            request.check_content()
+            request.check_content_type()
         if request.method == "DELETE":
             if request.cookie is not None:
                 self._sessions.end(request.cookie)
-            await answer.respond(204, b"", [(b"set-cookie", _set_cookie(request, "", 0))])
+            await response.respond(204, b"", [(b"set-cookie", _set_cookie(request, "", 0))])
             return
-        with self._bodies.hold(_quota(request, None)) as held:
-            token = _token_in(await self._body(request, receive, LONGEST_SESSION, held))
+        with self._bodies.hold(_quota_holder(request, None)) as held:
+            token = _parse_session_token(
+                await self._read_body(request, receive, SESSION_BODY_BYTES_MAX, held)
+            )
         headers = []
         if self._settings.tokens is not None:
-            holder = await self._holder_of(token, request.address, self._settings.tokens)
-            value = _set_cookie(request, self._sessions.begin(holder), int(SESSION_AGE))
+            holder = await self._authenticate_token(token, request.address, self._settings.tokens)
+            value = _set_cookie(request, self._sessions.begin(holder), int(SESSION_LIFETIME))
             headers.append((b"set-cookie", value))
         assert holder is not None
         me = {"role": holder.role, "name": holder.name, "read_only": self._settings.read_only}
-        await answer.respond(200, json.dumps(me).encode(), [*headers, _JSON])
+        await response.respond(200, json.dumps(me).encode(), [*headers, _JSON])
 
-    # What it brings
+    # Body
 
-    async def _body(self, request: Request, receive: Receive, most: int, held: HeldBody) -> bytes:
-        """All of it, before anything is done with it.
+    async def _read_body(self, request: Request, receive: Receive, most: int, held: BodyReservation) -> bytes:
+        """Return the whole body.
+
+        Args:
+            most: maximum size in bytes.
+            held: counts the bytes in memory.
 
         Raises:
-            Denied: it is too long, takes too long, or there are too many at once.
+            RequestDenied: the body is too large or too slow, or too many bytes are in memory.
         """
-        too_large = Denied(413, "too-large", f"A body of this request has at most {most} bytes.")
+        too_large = RequestDenied(
+            413, "too-large", f"The body of this request may have at most {most} bytes."
+        )
         if request.length is not None and request.length > most:
             raise too_large
         body = bytearray()
         try:
-            with anyio.fail_after(BODY_PATIENCE):
+            with anyio.fail_after(BODY_TIMEOUT):
                 is_whole = False
                 while not is_whole:
                     message = await receive()
                     if message["type"] == "http.disconnect":
-                        raise Denied(400, "bad-request", "The body ends before its end.")
+                        raise RequestDenied(
+                            400, "bad-request", "The connection was closed before the end of the body."
+                        )
                     piece = message.get("body", b"")
                     body += piece
                     held.add(len(piece))
@@ -335,22 +391,24 @@ class AccessMiddleware:
                         raise too_large
                     is_whole = not message.get("more_body", False)
         except TimeoutError:
-            raise Denied(408, "too-slow", f"The body has not come within {BODY_PATIENCE:.0f} s.") from None
+            raise RequestDenied(
+                408, "too-slow", f"The body was not received within {BODY_TIMEOUT:.0f} s."
+            ) from None
         return bytes(body)
 
 
 def may_write(request: Any) -> bool:
-    """Whether a request may change something, where its address alone does not tell whether it does.
+    """Return whether the author of a request may change something, for paths that allow reading and changing.
 
-    Takes anything with the `scope` of a request.
+    Accepts any object with the `scope` of a request.
     """
     state = request.scope["state"]
     return state["role"] == "write" and not state["read_only"]
 
 
 @dataclass(slots=True)
-class _Answer:
-    """What goes back, with the headers that every answer has."""
+class _Response:
+    """Sends a response with the headers that every response has."""
 
     request: Request
     original: Send
@@ -358,26 +416,26 @@ class _Answer:
     varies: bool = False
 
     async def send(self, message: Message) -> None:
-        """Send a message of the application. A large body goes in parts, as far as the client takes them."""
+        """Send a message of the application. A large body is sent in chunks, as the client receives them."""
         if message["type"] in ("http.response.start", "websocket.http.response.start"):
             message = {**message, "headers": self._headers(message.get("headers", ()))}
         elif message["type"] == "http.response.body" and not message.get("more_body", False):
             whole = memoryview(message.get("body", b""))
-            while len(whole) > SENT_AT_ONCE:
-                part, whole = bytes(whole[:SENT_AT_ONCE]), whole[SENT_AT_ONCE:]
+            while len(whole) > SEND_CHUNK_BYTES:
+                part, whole = bytes(whole[:SEND_CHUNK_BYTES]), whole[SEND_CHUNK_BYTES:]
                 await self.original({**message, "body": part, "more_body": True})
             message = {**message, "body": bytes(whole)}
         await self.original(message)
 
     async def respond(self, status: int, body: bytes, headers: Iterable[tuple[bytes, bytes]]) -> None:
-        """Send an answer of our own."""
+        """Send a response of the access checks."""
         kind = "websocket.http" if self.request.scope["type"] == "websocket" else "http"
         given = [*headers, (b"content-length", str(len(body)).encode())] if status != 204 else list(headers)
         await self.send({"type": f"{kind}.response.start", "status": status, "headers": given})
         await self.original({"type": f"{kind}.response.body", "body": body})
 
     async def preflight(self) -> None:
-        """Tell a browser what a page that is named may ask."""
+        """Respond to a CORS preflight request of an allowed origin."""
         headers = [
             (b"access-control-allow-methods", ALLOWED_METHODS.encode()),
             (b"access-control-allow-headers", ALLOWED_HEADERS.encode()),
@@ -386,8 +444,8 @@ class _Answer:
         ]
         await self.respond(204, b"", headers)
 
-    async def refuse(self, denied: Denied, receive: Receive) -> None:
-        """Say why not. Where it is not certain where the next request begins, the connection ends."""
+    async def refuse(self, denied: RequestDenied, receive: Receive) -> None:
+        """Respond with a problem. Close the connection if the start of the next request is unknown."""
         if self.request.scope["type"] == "websocket":
             await receive()
             if "websocket.http.response" not in self.request.scope.get("extensions", {}):
@@ -400,18 +458,21 @@ class _Answer:
             "detail": denied.detail,
         }
         headers = [*denied.headers, (b"content-type", b"application/problem+json")]
-        if self.request.says_body or denied.status in _MISSHAPEN:
+        if self.request.announces_body or denied.status in _AMBIGUOUS_STATUSES:
             headers.append((b"connection", b"close"))
         await self.respond(denied.status, json.dumps(problem).encode(), headers)
 
     def _headers(self, given: Iterable[tuple[bytes, bytes]]) -> list[tuple[bytes, bytes]]:
         is_page = self.request.is_page
-        ours = [*_ALWAYS, (b"content-security-policy", (PAGE_POLICY if is_page else API_POLICY).encode())]
+        ours = [
+            *_RESPONSE_HEADERS,
+            (b"content-security-policy", (PAGE_POLICY if is_page else API_POLICY).encode()),
+        ]
         if not is_page:
             ours.append((b"cache-control", b"no-store"))
         if self.origin is not None:
             ours.append((b"access-control-allow-origin", self.origin.encode("latin-1")))
-            ours.append((b"access-control-expose-headers", SHOWN_HEADERS.encode()))
+            ours.append((b"access-control-expose-headers", EXPOSED_HEADERS.encode()))
         if self.varies:
             ours.append((b"vary", b"Origin"))
         names = {name for name, _ in ours} - {b"vary"}
@@ -421,25 +482,27 @@ class _Answer:
         return [*kept, *ours]
 
 
-def _asker(request: Request, holder: Holder | None) -> str:
-    """Who asks, for the history: `anna@10.0.0.2 (what the client says it is)`."""
+def _author_of(request: Request, holder: Holder | None) -> str:
+    """Return the author of changes for the history: `anna@10.0.0.2 (content of X-Asker)`."""
     who = "local" if holder is None else f"{holder.name}@{request.address}"
     given = request.header(b"x-asker")
     if given is None:
         return who
     client = given.decode("latin-1")
-    if not 1 <= len(client) <= LONGEST_CLIENT or not (client.isascii() and client.isprintable()):
-        raise Denied(400, "bad-request", f"X-Asker has 1 to {LONGEST_CLIENT} printable ASCII characters.")
+    if not 1 <= len(client) <= CLIENT_NAME_LENGTH_MAX or not (client.isascii() and client.isprintable()):
+        raise RequestDenied(
+            400, "bad-request", f"X-Asker must have 1 to {CLIENT_NAME_LENGTH_MAX} printable ASCII characters."
+        )
     return f"{who} ({client})"[:ASKER_LENGTH_MAX]
 
 
-def _quota(request: Request, holder: Holder | None) -> str:
-    """Who has a share of what is there for all: the holder of a token, or without tokens the address."""
+def _quota_holder(request: Request, holder: Holder | None) -> str:
+    """Return the holder of the quotas of a request: the token's holder, or the address without tokens."""
     return f"the address {request.network}" if holder is None else f"the token {holder.name}"
 
 
-def _after(body: bytes, receive: Receive) -> Receive:
-    """What gives a whole body first, and then whatever comes."""
+def _with_body(body: bytes, receive: Receive) -> Receive:
+    """Return a receive function that returns a received body first."""
     given = False
 
     async def next_message() -> Message:
@@ -458,47 +521,49 @@ def _set_cookie(request: Request, value: str, age: int) -> bytes:
     return cookie.encode()
 
 
-def _token_in(body: bytes) -> bytes:
-    """The token in the body that begins a session."""
+def _parse_session_token(body: bytes) -> bytes:
+    """Return the token in the body that starts a session."""
     try:
         document = json.loads(body)
     except (ValueError, RecursionError):
         document = None
     if isinstance(document, Mapping) and list(document) == ["token"] and isinstance(document["token"], str):
         return document["token"].encode("utf-8", "surrogatepass")
-    raise Denied(422, "invalid-request", 'A session begins with {"token": TOKEN}.')
+    raise RequestDenied(422, "invalid-request", 'The body must be {"token": TOKEN}.')
 
 
 def _host_name(text: str) -> str:
     name = text.strip("[]").lower().removesuffix(".")
     with suppress(ValueError):
         return str(ip_address(name))
-    found = HOST.fullmatch(name)
+    found = HOST_PATTERN.fullmatch(name)
     if found is None or found["port"] is not None:
-        raise UsageError(f"{text!r:.100} is no name of a host, such as companion.local")
+        raise UsageError(f"{text!r:.100} is not a host name such as companion.local")
     return name
 
 
 def _origin(text: str) -> str:
     scheme, separator, host = text.lower().partition("://")
-    if scheme not in ("http", "https") or not separator or not HOST.fullmatch(host):
-        raise UsageError(f"{text!r:.100} is no origin of pages, such as https://station.example:8443")
+    if scheme not in ("http", "https") or not separator or not HOST_PATTERN.fullmatch(host):
+        raise UsageError(f"{text!r:.100} is not an origin such as https://station.example:8443")
     return f"{scheme}://{host}"
 
 
-def _is_only_here(listen: str) -> bool:
-    """Whether only this machine can connect there. Of another name than localhost nothing is known."""
+def _is_loopback_only(listen: str) -> bool:
+    """Return whether only this computer can connect to an address. Names other than localhost may resolve to
+    any."""
     return listen.lower() == "localhost" or is_loopback(listen.strip("[]"))
 
 
 _LOOPBACK_NAMES: Final = frozenset({"localhost"})
 _LOCAL: Final = Holder("local", "write")
+"""Holder of requests without tokens."""
 _FOREIGN: Final = Holder("local", "read")
-"""A page from elsewhere, where there are no tokens: it is in a browser of somebody on this computer."""
-_SECRET: Final = frozenset({b"authorization", b"cookie"})
-_MISSHAPEN: Final = (400, 414, 431)
+"""Holder of requests of foreign pages without tokens, which run in a browser on this computer."""
+_SECRET_HEADERS: Final = frozenset({b"authorization", b"cookie"})
+_AMBIGUOUS_STATUSES: Final = (400, 414, 431)
 _JSON: Final = (b"content-type", b"application/json")
-_ALWAYS: Final = [
+_RESPONSE_HEADERS: Final = [
     (b"x-content-type-options", b"nosniff"),
     (b"referrer-policy", b"no-referrer"),
     (b"cross-origin-opener-policy", b"same-origin"),

@@ -1,4 +1,4 @@
-"""The application: routers, problems, the pages, and what every answer carries."""
+"""The ASGI application: routes, errors, web page, API reference, and headers of all responses."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ import anyio
 from fastapi import FastAPI, Request, Response, WebSocket
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from paramclient.documents.document import build_documents
 from paramclient.service import problems
 from paramclient.service.access import AccessMiddleware, AccessSettings
-from paramclient.service.event_feed import COMPACT
+from paramclient.service.event_feed import COMPACT_SEPARATORS
 from paramclient.service.hub import Hub
 from paramclient.service.problems import RESPONSES, ServiceError
 from paramclient.service.routes import ROUTERS
@@ -30,25 +31,26 @@ MEDIA_TYPES: Final = {
     "js": "text/javascript; charset=utf-8",
     "svg": "image/svg+xml",
 }
+"""Media types of the static files, by file name extension."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """How the application is to be.
+    """Settings of the application.
 
     Attributes:
-        access: who is let in; without it, those on this machine.
+        access: settings of the access checks; the default allows only this computer.
     """
 
     access: AccessSettings = field(default_factory=AccessSettings)
 
 
 def create_app(hub: Hub, settings: Settings | None = None) -> ASGIApp:
-    """The application over a hub, which is opened and closed by whoever has made it."""
+    """Create the application over a hub, which the caller opens and closes."""
     app = FastAPI(
         title="paramclient",
         version=__version__,
-        summary="MAVLink parameters of everyone who is heard on the links of this service",
+        summary="MAVLink parameters of the components on the links of this service",
         openapi_url=None,
         docs_url=None,
         redoc_url=None,
@@ -56,19 +58,20 @@ def create_app(hub: Hub, settings: Settings | None = None) -> ASGIApp:
         responses=RESPONSES,
     )
     app.state.hub = hub
-    problems.install(app)
+    problems.install_handlers(app)
     for router in ROUTERS:
         app.include_router(router)
     _add_openapi(app, hub)
     _add_files(app, "page", index="/", prefix="/page/")
     _add_files(app, "reference", index="/docs", prefix="/docs/")
-    app.add_api_websocket_route("/{path:path}", _nothing_there)
+    app.add_api_websocket_route("/{path:path}", _reject_websocket)
+    _build_routes(app)
     access = Settings().access if settings is None else settings.access
-    return AccessMiddleware(_Stamped(_WithHeads(app), hub), access)
+    return AccessMiddleware(_PositionHeader(_HeadResponses(app), hub), access)
 
 
-class _WithHeads:
-    """Answers HEAD with the head of what GET would answer (RFC 9110, section 9.3.2)."""
+class _HeadResponses:
+    """Responds to HEAD with the headers of GET (RFC 9110, section 9.3.2)."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -81,7 +84,7 @@ class _WithHeads:
         answering = anyio.CancelScope()
 
         async def send_head(message: Message) -> None:
-            """Let nothing of the body through, nor wait for it: that of a stream of events has no end."""
+            """Send the headers and cancel the response, because an event stream has no end."""
             if message["type"] == "http.response.start":
                 await send(message)
                 await send({"type": "http.response.body", "body": b"", "more_body": False})
@@ -91,8 +94,8 @@ class _WithHeads:
             await self._app({**scope, "method": "GET"}, receive, send_head)
 
 
-class _Stamped:
-    """Gives every answer the number of the newest event."""
+class _PositionHeader:
+    """Adds the position of the newest event to every response."""
 
     def __init__(self, app: ASGIApp, hub: Hub) -> None:
         self._app = app
@@ -105,42 +108,53 @@ class _Stamped:
 
         is_answered = False
 
-        async def stamped(message: Message) -> None:
+        async def send_with_position(message: Message) -> None:
             nonlocal is_answered
             if message["type"] == "http.response.start":
                 given = list(message.get("headers", ()))
-                given.append((b"x-seq", str(self._feed.place).encode()))
+                given.append((b"x-seq", str(self._feed.position).encode()))
                 message["headers"] = given
             await send(message)
             is_answered = message["type"] == "http.response.body" and not message.get("more_body", False)
 
         try:
-            await self._app(scope, receive, stamped)
+            await self._app(scope, receive, send_with_position)
         except Exception:
-            if not is_answered:  # else it is a problem that was answered and logged
+            if not is_answered:  # a sent problem is logged already
                 raise
 
 
-async def _nothing_there(socket: WebSocket) -> None:
-    """A WebSocket elsewhere is told so like any other request; without a route it would be a bare 403."""
-    raise ServiceError(404, "not-found", "There is nothing at this address.")
+async def _reject_websocket(socket: WebSocket) -> None:
+    """Reject a WebSocket with an unknown path by a problem; the framework would send 403 without a body."""
+    raise ServiceError(404, "not-found", "This path does not exist.")
+
+
+def _build_routes(app: FastAPI) -> None:
+    """Build the handlers of all routes, and the models of all documents.
+
+    FastAPI and pydantic build them on first use, which takes up to 60 ms in the first request to a router.
+    """
+    anywhere = {"type": "http", "method": "GET", "path": "/", "root_path": "", "headers": []}
+    for route in app.routes:
+        route.matches(dict(anywhere))  # an included router builds its routes for a comparison
+    build_documents()
 
 
 def _add_openapi(app: FastAPI, hub: Hub) -> None:
-    """Serve the document of the API. To make it takes 0.2 s: that is done once, in a thread."""
+    """Serve the OpenAPI document. Creating it takes 0.2 s, once, in a worker thread."""
 
     @cache
     def text() -> str:
-        return json.dumps(app.openapi(), separators=COMPACT)
+        return json.dumps(app.openapi(), separators=COMPACT_SEPARATORS)
 
     async def answer(_: Request) -> Response:
-        return Response(await hub.aside(text), media_type="application/json")
+        return Response(await hub.run_in_thread(text), media_type="application/json")
 
     app.add_route("/openapi.json", answer, methods=["GET"], include_in_schema=False)
 
 
 def _add_files(app: FastAPI, folder: str, *, index: str, prefix: str) -> None:
-    """Serve the files of a folder of this package as they are; they are few and small, and stay in memory."""
+    """Serve the files of a folder of this package from memory."""
     files: MutableMapping[str, tuple[bytes, str, str]] = {}
     place = resources.files("paramclient.service").joinpath(folder)
     for file in place.iterdir() if place.is_dir() else ():
@@ -152,7 +166,7 @@ def _add_files(app: FastAPI, folder: str, *, index: str, prefix: str) -> None:
     async def answer(request: Request) -> Response:
         name: Any = request.path_params.get("name", "index.html")
         if name not in files:
-            raise ServiceError(404, "not-found", "There is nothing at this address.")
+            raise ServiceError(404, "not-found", "This path does not exist.")
         content, media_type, tag = files[name]
         headers = {"etag": tag, "cache-control": "no-cache"}
         if request.headers.get("if-none-match") == tag:

@@ -1,4 +1,4 @@
-"""Addresses of clients: of this computer, of one network, and behind a proxy that is trusted."""
+"""IP addresses of clients: loopback, networks, and clients behind trusted proxies."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from paramclient.errors import UsageError
 
 __all__ = [
     "Network",
-    "first_beyond",
-    "forwarded_for",
-    "is_in",
+    "client_behind",
+    "parse_forwarded",
+    "is_in_networks",
     "is_loopback",
-    "network",
-    "network_of",
-    "parsed",
+    "parse_network",
+    "client_network",
+    "parse_address",
 ]
 
 Network: TypeAlias = IPv4Network | IPv6Network
 
 
-def parsed(text: str) -> IPv4Address | IPv6Address | None:
-    """The address that a text is, without its zone; one of IPv4 that is mapped into IPv6 is that of IPv4.
+def parse_address(text: str) -> IPv4Address | IPv6Address | None:
+    """Parse an IP address without its zone; None for any other text.
 
-    None for anything else.
+    An IPv4-mapped IPv6 address is returned as the IPv4 address.
     """
     try:
         address = ip_address(text.partition("%")[0])
@@ -37,73 +37,77 @@ def parsed(text: str) -> IPv4Address | IPv6Address | None:
 
 
 def is_loopback(text: str) -> bool:
-    """Whether an address is one of this computer's loopback addresses."""
-    address = parsed(text)
+    """Return whether an address is a loopback address."""
+    address = parse_address(text)
     return address is not None and address.is_loopback
 
 
-def network_of(text: str) -> str:
-    """The client that an address stands for: an address of IPv4, and of IPv6 a network of 64 bits.
+def client_network(text: str) -> str:
+    """Return the network that counts as one client: an IPv4 address, or the 64-bit network of an IPv6
+    address.
 
-    One machine can have all addresses of such a network (RFC 4291, section 2.5.1).
+    One computer can have all addresses of such a network (RFC 4291, section 2.5.1).
     """
-    address = parsed(text)
+    address = parse_address(text)
     if isinstance(address, IPv6Address) and not address.is_loopback:
         return f"{IPv6Address(address.packed[:8] + bytes(8))}/64"
     return text if address is None else str(address)
 
 
-def network(text: str) -> Network:
-    """The network that a text names: an address, or `10.0.0.0/8`.
+def parse_network(text: str) -> Network:
+    """Parse an address or a network such as `10.0.0.0/8`.
 
     Raises:
-        UsageError: it names none.
+        UsageError: the text is neither.
     """
     try:
         return ip_network(text)
     except ValueError as error:
-        raise UsageError(f"{text!r:.100} is no address and no network such as 10.0.0.0/8: {error}") from None
+        raise UsageError(
+            f"{text!r:.100} is not an address or a network such as 10.0.0.0/8: {error}"
+        ) from None
 
 
-def is_in(text: str, networks: Iterable[Network]) -> bool:
-    """Whether an address belongs to one of the networks."""
-    address = parsed(text)
+def is_in_networks(text: str, networks: Iterable[Network]) -> bool:
+    """Return whether an address belongs to one of the networks."""
+    address = parse_address(text)
     return address is not None and any(address in each for each in networks)
 
 
-def forwarded_for(values: Iterable[str]) -> list[str]:
-    """The addresses in X-Forwarded-For headers, or in Forwarded headers (RFC 7239), in their order.
+def parse_forwarded(values: Iterable[str]) -> list[str]:
+    """Return the addresses in X-Forwarded-For or Forwarded headers (RFC 7239), in their order.
 
-    A comma always ends an entry, so a quotation mark that a client opens hides nothing that its proxy adds.
+    A comma always ends an entry, so that a quotation mark sent by a client hides nothing that its proxy
+    adds.
     """
     entries = [entry.strip() for value in values for entry in value.split(",")]
     return [_bare(entry) for entry in entries]
 
 
-def first_beyond(proxies: Iterable[Network], peer: str, told: list[str]) -> str:
-    """The client that proxies tell of: the last address that is not that of a trusted proxy.
+def client_behind(proxies: Iterable[Network], peer: str, told: list[str]) -> str:
+    """Return the client behind proxies: the last address that is not a trusted proxy.
 
     Args:
-        proxies: those that are trusted.
-        peer: whoever has connected, one of them.
-        told: the addresses that were told, the last one by the peer.
+        proxies: the trusted proxies.
+        peer: address of the connection, a trusted proxy.
+        told: the forwarded addresses, the last one added by the peer.
 
-    What is no address ends the search: the client is then the proxy that told it.
+    An invalid address ends the search: the client is then the proxy that added it.
     """
     proxies = tuple(proxies)
     client = peer
     for entry in reversed(told):
-        address = parsed(entry)
+        address = parse_address(entry)
         if address is None:
             break
         client = str(address)
-        if not is_in(client, proxies):
+        if not is_in_networks(client, proxies):
             break
     return client
 
 
 def _bare(entry: str) -> str:
-    """The address in an entry, without quotation marks, brackets and port."""
+    """Return the address in an entry, without quotation marks, brackets and port."""
     found = _FOR.search(entry)
     text = (found[1] if found else entry).strip().strip('"')
     with_port = _WITH_PORT.fullmatch(text)

@@ -1,8 +1,8 @@
-"""What happens, as an endless list with rising numbers: whoever listens reads on from where they stand.
+"""The event feed: numbered events of the service, kept in one list for all listeners.
 
-There is one list for all. A listener is a place in it, so a thousand of them take no memory to speak of, and
-one that is slow holds nobody up: when the list has gone on beyond its end, it is told so. What each is sent
-is written out once for all who stand at the same place and want the same.
+A listener is only a position in the list, so that 1,000 listeners need almost no memory, and a slow listener
+delays nobody. A listener whose position was overwritten receives the number of missed events. Listeners with
+the same position and filter share one encoded batch.
 """
 
 from __future__ import annotations
@@ -20,29 +20,34 @@ from typing import Any, Final, NamedTuple
 import anyio
 import anyio.lowlevel
 
-__all__ = ["COMPACT", "Batch", "Feed", "Listener", "Place", "Wanted"]
+__all__ = ["COMPACT_SEPARATORS", "Batch", "EventFeed", "Listener", "EventPosition", "EventFilter"]
 
-COMPACT: Final = (",", ":")
-"""How JSON is written that many are sent."""
-MOST_KEPT: Final = 16_384
-"""Events that are kept for those who are slow, or come back: ten whole tables. About 1 kB each, and 0.6 kB
-once it has been sent to a listener."""
-GATHERING_TIME: Final = 0.1
-GATHERING_SHARE: Final = 0.0005
-"""Seconds for which events are gathered before listeners are woken again, at most, and for each that there
-is: a download brings hundreds a second, and to wake two hundred for each of them would take more than the
-download itself. One alone hardly waits."""
-MOST_AT_ONCE: Final = 64
-"""Events that one listener is given at a time. To write out as many takes 9 ms; the event loop comes round
-before the next ones. What a listener has not been given can still be lost."""
-MOST_SHARED: Final = 32
-"""Batches that are kept written out, for listeners that stand at the same place and want the same."""
+COMPACT_SEPARATORS: Final = (",", ":")
+"""JSON separators without spaces."""
+EVENTS_KEPT_MAX: Final = 16_384
+"""Number of kept events for slow and reconnecting listeners: ten whole tables. An event takes about 1 kB, and
+0.6 kB once it is encoded."""
+BATCH_INTERVAL_MAX: Final = 0.1
+"""Maximum delay in seconds before listeners are woken again. A download causes hundreds of events per second;
+waking 200 listeners for each would take longer than the download."""
+BATCH_INTERVAL_PER_LISTENER: Final = 0.0005
+"""Delay in seconds per listener before listeners are woken again."""
+BATCH_EVENTS_MAX: Final = 64
+"""Maximum number of events in a batch. Encoding them takes 9 ms, and the event loop runs other tasks between
+batches. Events after the batch can still be lost."""
+SHARED_BATCHES_MAX: Final = 32
+"""Number of encoded batches kept for listeners with the same position and filter."""
 
-_PLACE: Final = re.compile(r"([0-9a-f]{16})-([0-9]{1,18})")
+_POSITION: Final = re.compile(r"([0-9a-f]{16})-([0-9]{1,18})")
 
 
-class Place(NamedTuple):
-    """A place in the list of one run of the service; the event with this number is the last that was seen."""
+class EventPosition(NamedTuple):
+    """Position in the events of one run of the service.
+
+    Attributes:
+        run: id of the run, new with each start of the service.
+        seq: number of the last received event.
+    """
 
     run: str
     seq: int
@@ -51,18 +56,20 @@ class Place(NamedTuple):
         return f"{self.run}-{self.seq}"
 
     @classmethod
-    def read(cls, text: str) -> Place | None:
-        """What `str` makes of it; None for anything else."""
-        found = _PLACE.fullmatch(text.strip())
+    def read(cls, text: str) -> EventPosition | None:
+        """Parse `RUN-SEQ`; None for any other text."""
+        found = _POSITION.fullmatch(text.strip())
         return None if found is None else cls(found[1], int(found[2]))
 
 
-class Wanted(NamedTuple):
-    """What a listener wants to hear of; None is everything.
+class EventFilter(NamedTuple):
+    """Filter of a listener; None matches everything.
 
     Attributes:
-        types: kinds of events.
-        link, system, component: whose. Events that are about nobody are for everybody.
+        types: types of events.
+        link: name of the link.
+        system: system id.
+        component: component id. Events without a link or component match every filter for these.
     """
 
     types: frozenset[str] | None = None
@@ -70,8 +77,8 @@ class Wanted(NamedTuple):
     system: int | None = None
     component: int | None = None
 
-    def has(self, event: Happened) -> bool:
-        """Whether it is among that."""
+    def matches(self, event: FeedEvent) -> bool:
+        """Return whether an event matches."""
         return (
             (self.types is None or event.kind in self.types)
             and (self.link is None or event.link in (None, self.link))
@@ -81,8 +88,8 @@ class Wanted(NamedTuple):
 
 
 @dataclass(slots=True)
-class Happened:
-    """One event. It is written out when somebody wants it, and `members` are released then."""
+class FeedEvent:
+    """One event. It is encoded on first use, which releases `members`."""
 
     seq: int
     kind: str
@@ -90,57 +97,61 @@ class Happened:
     system: int | None
     component: int | None
     at: float
-    members: Callable[[], str]
+    members: dict[str, Any] | Callable[[], str]
     text: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """What a listener is given at once.
+    """Events that a listener receives at once.
 
     Attributes:
-        place: where it stands after that.
-        missed: events that it was too slow for, and that are lost; those it did not want are among them.
-        texts: the events as JSON, with their numbers.
+        position: position of the listener after them.
+        missed: number of lost events, including those that do not match its filter.
+        texts: numbers and JSON of the events.
     """
 
-    place: Place
+    position: EventPosition
     missed: int
     texts: tuple[tuple[int, str], ...]
 
     @property
     def as_event_stream(self) -> bytes:
-        """The same in the format of server-sent events (WHATWG HTML, "Server-sent events")."""
-        run = self.place.run
+        """Return the batch as server-sent events (WHATWG HTML, "Server-sent events")."""
+        run = self.position.run
         return "".join([f"id: {run}-{seq}\ndata: {text}\n\n" for seq, text in self.texts]).encode()
 
 
-class Feed:
-    """The list.
+class EventFeed:
+    """The events of one run of the service.
+
+    Args:
+        clock: returns unix seconds.
+        kept: number of kept events.
 
     Attributes:
-        run: which run of the service this is: numbers of another one mean nothing here.
-        seq: the number of the newest event.
-        listeners: how many there are.
-        is_over: whether nothing more will come.
+        run: id of the run; numbers of other runs are not comparable.
+        seq: number of the newest event.
+        listeners: number of listeners.
+        is_ended: whether the feed has ended.
     """
 
-    def __init__(self, *, clock: Callable[[], float] = time.time, kept: int = MOST_KEPT) -> None:
+    def __init__(self, *, clock: Callable[[], float] = time.time, kept: int = EVENTS_KEPT_MAX) -> None:
         self.run = secrets.token_hex(8)
         self.seq = 0
         self.listeners = 0
-        self.is_over = False
+        self.is_ended = False
         self._clock = clock
-        self._told = 0  # up to here listeners have been woken
-        self._events: deque[Happened] = deque(maxlen=kept)
+        self._released_seq = 0  # number of the last event that listeners have been woken for
+        self._events: deque[FeedEvent] = deque(maxlen=kept)
         self._woken = anyio.Event()
-        self._something = anyio.Event()
-        self._shared: dict[tuple[int, Wanted], tuple[Batch, bytes]] = {}
+        self._has_new = anyio.Event()
+        self._shared: dict[tuple[int, EventFilter], tuple[Batch, bytes]] = {}
 
     @property
-    def place(self) -> Place:
-        """Where the list ends now."""
-        return Place(self.run, self.seq)
+    def position(self) -> EventPosition:
+        """Return the position of the newest event."""
+        return EventPosition(self.run, self.seq)
 
     def publish(
         self,
@@ -151,43 +162,47 @@ class Feed:
         system: int | None = None,
         component: int | None = None,
     ) -> int:
-        """Add an event; give its number.
+        """Add an event and return its number.
 
         Args:
-            kind: its type.
-            members: what else it says, as `json.dumps` takes it; or what writes it, without the braces, when
-                somebody wants it.
-            link, system, component: whom it is about.
+            kind: type of the event.
+            members: further members, as a dict for `json.dumps`; or a function that returns them as JSON
+                without the braces, called on first use.
+            link: name of the link, or None.
+            system: system id, or None.
+            component: component id, or None.
         """
         self.seq += 1
-        write = members if callable(members) else _writer(members)
-        self._events.append(Happened(self.seq, kind, link, system, component, self._clock(), write))
-        self._something.set()
+        self._events.append(FeedEvent(self.seq, kind, link, system, component, self._clock(), members))
+        self._has_new.set()
         return self.seq
 
-    def listen(self, after: Place | None = None, wanted: Wanted | None = None) -> Listener:
-        """A listener that stands at a place, or at the end where there is none or it is gone."""
+    def listen(self, after: EventPosition | None = None, event_filter: EventFilter | None = None) -> Listener:
+        """Return a listener at a position, or at the end if there is no position or its next event is
+        lost."""
         oldest = self.seq - len(self._events)
         can_resume = after is not None and after.run == self.run and oldest <= after.seq <= self.seq
         seq = after.seq if can_resume and after is not None else self.seq
-        return Listener(self, seq, Wanted() if wanted is None else wanted, is_resumed=can_resume)
+        return Listener(
+            self, seq, EventFilter() if event_filter is None else event_filter, is_resumed=can_resume
+        )
 
     def end(self) -> None:
-        """Nothing more will come: listeners are told what there is, and end."""
-        self.is_over = True
-        self._something.set()
+        """End the feed. Listeners receive the remaining events, then end."""
+        self.is_ended = True
+        self._has_new.set()
         self._wake()
 
-    async def run_gathering(self) -> None:
-        """Wake the listeners when there is something, not too often; until cancelled."""
+    async def wake_listeners(self) -> None:
+        """Wake listeners after new events, with a minimum interval, until cancelled."""
         while True:
-            await self._something.wait()
-            self._something = anyio.Event()
+            await self._has_new.wait()
+            self._has_new = anyio.Event()
             self._wake()
-            await anyio.sleep(min(GATHERING_TIME, GATHERING_SHARE * self.listeners))
+            await anyio.sleep(min(BATCH_INTERVAL_MAX, BATCH_INTERVAL_PER_LISTENER * self.listeners))
 
-    def text_of(self, event: Happened) -> str:
-        """An event as JSON."""
+    def event_json(self, event: FeedEvent) -> str:
+        """Return an event as JSON."""
         if not event.text:
             head = json.dumps(
                 {
@@ -199,52 +214,57 @@ class Feed:
                     **({} if event.system is None else {"system": event.system}),
                     **({} if event.component is None else {"component": event.component}),
                 },
-                separators=COMPACT,
+                separators=COMPACT_SEPARATORS,
             )
-            more = event.members()
-            event.members = _written
+            members, event.members = event.members, {}
+            if callable(members):
+                more = members()
+            else:
+                more = json.dumps(members, allow_nan=False, separators=COMPACT_SEPARATORS)[1:-1]
             event.text = f"{head[:-1]},{more}}}" if more else head
         return event.text
 
-    def _after(self, seq: int, wanted: Wanted) -> tuple[Batch, bytes]:
-        """What comes after a number, for somebody who wants this."""
-        key = (seq, wanted)
+    def _batch_after(self, seq: int, event_filter: EventFilter) -> tuple[Batch, bytes]:
+        """Return the batch after a number for this filter, also as server-sent events."""
+        key = (seq, event_filter)
         found = self._shared.get(key)
         if found is not None:
             return found
         oldest = self.seq - len(self._events)
-        if seq < oldest:  # what is left would be no use without what is lost
-            batch = Batch(Place(self.run, self._told), self._told - seq, ())
+        if seq < oldest:  # the kept events are useless without the lost ones
+            batch = Batch(EventPosition(self.run, self._released_seq), self._released_seq - seq, ())
         else:
-            end = min(self._told, seq + MOST_AT_ONCE)
+            end = min(self._released_seq, seq + BATCH_EVENTS_MAX)
             chosen = islice(self._events, seq - oldest, end - oldest)
-            texts = tuple((event.seq, self.text_of(event)) for event in chosen if wanted.has(event))
-            batch = Batch(Place(self.run, end), 0, texts)
-        if len(self._shared) >= MOST_SHARED:
+            texts = tuple(
+                (event.seq, self.event_json(event)) for event in chosen if event_filter.matches(event)
+            )
+            batch = Batch(EventPosition(self.run, end), 0, texts)
+        if len(self._shared) >= SHARED_BATCHES_MAX:
             del self._shared[next(iter(self._shared))]
         made = self._shared[key] = (batch, batch.as_event_stream)
         return made
 
     def _wake(self) -> None:
-        self._told = self.seq
+        self._released_seq = self.seq
         self._shared.clear()
         woken, self._woken = self._woken, anyio.Event()
         woken.set()
 
 
 class Listener:
-    """A place in the list that moves on; for one task, as a context manager.
+    """A position in the feed, for one task; a context manager.
 
     Attributes:
-        place: where it stands.
-        is_resumed: whether it goes on from where it was asked to.
+        position: its position.
+        is_resumed: whether it continues at the requested position.
     """
 
-    def __init__(self, feed: Feed, seq: int, wanted: Wanted, *, is_resumed: bool) -> None:
-        self.place = Place(feed.run, seq)
+    def __init__(self, feed: EventFeed, seq: int, event_filter: EventFilter, *, is_resumed: bool) -> None:
+        self.position = EventPosition(feed.run, seq)
         self.is_resumed = is_resumed
         self._feed = feed
-        self._wanted = wanted
+        self._event_filter = event_filter
 
     def __enter__(self) -> Listener:
         self._feed.listeners += 1
@@ -254,44 +274,39 @@ class Listener:
         self._feed.listeners -= 1
 
     def hello(self) -> str:
-        """The first event of every connection, as JSON."""
-        return self._own("hello", resumed=self.is_resumed)
+        """Return the first event of every connection as JSON."""
+        return self._event_for_self("hello", resumed=self.is_resumed)
 
     def gap(self, missed: int) -> str:
-        """That events were lost, as JSON."""
-        return self._own("gap", missed=missed)
+        """Return the event that reports lost events as JSON."""
+        return self._event_for_self("gap", missed=missed)
 
     async def next(self, within: float) -> tuple[Batch, bytes] | None:
-        """What has come since, also as server-sent events; None for nothing within these seconds.
+        """Return the next batch, also as server-sent events; None after a timeout without events.
 
-        There may be nothing in it that is wanted: then the place alone has moved.
+        A batch without matching events only moves the position.
+
+        Args:
+            within: timeout in seconds.
 
         Raises:
-            EOFError: nothing more will come.
+            EOFError: the feed has ended.
         """
         feed = self._feed
-        if feed._told <= self.place.seq and not feed.is_over:
+        if feed._released_seq <= self.position.seq and not feed.is_ended:
             with anyio.move_on_after(within):
                 await feed._woken.wait()
-        if feed._told <= self.place.seq:
-            if feed.is_over:
+        if feed._released_seq <= self.position.seq:
+            if feed.is_ended:
                 raise EOFError
             return None
-        await anyio.lowlevel.checkpoint()  # a listener that comes back may have thousands of events to take
-        batch, stream = feed._after(self.place.seq, self._wanted)
-        self.place = batch.place
+        await anyio.lowlevel.checkpoint()  # a reconnected listener may have thousands of events left
+        batch, stream = feed._batch_after(self.position.seq, self._event_filter)
+        self.position = batch.position
         return batch, stream
 
-    def _own(self, kind: str, **members: Any) -> str:
-        """An event for this listener alone; its number is that of its place."""
+    def _event_for_self(self, kind: str, **members: Any) -> str:
+        """Return an event for this listener only, with the number of its position."""
         at = round(self._feed._clock(), 3)
-        told = {"run": self.place.run, "seq": self.place.seq, "at": at, "type": kind, **members}
-        return json.dumps(told, separators=COMPACT)
-
-
-def _written() -> str:
-    raise AssertionError("an event is written out once")
-
-
-def _writer(members: dict[str, Any]) -> Callable[[], str]:
-    return lambda: json.dumps(members, allow_nan=False, separators=COMPACT)[1:-1]
+        event = {"run": self.position.run, "seq": self.position.seq, "at": at, "type": kind, **members}
+        return json.dumps(event, separators=COMPACT_SEPARATORS)

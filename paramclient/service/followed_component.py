@@ -1,4 +1,4 @@
-"""One component on one link: what of it has been told, and its parameters written out."""
+"""One component on one link: its published state and the JSON of its parameters."""
 
 from __future__ import annotations
 
@@ -13,232 +13,236 @@ from paramclient.client.component import Component
 from paramclient.client.local import local
 from paramclient.client.subscription import Changes
 from paramclient.documents.component import ComponentDoc, ProgressDoc
+from paramclient.documents.param import ParamDoc
 from paramclient.errors import NoReply, ParamClientError
-from paramclient.model.notation import bits_text, value_json
 from paramclient.model.params import as_params, held_of
-from paramclient.model.values import Param, Trust, type_name
+from paramclient.model.values import Param, Trust
 from paramclient.protocol.params.change import Change
-from paramclient.service.event_feed import COMPACT
 
 if TYPE_CHECKING:
     from paramclient.metadata import Metadata
-    from paramclient.service.event_feed import Feed
+    from paramclient.service.event_feed import EventFeed
 
-__all__ = ["Followed", "FollowedLink", "param_text"]
+__all__ = ["FollowedComponent", "FollowedLink", "param_json"]
 
-MOST_TOLD_SINGLY: Final = 32
-"""Parameters whose trust alone has moved, of which each is told; of more it is told that they have."""
+SINGLE_CHANGES_MAX: Final = 32
+"""Maximum number of parameters that get an event each if only their trust has changed. More parameters cause
+one event together."""
 
 
 class FollowedLink(Protocol):
-    """What a component needs of the link that it is on.
+    """The link of a component, as the component uses it.
 
     Attributes:
-        name: the name of the link on the service.
-        state: the state of the link, in a word.
-        followed: the components on the link, by system and component id.
+        name: name of the link.
+        state: state of the link.
+        followed: components on the link, by system and component id.
     """
 
     name: str
     state: str
-    followed: dict[tuple[int, int], Followed]
+    followed: dict[tuple[int, int], FollowedComponent]
 
-    def forget(self, followed: Followed) -> None:
-        """Follow a component no longer."""
+    def forget(self, followed: FollowedComponent) -> None:
+        """Remove a component."""
 
 
-class Followed:
-    """A component, from when it is heard until its client is closed or has forgotten it.
+class FollowedComponent:
+    """A component, from its first message until its client is closed or has removed it.
 
     Attributes:
-        component: the library's.
-        line: the link that it is on.
-        metadata: what its firmware says of its parameters, as far as that is here.
+        component: the component of the library.
+        link: its link.
+        metadata: descriptions of its parameters, or None.
     """
 
-    def __init__(self, component: Component, line: FollowedLink, feed: Feed) -> None:
+    def __init__(self, component: Component, link: FollowedLink, feed: EventFeed) -> None:
         self.component = local(component)
-        self.line = line
+        self.link = link
         self.metadata: Metadata | None = None
         self._feed = feed
-        self._shown = as_params(component.params).copy()
+        self._published = as_params(component.params).copy()
         self._heard_at: dict[str, float] = {}
         self._texts: dict[str, str] = {}
-        self._told: tuple[object, ...] | None = None
+        self._published_state: tuple[object, ...] | None = None
         self._is_fetching = False
         self._last_fetch: object = None
-        self._sink = _Sink(self)
-        self.component.listen(self._sink)
+        self._forwarder = _ChangeForwarder(self)
+        self.component.listen(self._forwarder)
 
     def __repr__(self) -> str:
-        return f"<Followed {self.component!r} on {self.line.name}>"
+        return f"<FollowedComponent {self.component!r} on {self.link.name}>"
 
     @property
     def address(self) -> tuple[int, int]:
-        """System and component id."""
+        """Return system and component id."""
         return self.component.system, self.component.component
 
     @property
     def key(self) -> str | None:
-        """The key under which its table is kept; None while it is open who the vehicle is."""
+        """Return the key of its table in the cache; None before the vehicle is identified."""
         identity = self.component.settled_identity
         return None if identity is None else identity.key
 
     @property
     def document(self) -> ComponentDoc:
-        """How it stands now."""
+        """Return its current state."""
         machine = self.component.machine
         fetch = machine.fetch
         return ComponentDoc.of(
             self.component,
-            link=self.line.name,
-            link_state=self.line.state,
+            link=self.link.name,
+            link_state=self.link.state,
             key=self.key,
             progress=None if fetch is None else fetch.progress(anyio.current_time()),
             last=machine.fetches.last,
         )
 
-    def text_of(self, param: Param) -> str:
-        """A parameter as JSON; that of a value of its table that has not moved is made once."""
+    def json_of(self, param: Param) -> str:
+        """Return a parameter as JSON. The JSON of an unchanged value of the table is encoded once."""
         name = param.name
-        if not self._is_shown(param):
-            self._look_at_values()
-            if not self._is_shown(param):  # an answer that is overtaken: the table has another value by now
-                return param_text(param, self._heard_at.get(name))
+        if not self._is_published(param):
+            self._publish_value_changes()
+            if not self._is_published(param):  # the table has a newer value than this response
+                return param_json(param, self._heard_at.get(name))
         text = self._texts.get(name)
         if text is None:
-            text = self._texts[name] = param_text(param, self._heard_at.get(name))
+            text = self._texts[name] = param_json(param, self._heard_at.get(name))
         return text
 
-    def _is_shown(self, param: Param) -> bool:
-        shown, name = self._shown, param.name
-        return shown.held.get(name) == held_of(param) and shown.defaults.get(name) == param.default
+    def _is_published(self, param: Param) -> bool:
+        published, name = self._published, param.name
+        return published.held.get(name) == held_of(param) and published.defaults.get(name) == param.default
 
-    def texts(self, params: Iterable[Param]) -> str:
-        """Parameters as one JSON object, by name."""
-        return "{" + ",".join([f"{json.dumps(each.name)}:{self.text_of(each)}" for each in params]) + "}"
+    def object_of(self, params: Iterable[Param]) -> str:
+        """Return parameters as one JSON object, by name."""
+        return "{" + ",".join([f"{json.dumps(each.name)}:{self.json_of(each)}" for each in params]) + "}"
 
     def heard_at(self, name: str) -> float | None:
-        """When the vehicle last gave or confirmed a value, in unix seconds, as far as is known."""
+        """Return when the vehicle last sent or confirmed a value, in unix seconds, or None."""
         return self._heard_at.get(name)
 
-    def was_heard(self, name: str) -> None:
-        """The vehicle has given this value at this moment."""
+    def record_received(self, name: str) -> None:
+        """Record that the vehicle has sent this value now."""
         self._heard_at[name] = _now()
         self._texts.pop(name, None)
 
-    def know_ages(self, heard_at: Iterable[tuple[str, float]]) -> None:
-        """Take from the cache when values were heard that have not been heard since."""
+    def add_cached_times(self, heard_at: Iterable[tuple[str, float]]) -> None:
+        """Add cached times of values that the vehicle has not sent since."""
         for name, at in heard_at:
             if self._heard_at.setdefault(name, at) == at:
                 self._texts.pop(name, None)
 
-    def tell(self, kind: str, members: dict[str, Any] | Callable[[], str]) -> None:
+    def publish(self, kind: str, members: dict[str, Any] | Callable[[], str]) -> None:
         """Publish an event of this component."""
         system, component = self.address
-        self._feed.publish(kind, members, link=self.line.name, system=system, component=component)
+        self._feed.publish(kind, members, link=self.link.name, system=system, component=component)
 
-    def tell_of_it(self, why: str, **more: Any) -> None:
-        """Publish how it stands now, and why that is told."""
-        self._told = self._standing()
-        self.tell("component", {"component_doc": self.document.as_json(), "why": why, **more})
+    def publish_state(self, why: str, **more: Any) -> None:
+        """Publish its state, with the reason of the event."""
+        self._published_state = self._state_key()
+        self.publish("component", {"component_doc": self.document.as_json(), "why": why, **more})
 
-    def look(self) -> None:
-        """Publish what has moved without anybody telling: everything that a call has done is told then."""
-        self._look_at_values()
-        self.look_at_state()
+    def publish_changes(self) -> None:
+        """Publish changes that caused no event yet, so that a response follows the events of its changes."""
+        self._publish_value_changes()
+        self.publish_state_changes()
 
-    def look_at_state(self) -> None:
-        """The same of its state, and of a fetch under way."""
+    def publish_state_changes(self) -> None:
+        """Publish changes of its state, and the progress of a fetch."""
         machine = self.component.machine
         fetch = machine.fetch
         if fetch is not None:
             self._is_fetching = True
             progress = ProgressDoc.of(fetch.progress(anyio.current_time()))
-            self.tell("progress", progress.as_json())
+            self.publish("progress", progress.as_json())
         elif self._is_fetching:
             self._is_fetching = False
             known, count = len(self.component.params), self.component.count
             ended = ProgressDoc(received=known, total=count, rate=0.0, seconds_left=0.0)
-            self.tell("progress", {**ended.as_json(), "done": True})
-        standing = self._standing()
-        if standing != self._told:
-            why = "state" if self._told is None or self._told[0] == standing[0] else "identified"
-            self.tell_of_it(why)
+            self.publish("progress", {**ended.as_json(), "done": True})
+        state_key = self._state_key()
+        if state_key != self._published_state:
+            why = (
+                "state"
+                if self._published_state is None or self._published_state[0] == state_key[0]
+                else "identified"
+            )
+            self.publish_state(why)
 
     def close(self) -> None:
-        """Hear no more of it."""
-        self.component.ignore(self._sink)
+        """Stop following the component."""
+        self.component.ignore(self._forwarder)
 
-    def changed(self, change: Change) -> None:
-        """A value has changed."""
+    def handle_change(self, change: Change) -> None:
+        """Handle a change of a value."""
         name, old, new, by = change.name, change.old, change.new, change.by
         if new is None:
-            self._shown.pop(name, None)
+            self._published.pop(name, None)
             self._heard_at.pop(name, None)
         else:
-            self._shown[name] = new
+            self._published[name] = new
             if new.trust is not Trust.CACHED:
                 self._heard_at[name] = _now()
         self._texts.pop(name, None)
-        self._tell_change(old, new, by)
+        self._publish_change(old, new, by)
 
-    def ended(self, error: ParamClientError | None) -> None:
-        """Nothing more will come of it: it was forgotten, or its client has ended."""
+    def handle_end(self, error: ParamClientError | None) -> None:
+        """Handle the end of its events: it was removed, or its client is closed."""
         if isinstance(error, NoReply):
-            self.line.forget(self)
+            self.link.forget(self)
 
-    def _look_at_values(self) -> None:
-        """See which parameters are others than were told: their trust, default or index has moved."""
-        params, shown = as_params(self.component.params), self._shown
+    def _publish_value_changes(self) -> None:
+        """Publish parameters whose trust, default or index differs from the published one."""
+        params, published = as_params(self.component.params), self._published
         last = self.component.machine.fetches.last
         if last is not self._last_fetch:
             self._last_fetch = last
-            self._was_fetched()
-        names = [name for name, held in params.held.items() if shown.held.get(name) != held]
-        if params.defaults != shown.defaults:
-            given, told = params.defaults, shown.defaults
-            names += [name for name in given.keys() | told.keys() if given.get(name) != told.get(name)]
-        moved = [params[name] for name in dict.fromkeys(names) if name in params]
-        if not moved:
+            self._record_all_received()
+        names = [name for name, held in params.held.items() if published.held.get(name) != held]
+        if params.defaults != published.defaults:
+            current, known = params.defaults, published.defaults
+            names += [name for name in current.keys() | known.keys() if current.get(name) != known.get(name)]
+        differing = [params[name] for name in dict.fromkeys(names) if name in params]
+        if not differing:
             return
         now = _now()
-        for param in moved:
+        for param in differing:
             self._texts.pop(param.name, None)
-            before = shown.get(param.name)
+            before = published.get(param.name)
             if param.trust is not Trust.CACHED and (before is None or before.trust is not param.trust):
                 self._heard_at[param.name] = now
-        if len(moved) <= MOST_TOLD_SINGLY:
-            for param in moved:
-                before, shown[param.name] = shown.get(param.name), param
-                self._tell_change(before, param, "vehicle")
+        if len(differing) <= SINGLE_CHANGES_MAX:
+            for param in differing:
+                before, published[param.name] = published.get(param.name), param
+                self._publish_change(before, param, "vehicle")
         else:
-            shown.update((param.name, param) for param in moved)
-            self.tell("params", {"count": len(params)})
+            published.update((param.name, param) for param in differing)
+            self.publish("params", {"count": len(params)})
 
-    def _was_fetched(self) -> None:
-        """Everything that is trusted was given or confirmed just now, changed or not."""
+    def _record_all_received(self) -> None:
+        """Record that the vehicle has sent or confirmed all trusted values now."""
         now = _now()
         for name, param in self.component.params.items():
             if param.trust is not Trust.CACHED:
                 self._heard_at[name] = now
         self._texts.clear()
 
-    def _tell_change(self, old: Param | None, new: Param | None, by: str) -> None:
+    def _publish_change(self, old: Param | None, new: Param | None, by: str) -> None:
         heard_at = None if new is None else self._heard_at.get(new.name)
 
         def write() -> str:
-            before = "null" if old is None else param_text(old, None)
-            after = "null" if new is None else param_text(new, heard_at)
+            before = "null" if old is None else param_json(old, None)
+            after = "null" if new is None else param_json(new, heard_at)
             return f'"name":{json.dumps(name)},"old":{before},"new":{after},"by":{json.dumps(by)}'
 
         known = new or old
-        assert known is not None, "something has changed"
+        assert known is not None, "a change has an old or a new value"
         name = known.name
-        self.tell("change", write)
+        self.publish("change", write)
 
-    def _standing(self) -> tuple[object, ...]:
-        """What of its state is worth an event when it moves; who it is comes first."""
+    def _state_key(self) -> tuple[object, ...]:
+        """Return the state whose changes are published; the identity is the first item."""
         component = self.component
         return (
             (self.key, component.identity),
@@ -250,41 +254,27 @@ class Followed:
             component.sync_state,
             component.is_armed,
             component.machine.fetches.last,
-            self.line.state,
+            self.link.state,
         )
 
 
-class _Sink(Changes):
-    """Hands changes on at once, in the order in which they happen, in place of keeping them for a task."""
+class _ChangeForwarder(Changes):
+    """Forwards changes immediately and in order, in place of queueing them for a task."""
 
-    def __init__(self, owner: Followed) -> None:
+    def __init__(self, owner: FollowedComponent) -> None:
         super().__init__()
         self._owner = owner
 
     def push(self, item: Change) -> None:
-        self._owner.changed(item)
+        self._owner.handle_change(item)
 
     def end(self, error: ParamClientError | None) -> None:
-        self._owner.ended(error)
+        self._owner.handle_end(error)
 
 
-def param_text(param: Param, heard_at: float | None) -> str:
-    """What `ParamDoc.kept` says of a parameter, as JSON, ten times as fast."""
-    default = param.default
-    document: dict[str, Any] = {
-        "name": param.name,
-        "value": value_json(param.value, param.type),
-        "type": type_name(param.type),
-        "index": param.index,
-        "bits": bits_text(param),
-    }
-    if default is not None:
-        document["default"] = value_json(default, param.type)
-        document["is_default"] = not param.is_changed
-    document["trust"] = param.trust.value
-    if heard_at is not None:
-        document["heard_at"] = heard_at
-    return json.dumps(document, allow_nan=False, separators=COMPACT)
+def param_json(param: Param, heard_at: float | None) -> str:
+    """Return a parameter as JSON."""
+    return ParamDoc.kept(param, heard_at=heard_at).model_dump_json()
 
 
 def _now() -> float:

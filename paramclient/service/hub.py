@@ -1,4 +1,4 @@
-"""The links and the cache that the service holds, and everyone who is heard on them."""
+"""The hub: links and cache of the service, and the components on them."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from paramclient.links import Link, create_link
 from paramclient.metadata.metadata_cache import MetadataStore
 from paramclient.model.notation import time_text
 from paramclient.protocol.vehicle_selection import LOOK_TIME, VehicleChoice
-from paramclient.service.event_feed import Feed
-from paramclient.service.followed_component import Followed
+from paramclient.service.event_feed import EventFeed
+from paramclient.service.followed_component import FollowedComponent
 from paramclient.service.jobs import Job, Jobs
-from paramclient.service.link import Line
+from paramclient.service.link import ServiceLink
 from paramclient.service.problems import ServiceError
-from paramclient.service.quota import LONG_REQUESTS_MAX, LONG_REQUESTS_OF_ONE, Quota
+from paramclient.service.quota import LONG_REQUESTS_MAX, LONG_REQUESTS_OF_HOLDER_MAX, Quota
 
 if TYPE_CHECKING:
     from paramclient.cache import CutOff, ParamCache, RunningSetup
@@ -42,10 +42,10 @@ if TYPE_CHECKING:
 
 __all__ = ["Hub"]
 
-OURSELVES: Final = "service"
-"""Who has asked for what the service does by itself."""
-READING_PATIENCE: Final = 1.0
-"""Seconds for what is being parsed or compared when the service ends; what has not begun is dropped."""
+SERVICE_AUTHOR: Final = "service"
+"""Author of fetches that the service starts itself."""
+FILE_WORK_TIMEOUT: Final = 1.0
+"""Timeout in seconds for running work of the file thread at shutdown. Queued work is dropped."""
 
 Result = TypeVar("Result")
 
@@ -53,27 +53,27 @@ logger = logging.getLogger(__name__)
 
 
 class Hub:
-    """All links, one cache for all of them, and who is heard, as an async context manager.
+    """All links with one cache, as an async context manager.
 
-    It begins with no vehicle, and with links that may not be there yet: each is opened when it can be, and
-    again when it has failed. At its end every call that waits gets ClientClosed, and the cache is written.
+    A link does not have to exist at the start: it is opened as soon as possible, and again after a failure.
+    At the end, waiting calls get ClientClosed, and the cache is written.
 
     Args:
-        links: each by its name, as an object or as a simulated vehicle, as `ParamClient` takes it; or a pair
-            of a name and what gives a new client for it.
-        cache: as for `ParamClient`; all links share it.
-        fetches: whether the table of everyone who is heard is brought up to date without being asked for.
-        options: for each `ParamClient`: `system`, `component`, `signing`, `listen_only`, …
+        links: links by name, object or simulated vehicle, as for `ParamClient`; or pairs of a name and a
+            function that creates a client.
+        cache: as for `ParamClient`; shared by all links.
+        fetches: whether the table of every new component is fetched automatically.
+        options: options of each `ParamClient`: `system`, `component`, `signing`, `listen_only`, …
 
     Attributes:
-        cache: where tables are kept, or None.
-        feed: what happens.
-        jobs: what is under way.
-        lines: the links, by name.
-        long_requests: how many requests that take long are not answered yet.
+        cache: the cache, or None.
+        feed: the event feed.
+        jobs: fetches and set-ups.
+        links: the links, by name.
+        long_requests: quota of long requests.
 
     Raises:
-        UsageError: no such link, two of one name, or options that cannot be.
+        UsageError: a link or option is invalid, or two links have one name.
     """
 
     def __init__(
@@ -85,9 +85,9 @@ class Hub:
         **options: Any,
     ) -> None:
         self.cache = choose_cache(cache, is_log=False)
-        self.feed = Feed()
+        self.feed = EventFeed()
         self.jobs = Jobs(self.feed)
-        self.lines: dict[str, Line] = {}
+        self.links: dict[str, ServiceLink] = {}
         self._owns_cache = self.cache is not cache
         self._fetches = fetches
         self._began = time.monotonic()
@@ -95,208 +95,217 @@ class Hub:
         self._worker = Worker("paramclient service")
         self._reader = Worker("paramclient files")
         self.long_requests = Quota(
-            "requests that take long", most=LONG_REQUESTS_MAX, most_of_one=LONG_REQUESTS_OF_ONE
+            "long requests", most=LONG_REQUESTS_MAX, most_of_holder=LONG_REQUESTS_OF_HOLDER_MAX
         )
         self._closing = anyio.Event()
         self._setups = None if self.cache is None else SetupNotes.beside(self.cache.path)
         self._tasks: anyio.abc.TaskGroup | None = None
-        self._line_tasks: anyio.abc.TaskGroup | None = None
+        self._link_tasks: anyio.abc.TaskGroup | None = None
         for link in links:
             self._add(link)
 
     def __repr__(self) -> str:
-        return f"<Hub {', '.join(map(repr, self.lines.values())) or 'without links'}>"
+        return f"<Hub {', '.join(map(repr, self.links.values())) or 'without links'}>"
 
     @property
-    def followed(self) -> list[Followed]:
-        """Everyone who is heard, link by link."""
-        return [followed for line in self.lines.values() for followed in line.followed.values()]
+    def followed(self) -> list[FollowedComponent]:
+        """Return all components, link by link."""
+        return [followed for each in self.links.values() for followed in each.followed.values()]
 
     @property
-    def age(self) -> float:
-        """Seconds since it was made."""
+    def uptime(self) -> float:
+        """Return the seconds since its creation."""
         return time.monotonic() - self._began
 
     @property
     def is_closing(self) -> bool:
-        """Whether the service is ending."""
+        """Return whether the service ends."""
         return self._closing.is_set()
 
     async def __aenter__(self) -> Hub:
         tasks = self._tasks = anyio.create_task_group()
         await tasks.__aenter__()
         self.jobs.open(tasks)
-        await self._recall_setups()
-        tasks.start_soon(self.feed.run_gathering, name="paramclient feed")
-        lines = self._line_tasks = anyio.create_task_group()
-        await lines.__aenter__()
-        for line in self.lines.values():
-            lines.start_soon(line.run, name=f"paramclient link {line.name}")
+        await self._load_interrupted_setups()
+        tasks.start_soon(self.feed.wake_listeners, name="paramclient feed")
+        link_tasks = self._link_tasks = anyio.create_task_group()
+        await link_tasks.__aenter__()
+        for each in self.links.values():
+            link_tasks.start_soon(each.run, name=f"paramclient link {each.name}")
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        tasks, lines = self._tasks, self._line_tasks
+        tasks, link_tasks = self._tasks, self._link_tasks
         assert tasks is not None
-        assert lines is not None
+        assert link_tasks is not None
         self.feed.end()
         self._closing.set()
         self._reader.drop(_closing)
         try:
-            lines.cancel_scope.cancel()
-            await lines.__aexit__(None, None, None)
-            await anyio.lowlevel.checkpoint()  # whoever waited on a client learns now that it is closed
+            link_tasks.cancel_scope.cancel()
+            await link_tasks.__aexit__(None, None, None)
+            await anyio.lowlevel.checkpoint()  # calls that wait for a client now raise ClientClosed
         finally:
             tasks.cancel_scope.cancel()
             await tasks.__aexit__(None, None, None)
             close = self.cache.close if self._owns_cache and self.cache is not None else _nothing
             with anyio.CancelScope(shield=True):
                 await self._worker.close(close)
-                await self._reader.abandon(_closing, READING_PATIENCE)
+                await self._reader.abandon(_closing, FILE_WORK_TIMEOUT)
 
-    async def aside(self, work: Callable[[], Result]) -> Result:
-        """Do what blocks, such as a look into the cache, in a thread. Cancelled, it is done all the same.
+    async def run_in_thread(self, work: Callable[[], Result]) -> Result:
+        """Run blocking work in a thread, such as an access to the cache. It is not interrupted by
+        cancellation.
 
         Raises:
-            ServiceError: the service is ending.
+            ServiceError: the service ends.
         """
         self._check_open()
         return await self._worker.run(work)
 
-    async def note_setup(self, job: Job) -> RunningSetup | None:
-        """Note on the disk that a set-up begins, before it does anything; None without a cache.
+    async def record_setup(self, job: Job) -> RunningSetup | None:
+        """Record in the cache that a set-up starts. None without a cache.
 
         Raises:
-            CacheError: it cannot be noted.
+            CacheError: the record cannot be written.
         """
         notes = self._setups
         if notes is None:
             return None
         (system, component), key = job.followed.address, job.followed.key
         begin = partial(notes.begin, system=system, component=component, asked_by=job.asked_by, key=key)
-        return await self.aside(lambda: begin(job.id, job.kind, link=job.followed.line.name))
+        return await self.run_in_thread(lambda: begin(job.id, job.kind, link=job.followed.link.name))
 
-    async def end_note(self, note: RunningSetup, *, is_cut_off: bool) -> None:
-        """A set-up has ended, or is cut off as the service ends. This is done to its end in any case."""
+    async def end_setup_record(self, note: RunningSetup, *, is_cut_off: bool) -> None:
+        """Record that a set-up has ended, or is interrupted by the end of the service. Not interrupted by
+        cancellation."""
         with anyio.CancelScope(shield=True):
             await self._worker.run(note.cut_off if is_cut_off else note.end)
 
-    async def cut_off(self) -> list[CutOff]:
-        """The set-ups that were cut off, as the disk knows them."""
-        return [] if self._setups is None else await self.aside(self._setups.cut_off)
+    async def interrupted_setups(self) -> list[CutOff]:
+        """Return the recorded set-ups that were interrupted."""
+        return [] if self._setups is None else await self.run_in_thread(self._setups.cut_off)
 
-    async def read_aside(self, work: Callable[[], Result]) -> Result:
-        """Parse or compare what somebody has sent, in a thread of its own: that may take seconds, and others
-        look into the cache. `long_requests` bounds how many wait for it.
+    async def run_in_file_thread(self, work: Callable[[], Result]) -> Result:
+        """Run work on received data in a thread of its own: parsing or comparing can take seconds, and must
+        not delay accesses to the cache. `long_requests` limits the waiting work.
 
         Raises:
-            ServiceError: the service is ending.
+            ServiceError: the service ends.
         """
         self._check_open()
         return await self._reader.run(work)
 
-    def find(self, system: int, component: int, link: str | None = None) -> Followed:
-        """The component of this address.
+    def find_component(self, system: int, component: int, link: str | None = None) -> FollowedComponent:
+        """Return the component with this address.
 
         Raises:
-            ServiceError: it was not heard, or it is heard on several links and none is named.
+            ServiceError: the component is unknown, or on several links and none is given.
         """
         found = [
             followed
-            for line in self.lines.values()
-            if link in (None, line.name) and (followed := line.followed.get((system, component))) is not None
+            for each in self.links.values()
+            if link in (None, each.name) and (followed := each.followed.get((system, component))) is not None
         ]
         if not found:
             on = "any link" if link is None else link
-            raise ServiceError(404, "unknown-component", f"{system}/{component} was not heard on {on}.")
+            raise ServiceError(
+                404, "unknown-component", f"No heartbeat of {system}/{component} was received on {on}."
+            )
         if len(found) > 1:
-            names = [followed.line.name for followed in found]
-            what = f"{system}/{component} is heard on {' and '.join(names)}; name one: ?link=…"
+            names = [followed.link.name for followed in found]
+            what = f"{system}/{component} is on {' and '.join(names)}. Choose one with ?link=NAME."
             raise ServiceError(409, "ambiguous", what, links=names)
         return found[0]
 
-    def clients(self, link: str | None = None) -> list[tuple[Line, ParamClient]]:
-        """The links that are open, or of these the one that is named.
+    def clients(self, link: str | None = None) -> list[tuple[ServiceLink, ParamClient]]:
+        """Return the open links with their clients.
+
+        Args:
+            link: name of the only link, or None for all.
 
         Raises:
-            ServiceError: there is no such link.
+            ServiceError: the link does not exist.
         """
         self._check_link(link)
-        chosen = [line for line in self.lines.values() if link in (None, line.name)]
-        return [(line, line.client) for line in chosen if line.client is not None]
+        chosen = [each for each in self.links.values() if link in (None, each.name)]
+        return [(each, each.client) for each in chosen if each.client is not None]
 
-    def begin_fetch(self, followed: Followed, asked_by: str, holder: str = "", **options: Any) -> Job:
-        """Begin to bring a component's table up to date; the options are those of `Component.fetch_all`.
+    def start_fetch(
+        self, followed: FollowedComponent, asked_by: str, holder: str = "", **options: Any
+    ) -> Job:
+        """Start a job that fetches a component's table; the options are those of `Component.fetch_all`.
 
-        Several at the same time share one download. To cancel the job gives up its own interest.
+        Simultaneous jobs share one download. Cancelling one does not affect the others.
 
         Raises:
-            ServiceError: too many jobs are under way, of this holder or of all.
+            ServiceError: too many jobs are running, of this holder or in total.
         """
-        return self.jobs.begin("fetch", followed, partial(_fetch, options), asked_by, holder)
+        return self.jobs.start("fetch", followed, partial(_fetch, options), asked_by, holder)
 
-    async def wait_for(
+    async def wait_for_component(
         self, system: int | None, component: int | None, link: str | None, timeout: float | None
-    ) -> Followed:
-        """The component with this address as soon as it is heard, on any link; see `ParamClient.component`.
+    ) -> FollowedComponent:
+        """Wait for the component with this address on any link; see `ParamClient.component`.
 
-        Links that are not open yet are waited for.
+        Includes links that are not open yet.
 
         Raises:
-            ServiceError: there is no such link.
-            NoReply: it was not heard in time.
+            ServiceError: the link does not exist, or the service ends.
+            NoReply: the component was not heard before the timeout.
         """
         self._check_link(link)
-        chosen = [line for line in self.lines.values() if link in (None, line.name)]
-        found: list[Followed] = []
+        chosen = [each for each in self.links.values() if link in (None, each.name)]
+        found: list[FollowedComponent] = []
         is_ending = False
         began = anyio.current_time()
         with anyio.move_on_after(timeout):
             async with anyio.create_task_group() as tasks:
 
-                async def look(line: Line) -> None:
-                    found.append(await line.wait_for(system, component))
+                async def look(each: ServiceLink) -> None:
+                    found.append(await each.wait_for(system, component))
                     tasks.cancel_scope.cancel()
 
-                for line in chosen:
-                    tasks.start_soon(look, line)
+                for each in chosen:
+                    tasks.start_soon(look, each)
                 await self._closing.wait()
                 is_ending = True
                 tasks.cancel_scope.cancel()
         if is_ending:
             self._check_open()
         if not found:
-            reasons = [f"; {line.error}" for line in chosen if line.state == "failed" and line.error]
+            reasons = [f"; {each.error}" for each in chosen if each.state == "failed" and each.error]
             awaited = address_in_words(system, component) + "".join(reasons)
             raise NoReply(awaited, attempts=0, waited=anyio.current_time() - began)
         return found[0]
 
-    async def wait_for_only(
+    async def wait_for_only_component(
         self, system: int | None, component: int | None, link: str | None, timeout: float | None
-    ) -> Followed:
-        """Wait for the component with this address if no other vehicle on any of the links can be meant.
+    ) -> FollowedComponent:
+        """Wait for the component with this address if no other vehicle on the links matches.
 
-        See `ParamClient.only_component`. Vehicles on links that are not open are not there.
+        See `ParamClient.only_component`. Links that are not open are ignored.
 
         Raises:
-            ServiceError: there is no such link.
-            AmbiguousVehicle: several vehicles are there.
-            NoReply: it was not heard in time.
+            ServiceError: the link does not exist, or the service ends.
+            AmbiguousVehicle: several vehicles match.
+            NoReply: the component was not heard before the timeout.
         """
         self._check_link(link)
-        chosen = [line for line in self.lines.values() if link in (None, line.name)]
+        chosen = [each for each in self.links.values() if link in (None, each.name)]
         choice = VehicleChoice(system, component, spans_links=len(chosen) > 1)
         began = anyio.current_time()
         with anyio.move_on_after(timeout):
             while True:
                 self._check_open()
                 now = anyio.current_time()
-                clients = [(line, local_client(line.client)) for line in chosen if line.client is not None]
-                news = [line.news for line in chosen] + [client.link_task.news for _, client in clients]
+                clients = [(each, local_client(each.client)) for each in chosen if each.client is not None]
+                news = [each.changed for each in chosen] + [client.link_task.news for _, client in clients]
                 machines = {
-                    machine: line
-                    for line, client in clients
+                    machine: each
+                    for each, client in clients
                     for machine in client.station.components.values()
                 }
                 since = max((client.station.listening_since for _, client in clients), default=math.inf)
@@ -311,12 +320,12 @@ class Hub:
                     for _, client in clients:
                         looking.enter_context(client.station.looking_for_others())
                     with anyio.move_on_after(None if choice.due == math.inf else choice.due - now):
-                        await _any_of([*news, self._closing])
+                        await _wait_for_any([*news, self._closing])
                 for _, client in clients:
                     await client.link_task.read_up(choice.due)
         awaited = address_in_words(system, component)
         if choice.due < math.inf:
-            awaited += f", and {LOOK_TIME} s more to see that it is the only one"
+            awaited += f", then {LOOK_TIME} s without another vehicle"
         raise NoReply(awaited, attempts=0, waited=anyio.current_time() - began)
 
     def _check_open(self) -> None:
@@ -329,40 +338,43 @@ class Hub:
         else:
             name = create_link(link).name
             make = partial(self._client, link)
-            make()  # what is wrong with the options shows now
-        if name in self.lines:
-            raise UsageError(f"the link {name} is named twice")
-        self.lines[name] = Line(name, make, self.feed, self._met)
+            make()  # invalid options raise an error here
+        if name in self.links:
+            raise UsageError(f"the link {name} is given twice")
+        self.links[name] = ServiceLink(name, make, self.feed, self._on_found)
 
     def _check_link(self, link: str | None) -> None:
-        if link is not None and link not in self.lines:
+        if link is not None and link not in self.links:
             raise ServiceError(
-                404, "unknown-link", f"There is no link {link!r} here.", links=list(self.lines)
+                404,
+                "unknown-link",
+                f"The service has no link {link!r}. Its links: {', '.join(self.links)}.",
+                links=list(self.links),
             )
 
     def _client(self, link: str | Link | Endpoint) -> ParamClient:
         cache = False if self.cache is None or _is_log(link) else self.cache
         return ParamClient(link, cache=cache, **self._options)
 
-    def _met(self, followed: Followed) -> None:
-        """Somebody was heard for the first time, is back, or has started again."""
-        assert self._tasks is not None, "nothing is heard before"
-        self._tasks.start_soon(self._welcome, followed)
+    def _on_found(self, followed: FollowedComponent) -> None:
+        """Handle a component that is new, found again, or restarted."""
+        assert self._tasks is not None, "the hub is open"
+        self._tasks.start_soon(self._load_component, followed)
 
-    async def _welcome(self, followed: Followed) -> None:
-        """See what is known of a component already, and bring its table up to date."""
+    async def _load_component(self, followed: FollowedComponent) -> None:
+        """Load cached data of a component, then fetch its table."""
         client = followed.component.client
         with suppress(ParamClientError, ServiceError):
             await followed.component.wait_for_cache()
-            await self._recall(followed)
+            await self._load_cached(followed)
         machine = followed.component.machine
         is_due = machine.who.has_parameters and machine.fetch is None and machine.sync_state == "unsynced"
         if self._fetches and is_due and not client.station.listens_only:
-            with suppress(ServiceError):  # as many are under way as may be
-                self.begin_fetch(followed, OURSELVES)
+            with suppress(ServiceError):  # the maximum number of jobs is running
+                self.start_fetch(followed, SERVICE_AUTHOR)
 
-    async def _recall_setups(self) -> None:
-        """See which set-ups the last run of the service has not brought to their end, and tell of them."""
+    async def _load_interrupted_setups(self) -> None:
+        """Load the set-ups that the end of the last run interrupted, and log them."""
         notes = self._setups
         if notes is None:
             return
@@ -370,26 +382,26 @@ class Hub:
         for each in self.jobs.cut_off:
             if not each.is_told:
                 logger.warning(
-                    "%s of %d/%d on %s, which %s had asked for at %s, was cut off %s, as the service ended",
+                    "%s of %d/%d on %s, started by %s at %s, was cut off %s by the end of the service",
                     *("a restore" if each.kind == "restore" else "an apply", each.system, each.component),
                     *(each.link, each.asked_by, time_text(each.began), progress_text(each)),
                 )
 
-    async def _recall(self, followed: Followed) -> None:
-        """What the disk knows: how old cached values are, and how the firmware describes its parameters."""
+    async def _load_cached(self, followed: FollowedComponent) -> None:
+        """Load the times of cached values and the descriptions of the parameters."""
         cache, key = self.cache, followed.key
         if cache is None or key is None:
             return
         component = followed.component
-        cached = await self.aside(lambda: cache.load(key, component.component))
+        cached = await self.run_in_thread(lambda: cache.load(key, component.component))
         if cached is not None:
-            followed.know_ages(cached.heard_at.items())
+            followed.add_cached_times(cached.heard_at.items())
         store = MetadataStore.beside(cache.path)
         identity = component.identity
-        followed.metadata = await self.aside(lambda: store.known(identity, component.component))
+        followed.metadata = await self.run_in_thread(lambda: store.known(identity, component.component))
 
 
-async def _any_of(events: Iterable[anyio.Event]) -> None:
+async def _wait_for_any(events: Iterable[anyio.Event]) -> None:
     """Wait until one of the events is set."""
     async with anyio.create_task_group() as tasks:
 
@@ -406,7 +418,7 @@ async def _fetch(options: dict[str, Any], job: Job) -> FetchResultDoc:
         job.progress = ProgressDoc.of(progress)
 
     result = await job.followed.component.fetch_all(progress=note, **options)
-    return FetchResultDoc.of(result, link=job.followed.line.name)
+    return FetchResultDoc.of(result, link=job.followed.link.name)
 
 
 def _is_log(link: object) -> bool:
@@ -414,7 +426,7 @@ def _is_log(link: object) -> bool:
 
 
 def _closing() -> ServiceError:
-    return ServiceError(503, "closing", "The service is ending.")
+    return ServiceError(503, "closing", "The service is shutting down.")
 
 
 def _nothing() -> None:

@@ -1,4 +1,4 @@
-"""What is under way for somebody: who asked for it, how far it is, how it ended."""
+"""Jobs: fetches and set-ups in progress, with author, progress and result."""
 
 from __future__ import annotations
 
@@ -19,43 +19,46 @@ from paramclient.service.problems import ServiceError, problem_of
 
 if TYPE_CHECKING:
     from paramclient.cache import CutOff
-    from paramclient.service.event_feed import Feed
-    from paramclient.service.followed_component import Followed
+    from paramclient.service.event_feed import EventFeed
+    from paramclient.service.followed_component import FollowedComponent
 
 __all__ = ["Job", "Jobs", "Kind", "Work"]
 
 Kind = Literal["fetch", "apply", "restore"]
 State = Literal["running", "done", "failed", "cancelled"]
 
-MOST_RUNNING: Final = 256
-"""Jobs that are under way at once: one for each component that a link can carry. Each is a task."""
-MOST_OF_ONE: Final = 64
-"""Those of one holder of a token or, without tokens, of one address; the service's own are not counted."""
-MOST_ENDED: Final = 64
-"""Jobs that are kept when they have ended, for those who ask late."""
+RUNNING_JOBS_MAX: Final = 256
+"""Maximum number of running jobs: one for each component of a full link. Each is a task."""
+HOLDER_JOBS_MAX: Final = 64
+"""Maximum number of running jobs of one holder of a token or, without tokens, of one address. Jobs of the
+service itself do not count."""
+ENDED_JOBS_KEPT_MAX: Final = 64
+"""Number of ended jobs that are kept for later requests."""
 
-LISTED_MAX: Final = 64
-"""Entries of a member of a result that stands in the list of jobs; `GET /jobs/{id}` has the longer ones."""
+LISTED_ENTRIES_MAX: Final = 64
+"""Maximum number of entries of a result's member in the list of jobs; `GET /jobs/{id}` has longer members."""
 
 logger = logging.getLogger(__name__)
 
 
 class Job:
-    """One piece of work.
+    """One job.
 
     Attributes:
-        id: its name.
-        kind: what it is.
-        followed: whom it is about.
-        asked_by: who wanted it.
-        holder: of whose quota it is; "" for that of the service.
+        id: random id.
+        kind: fetch, apply or restore.
+        followed: its component.
+        asked_by: author who started it.
+        holder: holder of its quota; "" for the service.
         state: running, done, failed or cancelled.
-        progress: how far it is, as a document; whoever does the work sets it.
-        result: what it ended with, as a document.
-        error: what it failed with.
+        progress: progress as a document, set by the work.
+        result: result as a document, or None.
+        error: error of a failed job, or None.
+        began: start time in unix seconds.
+        ended: end time in unix seconds, or None.
     """
 
-    def __init__(self, kind: Kind, followed: Followed, asked_by: str, holder: str) -> None:
+    def __init__(self, kind: Kind, followed: FollowedComponent, asked_by: str, holder: str) -> None:
         self.id = secrets.token_hex(8)
         self.kind = kind
         self.followed = followed
@@ -69,10 +72,10 @@ class Job:
         self.ended: float | None = None
         self._scope = anyio.CancelScope()
         self._over = anyio.Event()
-        self._link = followed.line.name
+        self._link = followed.link.name
 
     def document(self, *, with_result: bool = True) -> JobDoc:
-        """How it stands now."""
+        """Return its current state."""
         system, component = self.followed.address
         return JobDoc(
             id=self.id,
@@ -89,11 +92,12 @@ class Job:
             problem=None if self.error is None else problem_of(self.error),
         )
 
-    def later_document(self, *, in_list: bool = False) -> Callable[[], JobDoc]:
-        """What makes the same document, as it stands now, in any thread: a result may have many rows.
+    def document_factory(self, *, in_list: bool = False) -> Callable[[], JobDoc]:
+        """Return a function that creates the document of the current state in any thread: a result may have
+        many rows.
 
         Args:
-            in_list: leaves out the members of the result that have more than `LISTED_MAX` entries.
+            in_list: whether members of the result with more than `LISTED_ENTRIES_MAX` entries are omitted.
         """
         document, result = self.document(with_result=False), self.result
         if result is None:
@@ -102,114 +106,123 @@ class Job:
         return lambda: document.model_copy(update={"result": result.model_dump(mode="json", exclude=long)})
 
     def cancel(self) -> None:
-        """End it; what it shares with others goes on for them."""
+        """Cancel the job. A download shared with other jobs continues."""
         self._scope.cancel()
 
     async def wait(self) -> Document:
-        """What it ends with. Cancelled, it goes on.
+        """Wait for the end of the job and return its result. Cancellation does not cancel the job.
 
         Raises:
-            Exception: what it failed with; a ServiceError where somebody has cancelled it.
+            Exception: the error of the job; ServiceError if it was cancelled.
         """
         await self._over.wait()
         if self.error is not None:
             raise self.error.with_traceback(None)
-        assert self.result is not None, "it is over, and has not failed"
+        assert self.result is not None, "a job without an error has a result"
         return self.result
 
 
 Work = Callable[[Job], Awaitable[Document]]
-"""Does the work of a job, and gives the document of what became of it."""
+"""The work of a job: returns the document of its result."""
 
 
 class Jobs:
-    """Those that are under way, and the last ones that were.
+    """Running jobs, and the last ended ones.
 
     Args:
-        feed: where beginnings and ends are told.
+        feed: the event feed.
 
     Attributes:
-        cut_off: set-ups that an earlier run of the service has not brought to their end.
+        cut_off: set-ups that were interrupted by the end of an earlier run of the service.
     """
 
-    def __init__(self, feed: Feed) -> None:
+    def __init__(self, feed: EventFeed) -> None:
         self.cut_off: Sequence[CutOff] = ()
         self._feed = feed
         self._jobs: dict[str, Job] = {}
         self._tasks: anyio.abc.TaskGroup | None = None
 
     def open(self, tasks: anyio.abc.TaskGroup) -> None:
-        """From now on jobs run in these tasks."""
+        """Use this task group for jobs."""
         self._tasks = tasks
 
     @property
     def all(self) -> list[Job]:
-        """All of them, the oldest first."""
+        """Return all jobs, the oldest first."""
         return list(self._jobs.values())
 
     @property
-    def later_documents(self) -> list[Callable[[], JobDoc]]:
-        """What makes the documents of all of them for a list, the oldest first; see `Job.later_document`."""
+    def document_factories(self) -> list[Callable[[], JobDoc]]:
+        """Return functions that create the documents of all jobs for a list, the oldest first; see
+        `Job.document_factory`."""
         cut_off = [partial(JobDoc.of_cut_off, note) for note in self.cut_off]
-        return [*cut_off, *(job.later_document(in_list=True) for job in self._jobs.values())]
+        return [*cut_off, *(job.document_factory(in_list=True) for job in self._jobs.values())]
 
-    def later_document(self, name: str) -> Callable[[], JobDoc]:
-        """What makes the document of the one of this name.
+    def document_factory(self, name: str) -> Callable[[], JobDoc]:
+        """Return a function that creates the document of the job with this id.
 
         Raises:
-            ServiceError: there is none.
+            ServiceError: the job is unknown.
         """
         for note in self.cut_off:
             if note.id == name:
                 return partial(JobDoc.of_cut_off, note)
-        return self.find(name).later_document()
+        return self.find(name).document_factory()
 
-    def begin(self, kind: Kind, followed: Followed, work: Work, asked_by: str, holder: str = "") -> Job:
-        """Begin one.
+    def start(
+        self, kind: Kind, followed: FollowedComponent, work: Work, asked_by: str, holder: str = ""
+    ) -> Job:
+        """Start a job.
 
         Args:
-            kind: what it is.
-            followed: whom it is about.
-            work: does it.
-            asked_by: who wanted it.
-            holder: of whose quota it is; "" for that of the service.
+            kind: fetch, apply or restore.
+            followed: its component.
+            work: the work of the job.
+            asked_by: author who starts it.
+            holder: holder of its quota; "" for the service.
 
         Raises:
-            ServiceError: too many are under way, of this holder or of all.
+            ServiceError: too many jobs are running, of this holder or in total.
         """
         assert self._tasks is not None, "the hub is open"
         ended = [job.id for job in self._jobs.values() if job.state != "running"]
-        if len(self._jobs) - len(ended) >= MOST_RUNNING:
+        if len(self._jobs) - len(ended) >= RUNNING_JOBS_MAX:
             raise ServiceError(
-                429, "too-many", f"{MOST_RUNNING} jobs are under way already.", most=MOST_RUNNING
+                429,
+                "too-many",
+                f"{RUNNING_JOBS_MAX} jobs are already running. Try again later.",
+                most=RUNNING_JOBS_MAX,
             )
         own = sum(job.holder == holder for job in self._jobs.values() if job.state == "running")
-        if holder and own >= MOST_OF_ONE:
+        if holder and own >= HOLDER_JOBS_MAX:
             raise ServiceError(
-                429, "too-many", f"{MOST_OF_ONE} jobs of yours are under way already.", most=MOST_OF_ONE
+                429,
+                "too-many",
+                f"{HOLDER_JOBS_MAX} of your jobs are already running. Try again later.",
+                most=HOLDER_JOBS_MAX,
             )
-        for name in ended[: max(0, len(ended) - MOST_ENDED + 1)]:
+        for name in ended[: max(0, len(ended) - ENDED_JOBS_KEPT_MAX + 1)]:
             del self._jobs[name]
         job = Job(kind, followed, asked_by, holder)
         self._jobs[job.id] = job
-        self.tell(job)
+        self.publish(job)
         self._tasks.start_soon(self._run, job, work, name=f"paramclient job {job.id}")
         return job
 
     def find(self, name: str) -> Job:
-        """The one of this name.
+        """Return the job with this id.
 
         Raises:
-            ServiceError: there is none.
+            ServiceError: the job is unknown.
         """
         job = self._jobs.get(name)
         if job is None:
-            raise ServiceError(404, "unknown-job", "There is no such job, or it ended long ago.")
+            raise ServiceError(404, "unknown-job", "The job is unknown, or ended too long ago.")
         return job
 
-    def tell(self, job: Job) -> None:
-        """Publish how a job stands now."""
-        job.followed.tell("job", {"job": job.document(with_result=False).as_json()})
+    def publish(self, job: Job) -> None:
+        """Publish the current state of a job."""
+        job.followed.publish("job", {"job": job.document(with_result=False).as_json()})
 
     async def _run(self, job: Job, work: Work) -> None:
         try:
@@ -220,18 +233,20 @@ class Jobs:
             job.error = error
             job.state = "failed"
             if not isinstance(error, ParamClientError | ServiceError):
-                logger.error("job %s, a %s, failed", job.id, job.kind, exc_info=error)
+                logger.error("the %s job %s failed", job.kind, job.id, exc_info=error)
         finally:
             if job.state == "running":
                 job.state = "cancelled"
-                job.error = ServiceError(409, "cancelled", "It was cancelled before it had come to its end.")
+                job.error = ServiceError(409, "cancelled", "The job was cancelled before its end.")
             job.ended = time.time()
-            job.followed.look()
-            self.tell(job)
+            job.followed.publish_changes()
+            self.publish(job)
             job._over.set()
 
 
 def _is_long(content: object) -> bool:
     return (
-        not isinstance(content, str) and isinstance(content, Sequence | Mapping) and len(content) > LISTED_MAX
+        not isinstance(content, str)
+        and isinstance(content, Sequence | Mapping)
+        and len(content) > LISTED_ENTRIES_MAX
     )

@@ -1,4 +1,4 @@
-"""One link of the service: opened, followed, and opened again for as long as the service runs."""
+"""One link of the service: opening, events, polling of its components, reopening."""
 
 from __future__ import annotations
 
@@ -25,68 +25,73 @@ from paramclient.client.events import (
 from paramclient.documents.link import LinkDoc, StatsDoc
 from paramclient.errors import LinkError, ParamClientError, UsageError
 from paramclient.model.notation import hash_text, rounded
-from paramclient.service.followed_component import Followed
+from paramclient.service.followed_component import FollowedComponent
 
 if TYPE_CHECKING:
-    from paramclient.service.event_feed import Feed
+    from paramclient.service.event_feed import EventFeed
 
-__all__ = ["LOOKED_AT_ONCE", "Line"]
+__all__ = ["COMPONENTS_PER_TURN", "ServiceLink"]
 
-FIRST_BACKOFF: Final = 0.25
-LONGEST_BACKOFF: Final = 5.0
-"""Seconds between two attempts to open a link: doubled from the first to the longest, as when one drops."""
-LOOK_INTERVAL: Final = 0.2
-"""Seconds between two looks at what nobody tells of: states, progress."""
-LOOKS_AT_VALUES: Final = 5
-"""Of so many looks one goes through all values too."""
-LOOKED_AT_ONCE: Final = 64
-"""Components that are looked at before the event loop comes round: 3 ms where each has something to tell."""
+REOPEN_BACKOFF: Final = 0.25
+"""Seconds before the second attempt to open a link. The backoff is doubled after each attempt."""
+REOPEN_BACKOFF_MAX: Final = 5.0
+"""Maximum number of seconds between two attempts to open a link."""
+CHECK_INTERVAL: Final = 0.2
+"""Seconds between two checks for changes without an event: states, progress."""
+CHECKS_PER_VALUE_CHECK: Final = 5
+"""Number of checks of which one includes all values."""
+COMPONENTS_PER_TURN: Final = 16
+"""Number of components checked in one turn of the event loop: 3 ms if each publishes an event."""
 
 logger = logging.getLogger(__name__)
 
 
-class Line:
-    """One link, and who is heard on it.
+class ServiceLink:
+    """One link and the components on it.
 
     Args:
-        name: what the service calls it.
-        make: gives a new client for it, not yet opened.
-        feed: where to tell of it.
-        met: is told of every component that is heard, or has come back.
+        name: name of the link in the service.
+        make: creates a client for it, not yet open.
+        feed: the event feed.
+        on_found: called with every component that is heard, found again, or restarted.
 
     Attributes:
-        name: as given.
-        state: opening, open, away (dropped, and being opened again), failed (to be tried again), ended (a log
-            that is over).
-        error: why, for away and failed.
-        openings: how often it has been opened with a fresh client.
-        client: the client, or None while there is none.
-        followed: who is heard, by (system, component).
-        news: is set, and replaced, when anybody was heard or the state has changed.
+        name: name of the link in the service.
+        state: opening; open; away (lost, the client reconnects); failed (reopened after a backoff); ended
+            (end of a log).
+        error: reason of away and failed, or None.
+        openings: number of opened clients.
+        client: the open client, or None.
+        followed: its components, by system and component id.
+        changed: set and replaced after each new component or change of the state.
     """
 
     def __init__(
-        self, name: str, make: Callable[[], ParamClient], feed: Feed, met: Callable[[Followed], None]
+        self,
+        name: str,
+        make: Callable[[], ParamClient],
+        feed: EventFeed,
+        on_found: Callable[[FollowedComponent], None],
     ) -> None:
         self.name = name
         self.state = "opening"
         self.error: str | None = None
         self.openings = 0
         self.client: ParamClient | None = None
-        self.followed: dict[tuple[int, int], Followed] = {}
-        self.news = anyio.Event()
+        self.followed: dict[tuple[int, int], FollowedComponent] = {}
+        self.changed = anyio.Event()
         self._make = make
         self._feed = feed
-        self._met = met
-        self._over: anyio.Event = anyio.Event()
+        self._on_found = on_found
+        self._ended: anyio.Event = anyio.Event()
         self._ending: ParamClientError | None = None
 
     def __repr__(self) -> str:
-        return f"<Line {self.name} {self.state}>"
+        return f"<ServiceLink {self.name} {self.state}>"
 
     @property
     def document(self) -> LinkDoc:
-        """How it stands now."""
+        """Return its current state."""
         client = self.client
         return LinkDoc(
             name=self.name,
@@ -99,122 +104,122 @@ class Line:
         )
 
     async def run(self) -> None:
-        """Hold it open, until cancelled."""
-        backoff = FIRST_BACKOFF
+        """Keep the link open until cancelled."""
+        backoff = REOPEN_BACKOFF
         while True:
             try:
                 async with self._make() as client:
                     self.client = client
-                    self._follow(client)
-                    backoff = FIRST_BACKOFF
-                    await self._watch()
-            except (LinkError, UsageError) as error:  # the latter where a library is missing, or a log exists
-                self._become("failed", str(error))
+                    self._attach(client)
+                    backoff = REOPEN_BACKOFF
+                    await self._check_components()
+            except (LinkError, UsageError) as error:  # UsageError: a missing library, an existing log
+                self._set_state("failed", str(error))
             finally:
                 self.client = None
                 for followed in list(self.followed.values()):
                     self.forget(followed)
             await anyio.sleep(backoff)
-            backoff = min(backoff * 2, LONGEST_BACKOFF)
+            backoff = min(backoff * 2, REOPEN_BACKOFF_MAX)
 
-    async def wait_for(self, system: int | None, component: int | None) -> Followed:
-        """The component with this address as soon as it is heard, however often the link must be opened."""
+    async def wait_for(self, system: int | None, component: int | None) -> FollowedComponent:
+        """Wait for the component with this address, also while the link is reopened."""
         while True:
-            news, client = self.news, self.client
+            changed, client = self.changed, self.client
             if client is not None:
                 with suppress(LinkError):
                     found = await client.component(system, component, timeout=None)
                     followed = self.followed.get((found.system, found.component))
                     if followed is not None and followed.component is found:
                         return followed
-            await news.wait()
+            await changed.wait()
 
-    def happened(self, event: Event) -> None:
-        """The client tells of something, at the moment at which it happens."""
+    def handle_event(self, event: Event) -> None:
+        """Handle an event of the client immediately."""
         component = event.component
         address = (component.system, component.component)
         match event:
             case Heard():
-                followed = self.followed[address] = Followed(component, self, self._feed)
-                followed.tell_of_it("heard")
-                self._met(followed)
-                self._tell()
+                followed = self.followed[address] = FollowedComponent(component, self, self._feed)
+                followed.publish_state("heard")
+                self._on_found(followed)
+                self._notify()
             case Lost(silence=silence):
-                self.followed[address].look()
-                self.followed[address].tell_of_it("lost", silence_s=rounded(silence))
+                self.followed[address].publish_changes()
+                self.followed[address].publish_state("lost", silence_s=rounded(silence))
             case Found(silence=silence):
-                self.followed[address].look()
-                self.followed[address].tell_of_it("found", silence_s=rounded(silence))
-                self._met(self.followed[address])
+                self.followed[address].publish_changes()
+                self.followed[address].publish_state("found", silence_s=rounded(silence))
+                self._on_found(self.followed[address])
             case Rebooted():
-                self.followed[address].look()
-                self.followed[address].tell_of_it("rebooted")
-                self._met(self.followed[address])
+                self.followed[address].publish_changes()
+                self.followed[address].publish_state("rebooted")
+                self._on_found(self.followed[address])
             case Contested():
-                self.followed[address].look()
-                self.followed[address].tell_of_it("contested")
+                self.followed[address].publish_changes()
+                self.followed[address].publish_state("contested")
             case Uncontested():
-                self.followed[address].look()
-                self.followed[address].tell_of_it("uncontested")
-                self._met(self.followed[address])
+                self.followed[address].publish_changes()
+                self.followed[address].publish_state("uncontested")
+                self._on_found(self.followed[address])
             case Resynced(changed=changed, hash=crc):
-                self.followed[address].look()
-                self.followed[address].tell("resynced", {"changed": list(changed), "hash": hash_text(crc)})
+                self.followed[address].publish_changes()
+                self.followed[address].publish("resynced", {"changed": list(changed), "hash": hash_text(crc)})
 
-    def over(self, error: ParamClientError | None) -> None:
-        """Nothing more will come from the client."""
+    def handle_end(self, error: ParamClientError | None) -> None:
+        """Handle the end of the client's events."""
         self._ending = error
-        self._over.set()
+        self._ended.set()
 
-    def forget(self, followed: Followed) -> None:
-        """It is not followed any more."""
+    def forget(self, followed: FollowedComponent) -> None:
+        """Stop following a component."""
         followed.close()
         if self.followed.get(followed.address) is followed:
             del self.followed[followed.address]
-            followed.tell_of_it("forgotten")
+            followed.publish_state("forgotten")
 
-    def _follow(self, client: ParamClient) -> None:
+    def _attach(self, client: ParamClient) -> None:
         self.openings += 1
-        self._over = anyio.Event()
+        self._ended = anyio.Event()
         self._ending = None
-        self._sink = _Sink(self)
-        local_client(client).subscribe(self._sink)
+        self._forwarder = _EventForwarder(self)
+        local_client(client).subscribe(self._forwarder)
         for component in client.components.values():
-            self.happened(Heard(component))
-        self._become("open")
+            self.handle_event(Heard(component))
+        self._set_state("open")
 
-    async def _watch(self) -> None:
-        """Tell of what nobody tells of, until the link has failed for good."""
-        looks = 0
-        while not self._over.is_set():
-            with anyio.move_on_after(LOOK_INTERVAL):
-                await self._over.wait()
-            looks += 1
-            self._look_at_link()
+    async def _check_components(self) -> None:
+        """Publish changes without an event, until the link has failed permanently."""
+        checks = 0
+        while not self._ended.is_set():
+            with anyio.move_on_after(CHECK_INTERVAL):
+                await self._ended.wait()
+            checks += 1
+            self._check_link_state()
             for number, followed in enumerate(list(self.followed.values()), 1):
-                if looks % LOOKS_AT_VALUES:
-                    followed.look_at_state()
+                if checks % CHECKS_PER_VALUE_CHECK:
+                    followed.publish_state_changes()
                 else:
-                    followed.look()
-                if not number % LOOKED_AT_ONCE:
+                    followed.publish_changes()
+                if not number % COMPONENTS_PER_TURN:
                     await anyio.lowlevel.checkpoint()
         if self._ending is not None:
             raise self._ending
-        self._become("ended")
+        self._set_state("ended")
         await anyio.sleep_forever()
 
-    def _look_at_link(self) -> None:
+    def _check_link_state(self) -> None:
         client = self.client
         if client is None:
             return
         task = local_client(client).link_task
         if task.is_away:
             error = self.error if task.broken is None else str(task.broken)
-            self._become("away", error or f"{self.name} has dropped and is being opened again")
+            self._set_state("away", error or f"{self.name} is disconnected and reconnects")
         elif self.state == "away":
-            self._become("open")
+            self._set_state("open")
 
-    def _become(self, state: str, error: str | None = None) -> None:
+    def _set_state(self, state: str, error: str | None = None) -> None:
         if (state, error) == (self.state, self.error):
             return
         (logger.warning if state == "failed" and self.state != "failed" else logger.info)(
@@ -222,23 +227,23 @@ class Line:
         )
         self.state, self.error = state, error
         self._feed.publish("link", {"state": state, "error": error}, link=self.name)
-        self._tell()
+        self._notify()
 
-    def _tell(self) -> None:
-        news, self.news = self.news, anyio.Event()
-        news.set()
+    def _notify(self) -> None:
+        changed, self.changed = self.changed, anyio.Event()
+        changed.set()
 
 
-class _Sink(Events):
-    """Hands events on at once, in place of keeping them for a task: between a component and its first values
-    nothing is missed."""
+class _EventForwarder(Events):
+    """Forwards events immediately, in place of queueing them for a task, so that no value between a
+    component's discovery and its first values is missed."""
 
-    def __init__(self, owner: Line) -> None:
+    def __init__(self, owner: ServiceLink) -> None:
         super().__init__()
         self._owner = owner
 
     def push(self, item: Event) -> None:
-        self._owner.happened(item)
+        self._owner.handle_event(item)
 
     def end(self, error: ParamClientError | None) -> None:
-        self._owner.over(error)
+        self._owner.handle_end(error)

@@ -1,10 +1,9 @@
-"""What requests mean by parameters: a file, an earlier state, another vehicle, values as they stand."""
+"""Parameter sets named in requests: files, earlier states, other components, cached vehicles, values."""
 
 from __future__ import annotations
 
 import base64
 import binascii
-import time
 from codecs import BOM_UTF8
 from collections.abc import Callable
 from datetime import datetime
@@ -29,60 +28,65 @@ from paramclient.provision.vehicle_params import (
     fetch_set,
     load_cached_set,
     load_state_before_apply,
+    set_maker,
 )
 from paramclient.service.problems import ServiceError
-from paramclient.service.reading import check_lines, check_pieces
-from paramclient.service.request import LARGEST_UPLOAD
-from paramclient.service.route_context import Bits, ValueGiven, value_meant, value_of
+from paramclient.service.request import PARAM_FILE_BYTES_MAX
+from paramclient.service.request_body import check_line_lengths, check_separators
+from paramclient.service.route_context import Bits, ValueInput, parse_value, resolve_value
 
 if TYPE_CHECKING:
     from paramclient.cache import CachedComponent, ParamCache
-    from paramclient.service.followed_component import Followed
+    from paramclient.service.followed_component import FollowedComponent
     from paramclient.service.hub import Hub
 
 __all__ = [
-    "Elsewhere",
-    "FewPatterns",
-    "GivenFile",
-    "Moment",
+    "OtherComponent",
+    "LimitedPatterns",
+    "UploadedFile",
+    "Timestamp",
     "Number",
     "Patterns",
     "Source",
-    "LARGEST_UPLOAD",
-    "LONGEST_NAME",
-    "MOST_PATTERNS",
-    "MOST_VALUES",
-    "cached",
+    "PARAM_FILE_BYTES_MAX",
+    "FILE_NAME_LENGTH_MAX",
+    "PATTERNS_MAX",
+    "REQUEST_VALUES_MAX",
+    "load_cached_table",
     "check_size",
-    "key_of",
-    "known_to",
-    "known_set",
-    "parsed",
-    "past",
-    "read_upload",
-    "resolved",
-    "state",
-    "the_cache",
-    "written",
-    "when_of",
+    "wait_for_key",
+    "read_cache",
+    "current_set",
+    "read_file",
+    "load_cached_state",
+    "parse_upload",
+    "resolve_source",
+    "load_state",
+    "require_cache",
+    "flush_cache",
+    "parse_timestamp",
 ]
 
-MOST_VALUES: Final = 10_000
-"""Values of one request, and parameters of one file: more than a vehicle has."""
-MOST_PATTERNS: Final = 64
-"""Patterns of one request: each is compared with every name."""
-MOST_NAMES: Final = 10_000
-"""Names of one request, with its patterns: the page sends the names that were chosen, one by one."""
-LONGEST_NAME: Final = 255
-"""Characters of a file's name."""
-LATEST: Final = 253_402_300_799.0
-"""The last second of the year 9999: what stands beyond cannot be written as a date."""
+REQUEST_VALUES_MAX: Final = 10_000
+"""Maximum number of values of a request, and of parameters of a file: more than a vehicle has."""
+PATTERNS_MAX: Final = 64
+"""Maximum number of patterns of a request: each is compared with every name."""
+REQUEST_NAMES_MAX: Final = 10_000
+"""Maximum number of names and patterns of a request: the page sends all selected names."""
+FILE_NAME_LENGTH_MAX: Final = 255
+"""Maximum number of characters of a file's name."""
+TIMESTAMP_MAX: Final = 253_402_300_799.0
+"""Last second of the year 9999: later times have no date."""
 
 Result = TypeVar("Result")
 
 
-def when_of(text: object) -> object:
-    """A moment as a program writes it: unix seconds, or ISO 8601 with a zone."""
+def parse_timestamp(text: object) -> object:
+    """Parse a time: unix seconds, or ISO 8601 with a time zone.
+
+    Raises:
+        ValueError: the text is neither.
+    """
     if not isinstance(text, str):
         return text
     try:
@@ -92,60 +96,63 @@ def when_of(text: object) -> object:
     try:
         moment = datetime.fromisoformat(text)
     except ValueError:
-        raise ValueError("a time is unix seconds, or as 2026-11-20T14:00:00Z") from None
+        raise ValueError("a time must be unix seconds or ISO 8601 such as 2026-11-20T14:00:00Z") from None
     if moment.tzinfo is None:
-        raise ValueError("a time needs its zone, as in 2026-11-20T14:00:00Z")
+        raise ValueError("a time needs a time zone, as in 2026-11-20T14:00:00Z")
     return moment.timestamp()
 
 
-Moment = Annotated[float, BeforeValidator(when_of), Field(ge=0, le=LATEST, allow_inf_nan=False)]
-"""A time, in unix seconds when it is read."""
+Timestamp = Annotated[
+    float, BeforeValidator(parse_timestamp), Field(ge=0, le=TIMESTAMP_MAX, allow_inf_nan=False)
+]
+"""A time in unix seconds, also accepted as ISO 8601."""
 Id = Annotated[int, Field(ge=1, le=255)]
+"""A system or component id."""
 Number = Annotated[int, Field(ge=1, lt=1 << 62)]
+"""Number of a snapshot."""
 
 
-def _few_patterns(given: tuple[str, ...]) -> tuple[str, ...]:
-    if sum(map(is_pattern, given)) > MOST_PATTERNS:
-        raise ValueError(
-            f"at most {MOST_PATTERNS} of them may be patterns, with *, ? or [; the others are names"
-        )
+def _check_patterns(given: tuple[str, ...]) -> tuple[str, ...]:
+    if sum(map(is_pattern, given)) > PATTERNS_MAX:
+        raise ValueError(f"at most {PATTERNS_MAX} of the names may be patterns with *, ? or [")
     return given
 
 
-FewPatterns: Final = AfterValidator(_few_patterns)
-"""Stands with names and patterns of which few may be patterns."""
+LimitedPatterns: Final = AfterValidator(_check_patterns)
+"""Limits the number of patterns among names."""
 Patterns = Annotated[
     tuple[Annotated[str, Field(min_length=1, max_length=64)], ...],
-    Field(max_length=MOST_NAMES, fail_fast=True),
-    FewPatterns,
+    Field(max_length=REQUEST_NAMES_MAX, fail_fast=True),
+    LimitedPatterns,
 ]
-"""Names, and patterns of the shell."""
-Values = Annotated[dict[str, ValueGiven], InParts, Field(min_length=1, max_length=MOST_VALUES)]
+"""Names and shell patterns."""
+Values = Annotated[dict[str, ValueInput], InParts, Field(min_length=1, max_length=REQUEST_VALUES_MAX)]
 """Values by name."""
 
 
-class GivenFile(Body):
-    """A parameter file, as text or in base64. Its name may tell its form; `component` whose set is meant."""
+class UploadedFile(Body):
+    """A parameter file, as text or in base64. Its name can indicate its format; `component` selects one of
+    its sets."""
 
-    name: Annotated[str, Field(max_length=LONGEST_NAME)] = ""
+    name: Annotated[str, Field(max_length=FILE_NAME_LENGTH_MAX)] = ""
     text: str | None = None
     base64: str | None = None
     form: FileForm | None = None
     component: Id | None = None
 
     @model_validator(mode="after")
-    def _is_one(self) -> GivenFile:
+    def _is_one(self) -> UploadedFile:
         if (self.text is None) == (self.base64 is None):
-            raise ValueError("a file is given either as text or in base64")
+            raise ValueError("a file needs either `text` or `base64`")
         return self
 
     def read(self) -> ParamFile:
-        """The file. It takes its time.
+        """Parse the file. Blocks for up to seconds.
 
         Raises:
-            FileError: it cannot be read.
-            UsageError: it is not base64.
-            ServiceError: it is too large.
+            FileError: the file is invalid.
+            UsageError: the member is not base64.
+            ServiceError: the file is too large.
         """
         if self.text is not None:
             data = self.text.encode("utf-8", "surrogatepass")
@@ -153,210 +160,216 @@ class GivenFile(Body):
             try:
                 data = base64.b64decode(self.base64 or "", validate=True)
             except (binascii.Error, ValueError) as error:
-                raise UsageError(f"{self.name or 'the file'} is no base64: {error}") from None
-        return read_upload(data, self.name, self.form)
+                raise UsageError(f"{self.name or 'the file'} is not valid base64: {error}") from None
+        return parse_upload(data, self.name, self.form)
 
 
-class Elsewhere(Body):
-    """Another component that is heard."""
+class OtherComponent(Body):
+    """Another component on a link of the service."""
 
     system: Id
     component: Id
     link: Annotated[str, Field(max_length=200)] | None = None
 
 
-class Cached(Body):
-    """A component in the cache: as it was last known, in a snapshot, or at a time."""
+class CachedSource(Body):
+    """A component in the cache: its last known table, a snapshot, or its table at a time."""
 
     key: Annotated[str, Field(min_length=1, max_length=400)]
     component: Id
     snapshot: Number | None = None
-    at: Moment | None = None
+    at: Timestamp | None = None
 
 
 class Source(Body):
-    """Where parameters are taken from. One of the members stands, and no other.
+    """A parameter set of a request. Exactly one member is given.
 
-    `snapshot` (its number) and `at` are earlier states of the component that the request is about,
-    `component` is another one that is heard, `vehicle` one in the cache, `values` stand here, `defaults` are
-    the firmware's.
+    `snapshot` (its number) and `at` (a time) are earlier states of the component in the path, `component` is
+    another connected component, `vehicle` a component in the cache, `values` are given values, `defaults`
+    are the firmware's defaults.
     """
 
-    file: GivenFile | None = None
+    file: UploadedFile | None = None
     snapshot: Number | None = None
-    at: Moment | None = None
-    component: Elsewhere | None = None
-    vehicle: Cached | None = None
+    at: Timestamp | None = None
+    component: OtherComponent | None = None
+    vehicle: CachedSource | None = None
     values: Values | None = None
     defaults: Literal[True] | None = None
 
     @model_validator(mode="after")
     def _is_one(self) -> Source:
         if len(self.model_fields_set) != 1 or None in (getattr(self, name) for name in self.model_fields_set):
-            raise ValueError(f"a source has one of these members: {', '.join(type(self).model_fields)}")
+            raise ValueError(
+                f"a source needs exactly one of these members: {', '.join(type(self).model_fields)}"
+            )
         return self
 
 
-def read_upload(data: bytes, name: str, form: FileForm | None) -> ParamFile:
-    """A parameter file that somebody has sent. It takes its time.
+def parse_upload(data: bytes, name: str, form: FileForm | None) -> ParamFile:
+    """Parse a received parameter file. Blocks for up to seconds.
 
     Raises:
-        FileError: it cannot be read.
-        ServiceError: it is too large, or holds too many parameters.
+        FileError: the file is invalid.
+        ServiceError: the file exceeds a limit.
     """
-    check_size(len(data), LARGEST_UPLOAD)
-    check_pieces(data)
+    check_size(len(data), PARAM_FILE_BYTES_MAX)
+    check_separators(data)
     if not _has_no_lines(data, form):
-        check_lines(data)
+        check_line_lengths(data)
     try:
-        file = loads(data, source=name, form=form, params_max=MOST_VALUES)
-        TooManyParams.check(sum(map(len, file.sets)), MOST_VALUES, name)
+        file = loads(data, source=name, form=form, params_max=REQUEST_VALUES_MAX)
+        TooManyParams.check(sum(map(len, file.sets)), REQUEST_VALUES_MAX, name)
     except TooManyParams:
-        what = f"A file may hold {MOST_VALUES:,} parameters here, not more."
-        raise ServiceError(413, "too-large", what, most=MOST_VALUES) from None
+        what = f"A file may have at most {REQUEST_VALUES_MAX:,} parameters."
+        raise ServiceError(413, "too-large", what, most=REQUEST_VALUES_MAX) from None
     return file
 
 
 def _has_no_lines(data: bytes, form: FileForm | None) -> bool:
-    """Whether a file is JSON or packed, and so is never looked at line by line."""
+    """Return whether a file is JSON or packed, and therefore not parsed by lines."""
     if form is not None:
         return form in (FileForm.JSON, FileForm.PCK)
     return is_packed(data) or data.removeprefix(BOM_UTF8).lstrip().startswith(b"{")
 
 
-async def resolved(hub: Hub, target: Followed, source: Source) -> ParamSet:
-    """The parameters that a source stands for, of a request about this component.
+async def resolve_source(hub: Hub, target: FollowedComponent, source: Source) -> ParamSet:
+    """Return the parameter set of a source.
 
-    Another component that is heard is asked for its whole table.
+    Fetches the whole table of another connected component.
+
+    Args:
+        target: the component in the path.
 
     Raises:
-        ServiceError: there is no such component, vehicle, snapshot or state.
-        UsageError: it is `defaults`, which are no set of their own.
-        ParamClientError: it cannot be read, or not all of it came.
+        ServiceError: the component, vehicle, snapshot or state is unknown.
+        UsageError: the source is `defaults`, which are not a set of their own.
+        ParamClientError: the set cannot be read, or is incomplete.
     """
     if source.file is not None:
-        return _choose(await parsed(hub, source.file.read), target, source.file.component)
+        return _choose(await read_file(hub, source.file.read), target, source.file.component)
     if source.component is not None:
         where = source.component
-        other = hub.find(where.system, where.component, where.link)
-        found = await fetch_set(other.component, source=f"link {other.line.name}", run=hub.read_aside)
+        other = hub.find_component(where.system, where.component, where.link)
+        found = await fetch_set(other.component, source=f"link {other.link.name}", run=hub.run_in_file_thread)
         return found.set
     if source.vehicle is not None:
         kept = source.vehicle
         if kept.snapshot is not None and kept.at is not None:
-            raise UsageError("a state in the cache is a snapshot or that of a time, not both")
+            raise UsageError("`snapshot` and `at` exclude each other")
         when = kept.at if kept.snapshot is None else kept.snapshot
-        return await past(hub, kept.key, kept.component, when)
+        return await load_cached_state(hub, kept.key, kept.component, when)
     if source.values is not None:
-        return await _valued(hub, target, source.values)
+        return await _set_of_values(hub, target, source.values)
     if source.defaults:
-        raise UsageError("the firmware's defaults are a base to compare with, and nothing besides")
-    return await state(hub, target, source.at if source.snapshot is None else source.snapshot)
+        raise UsageError("the firmware's defaults can only be the base of a comparison")
+    return await load_state(hub, target, source.at if source.snapshot is None else source.snapshot)
 
 
-async def state(hub: Hub, target: Followed, when: float | int | None) -> ParamSet:
-    """An earlier state of a component that is heard.
+async def load_state(hub: Hub, target: FollowedComponent, when: float | int | None) -> ParamSet:
+    """Return an earlier state of a connected component.
 
     Args:
-        when: a float is a time, an int the number of a snapshot, None is before the last apply.
+        when: a float is a time in unix seconds, an int the number of a snapshot, None the state before the
+            last apply.
 
     Raises:
-        ServiceError: it is not known, or there is no cache.
+        ServiceError: the state is unknown, or there is no cache.
     """
-    cache = the_cache(hub)
-    key, component = await key_of(hub, target), target.component.component
+    cache = require_cache(hub)
+    key, component = await wait_for_key(hub, target), target.component.component
     if when is None:
-        return await known_to(hub, lambda: load_state_before_apply(cache, key, component))
-    return await past(hub, key, component, when)
+        return await read_cache(hub, lambda: load_state_before_apply(cache, key, component))
+    return await load_cached_state(hub, key, component, when)
 
 
-async def key_of(hub: Hub, target: Followed) -> str:
-    """The key under which a component is kept, when all that was heard of it is on the disk."""
+async def wait_for_key(hub: Hub, target: FollowedComponent) -> str:
+    """Wait for the identity of a component and return its key, after all received values are in the cache."""
     await wait_for_identity(target.component)
-    await written(hub)
+    await flush_cache(hub)
     return target.component.identity.key
 
 
-async def written(hub: Hub) -> None:
-    """Have everything on the disk that was heard so far.
+async def flush_cache(hub: Hub) -> None:
+    """Write all received values to the cache.
 
     Raises:
-        CacheError: it cannot be written, so that no answer from the cache would be the whole one.
+        CacheError: the cache cannot be written, so that reads from it would be incomplete.
     """
     for _, client in hub.clients():
         await local_client(client).cache_writer.write_all()
 
 
-async def past(hub: Hub, key: str, component: int, when: float | int | None) -> ParamSet:
-    """What the cache has of a component.
+async def load_cached_state(hub: Hub, key: str, component: int, when: float | int | None) -> ParamSet:
+    """Return a cached state of a component.
 
     Args:
-        when: a float is a time, an int the number of a snapshot, None is what was last known, if that is all.
+        when: a float is a time in unix seconds, an int the number of a snapshot, None the last known table
+            if it is complete.
 
     Raises:
-        ServiceError: the cache has no such vehicle, or not all of it, or no such state; or there is no cache.
+        ServiceError: the vehicle or state is unknown, the table is incomplete, or there is no cache.
     """
-    cache = the_cache(hub)
-    await cached(hub, key, component)
+    cache = require_cache(hub)
+    await load_cached_table(hub, key, component)
     if when is None:
-        return await known_to(hub, lambda: load_cached_set(cache, key, component))
-    return await known_to(hub, lambda: cache.state_at(key, component, when))
+        return await read_cache(hub, lambda: load_cached_set(cache, key, component))
+    return await read_cache(hub, lambda: cache.state_at(key, component, when))
 
 
-async def cached(hub: Hub, key: str, component: int) -> CachedComponent:
-    """A table in the cache.
+async def load_cached_table(hub: Hub, key: str, component: int) -> CachedComponent:
+    """Return a table in the cache.
 
     Raises:
-        ServiceError: there is none of this key.
+        ServiceError: the table is unknown.
     """
-    cache = the_cache(hub)
-    await written(hub)
-    table = await hub.aside(lambda: cache.load(key, component))
+    cache = require_cache(hub)
+    await flush_cache(hub)
+    table = await hub.run_in_thread(lambda: cache.load(key, component))
     if table is None:
-        what = f"The cache has no table of component {component} of a vehicle {key!r}."
+        what = f"The cache has no table of component {component} of vehicle {key!r}."
         raise ServiceError(404, "unknown-vehicle", what)
     return table
 
 
-def the_cache(hub: Hub) -> ParamCache:
-    """Where tables are kept.
+def require_cache(hub: Hub) -> ParamCache:
+    """Return the cache.
 
     Raises:
-        ServiceError: nowhere.
+        ServiceError: there is no cache.
     """
     if hub.cache is None:
-        raise ServiceError(
-            409, "no-cache", "This service keeps no cache, and so knows nothing of earlier times."
-        )
+        raise ServiceError(409, "no-cache", "The service runs without a cache and has no earlier states.")
     return hub.cache
 
 
-async def known_to(hub: Hub, look: Callable[[], Result]) -> Result:
-    """What the cache knows.
+async def read_cache(hub: Hub, look: Callable[[], Result]) -> Result:
+    """Read from the cache in a worker thread.
 
     Raises:
-        ServiceError: it can be read, and does not know it.
-        CacheError: it cannot be read.
+        ServiceError: 404, the cache has no such state.
+        CacheError: the cache cannot be read.
     """
     try:
-        return await hub.aside(look)
-    except (NotInCache, UnknownVehicle) as error:  # the latter where another program has just removed it
+        return await hub.run_in_thread(look)
+    except (NotInCache, UnknownVehicle) as error:  # UnknownVehicle: removed by another program
         raise ServiceError(404, "unknown-state", str(error), error=type(error).__name__) from error
 
 
-async def known_set(target: Followed, run: Runner) -> FetchedSet:
-    """The table of a component as it stands here, if all of it was heard or confirmed in this session.
+async def current_set(target: FollowedComponent, run: Runner) -> FetchedSet:
+    """Return the current table of a component without requests, if it was received or verified in this
+    session.
 
     Args:
         target: the component.
-        run: runs what takes long for a large table.
+        run: runs the work, which is long for a large table.
 
     Raises:
-        ServiceError: it was not; the vehicle has to be asked.
+        ServiceError: the table is incomplete or not verified, and must be fetched.
     """
     component = target.component
     table, count = copy_params(component.params), component.count
-    system, number, identity, at = component.system, component.component, component.identity, time.time()
+    to_set = set_maker(component, f"link {target.link.name}")
 
     def take() -> FetchedSet:
         params = list(table.values())
@@ -364,45 +377,46 @@ async def known_set(target: Followed, run: Runner) -> FetchedSet:
         listed = sum(param.index is not None for param in params)
         if not params or unsure or count is None or listed < count:
             told = f"{listed - unsure} of {'?' if count is None else count}"
-            what = f"{told} parameters were heard or confirmed in this session; fetch them first."
+            what = f"{told} parameters were received or verified in this session. Fetch the table first."
             raise ServiceError(409, "incomplete", what)
-        source = f"link {target.line.name}"
-        found = ParamSet.of(params, component=number, system=system, identity=identity, at=at, source=source)
-        return FetchedSet(found, params, ())
+        return FetchedSet(to_set(params), params, ())
 
     return await run(take)
 
 
 def check_size(size: int, most: int) -> None:
-    """See that what somebody sends is not too large.
+    """Check the size of received data.
 
     Raises:
-        ServiceError: it is.
+        ServiceError: 413, the data is too large.
     """
     if size > most:
-        raise ServiceError(413, "too-large", f"A file may have {most:,} bytes here, not more.", most=most)
+        raise ServiceError(413, "too-large", f"A file may have at most {most:,} bytes.", most=most)
 
 
-async def parsed(hub: Hub, read: Callable[[], ParamFile]) -> ParamFile:
-    """Read a file in a thread: a long one takes seconds, and others have files too.
+async def read_file(hub: Hub, read: Callable[[], ParamFile]) -> ParamFile:
+    """Parse a file in the file thread.
 
     Raises:
-        FileError: it cannot be read.
+        FileError: the file is invalid.
     """
-    return await hub.read_aside(read)
+    return await hub.run_in_file_thread(read)
 
 
-def _choose(file: ParamFile, target: Followed, component: int | None) -> ParamSet:
-    """What a file has for a component; the system counts only in a file that has several."""
+def _choose(file: ParamFile, target: FollowedComponent, component: int | None) -> ParamSet:
+    """Return the set of a file for a component; system ids count only in a file with several systems."""
     is_of_several = len({each.system for each in file.sets}) > 1
     wanted = target.component.component if component is None else component
     return file.choose(wanted, system=target.component.system if is_of_several else None)
 
 
-async def _valued(hub: Hub, target: Followed, values: dict[str, ValueGiven]) -> ParamSet:
-    """Values as a set. What bits mean tells the vehicle, one by one; the others are read in a thread."""
+async def _set_of_values(hub: Hub, target: FollowedComponent, values: dict[str, ValueInput]) -> ParamSet:
+    """Return values as a set. Types of bits are read from the vehicle; other values are parsed in a
+    thread."""
     of_bits = {
-        name: await value_of(target, name, given) for name, given in values.items() if isinstance(given, Bits)
+        name: await resolve_value(target, name, given)
+        for name, given in values.items()
+        if isinstance(given, Bits)
     }
     metadata = target.metadata
 
@@ -411,10 +425,10 @@ async def _valued(hub: Hub, target: Followed, values: dict[str, ValueGiven]) -> 
             {
                 name: WrittenParam(
                     check_name(name),
-                    value_meant(metadata, name, given) if not isinstance(given, Bits) else of_bits[name],
+                    parse_value(metadata, name, given) if not isinstance(given, Bits) else of_bits[name],
                 )
                 for name, given in values.items()
             }
         )
 
-    return await hub.read_aside(work)
+    return await hub.run_in_file_thread(work)

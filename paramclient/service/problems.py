@@ -1,4 +1,4 @@
-"""Every error as a problem document of RFC 9457: the library's, FastAPI's, and our own."""
+"""Errors as problem documents (RFC 9457): those of the library, of FastAPI, and of the service."""
 
 from __future__ import annotations
 
@@ -38,25 +38,26 @@ from paramclient.errors import (
     VehicleError,
 )
 
-__all__ = ["RESPONSES", "ServiceError", "install", "problem_of", "problem_response"]
+__all__ = ["RESPONSES", "ServiceError", "install_handlers", "problem_of", "problem_response"]
 
-MEDIA_TYPE: Final = "application/problem+json"
-MOST_FAULTS: Final = 20
-"""Faults of one request that are named: a body of megabytes may have one in each member."""
-LONGEST_TEXT: Final = 200
-"""Characters of a member's name that are repeated."""
+PROBLEM_MEDIA_TYPE: Final = "application/problem+json"
+"""Media type of problems."""
+FAULTS_MAX: Final = 20
+"""Maximum number of listed errors of one request: a body of megabytes may have one in each member."""
+MEMBER_NAME_LENGTH_MAX: Final = 200
+"""Maximum number of characters of a member's name in an error."""
 
 logger = logging.getLogger(__name__)
 
 
 class ServiceError(Exception):
-    """What the service itself cannot do.
+    """An error of the service itself.
 
     Args:
-        status: HTTP's number for it.
-        kind: its name, for programs.
-        detail: a sentence.
-        members: what else is known.
+        status: HTTP status code.
+        kind: name of the problem, for programs.
+        detail: text for users.
+        members: further members of the problem.
     """
 
     def __init__(self, status: int, kind: str, detail: str, **members: Any) -> None:
@@ -67,9 +68,9 @@ class ServiceError(Exception):
 
 
 def problem_of(error: Exception) -> Problem:
-    """An exception as a document.
+    """Return an exception as a problem document.
 
-    Of one that is not on purpose nothing is told but that it happened.
+    An unexpected exception is reported without details, which are logged.
     """
     if isinstance(error, ServiceError):
         return _problem(error.status, error.kind, str(error), error.members)
@@ -78,17 +79,17 @@ def problem_of(error: Exception) -> Problem:
         members = {name: _json(value) for name, value in vars(error).items() if not name.startswith("_")}
         named = {"error": type(error).__name__, **{k: v for k, v in members.items() if k not in _TAKEN}}
         return _problem(status, kind or _hyphened(type(error).__name__), str(error), named)
-    return _problem(500, "internal", "The service has failed at this; its log says more.", {})
+    return _problem(500, "internal", "Internal error of the service. Its log has the details.", {})
 
 
 def problem_response(problem: Problem, headers: Mapping[str, str] | None = None) -> Response:
-    """A document as an answer."""
+    """Return the response with a problem document."""
     content = json.dumps(problem.as_json(), allow_nan=False)
-    return Response(content, problem.status, headers=dict(headers or {}), media_type=MEDIA_TYPE)
+    return Response(content, problem.status, headers=dict(headers or {}), media_type=PROBLEM_MEDIA_TYPE)
 
 
-def install(app: FastAPI) -> None:
-    """Let an application answer with nothing else, in place of its own handlers."""
+def install_handlers(app: FastAPI) -> None:
+    """Replace the exception handlers of an application."""
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(WebSocketRequestValidationError, _invalid)
     app.add_exception_handler(HTTPException, _refused)
@@ -101,20 +102,20 @@ RESPONSES: Final[dict[int | str, dict[str, Any]]] = {
     "default": {
         "model": Problem,
         "description": "A problem (RFC 9457)",
-        "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
+        "content": {PROBLEM_MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
     }
 }
-"""What every route may answer besides, for the document of the API."""
+"""Errors that every route can return, for the OpenAPI document."""
 
 
 async def _invalid(request: HTTPConnection, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError | WebSocketRequestValidationError)
     faults = [
         {"where": _where(fault.get("loc", ())), "what": str(fault.get("msg", ""))}
-        for fault in error.errors()[:MOST_FAULTS]
+        for fault in error.errors()[:FAULTS_MAX]
     ]
-    told = "; ".join(f"{fault['where']}: {fault['what']}" for fault in faults)
-    return await _answer(request, _problem(422, "invalid-request", told, {"faults": faults}))
+    detail = "; ".join(f"{fault['where']}: {fault['what']}" for fault in faults)
+    return await _answer(request, _problem(422, "invalid-request", detail, {"faults": faults}))
 
 
 async def _refused(request: Request, error: Exception) -> Response:
@@ -130,7 +131,7 @@ async def _refused(request: Request, error: Exception) -> Response:
 
 
 def _methods(request: Request) -> list[str]:
-    """What the address of a request knows, of all routes that lead there: a 405 has to say it (RFC 9110)."""
+    """Return the methods of all routes with the path of a request: a 405 must name them (RFC 9110)."""
     routes = request.app.router.routes
     known = ["OPTIONS"]
     for method in ("DELETE", "GET", "PATCH", "POST", "PUT"):
@@ -148,7 +149,7 @@ async def _failed(request: HTTPConnection, error: Exception) -> Response:
 
 
 async def _answer(request: HTTPConnection, problem: Problem) -> Response:
-    """Answer with a problem; a WebSocket that is not open yet is refused with it."""
+    """Respond with a problem. A WebSocket that is not open yet is rejected with it."""
     response = problem_response(problem)
     if isinstance(request, WebSocket):
         await request.send_denial_response(response)
@@ -161,7 +162,8 @@ def _problem(status: int, kind: str, detail: str, members: Mapping[str, Any]) ->
 
 
 def _json(value: Any) -> Any:
-    """What an exception knows as JSON: numbers and words stay, a type by its name, bytes as digits."""
+    """Return an attribute of an exception as JSON: numbers and texts unchanged, types by name, bytes as
+    hexadecimal digits."""
     match value:
         case None | bool() | str():
             return value
@@ -184,11 +186,11 @@ def _infinity(value: float) -> str:
 
 
 def _where(place: Iterable[object]) -> str:
-    return ".".join(str(part)[:LONGEST_TEXT] for part in place) or "request"
+    return ".".join(str(part)[:MEMBER_NAME_LENGTH_MAX] for part in place) or "request"
 
 
 def _hyphened(name: str) -> str:
-    """`UnknownParameter`, and `Not Found`, as `unknown-parameter` and `not-found`."""
+    """Return `UnknownParameter` or `Not Found` as `unknown-parameter` or `not-found`."""
     return re.sub("[ -]*([A-Z])", r"-\1", name).strip("-").lower()
 
 
@@ -201,8 +203,8 @@ def _phrase(status: int) -> str:
 
 _TAKEN: Final = frozenset({"type", "title", "status", "detail", "error"})
 _OF_HTTP: Final = {
-    404: ("not-found", "There is nothing at this address."),
-    405: ("method-not-allowed", "This address knows other methods only."),
+    404: ("not-found", "This path does not exist."),
+    405: ("method-not-allowed", "This path does not support the method. The header Allow lists its methods."),
 }
 _KINDS: Final[dict[type[ParamClientError], tuple[int, str | None]]] = {
     UnknownParameter: (404, None),

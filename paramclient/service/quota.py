@@ -1,62 +1,115 @@
-"""How much of one kind of work may be under way at once: of one holder, and of all."""
+"""Quotas: the maximum number of requests of one kind in progress, of one holder and of all."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from typing import Final
+
+import anyio
 
 from paramclient.service.problems import ServiceError
 
-__all__ = ["LONG_REQUESTS_MAX", "LONG_REQUESTS_OF_ONE", "Quota"]
+__all__ = [
+    "LARGE_GETS_MAX",
+    "LARGE_GETS_OF_HOLDER_MAX",
+    "LARGE_POSTS_MAX",
+    "LARGE_POSTS_OF_HOLDER_MAX",
+    "LONG_REQUESTS_MAX",
+    "LONG_REQUESTS_OF_HOLDER_MAX",
+    "Quota",
+]
 
 LONG_REQUESTS_MAX: Final = 64
-"""Requests of all holders that parse a long body, compare or plan, and are not answered yet."""
-LONG_REQUESTS_OF_ONE: Final = 8
-"""Those of one holder: they share one thread, and each may keep it for seconds."""
+"""Maximum number of long requests in progress: parsing a long body, comparing, planning."""
+LONG_REQUESTS_OF_HOLDER_MAX: Final = 8
+"""Maximum number of long requests of one holder: they share one thread, and each occupies it for seconds."""
+LARGE_GETS_MAX: Final = 64
+"""Maximum number of large responses to GET that are created or sent. Each takes up to 2 MB, and its tables
+another 2 MB."""
+LARGE_GETS_OF_HOLDER_MAX: Final = 8
+"""Maximum number of large responses to GET for one holder. Further requests wait."""
+LARGE_POSTS_MAX: Final = 128
+"""Maximum number of large responses to POST, such as comparisons. `LONG_REQUESTS_MAX` limits how many are
+created at once."""
+LARGE_POSTS_OF_HOLDER_MAX: Final = 16
+"""Maximum number of large responses to POST for one holder. Further requests wait."""
 
 
 class Quota:
-    """Counts what is under way.
+    """Counts requests in progress, per holder and in total.
 
     Args:
-        what: for messages, in the plural.
-        most: of all holders together.
-        most_of_one: of one holder.
+        what: name of the counted requests in error messages, in the plural.
+        most: maximum of all holders together.
+        most_of_holder: maximum of one holder.
     """
 
-    def __init__(self, what: str, *, most: int, most_of_one: int) -> None:
+    def __init__(self, what: str, *, most: int, most_of_holder: int) -> None:
         self._what = what
         self._most = most
-        self._most_of_one = most_of_one
-        self._held: Counter[str] = Counter()
+        self._most_of_holder = most_of_holder
+        self._slots = anyio.Semaphore(most)
+        self._holders: dict[str, _HolderSlots] = {}
+
+    def __len__(self) -> int:
+        """Return the number of holders that have a slot or wait for one."""
+        return len(self._holders)
 
     @contextmanager
     def hold(self, holder: str) -> Iterator[None]:
-        """Count one more of this holder, for as long as the block lasts.
+        """Occupy a slot of this holder within the block.
 
         Raises:
-            ServiceError: 429, the holder has as many as it may, or all together have.
+            ServiceError: 429, the holder has no free slot, or all slots are occupied.
         """
-        self.check(holder, self._held)
-        self._held[holder] += 1
+        with self._slots_of(holder) as own:
+            self._take(own, f"{self._most_of_holder} {self._what} of yours", self._most_of_holder)
+            try:
+                self._take(self._slots, f"{self._most} {self._what}", self._most)
+                try:
+                    yield
+                finally:
+                    self._slots.release()
+            finally:
+                own.release()
+
+    @asynccontextmanager
+    async def wait(self, holder: str) -> AsyncIterator[None]:
+        """Occupy a slot of this holder within the block. Wait until one is free, in the order of arrival."""
+        with self._slots_of(holder) as own:
+            async with own, self._slots:
+                yield
+
+    @contextmanager
+    def _slots_of(self, holder: str) -> Iterator[anyio.Semaphore]:
+        own = self._holders.setdefault(holder, _HolderSlots(self._most_of_holder))
+        own.users += 1
         try:
-            yield
+            yield own.slots
         finally:
-            self._held[holder] -= 1
-            if not self._held[holder]:
-                del self._held[holder]
+            own.users -= 1
+            if not own.users:
+                del self._holders[holder]
 
-    def check(self, holder: str, held: Counter[str]) -> None:
-        """See that there may be one more of this holder, where so many are under way of each.
+    @staticmethod
+    def _take(slots: anyio.Semaphore, occupied: str, most: int) -> None:
+        try:
+            slots.acquire_nowait()
+        except anyio.WouldBlock:
+            raise ServiceError(
+                429, "too-many", f"{occupied} are already in progress. Try again later.", most=most
+            ) from None
 
-        Raises:
-            ServiceError: 429, there may not.
-        """
-        if held[holder] >= self._most_of_one:
-            told = f"{self._most_of_one} {self._what} of yours are under way already."
-            raise ServiceError(429, "too-many", told, most=self._most_of_one)
-        if held.total() >= self._most:
-            told = f"{self._most} {self._what} are under way already."
-            raise ServiceError(429, "too-many", told, most=self._most)
+
+class _HolderSlots:
+    """The slots of one holder.
+
+    Attributes:
+        slots: its free slots.
+        users: number of requests that have a slot or wait for one.
+    """
+
+    def __init__(self, most: int) -> None:
+        self.slots = anyio.Semaphore(most)
+        self.users = 0

@@ -1,4 +1,4 @@
-"""A request as those see it who decide whether it is let in, and why it is not."""
+"""Parsed requests for the access checks, and their rejection."""
 
 from __future__ import annotations
 
@@ -8,77 +8,96 @@ from dataclasses import dataclass, field
 from typing import Any, Final, TypeAlias
 from urllib.parse import unquote
 
-from paramclient.service.client_address import Network, first_beyond, forwarded_for, is_in, network_of, parsed
+from paramclient.service.client_address import (
+    Network,
+    client_behind,
+    client_network,
+    is_in_networks,
+    parse_address,
+    parse_forwarded,
+)
 
 __all__ = [
-    "ASK",
-    "HOST",
-    "LARGEST_DESCRIPTION",
-    "LARGEST_UPLOAD",
+    "BEARER_CHALLENGE",
+    "HOST_PATTERN",
+    "METADATA_BYTES_MAX",
+    "PARAM_FILE_BYTES_MAX",
     "SESSION_PATH",
-    "Denied",
+    "RequestDenied",
     "Request",
     "Scope",
 ]
 
 Scope: TypeAlias = MutableMapping[str, Any]
 
-MOST_HEADERS: Final = 64
-LONGEST_HEADERS: Final = 16 * 1024
-"""How many headers a request has, and how long they are together. Browsers send about 15 with 1 kB."""
-LONGEST_TARGET: Final = 8 * 1024
-"""Bytes of path and query."""
-LONGEST_BODY: Final = 64 * 1024
-"""Bytes of a body that has neither values nor a file in it."""
-LONGEST_VALUES: Final = 3 * 1024 * 1024
-"""Bytes of a body with values, or with files in JSON: the largest file in base64, and what stands beside."""
-LARGEST_UPLOAD: Final = 2 * 1024 * 1024
-"""Bytes of a parameter file that somebody sends: ten thousand parameters in the longest of the forms. To read
-more takes more than a few seconds, in which everybody else has half of the processor."""
-LARGEST_DESCRIPTION: Final = 8 * 1024 * 1024
-"""Bytes of a file that describes parameters: ArduPilot's for one vehicle has half of that."""
+HEADERS_MAX: Final = 64
+"""Maximum number of headers of a request. Browsers send about 15."""
+HEADER_BYTES_MAX: Final = 16 * 1024
+"""Maximum size of all headers of a request in bytes. Browsers send about 1 kB."""
+TARGET_BYTES_MAX: Final = 8 * 1024
+"""Maximum size of path and query in bytes."""
+PLAIN_BODY_BYTES_MAX: Final = 64 * 1024
+"""Maximum size in bytes of a body without values or files."""
+VALUES_BODY_BYTES_MAX: Final = 3 * 1024 * 1024
+"""Maximum size in bytes of a body with values, or with files in JSON: the largest file in base64, and other
+members."""
+PARAM_FILE_BYTES_MAX: Final = 2 * 1024 * 1024
+"""Maximum size of a parameter file in bytes: ten thousand parameters in the longest format. Parsing a larger
+file would take half of the processor for more than some seconds."""
+METADATA_BYTES_MAX: Final = 8 * 1024 * 1024
+"""Maximum size of a metadata file in bytes: ArduPilot's file of one vehicle has half of it."""
 
 SESSION_PATH: Final = "/api/v1/session"
-READ_BY_POST: Final = frozenset(
+"""Path of the sessions of browsers."""
+READING_POSTS: Final = frozenset(
     {"diff", "fetch", "files", "find", "metadata", "plan", "read", "refreshed", "successor", "verify"}
 )
-"""What asks by POST and changes nothing, by the last part of its path. All other methods than GET, and all
-other POSTs, need a token that may write: what is forgotten here is forbidden."""
-HOST: Final = re.compile(r"(?P<name>\[[0-9A-Fa-f:.]{2,45}\]|[A-Za-z0-9._-]{1,253})(?::(?P<port>[0-9]{1,5}))?")
-"""A name or an address, and a port."""
-ONCE: Final = (
+"""Last part of the paths whose POST changes nothing. All other POST requests, and methods other than GET,
+require write permission, so that a forgotten path is rejected."""
+HOST_PATTERN: Final = re.compile(
+    r"(?P<name>\[[0-9A-Fa-f:.]{2,45}\]|[A-Za-z0-9._-]{1,253})(?::(?P<port>[0-9]{1,5}))?"
+)
+"""A host name or an address, with an optional port."""
+UNIQUE_HEADERS: Final = (
     *(b"host", b"origin", b"authorization", b"content-type", b"content-length", b"transfer-encoding"),
     *(b"sec-fetch-site", b"sec-fetch-mode", b"sec-fetch-dest", b"x-asker"),
 )
-"""Headers that decide something: of two, what is behind here might take the other one."""
-LONG_BODIES: Final = {
-    ("POST", "apply"): LONGEST_VALUES,
-    ("POST", "diff"): LONGEST_VALUES,
-    ("POST", "plan"): LONGEST_VALUES,
-    ("POST", "verify"): LONGEST_VALUES,
-    ("PATCH", "params"): LONGEST_VALUES,
-    ("POST", "files"): LARGEST_UPLOAD,
-    ("PUT", "metadata"): LARGEST_DESCRIPTION,
+"""Headers that must not be repeated: the application could use another value than the access checks."""
+BODY_BYTES_MAX_BY_PATH: Final = {
+    ("POST", "apply"): VALUES_BODY_BYTES_MAX,
+    ("POST", "diff"): VALUES_BODY_BYTES_MAX,
+    ("POST", "plan"): VALUES_BODY_BYTES_MAX,
+    ("POST", "verify"): VALUES_BODY_BYTES_MAX,
+    ("PATCH", "params"): VALUES_BODY_BYTES_MAX,
+    ("POST", "files"): PARAM_FILE_BYTES_MAX,
+    ("PUT", "metadata"): METADATA_BYTES_MAX,
 }
-"""Bytes of the bodies with values and files, by method and the last part of the path."""
-_LARGE_READS: Final = frozenset(
+"""Maximum size in bytes of bodies with values or files, by method and the last part of the path."""
+_LARGE_GETS: Final = frozenset(
     {
         *("components", "file", "history", "jobs", "metadata", "metrics", "openapi.json", "params"),
         *("snapshots", "state", "vehicles"),
     }
 )
-LARGE_ANSWERS: Final = {
-    "GET": _LARGE_READS,
-    "HEAD": _LARGE_READS,
+LARGE_RESPONSES: Final = {
+    "GET": _LARGE_GETS,
+    "HEAD": _LARGE_GETS,
     "POST": frozenset({"diff", "files", "metadata", "plan", "verify"}),
 }
-"""What may be answered with megabytes, by method and the last part of the path or the one before a name."""
-ASK: Final = [(b"www-authenticate", b'Bearer realm="paramclient"')]
-"""What goes with 401."""
+"""Paths whose responses can have megabytes, by method: the last part of the path, or the one before an id."""
+BEARER_CHALLENGE: Final = [(b"www-authenticate", b'Bearer realm="paramclient"')]
+"""Header of a response with status 401."""
 
 
-class Denied(Exception):
-    """A request that goes no further."""
+class RequestDenied(Exception):
+    """The access checks reject a request.
+
+    Attributes:
+        status: HTTP status code.
+        kind: name of the problem, for programs.
+        detail: text for users.
+        headers: additional response headers.
+    """
 
     def __init__(
         self, status: int, kind: str, detail: str, headers: Iterable[tuple[bytes, bytes]] = ()
@@ -92,12 +111,15 @@ class Denied(Exception):
 
 @dataclass(slots=True)
 class Request:
-    """What is looked at of a request, read in one way only.
+    """A request as the access checks see it. Each header has one interpretation.
 
     Attributes:
-        scope: that of ASGI.
-        proxies: those whose word is taken for whom they forward.
-        address: where it comes from; "here" where there is no address.
+        scope: ASGI scope.
+        proxies: trusted proxies.
+        headers: names in lower case, and values.
+        method: HTTP method; GET for a WebSocket.
+        path: decoded path.
+        address: address of the client; "here" if there is none.
     """
 
     scope: Scope
@@ -114,26 +136,34 @@ class Request:
         self.address = self._peer
 
     def header(self, name: bytes) -> bytes | None:
-        """The value of a header that comes once at most.
+        """Return the value of a header, or None.
 
         Raises:
-            Denied: it comes more than once.
+            RequestDenied: the header is repeated.
         """
         values = [value for key, value in self.headers if key == name]
         if len(values) > 1:
-            raise Denied(400, "bad-request", f"{name.decode('latin-1')} comes more than once.")
+            raise RequestDenied(400, "bad-request", f"The header {name.decode('latin-1')} is repeated.")
         return values[0] if values else None
 
-    def check_shape(self) -> None:
-        """See that it is short, and means one thing to everyone who reads it."""
-        for name in ONCE:
+    def check_format(self) -> None:
+        """Check sizes and the format of headers and path.
+
+        Raises:
+            RequestDenied: a limit is exceeded, or the request is ambiguous.
+        """
+        for name in UNIQUE_HEADERS:
             self.header(name)
-        if len(self.headers) > MOST_HEADERS or sum(map(_length, self.headers)) > LONGEST_HEADERS:
-            raise Denied(431, "headers-too-large", "The headers are too many or too long.")
+        if len(self.headers) > HEADERS_MAX or sum(map(_length, self.headers)) > HEADER_BYTES_MAX:
+            raise RequestDenied(
+                431,
+                "headers-too-large",
+                f"A request may have {HEADERS_MAX} headers and {HEADER_BYTES_MAX} bytes of headers.",
+            )
         raw = self.scope.get("raw_path") or self.path.encode()
-        if len(raw) + len(self.scope.get("query_string", b"")) > LONGEST_TARGET:
-            raise Denied(414, "address-too-long", "The address is too long.")
-        # a slash that is written %2F belongs to a name, as to that of a serial port
+        if len(raw) + len(self.scope.get("query_string", b"")) > TARGET_BYTES_MAX:
+            raise RequestDenied(414, "address-too-long", f"Path and query may have {TARGET_BYTES_MAX} bytes.")
+        # %2F is a slash within a name, such as that of a serial port
         parts = [unquote(part) for part in raw.decode("ascii", "replace").split("/")]
         is_plain = (
             raw.startswith(b"/")
@@ -142,81 +172,100 @@ class Request:
             and not _UNPRINTABLE.search(self.path)
         )
         if not is_plain:
-            raise Denied(400, "bad-path", "This is no path: it is not in its plain form.")
+            raise RequestDenied(
+                400, "bad-path", "The path is not in normal form: it has empty, dot or unprintable parts."
+            )
         if self.header(b"transfer-encoding") is not None and self.header(b"content-length") is not None:
-            raise Denied(400, "bad-request", "A body has a length or is sent in chunks, not both.")
+            raise RequestDenied(
+                400, "bad-request", "Content-Length and Transfer-Encoding exclude each other."
+            )
 
     @property
-    def says_body(self) -> bool:
-        """Whether anything in it says that a body follows, right or wrong."""
+    def announces_body(self) -> bool:
+        """Return whether a header announces a body, valid or not."""
         return any(name in (b"content-length", b"transfer-encoding") for name, _ in self.headers)
 
     @property
     def length(self) -> int | None:
-        """How long it says that its body is."""
+        """Return the value of Content-Length, or None.
+
+        Raises:
+            RequestDenied: the value is not a number.
+        """
         length = self.header(b"content-length")
         if length is None:
             return None
         if not length.isdigit() or len(length) > 18:
-            raise Denied(400, "bad-request", "Content-Length is no number.")
+            raise RequestDenied(400, "bad-request", "Content-Length is not a number.")
         return int(length)
 
     @property
     def has_body(self) -> bool:
+        """Return whether a body follows."""
         return bool(self.length) or self.header(b"transfer-encoding") is not None
 
     @property
-    def longest_body(self) -> int:
-        """Bytes that its body may have."""
-        return LONG_BODIES.get((self.method, self.path.rpartition("/")[2]), LONGEST_BODY)
+    def body_bytes_max(self) -> int:
+        """Return the maximum size of the body in bytes."""
+        return BODY_BYTES_MAX_BY_PATH.get((self.method, self.path.rpartition("/")[2]), PLAIN_BODY_BYTES_MAX)
 
-    def check_content(self) -> None:
-        """See that it may have a body, of a kind that no page elsewhere can send without asking first."""
+    def check_content_type(self) -> None:
+        """Check that the method permits a body, and that a foreign page cannot send its type without a
+        preflight request.
+
+        Raises:
+            RequestDenied: the method or the content type is not permitted.
+        """
         if self.method not in ("POST", "PUT", "PATCH"):
-            raise Denied(400, "bad-request", f"{self.method:.10} has no body.")
+            raise RequestDenied(
+                400, "bad-request", f"A request with the method {self.method:.10} must not have a body."
+            )
         given = (self.header(b"content-type") or b"").split(b";")[0].strip().lower()
         if given not in (b"application/json", b"application/octet-stream"):
-            raise Denied(
-                415, "content-type", "A body is application/json, or application/octet-stream for a file."
+            raise RequestDenied(
+                415,
+                "content-type",
+                "The content type must be application/json, or application/octet-stream for a file.",
             )
 
     @property
     def _host(self) -> re.Match[str]:
         given = self.header(b"host")
-        found = HOST.fullmatch("" if given is None else given.decode("latin-1"))
+        found = HOST_PATTERN.fullmatch("" if given is None else given.decode("latin-1"))
         if found is None:
-            raise Denied(400, "bad-request", "Host names no host.")
+            raise RequestDenied(400, "bad-request", "The header Host is missing or not a host name.")
         return found
 
     @property
     def host_name(self) -> str:
-        """The name or address by which the service was called."""
+        """Return the host name or address in Host."""
         return self._host["name"].strip("[]").lower().removesuffix(".")
 
     @property
     def own_origin(self) -> str:
-        """The origin of a page that comes from here."""
+        """Return the origin of pages of this service."""
         return f"{'https' if self.is_secure else 'http'}://{self._host[0].lower()}"
 
     @property
     def origin(self) -> str | None:
-        """The origin of the page that asks, if one does."""
+        """Return the origin of the requesting page, or None."""
         origin = self.header(b"origin")
         return None if origin is None else origin.decode("latin-1").lower()
 
     @property
     def is_secure(self) -> bool:
+        """Return whether the connection uses TLS."""
         return self.scope.get("scheme") in ("https", "wss")
 
     @property
     def is_preflight(self) -> bool:
-        """Whether a browser asks what a page may ask."""
+        """Return whether the request is a CORS preflight request."""
         asked = self.header(b"access-control-request-method")
         return self.method == "OPTIONS" and self.origin is not None and asked is not None
 
     @property
     def is_public(self) -> bool:
-        """Whether it needs no token: the page that asks for one, and whether anybody is there."""
+        """Return whether the request needs no token: the page with its login, and the health check."""
         if self.path == SESSION_PATH:
             return self.method in ("POST", "DELETE")
         is_page = self.path in ("/", "/health", "/favicon.ico") or self.path.startswith("/page/")
@@ -224,44 +273,52 @@ class Request:
 
     @property
     def is_page(self) -> bool:
+        """Return whether the path belongs to the web page or the API reference."""
         return self.path in ("/", "/docs") or self.path.startswith(("/page/", "/docs/"))
 
     @property
-    def changes(self) -> bool:
-        """Whether it may change something."""
+    def is_change(self) -> bool:
+        """Return whether the request can change something."""
         if self.scope["type"] == "websocket" or self.method in ("GET", "HEAD", "OPTIONS"):
             return False
         if self.method == "DELETE" and self.path.startswith("/api/v1/jobs/"):
-            return False  # whoever may begin a download may end it; of other jobs the route asks
-        return self.method != "POST" or self.path.rpartition("/")[2] not in READ_BY_POST
+            return False  # readers may cancel fetches; the route checks other jobs
+        return self.method != "POST" or self.path.rpartition("/")[2] not in READING_POSTS
 
     @property
-    def has_large_answer(self) -> bool:
-        """Whether its answer may have megabytes."""
+    def has_large_response(self) -> bool:
+        """Return whether the response can have megabytes."""
         *_, before, last = ("", "", *self.path.split("/"))
-        names = LARGE_ANSWERS.get(self.method, frozenset())
+        names = LARGE_RESPONSES.get(self.method, frozenset())
         return self.scope["type"] == "http" and (last in names or before in {"jobs", "snapshots"} & names)
 
     @property
     def token(self) -> bytes | None:
-        """The token that it shows."""
+        """Return the bearer token, or None.
+
+        Raises:
+            RequestDenied: the header Authorization has another scheme.
+        """
         given = self.header(b"authorization")
         if given is None:
             return None
         scheme, _, token = given.partition(b" ")
         if scheme.lower() != b"bearer" or not token.strip():
-            raise Denied(401, "unauthenticated", "A token is shown as `Authorization: Bearer TOKEN`.", ASK)
+            raise RequestDenied(
+                401, "unauthenticated", "Send the token as `Authorization: Bearer TOKEN`.", BEARER_CHALLENGE
+            )
         return token.strip()
 
     @property
     def cookie_name(self) -> str:
-        """Cookies of one machine are the same for all ports: each service has a name of its own."""
+        """Return the name of the session cookie, which contains the port: all ports of a host share
+        cookies."""
         port = (self.scope.get("server") or ("", 0))[1]
         return f"paramclient-{port or 0}"
 
     @property
     def cookie(self) -> bytes | None:
-        """The session that it shows."""
+        """Return the value of the session cookie, or None."""
         name = self.cookie_name.encode()
         for pair in b";".join(value for key, value in self.headers if key == b"cookie").split(b";"):
             key, _, value = pair.strip().partition(b"=")
@@ -269,32 +326,32 @@ class Request:
                 return value
         return None
 
-    def take_forwarded(self) -> None:
-        """Where a trusted proxy has sent it, take the address from what that says.
+    def apply_forwarded_headers(self) -> None:
+        """Replace the address by that of the client behind trusted proxies.
 
         Raises:
-            Denied: X-Forwarded-For and Forwarded name different clients; one of them is not the proxy's.
+            RequestDenied: X-Forwarded-For and Forwarded name different clients.
         """
-        if not is_in(self._peer, self.proxies):
+        if not is_in_networks(self._peer, self.proxies):
             return
         clients = {
-            first_beyond(self.proxies, self._peer, forwarded_for(values))
+            client_behind(self.proxies, self._peer, parse_forwarded(values))
             for name in (b"x-forwarded-for", b"forwarded")
             if (values := [value.decode("latin-1") for key, value in self.headers if key == name])
         }
         if len(clients) > 1:
-            raise Denied(400, "bad-request", "X-Forwarded-For and Forwarded name different clients.")
+            raise RequestDenied(400, "bad-request", "X-Forwarded-For and Forwarded name different clients.")
         self.address = next(iter(clients), self._peer)
 
     @property
     def network(self) -> str:
-        """The address, or the network of an IPv6 one: a machine has 2⁶⁴ of these."""
-        return network_of(self.address)
+        """Return the network that counts as one client: a computer has 2⁶⁴ IPv6 addresses."""
+        return client_network(self.address)
 
     @property
     def _peer(self) -> str:
         client = self.scope.get("client")
-        address = parsed(str(client[0])) if client else None
+        address = parse_address(str(client[0])) if client else None
         return "here" if address is None else str(address)
 
 

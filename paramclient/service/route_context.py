@@ -1,4 +1,4 @@
-"""What routes have in common: whom a request is about, who asks, and what becomes of it when they leave."""
+"""Shared parts of routes: component, author and quota of a request, values, cancellation."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from paramclient.errors import UsageError
 from paramclient.metadata.info import number_of
 from paramclient.model.values import Param, ParamType, Value, from_bits, type_name
 from paramclient.service import access
-from paramclient.service.followed_component import Followed
+from paramclient.service.followed_component import FollowedComponent
 from paramclient.service.hub import Hub
-from paramclient.service.link import LOOKED_AT_ONCE
+from paramclient.service.link import COMPONENTS_PER_TURN
 from paramclient.service.problems import ServiceError
 
 if TYPE_CHECKING:
@@ -30,92 +30,97 @@ __all__ = [
     "Raw",
     "Seconds",
     "Target",
-    "TheHub",
-    "ValueGiven",
-    "answered",
-    "asker_of",
+    "HubArgument",
+    "ValueInput",
+    "run_until_disconnect",
+    "author_of",
     "holder_of",
-    "may_write",
-    "value_meant",
-    "value_of",
+    "require_write",
+    "parse_value",
+    "resolve_value",
 ]
 
 Result = TypeVar("Result")
 
 
 async def hub_of(request: Request) -> Hub:
-    """The hub of the application that a request has come to."""
+    """Return the hub of the application."""
     hub: Hub = request.app.state.hub
     return hub
 
 
-TheHub = Annotated[Hub, Depends(hub_of)]
+HubArgument = Annotated[Hub, Depends(hub_of)]
 
 LinkName = Annotated[
-    str | None, Query(max_length=200, description="The name of a link, where several carry the same ids.")
+    str | None,
+    Query(max_length=200, description="Name of the link, needed if several links have the same ids."),
 ]
 Seconds = Annotated[
     float | None,
-    Field(gt=0, le=86_400, description="Seconds until giving up; null leaves it to the measured round trip."),
+    Field(
+        gt=0, le=86_400, description="Timeout in seconds; null derives it from the measured round-trip time."
+    ),
 ]
 
 
 async def target_of(
-    hub: TheHub,
+    hub: HubArgument,
     system: Annotated[int, Path(ge=1, le=255)],
     component: Annotated[int, Path(ge=0, le=255)],
     link: LinkName = None,
-) -> Followed:
-    """The component that an address names."""
-    return hub.find(system, component, link)
+) -> FollowedComponent:
+    """Return the component with the ids in the path."""
+    return hub.find_component(system, component, link)
 
 
-Target = Annotated[Followed, Depends(target_of)]
+Target = Annotated[FollowedComponent, Depends(target_of)]
 
 
-def asker_of(request: Request) -> str:
-    """Who asks, as the history names them."""
+def author_of(request: Request) -> str:
+    """Return the author of a request for the history."""
     asker: str = request.scope["state"]["asker"]
     return asker
 
 
 def holder_of(request: Request) -> str:
-    """Of whose quota a request is: of the token's that came with it, else of the address's."""
+    """Return the holder of the quotas of a request: of its token, else its address."""
     holder: str = request.scope["state"]["quota"]
     return holder
 
 
-async def may_write(request: Request) -> None:
-    """Refuse those who may only read, where the address alone does not tell what is asked for.
+async def require_write(request: Request) -> None:
+    """Reject a request without write permission, on paths that do not always require it.
 
     Raises:
-        ServiceError: this is one of them.
+        ServiceError: 403, write permission is missing.
     """
     if not access.may_write(request):
-        raise ServiceError(403, "forbidden", "This may be done by those only who may write.")
+        raise ServiceError(403, "forbidden", "This request requires write permission.")
 
 
-async def answered(request: Request, work: Callable[[], Awaitable[Result]], *about: Followed) -> Result:
-    """Do what was asked for, unless they leave before it is done; then it is cancelled, for them alone.
+async def run_until_disconnect(
+    request: Request, work: Callable[[], Awaitable[Result]], *about: FollowedComponent
+) -> Result:
+    """Run the work of a request, and cancel it if the client disconnects.
 
-    What it has changed is among the events before the answer begins, whatever the outcome.
+    Events of its changes are published before the response, also after an error.
 
     Args:
-        request: it must have been read to its end.
-        work: what to do.
-        about: the components that it may change.
+        request: a request whose body is received.
+        work: the work.
+        about: components that it may change.
     """
-    outcome: Result | Exception = ServiceError(499, "gone", "Whoever asked has left.")
+    outcome: Result | Exception = ServiceError(499, "gone", "The client has disconnected.")
     async with anyio.create_task_group() as tasks:
-        tasks.start_soon(_cancel_when_gone, request, tasks.cancel_scope)
+        tasks.start_soon(_cancel_on_disconnect, request, tasks.cancel_scope)
         try:
             outcome = await work()
-        except Exception as error:  # out of the group it would come wrapped
+        except Exception as error:  # the task group would wrap it
             outcome = error
         tasks.cancel_scope.cancel()
     for number, followed in enumerate(about, 1):
-        followed.look()
-        if not number % LOOKED_AT_ONCE:
+        followed.publish_changes()
+        if not number % COMPONENTS_PER_TURN:
             await anyio.lowlevel.checkpoint()
     if isinstance(outcome, Exception):
         raise outcome
@@ -123,46 +128,48 @@ async def answered(request: Request, work: Callable[[], Awaitable[Result]], *abo
 
 
 class Bits(Body):
-    """A value by the digits of its bits, as `bits` of a parameter has them."""
+    """A value by its bits, as in the member `bits` of a parameter."""
 
     bits: Annotated[str, Field(pattern="^[0-9a-fA-F]{1,16}$")]
 
 
 class Raw(Body):
-    """A value by the four bytes of the message, in their order."""
+    """A value by the four bytes of the message."""
 
     raw: Annotated[str, Field(pattern="^[0-9a-fA-F]{8}$")]
 
 
 Finite = Annotated[StrictFloat, Field(allow_inf_nan=False)]
-"""A number of JSON: that of 1e400 would be read as an infinity, which only the word for it means."""
+"""A finite JSON number: 1e400 would become infinity, which has a word of its own."""
 
-ValueGiven = Annotated[
+ValueInput = Annotated[
     StrictInt | Finite | Annotated[str, Field(max_length=400)] | Bits | Raw,
     Field(description='A number, "NaN", "Infinity", the name of a value or of bits, or {"bits": …}.'),
 ]
 
 
-async def value_of(followed: Followed, name: str, given: int | float | str | Bits | Raw) -> Value:
-    """The value that somebody means.
+async def resolve_value(
+    followed: FollowedComponent, name: str, given: int | float | str | Bits | Raw
+) -> Value:
+    """Return the value of a request.
 
     Raises:
-        UsageError: there is none of this name, or the bits are of another type.
-        ParamClientError: the type had to be asked for, and did not come.
+        UsageError: no value has this name, or the bits do not fit the type.
+        ParamClientError: the vehicle did not send the type of the parameter.
     """
     if not isinstance(given, Bits):
-        return value_meant(followed.metadata, name, given)
+        return parse_value(followed.metadata, name, given)
     known = followed.component.params.get(name)
     if known is None:
         known = await followed.component.get(name)
     return _of_bits(int(given.bits, 16), known)
 
 
-def value_meant(metadata: Metadata | None, name: str, given: int | float | str | Raw) -> Value:
-    """The same without bits, which mean nothing without the vehicle's type.
+def parse_value(metadata: Metadata | None, name: str, given: int | float | str | Raw) -> Value:
+    """Return a value that is not given by bits, which would need the vehicle's type.
 
     Raises:
-        UsageError: there is no value of this name.
+        UsageError: no value has this name.
     """
     if isinstance(given, Raw):
         return binascii.unhexlify(given.raw)
@@ -173,19 +180,25 @@ def value_meant(metadata: Metadata | None, name: str, given: int | float | str |
         return number
     info = None if metadata is None else metadata.get(name)
     if info is None:
-        raise UsageError(f"{name}: {given!r} is no number, and there is no description with names")
+        raise UsageError(
+            f"{name}: {given!r} is not a number, and the service has no metadata with value names"
+        )
     return info.parse(given)
 
 
 def _of_bits(bits: int, known: Param) -> Value:
-    """The value of a parameter whose bits these would be."""
+    """Return the value with these bits in the type of a parameter.
+
+    Raises:
+        UsageError: the bits do not fit the type.
+    """
     size = known.type.size if isinstance(known.type, ParamType) else 4
     if bits >> (32 if known.is_raw else 8 * size):
         raise UsageError(f"{known.name}: {bits:x} has more bits than {type_name(known.type)}")
     return from_bits(bits, known.type, is_raw=known.is_raw)
 
 
-async def _cancel_when_gone(request: Request, scope: anyio.CancelScope) -> None:
+async def _cancel_on_disconnect(request: Request, scope: anyio.CancelScope) -> None:
     while (await request.receive())["type"] != "http.disconnect":
         pass
     scope.cancel()

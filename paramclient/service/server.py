@@ -1,4 +1,4 @@
-"""The service as a server: its socket, uvicorn with our settings, and a good end."""
+"""The HTTP server of the service: listening socket, uvicorn with its settings, and shutdown."""
 
 from __future__ import annotations
 
@@ -14,37 +14,40 @@ import uvicorn
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from paramclient.errors import LinkError, UsageError
+from paramclient.service.acceptor import Acceptor
 from paramclient.service.app import Settings, create_app
+from paramclient.service.connection_slots import ConnectionSlot, ConnectionSlots
 from paramclient.service.connections import Connection, WebSocketConnection
-from paramclient.service.gate import Gate
 from paramclient.service.hub import Hub
 from paramclient.service.log_limit import LogLimit
-from paramclient.service.places import Place, Places
 from paramclient.service.tls import tls_of
 
 __all__ = ["Listening", "serve"]
 
 BACKLOG: Final = 256
-"""Connections that may wait to be accepted: all listeners that come back at once after a restart."""
-ENDING_TIME: Final = 1.5
-"""Seconds for answers that are under way when the service ends; then their connections are cut off."""
-CUT_OFF_TIME: Final = 0.5
-"""Seconds for requests to notice that their connection was cut off; then they are cancelled."""
-ENDING_INTERVAL: Final = 0.02
-"""Seconds between two looks whether all has ended."""
-KEEP_ALIVE: Final = 30.0
-"""Seconds for which a connection without a request is kept."""
-LARGEST_FRAME: Final = 4_096
-"""Bytes of a WebSocket message to us; nothing is expected."""
+"""Maximum number of connections waiting for `accept`: all event listeners reconnect at once after a
+restart."""
+SHUTDOWN_TIMEOUT: Final = 1.5
+"""Timeout in seconds for responses in progress at shutdown. Their connections are then aborted."""
+CANCEL_TIMEOUT: Final = 0.5
+"""Timeout in seconds for requests of aborted connections. They are then cancelled."""
+SHUTDOWN_CHECK_INTERVAL: Final = 0.02
+"""Seconds between two checks whether all requests have ended."""
+IDLE_CONNECTION_TIMEOUT: Final = 30.0
+"""Seconds after which an idle connection is closed."""
+WEBSOCKET_MESSAGE_BYTES_MAX: Final = 4_096
+"""Maximum size of a received WebSocket message in bytes; none is expected."""
 
 
 @dataclass(frozen=True, slots=True)
 class Listening:
-    """Where to listen.
+    """Listening address of the service.
 
     Attributes:
-        host, port: port 0 lets the system choose.
-        tls_cert, tls_key: files in PEM, or neither.
+        host: host name or IP address.
+        port: TCP port; 0 for any free port.
+        tls_cert: path of the certificate in PEM, or None.
+        tls_key: path of its private key in PEM, or None.
     """
 
     host: str = "127.0.0.1"
@@ -54,27 +57,29 @@ class Listening:
 
     @classmethod
     def at(cls, text: str, *, tls_cert: Path | None = None, tls_key: Path | None = None) -> Listening:
-        """What `HOST:PORT` means; an IPv6 address stands in brackets.
+        """Parse `HOST:PORT`; an IPv6 address is in brackets.
 
         Raises:
-            UsageError: it is none.
+            UsageError: the text has another format.
         """
         host, colon, port = text.rpartition(":")
         bare = host[1:-1] if host.startswith("[") and host.endswith("]") else host
         is_number = port.isascii() and port.isdecimal() and int(port) < 1 << 16
         if not (colon and bare and is_number) or (":" in bare and bare == host):
-            raise UsageError(f"where to listen is HOST:PORT, such as 127.0.0.1:8765 or [::1]:0, not {text!r}")
+            raise UsageError(
+                f"{text!r} is not a listening address HOST:PORT such as 127.0.0.1:8765 or [::1]:0"
+            )
         return cls(bare, int(port), tls_cert, tls_key)
 
     @property
     def url(self) -> str:
-        """Its address."""
+        """Return the URL of the service."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{'http' if self.tls_cert is None else 'https'}://{host}:{self.port}"
 
 
 class _Server(uvicorn.Server):
-    """Accepts by a gate, tells when it is ready, and leaves signals to whoever has started it."""
+    """uvicorn without its own listening socket and signal handlers; `is_ready` is set after its start."""
 
     def __init__(self, config: uvicorn.Config) -> None:
         super().__init__(config)
@@ -85,29 +90,29 @@ class _Server(uvicorn.Server):
         self.started = True
         self.is_ready.set()
 
-    def protocol(self, place: Place) -> Connection:
-        """The protocol of a new connection."""
+    def protocol(self, slot: ConnectionSlot) -> Connection:
+        """Return the protocol of a new connection."""
         return Connection(
-            place, config=self.config, server_state=self.server_state, app_state=self.lifespan.state
+            slot, config=self.config, server_state=self.server_state, app_state=self.lifespan.state
         )
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Let answers come to their end for a while; then cut off whoever does not take them."""
+        """Wait for responses in progress, then abort connections and cancel requests."""
         state = self.server_state
         for connection in list(state.connections):
             connection.shutdown()
-        with anyio.move_on_after(ENDING_TIME):
-            while state.connections or state.tasks:  # noqa: ASYNC110 - these sets tell nobody
-                await anyio.sleep(ENDING_INTERVAL)
-        self.cut_off()
-        with anyio.move_on_after(CUT_OFF_TIME):
+        with anyio.move_on_after(SHUTDOWN_TIMEOUT):
+            while state.connections or state.tasks:  # noqa: ASYNC110 - uvicorn's sets have no event
+                await anyio.sleep(SHUTDOWN_CHECK_INTERVAL)
+        self.abort_connections()
+        with anyio.move_on_after(CANCEL_TIMEOUT):
             while state.tasks:  # noqa: ASYNC110
-                await anyio.sleep(ENDING_INTERVAL)
+                await anyio.sleep(SHUTDOWN_CHECK_INTERVAL)
         for task in state.tasks:
             task.cancel()
 
-    def cut_off(self) -> None:
-        """End all connections at once."""
+    def abort_connections(self) -> None:
+        """Abort all connections."""
         for connection in list(self.server_state.connections):
             connection.transport.abort()
 
@@ -116,8 +121,8 @@ class _Server(uvicorn.Server):
         yield
 
 
-class _Ending:
-    """An application whose requests may be cancelled when the service ends, and nothing is wrong then."""
+class _ShutdownCancellation:
+    """Runs an application whose requests may be cancelled without an error at shutdown."""
 
     def __init__(self, app: ASGIApp, stop: anyio.Event) -> None:
         self._app = app
@@ -139,27 +144,27 @@ async def serve(
     stop: anyio.Event | None = None,
     listens: Callable[[str], None] | None = None,
 ) -> None:
-    """Serve a hub, which is not open yet, until `stop` is set; then end in good order.
+    """Open a hub and serve it until `stop` is set.
 
-    Streams of events end, calls that wait are answered with a problem, the cache is written. Cancelled, it
-    cuts connections off, and writes the cache all the same. It runs on asyncio alone, as uvicorn does.
+    At the end, event streams end, waiting requests get a problem as response, and the cache is written.
+    Cancellation aborts connections, and writes the cache too. Runs on asyncio only, because of uvicorn.
 
     Args:
-        hub: the links and the cache.
-        settings: of the application.
-        listening: where.
-        stop: what ends it; None for nothing but cancellation.
-        listens: is told the address when it can be reached.
+        hub: links and cache, not yet open.
+        settings: settings of the application.
+        listening: listening address.
+        stop: ends the call when set; None for no end but cancellation.
+        listens: called with the URL as soon as the service accepts connections.
 
     Raises:
-        LinkError: nobody can listen there.
-        UsageError: the certificate cannot be used, or others could connect and there are no tokens.
+        LinkError: the address cannot be listened on.
+        UsageError: the certificate is invalid, or other computers could connect without tokens.
     """
     listening = Listening() if listening is None else listening
     settings = Settings() if settings is None else settings
     settings = replace(settings, access=replace(settings.access, listen=listening.host))
     stop = anyio.Event() if stop is None else stop
-    app = _Ending(create_app(hub, settings), stop)
+    app = _ShutdownCancellation(create_app(hub, settings), stop)
     config = _config(app, listening)
     opened = _open(listening)
     server = _Server(config)
@@ -169,8 +174,8 @@ async def serve(
         async with anyio.create_task_group() as tasks, hub:
             tasks.start_soon(server.serve)
             await server.is_ready.wait()
-            places = Places(is_proxy=settings.access.is_proxy)
-            gate = Gate(opened, places, server.protocol, tls=config.ssl, limit=LogLimit())
+            slots = ConnectionSlots(is_proxy=settings.access.is_proxy)
+            gate = Acceptor(opened, slots, server.protocol, tls=config.ssl, limit=LogLimit())
             tasks.start_soon(gate.run)
             if listens is not None:
                 listens(url)
@@ -181,7 +186,7 @@ async def serve(
                 server.should_exit = True
     finally:
         opened.close()
-        server.cut_off()
+        server.abort_connections()
 
 
 def _config(app: ASGIApp, listening: Listening) -> uvicorn.Config:
@@ -191,20 +196,24 @@ def _config(app: ASGIApp, listening: Listening) -> uvicorn.Config:
         lifespan="off",
         http=Connection,
         ws=WebSocketConnection,
-        ws_max_size=LARGEST_FRAME,
+        ws_max_size=WEBSOCKET_MESSAGE_BYTES_MAX,
         ws_per_message_deflate=False,
         log_config=None,
         access_log=False,
         server_header=False,
         proxy_headers=False,
-        timeout_keep_alive=int(KEEP_ALIVE),
+        timeout_keep_alive=int(IDLE_CONNECTION_TIMEOUT),
         ssl_certfile=None if tls is None else tls.cert,
         ssl_keyfile=None if tls is None else tls.key,
     )
 
 
 def _open(listening: Listening) -> socket.socket:
-    """A socket that is bound."""
+    """Return a listening socket.
+
+    Raises:
+        LinkError: the address cannot be listened on.
+    """
     where = f"{listening.host}:{listening.port}"
     try:
         found = socket.getaddrinfo(

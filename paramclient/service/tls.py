@@ -1,4 +1,4 @@
-"""TLS by files: a certificate and its key, looked at before anybody connects."""
+"""TLS certificate and private key files, checked before the service starts."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from paramclient.errors import UsageError
 
 __all__ = ["Tls", "tls_of"]
 
-LONGEST_FILE: Final = 1_000_000
-"""Bytes of a file that are looked at: a chain of certificates has some thousands."""
+PEM_FILE_BYTES_MAX: Final = 1_000_000
+"""Maximum number of bytes read from a file: a chain of certificates has some thousands."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tls:
-    """Two files that belong together.
+    """A certificate and its private key.
 
     Attributes:
-        cert: the certificate in PEM, and those between it and the authority.
-        key: its private key in PEM, not encrypted.
+        cert: path of the certificate and its intermediate certificates, in PEM.
+        key: path of the private key in PEM, not encrypted.
     """
 
     cert: Path
@@ -31,17 +31,17 @@ class Tls:
 
 
 def tls_of(cert: str | os.PathLike[str] | None, key: str | os.PathLike[str] | None) -> Tls | None:
-    """What a server needs for TLS; None where neither file is named.
+    """Return the checked files, or None if neither is given.
 
     Raises:
-        UsageError: one is missing, cannot be read, holds something else, or the key belongs to another
-            certificate. The text names the file.
+        UsageError: a file is missing, unreadable, not PEM, writable by other users, or the key belongs to
+            another certificate. The message names the file.
     """
     if cert is None and key is None:
         return None
     if cert is None or key is None:
         raise UsageError(
-            "TLS needs both: --tls-cert FILE, the certificate, and --tls-key FILE, its private key"
+            "TLS needs both --tls-cert FILE, the certificate, and --tls-key FILE, its private key"
         )
     tls = Tls(Path(cert), Path(key))
     _check_pem(tls.cert, "certificate", b"CERTIFICATE-----")
@@ -49,7 +49,7 @@ def tls_of(cert: str | os.PathLike[str] | None, key: str | os.PathLike[str] | No
 
     def encrypted() -> NoReturn:
         raise UsageError(
-            f"{tls.key}: the private key is encrypted, and nobody is there to be asked for its password"
+            f"{tls.key}: the private key is encrypted. Decrypt it: the service cannot ask for a password"
         )
 
     try:
@@ -59,7 +59,9 @@ def tls_of(cert: str | os.PathLike[str] | None, key: str | os.PathLike[str] | No
             raise UsageError(
                 f"{tls.key}: this private key does not belong to the certificate {tls.cert}"
             ) from None
-        raise UsageError(f"{tls.cert} with {tls.key}: no certificate with its key: {error.reason}") from None
+        raise UsageError(
+            f"{tls.cert} with {tls.key}: not a certificate with its private key: {error.reason or error}"
+        ) from None
     return tls
 
 
@@ -67,13 +69,13 @@ def _check_pem(path: Path, what: str, mark: bytes) -> None:
     try:
         with path.open("rb") as file:
             status = os.fstat(file.fileno())
-            data = file.read(LONGEST_FILE)
+            data = file.read(PEM_FILE_BYTES_MAX)
     except OSError as error:
         raise UsageError(f"{path}: the {what} cannot be read: {error.strerror}") from error
     if not has_trusted_owner(status) or mode_of(status) & OTHERS_WRITE:
         raise UsageError(
-            f"{path}: others than the user of this program can change this {what} (owner {status.st_uid},"
-            f" mode {mode_of(status):o})"
+            f"{path}: other users can change this {what} (owner {status.st_uid}, mode {mode_of(status):o})."
+            " Change its owner or mode"
         )
     if mark not in data:
-        raise UsageError(f"{path}: there is no {what} in PEM in this file")
+        raise UsageError(f"{path}: the file contains no {what} in PEM format")

@@ -1,4 +1,4 @@
-"""Tokens: who has one, what it allows, the sessions of browsers, and those who guess."""
+"""Access tokens, sessions of browsers, and the delay after wrong tokens."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from typing import Final, Literal, TypeAlias
 
 from paramclient.client.signing import read_private
 from paramclient.errors import UsageError
-from paramclient.service.client_address import network_of
+from paramclient.service.client_address import client_network
 
 __all__ = [
-    "Guesses",
+    "WrongTokens",
     "Holder",
     "Role",
     "Sessions",
@@ -30,47 +30,52 @@ __all__ = [
 ]
 
 Role: TypeAlias = Literal["read", "write"]
-"""What a token allows: to see everything, or to change it too."""
+"""Permission of a token: read, or read and write."""
 
-TOKEN_VARIABLE: Final = "PARAMCLIENT_SERVICE_TOKEN"
-FILE_VARIABLE: Final = "PARAMCLIENT_SERVICE_TOKEN_FILE"
-NAME_IN_ENVIRONMENT: Final = "token"
-"""The name of the holder of a token that comes without one."""
+SERVICE_TOKEN_VARIABLE: Final = "PARAMCLIENT_SERVICE_TOKEN"
+"""Environment variable with one token."""
+SERVICE_TOKEN_FILE_VARIABLE: Final = "PARAMCLIENT_SERVICE_TOKEN_FILE"
+"""Environment variable with the path of a token file."""
+ENVIRONMENT_TOKEN_NAME: Final = "token"
+"""Name of the holder of a token from `SERVICE_TOKEN_VARIABLE`."""
 TOKEN_BYTES: Final = 32
-SHORTEST_TOKEN: Final = 16
-"""Characters: of a token that is drawn at random it cannot be guessed, at the rate that is allowed."""
-LONGEST_TOKEN: Final = 256
-MOST_TOKENS: Final = 256
-"""Each is compared for each request."""
-LONGEST_FILE: Final = 100_000
+"""Number of random bytes of a new token."""
+TOKEN_LENGTH_MIN: Final = 16
+"""Minimum number of characters of a token: a random one cannot be guessed at the permitted rate."""
+TOKEN_LENGTH_MAX: Final = 256
+"""Maximum number of characters of a token."""
+TOKENS_MAX: Final = 256
+"""Maximum number of tokens: each request is compared with all."""
+TOKEN_FILE_BYTES_MAX: Final = 100_000
+"""Maximum size of a token file in bytes."""
 _NO_LINK: Final = getattr(os, "O_NOFOLLOW", 0)  # Windows has no such flag
-DIGEST: Final = "sha256:"
-"""How a line begins its third word that has not the token but its digest."""
+DIGEST_PREFIX: Final = "sha256:"
+"""Prefix of the third word of a line that contains a digest in place of a token."""
 
-SESSION_AGE: Final = 12 * 3600.0
-"""Seconds for which a browser is known: a day in the field."""
-MOST_SESSIONS: Final = 16
-"""Sessions of one holder: a laptop, a phone, and what was not ended. The oldest goes first."""
+SESSION_LIFETIME: Final = 12 * 3600.0
+"""Lifetime of a session in seconds: a working day."""
+SESSIONS_OF_HOLDER_MAX: Final = 16
+"""Maximum number of sessions of one holder. The oldest is removed first."""
 
-GUESSES: Final = 10
-"""Different wrong tokens from one address before its tokens are looked at late. The same one again is no
-guess: a program that was not told of a change must not slow down the others on its machine."""
-GUESS_DELAY: Final = 1.0
-"""Seconds until a token from such an address is looked at, right or wrong: with its 128 connections an
-address gets as many answers a second."""
-GUESSES_AGE: Final = 60.0
+WRONG_TOKENS_MAX: Final = 10
+"""Different wrong tokens from one address before its tokens are delayed. A repeated token does not count: a
+program with an old token must not delay the others on its computer."""
+WRONG_TOKEN_DELAY: Final = 1.0
+"""Delay in seconds of each token from such an address, valid or not: its at most 128 connections get as many
+responses per second."""
+WRONG_TOKEN_LIFETIME: Final = 60.0
 """Seconds after which a wrong token is forgotten."""
-MOST_GUESSERS: Final = 1_024
-"""Addresses that are remembered for it; the one that was there first goes first."""
+WRONG_TOKEN_ADDRESSES_MAX: Final = 1_024
+"""Maximum number of remembered addresses with wrong tokens. The oldest is removed first."""
 
 
 @dataclass(frozen=True, slots=True)
 class Holder:
-    """Who has a token.
+    """Holder of a token.
 
     Attributes:
-        name: as it stands in the history.
-        role: what the token allows.
+        name: its name in the history.
+        role: permission of the token.
     """
 
     name: str
@@ -78,27 +83,27 @@ class Holder:
 
 
 class Tokens:
-    """The tokens that are valid, each kept as its digest only.
+    """The valid tokens. Only their digests are kept.
 
     Args:
-        digests: by holder, SHA-256 of the token.
+        digests: holders and SHA-256 of their tokens.
 
     Raises:
-        UsageError: there is none, too many, or two of the same name or token.
+        UsageError: there are none or too many, or two have the same name or token.
     """
 
     def __init__(self, digests: Iterable[tuple[Holder, bytes]]) -> None:
         self._digests = tuple(digests)
         names = [holder.name for holder, _ in self._digests]
-        if not 1 <= len(names) <= MOST_TOKENS:
-            raise UsageError(f"there are 1 to {MOST_TOKENS} tokens, not {len(names)}")
+        if not 1 <= len(names) <= TOKENS_MAX:
+            raise UsageError(f"1 to {TOKENS_MAX} tokens are permitted, not {len(names)}")
         if len(set(names)) < len(names):
-            raise UsageError("two tokens have the same name; the history could not tell them apart")
+            raise UsageError("two tokens have the same name; the history could not distinguish them")
         if len({digest for _, digest in self._digests}) < len(names):
-            raise UsageError("two names have the same token; the history could not tell them apart")
+            raise UsageError("two names have the same token; the history could not distinguish them")
 
     def holder(self, token: bytes) -> Holder | None:
-        """Whose token this is. It takes as long for each of them, and for one that nobody has."""
+        """Return the holder of a token, or None, in constant time."""
         digest = _digest(token)
         found = None
         for holder, known in self._digests:
@@ -108,10 +113,10 @@ class Tokens:
 
     @classmethod
     def of_text(cls, text: str) -> Tokens:
-        """Tokens by lines: `NAME ROLE TOKEN`, or `NAME ROLE sha256:DIGEST`; `#` begins a comment.
+        """Parse lines of `NAME ROLE TOKEN` or `NAME ROLE sha256:DIGEST_PREFIX`; `#` starts a comment.
 
         Raises:
-            UsageError: a line is none of these. The text never tells what is in it.
+            UsageError: a line is invalid. The message never contains parts of the line.
         """
         digests = []
         for number, line in enumerate(text.splitlines(), 1):
@@ -126,15 +131,15 @@ class Tokens:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Tokens:
-        """The tokens in a file, which must be its owner's alone.
+        """Read a token file, which only its owner may access.
 
         Raises:
-            UsageError: it cannot be read, is open to others, or is no such file.
+            UsageError: the file cannot be read, other users can access it, or it is invalid.
         """
-        data = read_private(path, "file of tokens", LONGEST_FILE + 1)
+        data = read_private(path, "file of tokens", TOKEN_FILE_BYTES_MAX + 1)
         try:
-            if len(data) > LONGEST_FILE:
-                raise UsageError(f"a file of tokens has no more than {LONGEST_FILE} bytes")
+            if len(data) > TOKEN_FILE_BYTES_MAX:
+                raise UsageError(f"a file of tokens may have at most {TOKEN_FILE_BYTES_MAX} bytes")
             return cls.of_text(data.decode("utf-8", "replace"))
         except UsageError as error:
             raise UsageError(f"{os.fspath(path)}: {error}") from None
@@ -149,58 +154,61 @@ class Tokens:
 def tokens_from(
     path: str | os.PathLike[str] | None = None, environment: Mapping[str, str] = os.environ
 ) -> Tokens | None:
-    """The tokens of a file, else those that the environment names, or None.
+    """Return the tokens of a file, or those of the environment, or None.
 
-    `PARAMCLIENT_SERVICE_TOKEN_FILE` names a file, `PARAMCLIENT_SERVICE_TOKEN` has one token, which may write.
+    Args:
+        path: the token file; None for the environment.
+        environment: `PARAMCLIENT_SERVICE_TOKEN_FILE` is the path of a token file,
+            `PARAMCLIENT_SERVICE_TOKEN` a token with write permission.
 
     Raises:
-        UsageError: both are there, or what they name are no tokens.
+        UsageError: both variables are set, or the tokens are invalid.
     """
     if path is not None:
         return Tokens.read(path)
-    given = [name for name in (FILE_VARIABLE, TOKEN_VARIABLE) if environment.get(name)]
+    given = [name for name in (SERVICE_TOKEN_FILE_VARIABLE, SERVICE_TOKEN_VARIABLE) if environment.get(name)]
     if not given:
         return None
     if len(given) > 1:
-        raise UsageError(f"the environment has {' and '.join(given)}; one of them is enough")
+        raise UsageError(f"{' and '.join(given)} are set; one of them is enough")
     value = environment[given[0]]
     try:
-        if given[0] == FILE_VARIABLE:
+        if given[0] == SERVICE_TOKEN_FILE_VARIABLE:
             return Tokens.read(value)
-        return Tokens([_of_line([NAME_IN_ENVIRONMENT, "write", value])])
+        return Tokens([_of_line([ENVIRONMENT_TOKEN_NAME, "write", value])])
     except UsageError as error:
         raise UsageError(f"{given[0]}: {error}") from None
 
 
 def new_token() -> str:
-    """A token that nobody can guess."""
+    """Return a new random token."""
     return secrets.token_urlsafe(TOKEN_BYTES)
 
 
 def token_line(name: str, role: str, token: str) -> str:
-    """The line of a file of tokens that lets a token in without telling it.
+    """Return the line of a token file, with the digest of the token.
 
     Raises:
-        UsageError: no such name, role or token can be.
+        UsageError: the name, role or token is invalid.
     """
     holder, digest = _of_line([name, role, token])
-    return f"{holder.name} {holder.role} {DIGEST}{digest.hex()}"
+    return f"{holder.name} {holder.role} {DIGEST_PREFIX}{digest.hex()}"
 
 
 def add_token(path: str | os.PathLike[str], name: str, role: Role) -> str:
-    """Make a token, and add its line to a file, which is made for its owner alone if it is not there.
+    """Create a token and append its line to a file. A new file is accessible only by its owner.
 
     Raises:
-        UsageError: the file cannot be written, is a link, belongs to another user, is open to others, holds
-            something else, or has the name.
+        UsageError: the file cannot be written, is a symbolic link, belongs to another user, is accessible by
+            other users, is not a token file, or contains the name.
     """
     token = new_token()
     line = token_line(name, role, token)
     try:
         if Path(path).is_symlink():
-            raise UsageError(f"{os.fspath(path)}: it is a link; name the file itself")
+            raise UsageError(f"{os.fspath(path)}: the file is a symbolic link; give the path of its target")
         os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | _NO_LINK, 0o600))
-        before = read_private(path, "file of tokens", LONGEST_FILE + 1).decode("utf-8", "replace")
+        before = read_private(path, "file of tokens", TOKEN_FILE_BYTES_MAX + 1).decode("utf-8", "replace")
         gap = "" if before.endswith("\n") or not before else "\n"
         try:
             Tokens.of_text(f"{before}{gap}{line}")
@@ -209,15 +217,15 @@ def add_token(path: str | os.PathLike[str], name: str, role: Role) -> str:
         with Path(path).open("a", encoding="ascii") as file:
             file.write(f"{gap}{line}\n")
     except OSError as error:
-        raise UsageError(f"{os.fspath(path)}: the token cannot be kept: {error.strerror}") from error
+        raise UsageError(f"{os.fspath(path)}: the token cannot be written: {error.strerror}") from error
     return token
 
 
 class Sessions:
-    """The browsers that have shown a token, by the random text of their cookies.
+    """Sessions of browsers, by the digest of their cookies.
 
     Args:
-        clock: seconds, that only go forward.
+        clock: returns monotonic time in seconds.
     """
 
     def __init__(self, clock: Callable[[], float]) -> None:
@@ -225,34 +233,34 @@ class Sessions:
         self._open: dict[bytes, tuple[Holder, float]] = {}
 
     def begin(self, holder: Holder) -> str:
-        """A new one; what it gives is the cookie's value, which is not kept."""
+        """Start a session. Return the value of its cookie, which is not kept."""
         now = self._clock()
         self._open = {key: each for key, each in self._open.items() if each[1] > now}
         own = [key for key, (whose, _) in self._open.items() if whose == holder]
-        for key in own[: max(0, len(own) + 1 - MOST_SESSIONS)]:
+        for key in own[: max(0, len(own) + 1 - SESSIONS_OF_HOLDER_MAX)]:
             del self._open[key]
         text = new_token()
-        self._open[_digest(text.encode())] = (holder, now + SESSION_AGE)
+        self._open[_digest(text.encode())] = (holder, now + SESSION_LIFETIME)
         return text
 
     def holder(self, text: bytes) -> Holder | None:
-        """Whose session this is, if it is one."""
+        """Return the holder of a session, or None if it is unknown or expired."""
         holder, until = self._open.get(_digest(text), (None, 0.0))
         return holder if until > self._clock() else None
 
     def end(self, text: bytes) -> None:
-        """It is one no more."""
+        """End a session."""
         self._open.pop(_digest(text), None)
 
     def __len__(self) -> int:
         return len(self._open)
 
 
-class Guesses:
-    """Wrong tokens by the address that they came from, for a short while.
+class WrongTokens:
+    """Recent wrong tokens by address.
 
     Args:
-        clock: seconds, that only go forward.
+        clock: returns monotonic time in seconds.
     """
 
     def __init__(self, clock: Callable[[], float]) -> None:
@@ -261,53 +269,59 @@ class Guesses:
         self._wrong: OrderedDict[str, dict[bytes, float]] = OrderedDict()
 
     def wait(self, address: str) -> float:
-        """Seconds for which tokens from this address are still looked at late; 0 where they are not."""
-        wrong = self._wrong.get(network_of(address))
-        if wrong is None or len(wrong) < GUESSES:
+        """Return the seconds for which tokens from this address are delayed; 0 if they are not."""
+        wrong = self._wrong.get(client_network(address))
+        if wrong is None or len(wrong) < WRONG_TOKENS_MAX:
             return 0.0
-        return max(0.0, next(iter(wrong.values())) + GUESSES_AGE - self._clock())
+        return max(0.0, next(iter(wrong.values())) + WRONG_TOKEN_LIFETIME - self._clock())
 
     def add(self, address: str, token: bytes) -> bool:
-        """A wrong one has come; true when it was the last before tokens are looked at late."""
+        """Count a wrong token. Return whether tokens from this address are delayed from now on."""
         now = self._clock()
-        network = network_of(address)
-        wrong = {key: at for key, at in self._wrong.pop(network, {}).items() if now - at < GUESSES_AGE}
+        network = client_network(address)
+        wrong = {
+            key: at for key, at in self._wrong.pop(network, {}).items() if now - at < WRONG_TOKEN_LIFETIME
+        }
         key = hmac.digest(self._key, token, "sha256")[:8]
         is_new = key not in wrong
-        if len(wrong) < GUESSES:
+        if len(wrong) < WRONG_TOKENS_MAX:
             wrong.setdefault(key, now)
         self._wrong[network] = wrong
-        while len(self._wrong) > MOST_GUESSERS:
+        while len(self._wrong) > WRONG_TOKEN_ADDRESSES_MAX:
             self._wrong.popitem(last=False)
-        return is_new and len(wrong) == GUESSES
+        return is_new and len(wrong) == WRONG_TOKENS_MAX
 
     def __len__(self) -> int:
         return len(self._wrong)
 
 
 def _of_line(words: list[str]) -> tuple[Holder, bytes]:
-    """Nothing of it is repeated in errors: the words may be in another order, and any of them the token."""
+    """Parse the words of a line. Errors contain no word: any of them could be the token.
+
+    Raises:
+        UsageError: the line is invalid.
+    """
     if len(words) != 3:
-        raise UsageError("a line has three words: NAME, read or write, and TOKEN")
+        raise UsageError("a line must have three words: NAME, read or write, and TOKEN")
     name, role, token = words
     if not _NAME.fullmatch(name):
-        raise UsageError("a name has 1 to 32 letters, digits, dots, hyphens and underscores")
+        raise UsageError("a name must have 1 to 32 letters, digits, dots, hyphens and underscores")
     if role == "read":
         holder = Holder(name, "read")
     elif role == "write":
         holder = Holder(name, "write")
     else:
-        raise UsageError("the second word says what the token allows: read, or write")
-    if token.startswith(DIGEST):
-        digits = token.removeprefix(DIGEST)
+        raise UsageError("the second word is the permission: read or write")
+    if token.startswith(DIGEST_PREFIX):
+        digits = token.removeprefix(DIGEST_PREFIX)
         if not _DIGEST.fullmatch(digits):
-            raise UsageError("a digest has 64 hexadecimal digits")
+            raise UsageError("a digest must have 64 hexadecimal digits")
         return holder, bytes.fromhex(digits)
     is_sound = token.isascii() and token.isprintable() and " " not in token
-    if not is_sound or not SHORTEST_TOKEN <= len(token) <= LONGEST_TOKEN:
+    if not is_sound or not TOKEN_LENGTH_MIN <= len(token) <= TOKEN_LENGTH_MAX:
         raise UsageError(
-            f"a token has {SHORTEST_TOKEN} to {LONGEST_TOKEN} printable ASCII characters; "
-            "`paramclient token` makes a good one"
+            f"a token must have {TOKEN_LENGTH_MIN} to {TOKEN_LENGTH_MAX} printable ASCII characters; "
+            "create one with `paramclient token`"
         )
     return holder, _digest(token.encode())
 

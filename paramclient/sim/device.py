@@ -7,13 +7,29 @@ import struct
 from abc import ABC, abstractmethod
 from collections import Counter
 from dataclasses import replace
-from typing import Final
+from typing import Final, TypedDict
 
 from paramclient.errors import UsageError
 from paramclient.protocol import wire
 from paramclient.sim.air import OUT_LIMIT
 
-__all__ = ["Device"]
+__all__ = ["Device", "DeviceOptions"]
+
+
+class DeviceOptions(TypedDict, total=False):
+    """Arguments of every kind of component; see `Vehicle`."""
+
+    boot_time: float
+    telemetry: float
+    mavlink_version: int
+    stream: bool
+    high_latency: bool
+    signing_key: wire.SigningKey | None
+    signing_timestamp: int
+    usb: bool
+    armed: bool
+    reboot_ack: bool
+    reboot_down: float
 
 
 class Device(ABC):
@@ -43,17 +59,17 @@ class Device(ABC):
         component: int,
         heartbeat: wire.Heartbeat,
         version: wire.AutopilotVersion,
-        boot_time: float,
-        telemetry: float,
-        mavlink_version: int,
-        stream: bool,
-        high_latency: bool,
-        signing_key: wire.SigningKey | None,
-        signing_timestamp: int,
-        usb: bool,
-        armed: bool,
-        reboot_ack: bool,
-        reboot_down: float,
+        boot_time: float = 0.0,
+        telemetry: float = 0.0,
+        mavlink_version: int = 2,
+        stream: bool = False,
+        high_latency: bool = False,
+        signing_key: wire.SigningKey | None = None,
+        signing_timestamp: int = 0,
+        usb: bool = False,
+        armed: bool = False,
+        reboot_ack: bool = True,
+        reboot_down: float = 1.0,
     ) -> None:
         for what, number in (("system", system), ("component", component)):
             if not 1 <= number <= 255:

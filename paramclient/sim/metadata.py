@@ -11,11 +11,11 @@ from typing import Any, Final
 from paramclient.model.values import ParamType, crc32_px4
 from paramclient.sim.param_table import SimParam
 
-__all__ = ["GENERAL_FILE", "PARAMETER_FILE", "metadata_files"]
+__all__ = ["GENERAL_FILE", "METADATA_FILE", "metadata_files"]
 
 GENERAL_FILE: Final = "etc/extras/component_general.json.xz"
 """Path of PX4's general metadata file (COMPONENT_METADATA.hpp)."""
-PARAMETER_FILE: Final = "etc/extras/parameters.json.xz"
+METADATA_FILE: Final = "etc/extras/parameters.json.xz"
 """Path of PX4's parameter metadata file (PX4's build)."""
 
 
@@ -23,10 +23,10 @@ PARAMETER_FILE: Final = "etc/extras/parameters.json.xz"
 def metadata_files(rows: tuple[SimParam, ...]) -> dict[str, bytes]:
     """Return the two packed files of a table, by path. Only a few parameters have more than a type."""
     parameters = _packed({"version": 1, "parameters": [_described(row) for row in rows]})
-    kinds = [{"type": 1, "uri": f"mftp://{PARAMETER_FILE}", "fileCrc": crc32_px4(parameters)}]
+    kinds = [{"type": 1, "uri": f"mftp://{METADATA_FILE}", "fileCrc": crc32_px4(parameters)}]
     return {
         GENERAL_FILE: _packed({"version": 1, "metadataTypes": kinds}),
-        PARAMETER_FILE: parameters,
+        METADATA_FILE: parameters,
     }
 
 

@@ -5,38 +5,27 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from typing import TypedDict
+from typing import Unpack
 
 from paramclient.errors import ParamErrorCode, UsageError
 from paramclient.model.values import Encoding, Param, Value, bits_of
 from paramclient.protocol import wire
 from paramclient.protocol.ftp.param_pck import PackedParam
-from paramclient.sim.device import Device
+from paramclient.sim.device import Device, DeviceOptions
 from paramclient.sim.ftp import FileServer
 from paramclient.sim.param_table import Entry, SimParam
 
 __all__ = ["Vehicle", "VehicleOptions"]
 
 
-class VehicleOptions(TypedDict, total=False):
+class VehicleOptions(DeviceOptions, total=False):
     """Arguments of every kind of vehicle; see `Vehicle`."""
 
-    boot_time: float
     param_error: bool
-    telemetry: float
-    mavlink_version: int
-    stream: bool
     dead: Iterable[int | str]
     list_stops_at: int | None
     list_stops: float
     repeated_names: bool
-    high_latency: bool
-    signing_key: wire.SigningKey | None
-    signing_timestamp: int
-    usb: bool
-    armed: bool
-    reboot_ack: bool
-    reboot_down: float
 
 
 class Vehicle(Device):
@@ -98,29 +87,19 @@ class Vehicle(Device):
         version: wire.AutopilotVersion,
         burst: int,
         period: float,
-        boot_time: float = 0.0,
         param_error: bool = False,
-        telemetry: float = 0.0,
-        mavlink_version: int = 2,
-        stream: bool = False,
         dead: Iterable[int | str] = (),
         list_stops_at: int | None = None,
         list_stops: float = 1,
         repeated_names: bool = False,
-        high_latency: bool = False,
-        signing_key: wire.SigningKey | None = None,
-        signing_timestamp: int = 0,
-        usb: bool = False,
-        armed: bool = False,
-        reboot_ack: bool = True,
-        reboot_down: float = 1.0,
+        **options: Unpack[DeviceOptions],
     ) -> None:
         rows = tuple(table)
         if not repeated_names and len({row.name for row in rows}) < len(rows):
             raise UsageError("the table contains a parameter name twice")
         if len(rows) > _TABLE_SIZE_MAX:
             raise UsageError(f"a table holds at most {_TABLE_SIZE_MAX} parameters, not {len(rows)}")
-        if param_error and mavlink_version == 1:
+        if param_error and options.get("mavlink_version") == 1:
             raise UsageError("PARAM_ERROR does not exist in MAVLink 1")
         if burst < 1 or not (math.isfinite(period) and period > 0.0):
             raise UsageError("burst must be a number from 1 up, and period a number of seconds above 0")
@@ -147,17 +126,7 @@ class Vehicle(Device):
             component=component,
             heartbeat=heartbeat,
             version=version,
-            boot_time=boot_time,
-            telemetry=telemetry,
-            mavlink_version=mavlink_version,
-            stream=stream,
-            high_latency=high_latency,
-            signing_key=signing_key,
-            signing_timestamp=signing_timestamp,
-            usb=usb,
-            armed=armed,
-            reboot_ack=reboot_ack,
-            reboot_down=reboot_down,
+            **options,
         )
 
     # Public interface

@@ -559,6 +559,41 @@ def test_what_was_observed_before_a_whole_table_leaves_it_whole(path: Path) -> N
         ]
 
 
+@pytest.mark.parametrize("is_first", [True, False])
+def test_an_unlisted_value_from_before_a_whole_table_goes_with_it(path: Path, is_first: bool) -> None:
+    """In either order of writing, and the whole table keeps its state and its hash."""
+    unlisted = update(stored("HIDDEN", 1, at=NOW + 1), at=NOW + 3)
+    state = TableState(7, 1, complete=True, synced_at=NOW + 2)
+    whole = [stored("PARAM_0", 0, index=0, at=NOW + 2), stored("HIDDEN_TOO", 2, at=NOW + 1)]
+    listed = update(*whole, at=NOW + 2, replace=True, whole_at=NOW + 2, table=state)
+    with ParamCache(path) as one, ParamCache(path) as other:
+        one.save(whole_table(1))
+        for each in (unlisted, listed) if is_first else (listed, unlisted):
+            other.save(each)
+        assert values(one) == {"PARAM_0": 0, "HIDDEN_TOO": 2}
+        later = TableState(8, 1, complete=True, synced_at=NOW + 4)
+        params = [stored("PARAM_0", 5, index=0, at=NOW + 4), stored("HIDDEN", 1, at=NOW + 1)]
+        one.save(update(*params, at=NOW + 4, replace=True, whole_at=NOW + 4, table=later))
+        table = one.load(PX4.key, 1)
+        assert table is not None
+        assert (values(one)["PARAM_0"], table.hash, table.complete) == (5, 8, True)
+
+
+@pytest.mark.parametrize("is_first", [True, False])
+def test_a_value_that_was_read_by_name_has_the_index_of_the_whole_table(path: Path, is_first: bool) -> None:
+    """In either order of writing: a response to a read by name may have no index."""
+    read = update(stored("PARAM_0", 19, at=NOW + 3), at=NOW + 3)
+    state = TableState(7, 1, complete=True, synced_at=NOW + 2)
+    whole = [stored("PARAM_0", 17, index=0, at=NOW + 2)]
+    listed = update(*whole, at=NOW + 4, replace=True, whole_at=NOW + 2, table=state)
+    with ParamCache(path) as one, ParamCache(path) as other:
+        for each in (read, listed) if is_first else (listed, read):
+            one.save(each)
+        table = other.load(PX4.key, 1)
+        assert table is not None
+        assert (table.params["PARAM_0"].value, table.params["PARAM_0"].index) == (19, 0)
+
+
 def test_a_name_that_was_found_missing_before_it_was_heard_is_not_gone(path: Path) -> None:
     with ParamCache(path) as one, ParamCache(path) as other:
         one.save(whole_table(3))
@@ -660,8 +695,8 @@ class Model:
                     param = replace(param, index=old.param.index)
                 if not (old.param.type == param.type and same_bits(param.type, old.param.bits, param.bits)):
                     self.lines.append((name, old.param.bits, param.bits, item.by))
-            volatile = bool(old and old.volatile) if item.volatile is None else item.volatile
-            self.params[name] = replace(item, param=param, volatile=volatile)
+            volatile = bool(old and old.volatile if item.volatile is None else item.volatile)
+            self.params[name] = StoredParam(param, item.heard_at, volatile, item.by)
         self.lines += [(name, item.param.bits, None, BY_VEHICLE) for name, item in gone.items()]
         is_less = state is not None and not state.complete and self.state.complete and not whole
         counts: tuple[int | None, ...] = (self.state.count,) if params else (self.state.count, None)
@@ -728,7 +763,7 @@ class CacheMachine(RuleBasedStateMachine):
     def save(self, by: int, updates: list[Any]) -> None:
         batch = []
         for (identity, component), drawn, removed, whole, state in updates:
-            params = [replace(item, heard_at=self.now + item.heard_at) for item in drawn]
+            params = [item._replace(heard_at=self.now + item.heard_at) for item in drawn]
             params.sort(key=lambda item: item.heard_at)
             self.now += 1.0
             batch.append(

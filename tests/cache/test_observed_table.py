@@ -7,11 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from paramclient.cache import HeardParams, StoredParam, UnixTimes
-from paramclient.cache.observed_table import FirstRows
+from paramclient.cache.cells import Damaged
 from paramclient.cache.packed_table import Packed, pack
-from paramclient.cache.rows import Damaged, Row, read_param, read_params
+from paramclient.cache.stored_param import StoredTable
 from paramclient.model.params import Params
 from paramclient.model.values import Encoding, Param, ParamType, Trust, decode, from_bits, known_type
+from tests.caches import cells
 
 AT = 1_795_000_000.5
 TIMES = UnixTimes(AT, AT - 100.0)
@@ -54,39 +55,25 @@ def test_a_table_gives_the_same_rows_in_every_way(
         for name, param in params.items()
     ]
     assert dict(heard.heard_at()) == times
-    expected = {
-        each.param.name: Row.of(each.param, each.param.index, bool(each.volatile), each.heard_at)
-        for each in stored
-    }
-    rows = list(heard.rows())
-    assert rows == [
-        (name, row, each.volatile, each.by)
-        for (name, row), each in zip(expected.items(), stored, strict=True)
-    ]
-    assert [type(cell) for _, row, *_ in rows for cell in row if cell is not None] == [
-        type(cell) for row in expected.values() for cell in row if cell is not None
-    ]
-    first = heard.first_rows()
+    assert [type(cell) for item in heard for cell in item] == [type(cell) for item in stored for cell in item]
+    expected = {item.name: item.stored_over(None, keeps_index=True) for item in stored}
+    first = heard.first_table()
     if not params:
         assert first is None
         return
-    assert isinstance(first, FirstRows)
-    assert first == expected
-    names, columns = first.columns()
-    assert list(names) == list(expected)
-    assert [tuple(cells) for cells in zip(*columns, strict=True)] == [tuple(row) for row in expected.values()]
+    assert first is not None
+    assert first == first.rows() == expected
+    assert [tuple(cells) for cells in zip(*first.columns, strict=True)] == [
+        tuple(row[:-1]) for row in expected.values()
+    ]
     assert pack(first) == pack(expected)
-    kept, left_out, heard_at = Packed(pack(first)).params()
-    assert kept == read_params(expected)
-    assert left_out == frozenset(name for name, row in expected.items() if row.volatile)
-    assert heard_at == times
-    again = read_params(expected)
-    one_by_one = {
-        name: read_param(name, *row.value, row.param_index, row.default_bits)
-        for name, row in expected.items()
-    }
-    assert dict(again) == one_by_one
-    assert [repr(each.default) for each in again.values()] == [
+    found = Packed(pack(first)).table()
+    assert found == expected
+    assert dict(found.params()) == dict(StoredTable.of(expected).params())
+    one_by_one = {name: row.param for name, row in expected.items()}
+    cached = {name: param.with_trust(Trust.CACHED) for name, param in params.items()}
+    assert dict(first.params()) == one_by_one == cached
+    assert [repr(each.default) for each in first.params().values()] == [
         repr(each.default) for each in one_by_one.values()
     ]
 
@@ -98,23 +85,23 @@ def test_what_was_overwritten_comes_first_and_by_itself() -> None:
     heard = HeardParams(params, TIMES, volatile=None, by={}, overwritten=[before])
     assert (len(heard), heard[0], [each.param.value for each in heard[-1:]]) == (2, before, [2])
     assert list(heard.heard_at()) == [("A", AT), ("A", AT)]
-    rows = [(name, row.bits, by) for name, row, _, by in heard.rows()]
+    rows = [(item.name, item.bits, item.by) for item in heard]
     assert rows == [("A", 1, "us"), ("A", 2, "vehicle")]
-    assert heard.first_rows() is None, "a name is in it twice"
+    assert heard.first_table() is None, "a name is in it twice"
 
 
 @pytest.mark.parametrize(
     "row",
     [
-        Row(300, 1, 0, 0, 0, AT),
-        Row(-1, 1, 0, 0, 0, AT),
-        Row(ParamType.INT8, 256, 0, 0, 0, AT),
-        Row(ParamType.INT64, 1 << 32, 1, 0, 0, AT),
-        Row(77, 1 << 32, 1, 0, 0, AT),
-        Row(ParamType.INT8, 1, 0, 1 << 40, 0, AT),
-        Row(ParamType.INT8, 1, 0, 0, 0, AT, 1 << 40),
+        cells("A", 300, 1, 0, 0, 0, AT),
+        cells("A", -1, 1, 0, 0, 0, AT),
+        cells("A", ParamType.INT8, 256, 0, 0, 0, AT),
+        cells("A", ParamType.INT64, 1 << 32, 1, 0, 0, AT),
+        cells("A", 77, 1 << 32, 1, 0, 0, AT),
+        cells("A", ParamType.INT8, 1, 0, 1 << 40, 0, AT),
+        cells("A", ParamType.INT8, 1, 0, 0, 0, AT, 1 << 40),
     ],
 )
-def test_rows_that_hold_no_parameter_are_damage(row: Row) -> None:
+def test_rows_that_hold_no_parameter_are_damage(row: StoredParam) -> None:
     with pytest.raises(Damaged):
-        read_params({"A": row})
+        StoredTable.of({"A": row}).params()

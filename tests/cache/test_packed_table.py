@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import math
+import pickle
 import struct
 import tracemalloc
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,18 +17,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from paramclient.cache import ParamCache, sqlite
+from paramclient.cache import ParamCache, StoredParam, packed_table, sqlite
+from paramclient.cache.cells import Damaged
 from paramclient.cache.packed_table import Packed, pack, packed_row, row_checksum, unpack
-from paramclient.cache.rows import Damaged, Row
+from paramclient.cache.stored_param import COLUMN_NAMES, COLUMNS, Column, StoredTable
 from paramclient.cache.transaction import Session
 from paramclient.errors import UsageError
 from paramclient.model.values import ParamType
-from tests.caches import NOW, PX4, stored, update, values, whole_table
+from tests.caches import NOW, PX4, cells, stored, update, values, whole_table
 
 INT64 = st.integers(-(1 << 63), (1 << 63) - 1)
 NAMES = st.text(st.characters(exclude_categories=["Cs"]), max_size=20) | st.sampled_from("A \0")
 ROWS = st.builds(
-    Row,
+    cells,
+    NAMES,
     st.integers(0, 255),
     INT64 | st.integers(0, 9),
     st.integers(0, 1),
@@ -35,12 +39,16 @@ ROWS = st.builds(
     st.floats(0, 253402300800.0, exclude_max=True),
     st.none() | INT64,
 )
-TABLES = st.dictionaries(NAMES, ROWS, max_size=12)
-TABLE = {f"PARAM_{number}": Row(9, number << 20, 0, number, number % 2, NOW + number) for number in range(30)}
-EVERY = {
-    "B": Row(6, -1, 0, 1, 0, 1.5),
-    "A": Row(9, 7, 1, None, 1, 2.5, -2),
+TABLES = st.lists(ROWS, max_size=12).map(lambda rows: {row.name: row for row in rows})
+TABLE = {
+    name: cells(name, 9, number << 20, 0, number, number % 2, NOW + number)
+    for number, name in enumerate(f"PARAM_{each}" for each in range(30))
 }
+EVERY = {
+    "B": cells("B", 6, -1, 0, 1, 0, 1.5),
+    "A": cells("A", 9, 7, 1, None, 1, 2.5, -2),
+}
+BEFORE = pack(EVERY)
 
 
 def sealed(whole: bytes) -> bytes:
@@ -48,21 +56,23 @@ def sealed(whole: bytes) -> bytes:
     return whole + struct.pack("<I", zlib.crc32(whole))
 
 
-def order(item: tuple[str, Row]) -> tuple[bool, int, str]:
+def order(item: tuple[str, StoredParam]) -> tuple[bool, int, str]:
     name, row = item
     return row.param_index is None, row.param_index or 0, name
 
 
 @given(TABLES)
-def test_every_cell_comes_back_in_the_order_of_a_table(rows: dict[str, Row]) -> None:
+def test_every_cell_comes_back_in_the_order_of_a_table(rows: dict[str, StoredParam]) -> None:
     found = unpack(pack(rows))
     assert list(found.items()) == sorted(rows.items(), key=order)
-    assert all(type(row) is Row for row in found.values())
+    assert all(type(row) is StoredParam for row in found.values())
     assert [list(map(type, found[name])) for name in rows] == [list(map(type, row)) for row in rows.values()]
 
 
 @given(TABLES, st.randoms())
-def test_the_bytes_do_not_depend_on_the_order_in_which_rows_came(rows: dict[str, Row], chance: Any) -> None:
+def test_the_bytes_do_not_depend_on_the_order_in_which_rows_came(
+    rows: dict[str, StoredParam], chance: Any
+) -> None:
     items = list(rows.items())
     chance.shuffle(items)
     assert pack(dict(items)) == pack(rows)
@@ -84,11 +94,11 @@ def test_the_bytes_are_these_on_every_machine() -> None:
 
 
 @given(TABLES)
-def test_only_some_columns_are_the_same_as_in_all_of_it(rows: dict[str, Row]) -> None:
+def test_only_some_columns_are_the_same_as_in_all_of_it(rows: dict[str, StoredParam]) -> None:
     packed = Packed(pack(rows))
     places = packed.places()
     assert packed.size == len(rows)
-    assert list(places) == list(packed.rows())
+    assert list(places) == list(packed.table())
     some = list(rows)[::2]
     assert packed.heard_at(places[name] for name in some) == [rows[name].heard_at for name in some]
     values_of = packed.values((name, places[name]) for name in some)
@@ -98,13 +108,16 @@ def test_only_some_columns_are_the_same_as_in_all_of_it(rows: dict[str, Row]) ->
 def test_tables_of_the_same_names_are_told_by_their_bytes() -> None:
     other = {name: row._replace(bits=5, heard_at=NOW) for name, row in TABLE.items()}
     assert Packed(pack(other)).named == Packed(pack(TABLE)).named
-    assert Packed(pack({**other, "MORE": other["PARAM_0"]})).named != Packed(pack(TABLE)).named
+    assert (
+        Packed(pack({**other, "MORE": other["PARAM_0"]._replace(name="MORE")})).named
+        != Packed(pack(TABLE)).named
+    )
 
 
 # What is not the work of `pack`
 
 
-def believed(blob: bytes) -> dict[str, Row] | None:
+def believed(blob: bytes) -> dict[str, StoredParam] | None:
     """The table in some bytes, or None where it is told that they are damaged."""
     try:
         rows = unpack(blob)
@@ -128,7 +141,7 @@ def test_arbitrary_bytes_are_damage(data: bytes) -> None:
 
 @given(TABLES, st.data())
 @settings(max_examples=300)
-def test_changed_bytes_are_damage_or_a_table(rows: dict[str, Row], data: st.DataObject) -> None:
+def test_changed_bytes_are_damage_or_a_table(rows: dict[str, StoredParam], data: st.DataObject) -> None:
     blob = pack(rows)
     changed = bytearray(blob)
     for _ in range(data.draw(st.integers(1, 4))):
@@ -219,13 +232,55 @@ def test_a_claim_takes_no_memory() -> None:
         tracemalloc.stop()
 
 
+# A column of a later version
+
+
+@pytest.fixture
+def later_columns(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Two more columns than now."""
+    columns = (
+        *COLUMNS,
+        Column("source", "text", "s", is_optional=True),
+        Column("age", "integer", "i", is_optional=True),
+    )
+    monkeypatch.setattr(packed_table, "COLUMNS", columns)
+    monkeypatch.setattr(packed_table, "COLUMN_NAMES", tuple(column.name for column in columns))
+    monkeypatch.setattr(packed_table, "_COLUMNS", {column.name: column for column in columns})
+    monkeypatch.setattr(packed_table, "_OPTIONAL", tuple(each for each in columns if each.is_optional))
+    packed_table._layout.cache_clear()
+    yield
+    packed_table._layout.cache_clear()
+
+
+@pytest.mark.parametrize("sources", [("log", None), ("", "a file"), (None, None)])
+@pytest.mark.parametrize("ages", [(5, None), (None, None), (0, -1)])
+def test_a_later_column_is_kept_beside_the_others(later_columns: None, sources: Any, ages: Any) -> None:
+    table = StoredTable([*StoredTable.of(EVERY).columns, sources, ages])
+    found = Packed(pack(table)).table().columns
+    assert list(map(tuple, zip(*found, strict=True))) == list(zip(*table.columns, strict=True))
+
+
+def test_a_table_from_before_a_column_has_none_of_it(later_columns: None) -> None:
+    [*columns, sources, ages] = Packed(BEFORE).table().columns
+    assert list(zip(*columns, strict=True)) == [row[:-1] for row in EVERY.values()]
+    assert list(sources) == list(ages) == [None, None]
+    assert pack(StoredTable([*columns, sources, ages])) == BEFORE
+
+
+def test_the_fields_of_a_stored_parameter_are_its_columns_and_the_author() -> None:
+    assert StoredParam._fields == (*COLUMN_NAMES, "by")
+    assert tuple(column.name for column in COLUMNS) == COLUMN_NAMES
+    item = stored("A", 7, volatile=True, by="us", index=3)
+    assert copy.copy(item) == item == pickle.loads(pickle.dumps(item))
+
+
 # What cannot be kept
 
 
 @pytest.mark.parametrize(
     "rows",
     [
-        {"\udcff": EVERY["A"]},
+        {"\udcff": EVERY["A"]._replace(name="\udcff")},
         {"A": EVERY["A"]._replace(type=256)},
         {"A": EVERY["A"]._replace(type=-1)},
         {"A": EVERY["A"]._replace(is_raw=2)},
@@ -236,7 +291,7 @@ def test_a_claim_takes_no_memory() -> None:
         {"A": EVERY["A"]._replace(default_bits=1 << 63)},
     ],
 )
-def test_what_cannot_be_kept_is_refused(rows: dict[str, Row]) -> None:
+def test_what_cannot_be_kept_is_refused(rows: dict[str, StoredParam]) -> None:
     with pytest.raises(UsageError, match="the table cannot be stored"):
         pack(rows)
 
@@ -273,9 +328,9 @@ def test_what_stands_beside_the_bytes_is_in_the_checksum() -> None:
 def test_a_table_of_which_nothing_has_changed_is_not_written(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    written: list[Mapping[str, Row]] = []
+    written: list[Mapping[str, StoredParam]] = []
 
-    def noted(rows: Mapping[str, Row]) -> tuple[int, float, bytes]:
+    def noted(rows: Mapping[str, StoredParam]) -> tuple[int, float, bytes]:
         written.append(rows)
         return packed_row(rows)
 

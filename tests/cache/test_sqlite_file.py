@@ -26,11 +26,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from paramclient.cache import HISTORY_LINES, ParamCache, lock, sqlite_file
+from paramclient.cache import HISTORY_LINES, ParamCache, StoredParam, lock, sqlite_file
+from paramclient.cache.cells import Damaged
 from paramclient.cache.packed_table import unpack
-from paramclient.cache.rows import Damaged, checksum
 from paramclient.cache.sqlite_file import APPLICATION_ID, Database
 from paramclient.cache.sqlite_schema import MIGRATIONS
+from paramclient.cache.stored_param import checksum
 from paramclient.errors import CacheError, UnknownVehicle
 from paramclient.model.identity import Identity
 from paramclient.model.values import ParamType
@@ -125,7 +126,7 @@ def make_older(path: Path, version: int) -> None:
             connection.executemany(
                 "INSERT INTO param (owner, name, type, bits, is_raw, param_index, volatile, heard_at,"
                 " default_bits) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
-                [(owner, name, *row) for name, row in rows.items()],
+                [(owner, *row[:8]) for row in rows.values()],
             )
             connection.execute("UPDATE component SET checksum = ? WHERE id = ?", (checksum(rows), owner))
         connection.execute("DROP TABLE packed")
@@ -276,7 +277,7 @@ def test_who_writes_holds_the_file_before_he_reads_what_is_there(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path.write_bytes(sound_file())
-    monkeypatch.setattr(sqlite_file, "BUSY_TIMEOUT", 0.05)
+    monkeypatch.setattr(sqlite_file, "LOCK_WAIT_MAX", 0.05)
     ours, theirs = Database(path), Database(path)
 
     def work(_: sqlite3.Connection) -> None:
@@ -292,7 +293,7 @@ def test_who_writes_holds_the_file_before_he_reads_what_is_there(
 def test_a_program_that_holds_the_file_for_too_long_is_an_error_and_no_hindrance_to_reading(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sqlite_file, "BUSY_TIMEOUT", 0.05)
+    monkeypatch.setattr(sqlite_file, "LOCK_WAIT_MAX", 0.05)
     with ParamCache(path) as cache, connect(path) as other:
         cache.save(whole_table(3))
         other.execute("BEGIN IMMEDIATE")
@@ -307,7 +308,7 @@ def test_a_program_that_holds_the_file_for_too_long_is_an_error_and_no_hindrance
 def test_a_folder_that_another_program_holds_is_waited_for_but_not_for_ever(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lock, "BUSY_TIMEOUT", 0.05)
+    monkeypatch.setattr(lock, "LOCK_WAIT_MAX", 0.05)
     folder = os.open(path.parent, os.O_RDONLY)
     try:
         fcntl.flock(folder, fcntl.LOCK_EX)
@@ -822,7 +823,7 @@ def test_a_file_from_before_tables_were_packed_keeps_every_cell(path: Path, vers
         stored("NAN", 0x7FA00001, ParamType.REAL32, index=1),
         stored("RAW", 0xFFFFFFFF, 77, index=32767, is_raw=True),
         stored("A", 3, index=1),
-        replace(odd, param=replace(odd.param, default=-5)),
+        StoredParam(replace(odd.param, default=-5), odd.heard_at),
     ]
     with ParamCache(path) as cache:
         cache.save(update(*cells))
@@ -1263,7 +1264,7 @@ def test_no_descriptor_is_left_open(path: Path, monkeypatch: pytest.MonkeyPatch)
         gc.collect()
         return len(list(Path("/proc/self/fd").iterdir()))
 
-    monkeypatch.setattr(sqlite_file, "BUSY_TIMEOUT", 0.0)
+    monkeypatch.setattr(sqlite_file, "LOCK_WAIT_MAX", 0.0)
     before = descriptors()
     for _ in range(3):
         path.write_bytes(rubbish(100))

@@ -3,10 +3,12 @@ file is asked of PostgreSQL here, by the same tests. Then what only stations tha
 
 from __future__ import annotations
 
+import json
 import sys
 import threading
 import time
 import traceback
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -26,15 +28,16 @@ from hypothesis import strategies as st
 
 from paramclient import ParamClient, Trust
 from paramclient.cache import CacheChange, CopyResult, ParamCache, StoredParam, TableState, TableUpdate
+from paramclient.cache.cells import Damaged
 from paramclient.cache.database_url import DatabaseAddress
 from paramclient.cache.operations import Save
-from paramclient.cache.outbox import LocalCopy
+from paramclient.cache.outbox import LocalCopy, packed, unpacked
 from paramclient.cache.postgres import PostgresDatabase, PostgresSession, Unavailable
-from paramclient.cache.rows import Row
 from paramclient.cache.shared import SharedStore, _Link
 from paramclient.cache.transaction import Line, Session
 from paramclient.cache.transfer import take_whole
 from paramclient.errors import CacheError, UsageError
+from paramclient.model.values import Param, ParamType
 from tests.cache import test_cache, test_fleet, test_snapshots
 from tests.caches import NOW, PX4, stored, update, values, whole_table
 from tests.client.test_observation_times import interleaved
@@ -323,7 +326,7 @@ def test_whatever_two_programs_write_to_a_database_was_so(path: str, tmp_path: P
     )
 
 
-def kept_of(updates: Iterable[TableUpdate]) -> tuple[Mapping[str, Row], Sequence[Line]]:
+def kept_of(updates: Iterable[TableUpdate]) -> tuple[Mapping[str, StoredParam], Sequence[Line]]:
     """What becomes of a whole table by these."""
     with TemporaryDirectory() as folder:
         copy = LocalCopy(Path(folder) / "copy")
@@ -965,3 +968,26 @@ async def test_an_apply_whose_process_is_killed_is_told_with_a_shared_database_t
     with database_on(server_url) as url:
         await told_after_a_kill(url)
     assert len([*tmp_path.rglob("*.setups")]) == 1  # noqa: ASYNC240 - nothing runs beside
+
+
+def test_a_write_that_an_earlier_version_has_queued_is_executed() -> None:
+    described = [1, "udp", None, 12, 0, 0, "", 0, 0, 0, 0]
+    items = [["A", 4, 65531, 0, 3, 7, NOW, True, "us"], ["B", 6, 2, 0, None, None, int(NOW), None, "vehicle"]]
+    told = ["save", [[described, 1, 12, NOW, None, items, [], False, {}, None]]]
+    operation = unpacked(zlib.compress(json.dumps(told).encode()))
+    expected = [
+        StoredParam(Param("A", -5, ParamType.INT16, 3, 0xFFFB, default=7), NOW, True, "us"),
+        StoredParam(Param("B", 2, ParamType.INT32, None, 2), NOW),
+    ]
+    assert isinstance(operation, Save)
+    assert repr(operation.updates[0].params) == repr(expected), "types of the cells too"
+    again = unpacked(packed(operation))
+    assert isinstance(again, Save)
+    assert repr(again.updates[0].params) == repr(expected)
+
+
+def test_a_queued_write_with_a_value_that_is_none_is_damaged() -> None:
+    described = [1, "udp", None, 12, 0, 0, "", 0, 0, 0, 0]
+    told = ["save", [[described, 1, 12, NOW, None, [["A", 300, *(0,) * 7]], [], False]]]
+    with pytest.raises(Damaged):
+        unpacked(zlib.compress(json.dumps(told).encode()))

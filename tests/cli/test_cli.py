@@ -1362,6 +1362,14 @@ def test_help_has_examples(command: Command, arguments: Sequence[str]) -> None:
         assert command().out == helped.out
 
 
+@pytest.mark.parametrize("name", ["apply", "verify"])
+def test_the_help_names_the_arguments_as_in_the_usage(name: str, command: Command) -> None:
+    helped = command(name, "--help").out
+    assert helped.startswith(f"Usage: paramclient {name} [OPTIONS] URL FILE\n")
+    assert re.search(r"\bFILE +A parameter file;", helped)
+    assert "SOURCE" not in helped
+
+
 # Output
 
 
@@ -1408,7 +1416,7 @@ def test_text_from_the_wire_is_escaped(
         assert (outcome.out + outcome.err).replace("\n", "").isprintable()
         assert (outcome.out + outcome.err).isascii()
     assert fetched.code == 1
-    assert "no parameter file can hold the name" in fetched.err
+    assert "no parameter file can contain this name" in fetched.err
     fetched = command("fetch", url, "--json", "--cache", cache)
     assert list(fetched.json["params"]) == ["[red]B[/red]"]
     assert fetched.out.replace("\n", "").isprintable()

@@ -11,7 +11,7 @@ import pytest
 from paramclient.metadata import MetadataStore
 from paramclient.model.values import ParamType
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
-from paramclient.sim.metadata import PARAMETER_FILE
+from paramclient.sim.metadata import METADATA_FILE
 from tests.commands import Command, Put, behind, in_process, leaping
 
 DATA = Path(__file__).parents[1] / "data"
@@ -275,7 +275,7 @@ def test_without_stored_metadata_there_is_no_wait(
 
 def test_a_vehicle_whose_metadata_file_is_missing(command: Command, put: Any) -> None:
     vehicle = quad()
-    del vehicle.files[PARAMETER_FILE]
+    del vehicle.files[METADATA_FILE]
     done = command("get", put(vehicle), "MC_ROLL_P", "--metadata", "vehicle", "--no-cache")
     assert done.code == 1
     assert "file not found" in done.err

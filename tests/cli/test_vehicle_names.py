@@ -9,7 +9,7 @@ import pytest
 
 from paramclient import AmbiguousVehicle, ParamCache, UnknownVehicle
 from paramclient.cache import CachedVehicle, TableState
-from paramclient.cache.lookup import LISTED_MAX, find_vehicle, is_vehicle_name
+from paramclient.cache.lookup import VEHICLES_LISTED_MAX, find_vehicle, is_vehicle_name
 from paramclient.model.identity import Identity
 from paramclient.sim import PX4Vehicle
 from tests.caches import NOW, PX4, stored, update
@@ -132,11 +132,11 @@ def test_system_and_component_only_narrow_a_name() -> None:
 
 
 def test_a_long_list_of_vehicles_is_shortened() -> None:
-    many = [known(1 + number % 255, f"{number:016x}") for number in range(LISTED_MAX + 2)]
+    many = [known(1 + number % 255, f"{number:016x}") for number in range(VEHICLES_LISTED_MAX + 2)]
     with pytest.raises(UnknownVehicle, match="and 2 more; `paramclient cache list` shows all") as caught:
         find_vehicle(many, "uid:ffffff", place="here")
-    assert str(caught.value).count("\n") == LISTED_MAX + 1
-    assert len(caught.value.vehicles) == LISTED_MAX + 2
+    assert str(caught.value).count("\n") == VEHICLES_LISTED_MAX + 1
+    assert len(caught.value.vehicles) == VEHICLES_LISTED_MAX + 2
 
 
 def test_an_empty_cache_is_reported() -> None:

@@ -364,7 +364,7 @@ def test_a_short_timeout_reports_the_remaining_wait(command: Command, put: Put) 
     put(Tap(one))
     done = command("set", URL, "MC_ROLL_P", "7.5", "--timeout", "1")
     assert (done.code, done.out) == (3, "")
-    assert "an autopilot, and 1.2 s more to see that it is the only one" in done.err
+    assert "an autopilot, then 1.2 s without another vehicle" in done.err
     assert untouched(one)
 
 

@@ -146,7 +146,7 @@ async def test_when_one_is_silent_the_other_is_identified_anew_and_written_again
         told = [await anext(events) for _ in range(3)]
         assert [type(each) for each in told][1:] == [Contested, Uncontested]
         assert (await vehicle.set("SHARED_A", 9)).actual == 9
-        await anyio.sleep(2 * cache_writer.FLUSH_INTERVAL)
+        await anyio.sleep(2 * cache_writer.CACHE_FLUSH_INTERVAL)
     [table] = cached(path).values()
     assert table == {"SHARED_A": 9.0, "SHARED_B": 2.0, "PX4_ONLY": 3.0}
 
@@ -258,7 +258,7 @@ async def test_one_without_a_hardware_id_in_place_of_a_vehicle_leaves_nothing_wi
             assert (await vehicle.get("A")).value == 99.0
         await until(lambda: vehicle.identity.uid == f"{5:016x}" and vehicle.peer.startswith("10.0.0.3"))
         assert (await vehicle.fetch_all()).params["A"].value == 1.0
-        await anyio.sleep(2 * cache_writer.FLUSH_INTERVAL)
+        await anyio.sleep(2 * cache_writer.CACHE_FLUSH_INTERVAL)
     tables = cached(path)
     assert tables[f"uid:{5:016x}"] == table
     assert [line.name for line in lines(path)] == (["B"] if stays > 10.0 else []), "its own alone"

@@ -40,7 +40,7 @@ from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.change_origin import Authors
 from paramclient.protocol.params.sync import Upkeep
 from paramclient.protocol.params.table import Room, Table
-from paramclient.protocol.requests.round_trip import INITIAL_TIMEOUT
+from paramclient.protocol.requests.retry import INITIAL_TIMEOUT
 from paramclient.protocol.station import Station
 from paramclient.protocol.stats import traffic as traffic_room
 from paramclient.protocol.vehicle.presence import LOST_AFTER
@@ -300,7 +300,7 @@ def test_what_is_remembered_of_the_reads_of_a_file_is_so_much_and_no_more() -> N
         job._give_up(number)
     for _ in range(3 * reading_room.BURSTS_MAX):
         job._burst(session.now)
-        job._burst_attempts = 0
+        job._burst_attempts.restart()
     assert len(job._late) == reading_room.LATE_READS_MAX
     assert len(job._bursts) == reading_room.BURSTS_MAX
 
@@ -426,7 +426,7 @@ async def test_one_that_is_another_vehicle_each_time_fills_no_cache(
         for number in range(4):
             liar.say(AutopilotVersion(16, uid=number + 1))
             liar.say(param_value(f"V{number}"))
-            await anyio.sleep(LOST_AFTER + 2 * cache_writer.FLUSH_INTERVAL)  # till then it may be two
+            await anyio.sleep(LOST_AFTER + 2 * cache_writer.CACHE_FLUSH_INTERVAL)  # till then it may be two
             assert len(local_client(client).cache_writer._bringing) <= 1
     with ParamCache(path) as cache:
         systems = [each.identity.system for each in cache.vehicles()]

@@ -137,7 +137,7 @@ async def test_what_would_have_to_be_sent_is_refused_at_once() -> None:
         ]
         began = anyio.current_time()
         for call in calls:
-            with pytest.raises(UsageError, match="where nothing is sent"):
+            with pytest.raises(UsageError, match="the client only listens"):
                 await call()
         assert anyio.current_time() - began < 0.01
         assert residue(component) == []
@@ -147,7 +147,7 @@ async def test_what_would_have_to_be_sent_is_refused_at_once() -> None:
 
 def test_what_may_be_asked_cannot_be_said_where_nothing_is() -> None:
     for options in ({"policy": Policy.HASH_ONLY}, {"watch_interval": 5.0}):
-        with pytest.raises(UsageError, match="here nothing is sent"):
+        with pytest.raises(UsageError, match="the client only listens"):
             listener(small_px4(), **options)
     listener(small_px4(), watch_interval=0, policy="auto")
 
@@ -243,9 +243,9 @@ async def test_a_cached_table_is_confirmed_by_a_hash_that_others_ask_for(tmp_pat
 def test_the_command_listens_too(capsys: pytest.CaptureFixture[str]) -> None:
     patience = ("--timeout", "0.3", "--no-cache", "--listen-only")
     assert run(["fetch", "sim:px4", *patience]) == 3
-    assert "for which nobody was heard asking" in capsys.readouterr().err
+    assert "which no other station has requested" in capsys.readouterr().err
     assert run(["get", "sim:px4", "MC_ROLL_P", *patience]) == 2
-    assert "where nothing is sent" in capsys.readouterr().err
+    assert "the client only listens" in capsys.readouterr().err
     assert run(["link", "sim:px4", "--listen-only", "--json", "--seconds", "0.3"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["frames"] > 0

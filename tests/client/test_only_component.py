@@ -112,7 +112,7 @@ async def test_a_time_limit_holds_for_everything() -> None:
         with pytest.raises(NoReply, match="an autopilot") as caught:
             await client.only_component(timeout=0.4)
         assert 0.3 < caught.value.waited < 0.5
-        with pytest.raises(NoReply, match=r"an autopilot, and 1\.2 s more to see that it is the only one"):
+        with pytest.raises(NoReply, match=r"an autopilot, then 1\.2 s without another vehicle"):
             await client.only_component(timeout=1.0)
         with pytest.raises(NoReply, match="system id 7"):
             await client.only_component(7, timeout=0.1)
@@ -185,7 +185,7 @@ async def test_the_vehicles_on_all_links_of_a_service_count() -> None:
         assert (answer.json()["system"], answer.json()["component"]) == (1, 1)
         answer = await browser.post("/api/v1/find?link=nowhere", json={"only": True})
         problem(answer, 404, "unknown-link")
-        assert len(hub.lines) == 2
+        assert len(hub.links) == 2
 
 
 @direct_only("it has services of its own")

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import inspect
 import math
 import time
+import weakref
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import anyio
 import anyio.lowlevel
@@ -16,14 +21,16 @@ import pytest
 
 from paramclient import ParamCache, ParamClient
 from paramclient.cache import CachedComponent, TableUpdate
-from paramclient.client import cache_writer, event_loop_share, link_task
+from paramclient.client import cache_writer, link_task, loop_scheduler
 from paramclient.client.cache_writer import DOWNLOAD_INTERVAL, NEW_SHARE_MIN
-from paramclient.client.event_loop_share import TURN_MAX
+from paramclient.client.fetch_all import FetchTogether
 from paramclient.client.link_task import HELD_UP_MIN, TIMEOUT_DELAY_MAX, LinkTask
+from paramclient.client.loop_scheduler import TURN_MAX
+from paramclient.errors import NoReply
 from paramclient.links import Peer
 from paramclient.model.values import ParamType
+from paramclient.protocol import scheduler, wire
 from paramclient.protocol import station as station_room
-from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ComponentLost
 from paramclient.protocol.params.fetch import Fetch
@@ -63,8 +70,8 @@ def test_what_one_says_makes_nobody_look_at_the_others(looks: Counter[int]) -> N
     station.next_deadline()
     looks.clear()
     hear(station, 7, 0.1)
-    station.tick(0.1, everyone=False)
-    station.next_deadline(everyone=False)
+    station.tick(0.1)
+    station.next_deadline()
     assert set(looks) == {7}
     assert looks[7] <= 3
 
@@ -74,14 +81,14 @@ def test_a_deadline_is_kept_whoever_was_looked_at_meanwhile() -> None:
     station = Station(link="x", is_stream=False)
     for system in range(1, 11):
         hear(station, system, system / 100)
-    station.tick(0.1, everyone=False)
+    station.tick(0.1)
     station.data_to_send()
-    assert station.next_deadline(everyone=False) == 0.26  # the first timeout, 0.25 s
+    assert station.next_deadline() == 0.26  # the first timeout, 0.25 s
     asked: list[tuple[float, int]] = []
     now = 0.1
     while len(set(asked)) < 10:
-        now = station.next_deadline(everyone=False)
-        station.tick(now, everyone=False)
+        now = station.next_deadline()
+        station.tick(now)
         for data, _ in station.data_to_send():
             for frame in wire.Framer(wire.DECODED_IDS, stream=False).receive(data):
                 message = wire.decode(frame)
@@ -90,7 +97,7 @@ def test_a_deadline_is_kept_whoever_was_looked_at_meanwhile() -> None:
     assert sorted(set(asked)) == [(round(0.25 + system / 100, 3), system) for system in range(1, 11)]
 
 
-def test_what_was_asked_of_one_goes_out_when_it_was_touched() -> None:
+def test_what_was_asked_of_one_goes_out() -> None:
     station = Station(link="x", is_stream=False)
     hear(station, 1, 0.0)
     hear(station, 2, 0.0)
@@ -99,9 +106,8 @@ def test_what_was_asked_of_one_goes_out_when_it_was_touched() -> None:
     machine = station.components[2, 1]
     for index in range(40):  # more than may go out at once
         machine.reads.ask(index, 0.0)
-    station.touch(machine)
-    assert station.next_deadline(everyone=False) == pytest.approx(machine.reads.pace.next_at())
-    assert station.next_deadline(everyone=False) == station.next_deadline()
+    assert station.next_deadline() == pytest.approx(machine.reads.pace.next_at())
+    assert station.next_deadline() == min(each.next_deadline() for each in station.components.values())
 
 
 def test_what_is_due_of_many_at_once_is_done_in_parts() -> None:
@@ -112,12 +118,72 @@ def test_what_is_due_of_many_at_once_is_done_in_parts() -> None:
     ticks = 0
     now = 100.0  # all of them are lost by now
     while station.next_deadline() <= now:
-        station.tick(now, everyone=not ticks)
+        station.tick(now)
         ticks += 1
         lost = [event for event in station.events() if isinstance(event, ComponentLost)]
-        assert len(lost) <= station_room.TICKED_COMPONENTS_MAX
+        assert len(lost) <= scheduler.TICKED_COMPONENTS_MAX
     assert all(machine.presence.is_lost for machine in station.components.values())
-    assert ticks >= MANY / station_room.TICKED_COMPONENTS_MAX
+    assert ticks >= MANY / scheduler.TICKED_COMPONENTS_MAX
+
+
+def test_deadlines_of_many_are_evaluated_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    station = Station(link="x", is_stream=False)
+    for system in range(1, MANY + 1):
+        hear(station, system, 0.0)
+    station.tick(0.0)
+    while station.next_deadline() <= 0.0:
+        station.tick(0.0)
+    evaluated: list[ComponentMachine] = []
+    next_deadline = ComponentMachine.next_deadline
+
+    def evaluate(machine: ComponentMachine) -> float:
+        evaluated.append(machine)
+        return next_deadline(machine)
+
+    monkeypatch.setattr(scheduler, "EXAMINED_COMPONENTS_MAX", MANY // 5)
+    monkeypatch.setattr(ComponentMachine, "next_deadline", evaluate)
+    station.scheduler.reschedule_all()
+    for part in range(1, 6):
+        assert len(evaluated) == (part - 1) * (MANY // 5)
+        due = station.next_deadline()
+        assert (due <= 0.0) is (part < 5), "it is due again at once until all have been evaluated"
+    assert set(evaluated) == set(station.components.values())
+    assert due == station.next_deadline()
+
+
+def test_a_fetch_that_is_given_back_is_freed_without_a_garbage_collection() -> None:
+    station = Station(link="x", is_stream=False)
+    hear(station, 1, 0.0)
+    machine = station.components[1, 1]
+    gc.collect()
+    gc.disable()
+    try:
+        fetch = machine.begin_fetch(0.0)
+        left = [weakref.ref(each) for each in (fetch, fetch.download, fetch._hash_read)]
+        assert all(each() is not None for each in left)
+        machine.end_fetch(fetch, 1.0)
+        del fetch
+        assert [each() for each in left] == [None, None, None]
+    finally:
+        gc.enable()
+
+
+@swiftly
+async def test_the_errors_of_silent_components_hold_no_calls() -> None:
+    station: Any = SimpleNamespace()
+    together = FetchTogether(station, {}, system=None, refresh=False)
+    for system in range(1, 4):
+        fetch: Any = SimpleNamespace(error=None if system > 1 else NoReply("x", attempts=1, waited=1.0))
+        fetch.result = SimpleNamespace(complete=True) if system == 3 else None
+        fetch.partial = partial(_raise, NoReply("y", attempts=1, waited=1.0))
+        together._fetches[system, 1] = fetch
+    outcome = await together.outcome(0.0, waited=1.0)
+    assert outcome.results.keys() == {(3, 1)}
+    assert [error.__traceback__ for error in outcome.silent.values()] == [None, None]
+
+
+def _raise(error: Exception, *_: object) -> None:
+    raise error
 
 
 def test_who_was_forgotten_leaves_no_deadline_to_whoever_comes_in_its_place(
@@ -131,17 +197,15 @@ def test_who_was_forgotten_leaves_no_deadline_to_whoever_comes_in_its_place(
     gone = station.components[1, 1]
     for second in range(1, 20):
         hear(station, 2, float(second))
-        station.tick(float(second), everyone=False)
-        station.next_deadline(everyone=False)
+        station.tick(float(second))
+        station.next_deadline()
     assert gone.presence.is_lost
-    station.touch(gone)
     hear(station, 3, 20.0)
     gone.reads.ask("A", 20.0)
-    station.touch(gone)
     hear(station, 2, 20.0)
     for second in range(20, 60):
-        station.tick(float(second), everyone=False)
-        assert station.next_deadline(everyone=False) > second
+        station.tick(float(second))
+        assert station.next_deadline() > second
     assert [*station.components] == [(2, 1), (3, 1)]
     assert all(machine.presence.is_lost for machine in station.components.values()), "by their own deadlines"
     assert station.autopilot_of(1) is None
@@ -175,16 +239,18 @@ def session(air: Air, vehicles: list[Vehicle], *, everyone: bool) -> tuple[list[
     air.tick(now)
     while not (fetches and all(fetch.done for fetch in fetches)):
         assert now < 120.0
-        station.tick(now, everyone=everyone)
+        if everyone:
+            station.scheduler.reschedule_all()
+        station.tick(now)
         machines = list(station.components.values())
         if not fetches and len(machines) == len(vehicles) and all(each.who.settled for each in machines):
             fetches = [machine.begin_fetch(now) for machine in machines]
-            for machine in machines:
-                station.touch(machine)
         for data, _ in station.data_to_send():
             air.receive(data, now)
         deadline = air.next_deadline()
-        ours = station.next_deadline(everyone=everyone)
+        if everyone:
+            station.scheduler.reschedule_all()
+        ours = station.next_deadline()
         now = max(min(ours, math.inf if deadline is None else deadline), now + 1e-7)
         air.tick(now)
         for data in air.data_to_send():
@@ -265,20 +331,16 @@ class Watched(Station):
     def __init__(self) -> None:
         super().__init__(link="flood", is_stream=False)
         self.ticks: list[float] = []
-        self.most_lists = math.inf
         self.on_receive: Callable[[], None] = lambda: None
 
     def receive(self, data: bytes, peer: Peer, now: float, moment: float | None = None) -> bool:
         self.on_receive()
         return True
 
-    def tick(
-        self, now: float, *, everyone: bool = True, most_lists: float = math.inf, is_crowded: bool = False
-    ) -> None:
+    def tick(self, now: float) -> None:
         self.ticks.append(now)
-        self.most_lists = most_lists
 
-    def next_deadline(self, *, everyone: bool = True) -> float:
+    def next_deadline(self) -> float:
         return anyio.current_time() + 0.01
 
 
@@ -294,38 +356,38 @@ async def carry(link: Flood, station: Watched, seconds: float, dispatch: Callabl
 @swiftly
 async def test_time_outs_wait_until_what_has_come_is_read() -> None:
     link, station = Flood(), Watched()
-    link.size = event_loop_share.BACKLOG_DATAGRAMS_MIN
+    link.size = loop_scheduler.BACKLOG_DATAGRAMS_MIN
     began = anyio.current_time()
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(carry, link, station, 2.0, lambda: None)
         await anyio.sleep(1.0)
         meanwhile = [at for at in station.ticks if at > began + link.interval]
         assert not meanwhile, "more was there after each reading"
-        link.size = event_loop_share.BACKLOG_DATAGRAMS_MIN - 1
+        link.size = loop_scheduler.BACKLOG_DATAGRAMS_MIN - 1
         await anyio.sleep(0.1)
         assert station.ticks[-1] > began + 1.0
         assert len(station.ticks) > 5
-        assert station.most_lists > 1
+        assert station.scheduler.lists_max > 1
 
 
 @swiftly
 async def test_time_outs_do_not_wait_for_ever() -> None:
     link, station = Flood(), Watched()
-    link.size = event_loop_share.BACKLOG_DATAGRAMS_MIN
+    link.size = loop_scheduler.BACKLOG_DATAGRAMS_MIN
     began = anyio.current_time()
     await carry(link, station, TIMEOUT_DELAY_MAX + 1.0, lambda: None)
     meanwhile = [at - began for at in station.ticks if at > began + link.interval]
     assert TIMEOUT_DELAY_MAX <= meanwhile[0] < TIMEOUT_DELAY_MAX + 0.1
     assert 50 < len(meanwhile) < 1.0 / TURN_MAX
-    assert station.most_lists == 1, "and no further list begins"
+    assert station.scheduler.lists_max == 1, "and no further list begins"
 
 
 class Starved(Watched):
     """Other programs have the processor whenever it has said until when to wait."""
 
-    def next_deadline(self, *, everyone: bool = True) -> float:
+    def next_deadline(self) -> float:
         swift_loop().call_later(0.001, self._starve)
-        return super().next_deadline(everyone=everyone)
+        return super().next_deadline()
 
     def _starve(self) -> None:
         swift_loop().now += HELD_UP_MIN + 0.002
@@ -335,7 +397,7 @@ class Starved(Watched):
 async def test_time_outs_wait_while_other_programs_have_the_processor() -> None:
     """What has come is there, but the reader had no turn meanwhile."""
     link, station = Flood(), Starved()
-    link.size = event_loop_share.BACKLOG_DATAGRAMS_MIN
+    link.size = loop_scheduler.BACKLOG_DATAGRAMS_MIN
     link.interval = TURN_MAX + 0.003  # the sender wakes before it
     began = anyio.current_time()
     await carry(link, station, 1.0, lambda: None)
@@ -346,7 +408,7 @@ async def test_time_outs_wait_while_other_programs_have_the_processor() -> None:
 async def test_time_outs_wait_for_nothing_that_does_not_come() -> None:
     """The last reading brought many, and then the link falls silent."""
     link, station = Flood(), Watched()
-    link.size = event_loop_share.BACKLOG_DATAGRAMS_MIN
+    link.size = loop_scheduler.BACKLOG_DATAGRAMS_MIN
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(carry, link, station, 1.0, lambda: None)
         await anyio.sleep(0.5)
@@ -360,12 +422,12 @@ async def test_time_outs_wait_for_nothing_that_does_not_come() -> None:
 async def test_time_outs_wait_for_what_waits_for_its_turn() -> None:
     """Few datagrams were read, among them perhaps the answers, and another link has the turn."""
     link, station = Flood(), Watched()
-    link.size = event_loop_share.TURN_DATAGRAMS_MIN
+    link.size = loop_scheduler.TURN_DATAGRAMS_MIN
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(carry, link, station, 3.0, lambda: None)
         await anyio.sleep(0.5)
         assert len(station.ticks) > 5
-        async with event_loop_share.EventLoopShare.of_this_loop().turn:
+        async with loop_scheduler.LoopScheduler.of_this_loop().turn:
             await anyio.sleep(2 * link.interval)
             before = len(station.ticks)
             await anyio.sleep(0.5)
@@ -413,8 +475,8 @@ async def test_what_comes_at_once_gives_way_to_other_tasks(monkeypatch: pytest.M
 
 
 def test_a_link_has_no_more_lists_than_the_others_leave_it() -> None:
-    readers = event_loop_share.EventLoopShare()
-    most = event_loop_share.BURST_LISTS_MAX
+    readers = loop_scheduler.LoopScheduler()
+    most = loop_scheduler.BURST_LISTS_MAX
     assert readers.most_lists("a", 10 * most, 1.0) == math.inf, "it has its own measure"
     assert readers.most_lists("a", 0, 1.0) == math.inf
     assert readers.most_lists("b", most - 3, 2.0) == math.inf
@@ -429,7 +491,7 @@ def test_a_link_has_no_more_lists_than_the_others_leave_it() -> None:
 
 
 def test_a_list_that_is_only_awaited_takes_no_time_of_others() -> None:
-    readers = event_loop_share.EventLoopShare()
+    readers = loop_scheduler.LoopScheduler()
     readers.most_lists("a", 0, 1.0, awaited=5)
     assert not readers.is_busy_without("b")
     readers.most_lists("a", 1, 1.0)
@@ -440,25 +502,23 @@ def test_a_list_that_is_only_awaited_takes_no_time_of_others() -> None:
 
 
 def test_no_link_has_lists_beside_each_other_while_more_has_come_on_one_than_was_read() -> None:
-    readers = event_loop_share.EventLoopShare()
-    readers.came("b", event_loop_share.BACKLOG_DATAGRAMS_MIN - 1)
+    readers = loop_scheduler.LoopScheduler()
+    readers.came("b", loop_scheduler.BACKLOG_DATAGRAMS_MIN - 1)
     assert readers.most_lists("a", 0, 1.0) == math.inf
-    readers.came("b", event_loop_share.BACKLOG_DATAGRAMS_MIN)
+    readers.came("b", loop_scheduler.BACKLOG_DATAGRAMS_MIN)
     assert readers.most_lists("a", 0, 1e6) == 1, "it is not done with them"
     readers.taken("b", 2.0)
     assert readers.most_lists("a", 0, 2.0) == 1
-    assert readers.most_lists("a", 0, 2.0 + event_loop_share.BACKLOG_VALIDITY) == math.inf
-    readers.came("b", event_loop_share.BACKLOG_DATAGRAMS_MIN - 1)
+    assert readers.most_lists("a", 0, 2.0 + loop_scheduler.BACKLOG_VALIDITY) == math.inf
+    readers.came("b", loop_scheduler.BACKLOG_DATAGRAMS_MIN - 1)
     readers.taken("b", 2.0)
     assert readers.most_lists("a", 0, 2.0) == math.inf
 
 
 def test_links_of_two_event_loops_share_nothing() -> None:
-    async def find() -> event_loop_share.EventLoopShare:
-        assert (
-            event_loop_share.EventLoopShare.of_this_loop() is event_loop_share.EventLoopShare.of_this_loop()
-        )
-        return event_loop_share.EventLoopShare.of_this_loop()
+    async def find() -> loop_scheduler.LoopScheduler:
+        assert loop_scheduler.LoopScheduler.of_this_loop() is loop_scheduler.LoopScheduler.of_this_loop()
+        return loop_scheduler.LoopScheduler.of_this_loop()
 
     assert anyio.run(find) is not anyio.run(find)
 
@@ -466,36 +526,38 @@ def test_links_of_two_event_loops_share_nothing() -> None:
 @swiftly
 async def test_no_list_begins_while_another_link_brings_more_than_is_read() -> None:
     busy, quiet, station = Flood(), Flood(), Watched()
-    busy.size, quiet.size = event_loop_share.BACKLOG_DATAGRAMS_MIN, 1
+    busy.size, quiet.size = loop_scheduler.BACKLOG_DATAGRAMS_MIN, 1
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(carry, quiet, station, 3.0, lambda: None)
         await anyio.sleep(0.5)
-        seen = [station.most_lists]
+        seen = [station.scheduler.lists_max]
         tasks.start_soon(carry, busy, Watched(), 2.0, lambda: None)
-        for size in (event_loop_share.BACKLOG_DATAGRAMS_MIN, 0, event_loop_share.BACKLOG_DATAGRAMS_MIN):
+        for size in (loop_scheduler.BACKLOG_DATAGRAMS_MIN, 0, loop_scheduler.BACKLOG_DATAGRAMS_MIN):
             busy.size = size
             busy.is_stuck.set()
             await anyio.sleep(0.5)
-            seen.append(station.most_lists)
+            seen.append(station.scheduler.lists_max)
         assert seen == [math.inf, 1, math.inf, 1]
         half_a_second = [at for at in station.ticks if at > anyio.current_time() - 0.5]
         assert len(half_a_second) > 20, "what is due is done all the same"
         await anyio.sleep(0.6)
-        assert station.most_lists > 1, "that one was closed"
+        assert station.scheduler.lists_max > 1, "that one was closed"
         tasks.cancel_scope.cancel()
 
 
 @swiftly
-async def test_a_link_that_was_closed_leaves_nothing_behind_whichever_of_its_tasks_ends_last() -> None:
+async def test_a_link_that_was_closed_leaves_nothing_behind_whichever_of_its_tasks_ends_last(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     station = Watched()
-    station.bursts = lambda now: (event_loop_share.BURST_LISTS_MAX, 0)  # type: ignore[method-assign]
+    monkeypatch.setattr(scheduler.Turns, "bursts", loop_scheduler.BURST_LISTS_MAX)
     for first in ("read", "send"):
         tasks = {}
         link = LinkTask(Flood(), station, dispatch=lambda: None, end=lambda error: None)
         for name in ("read", "send"):
             tasks[name] = asyncio.create_task(getattr(link, name)())
         await anyio.sleep(0.1)
-        readers = event_loop_share.EventLoopShare.of_this_loop()
+        readers = loop_scheduler.LoopScheduler.of_this_loop()
         assert readers.most_lists("another", 0, anyio.current_time()) == 1
         for name in (first, *({*tasks} - {first})):
             tasks[name].cancel()
@@ -521,7 +583,7 @@ class Portions(ParamCache):
 async def test_what_is_new_is_written_in_portions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No transaction begins another table when it has enough: to gather one takes the loop's time."""
     monkeypatch.setattr(cache_writer, "TRANSACTION_PARAMS", 200)
-    monkeypatch.setattr(cache_writer, "FLUSH_INTERVAL", 1000.0)  # everything on closing
+    monkeypatch.setattr(cache_writer, "CACHE_FLUSH_INTERVAL", 1000.0)  # everything on closing
     vehicles = [small(system) for system in range(1, 8)]
     cache = Portions(tmp_path / "cache.sqlite3")
     with cache:

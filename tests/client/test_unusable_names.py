@@ -101,7 +101,7 @@ def test_a_vehicle_with_such_a_name_is_fetched_but_for_its_index(ftp: bool) -> N
     session = Simulation(ArduPilotVehicle(table=odd, ftp=ftp))
     result = session.fetch(limit=30)
     assert (result.source, [*result.params], result.missing) == ("ftp" if ftp else "stream", ["A", "D"], (1,))
-    assert any("no parameter file can hold the name" in note and "'B C'" in note for note in result.notes)
+    assert any("no parameter file can contain this name" in note and "'B C'" in note for note in result.notes)
     assert not session.machine.table.complete
     again = session.fetch(limit=30)
     assert (again.missing, [*again.params]) == ((1,), ["A", "D"])
@@ -169,7 +169,7 @@ def test_such_a_name_in_the_cache_blocks_no_export_and_goes_with_the_next_whole_
         assert [*cache.state_at(identity.key, 1, made.id)] == ["A", "B"]
     saved = command("save", "cache:1", tmp_path / "a.params", "--cache", path)
     assert (saved.code, [*loads((tmp_path / "a.params").read_bytes()).sets[0]]) == (0, ["A", "B"])
-    assert "left out, as no parameter file can hold the name: 'A\\nB'" in saved.err
+    assert "skipped, because no parameter file can contain the name: 'A\\nB'" in saved.err
     assert r"'A\nB'" in command("show", "1", "--cache", path).err
     assert command("fetch", put(vehicle), "--refresh", "--cache", path).code == 0
     with ParamCache(path) as cache:

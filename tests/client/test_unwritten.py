@@ -18,7 +18,7 @@ import pytest
 
 from paramclient import CacheError, Component, ParamCache, ParamClient
 from paramclient.cache import sqlite_file
-from paramclient.client.cache_writer import FLUSH_INTERVAL, RETRY_INTERVAL
+from paramclient.client.cache_writer import CACHE_FLUSH_INTERVAL, RETRY_INTERVAL
 from paramclient.client.client import local_client
 from paramclient.client.local import local
 from paramclient.model.paramset import ParamSet, WrittenParam
@@ -35,7 +35,7 @@ NAME = "PARAM_01"
 
 @pytest.fixture(autouse=True)
 def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sqlite_file, "BUSY_TIMEOUT", 0.05)
+    monkeypatch.setattr(sqlite_file, "LOCK_WAIT_MAX", 0.05)
 
 
 @pytest.fixture
@@ -149,7 +149,7 @@ async def test_what_is_written_late_has_the_times_of_the_observations_and_every_
                 await until(partial(is_heard, component, value))
                 heard.append(anyio.current_time() - began_at)
                 await anyio.sleep(10)
-        await anyio.sleep(2 * RETRY_INTERVAL + FLUSH_INTERVAL)
+        await anyio.sleep(2 * RETRY_INTERVAL + CACHE_FLUSH_INTERVAL)
     with ParamCache(path) as cache:
         lines = cache.history(cache.vehicles()[0].key)
     assert [(line.old.value, line.new and line.new.value) for line in lines] == [(1, 5), (5, 6), (6, 7)]

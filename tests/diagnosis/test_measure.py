@@ -15,11 +15,11 @@ from paramclient.cli.exit_codes import ExitCode
 from paramclient.diagnosis import (
     FileService,
     HashService,
+    HeardStation,
     LinkReport,
     ListService,
     ReadService,
     Severity,
-    Station,
     VehicleReport,
     check_vehicle,
     findings_of,
@@ -219,7 +219,7 @@ def test_the_output_is_a_table(live_command: Command, put: Put) -> None:
     assert rows["hardware id"] == ["0000001234567890"]
     assert rows["list"][0].startswith("903 of 903 in ")
     assert rows["hash"][0].startswith("cf579589, the same after ")
-    assert rows["other stations"] == ["none heard"]
+    assert rows["other stations"] == ["none"]
     assert rows["note"]
 
 
@@ -358,9 +358,9 @@ def test_nothing_unusual() -> None:
         ({"link": {"round_trips": (0.1, 0.6, 0.9)}}, Severity.SLOW, "The round trip is 0.60 s"),
         ({"link": {"round_trips": (), "unanswered": 1}}, Severity.PROBLEM, "No command was acknowledged"),
         ({"link": {"unanswered": 1}}, Severity.SLOW, "1 of 4 commands"),
-        ({"link": {"stations": (Station(255, 190, True),)}}, Severity.PROBLEM, "has this one's address"),
+        ({"link": {"stations": (HeardStation(255, 190, True),)}}, Severity.PROBLEM, "has this one's address"),
         (
-            {"link": {"stations": (Station(254, 190, False),)}},
+            {"link": {"stations": (HeardStation(254, 190, False),)}},
             Severity.NOTE,
             "Another ground station, 254/190",
         ),

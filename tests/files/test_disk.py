@@ -25,7 +25,7 @@ from paramclient import (
 )
 from paramclient.errors import UsageError
 from paramclient.files import LARGEST_FILE, dumps, loads
-from paramclient.files.includes import DEPTH_MAX, FILES_MAX
+from paramclient.files.includes import FILES_MAX, INCLUDE_DEPTH_MAX
 from paramclient.files.param_file import ENDINGS
 
 ROOT = Path(__file__).parents[2]
@@ -412,12 +412,12 @@ def test_an_error_in_an_included_file_names_both_lines(tmp_path: Path) -> None:
 
 
 def test_includes_are_limited(tmp_path: Path) -> None:
-    chain = {f"f{number}_parm": f"@include f{number + 1}.parm\n" for number in range(DEPTH_MAX)}
-    assert values(tree(tmp_path, **chain, **{f"f{DEPTH_MAX}_parm": "A 1\n"})) == {"A": 1}
-    (tmp_path / f"f{DEPTH_MAX}.parm").write_text(f"@include f{DEPTH_MAX + 1}.parm\n")
+    chain = {f"f{number}_parm": f"@include f{number + 1}.parm\n" for number in range(INCLUDE_DEPTH_MAX)}
+    assert values(tree(tmp_path, **chain, **{f"f{INCLUDE_DEPTH_MAX}_parm": "A 1\n"})) == {"A": 1}
+    (tmp_path / f"f{INCLUDE_DEPTH_MAX}.parm").write_text(f"@include f{INCLUDE_DEPTH_MAX + 1}.parm\n")
     assert "nested more than" in str(refused(lambda: read_file(tmp_path / "f0.parm")))
-    wide = {f"g{number}_parm": f"@include g{number + 1}.parm\n" * 4 for number in range(DEPTH_MAX)}
-    first = tree(tmp_path, **wide, **{f"g{DEPTH_MAX}_parm": "A 1\n"})
+    wide = {f"g{number}_parm": f"@include g{number + 1}.parm\n" * 4 for number in range(INCLUDE_DEPTH_MAX)}
+    first = tree(tmp_path, **wide, **{f"g{INCLUDE_DEPTH_MAX}_parm": "A 1\n"})
     assert f"more than {FILES_MAX} files" in str(refused(lambda: read_file(first)))
     (tmp_path / "large.parm").write_text("# " + "x" * (LARGEST_FILE // 2) + "\nA 1\n")
     (tmp_path / "twice.parm").write_text("@include large.parm\n@include large.parm\n")

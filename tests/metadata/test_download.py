@@ -24,10 +24,18 @@ from paramclient.model.values import crc32_px4
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import EventMaker
 from paramclient.protocol.requests.context import Context
+from paramclient.protocol.requests.retry import VersionAttempts
+from paramclient.protocol.vehicle.commands import MessageRequests
 from paramclient.protocol.vehicle.metadata_location import Descriptions
-from paramclient.protocol.wire import CommandAck, CommandLong, ComponentMetadata, FileTransfer
+from paramclient.protocol.wire import (
+    AUTOPILOT_VERSION_ID,
+    CommandAck,
+    CommandLong,
+    ComponentMetadata,
+    FileTransfer,
+)
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle
-from paramclient.sim.metadata import GENERAL_FILE, PARAMETER_FILE
+from paramclient.sim.metadata import GENERAL_FILE, METADATA_FILE
 from tests.shell import (
     FlakyLink,
     Tap,
@@ -71,7 +79,7 @@ def file_of(document: object) -> bytes:
 def publish(vehicle: PX4Vehicle, **entry: Any) -> None:
     """Replace the entry of the parameter metadata in a vehicle's general file."""
     kinds = [
-        {"type": 1, "uri": f"mftp://{PARAMETER_FILE}"} | entry,
+        {"type": 1, "uri": f"mftp://{METADATA_FILE}"} | entry,
         {"type": 4, "uri": "https://x.invalid/e"},
     ]
     vehicle.files[GENERAL_FILE] = file_of({"version": 1, "metadataTypes": kinds})
@@ -102,7 +110,7 @@ async def test_a_vehicle_describes_its_parameters() -> None:
         assert read["EKF2_GPS_CTRL"].text(7) == "Position|Altitude|Velocity"
         volatile = {info.name for info in read.values() if info.is_volatile}
         assert volatile == {name for name, entry in vehicle._by_name.items() if entry.volatile}
-        assert read.source == f"mftp://{PARAMETER_FILE} of 1/1"
+        assert read.source == f"mftp://{METADATA_FILE} of 1/1"
         assert not residue(component)
         await anyio.sleep(1.0)
         assert not vehicle.open_files
@@ -144,10 +152,10 @@ async def test_metadata_of_another_firmware_is_downloaded(tmp_path: Path) -> Non
     kept = MetadataStore(tmp_path)
     for units in ("m", "s"):
         vehicle = describing()
-        vehicle.files[PARAMETER_FILE] = file_of(
+        vehicle.files[METADATA_FILE] = file_of(
             {"version": 1, "parameters": [{"name": "PARAM_03", "units": units}]}
         )
-        publish(vehicle, fileCrc=crc32_px4(vehicle.files[PARAMETER_FILE]))
+        publish(vehicle, fileCrc=crc32_px4(vehicle.files[METADATA_FILE]))
         async with a_client(vehicle) as client:
             read = await metadata_of(await client.component(), store=kept)
             assert read is not None
@@ -182,7 +190,7 @@ async def test_a_file_without_a_checksum_is_not_cached(tmp_path: Path) -> None:
 async def test_the_checksum_may_be_that_of_the_unpacked_file(tmp_path: Path) -> None:
     """PX4 announces this checksum for its general file."""
     vehicle = describing()
-    unpacked = lzma.decompress(vehicle.files[PARAMETER_FILE])
+    unpacked = lzma.decompress(vehicle.files[METADATA_FILE])
     publish(vehicle, fileCrc=crc32_px4(unpacked))
     kept = MetadataStore(tmp_path)
     async with a_client(vehicle) as client:
@@ -231,7 +239,7 @@ async def test_nothing_is_downloaded_from_the_internet() -> None:
 @swiftly
 async def test_a_file_on_board_is_preferred_to_the_internet() -> None:
     vehicle = describing()
-    publish(vehicle, uri="https://example.invalid/p", uriFallback=f"mftp://{PARAMETER_FILE}")
+    publish(vehicle, uri="https://example.invalid/p", uriFallback=f"mftp://{METADATA_FILE}")
     async with a_client(vehicle) as client:
         assert await metadata_of(await client.component()) is not None
 
@@ -252,13 +260,13 @@ async def test_a_file_on_another_component() -> None:
 @swiftly
 async def test_files_that_are_not_as_announced(wrong: str, tmp_path: Path) -> None:
     vehicle = describing()
-    content = vehicle.files[PARAMETER_FILE]
+    content = vehicle.files[METADATA_FILE]
     if wrong == "checksum":
         publish(vehicle, fileCrc=crc32_px4(content) ^ 1)
     elif wrong == "missing":
-        del vehicle.files[PARAMETER_FILE]
+        del vehicle.files[METADATA_FILE]
     elif wrong == "damaged":
-        vehicle.files[PARAMETER_FILE] = content[:-20]
+        vehicle.files[METADATA_FILE] = content[:-20]
         publish(vehicle, fileCrc=crc32_px4(content[:-20]))
     else:
         publish(vehicle, uri="mftp://" + "x" * 240)
@@ -268,7 +276,7 @@ async def test_files_that_are_not_as_announced(wrong: str, tmp_path: Path) -> No
         "missing": (FileTransferError, "file not found"),
         "damaged": (
             MetadataError,
-            f"mftp://{PARAMETER_FILE} of 1/1: cannot be unpacked: the file is truncated",
+            f"mftp://{METADATA_FILE} of 1/1: cannot be unpacked: the file is truncated",
         ),
         "long": (MetadataError, r"1/1 announces its metadata at mftp://x*: .* 239 bytes"),
     }[wrong]
@@ -379,7 +387,7 @@ async def test_a_link_that_drops_during_a_download() -> None:
 async def test_a_too_large_file_is_not_downloaded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(download, "PACKED_SIZE_MAX", 400)
     vehicle = describing()
-    assert len(vehicle.files[GENERAL_FILE]) < 400 < len(vehicle.files[PARAMETER_FILE])
+    assert len(vehicle.files[GENERAL_FILE]) < 400 < len(vehicle.files[METADATA_FILE])
     async with a_client(vehicle) as client:
         with pytest.raises(FileTransferError, match="longer than 400 bytes"):
             await metadata_of(await client.component())
@@ -414,7 +422,8 @@ class Asked:
     def __init__(self) -> None:
         self.sent: list[Any] = []
         self.context = Context((1, 1), self.sent.append)
-        self.machine = Descriptions(self.context)
+        self.messages = MessageRequests(self.context)
+        self.machine = Descriptions(self.context, self.messages)
 
 
 def test_the_request_and_its_responses() -> None:
@@ -424,7 +433,7 @@ def test_the_request_and_its_responses() -> None:
     asked.machine.heard(ComponentMetadata("mftp://a", 7), 0.1)
     assert ask.result == ComponentMetadata("mftp://a", 7)
     asked.machine.heard(ComponentMetadata("mftp://b", 8), 0.2)  # unsolicited
-    assert asked.machine.next_deadline() == float("inf")
+    assert asked.messages.next_deadline() == float("inf")
     ask = asked.machine.ask(1.0)
     asked.machine.heard(ComponentMetadata("", 0), 1.1)
     assert ask.done
@@ -437,20 +446,20 @@ def test_the_request_and_its_responses() -> None:
 def test_refusals_end_the_request(result: int, is_answer: bool) -> None:
     asked = Asked()
     ask = asked.machine.ask(0.0)
-    asked.machine.acknowledged(CommandAck(512, result, 255, 190), 0.1)
+    asked.messages.acknowledged(CommandAck(512, result, 255, 190), 0.1)
     assert ask.done is is_answer
 
 
 def test_the_refusal_of_another_request_is_ignored() -> None:
     asked = Asked()
     ask = asked.machine.ask(0.0)
-    asked.machine.acknowledged(CommandAck(511, 3, 255, 190), 0.1)
-    asked.machine.acknowledged(CommandAck(512, 3, 254, 190), 0.1)  # another station's
-    asked.context.is_identifying = True
-    asked.machine.acknowledged(CommandAck(512, 3, 255, 190), 0.1)  # may belong to AUTOPILOT_VERSION
+    asked.messages.acknowledged(CommandAck(511, 3, 255, 190), 0.1)
+    asked.messages.acknowledged(CommandAck(512, 3, 254, 190), 0.1)  # another station's
+    version = asked.messages.begin(AUTOPILOT_VERSION_ID, VersionAttempts(asked.context.retry), 0.1)
+    asked.messages.acknowledged(CommandAck(512, 3, 255, 190), 0.1)  # may belong to AUTOPILOT_VERSION
     assert not ask.done
-    asked.context.is_identifying = False
-    asked.machine.acknowledged(CommandAck(512, 3), 0.1)  # MAVLink 1 has no target in COMMAND_ACK
+    asked.messages.end(version)
+    asked.messages.acknowledged(CommandAck(512, 3), 0.1)  # MAVLink 1 has no target in COMMAND_ACK
     assert ask.done
 
 
@@ -460,14 +469,14 @@ def test_the_request_is_repeated_until_it_is_given_up() -> None:
     late = asked.machine.ask(0.5)
     now = 0.0
     while not ask.done:
-        now = asked.machine.next_deadline()
+        now = asked.messages.next_deadline()
         assert now < 100.0
-        asked.machine.tick(now)
+        asked.messages.tick(now)
     assert isinstance(ask.error, NoReply)
     assert isinstance(late.error, NoReply)
     assert len(asked.sent) == ask.attempts >= 5
     assert "COMPONENT_METADATA of 1/1" in str(ask.error)
-    asked.machine.tick(now + 1)
+    asked.messages.tick(now + 1)
     asked.machine.release(ask)
 
 
@@ -613,4 +622,4 @@ def test_a_mavlink_1_vehicle_cannot_have_metadata() -> None:
 
 def test_a_vehicle_without_metadata_has_no_files() -> None:
     assert not PX4Vehicle().files
-    assert set(PX4Vehicle(metadata=True).files) == {GENERAL_FILE, PARAMETER_FILE}
+    assert set(PX4Vehicle(metadata=True).files) == {GENERAL_FILE, METADATA_FILE}

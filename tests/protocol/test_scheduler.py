@@ -1,9 +1,9 @@
-"""Several lists on one link: whose turn it is, and what they make of a link that has no room for all."""
+"""Several components on one link: which are due, whose list runs, and what they make of a link that has no
+room for all."""
 
 from __future__ import annotations
 
 import asyncio
-import functools
 import math
 from collections.abc import Callable
 from itertools import pairwise
@@ -19,11 +19,15 @@ from paramclient.protocol.scheduler import (
     GROWTH_BURSTY,
     JUDGED_TIME,
     JUDGED_VALUES_MIN,
+    LIMIT_RECHECK_INTERVAL,
     MEASUREMENT_LIFETIME,
     RETRY_DELAY,
     RETRY_DELAY_BURSTY,
     RETRY_DELAY_MAX,
+    STALE_DEADLINES_MAX,
     START_INTERVAL_BURSTY,
+    TICKED_COMPONENTS_MAX,
+    Scheduler,
     Seen,
     Turns,
 )
@@ -474,12 +478,10 @@ def test_many_vehicles_on_a_fast_link_are_hardly_slower_than_one() -> None:
     assert all(fetch.result is not None and fetch.result.complete for fetch in fetches)
 
 
-def test_a_program_that_stays_behind_follows_one_after_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_program_that_stays_behind_follows_one_after_the_other() -> None:
     vehicles = [PX4Vehicle(system=system, table=table(60)) for system in range(1, 5)]
     world = Simulation(*vehicles)
-    tick, next_deadline = world.station.tick, world.station.next_deadline
-    monkeypatch.setattr(world.station, "tick", functools.partial(tick, most_lists=1))
-    monkeypatch.setattr(world.station, "next_deadline", lambda: max(next_deadline(), world.now + STEP))
+    world.station.scheduler.lists_max = 1
     fetches = begin_all(world, 4)
     while not all(fetch.done for fetch in fetches):
         world.run(0.005)
@@ -672,3 +674,119 @@ def test_only_lists_that_come_on_other_links_are_beside_it() -> None:
     road.turns.tick(road.now, most=1, is_crowded=True)
     assert road.turns.is_beside_others(lane)
     assert road.turns.beside_others_at(lane) == road.now
+
+
+class Timer:
+    """A component with a single deadline, which its `tick` ends.
+
+    Args:
+        scheduler: handles it.
+        due: its deadline.
+    """
+
+    def __init__(self, scheduler: Scheduler, due: float = math.inf) -> None:
+        self.due = due
+        self.ticked: list[float] = []
+        self.looks = 0
+        self.is_waiting = self.is_busy = False
+        self._reschedule = scheduler.reporter(self)
+        scheduler.add(self)
+
+    def set(self, due: float) -> None:
+        self.due = due
+        self._reschedule()
+
+    def tick(self, now: float) -> None:
+        self.ticked.append(now)
+        self.due = math.inf
+
+    def next_deadline(self) -> float:
+        self.looks += 1
+        return self.due
+
+
+def state_of(scheduler: Scheduler) -> tuple[bool, bool]:
+    return scheduler.is_waiting, scheduler.is_busy
+
+
+def test_a_component_is_handled_at_its_deadline_and_looked_at_after_changes_only() -> None:
+    scheduler = Scheduler()
+    timers = [Timer(scheduler, due) for due in (3.0, 1.0, math.inf)]
+    assert scheduler.next_deadline() == 1.0
+    scheduler.tick(1.0)
+    assert [timer.ticked for timer in timers] == [[], [1.0], []]
+    assert scheduler.next_deadline() == 3.0
+    timers[2].set(2.0)
+    assert scheduler.next_deadline() == 2.0
+    timers[2].set(5.0)
+    assert scheduler.next_deadline() == 3.0, "the earlier deadline is stale"
+    scheduler.tick(10.0)
+    assert [timer.ticked for timer in timers] == [[10.0], [1.0], [10.0]]
+    assert scheduler.next_deadline() == math.inf
+    assert [timer.looks for timer in timers] == [2, 2, 4]
+
+
+def test_a_deadline_that_comes_back_is_handled_once() -> None:
+    scheduler = Scheduler()
+    timer = Timer(scheduler, 1.0)
+    for due in (2.0, 1.0, 2.0, 1.0):
+        timer.set(due)
+        scheduler.next_deadline()
+    scheduler.tick(5.0)
+    scheduler.tick(5.0)
+    assert timer.ticked == [5.0]
+
+
+def test_a_removed_component_is_not_handled_any_more() -> None:
+    scheduler = Scheduler()
+    gone, other = Timer(scheduler, 1.0), Timer(scheduler, 2.0)
+    gone.is_waiting = gone.is_busy = True
+    assert scheduler.next_deadline() == 1.0
+    assert state_of(scheduler) == (True, True)
+    scheduler.remove(gone)
+    gone.set(0.5)
+    assert scheduler.next_deadline() == 2.0
+    assert state_of(scheduler) == (False, False)
+    scheduler.tick(3.0)
+    assert not gone.ticked
+    assert other.ticked == [3.0]
+
+
+def test_many_due_components_are_handled_in_parts_the_most_overdue_first() -> None:
+    scheduler = Scheduler()
+    timers = [Timer(scheduler, 1000.0 - number) for number in range(TICKED_COMPONENTS_MAX + 10)]
+    scheduler.tick(2000.0)
+    assert [timer for timer in timers if not timer.ticked] == timers[:10]
+    assert scheduler.next_deadline() <= 2000.0, "due again at once"
+    scheduler.tick(2000.0)
+    assert all(timer.ticked for timer in timers)
+
+
+def test_deadlines_that_move_often_take_no_memory() -> None:
+    scheduler = Scheduler()
+    timer, _ = Timer(scheduler), Timer(scheduler, 1.0)
+    for due in range(1000, 0, -1):
+        timer.set(2.0 + due)
+        assert scheduler.next_deadline() == 1.0
+        assert len(scheduler._order) <= STALE_DEADLINES_MAX * 3
+    timer.set(0.5)
+    assert scheduler.next_deadline() == 0.5
+
+
+def test_a_list_that_the_event_loop_does_not_permit_is_tried_again_soon() -> None:
+    scheduler, lanes = Scheduler(), [Lane(), Lane()]
+    scheduler.lists_max = 1
+    for lane in lanes:
+        scheduler.turns.ask(lane, 0.0)
+        lane.passed = lane.came = JUDGED_VALUES_MIN
+    now = 0.0
+    for _ in range(100):
+        now += STEP
+        lanes[0].passed += 10
+        lanes[0].came += 10
+        scheduler.tick(now)
+        assert now < scheduler.next_deadline() <= now + max(JUDGED_TIME, LIMIT_RECHECK_INTERVAL)
+    assert not lanes[1].is_running
+    scheduler.lists_max = math.inf
+    scheduler.tick(now)
+    assert lanes[1].is_running

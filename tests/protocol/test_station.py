@@ -14,6 +14,7 @@ from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ComponentHeard, ComponentIdentified
 from paramclient.protocol.params.fetch_result import FetchResult
 from paramclient.protocol.params.sync import Upkeep
+from paramclient.protocol.requests.retry import HEARTBEAT_REQUESTS
 from paramclient.protocol.station import Station
 from paramclient.protocol.wire import (
     MAV_AUTOPILOT_INVALID,
@@ -173,7 +174,7 @@ def test_a_vehicle_that_never_sends_a_heartbeat_is_not_asked_for_ever() -> None:
     station = a_station()
     for step in range(1000):
         station.receive(telemetry(4), "there", 0.1 * step)
-    assert len(heartbeat_requests(station)) == room.HEARTBEAT_REQUESTS_MAX
+    assert len(heartbeat_requests(station)) == HEARTBEAT_REQUESTS.count
 
 
 @pytest.mark.parametrize("is_stream", [False, True])

@@ -23,7 +23,7 @@ from paramclient.remote import RemoteClient, bounded, http, mirror, roster
 from paramclient.remote.bounded import (
     DOCUMENT_VALUES_MAX,
     EVENT_BYTES_MAX,
-    NESTING_MAX,
+    JSON_NESTING_MAX,
     RESPONSE_BYTES_MAX,
     EventReader,
     checked_document,
@@ -156,7 +156,11 @@ REFUSED = {"error": "Refused", "detail": "x", "system": 1, "component": 1}
         ("/events", answers_with(EVENTS, [b"x" * 65_536]), "not as a service"),
         ("/events", answers_with(EVENTS, [b"data: " + b"x" * 60_000 + b"\n"]), "not as a service"),
         ("/events", stream(DEEP), "not as a service"),
-        ("/events", stream(b"[" * (NESTING_MAX + 1) + b"]" * (NESTING_MAX + 1)), "not as a service"),
+        (
+            "/events",
+            stream(b"[" * (JSON_NESTING_MAX + 1) + b"]" * (JSON_NESTING_MAX + 1)),
+            "not as a service",
+        ),
         ("/events", stream(WIDE[:EVENT_BYTES_MAX]), "not as a service"),
         ("/events", stream(b"\xff\xfe"), "not as a service"),
         ("/events", stream(HUGE), "not as a service"),
@@ -325,9 +329,9 @@ def test_the_largest_document_within_the_bounds() -> None:
 
 def test_depth() -> None:
     for opening, closing in ((b"[", b"]"), (b'{"a":', b"}")):
-        deepest = opening * (NESTING_MAX - 1) + b"[]" + closing * (NESTING_MAX - 1)
+        deepest = opening * (JSON_NESTING_MAX - 1) + b"[]" + closing * (JSON_NESTING_MAX - 1)
         assert checked_document(deepest)
-        for depth in (NESTING_MAX, 10 * NESTING_MAX, 100_000):
+        for depth in (JSON_NESTING_MAX, 10 * JSON_NESTING_MAX, 100_000):
             with pytest.raises(ValueError, match="deeper than"):
                 checked_document(opening * depth + b"[]" + closing * depth)
 

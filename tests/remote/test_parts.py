@@ -38,13 +38,14 @@ from paramclient.client.client import implementation_of, local_client
 from paramclient.client.link_client import LinkClient
 from paramclient.client.link_component import LinkComponent
 from paramclient.documents.param import ParamDoc
+from paramclient.model.notation import parse_number
 from paramclient.model.values import Value, from_bits, type_name
 from paramclient.remote import RemoteComponent
 from paramclient.remote.bounded import EVENT_BYTES_MAX, EventReader
-from paramclient.remote.decoding import number_of, param_of, value_as_sent
+from paramclient.remote.decoding import param_of, value_as_sent
 from paramclient.remote.mirror import LOADING_CHANGES_MAX, Mirror
 from paramclient.remote.problems import error_of
-from paramclient.remote.service_address import TOKEN_VARIABLE, ServiceAddress, chosen_token
+from paramclient.remote.service_address import CLIENT_TOKEN_VARIABLE, ServiceAddress, chosen_token
 from paramclient.remote.service_client import ServiceClient
 
 WHOM: dict[str, Any] = {"system": 1, "component": 1}
@@ -119,9 +120,9 @@ def test_arguments_that_say_nothing_are_not() -> None:
 
 
 def test_a_token_is_given_or_stands_in_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
+    monkeypatch.delenv(CLIENT_TOKEN_VARIABLE, raising=False)
     assert chosen_token(None) is None
-    monkeypatch.setenv(TOKEN_VARIABLE, "from-there")
+    monkeypatch.setenv(CLIENT_TOKEN_VARIABLE, "from-there")
     assert chosen_token(None) == "from-there"
     assert chosen_token("given") == "given"
     for bad in ("two words", "line\nbreak", "grün"):
@@ -210,7 +211,7 @@ def test_raw_bytes_stay_raw(kind: int, bits: int) -> None:
 @pytest.mark.parametrize("value", [0, -(2**63), 2**64, 2.0, -0.0, 1e300, math.inf, -math.inf, math.nan])
 def test_what_is_written_stays_a_whole_number_or_a_fraction(value: float) -> None:
     sent = json.loads(json.dumps(value_as_sent(value), allow_nan=False))
-    assert repr(number_of(sent)) == repr(value)
+    assert repr(parse_number(sent)) == repr(value)
 
 
 def test_raw_bytes_are_written_in_the_order_of_the_message() -> None:

@@ -17,20 +17,20 @@ import pytest
 
 from paramclient.client import signing
 from paramclient.errors import UsageError
-from paramclient.service import held_bodies
+from paramclient.service import body_memory
 from paramclient.service.access import AccessMiddleware, AccessSettings, may_write
 from paramclient.service.request import SESSION_PATH
 from paramclient.service.tokens import (
-    GUESS_DELAY,
-    GUESSES,
-    GUESSES_AGE,
-    MOST_GUESSERS,
-    MOST_SESSIONS,
-    SESSION_AGE,
-    Guesses,
+    SESSION_LIFETIME,
+    SESSIONS_OF_HOLDER_MAX,
+    WRONG_TOKEN_ADDRESSES_MAX,
+    WRONG_TOKEN_DELAY,
+    WRONG_TOKEN_LIFETIME,
+    WRONG_TOKENS_MAX,
     Holder,
     Sessions,
     Tokens,
+    WrongTokens,
     add_token,
     new_token,
     token_line,
@@ -178,13 +178,13 @@ class Asked:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "1 to 256 tokens, not 0"),
-        ("anna write", "line 1: a line has three words"),
-        (f"anna admin {ANNA}", "line 1: the second word says what the token allows"),
-        (f"an/na write {ANNA}", "line 1: a name has 1 to 32 letters"),
-        (f"\nanna write {ANNA[:15]}", "line 2: a token has 16 to 256 printable ASCII characters"),
-        (f"anna write {ANNA}\u00e4", "line 1: a token has 16"),
-        ("anna write sha256:12", "line 1: a digest has 64 hexadecimal digits"),
+        ("", "1 to 256 tokens are permitted, not 0"),
+        ("anna write", "line 1: a line must have three words"),
+        (f"anna admin {ANNA}", "line 1: the second word is the permission"),
+        (f"an/na write {ANNA}", "line 1: a name must have 1 to 32 letters"),
+        (f"\nanna write {ANNA[:15]}", "line 2: a token must have 16 to 256 printable ASCII characters"),
+        (f"anna write {ANNA}\u00e4", "line 1: a token must have 16"),
+        ("anna write sha256:12", "line 1: a digest must have 64 hexadecimal digits"),
         (f"anna write {ANNA}\nanna read {BEN}", "two tokens have the same name"),
         (f"anna write {ANNA}\nben read {ANNA}", "two names have the same token"),
         (f"anna write {ANNA}\n{token_line('ben', 'read', ANNA)}", "two names have the same token"),
@@ -237,7 +237,7 @@ def test_tokens_come_from_a_file_or_the_environment(tmp_path: Path) -> None:
     assert alone is not None
     assert alone.holder(token.encode()) == Holder("token", "write")
     assert tokens_from(None, {}) is None
-    with pytest.raises(UsageError, match="PARAMCLIENT_SERVICE_TOKEN: a token has 16"):
+    with pytest.raises(UsageError, match="PARAMCLIENT_SERVICE_TOKEN: a token must have 16"):
         tokens_from(None, {"PARAMCLIENT_SERVICE_TOKEN": "short"})
     both = {"PARAMCLIENT_SERVICE_TOKEN": token, "PARAMCLIENT_SERVICE_TOKEN_FILE": str(path)}
     with pytest.raises(UsageError, match="one of them is enough"):
@@ -245,7 +245,7 @@ def test_tokens_come_from_a_file_or_the_environment(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="nowhere: the file of tokens cannot be read: No such file"):
         tokens_from(tmp_path / "nowhere", {})
     path.write_text("#" * 100_001)
-    with pytest.raises(UsageError, match="tokens: a file of tokens has no more than 100000 bytes"):
+    with pytest.raises(UsageError, match="tokens: a file of tokens may have at most 100000 bytes"):
         tokens_from(path, {})
 
 
@@ -262,9 +262,9 @@ def test_a_token_is_made_and_kept_as_its_digest(tmp_path: Path) -> None:
     assert path.stat().st_mode & 0o777 == 0o600 or os.name != "posix"
     with pytest.raises(UsageError, match="tokens: two tokens have the same name"):
         add_token(path, "anna", "read")
-    with pytest.raises(UsageError, match="a name has 1 to 32 letters"):
+    with pytest.raises(UsageError, match="a name must have 1 to 32 letters"):
         add_token(path, "an na", "read")
-    with pytest.raises(UsageError, match="the token cannot be kept: Is a directory"):
+    with pytest.raises(UsageError, match="the token cannot be written: Is a directory"):
         add_token(tmp_path, "anna", "read")
     assert path.read_text() == kept
 
@@ -289,7 +289,7 @@ def test_a_file_of_tokens_is_of_this_user_or_root_and_no_link_to_write_through(
     link = tmp_path / "link"
     link.symlink_to(path)
     assert len(Tokens.read(link)) == 1
-    with pytest.raises(UsageError, match="link: it is a link; name the file itself"):
+    with pytest.raises(UsageError, match="link: the file is a symbolic link"):
         add_token(link, "bob", "read")
     assert len(Tokens.read(path)) == 1
     monkeypatch.setattr(signing, "has_trusted_owner", lambda status: False)
@@ -342,7 +342,7 @@ def test_on_this_machine_alone_no_token_is_needed(listen: str) -> None:
 )
 def test_beyond_this_machine_it_does_not_start_without_a_token(options: dict[str, Any]) -> None:
     with pytest.raises(
-        UsageError, match=r"needs a token. Make one with `paramclient token NAME --file FILE`"
+        UsageError, match=r"needs a token. Create one with `paramclient token NAME --file FILE`"
     ):
         AccessSettings(**options)
     assert AccessSettings(**options, tokens=TOKENS).tokens is TOKENS
@@ -356,13 +356,13 @@ def test_hosts_are_the_same_when_they_are_taken_over() -> None:
 
 @pytest.mark.parametrize("origin", ["*", "null", "station.example", "https://a/b", "https://*", "file://x"])
 def test_origins_are_named_one_by_one(origin: str) -> None:
-    with pytest.raises(UsageError, match="is no origin of pages"):
+    with pytest.raises(UsageError, match="is not an origin"):
         AccessSettings(origins=[origin])
 
 
 @pytest.mark.parametrize("host", ["*", "a b", "companion.local:80", "", "http://x", "a/b"])
 def test_hosts_are_named_one_by_one(host: str) -> None:
-    with pytest.raises(UsageError, match="is no name of a host"):
+    with pytest.raises(UsageError, match="is not a host name"):
         AccessSettings(hosts=[host], tokens=TOKENS)
 
 
@@ -502,13 +502,13 @@ async def test_a_browser_shows_its_token_once() -> None:
     name, *rest = begun.headers["set-cookie"].split("; ")
     assert name.startswith("paramclient-8765=")
     assert len(name.partition("=")[2]) >= 43
-    assert rest == ["Path=/", f"Max-Age={SESSION_AGE:.0f}", "HttpOnly", "SameSite=Strict"]
+    assert rest == ["Path=/", f"Max-Age={SESSION_LIFETIME:.0f}", "HttpOnly", "SameSite=Strict"]
     assert BEN not in begun.headers["set-cookie"]
     cookie = cookie_of(begun)
     assert (await door.request(raw=[cookie])).status == 200
     assert door.state["asker"] == "ben@10.0.0.2"
     assert (await door.request("POST", WRITE, raw=[cookie])).problem == "forbidden"
-    door.now = SESSION_AGE
+    door.now = SESSION_LIFETIME
     assert (await door.request(raw=[cookie])).problem == "unauthenticated"
     assert (await door.request(path="/", raw=[cookie])).status == 200, "or nobody could show another token"
 
@@ -567,12 +567,12 @@ def test_sessions_are_few() -> None:
     sessions = Sessions(lambda: now)
     anna, ben = Holder("anna", "write"), Holder("ben", "read")
     kept = sessions.begin(ben)
-    texts = [sessions.begin(anna) for _ in range(3 * MOST_SESSIONS)]
-    assert len(sessions) == MOST_SESSIONS + 1
+    texts = [sessions.begin(anna) for _ in range(3 * SESSIONS_OF_HOLDER_MAX)]
+    assert len(sessions) == SESSIONS_OF_HOLDER_MAX + 1
     assert sessions.holder(kept.encode()) == ben
     assert sessions.holder(texts[-1].encode()) == anna
     assert sessions.holder(texts[0].encode()) is None
-    now = SESSION_AGE
+    now = SESSION_LIFETIME
     sessions.begin(ben)
     assert len(sessions) == 1
 
@@ -587,26 +587,26 @@ async def test_guesses_are_answered_late_and_a_right_token_is_not_refused(
     door = Door(GUARDED)
     asked = anyio.current_time()
     with caplog.at_level(logging.DEBUG):
-        for number in range(GUESSES):
+        for number in range(WRONG_TOKENS_MAX):
             assert (await door.request(token=f"wrong-{number}")).status == 401
         assert round(anyio.current_time() - asked, 3) == 0
         for number in range(3):
             late = await door.request(token=f"wrong-too-{number}")
             assert (late.status, late.problem) == (429, "too-many-guesses")
-            assert late.headers["retry-after"] == str(int(GUESSES_AGE))
-            assert round(anyio.current_time() - asked, 3) == (number + 1) * GUESS_DELAY
-    assert [record.getMessage() for record in caplog.records] == ["many wrong tokens have come from 10.0.0.2"]
+            assert late.headers["retry-after"] == str(int(WRONG_TOKEN_LIFETIME))
+            assert round(anyio.current_time() - asked, 3) == (number + 1) * WRONG_TOKEN_DELAY
+    assert [record.getMessage() for record in caplog.records] == ["many wrong tokens from 10.0.0.2"]
     asked = anyio.current_time()
     assert (await door.request(token=ANNA)).status == 200, "others may be behind the same proxy"
     body = json.dumps({"token": ANNA}).encode()
     assert (await door.request("POST", SESSION_PATH, body=body)).status == 200
-    assert round(anyio.current_time() - asked, 3) == 2 * GUESS_DELAY, (
+    assert round(anyio.current_time() - asked, 3) == 2 * WRONG_TOKEN_DELAY, (
         "else a right one is told from a wrong one at once"
     )
     asked = anyio.current_time()
     assert (await door.request(token=ANNA, client=("10.0.0.3", 1))).status == 200
     assert (await door.request(path="/")).status == 200
-    door.now = GUESSES_AGE
+    door.now = WRONG_TOKEN_LIFETIME
     assert (await door.request(token=ANNA)).status == 200
     assert round(anyio.current_time() - asked, 3) == 0, "nobody else waits, and nobody a minute later"
 
@@ -659,23 +659,23 @@ async def test_what_others_say_of_themselves_counts_for_nothing() -> None:
 @swiftly
 async def test_guesses_slow_down_one_client_of_a_proxy_that_is_trusted() -> None:
     door = Door(PROXY)
-    for number in range(2 * GUESSES):
+    for number in range(2 * WRONG_TOKENS_MAX):
         await door.request(token=f"wrong-{number}", raw=[(b"x-forwarded-for", b"198.51.100.7")])
     asked = anyio.current_time()
     assert (await door.request(token=ANNA, raw=[(b"x-forwarded-for", b"198.51.100.8")])).status == 200
     assert round(anyio.current_time() - asked, 3) == 0
     assert (await door.request(token=ANNA, raw=[(b"x-forwarded-for", b"198.51.100.7")])).status == 200
-    assert round(anyio.current_time() - asked, 3) == GUESS_DELAY
+    assert round(anyio.current_time() - asked, 3) == WRONG_TOKEN_DELAY
 
 
 @pytest.mark.parametrize("proxy", ["proxy.example", "10.0.0.1/8", "10.0.0.0/33", ""])
 def test_proxies_are_addresses_and_networks(proxy: str) -> None:
-    with pytest.raises(UsageError, match="is no address and no network such as"):
+    with pytest.raises(UsageError, match="is not an address or a network such as"):
         AccessSettings(tokens=TOKENS, proxies=[proxy])
 
 
 def test_behind_a_proxy_it_does_not_start_without_a_token() -> None:
-    with pytest.raises(UsageError, match=r"behind a proxy .* needs a token"):
+    with pytest.raises(UsageError, match=r"behind a proxy, .* needs a token"):
         AccessSettings(proxies=["127.0.0.1"])
 
 
@@ -683,23 +683,23 @@ def test_behind_a_proxy_it_does_not_start_without_a_token() -> None:
 async def test_a_program_with_an_old_token_slows_nobody_down() -> None:
     door = Door(GUARDED)
     asked = anyio.current_time()
-    for _ in range(10 * GUESSES):
+    for _ in range(10 * WRONG_TOKENS_MAX):
         assert (await door.request(token="an-old-token-of-somebody")).status == 401
     assert (await door.request(token=ANNA)).status == 200
     assert round(anyio.current_time() - asked, 3) == 0
 
 
 def test_those_who_guess_are_remembered_in_bounds() -> None:
-    guesses = Guesses(lambda: 0.0)
-    for number in range(GUESSES):
+    guesses = WrongTokens(lambda: 0.0)
+    for number in range(WRONG_TOKENS_MAX):
         guesses.add(f"2001:db8::{number:x}", f"wrong-{number}".encode())
-    assert guesses.wait("2001:db8::ffff") == GUESSES_AGE, "one machine has many such addresses"
+    assert guesses.wait("2001:db8::ffff") == WRONG_TOKEN_LIFETIME, "one machine has many such addresses"
     assert guesses.wait("2001:db8:0:1::1") == 0
-    for number in range(2 * MOST_GUESSERS):
-        for token in range(3 * GUESSES):
+    for number in range(2 * WRONG_TOKEN_ADDRESSES_MAX):
+        for token in range(3 * WRONG_TOKENS_MAX):
             guesses.add(f"10.0.{number >> 8}.{number & 255}", str(token).encode())
-    assert len(guesses) == MOST_GUESSERS
-    assert max(map(len, guesses._wrong.values())) == GUESSES
+    assert len(guesses) == WRONG_TOKEN_ADDRESSES_MAX
+    assert max(map(len, guesses._wrong.values())) == WRONG_TOKENS_MAX
 
 
 # By which name it is called
@@ -1025,7 +1025,7 @@ async def test_a_body_that_takes_for_ever_is_not_waited_for() -> None:
 
 @swiftly
 async def test_bodies_are_not_many_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(held_bodies, "MAX_BODIES", 250)
+    monkeypatch.setattr(body_memory, "TOTAL_BODY_BYTES_MAX", 250)
     door = Door(SMALL)
     statuses: list[int] = []
 
@@ -1053,7 +1053,7 @@ class Pending(Door):
 
 @swiftly
 async def test_bodies_count_until_their_requests_are_answered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(held_bodies, "MAX_BODIES", 250)
+    monkeypatch.setattr(body_memory, "TOTAL_BODY_BYTES_MAX", 250)
     door = Pending(SMALL)
     statuses: list[int] = []
 
@@ -1087,7 +1087,7 @@ async def test_one_holder_takes_no_room_from_others() -> None:
         await until(lambda: len(answers) == 45)
         assert {answer.problem for answer in answers} == {"too-many"}
         assert {answer.status for answer in answers} == {429}
-        assert str(held_bodies.MAX_BODIES_OF_ONE).encode() in answers[0].body
+        assert str(body_memory.HOLDER_BODY_BYTES_MAX).encode() in answers[0].body
         assert answers[0].headers["retry-after"] == "1"
         others = await door.request("POST", "/api/v1/components/1/1/diff", body=megabyte, token=BEN)
         assert others.status == 200
@@ -1108,7 +1108,7 @@ async def test_one_holder_takes_no_room_from_others() -> None:
 async def test_without_tokens_the_address_is_the_holder(
     first: str, second: str, statuses: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(held_bodies, "MAX_BODIES_OF_ONE", 150)
+    monkeypatch.setattr(body_memory, "HOLDER_BODY_BYTES_MAX", 150)
     door = Pending(SMALL)
     given: list[int] = []
 

@@ -31,11 +31,11 @@ from paramclient.service import (
     Settings,
     Tokens,
     access,
+    connection_slots,
     connections,
-    places,
     serve,
 )
-from paramclient.service.tokens import GUESSES
+from paramclient.service.tokens import WRONG_TOKENS_MAX
 from paramclient.sim import GenericVehicle
 from tests.shell import until
 
@@ -195,7 +195,7 @@ async def test_an_unknown_client_learns_nothing_and_changes_nothing() -> None:
 async def test_a_write_tells_who_asked_and_a_reader_cannot() -> None:
     async with served(a_vehicle(), tokens=TOKENS) as service:
         await met(service, bearer(BEN))
-        changes = service.hub.find(1, 1, None).component.changes()
+        changes = service.hub.find_component(1, 1, None).component.changes()
         body = b'{"value": 7.0}'
         more = ("Connection: close", "Content-Type: application/json", f"Content-Length: {len(body)}")
         head = service.head("PUT", f"{C}/params/A", *more, bearer(BEN))
@@ -215,14 +215,14 @@ async def test_beyond_this_machine_nothing_is_served_without_a_token() -> None:
 async def test_guessing_is_slow_and_leaves_no_trace_of_tokens(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(access, "GUESS_DELAY", 0.05)
+    monkeypatch.setattr(access, "WRONG_TOKEN_DELAY", 0.05)
     caplog.set_level(logging.DEBUG)
     async with served(tokens=TOKENS) as service:
         statuses = [
             (await service.ask("GET", "/api/v1/me", bearer(f"guess-{number}"))).status
-            for number in range(GUESSES + 2)
+            for number in range(WRONG_TOKENS_MAX + 2)
         ]
-        assert statuses == [401] * GUESSES + [429] * 2
+        assert statuses == [401] * WRONG_TOKENS_MAX + [429] * 2
         answer = await service.ask("GET", f"/api/v1/me?token={ANNA}")
         assert answer.status == 401, "a token in an address is none"
         assert ANNA.encode() not in answer.body
@@ -430,7 +430,7 @@ async def test_a_deep_body_is_a_problem_and_no_more() -> None:
 
 
 async def test_whoever_asks_nothing_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connections, "HEAD_PATIENCE", 0.2)
+    monkeypatch.setattr(connections, "REQUEST_HEAD_TIMEOUT", 0.2)
     async with served() as service:
         for data in (b"", b"GET /health HT"):
             async with service.connection() as (reader, writer):
@@ -464,7 +464,7 @@ async def test_a_body_that_does_not_come_is_not_waited_for_at_the_end(
 
 
 async def test_connections_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(places, "MOST_CONNECTIONS", 3)
+    monkeypatch.setattr(connection_slots, "SERVICE_CONNECTIONS_MAX", 3)
     async with served() as service, contextlib.AsyncExitStack() as stack:
         held = [await stack.enter_async_context(service.connection()) for _ in range(3)]
         for reader, writer in held:
@@ -477,8 +477,8 @@ async def test_connections_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 async def test_of_one_address_beyond_this_machine_there_are_fewer(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(places, "MOST_FROM_ONE", 2)
-    monkeypatch.setattr(places, "is_loopback", lambda _: False)
+    monkeypatch.setattr(connection_slots, "ADDRESS_CONNECTIONS_MAX", 2)
+    monkeypatch.setattr(connection_slots, "is_loopback", lambda _: False)
     async with served() as service, contextlib.AsyncExitStack() as stack:
         for _ in range(2):
             reader, writer = await stack.enter_async_context(service.connection())
@@ -544,7 +544,7 @@ async def test_a_slow_listener_is_told_that_it_lost_events_and_goes_on() -> None
 
 
 async def test_a_listener_who_never_reads_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connections, "STALL_PATIENCE", 0.2)
+    monkeypatch.setattr(connections, "CLIENT_STALL_TIMEOUT", 0.2)
     async with served() as service:
         service.hub.feed._events = deque(maxlen=64)
         with a_narrow_socket(service.port) as narrow:
@@ -583,12 +583,12 @@ async def test_what_one_connection_sends_is_parsed_in_slices(
             more = ("Connection: close", "Content-Type: application/json", f"Content-Length: {len(body)}")
             writer.write(service.head("POST", "/api/v1/find", *more) + body)
             assert Answer.of(await taken(reader)).problem == "no-reply"
-    assert max(slices) <= connections.BYTES_AT_ONCE
+    assert max(slices) <= connections.BYTES_PER_TURN
     assert sum(slices) > 160_000 + 60_000
 
 
 async def test_of_a_websocket_that_is_not_read_nothing_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connections, "STALL_PATIENCE", 0.5)
+    monkeypatch.setattr(connections, "CLIENT_STALL_TIMEOUT", 0.5)
     made: list[Any] = []
     original = connections.WebSocketConnection.connection_made
 

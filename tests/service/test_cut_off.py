@@ -144,8 +144,8 @@ async def test_an_apply_that_the_end_of_the_service_cuts_off_is_told_at_the_next
     caplog.clear()
     async with serving(px4(), place=tmp_path) as service:
         [line] = [message for message in caplog.messages if "cut off" in message]
-        assert line.startswith("an apply of 1/1 on sim:0, which local had asked for at 20")
-        assert line.endswith("of 20 values, as the service ended")
+        assert line.startswith("an apply of 1/1 on sim:0, started by local at 20")
+        assert line.endswith("of 20 values by the end of the service")
         [listed] = await set_ups(service)
         assert (listed["id"], listed["state"], listed["asked_by"]) == (job, "cut-off", "local")
         assert listed["progress"]["done"] >= 5
@@ -223,5 +223,5 @@ async def told_after_a_kill(cache: str) -> None:
         process.send_signal(signal.SIGTERM)
         code, err = await ended(process)
     assert code == 0
-    assert "which local had asked for at" in err
+    assert "started by local at" in err
     assert "was cut off" in err

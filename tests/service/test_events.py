@@ -15,7 +15,7 @@ import pytest
 from starlette.types import Message
 
 from paramclient.service import Hub, create_app
-from paramclient.service.event_feed import MOST_AT_ONCE, Feed, Listener, Place, Wanted
+from paramclient.service.event_feed import BATCH_EVENTS_MAX, EventFeed, EventFilter, EventPosition, Listener
 from paramclient.service.routes import events
 from paramclient.sim import Air
 from tests.served import C, met, problem, service
@@ -48,7 +48,7 @@ class Heard:
 
     def __init__(self) -> None:
         self.text = ""
-        self.is_over = False
+        self.is_ended = False
 
     @property
     def all(self) -> list[dict[str, Any]]:
@@ -83,7 +83,7 @@ async def listening(
         async def read() -> None:
             async for chunk in answer.aiter_text():
                 heard.text += chunk
-            heard.is_over = True
+            heard.is_ended = True
 
         reader = asyncio.create_task(read())
         await asyncio.sleep(0.01)
@@ -96,7 +96,7 @@ async def listening(
 # the list
 
 
-def publish(feed: Feed, count: int, **about: Any) -> None:
+def publish(feed: EventFeed, count: int, **about: Any) -> None:
     for number in range(count):
         feed.publish("note", {"number": number}, **about)
 
@@ -108,9 +108,9 @@ async def taken(listener: Listener) -> list[int]:
 
 
 @asynccontextmanager
-async def a_feed(**options: Any) -> AsyncIterator[Feed]:
-    feed = Feed(**options)
-    gathering = asyncio.create_task(feed.run_gathering())
+async def a_feed(**options: Any) -> AsyncIterator[EventFeed]:
+    feed = EventFeed(**options)
+    gathering = asyncio.create_task(feed.wake_listeners())
     yield feed
     gathering.cancel()
 
@@ -121,11 +121,11 @@ async def test_whoever_listens_gets_everything_once_and_in_order() -> None:
         publish(feed, 3)
         listener = feed.listen()
         assert await taken(listener) == []
-        publish(feed, MOST_AT_ONCE + 10)
+        publish(feed, BATCH_EVENTS_MAX + 10)
         got = await taken(listener) + await taken(listener)
-        assert got == list(range(4, 4 + MOST_AT_ONCE + 10))
+        assert got == list(range(4, 4 + BATCH_EVENTS_MAX + 10))
         assert await taken(listener) == []
-        again = feed.listen(Place(feed.run, 5))
+        again = feed.listen(EventPosition(feed.run, 5))
         assert again.is_resumed
         assert (await taken(again))[0] == 6
 
@@ -134,23 +134,23 @@ async def test_whoever_listens_gets_everything_once_and_in_order() -> None:
 async def test_a_place_that_is_gone_or_never_was_is_not_gone_on_from() -> None:
     async with a_feed(kept=10) as feed:
         publish(feed, 30)
-        assert feed.listen(Place(feed.run, 20)).is_resumed
-        for place in (Place(feed.run, 19), Place(feed.run, 31), Place("0" * 16, 25)):
+        assert feed.listen(EventPosition(feed.run, 20)).is_resumed
+        for place in (EventPosition(feed.run, 19), EventPosition(feed.run, 31), EventPosition("0" * 16, 25)):
             listener = feed.listen(place)
             assert not listener.is_resumed
-            assert listener.place == feed.place
+            assert listener.position == feed.position
 
 
 @pytest.mark.parametrize(
     "text", ["", "x", "-", "0123456789abcdef-", "0123456789abcdef-1x", "-1", "é-1", "1" * 99]
 )
 def test_what_is_no_place_is_none(text: str) -> None:
-    assert Place.read(text) is None
+    assert EventPosition.read(text) is None
 
 
 def test_a_place_is_read_as_it_is_written() -> None:
-    place = Place("0123456789abcdef", 17)
-    assert Place.read(str(place)) == place
+    place = EventPosition("0123456789abcdef", 17)
+    assert EventPosition.read(str(place)) == place
 
 
 @swiftly
@@ -161,7 +161,7 @@ async def test_a_slow_listener_learns_how_much_it_has_lost_and_goes_on() -> None
         news = await listener.next(1)
         assert news is not None
         assert (news[0].missed, news[0].texts) == (25, ())
-        assert listener.place == feed.place
+        assert listener.position == feed.position
         publish(feed, 2)
         assert await taken(listener) == [26, 27]
 
@@ -169,8 +169,8 @@ async def test_a_slow_listener_learns_how_much_it_has_lost_and_goes_on() -> None
 @swiftly
 async def test_listeners_get_what_they_want_and_move_on_past_the_rest() -> None:
     async with a_feed() as feed:
-        of_two = feed.listen(wanted=Wanted(system=2))
-        of_links = feed.listen(wanted=Wanted(types=frozenset({"link"})))
+        of_two = feed.listen(event_filter=EventFilter(system=2))
+        of_links = feed.listen(event_filter=EventFilter(types=frozenset({"link"})))
         feed.publish("note", {}, link="a", system=1, component=1)
         feed.publish("note", {}, link="a", system=2, component=1)
         feed.publish("link", {}, link="a")
@@ -178,7 +178,7 @@ async def test_listeners_get_what_they_want_and_move_on_past_the_rest() -> None:
         assert await taken(of_links) == [3]
         feed.publish("note", {}, link="a", system=1, component=1)
         assert await taken(of_two) == []
-        assert of_two.place.seq == 4
+        assert of_two.position.seq == 4
 
 
 @swiftly
@@ -191,7 +191,7 @@ async def test_many_listeners_are_woken_seldom_and_one_at_once() -> None:
         async def listen(listener: Listener) -> None:
             nonlocal wakings
             with listener:
-                while listener.place.seq < 100:
+                while listener.position.seq < 100:
                     await listener.next(1)
                     wakings += 1
 
@@ -220,7 +220,7 @@ async def test_an_event_that_was_sent_releases_what_it_was_written_from() -> Non
         feed.publish("change", members)
         del members
         assert released() is not None
-        for each in (listener, feed.listen(Place(feed.run, 0))):  # the second one gets the same text
+        for each in (listener, feed.listen(EventPosition(feed.run, 0))):  # the second one gets the same text
             news = await each.next(1)
             assert news is not None
             assert json.loads(news[0].texts[0][1])["value"] == 1
@@ -283,7 +283,7 @@ async def test_who_comes_back_misses_nothing_and_gets_nothing_twice() -> None:
     async with service(generic(burst=1, period=0.05)) as (hub, browser):
         await met(browser)
         whole: list[int] = []
-        last = str(hub.feed.place)
+        last = str(hub.feed.position)
         fetch = asyncio.create_task(browser.post(f"{C}/fetch", json={}))
         for _ in range(6):
             async with listening(browser, after=last) as heard:
@@ -304,7 +304,7 @@ async def test_after_another_run_everything_is_to_be_loaded_anew() -> None:
         service(generic()) as (hub, browser),
         listening(browser, after="0123456789abcdef-1") as heard,
         listening(browser, after="nonsense") as other,
-        listening(browser, after=str(hub.feed.place)) as by_query,
+        listening(browser, after=str(hub.feed.position)) as by_query,
     ):
         assert [each.all[0]["resumed"] for each in (heard, other, by_query)] == [False, False, True]
 
@@ -327,7 +327,7 @@ async def test_a_listener_hears_of_what_it_has_asked_for() -> None:
 @swiftly
 async def test_a_stream_in_which_nothing_happens_says_that_it_lives() -> None:
     async with service() as (_, browser), listening(browser) as heard:
-        await asyncio.sleep(10 * events.KEEPALIVE)
+        await asyncio.sleep(10 * events.KEEPALIVE_INTERVAL)
         assert 9 <= heard.text.count(": \n") <= 11
         assert len(heard.all) == 1
 
@@ -337,17 +337,17 @@ async def test_what_is_not_wanted_moves_the_place_of_those_who_come_back() -> No
     async with service(generic()) as (hub, browser), listening(browser, types="link") as heard:
         await met(browser)
         await browser.post(f"{C}/fetch", json={})
-        await asyncio.sleep(3 * events.KEEPALIVE)
-        assert heard.last_id == str(hub.feed.place)
+        await asyncio.sleep(3 * events.KEEPALIVE_INTERVAL)
+        assert heard.last_id == str(hub.feed.position)
 
 
 @swiftly
 async def test_a_listener_that_does_not_read_is_told_of_the_gap(monkeypatch: pytest.MonkeyPatch) -> None:
     vehicle = small_px4()
     hub = Hub([vehicle], cache=False, fetches=False)
-    hub.feed = Feed(kept=20)
+    hub.feed = EventFeed(kept=20)
     hub.jobs._feed = hub.feed
-    for line in hub.lines.values():
+    for line in hub.links.values():
         line._feed = hub.feed
     got: list[bytes] = []
     may_go_on = asyncio.Event()
@@ -359,8 +359,8 @@ async def test_a_listener_that_does_not_read_is_told_of_the_gap(monkeypatch: pyt
 
     async with hub:
         listener = asyncio.create_task(call_app(hub, "/api/v1/events", send))
-        await hub.wait_for(1, 1, None, None)
-        await hub.begin_fetch(hub.find(1, 1), "test").wait()
+        await hub.wait_for_component(1, 1, None, None)
+        await hub.start_fetch(hub.find_component(1, 1), "test").wait()
         await asyncio.sleep(1)
         assert hub.feed.seq > 20
         may_go_on.set()
@@ -383,7 +383,7 @@ async def test_a_listener_that_never_takes_what_it_is_sent_is_left() -> None:
         listener = asyncio.create_task(call_app(hub, "/api/v1/events", send))
         await asyncio.sleep(0.1)
         assert hub.feed.listeners == 1
-        await asyncio.sleep(events.SLOWEST)
+        await asyncio.sleep(events.LISTENER_SEND_TIMEOUT)
         assert hub.feed.listeners == 0
         listener.cancel()
         await asyncio.sleep(0)
@@ -392,14 +392,14 @@ async def test_a_listener_that_never_takes_what_it_is_sent_is_left() -> None:
 
 @swiftly
 async def test_streams_are_bounded_and_end_with_the_service(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(events, "MOST_LISTENERS", 2)
+    monkeypatch.setattr(events, "LISTENERS_MAX", 2)
     async with service() as (hub, browser):
         async with listening(browser) as first, listening(browser) as second:
             problem(await browser.get("/api/v1/events"), 429, "too-many")
             hub.feed.end()
             await asyncio.sleep(1)
-            assert first.is_over
-            assert second.is_over
+            assert first.is_ended
+            assert second.is_ended
         assert hub.feed.listeners == 0
 
 
@@ -478,7 +478,7 @@ async def test_a_websocket_carries_the_same_events_and_resumes() -> None:
 
     async with service(generic()) as (hub, browser):
         await met(browser)
-        place = hub.feed.place
+        place = hub.feed.position
         async with listening(browser, after=str(place)) as heard:
             inbox: asyncio.Queue[Message] = asyncio.Queue()
             query = f"after={place}&types=change,job"
@@ -503,7 +503,7 @@ async def test_a_websocket_carries_the_same_events_and_resumes() -> None:
 
 @swiftly
 async def test_a_websocket_that_cannot_be_opened_is_a_problem_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(events, "MOST_LISTENERS", 0)
+    monkeypatch.setattr(events, "LISTENERS_MAX", 0)
     for path, query, status in (
         ("/api/v1/ws", "", 429),
         ("/api/v1/ws", "system=x", 422),

@@ -11,27 +11,33 @@ from collections.abc import AsyncIterator, Iterator
 import anyio
 import pytest
 
-from paramclient.service import Listening, gate, places
-from paramclient.service.client_address import is_loopback, network_of
-from paramclient.service.log_limit import MINUTE, MOST_KINDS, LogLimit
-from paramclient.service.places import KEPT_FOR_LOOPBACK, MOST_FROM_ONE, Place, Places, Stage
+from paramclient.service import Listening, acceptor, connection_slots
+from paramclient.service.client_address import client_network, is_loopback
+from paramclient.service.connection_slots import (
+    ADDRESS_CONNECTIONS_MAX,
+    LOOPBACK_RESERVED,
+    ConnectionSlot,
+    ConnectionSlots,
+    Stage,
+)
+from paramclient.service.log_limit import LOG_INTERVAL, LOG_KINDS_MAX, LogLimit
 from tests.service.test_attacks import Answer, Served, over_tls, served, taken, trusting
 from tests.shell import PATIENCE, Clock, until
 
-# Places
+# Connection slots
 
 
-def take(places_: Places, address: str) -> Place:
-    place = places_.take(address)
-    assert place is not None
-    return place
+def take(slots: ConnectionSlots, address: str) -> ConnectionSlot:
+    slot = slots.take(address)
+    assert slot is not None
+    return slot
 
 
-def held(places_: Places, address: str) -> Place:
-    """A place of a connection that is being answered."""
-    place = take(places_, address)
-    place.stage = Stage.ASKING
-    return place
+def held(slots: ConnectionSlots, address: str) -> ConnectionSlot:
+    """A slot of a connection that is being answered."""
+    slot = take(slots, address)
+    slot.stage = Stage.ACTIVE
+    return slot
 
 
 @pytest.mark.parametrize(
@@ -46,45 +52,45 @@ def held(places_: Places, address: str) -> Place:
     ],
 )
 def test_which_addresses_are_one_client(one: str, other: str, are_one: bool) -> None:
-    assert (network_of(one) == network_of(other)) is are_one
-    seats = Places(1_000)
-    for _ in range(MOST_FROM_ONE):
+    assert (client_network(one) == client_network(other)) is are_one
+    seats = ConnectionSlots(1_000)
+    for _ in range(ADDRESS_CONNECTIONS_MAX):
         held(seats, one)
     assert (seats.take(other) is None) is are_one
     assert seats.take("127.0.0.1") is not None
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1", "127.9.9.9", "::1", "::ffff:127.0.0.1"])
-def test_loopback_has_places_of_its_own_and_no_limit_for_one_address(address: str) -> None:
+def test_loopback_has_slots_of_its_own_and_no_limit_for_one_address(address: str) -> None:
     assert is_loopback(address)
-    seats = Places(512)
+    seats = ConnectionSlots(512)
     beyond = 0
-    while seats.take(f"192.0.2.{beyond % 200}") is not None and beyond < 512 - KEPT_FOR_LOOPBACK:
+    while seats.take(f"192.0.2.{beyond % 200}") is not None and beyond < 512 - LOOPBACK_RESERVED:
         beyond += 1
-    for place in list(seats.at[Stage.SILENT]):
-        place.stage = Stage.ASKING
-    assert len(seats) == 512 - KEPT_FOR_LOOPBACK
+    for slot in list(seats.at[Stage.SILENT]):
+        slot.stage = Stage.ACTIVE
+    assert len(seats) == 512 - LOOPBACK_RESERVED
     assert seats.take("192.0.2.250") is None
-    for _ in range(KEPT_FOR_LOOPBACK):
+    for _ in range(LOOPBACK_RESERVED):
         held(seats, address)
     assert seats.take(address) is None
 
 
 def test_a_proxy_that_is_trusted_is_many_clients() -> None:
-    seats = Places(512, is_proxy=lambda address: address == "192.0.2.1")
-    for _ in range(512 - KEPT_FOR_LOOPBACK):
+    seats = ConnectionSlots(512, is_proxy=lambda address: address == "192.0.2.1")
+    for _ in range(512 - LOOPBACK_RESERVED):
         held(seats, "192.0.2.1")
     assert seats.take("192.0.2.1") is None
     assert seats.take("127.0.0.1") is not None
 
 
 def test_whoever_says_least_loses_its_place_first() -> None:
-    seats = Places(4, is_here=lambda _: True)
+    seats = ConnectionSlots(4, is_local=lambda _: True)
     ended: list[str] = []
-    for name, stage in (("idle", Stage.IDLE), ("begun", Stage.BEGUN), ("old", Stage.SILENT)):
-        place = take(seats, "127.0.0.1")
-        place.stage = stage
-        place.leave = lambda name=name: ended.append(name)  # type: ignore[misc]
+    for name, stage in (("idle", Stage.IDLE), ("begun", Stage.STARTED), ("old", Stage.SILENT)):
+        slot = take(seats, "127.0.0.1")
+        slot.stage = stage
+        slot.close = lambda name=name: ended.append(name)  # type: ignore[misc]
     held(seats, "127.0.0.1")
     for expected in ("old", "begun", "idle"):
         held(seats, "127.0.0.1")
@@ -94,16 +100,16 @@ def test_whoever_says_least_loses_its_place_first() -> None:
 
 
 def test_a_client_that_has_too_many_takes_no_place_of_another_one() -> None:
-    seats = Places(1_000)
+    seats = ConnectionSlots(1_000)
     other = take(seats, "192.0.2.2")
-    own = [take(seats, "192.0.2.1") for _ in range(MOST_FROM_ONE)]
+    own = [take(seats, "192.0.2.1") for _ in range(ADDRESS_CONNECTIONS_MAX)]
     take(seats, "192.0.2.1")
     assert own[0] not in seats.at[Stage.SILENT]
     assert other in seats.at[Stage.SILENT]
 
 
 def test_those_beyond_this_computer_end_no_connection_of_it() -> None:
-    seats = Places(8, is_here=lambda address: address == "127.0.0.1")
+    seats = ConnectionSlots(8, is_local=lambda address: address == "127.0.0.1")
     for _ in range(8):
         take(seats, "127.0.0.1")
     assert seats.take("192.0.2.1") is None
@@ -112,11 +118,11 @@ def test_those_beyond_this_computer_end_no_connection_of_it() -> None:
 
 
 def test_a_place_is_given_back_once() -> None:
-    seats = Places(8)
-    place = take(seats, "192.0.2.1")
-    place.free()
-    place.free()
-    place.stage = Stage.ASKING
+    seats = ConnectionSlots(8)
+    slot = take(seats, "192.0.2.1")
+    slot.release()
+    slot.release()
+    slot.stage = Stage.ACTIVE
     assert len(seats) == 0
     assert not any(seats.at.values())
 
@@ -142,40 +148,40 @@ def test_of_each_kind_there_is_one_line_in_a_minute(
 ) -> None:
     for number in range(1_000):
         clock.now = number * 0.1
-        limit.tell(LOG, "full", f"refused {number}")
-        limit.tell(LOG, "tls", f"failed {number}")
+        limit.log(LOG, "full", f"refused {number}")
+        limit.log(LOG, "tls", f"failed {number}")
         limit.flush()
     assert caplog.messages == [
         *("refused 0", "failed 0"),
         *("refused 0 (and 599 more such lines in 60 s)", "failed 0 (and 599 more such lines in 60 s)"),
     ]
     caplog.clear()
-    clock.now += MINUTE
+    clock.now += LOG_INTERVAL
     limit.flush()
     assert caplog.messages[0] == "refused 0 (and 400 more such lines in 100 s)"
-    clock.now += MINUTE
+    clock.now += LOG_INTERVAL
     limit.flush()
-    limit.tell(LOG, "full", "refused again")
+    limit.log(LOG, "full", "refused again")
     assert caplog.messages[2:] == ["refused again"]
 
 
 def test_at_the_end_it_is_told_how_many_there_were(limit: LogLimit, caplog: pytest.LogCaptureFixture) -> None:
     for _ in range(3):
-        limit.tell(LOG, "full", "refused")
+        limit.log(LOG, "full", "refused")
     limit.flush(ends=True)
     limit.flush(ends=True)
     assert caplog.messages == ["refused", "refused (and 2 more such lines in 0 s)"]
 
 
 def test_kinds_are_bounded(limit: LogLimit, caplog: pytest.LogCaptureFixture) -> None:
-    for number in range(MOST_KINDS * 10):
-        limit.tell(LOG, f"kind {number}", "text")
-    assert len(caplog.messages) == MOST_KINDS + 1
+    for number in range(LOG_KINDS_MAX * 10):
+        limit.log(LOG, f"kind {number}", "text")
+    assert len(caplog.messages) == LOG_KINDS_MAX + 1
 
 
 def test_lines_of_libraries_are_held_to_the_same(limit: LogLimit, caplog: pytest.LogCaptureFixture) -> None:
     uvicorn, aio = logging.getLogger("uvicorn.error"), logging.getLogger("asyncio")
-    with limit.of_libraries():
+    with limit.limit_libraries():
         for number in range(5):
             uvicorn.warning("Invalid HTTP request received.")
             aio.error("socket.accept() out of system resource\nsocket: <%d>", number)
@@ -222,10 +228,10 @@ async def asked_over_tls(service: Served) -> Answer:
 async def narrow(
     monkeypatch: pytest.MonkeyPatch, listening: Listening | None = None
 ) -> AsyncIterator[Served]:
-    """A service with 40 places, for which only 127.0.0.1 is this computer."""
-    monkeypatch.setattr(places, "MOST_CONNECTIONS", 40)
-    monkeypatch.setattr(places, "MOST_FROM_ONE", 10)
-    monkeypatch.setattr(places, "is_loopback", lambda address: address == "127.0.0.1")
+    """A service with 40 connection slots, for which only 127.0.0.1 is this computer."""
+    monkeypatch.setattr(connection_slots, "SERVICE_CONNECTIONS_MAX", 40)
+    monkeypatch.setattr(connection_slots, "ADDRESS_CONNECTIONS_MAX", 10)
+    monkeypatch.setattr(connection_slots, "is_loopback", lambda address: address == "127.0.0.1")
     async with served(listening=listening) as service:
         yield service
 
@@ -237,7 +243,7 @@ async def test_silent_connections_keep_nobody_out(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, source: str, data: bytes
 ) -> None:
     """From this computer, where there is no limit for one address, and from beyond it."""
-    monkeypatch.setattr(gate, "HANDSHAKE_PATIENCE", 600.0)  # so no place becomes free by waiting
+    monkeypatch.setattr(acceptor, "HANDSHAKE_TIMEOUT", 600.0)  # so no slot becomes free by waiting
     caplog.set_level(logging.INFO, "paramclient")
     async with narrow(monkeypatch, over_tls()) as service:
         with silent(service.port, 200, source, data):
@@ -252,7 +258,7 @@ async def test_silent_connections_keep_nobody_out(
 async def test_a_handshake_that_does_not_come_is_not_waited_for(
     monkeypatch: pytest.MonkeyPatch, data: bytes
 ) -> None:
-    monkeypatch.setattr(gate, "HANDSHAKE_PATIENCE", 0.2)
+    monkeypatch.setattr(acceptor, "HANDSHAKE_TIMEOUT", 0.2)
     async with served(listening=over_tls()) as service, service.connection() as (reader, writer):
         writer.write(data)
         assert await asyncio.wait_for(taken(reader), 5) == b""
@@ -265,7 +271,7 @@ async def test_failed_handshakes_make_one_line(caplog: pytest.LogCaptureFixture)
             await service.send(b"GET /health HTTP/1.1\r\n\r\n")
     said = [each for each in caplog.messages if "TLS handshake" in each]
     assert len(said) == 2, caplog.messages
-    assert "the TLS handshake with 127.0.0.1 failed: http request" in said[0]
+    assert "TLS handshake with 127.0.0.1 failed: http request" in said[0]
     assert "(and 19 more such lines in" in said[1]
     assert len(caplog.messages) == 2
 
@@ -287,7 +293,7 @@ async def test_an_address_beyond_this_computer_has_its_share_and_no_more(
             writer.write(service.head("GET", "/health", "Connection: close"))
             assert Answer.of(await taken(reader)).status == 200
     [first, rest] = [each for each in caplog.messages if "refused" in each]
-    assert first == "a connection from 127.0.0.2 was refused: there are as many as there may be"
+    assert first == "refused a connection from 127.0.0.2: the maximum number of connections is reached"
     assert "(and 1 more such lines" in rest
 
 
@@ -299,10 +305,10 @@ async def test_without_files_it_waits_and_goes_on(
         monkeypatch.setattr(socket.socket, "accept", _no_files)
         pending = asyncio.create_task(service.ask())
         await until(lambda: bool(caplog.messages))
-        await asyncio.sleep(3 * gate.ACCEPT_RETRY)
+        await asyncio.sleep(3 * acceptor.ACCEPT_RETRY)
         monkeypatch.undo()
         assert (await pending).status == 200
-    assert caplog.messages[0] == "no connection can be accepted: Too many open files"
+    assert caplog.messages[0] == "cannot accept a connection: Too many open files"
     assert len(caplog.messages) == 2
 
 
@@ -314,6 +320,6 @@ def test_there_are_no_more_connections_than_half_of_the_files(monkeypatch: pytes
     import resource
 
     monkeypatch.setattr(resource, "getrlimit", lambda _: (256, 256))
-    assert places.most_connections() == 128
+    assert connection_slots.connection_limit() == 128
     monkeypatch.setattr(resource, "getrlimit", lambda _: (resource.RLIM_INFINITY,) * 2)
-    assert places.most_connections() == places.MOST_CONNECTIONS
+    assert connection_slots.connection_limit() == connection_slots.SERVICE_CONNECTIONS_MAX

@@ -211,7 +211,7 @@ def test_search_by_name_by_description_by_meaning_by_value(sight: Sight, bench: 
     expect(names).to_have_count(len(expected))
     assert set(names.all_inner_texts()) == expected
     sight.find("no such thing")
-    expect(sight.page.get_by_text("Nothing fits what is searched for.")).to_be_visible()
+    expect(sight.page.get_by_text("No parameter matches the search.")).to_be_visible()
     sight.search.press("Escape")
     expect(sight.page.locator("#count")).to_have_text("903 parameters")
 
@@ -292,7 +292,9 @@ def test_the_outcome_of_each(visit: Callable[..., Sight], bench: Bench) -> None:
     sight.stage("RTL_CLIMB_MIN", "12")
     sight.send()
     expect(sight.line("RTL_SPEED")).to_contain_text(re.compile("refused.*read.only", re.IGNORECASE))
-    expect(sight.line("RTL_ALT")).to_contain_text(f"adjusted The vehicle made {HIGHEST} of {HIGHEST + 2000}.")
+    expect(sight.line("RTL_ALT")).to_contain_text(
+        f"adjusted The vehicle changed {HIGHEST + 2000} to {HIGHEST}."
+    )
     expect(sight.line("RTL_CLIMB_MIN")).to_contain_text("accepted")
     assert bench.ardupilot.values["RTL_ALT"] == HIGHEST
     assert bench.ardupilot.values["RTL_CLIMB_MIN"] == 12
@@ -306,7 +308,7 @@ def test_what_is_no_value_cannot_be_staged_and_what_is_out_of_range_is_doubted(s
     field = editor.get_by_role("textbox")
     field.fill("twelve")
     field.press("Enter")
-    expect(editor.get_by_role("alert")).to_have_text(re.compile("no number"))
+    expect(editor.get_by_role("alert")).to_have_text(re.compile("Not a number"))
     field.fill("1e39")
     expect(editor.get_by_role("alert")).to_have_text(re.compile("more than a REAL32 holds"))
     field.fill("12.5")
@@ -362,7 +364,7 @@ def test_an_armed_vehicle_wants_a_second_word(sight: Sight, bench: Bench) -> Non
         expect(sight.page.locator("#badges")).to_contain_text("ARMED")
         expect(sight.spoken).to_contain_text("PX4 1/1 is armed.")
         expect(send).to_be_disabled()
-        sight.dialog.get_by_role("checkbox", name="Send all the same").check()
+        sight.dialog.get_by_role("checkbox", name="Send anyway").check()
         send.click()
         expect(sight.line("MC_YAW_P")).to_contain_text("accepted")
     finally:
@@ -378,7 +380,7 @@ def test_what_others_change_is_marked_and_takes_no_focus_away(sight: Sight, benc
     field = editor.get_by_role("textbox")
     field.fill("0.3")
     bench.ask("PATCH", "/components/1/1/params?link=px4", {"values": {"MC_YAWRATE_P": 0.4}})
-    expect(editor).to_contain_text(re.compile(r"Meanwhile it is 0\.4, by \w+"))
+    expect(editor).to_contain_text(re.compile(r"The vehicle now has 0\.4, by \w+"))
     expect(field).to_be_focused()
     expect(field).to_have_value("0.3")
     field.press("Escape")
@@ -413,7 +415,7 @@ def test_an_open_review_follows_what_others_change(sight: Sight, bench: Bench) -
     expect(now).to_have_text("0.25")
     expect(remark).to_have_text(f"It was {was} when you edited it.")
     bench.set("MC_PITCHRATE_P", 0.2)
-    expect(remark).to_contain_text("The vehicle has that already.")
+    expect(remark).to_contain_text("The vehicle already has this value.")
     sight.dialog.get_by_role("button", name="Send").click()
     expect(sight.dialog.get_by_role("status")).to_have_text("1 accepted.")
     bench.set("MC_PITCHRATE_P", 0.3)
@@ -504,7 +506,7 @@ def test_what_is_no_parameter_file_is_said_to_be_none(sight: Sight) -> None:
 @needs_browser
 def test_an_earlier_state_is_kept_and_gone_back_to(sight: Sight, bench: Bench) -> None:
     sight.page.get_by_role("button", name="Snapshot").click()
-    expect(sight.page.get_by_text("The present state is kept; Compare shows it.")).to_be_visible()
+    expect(sight.page.get_by_text("Snapshot created. Compare shows it.")).to_be_visible()
     before = bench.px4.values["MC_YAWRATE_MAX"]
     bench.set("MC_YAWRATE_MAX", 123.0)
     sight.find("MC_YAWRATE_MAX")
@@ -585,7 +587,7 @@ def test_who_listens_is_told_where_they_are(sight: Sight) -> None:
     expect(row).to_have_attribute("aria-selected", "true")
     expect(row).to_have_attribute("aria-rowindex", "3")
     unnamed = sight.page.evaluate(
-        """() => [...document.querySelectorAll("button, input, select, a, dialog, nav, aside")]
+        """() => [...document.querySelectorAll("button, input, select, a, dialog, nav, run_in_thread")]
             .filter((each) => each.checkVisibility())
             .filter((each) => !(each.textContent.trim() || each.ariaLabel || each.labels?.length
                 || each.getAttribute("aria-labelledby")))
@@ -636,10 +638,10 @@ def test_a_service_that_goes_and_comes_back(visit: Callable[..., Sight], tmp_pat
         sight = visit(first.url)
         sight.stage("MC_ROLL_P", "7.5")
         port = urlsplit(first.url).port
-    expect(sight.page.get_by_text("The service does not answer.")).to_be_visible()
+    expect(sight.page.get_by_text("The service does not respond.")).to_be_visible()
     with at_work(tmp_path, port=port or 0) as second:
         second.do(second.px4.set_param, "MC_PITCH_P", 3.25)
-        expect(sight.page.get_by_text("The service does not answer.")).to_be_hidden()
+        expect(sight.page.get_by_text("The service does not respond.")).to_be_hidden()
         sight.find("MC_PITCH_P")
         expect(sight.value("MC_PITCH_P")).to_contain_text("3.25")
         sight.send()  # what was staged has waited
@@ -652,8 +654,8 @@ def test_a_vehicle_of_yesterday_is_looked_at(visit: Callable[..., Sight], tmp_pa
     with at_work(tmp_path) as bench:
         until(lambda: bench.is_synced(1))
         sight = visit(bench.url)
-        sight.page.get_by_text("Not heard now").click()
-        kept = sight.page.get_by_role("list", name="Vehicles that are not heard now").get_by_role("button")
+        sight.page.get_by_text("Not connected").click()
+        kept = sight.page.get_by_role("list", name="Vehicles that are not connected").get_by_role("button")
         expect(kept).to_have_count(1)
         kept.click()
         expect(sight.page.get_by_role("heading", level=1)).to_have_text("PX4 9/1")
@@ -720,7 +722,7 @@ def test_a_token_is_asked_for_and_who_may_only_read_sees_that(
         field = sight.dialog.get_by_label("Token")
         field.fill("x" * 32)
         field.press("Enter")
-        expect(sight.dialog.get_by_role("alert")).to_have_text("The service does not know this token.")
+        expect(sight.dialog.get_by_role("alert")).to_have_text("The token is not valid for this service.")
         field.fill(reader)
         field.press("Enter")
         expect(sight.page.locator("#role")).to_have_text("read-only")

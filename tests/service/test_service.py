@@ -75,7 +75,7 @@ async def test_a_link_that_drops_is_away_until_it_is_back() -> None:
         link.is_away = False
         await asyncio.sleep(6)
         assert (await browser.get(C)).json()["link_state"] == "open"
-        assert [each.state for each in hub.lines.values()] == ["open"]
+        assert [each.state for each in hub.links.values()] == ["open"]
 
 
 @swiftly
@@ -87,9 +87,9 @@ async def test_a_link_that_fails_for_good_is_opened_with_a_fresh_client() -> Non
         await link.drop()
         await asyncio.sleep(0.1)
         assert hub.followed == []
-        assert hub.lines[link.name].state == "failed"
+        assert hub.links[link.name].state == "failed"
         await met(browser)
-        assert hub.lines[link.name].openings == 2
+        assert hub.links[link.name].openings == 2
 
 
 @swiftly
@@ -342,7 +342,7 @@ def test_values_of_before_are_cached_with_their_age_until_the_hash_confirms_them
     most_told_singly: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """That their trust has moved is told one by one where they are few, else at once for all."""
-    monkeypatch.setattr(followed_component, "MOST_TOLD_SINGLY", most_told_singly)
+    monkeypatch.setattr(followed_component, "SINGLE_CHANGES_MAX", most_told_singly)
     swiftly(confirm)(most_told_singly, tmp_path)
 
 
@@ -621,4 +621,4 @@ async def test_every_answer_forbids_a_browser_to_make_a_program_of_it() -> None:
             headers = (await browser.get(path)).headers
             assert headers["x-content-type-options"] == "nosniff"
             assert headers["content-security-policy"].startswith("default-src 'none'")
-            assert headers["x-seq"] == str(hub.feed.place)
+            assert headers["x-seq"] == str(hub.feed.position)

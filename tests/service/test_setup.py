@@ -24,10 +24,10 @@ from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType
 from paramclient.protocol import wire
 from paramclient.service import AccessSettings, Hub, Settings, Tokens, create_app
-from paramclient.service.param_sources import LARGEST_UPLOAD
-from paramclient.service.quota import LONG_REQUESTS_OF_ONE
-from paramclient.service.reading import LONGEST_LINE
-from paramclient.service.routes.param_files import attachment
+from paramclient.service.param_sources import PARAM_FILE_BYTES_MAX
+from paramclient.service.quota import LONG_REQUESTS_OF_HOLDER_MAX
+from paramclient.service.request_body import LINE_BYTES_MAX
+from paramclient.service.routes.param_files import file_response
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
 from paramclient.sim.vehicle import Vehicle
 from tests.asgi import a_browser
@@ -228,7 +228,7 @@ async def test_an_earlier_state_comes_back(vehicle: Callable[..., Vehicle], tmp_
         unknown = await service.post(f"{HERE}/restore", {"snapshot": 999}, 404)
         assert unknown["type"] == "urn:paramclient:unknown-state"
         both = await service.post(f"{HERE}/restore", {"snapshot": 1, "at": 5}, 422)
-        assert "not of both" in both["detail"]
+        assert "exclude each other" in both["detail"]
 
 
 @swiftly
@@ -341,12 +341,12 @@ FAULTS: list[tuple[Any, str]] = [
     ({}, "wanted"),
     ({"wanted": {}}, "one of these members"),
     ({"wanted": {"snapshot": 1, "at": 1.0}}, "one of these members"),
-    ({"wanted": {"defaults": True}}, "base to compare with"),
-    ({"wanted": {"file": {"name": "a.param"}}}, "either as text or in base64"),
-    ({"wanted": {"file": {"base64": "###"}}}, "no base64"),
+    ({"wanted": {"defaults": True}}, "base of a comparison"),
+    ({"wanted": {"file": {"name": "a.param"}}}, "either `text` or `base64`"),
+    ({"wanted": {"file": {"base64": "###"}}}, "not valid base64"),
     ({"wanted": {"values": {}}}, "values"),
     ({"wanted": {"values": {"NO GOOD NAME AT ALL": 1}}}, "NO GOOD NAME"),
-    ({"wanted": {"values": {"MODE": "Loiter"}}}, "no number"),
+    ({"wanted": {"values": {"MODE": "Loiter"}}}, "not a number"),
     ({"wanted": {"at": "2026-11-20"}}, "zone"),
     ({"wanted": {"at": "yesterday"}}, "2026-11-20T14:00:00Z"),
     ({"wanted": {"at": "inf"}}, "less than"),
@@ -428,7 +428,7 @@ async def test_a_table_comes_as_a_file_of_every_form_and_goes_back(vehicle: Call
         for form in WRITABLE:
             answer = await service.file(f"{HERE}/file", form=form)
             disposition = answer.headers["content-disposition"]
-            assert re.fullmatch(r'attachment; filename="[A-Za-z0-9._-]+"', disposition)
+            assert re.fullmatch(r'file_response; filename="[A-Za-z0-9._-]+"', disposition)
             assert answer.headers["content-type"] == "application/octet-stream"
             assert answer.headers["x-content-type-options"] == "nosniff"
             name = disposition.split('"')[1]
@@ -457,9 +457,9 @@ async def test_the_name_of_a_file_is_safe_whoever_the_vehicle_is() -> None:
         {"A": WrittenParam("A", 1, ParamType.INT32)}, system=9, component=1, identity=whose, at=NOW
     )
     async with Hub([], cache=False) as hub:
-        answer = await attachment(hub, params, FileForm.QGC)
+        answer = await file_response(hub, params, FileForm.QGC)
     name = "autopilot_200-9-1-20261118-110640.params"
-    assert answer.headers["content-disposition"] == f'attachment; filename="{name}"'
+    assert answer.headers["content-disposition"] == f'file_response; filename="{name}"'
 
 
 @swiftly
@@ -516,12 +516,12 @@ async def test_a_file_is_read_and_its_faults_are_told_by_line() -> None:
         assert (await upload(b"", 422))["error"] == "FileError"
         assert (await upload(b"{" * 50_000, 422, form="json"))["error"] == "FileError"
         assert (await upload(b"- " * 8_000, 422, form="yaml"))["error"] == "FileError"
-        assert (await upload(b"- " * 50_000, 413, form="yaml"))["most"] == LONGEST_LINE
-        assert (await upload(b"A,1\n" * (LARGEST_UPLOAD // 4 + 1), 413))[
+        assert (await upload(b"- " * 50_000, 413, form="yaml"))["most"] == LINE_BYTES_MAX
+        assert (await upload(b"A,1\n" * (PARAM_FILE_BYTES_MAX // 4 + 1), 413))[
             "type"
         ] == "urn:paramclient:too-large"
-        large = {"file": {"name": "a.parm", "text": "A 1\n" * (LARGEST_UPLOAD // 4 + 1)}}
-        assert (await service.post(f"{HERE}/plan", {"wanted": large}, 413))["most"] == LARGEST_UPLOAD
+        large = {"file": {"name": "a.parm", "text": "A 1\n" * (PARAM_FILE_BYTES_MAX // 4 + 1)}}
+        assert (await service.post(f"{HERE}/plan", {"wanted": large}, 413))["most"] == PARAM_FILE_BYTES_MAX
         several = dumps(
             [
                 ParamSet({"A": WrittenParam("A", 1, ParamType.INT32)}, component=each, system=1)
@@ -543,9 +543,9 @@ async def test_files_are_read_one_after_the_other_and_not_without_end() -> None:
             answers.append(answer.status_code)
 
         async with anyio.create_task_group() as tasks:
-            for _ in range(LONG_REQUESTS_OF_ONE + 3):
+            for _ in range(LONG_REQUESTS_OF_HOLDER_MAX + 3):
                 tasks.start_soon(upload)
-        assert sorted(answers) == [200] * LONG_REQUESTS_OF_ONE + [429] * 3
+        assert sorted(answers) == [200] * LONG_REQUESTS_OF_HOLDER_MAX + [429] * 3
 
 
 @swiftly

@@ -22,13 +22,13 @@ def test_two_files_that_belong_together() -> None:
 @pytest.mark.parametrize(
     ("cert", "key", "words"),
     [
-        (CERT, None, "TLS needs both: --tls-cert FILE, the certificate, and --tls-key FILE, its private key"),
+        (CERT, None, "TLS needs both --tls-cert FILE, the certificate, and --tls-key FILE, its private key"),
         (None, KEY, "TLS needs both"),
         ("nowhere.pem", KEY, "nowhere.pem: the certificate cannot be read: No such file or directory"),
         (CERT, "nowhere.key", "nowhere.key: the private key cannot be read: No such file or directory"),
         (CERT, DATA, f"{DATA}: the private key cannot be read: Is a directory"),
-        (KEY, CERT, f"{KEY}: there is no certificate in PEM in this file"),
-        (CERT, CERT, f"{CERT}: there is no private key in PEM in this file"),
+        (KEY, CERT, f"{KEY}: the file contains no certificate in PEM format"),
+        (CERT, CERT, f"{CERT}: the file contains no private key in PEM format"),
         (
             CERT,
             DATA / "tls_other.key",
@@ -48,5 +48,5 @@ def test_what_is_wrong_is_told_with_the_name_of_the_file(
 def test_a_file_that_is_damaged_is_named(tmp_path: Path) -> None:
     cert = tmp_path / "cert.pem"
     cert.write_text("-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n")
-    with pytest.raises(UsageError, match=r"cert\.pem with .*tls_station\.key: no certificate with its key"):
+    with pytest.raises(UsageError, match=r"cert\.pem with .*tls_station\.key: not a certificate with its"):
         tls_of(cert, KEY)

@@ -9,6 +9,7 @@ import json
 import math
 import threading
 import tracemalloc
+import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
@@ -18,10 +19,12 @@ import anyio
 import httpx
 import pytest
 from fastapi import FastAPI
+from fastapi.dependencies import utils as dependency_utils
 
-from paramclient.client.fetch_all import STARTED_FETCHES_MAX, FetchTogether
+from paramclient.client.fetch_all import ENDED_FETCHES_MAX, STARTED_FETCHES_MAX, FetchTogether
 from paramclient.documents.component import ComponentsDoc
-from paramclient.documents.diff import DiffDoc
+from paramclient.documents.diff import DiffDoc, DifferenceDoc
+from paramclient.documents.document import Document
 from paramclient.documents.job import JobsDoc
 from paramclient.errors import FileError, UsageError
 from paramclient.files import document_schema, dumps, formats, line_formats, loads, script
@@ -38,28 +41,26 @@ from paramclient.service import (
     Hub,
     Settings,
     Tokens,
-    answering,
     create_app,
     jobs,
-    quota,
+    responses,
 )
 from paramclient.service import hub as hub_room
 from paramclient.service.access import AccessMiddleware
-from paramclient.service.answer_places import READ_OF_ONE, AnswerPlaces
-from paramclient.service.answering import written_out
-from paramclient.service.event_feed import MOST_AT_ONCE
-from paramclient.service.link import LOOKED_AT_ONCE
+from paramclient.service.event_feed import BATCH_EVENTS_MAX
+from paramclient.service.link import COMPONENTS_PER_TURN
 from paramclient.service.param_sources import (
-    LARGEST_UPLOAD,
-    MOST_NAMES,
-    MOST_PATTERNS,
-    MOST_VALUES,
-    read_upload,
+    PARAM_FILE_BYTES_MAX,
+    PATTERNS_MAX,
+    REQUEST_NAMES_MAX,
+    REQUEST_VALUES_MAX,
+    parse_upload,
 )
 from paramclient.service.problems import ServiceError
-from paramclient.service.quota import LONG_REQUESTS_OF_ONE
-from paramclient.service.reading import LONGEST_LINE, LONGEST_NUMBER, MOST_PIECES
-from paramclient.service.route_context import answered
+from paramclient.service.quota import LARGE_GETS_OF_HOLDER_MAX, LONG_REQUESTS_OF_HOLDER_MAX, Quota
+from paramclient.service.request_body import DIGITS_MAX, LINE_BYTES_MAX, SEPARATORS_MAX
+from paramclient.service.responses import encode_document
+from paramclient.service.route_context import run_until_disconnect
 from paramclient.service.routes import params as params_room
 from paramclient.service.routes import setup as setup_room
 from paramclient.sim import GenericVehicle
@@ -146,28 +147,31 @@ def test_names_and_patterns_choose_as_the_shell_does() -> None:
 @swiftly
 async def test_a_request_has_few_patterns_and_many_names(monkeypatch: pytest.MonkeyPatch) -> None:
     many = [f"A*{number}" for number in range(10_000)]
-    few = ["ABC_*", *[f"*{number % 40:02}" for number in range(MOST_PATTERNS - 1)]]
+    few = ["ABC_*", *[f"*{number % 40:02}" for number in range(PATTERNS_MAX - 1)]]
     async with service(GenericVehicle(table=TABLE)) as (_, browser):
         await fetched(browser)
         for path, member in (("diff", "only"), ("plan", "only"), ("plan", "include"), ("verify", "include")):
             body = {"wanted": {"values": VALUES}, member: many}
             told = problem(await browser.post(f"{C}/{path}", json=body), 422, "invalid-request")
-            assert f"at most {MOST_PATTERNS} of them may be patterns" in told["detail"]
+            assert f"at most {PATTERNS_MAX} of the names may be patterns" in told["detail"]
             body = {"wanted": {"values": VALUES}, member: [*few, *TABLE]}
             assert (await browser.post(f"{C}/{path}", json=body)).status_code == 200
-        body = {"wanted": {"values": VALUES}, "only": [f"A{number}" for number in range(MOST_NAMES + 1)]}
+        body = {
+            "wanted": {"values": VALUES},
+            "only": [f"A{number}" for number in range(REQUEST_NAMES_MAX + 1)],
+        }
         told = problem(await browser.post(f"{C}/diff", json=body), 422, "invalid-request")
-        assert str(MOST_NAMES) in told["detail"]
+        assert str(REQUEST_NAMES_MAX) in told["detail"]
         told = problem(
             await browser.post("/api/v1/fleet/diff", json={"names": many[:500]}), 422, "invalid-request"
         )
-        assert f"at most {MOST_PATTERNS}" in told["detail"]
+        assert f"at most {PATTERNS_MAX}" in told["detail"]
 
         with threads_of(monkeypatch, (params_room, "NameChoice")) as seen:
             answer = await browser.get(f"{C}/params", params={"names": few})
             assert answer.json()["params"].keys() == TABLE.keys()
         assert seen == {"NameChoice": {"paramclient service"}}
-        query = {"names": many[: MOST_PATTERNS + 1]}
+        query = {"names": many[: PATTERNS_MAX + 1]}
         problem(await browser.get(f"{C}/params", params=query), 422, "invalid-request")
 
 
@@ -192,7 +196,7 @@ async def test_what_has_too_many_values_is_not_parsed(
         with threads_of(monkeypatch, (json, "loads")) as seen:
             answer = await browser.post(f"{C}/diff", content=body, headers=A_JSON)
         assert seen == {"loads": set()}
-        assert problem(answer, 413, "too-large")["most"] == MOST_PIECES
+        assert problem(answer, 413, "too-large")["most"] == SEPARATORS_MAX
 
 
 FILES: list[tuple[str, bytes]] = [
@@ -207,36 +211,36 @@ FILES: list[tuple[str, bytes]] = [
 @swiftly
 async def test_a_file_with_too_many_values_is_not_read(name: str, data: bytes) -> None:
     """As it is, and in a body: with line ends and brackets it is the file that has too many."""
-    assert len(data) <= LARGEST_UPLOAD
+    assert len(data) <= PARAM_FILE_BYTES_MAX
     coded = {"file": {"name": name, "base64": base64.b64encode(data).decode()}}
     async with service(GenericVehicle(table=TABLE)) as (_, browser):
         await fetched(browser)
         with peak() as used:
             answer = await browser.post(f"/api/v1/files?name={name}", content=data, headers=A_FILE)
-            assert problem(answer, 413, "too-large")["most"] == MOST_PIECES
+            assert problem(answer, 413, "too-large")["most"] == SEPARATORS_MAX
             answer = await browser.post(f"{C}/plan", json={"wanted": coded})
-            assert problem(answer, 413, "too-large")["most"] == MOST_PIECES
+            assert problem(answer, 413, "too-large")["most"] == SEPARATORS_MAX
             assert used() < 40
 
 
 @swiftly
 async def test_nobody_wants_more_values_than_a_vehicle_has() -> None:
     unknown = {f"U{number}": number for number in range(60_000)}
-    text = "".join(f"U{number} 1\n" for number in range(MOST_VALUES + 1))
+    text = "".join(f"U{number} 1\n" for number in range(REQUEST_VALUES_MAX + 1))
     vehicle = Tap(GenericVehicle(table=TABLE))
     async with service(vehicle) as (_, browser):
         await fetched(browser)
         vehicle.heard.clear()
         answer = await browser.post(f"{C}/plan", json={"wanted": {"values": unknown}})
-        assert problem(answer, 413, "too-large")["most"] == MOST_PIECES
-        few = dict(list(unknown.items())[: MOST_VALUES + 1])
+        assert problem(answer, 413, "too-large")["most"] == SEPARATORS_MAX
+        few = dict(list(unknown.items())[: REQUEST_VALUES_MAX + 1])
         answer = await browser.post(f"{C}/plan", json={"wanted": {"values": few}})
-        assert str(MOST_VALUES) in problem(answer, 422, "invalid-request")["detail"]
+        assert str(REQUEST_VALUES_MAX) in problem(answer, 422, "invalid-request")["detail"]
         for path in ("plan", "verify", "diff"):
             told = problem(await browser.post(f"{C}/{path}", json={"wanted": a_file(text)}), 413, "too-large")
-            assert told["most"] == MOST_VALUES
+            assert told["most"] == REQUEST_VALUES_MAX
         answer = await browser.post("/api/v1/files?name=a.parm", content=text.encode(), headers=A_FILE)
-        assert problem(answer, 413, "too-large")["most"] == MOST_VALUES
+        assert problem(answer, 413, "too-large")["most"] == REQUEST_VALUES_MAX
         assert not vehicle.heard, "the vehicle is asked for none of them"
 
 
@@ -253,6 +257,57 @@ async def test_what_a_vehicle_has_is_within_all_limits() -> None:
         bits = {"values": {name: {"bits": "40d00000"} for name in LARGE}}
         compared = await browser.post(f"{C}/diff", json={"wanted": bits, "full": True})
         assert len(compared.json()["params"]) == len(LARGE)
+
+
+@swiftly
+async def test_the_rows_of_a_comparison_are_written_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Thousands at once make full garbage collections long, in which no thread runs."""
+    most, made = 0, weakref.WeakSet[DifferenceDoc]()
+    create = DifferenceDoc.of
+
+    def of(*args: Any) -> DifferenceDoc:
+        nonlocal most
+        document = create(*args)
+        made.add(document)
+        most = max(most, len(made))
+        return document
+
+    async with service(GenericVehicle(table=TABLE)) as (_, browser):
+        await fetched(browser)
+        body = {"wanted": {"values": VALUES}, "known": True}
+        expected = (await browser.post(f"{C}/diff", json=body)).json()["params"]
+        assert len(expected) == len(TABLE)
+        monkeypatch.setattr(DifferenceDoc, "of", of)
+        assert (await browser.post(f"{C}/diff", json=body)).json()["params"] == expected
+    assert 1 <= most <= 2
+
+
+# The first requests
+
+
+@swiftly
+async def test_the_first_requests_build_neither_handlers_nor_models(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To build those of one router takes 30 ms and more, in which nobody else is served."""
+    built: list[str] = []
+    analyze = dependency_utils.get_typed_signature
+
+    def get_typed_signature(call: Callable[..., Any]) -> Any:
+        built.append(repr(call))
+        return analyze(call)
+
+    async with service(GenericVehicle(table=TABLE)) as (_, browser):
+        monkeypatch.setattr(dependency_utils, "get_typed_signature", get_typed_signature)
+        documents = Document.__subclasses__()
+        for document in documents:
+            documents += document.__subclasses__()
+        assert len(documents) > 50
+        assert all(document.__pydantic_complete__ for document in documents)
+        await fetched(browser)
+        for path in ("components", "jobs", "links", "metadata", "history", "nothing", f"{C[8:]}/params"):
+            await browser.get(f"/api/v1/{path}")
+        assert not built
+        create_app(Hub([], cache=False))
+        assert built, "this is how FastAPI builds them"
 
 
 # Errors, one by one
@@ -340,7 +395,7 @@ def test_a_document_in_yaml_takes_as_much_memory_as_its_values() -> None:
 async def test_what_takes_long_is_done_in_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     text = f"# {'long ' * 1_000}\n" + "".join(f"{name},{value}\n" for name, value in VALUES.items())
     calls = (
-        *((json, "loads"), (setup_room, "compare"), (answering, "written_out")),
+        *((json, "loads"), (setup_room, "compare"), (responses, "encode_document")),
         *((inspection, "plan"), (NameChoice, "choose")),
     )
     async with service(GenericVehicle(table=TABLE)) as (_, browser):
@@ -390,9 +445,12 @@ def test_a_document_is_written_as_pydantic_writes_it() -> None:
 
     for count in (0, 3, 500):
         document = DiffDoc.of(compare_room.compare(of(count, 0.5), of(count + 1, 1.5)), everything=True)
-        assert written_out(document) == document.model_dump_json().encode()
-    assert written_out(JobsDoc(jobs=[])) == b'{"jobs":[]}'
-    assert written_out(ComponentsDoc(run="a", seq=1, components=[])) == b'{"run":"a","seq":1,"components":[]}'
+        assert encode_document(document) == document.model_dump_json().encode()
+    assert encode_document(JobsDoc(jobs=[])) == b'{"jobs":[]}'
+    assert (
+        encode_document(ComponentsDoc(run="a", seq=1, components=[]))
+        == b'{"run":"a","seq":1,"components":[]}'
+    )
 
 
 # Quotas
@@ -423,14 +481,14 @@ async def test_jobs_have_a_quota_for_each_holder() -> None:
         statuses = [
             (await browser.post(f"{C}/fetch", json=body, headers=BEN)).status_code for _ in range(256)
         ]
-        assert statuses == [202] * jobs.MOST_OF_ONE + [429] * (256 - jobs.MOST_OF_ONE)
+        assert statuses == [202] * jobs.HOLDER_JOBS_MAX + [429] * (256 - jobs.HOLDER_JOBS_MAX)
         told = problem(await browser.post(f"{C}/fetch", json=body, headers=BEN), 429, "too-many")
-        assert told["most"] == jobs.MOST_OF_ONE
+        assert told["most"] == jobs.HOLDER_JOBS_MAX
         others = await browser.post(f"{C}/fetch", json=body, headers=ANNA)
         assert others.status_code == 202
-        hub.begin_fetch(hub.find(1, 1), "service")
+        hub.start_fetch(hub.find_component(1, 1), "service")
         listed = (await browser.get("/api/v1/jobs", headers=ANNA)).json()["jobs"]
-        assert len(listed) == jobs.MOST_OF_ONE + 2
+        assert len(listed) == jobs.HOLDER_JOBS_MAX + 2
         own = next(job["id"] for job in listed if job["asked_by"].startswith("ben"))
         await browser.delete(f"/api/v1/jobs/{own}", headers=BEN)
         await until(lambda: hub.jobs.find(own).state == "cancelled")
@@ -451,22 +509,22 @@ async def test_plans_have_a_quota_for_each_holder_and_for_all(monkeypatch: pytes
             answers.append((await client.post(f"{C}/plan", json=body)).status_code)
 
         async with anyio.create_task_group() as tasks:
-            for _ in range(LONG_REQUESTS_OF_ONE):
+            for _ in range(LONG_REQUESTS_OF_HOLDER_MAX):
                 tasks.start_soon(ask, browser)
             await anyio.sleep(0.5)
             assert not answers, "they wait for the vehicle"
             for path in ("plan", "diff", "verify"):
                 told = problem(await browser.post(f"{C}/{path}", json=body), 429, "too-many")
-                assert told["most"] == LONG_REQUESTS_OF_ONE
+                assert told["most"] == LONG_REQUESTS_OF_HOLDER_MAX
             dry = {**body, "dry_run": True}
             problem(await browser.post(f"{C}/apply", json=dry), 429, "too-many")
             problem(await browser.post("/api/v1/files", content=b"A 1\n", headers=A_FILE), 429, "too-many")
             read = await other.post("/api/v1/files", content=b"A 1\n", headers=A_FILE)
             assert read.status_code == 200
             assert (await browser.get(f"{C}/params")).status_code == 200
-            monkeypatch.setattr(hub, "long_requests", quota.Quota("requests", most=0, most_of_one=1))
+            monkeypatch.setattr(hub, "long_requests", Quota("requests", most=0, most_of_holder=1))
             problem(await other.post("/api/v1/files", content=b"A 1\n", headers=A_FILE), 429, "too-many")
-        assert answers == [504] * LONG_REQUESTS_OF_ONE
+        assert answers == [504] * LONG_REQUESTS_OF_HOLDER_MAX
 
 
 @swiftly
@@ -486,7 +544,7 @@ async def test_a_list_of_jobs_has_no_long_results() -> None:
     async with service(GenericVehicle(table=LARGE)) as (_, browser):
         await fetched(browser)
         answer = await browser.post(f"{C}/apply", json={"wanted": {"values": LARGE}, "full": True})
-        assert len(answer.json()["params"]) == len(LARGE) > jobs.LISTED_MAX
+        assert len(answer.json()["params"]) == len(LARGE) > jobs.LISTED_ENTRIES_MAX
         [_, last] = (await browser.get("/api/v1/jobs")).json()["jobs"]
         whole = (await browser.get(f"/api/v1/jobs/{last['id']}")).json()
         assert whole["result"] == answer.json()
@@ -514,7 +572,7 @@ class Turns:
 
 @swiftly
 async def test_a_table_is_read_a_part_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    table = {f"ABC_P{number:04}": float(number) for number in range(3 * params_room.AT_ONCE)}
+    table = {f"ABC_P{number:04}": float(number) for number in range(3 * params_room.PARAMS_PER_TURN)}
     async with service(GenericVehicle(table=table)) as (_, browser):
         await fetched(browser)
         turns = Turns()
@@ -532,7 +590,7 @@ async def test_a_table_is_read_a_part_at_a_time(monkeypatch: pytest.MonkeyPatch)
         ):
             answer = await browser.get(f"{C}/params{query}")
             assert list(answer.json()["params"]) == list(table)[:count]
-        assert params_room.AT_ONCE / 2 < turns.most <= params_room.AT_ONCE
+        assert params_room.PARAMS_PER_TURN / 2 < turns.most <= params_room.PARAMS_PER_TURN
 
 
 @swiftly
@@ -550,15 +608,19 @@ async def test_events_are_written_out_few_at_a_time() -> None:
             async for line in stream.aiter_lines():
                 if line.endswith("-1000"):
                     break
-        assert turns.most == MOST_AT_ONCE
+        assert turns.most == BATCH_EVENTS_MAX
 
 
 @swiftly
-async def test_fetches_of_many_are_begun_few_at_a_time() -> None:
+async def test_fetches_of_many_are_begun_and_ended_few_at_a_time() -> None:
     class Station:
         def begin_fetches(self, machines: list[Any], now: float, *, refresh: bool) -> list[Any]:
             turns.note()
             return [SimpleNamespace(done=False) for _ in machines]
+
+    def end_fetch(fetch: Any, now: float) -> None:
+        ends.note()
+        ended.append(next(address for address, each in together._fetches.items() if each is fetch))
 
     def component(system: int) -> Any:
         machine = SimpleNamespace(
@@ -566,6 +628,7 @@ async def test_fetches_of_many_are_begun_few_at_a_time() -> None:
             presence=SimpleNamespace(is_lost=False),
             peers=SimpleNamespace(contest=None),
             fetch=None,
+            end_fetch=end_fetch,
             system=system,
             vehicle=(system, None),
             address=(system, 1),
@@ -574,8 +637,10 @@ async def test_fetches_of_many_are_begun_few_at_a_time() -> None:
 
     components = {(system, 1): component(system) for system in range(1, 251)}
     station: Any = Station()
+    station.components = {address: each.machine for address, each in components.items()}
     together = FetchTogether(station, components, system=None, refresh=False)
-    turns = Turns()
+    turns, ends = Turns(), Turns()
+    ended: list[tuple[int, int]] = []
     checks = 0
 
     def check() -> None:
@@ -584,19 +649,22 @@ async def test_fetches_of_many_are_begun_few_at_a_time() -> None:
         if len(together._fetches) == 250:
             raise EOFError
 
-    together._end = lambda now: together._fetches.clear()  # type: ignore[method-assign]
-    closed: Any = None
+    async def closed(machine: Any) -> None:
+        pass
+
     bounds = {"until": 9e9, "hear_until": 0.0, "listen_until": 0.0}
     with pytest.raises(EOFError):
         await together.run(check, lambda: None, closed, **bounds, progress=None)
     assert turns.most == STARTED_FETCHES_MAX
+    assert ends.most == ENDED_FETCHES_MAX
+    assert ended == list(reversed(components)), "none that waits for its turn gets it now"
     assert checks == 1 + math.ceil(250 / STARTED_FETCHES_MAX)
 
 
 @swiftly
 async def test_many_components_are_looked_at_few_at_a_time() -> None:
     turns = Turns()
-    looked: Any = SimpleNamespace(look=turns.note)
+    looked: Any = SimpleNamespace(publish_changes=turns.note)
 
     async def receive() -> dict[str, str]:
         await anyio.sleep(9)
@@ -607,8 +675,8 @@ async def test_many_components_are_looked_at_few_at_a_time() -> None:
     async def work() -> int:
         return 7
 
-    assert await answered(request, work, *[looked] * 1_000) == 7
-    assert turns.most == LOOKED_AT_ONCE
+    assert await run_until_disconnect(request, work, *[looked] * 1_000) == 7
+    assert turns.most == COMPONENTS_PER_TURN
 
 
 ESCAPES = b'a: "' + b"\\x41" * 20_000 + b'"\n'
@@ -617,10 +685,10 @@ ESCAPES = b'a: "' + b"\\x41" * 20_000 + b'"\n'
 @pytest.mark.parametrize(
     ("name", "data", "most"),
     [
-        ("a.parm", b"P1 " + b"1" * 100_000, LONGEST_LINE),
-        ("a.yaml", ESCAPES, LONGEST_LINE),
-        ("a.yaml", b"paramclient: 1\rsets: {" + b"a: b, " * 5_000 + b"}", LONGEST_LINE),
-        ("a.params", b"1\t1\tA\t1\t9\r" * 60_001, MOST_PIECES),
+        ("a.parm", b"P1 " + b"1" * 100_000, LINE_BYTES_MAX),
+        ("a.yaml", ESCAPES, LINE_BYTES_MAX),
+        ("a.yaml", b"paramclient: 1\rsets: {" + b"a: b, " * 5_000 + b"}", LINE_BYTES_MAX),
+        ("a.params", b"1\t1\tA\t1\t9\r" * 60_001, SEPARATORS_MAX),
     ],
 )
 @swiftly
@@ -637,7 +705,7 @@ async def test_a_file_without_lines_may_be_long() -> None:
     coarse = {name: WrittenParam(name, value, ParamType.REAL32) for name, value in LARGE.items()}
     packed = dumps(ParamSet(coarse), form="pck")
     assert b"\n" not in document
-    assert min(len(document), len(packed)) > LONGEST_LINE
+    assert min(len(document), len(packed)) > LINE_BYTES_MAX
     async with service() as (_, browser):
         for name, data in (("a.json", document), ("", b"\xef\xbb\xbf \n" + document), ("a.pck", packed)):
             answer = await browser.post(f"/api/v1/files?name={name}", content=data, headers=A_FILE)
@@ -658,7 +726,7 @@ def test_in_a_document_of_one_line_no_comment_is_sought(monkeypatch: pytest.Monk
     assert not sought
 
 
-@pytest.mark.parametrize("number", ["9" * 4_300, "9" * (LONGEST_NUMBER + 1), "0." + "3" * 200])
+@pytest.mark.parametrize("number", ["9" * 4_300, "9" * (DIGITS_MAX + 1), "0." + "3" * 200])
 @swiftly
 async def test_a_body_with_endless_numbers_is_not_parsed(
     number: str, monkeypatch: pytest.MonkeyPatch
@@ -667,7 +735,7 @@ async def test_a_body_with_endless_numbers_is_not_parsed(
         with threads_of(monkeypatch, (json, "loads")) as seen:
             answer = await browser.post("/api/v1/find", content=f'{{"system":{number}}}', headers=A_JSON)
         assert seen == {"loads": set()}
-        assert problem(answer, 413, "too-large")["most"] == LONGEST_NUMBER
+        assert problem(answer, 413, "too-large")["most"] == DIGITS_MAX
         answer = await browser.post("/api/v1/find", content=f'{{"system":{"9" * 128}}}', headers=A_JSON)
         assert answer.status_code == 422
 
@@ -700,12 +768,12 @@ def test_a_file_with_too_many_parameters_is_not_read_to_its_end(
         loads(data, params_max=1_000)
     assert made <= 1_001
     with pytest.raises(ServiceError, match="10,000"):
-        read_upload(data, "", None)
+        parse_upload(data, "", None)
 
 
 @pytest.mark.asyncio
 async def test_the_end_of_the_service_waits_for_nothing_that_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hub_room, "READING_PATIENCE", 0.1)
+    monkeypatch.setattr(hub_room, "FILE_WORK_TIMEOUT", 0.1)
     begun: list[int] = []
     may_end = threading.Event()
     problems: list[str] = []
@@ -716,7 +784,7 @@ async def test_the_end_of_the_service_waits_for_nothing_that_is_read(monkeypatch
 
     async def ask(hub: Hub) -> None:
         with pytest.raises(ServiceError) as caught:
-            await hub.read_aside(work)
+            await hub.run_in_file_thread(work)
         problems.append(caught.value.kind)
 
     async with anyio.create_task_group() as tasks:
@@ -736,7 +804,7 @@ async def test_large_answers_wait_for_each_other_until_they_are_sent() -> None:
     async with service(GenericVehicle(table=LARGE)) as (_, browser):
         await fetched(browser)
         async with contextlib.AsyncExitStack() as stack:
-            for _ in range(READ_OF_ONE):
+            for _ in range(LARGE_GETS_OF_HOLDER_MAX):
                 request = browser.stream("GET", f"{C}/params")
                 assert (await stack.enter_async_context(request)).status_code == 200  # and takes nothing
             answers: list[httpx.Response] = []
@@ -758,13 +826,13 @@ async def test_large_answers_wait_for_each_other_until_they_are_sent() -> None:
 
 
 @swiftly
-async def test_places_for_answers_are_of_a_holder_and_of_all() -> None:
-    places = AnswerPlaces(3, 2)
+async def test_a_quota_limits_each_holder_and_all_together() -> None:
+    quota = Quota("requests", most=3, most_of_holder=2)
     held: list[str] = []
     may_leave = anyio.Event()
 
     async def answer(holder: str) -> None:
-        async with places.take(holder):
+        async with quota.wait(holder):
             held.append(holder)
             await may_leave.wait()
 
@@ -775,7 +843,7 @@ async def test_places_for_answers_are_of_a_holder_and_of_all() -> None:
         assert held == ["a", "a", "b"]
         may_leave.set()
     assert sorted(held) == ["a", "a", "a", "b", "b"]
-    assert not places._of_holders
+    assert not len(quota)
 
 
 @pytest.mark.asyncio

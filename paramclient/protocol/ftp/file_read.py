@@ -10,7 +10,13 @@ from paramclient.errors import FileErrorCode, FileTransferError, UsageError
 from paramclient.protocol.ftp.blocks import Blocks
 from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.ftp.transfer_job import Job, Line
-from paramclient.protocol.requests.round_trip import ATTEMPTS_MAX, SILENCE_MAX
+from paramclient.protocol.requests.retry import (
+    OVERTAKING_READS,
+    READS_BEHIND_BURST_COPIES_MAX,
+    REOPENS_MAX,
+    BlockRetries,
+    BurstAttempts,
+)
 
 __all__ = ["FILE_SIZE_MAX", "FileRead"]
 
@@ -18,26 +24,8 @@ FILE_SIZE_MAX: Final = 64 * 1024 * 1024
 """Bytes of a file, by default: more than any flight log, less than memory."""
 BURST_RESPONSES_MAX: Final = 4096
 """Sequence numbers of the responses to one burst; ArduPilot ends one after 2000 (GCS_FTP.cpp)."""
-BURST_DOUBLINGS_MAX: Final = 1
-"""Doublings of the timeout of a burst."""
 BURSTS_MAX: Final = 4
 """Bursts whose late responses are still accepted."""
-FIRST_BLOCK_DELAY: Final = 0.7
-"""Seconds by which the first block of a burst may be later than a short response: at 1,200 bytes/s it takes
-0.22 s alone, and 0.67 s where the vehicle uses a third of that. After that a read is sent behind the burst:
-its response, without a block before it, shows that the burst was lost."""
-FIRST_BLOCK_ROUND_TRIPS: Final = 2.5
-"""The same in round trips."""
-BURST_SILENCE: Final = 0.5
-"""Seconds without a message of the server after which a burst without a block is repeated. At 57600 baud its
-first block comes 0.1 s after the request, behind the banner (measured), and later behind telemetry. ArduPilot
-ends no burst for another one: repeated meanwhile, the whole file is sent twice."""
-SECOND_BLOCK_TIMEOUT: Final = 2.0
-"""Seconds until the second block of a burst counts as late while the pace is unknown."""
-SILENT_GAPS: Final = 6
-"""Usual gaps of silence after which a burst is over, or its remaining blocks were lost."""
-BURST_END_SILENCE_MIN: Final = 0.05
-"""The same in seconds, at least."""
 READS_BEHIND_BURST_MAX: Final = 4
 """Reads that may wait in the vehicle for the end of its burst: ArduPilot queues 5."""
 WINDOW_MIN: Final = 3
@@ -51,12 +39,6 @@ BLOCK_GAP_DEFAULT: Final = 0.01
 BLOCK_GAP_MIN: Final = 1e-5
 """Seconds between two blocks that calculations assume, at least. Two blocks processed together can be
 nanoseconds apart, and deadlines from such a pace are too close for any clock."""
-OVERTAKING_READS: Final = 2
-"""Answered later reads after which a read counts as lost."""
-COPY_RISK: Final = 0.01
-"""The probability of no response below which early copies bring a read."""
-FILE_READ_COPIES_MAX: Final = 6
-"""Early copies of one read, at most."""
 TAIL_BLOCKS: Final = 4
 """Missing blocks at the end of a file up to which single reads are better than a new burst."""
 TAIL_SHARE: Final = 0.15
@@ -66,13 +48,8 @@ GENERATED_PREFIX: Final = b"@"
 estimate."""
 UNKNOWN_SIZE: Final = 1 << 32
 """Bytes that no file has: an offset has 32 bits."""
-BURST_DELAY: Final = 0.03
-"""Seconds by which the first block of a burst may be later than the response to a read that was sent behind
-it: PX4 answers reads at once, and begins a burst up to 20 ms later (measured)."""
 LATE_READS_MAX: Final = 256
 """Lost reads whose late responses are still accepted."""
-REOPENS_MAX: Final = 2
-"""Times that a file is opened again when it is unknown whether it is open."""
 PIECES_PER_BLOCK: Final = 4
 """Pieces of a file for each block of its largest size: each piece takes memory, however short it is, and some
 servers send less than requested."""
@@ -105,6 +82,7 @@ class FileRead(Job[bytes]):
         self._read_size = read_size
         self._limit = limit
         self._restarts = 0
+        self._retries = BlockRetries(line.retry)
         self._has_bursts = True
         self._start_anew()
         self._gap = BLOCK_GAP_DEFAULT
@@ -120,11 +98,10 @@ class FileRead(Job[bytes]):
         self._bursts: list[int] = []
         self._burst_runs = False
         self._read_behind_at = -math.inf  # when a read of the burst's first offset was sent behind it last
-        self._burst_attempts = 0
+        self._burst_attempts = BurstAttempts(self._line.retry, self._line)
         self._burst_session = 0
         self._has_early_burst = False
         self._may_burst = False
-        self._burst_sent_at = math.inf
         self._opened_at = math.inf
         self._block_at = math.inf  # the last block of the running burst
         self._overtaken_at = math.inf  # the first read behind that burst was answered before any block of it
@@ -147,11 +124,8 @@ class FileRead(Job[bytes]):
 
     def begin(self, now: float) -> None:
         self._start_anew()
-        round_trip = self._line.round_trip
-        # before the round trip is measured, a response may take several timeouts
-        is_worth_it = round_trip.smoothed is None or round_trip.seen_loss < COPY_RISK
         # MAVSDK's server closes the file on a request with another number (measured)
-        if is_worth_it and self._line.keeps_session:
+        if self._retries.may_burst_early and self._line.keeps_session:
             self._begin_early(now)
         else:
             self._open_file(Opcode.OPEN_FILE_RO, self._opened, now)
@@ -238,7 +212,7 @@ class FileRead(Job[bytes]):
         if self.session is not None and not self.is_ended:
             self._flights.clear()
             self._asked.clear()
-            self._burst_attempts = 0
+            self._burst_attempts.restart()
             self._burst_runs = False
             self._go_on(now)
 
@@ -249,15 +223,15 @@ class FileRead(Job[bytes]):
         # also after a repeated open: on a slow link its response may only be late
         self._has_early_burst = self._burst_runs and packet.session == self._burst_session
         if not self._has_early_burst:
-            self._burst_attempts = 0
+            self._burst_attempts.restart()
             self._burst(now)
 
     # the burst
 
     def _burst(self, now: float) -> None:
         """Request everything from the present offset as a burst."""
-        if self._line.round_trip.is_hopeless(self._burst_attempts, now):
-            self.fail(self._no_reply(self._burst_attempts, now), now)
+        if self._burst_attempts.is_hopeless(now):
+            self.fail(self._no_reply(self._burst_attempts.count, now), now)
             return
         sequence = self._line.next_sequence(answers=BURST_RESPONSES_MAX)
         self._bursts = [*self._bursts[1 - BURSTS_MAX :], sequence]
@@ -265,8 +239,7 @@ class FileRead(Job[bytes]):
         self._read_behind_at = -math.inf
         self._has_early_burst = False
         self._may_burst = False
-        self._burst_attempts += 1
-        self._burst_sent_at = now
+        self._burst_attempts.sent(now)
         self._block_at = self._overtaken_at = math.inf
         self._first_block = None
         session = self.asked_session if self.session is None else self.session
@@ -281,7 +254,7 @@ class FileRead(Job[bytes]):
             )
         )
         if self.session is not None:
-            for _ in range(min(self._most_copies, 2)):
+            for _ in range(min(self._most_copies, READS_BEHIND_BURST_COPIES_MAX)):
                 self._read_behind(now)
 
     def _is_of_a_burst(self, packet: Packet) -> bool:
@@ -290,8 +263,8 @@ class FileRead(Job[bytes]):
     def _take_burst(self, packet: Packet, now: float) -> None:
         if self._block_at == math.inf and self._burst_runs:
             first_answer = (self._bursts[-1] + 1) & 0xFFFF
-            if packet.sequence == first_answer and self._burst_attempts == 1:
-                self._line.round_trip.answered(self._burst_sent_at, now, 1)
+            if packet.sequence == first_answer:
+                self._burst_attempts.answered(now)
         is_latest = 0 < (packet.sequence - self._bursts[-1]) & 0xFFFF <= BURST_RESPONSES_MAX
         if packet.opcode == Opcode.NAK:
             self._end_of_burst(packet, is_latest, now)
@@ -302,7 +275,7 @@ class FileRead(Job[bytes]):
         self._came += 1
         self._measure(packet, now)
         if self._keep(packet, packet.offset, now):
-            self._burst_attempts = 0
+            self._burst_attempts.restart()
         if not packet.burst_complete:
             self._burst_runs = True  # also after it was taken to be over
         elif is_latest:
@@ -344,27 +317,20 @@ class FileRead(Job[bytes]):
             self._flights[sequence] = flight._replace(sent_at=now, is_only=False)
 
     def _quiet_at(self) -> float:
+        burst = self._burst_attempts
         if self._block_at == math.inf:
-            return min(self._next_read_behind_at, self._repeats_at, self._overtaken_at + BURST_DELAY)
-        if self._gap == BLOCK_GAP_DEFAULT:
-            return self._block_at + SECOND_BLOCK_TIMEOUT
-        return self._block_at + max(SILENT_GAPS * self._gap, BURST_END_SILENCE_MIN)
+            return min(self._next_read_behind_at, self._repeats_at, burst.overtaken_at(self._overtaken_at))
+        return burst.over_at(self._block_at, None if self._gap == BLOCK_GAP_DEFAULT else self._gap)
 
     @property
     def _begins_by(self) -> float:
         """When the first block of the burst is late."""
-        round_trip = self._line.round_trip
-        longer = min(FIRST_BLOCK_DELAY, FIRST_BLOCK_ROUND_TRIPS * (round_trip.smoothed or FIRST_BLOCK_DELAY))
-        if self._has_early_burst:
-            return self._opened_at + longer
-        backoff = 2.0 ** min(max(self._burst_attempts - 2, 0), BURST_DOUBLINGS_MAX)
-        return self._burst_sent_at + (round_trip.timeout + longer) * backoff
+        return self._burst_attempts.begins_by(self._opened_at if self._has_early_burst else None)
 
     @property
     def _repeats_at(self) -> float:
         """When a burst without a block is requested again."""
-        heard_at = min(self._line.heard_at, self._burst_sent_at + SILENCE_MAX)
-        return max(self._begins_by, max(self._burst_sent_at, heard_at) + BURST_SILENCE)
+        return self._burst_attempts.repeats_at(self._begins_by)
 
     @property
     def _next_read_behind_at(self) -> float:
@@ -373,17 +339,17 @@ class FileRead(Job[bytes]):
             return math.inf
         if self._read_behind_at == -math.inf:
             return self._begins_by
-        return self._read_behind_at + self._line.round_trip.prompt_timeout
+        return self._burst_attempts.next_read_behind_at(self._read_behind_at)
 
     def _burst_is_silent(self, now: float) -> None:
         if self._block_at < math.inf:
             self._stop_burst(now)
         elif self._overtaken_at < math.inf:
-            self._line.round_trip.timed_out(self._burst_attempts)
+            self._burst_attempts.timed_out()
             self._may_burst = True
             self._stop_burst(now)
         elif now >= self._repeats_at:
-            self._line.round_trip.timed_out(self._burst_attempts)
+            self._burst_attempts.timed_out()
             self._burst(now)
         else:
             self._read_behind(now)
@@ -400,13 +366,13 @@ class FileRead(Job[bytes]):
         for sequence, other in list(self._flights.items()):
             if other.number <= flight.number - OVERTAKING_READS:
                 self._give_up(sequence)
-                self._line.round_trip.timed_out(1)
-        self._line.round_trip.answered(flight.sent_at, now, 1 if flight.is_only else 2)
+                self._retries.timed_out(1)
+        self._retries.answered(flight.sent_at, now, is_sure=flight.is_only)
         self._asked.pop(flight.offset, None)
         if packet.opcode == Opcode.ACK and packet.data:
             is_ahead = flight.offset >= self._blocks.reached
             self._keep(packet, flight.offset, now)
-            if is_ahead and self._burst_runs and flight.sent_at >= self._burst_sent_at:
+            if is_ahead and self._burst_runs and flight.sent_at >= self._burst_attempts.sent_at:
                 self._overtaken_at = min(self._overtaken_at, now)
             self._may_burst = self._may_burst or (is_ahead and not self._burst_runs)
         elif packet.opcode == Opcode.ACK or self._code(packet) == FileErrorCode.EOF:
@@ -429,14 +395,13 @@ class FileRead(Job[bytes]):
         self._asked[flight.offset] = attempts, now
         is_silence = self._line.heard_at < flight.sent_at
         if not (is_silence and self._is_silent):  # a silence that all reads share counts once
-            self._line.round_trip.timed_out(attempts)
+            self._retries.timed_out(attempts)
         self._is_silent = is_silence
-        # a server that answers other requests meanwhile is there, and the loss is higher than measured
-        if attempts >= ATTEMPTS_MAX or (is_silence and self._line.round_trip.is_hopeless(attempts, now)):
+        if self._retries.is_hopeless(attempts, now, is_silence=is_silence):
             self.fail(self._no_reply(attempts, now), now)
 
     def _flight_deadline(self, flight: _Flight) -> float:
-        return flight.sent_at + self._line.round_trip.timeout + flight.ahead * self._gap
+        return self._retries.due_at(flight.sent_at, flight.ahead, self._gap)
 
     def _is_wanted(self, offset: int) -> bool:
         is_behind = self._blocks.end is None and offset >= self._blocks.reached
@@ -451,7 +416,7 @@ class FileRead(Job[bytes]):
             return READS_BEHIND_BURST_MAX
         if self._is_silent:
             return WINDOW_MIN
-        round_trip = self._line.round_trip.smoothed or self._line.round_trip.timeout
+        round_trip = self._line.retry.round_trip.smoothed or self._line.retry.timeout
         return min(max(math.ceil(round_trip / self._gap) + 2, WINDOW_MIN), WINDOW_MAX)
 
     @property
@@ -501,11 +466,7 @@ class FileRead(Job[bytes]):
 
     @property
     def _most_copies(self) -> int:
-        passed = self._came / (self._came + self._lost) if self._came else 1.0
-        loss = max(self._line.round_trip.seen_loss, 1.0 - passed * passed)
-        if loss < COPY_RISK:
-            return 0
-        return min(math.ceil(math.log(COPY_RISK) / math.log(loss)) - 1, FILE_READ_COPIES_MAX)
+        return self._retries.copies(self._came, self._lost)
 
     def _read(self, offset: int, now: float) -> None:
         sequence = self._line.next_sequence()

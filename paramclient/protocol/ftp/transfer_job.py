@@ -5,51 +5,23 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Final, TypeVar
+from typing import TypeVar
 
 from paramclient.errors import FileErrorCode, FileTransferError, NoReply, UsageError
 from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.operation import Operation
-from paramclient.protocol.requests.round_trip import SILENCE_MAX
+from paramclient.protocol.requests.retry import OPENS_MAX, SESSION_IDLE_TIME, FileAttempts, RetryPolicy
 from paramclient.protocol.wire import FileTransfer
 
 __all__ = ["BUSY", "SESSION_LOST", "Job", "Line", "path_bytes"]
 
 Result = TypeVar("Result")
 
-COPY_RISK: Final = 0.01
-"""The share of unanswered requests above which each is sent twice: servers send the same response to the same
-request, so the copy costs only its few bytes."""
-SESSION_IDLE_TIME: Final = 3.2
-"""Seconds without a request to a server whose session is in use: ArduPilot ends a session 3 s after its last
-response to any station, and the refusal of an open is such a response (measured)."""
-BUSY_TIMEOUT: Final = 30.0
-"""Seconds of waiting for the end of another station's session. Its transfer keeps the session open."""
-OPEN_FAILURES_MAX: Final = 8
-"""Failures of an open without a reason. ArduPilot says no more when the session is open already, as after an
-open whose response was lost; it is then closed and opened again at once."""
-OPEN_FAILURES_LOSSY_MAX: Final = 16
-"""The same with packet loss: a lost close request, or one that arrives after the open, leaves the session
-open."""
-CLOSE_ATTEMPTS: Final = 4
-"""Close requests, or requests for the response to an open. The session of a server that is silent for that
-long ends by its own timeout: ArduPilot after 3 s, PX4 after 10 s."""
-CLOSE_COPIES_MAX: Final = 4
-"""Copies of a close request on a lossy link: each has 12 bytes of payload."""
-UNHEARD_ATTEMPTS_MAX: Final = 16
-"""Requests after which a server that has never responded counts as none: with two of three exchanges lost,
-all of them are lost once in 700 times."""
-ATTEMPTS_WITHOUT_BACKOFF: Final = 2
-"""Requests without backoff to a server that has not responded yet."""
-BACKOFF_DOUBLINGS_MAX: Final = 4
-"""Doublings of the timeout after these."""
 BUSY = frozenset((FileErrorCode.INVALID_SESSION, FileErrorCode.NO_SESSIONS_AVAILABLE))
 """Responses to an open while another station has a file open, or has left one open."""
 SESSION_LOST = frozenset((FileErrorCode.INVALID_SESSION, FileErrorCode.FILE_NOT_FOUND))
 """Responses to a request in a session that is not open."""
-OPENS_MAX: Final = 3
-"""Opens of a file whose session is lost on board."""
 
 
 def path_bytes(path: str) -> bytes:
@@ -71,7 +43,7 @@ class Line:
 
     Attributes:
         target: system and component.
-        round_trip: the component's; requests feed it, and it decides when to repeat them.
+        retry: the component's policy, which decides when to repeat the requests.
         heard_at: when the server's last message to us was received.
     """
 
@@ -81,7 +53,7 @@ class Line:
         now: float,
     ) -> None:
         self.target = context.target
-        self.round_trip = context.round_trip
+        self.retry: RetryPolicy = context.retry
         self.heard_at = -math.inf
         self._context = context
         self._send = context.send
@@ -123,7 +95,7 @@ class Job(Operation[Result]):
     """One transfer with one file. Its owner passes responses and time to it.
 
     A job ends with its result or its error when its session is closed: the server has acknowledged that, or
-    was silent for `CLOSE_ATTEMPTS` timeouts. The receiver of the result may thus open the next file at once.
+    was silent for several timeouts. The receiver of the result may thus open the next file at once.
 
     Attributes:
         path: of the file or directory.
@@ -150,8 +122,7 @@ class Job(Operation[Result]):
         self._tell: Callable[[float], None] | None = None  # reports the end, once its session is closed
         self._request: Packet | None = None
         self._then: Callable[[Packet, float], None] | None = None
-        self._attempts = 0
-        self._sent_at = math.inf
+        self._attempts = FileAttempts(line.retry, line)
         self._failures = 0
         self._openings = 1
         self._busy_since = math.inf
@@ -160,7 +131,7 @@ class Job(Operation[Result]):
     @property
     def attempts(self) -> int:
         """The number of times the present request was sent."""
-        return self._attempts
+        return self._attempts.count
 
     @property
     def _has_request(self) -> bool:
@@ -227,12 +198,12 @@ class Job(Operation[Result]):
             # An open is in flight. Its response says which session to close, as PX4 uses numbers of its own;
             # ArduPilot uses ours, so this closes the session even without that response.
             self._send_blind_close()
-            self._attempts = min(self._attempts, 1)
+            self._attempts.await_open()
         else:
             self._closed(now)
 
     def _terminate(self, session: int, now: float) -> None:
-        copies = self._line.round_trip.copies(COPY_RISK, CLOSE_COPIES_MAX)
+        copies = self._attempts.close_copies
         self._ask(
             Opcode.TERMINATE_SESSION, lambda _, now: self._closed(now), now, session=session, copies=copies
         )
@@ -262,9 +233,7 @@ class Job(Operation[Result]):
         is_answer = packet.sequence == (request.sequence + 1) & 0xFFFF and packet.requested == request.opcode
         if is_answer and packet.opcode in (Opcode.ACK, Opcode.NAK):
             then = self._then
-            # slow operations on board say nothing of the link
-            attempts = 2 if request.opcode == Opcode.CALC_FILE_CRC32 else self._attempts
-            self._line.round_trip.answered(self._sent_at, now, attempts)
+            self._attempts.answered(now)
             self._request = self._then = None
             then(packet, now)
 
@@ -273,25 +242,25 @@ class Job(Operation[Result]):
         if self._open_at <= now:
             self._open_at = math.inf
             self.begin(now)
-        if self._request is not None and self._deadline() <= now:
-            self._line.round_trip.timed_out(self._attempts)
-            if self.is_ended and self._attempts >= CLOSE_ATTEMPTS:
+        if self._request is not None and self._attempts.due_at <= now:
+            self._attempts.timed_out()
+            if self.is_ended and self._attempts.is_close_hopeless:
                 self._send_blind_close()
                 self._closed(now)
-            elif self._is_hopeless(now):
+            elif self._attempts.is_hopeless(now):
                 self._request = None
-                self.fail(self._no_reply(self._attempts, now), now)
+                self.fail(self._no_reply(self.attempts, now), now)
             else:
                 self._transmit(self._request, now)
 
     def next_deadline(self) -> float:
         """Return when `tick` is due, or infinity."""
-        return min(self._open_at, self._deadline() if self._request is not None else math.inf)
+        return min(self._open_at, self._attempts.due_at if self._request is not None else math.inf)
 
     def resume(self, now: float) -> None:
         """Repeat the request: the link is back."""
         if self._request is not None:
-            self._attempts = 0
+            self._attempts.restart()
             self._transmit(self._request, now)
 
     def _ask(
@@ -309,7 +278,8 @@ class Job(Operation[Result]):
         sequence = self._line.next_sequence()
         self._request = Packet(sequence, session, opcode, data, offset=offset)
         self._then = then
-        self._attempts = 0
+        is_slow = opcode == Opcode.CALC_FILE_CRC32
+        self._attempts = FileAttempts(self._line.retry, self._line, is_slow=is_slow)
         self._transmit(self._request, now, copies=copies)
 
     def _open_file(
@@ -332,12 +302,12 @@ class Job(Operation[Result]):
                 self._terminate(number, now)  # open already, by an open of ours whose response was lost
             elif self.is_ended:
                 self._closed(now)
-            elif is_first and code == FileErrorCode.FAIL and self._attempts == 1 and not self._failures:
+            elif is_first and code == FileErrorCode.FAIL and self.attempts == 1 and not self._failures:
                 # no response was lost, so another station's session has this number
                 self._failures = 1
                 self.asked_session = None
                 self.begin(now)
-            elif code == FileErrorCode.FAIL and self._failures < self._failures_allowed:
+            elif code == FileErrorCode.FAIL and self._failures < self._attempts.open_failures_max:
                 # the open session may be that of an open whose response was lost
                 self._failures += 1
                 self._line.close_session(number)
@@ -354,7 +324,7 @@ class Job(Operation[Result]):
     def _wait_or_refuse(self, packet: Packet, what: str, now: float) -> None:
         """Retry later while the server's session is in use; otherwise end with the error of a NAK."""
         self._busy_since = min(self._busy_since, now)
-        is_in_use = self._code(packet) in BUSY and now - self._busy_since < BUSY_TIMEOUT
+        is_in_use = self._code(packet) in BUSY and self._attempts.may_wait(self._busy_since, now)
         if is_in_use and not self.yields:
             self._open_at = now + SESSION_IDLE_TIME
         else:
@@ -368,26 +338,6 @@ class Job(Operation[Result]):
             return False
         self.session = None
         return True
-
-    @property
-    def _failures_allowed(self) -> int:
-        return OPEN_FAILURES_LOSSY_MAX if self._is_lossy else OPEN_FAILURES_MAX
-
-    @property
-    def _is_lossy(self) -> bool:
-        """Whether requests are known to be lost on this link."""
-        return self._line.round_trip.seen_loss >= COPY_RISK
-
-    def _is_hopeless(self, now: float) -> bool:
-        """Return whether the request was sent often enough."""
-        is_unheard = self._line.heard_at == -math.inf  # the loss of requests is unknown
-        if (
-            is_unheard
-            and self._attempts < UNHEARD_ATTEMPTS_MAX
-            and now - self._line.round_trip.heard_at < SILENCE_MAX
-        ):
-            return False
-        return self._line.round_trip.is_hopeless(self._attempts, now)
 
     def _refused(self, packet: Packet, what: str, now: float) -> None:
         """End with the error in a NAK."""
@@ -416,24 +366,9 @@ class Job(Operation[Result]):
         return packet.data[0] if packet.data else FileErrorCode.FAIL
 
     def _transmit(self, request: Packet, now: float, *, copies: int = 1) -> None:
-        self._attempts += 1
-        self._sent_at = now
-        for _ in range(max(copies, 2) if self._is_lossy else copies):
+        self._attempts.sent(now)
+        for _ in range(max(copies, self._attempts.copies)):
             self._line.send(request)
-
-    def _deadline(self) -> float:
-        # during a burst the server does nothing else
-        since = min(max(self._sent_at, self._line.heard_at), self._sent_at + SILENCE_MAX)
-        round_trip = self._line.round_trip
-        # slow operations on board are not repeated at once
-        is_slow = self._request is not None and self._request.opcode == Opcode.CALC_FILE_CRC32
-        if is_slow:
-            return since + round_trip.timeout
-        timeout = round_trip.repeat_timeout(self._attempts)
-        if self._line.heard_at == -math.inf and round_trip.smoothed is not None:
-            # the server may be busy with another station, whose burst nothing interrupts
-            timeout *= 2.0 ** min(max(self._attempts - ATTEMPTS_WITHOUT_BACKOFF, 0), BACKOFF_DOUBLINGS_MAX)
-        return since + timeout
 
 
 def _ignore(now: float) -> None:

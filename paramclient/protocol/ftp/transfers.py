@@ -85,7 +85,7 @@ class FileWrite(Job[None]):
             self._refused(packet, what, now)
 
     def _taken(self, packet: Packet, now: float) -> None:
-        was_closed_before = self._code(packet) == FileErrorCode.INVALID_SESSION and self._attempts > 1
+        was_closed_before = self._code(packet) == FileErrorCode.INVALID_SESSION and self.attempts > 1
         self.session = None
         if packet.opcode == Opcode.NAK and not was_closed_before:
             self._refused_or_lost(packet, "does not take", now)
@@ -162,7 +162,6 @@ class FileTransfers(Machine):
         self._context = context
         self._target = context.target
         self._own = context.own
-        self._round_trip = context.round_trip
         self._line: Line | None = None
         self._job: Job[Any] | None = None
         self._waiting: deque[Job[Any]] = deque()
@@ -240,6 +239,7 @@ class FileTransfers(Machine):
             now: the time.
             is_served: whether the component may have a server; otherwise no response is awaited.
         """
+        self._context.reschedule()
         if job in self._waiting:
             self._waiting.remove(job)
         elif job is self._job and not job.done:

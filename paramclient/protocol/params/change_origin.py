@@ -39,8 +39,7 @@ def check_asker(asker: str | None) -> str | None:
         return None
     if not 1 <= len(asker) <= ASKER_LENGTH_MAX or not (asker.isascii() and asker.isprintable()):
         raise UsageError(
-            f"who asks for a change is told in 1 to {ASKER_LENGTH_MAX} printable ASCII characters, "
-            f"not {asker!r:.200}"
+            f"asker must have 1 to {ASKER_LENGTH_MAX} printable ASCII characters, not {asker!r:.200}"
         )
     return asker
 

@@ -11,11 +11,11 @@ from typing import Final
 from paramclient.protocol.params.reads import Read, Reads
 from paramclient.protocol.params.table import Table
 from paramclient.protocol.requests.operation import Operation
-from paramclient.protocol.requests.round_trip import RoundTrip
+from paramclient.protocol.requests.retry import RetryPolicy
 
 __all__ = ["Repeated", "repeated_names"]
 
-NAMES_LISTED_MAX: Final = 5
+DUPLICATES_LISTED_MAX: Final = 5
 """Names that a note lists one by one."""
 READ_DELAY_MIN: Final = 0.3
 """Seconds until the names are read, at least: late responses to reads by index carry them too."""
@@ -51,14 +51,14 @@ class Repeated(Operation[None]):
 
     Args:
         names: as of `repeated_names`.
-        round_trip, reads, table: the component's.
+        policy, reads, table: the component's.
         now: the time.
     """
 
     def __init__(
         self,
         names: Mapping[str, tuple[int, ...]],
-        round_trip: RoundTrip,
+        policy: RetryPolicy,
         reads: Reads,
         table: Table,
         now: float,
@@ -69,7 +69,7 @@ class Repeated(Operation[None]):
         self._table = table
         self._open: dict[str, Read] = {}
         self._answers: dict[str, list[int]] = {}
-        first_at = now + max(round_trip.timeout, READ_DELAY_MIN)
+        first_at = now + max(policy.timeout, READ_DELAY_MIN)
         self._ask_at = dict.fromkeys(sorted(names.keys() | table.passed_over.keys()), first_at)
         table.passed_over.clear()
 
@@ -86,15 +86,19 @@ class Repeated(Operation[None]):
     @property
     def note(self) -> str:
         """A note for the user."""
-        told = [
+        listed = [
             f"{name} (indices {', '.join(map(str, places))})"
-            for name, places in list(self.names.items())[:NAMES_LISTED_MAX]
+            for name, places in list(self.names.items())[:DUPLICATES_LISTED_MAX]
         ]
-        more = f" and {len(self.names) - NAMES_LISTED_MAX} more" if len(self.names) > NAMES_LISTED_MAX else ""
+        more = (
+            f" and {len(self.names) - DUPLICATES_LISTED_MAX} more"
+            if len(self.names) > DUPLICATES_LISTED_MAX
+            else ""
+        )
         return (
-            f"Several parameters share a name, as where names are cut at 16 bytes: {', '.join(told)}{more}. "
-            "The table holds the one that the vehicle answers with when it is asked by name; "
-            "the others can be read by index only."
+            f"Several parameters have one name, such as one cut to 16 bytes: {', '.join(listed)}{more}. "
+            "The table has the one that the vehicle returns for a read by name; "
+            "the others can only be read by index."
         )
 
     def cancel(self) -> None:

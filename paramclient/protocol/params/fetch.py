@@ -39,20 +39,11 @@ from paramclient.protocol.params.list_estimate import ListPace
 from paramclient.protocol.params.reads import Read
 from paramclient.protocol.params.sampling import Sampling
 from paramclient.protocol.requests.operation import Operation
+from paramclient.protocol.requests.retry import FETCH_RESTARTS_MAX, OpenRetries
 from paramclient.protocol.wire import HASH_CHECK, ParamRequestRead, ParamValue
 
 __all__ = ["Check", "Fetch"]
 
-FILE_OPEN_TIMEOUT: Final = 1.0
-"""Seconds, at least, for which the opening of the file may stay unanswered before the list is requested as
-well."""
-FILE_OPEN_TIMEOUT_FACTOR: Final = 4.0
-"""The same in timeouts of a request: on a slow link it is longer."""
-FILE_OPEN_TIMEOUT_SILENT: Final = 2.0
-"""The same in seconds where no request at all has been answered: until then four requests of each kind have
-been sent."""
-UNANSWERED_OPENS_MAX: Final = 5
-"""Unanswered requests to open the file after which the component counts as one that serves no files."""
 FILE_TIME_RATIO: Final = 0.1
 """The duration of the file as a share of the list's: 3.07 s of 34.6 s at 57600 baud (measured)."""
 FILE_TIME_MIN: Final = 0.4
@@ -60,8 +51,6 @@ FILE_TIME_MIN: Final = 0.4
 REPEATED_TIME_MAX: Final = 1.5
 """Seconds of a download that may be repeated when the component seems to have restarted: ArduPilot's clock
 shows a restart 1.4 s later (measured)."""
-FETCH_RESTARTS_MAX: Final = 8
-"""Restarts of the vehicle, or changes of its identity, after which a fetch is given up."""
 
 
 class Check(NamedTuple):
@@ -123,7 +112,7 @@ class Fetch(Operation[FetchResult]):
         self._means = means
         self._context = means.context
         self._target = means.context.target
-        self._round_trip = means.context.round_trip
+        self._open_retries = OpenRetries(means.context.retry)
         self._reads = means.reads
         table = self._table = means.table
         self._may_use_file = may_use_file
@@ -337,7 +326,7 @@ class Fetch(Operation[FetchResult]):
         if self.file is not None:
             return True
         read = self._hash_read
-        return read is not None and read.attempts > 1 and not read.controls
+        return read is not None and read.attempts > 1 and not read.request.controls
 
     def held_up(self, now: float) -> float:
         """Return the seconds for which the list has waited for its turn: other lists of the link ran."""
@@ -476,14 +465,12 @@ class Fetch(Operation[FetchResult]):
     def _list_due_at(self) -> float:
         """When the list is requested in parallel to an unanswered file; infinity while the file is
         received."""
-        file, trip = self.file, self._round_trip
+        file = self.file
         if file is None or file.done or file.is_served or not file.is_awaited or self._list_error is not None:
             return math.inf
         if file.blocked_until is not None or self.download is not None or self._is_file_check:
             return math.inf
-        if trip.smoothed is None:
-            return file.asked_at + FILE_OPEN_TIMEOUT_SILENT
-        return file.asked_at + max(FILE_OPEN_TIMEOUT, FILE_OPEN_TIMEOUT_FACTOR * trip.prompt_timeout)
+        return self._open_retries.list_due_at(file.asked_at)
 
     def _measure_list(self, now: float) -> None:
         """Measure whether the list is faster than waiting for the end of another station's session."""
@@ -622,7 +609,7 @@ class Fetch(Operation[FetchResult]):
                 self.fail(download.error, download.ended_at)
             return
         if file is not None and not file.done:
-            self._file_was_silent = file.is_silent and file.attempts >= UNANSWERED_OPENS_MAX
+            self._file_was_silent = file.is_silent and self._open_retries.is_hopeless(file.attempts)
             if self._file_was_silent and not self._was_in_use:
                 self._notes += (NO_FILE.format(file.silence(download.ended_at)),)
             self._drop_file(download.ended_at)
@@ -644,7 +631,7 @@ class Fetch(Operation[FetchResult]):
             names = repeated_names(download.names)
             if not (names or self._table.passed_over):
                 return False
-            self._repeated = Repeated(names, self._round_trip, self._reads, self._table, download.ended_at)
+            self._repeated = Repeated(names, self._context.retry, self._reads, self._table, download.ended_at)
             self._repeated.on_done.append(partial(self._download_ended, download))
         return not self._repeated.done
 
@@ -730,7 +717,7 @@ class Fetch(Operation[FetchResult]):
             resumed=0 if download is None else download.resumed,
             lost=0 if download is None else download.lost,
             repeated=0 if download is None else download.repeated,
-            round_trip=self._round_trip.smoothed,
+            round_trip=self._context.round_trip.smoothed,
         )
 
     def _drop_hash_read(self) -> None:
@@ -766,3 +753,4 @@ class Fetch(Operation[FetchResult]):
         download, self.download = self.download, None
         if download is not None:
             download.cancel()
+            download.drop_callbacks()

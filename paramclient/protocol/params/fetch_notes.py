@@ -20,34 +20,34 @@ __all__ = [
 ]
 
 UNPROVEN = (
-    "Which parameters this firmware leaves out of its hash could not be proven, "
-    "so after a start from the cache every value is read afresh."
+    "The parameters that this firmware excludes from its hash are not verified: "
+    "a start from the cache reads every value again."
 )
-LEFT_OUT = "Left out, as no parameter file can hold the name: what came under {!r}{}."
-MOVED = "The table moved during the download, so no hash stands for it; the next session downloads it again."
+LEFT_OUT = "Skipped {!r}{}: no parameter file can contain this name."
+MOVED = "The table changed during the download and has no hash: the next session downloads it again."
 UNBRACKETED = (
-    "No hash was heard before the download, and what this firmware leaves out of it could not be proven, "
-    "so none stands for the table; the next session downloads it again."
+    "No hash was received before the download, and the parameters that this firmware excludes from it are "
+    "not verified: the table has no hash, and the next session downloads it again."
 )
-NOT_ASKED = "The vehicle was not asked, as the policy is cache-only: the values are those last known."
+NOT_ASKED = "The policy is cache-only: the values are the last known ones, without requests to the vehicle."
 NOT_CONFIRMED = (
-    "The vehicle's hash did not confirm the cached table, and the policy hash-only allows no download: "
-    "the values are those last known."
+    "The vehicle's hash does not match the cached table, and the policy hash-only allows no download: "
+    "the values are the last known ones."
 )
-NO_FILE = "The parameters did not come as a file, so they were listed: {}."
+NO_FILE = "The parameters were downloaded as a list instead of a file: {}."
 FILE_IN_USE = (
-    "The parameters were listed: the file could not be opened, as another station reads one, "
-    "or has left one open."
+    "The parameters were downloaded as a list: the file could not be opened, because another station reads "
+    "one or has left one open."
 )
-SAMPLED = "A sample of the cached table agreed with the vehicle; nothing else was asked."
-NOT_SAMPLED = "The sample did not confirm the cached table: {}."
-NOT_REFRESHED = "What the hash leaves out was not read afresh, as the policy is hash-only."
+SAMPLED = "A sample of the cached table matches the vehicle; no other values were requested."
+NOT_SAMPLED = "The sample does not match the cached table: {}."
+NOT_REFRESHED = "The values outside the hash were not read again, because the policy is hash-only."
 UNSETTLED = "The number of parameters kept changing during the download."
 NOT_RESUMED = (
-    "What an earlier download had brought could not be confirmed by the vehicle's hash, "
-    "so all was downloaded anew."
+    "The vehicle's hash does not match the values of an earlier download: "
+    "the whole table was downloaded again."
 )
 FROM_MEMORY = (
-    "{} values are those of an earlier session: this vehicle has no hash to confirm them. "
-    "A fetch with refresh=True reads them anew."
+    "{} values are from an earlier session: this vehicle has no hash to verify them. "
+    "A fetch with refresh=True reads them again."
 )

@@ -141,6 +141,7 @@ class Fetches(Machine):
         fetch.holders -= 1
         if fetch.holders <= 0 and not fetch.done:
             fetch.cancel(now)
+            fetch.drop_callbacks()
             if self.current is fetch:
                 self.current = None
 

@@ -17,10 +17,11 @@ from paramclient.protocol.params.fetch_result import Progress
 from paramclient.protocol.params.table import Table
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.operation import Operation
+from paramclient.protocol.requests.retry import FILE_READS_MAX
 from paramclient.protocol.scheduler import Seen, Turns
 from paramclient.protocol.wire import PARAMETERS_MAX, ParamValue
 
-__all__ = ["PARAMETER_FILE", "PackFetch"]
+__all__ = ["PARAMETER_FILE", "WITH_DEFAULTS", "PackFetch"]
 
 PARAMETER_FILE: Final = "@PARAM/param.pck"
 """The parameter file of ArduPilot 4.1 and later, and of PX4 after 1.17."""
@@ -29,9 +30,6 @@ WITH_DEFAULTS: Final = "?withdefaults=1"
 file."""
 FILE_SILENCE_TIMEOUT: Final = 2.0
 """Seconds of silence after which the file no longer delays the lists of other components."""
-FILE_READS_MAX: Final = 2
-"""Reads of a file that turns out to be invalid or stale: it is generated for each reader, and a gap that is
-filled later may contain newer values of another length."""
 
 
 class PackFetch(Operation[None]):

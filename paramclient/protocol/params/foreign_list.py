@@ -6,8 +6,9 @@ import math
 from collections.abc import Mapping
 from typing import Final
 
-from paramclient.protocol.params.list_stream import JUMP_MAX, QUIET_GAPS, STREAM_PAUSE_MAX
+from paramclient.protocol.params.list_stream import JUMP_MAX
 from paramclient.protocol.params.reads import Reads
+from paramclient.protocol.requests.retry import QUIET_GAPS, STREAM_PAUSE_MAX
 from paramclient.protocol.wire import NO_INDEX, ParamValue
 
 __all__ = ["Following"]

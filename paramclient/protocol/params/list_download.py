@@ -7,12 +7,20 @@ from collections.abc import Mapping
 from typing import Final
 
 from paramclient.errors import NoReply
-from paramclient.protocol.params.list_stream import JUMP_MAX, LIST_REORDER_DEPTH, LIST_SILENCE_MIN, ListStream
+from paramclient.protocol.params.list_stream import JUMP_MAX, ListStream
 from paramclient.protocol.params.reads import Read, Reads
 from paramclient.protocol.params.table import Table
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.operation import Operation
-from paramclient.protocol.requests.round_trip import SILENCE_MAX
+from paramclient.protocol.requests.retry import (
+    COUNT_CHANGES_MAX,
+    EMPTY_LISTS_MAX,
+    LIST_REORDER_DEPTH,
+    LIST_SILENCE_MIN,
+    LISTS_MAX,
+    ListAttempts,
+    ReadRetries,
+)
 from paramclient.protocol.scheduler import Seen, Turns
 from paramclient.protocol.wire import NO_INDEX, PARAMETERS_MAX, ParamRequestList, ParamValue
 
@@ -21,33 +29,6 @@ __all__ = ["Download", "present_of"]
 RESUME_SHARE_MIN: Final = 0.5
 """The share of the table that must be present for single reads of the missing values to be worthwhile, where
 the pace of the list is unknown."""
-LIST_TIMEOUT: Final = 20.0
-"""Seconds of silence after which PARAM_REQUEST_LIST counts as unanswered: longer than ArduPilot leaves it
-unanswered after boot."""
-LIST_DELAY: Final = 0.13
-"""Seconds by which the first value of ArduPilot's list may be later than a short response (measured: up to
-0.09 s). A repeated request meanwhile restarts the list."""
-LIST_DELAY_FACTOR: Final = 3.0
-"""How many times longer than for the first list the start of another one may take: reads, which wait for each
-other, say less of that."""
-LIST_RISK: Final = 0.05
-"""The probability of no response below which copies bring a repeated request for the list. The first request
-has no copy: PX4 would take it for a restart, and leave out its hash."""
-LIST_COPIES_MAX: Final = 3
-"""Requests for the list that are sent at once, at most."""
-LIST_ATTEMPTS_MIN: Final = 12
-"""Requests for the list, at least, before a component that is heard counts as silent: enough at high packet
-loss."""
-LIST_RETRY_INTERVAL_MAX: Final = 2.5
-"""Seconds between two of them, at most, on a link with shorter round trips."""
-LISTS_WITHOUT_BACKOFF: Final = 3
-"""The first of them that follow without a longer backoff: they were lost rather than left unanswered."""
-LISTS_MAX: Final = 20
-"""Requests for the list: again when the count has changed, or when too much is missing for single reads."""
-EMPTY_LISTS_MAX: Final = 3
-"""Passes of the list in a row without a new value, after which only single reads are used."""
-COUNT_CHANGES_MAX: Final = 8
-"""Changes of the count that invalidate all values. A table that still changes is taken as it arrives."""
 MISSING_WITHOUT_LIST_MAX: Final = 24
 """Missing values that are never worth another pass of the list."""
 REQUESTED_INDICES_MAX: Final = 256
@@ -64,9 +45,6 @@ LOSS_MAX: Final = 0.9
 """The highest packet loss that estimates assume, as a share of exchanges."""
 LIST_TIME_ASSUMED: Final = 5.0
 """Seconds that a list is assumed to take before its pace is measured: on a cable 1, on a radio 30."""
-DEAD_INDEX_RISK: Final = 1e-3
-"""The probability of mere packet loss below which an index is given up, by the reads answered while it stayed
-silent."""
 BURST_GAIN: Final = 3.0
 """The assumed speed of the link, as a multiple of the pace of a list in bursts: within a burst of PX4 the
 link is much faster, but a busy program sees bursts on any link."""
@@ -95,7 +73,7 @@ class Download(Operation[None]):
     to belong to another count or to other names, they are discarded.
 
     Args:
-        target, round_trip, send, reads, turns, now: as their names say.
+        context, reads, turns, now: as their names say.
         listed: whether the list was requested already.
         count, present: the values of an earlier download: param_count and names by index.
         beside_file: whether a file was requested that may still bring everything. Then no pass is requested
@@ -127,6 +105,7 @@ class Download(Operation[None]):
     ) -> None:
         super().__init__(now)
         self._target = context.target
+        self._policy = context.retry
         self._round_trip = context.round_trip
         self._send = context.send
         self._reads = reads
@@ -157,18 +136,14 @@ class Download(Operation[None]):
         self._is_heard = self._is_checked = False  # a value was received; a present one was read to check
         self._list_timeout = math.inf  # seconds in which another pass may stay without a value
         self._is_answered = False  # its first value measures the round trip
-        self._list_wait = 0.0
         self._ahead_at: float | None = None  # when the next pass was requested before the end of this one
-        self._list_asked = 0  # requests since the turn began
+        self._request = ListAttempts(context.retry, now)
         self._is_head_counted = False  # its head has been received since
         self._has_looked = False  # near its end, skipped indices were looked at
-        self._list_at = now
-        self._patient_since = now
         if listed:
             self.lists = 1
-            self._list_wait = self._round_trip.repeat_timeout(1) + LIST_DELAY
-            self._list_asked = 1
-            self._silent_at = now + self._list_wait
+            self._request.was_sent()
+            self._silent_at = self._request.due_at
             turns.has_begun(self)
         elif present:
             self._go_on(now)
@@ -222,16 +197,15 @@ class Download(Operation[None]):
         if self.held_since is not None:
             self.held_up += now - self.held_since
             self.held_since = None
-        self._patient_since = now
+        self._request.patient_since = now
         is_running = self._stream.is_at_pace and now < self._quiet_at
         if self.lists == 0 and is_running:
             return  # another station has requested it meanwhile
         self._stream.rewind()
         self._stream.heard_at = now
-        self._list_wait = 0.0
-        self._list_asked = 0
+        self._request.restart()
         self._ask_for_list(now)
-        self._silent_at = now + self._list_wait
+        self._silent_at = now + self._request.wait
 
     def held_for(self, now: float) -> float:
         """Return the seconds for which it has waited for its turn."""
@@ -300,9 +274,8 @@ class Download(Operation[None]):
         if self.count is None and not self._is_head_counted:
             self._is_head_counted = True
             self._note_answer(now)
-            self._list_at = now
-            self._list_wait = max(self._list_wait, LIST_SILENCE_MIN)
-            self._silent_at = now + self._list_wait
+            self._request.head_heard(now)
+            self._silent_at = self._request.due_at
 
     def go_on(self, now: float) -> None:
         """Request what is missing: the file will not bring it."""
@@ -314,12 +287,10 @@ class Download(Operation[None]):
         if self.done or self.held_since is not None:
             return
         if self.count is None:
-            if self._list_at + self._list_wait <= now and not self.gives_way:
+            if self._request.due_at <= now and not self.gives_way:
                 if self._turns.is_beside_others(self):
-                    self._patient_since = now  # the vehicle may have no bandwidth to answer
-                is_gone = now - self._round_trip.heard_at >= SILENCE_MAX
-                is_enough = is_gone or self._list_asked >= LIST_ATTEMPTS_MIN
-                if is_enough and now - self._patient_since >= LIST_TIMEOUT:
+                    self._request.patient_since = now  # the vehicle may have no bandwidth to answer
+                if self._request.is_hopeless(now):
                     self._end_unanswered(now)
                 else:
                     self._ask_for_list(now)
@@ -340,16 +311,16 @@ class Download(Operation[None]):
         if self.done or self.held_since is not None:
             return math.inf
         if self.count is None:
-            return math.inf if self.gives_way else self._list_at + self._list_wait
+            return math.inf if self.gives_way else self._request.due_at
         if not self._is_streaming:
             return math.inf
         return self._quiet_at if self._asked or self.gives_way else min(self._quiet_at, self._end_look_at)
 
     def resume(self, now: float) -> None:
         """Repeat what could not be sent: the link is back."""
-        self._list_at = now - self._list_wait
-        self._patient_since = self._stream.heard_at = now
-        self._silent_at = now + self._round_trip.timeout
+        self._request.resume(now)
+        self._stream.heard_at = now
+        self._silent_at = now + self._policy.timeout
 
     def cancel(self) -> None:
         """Cancel the download; a running list goes on and still fills the table."""
@@ -364,7 +335,7 @@ class Download(Operation[None]):
     @property
     def _quiet_at(self) -> float:
         """When a list without further values counts as over."""
-        timeout = self._round_trip.timeout
+        timeout = self._policy.timeout
         if self._stream.is_awaited and self._passes > 1:
             timeout = min(timeout, self._list_timeout)
         stream = self._stream
@@ -377,9 +348,9 @@ class Download(Operation[None]):
     def _note_answer(self, now: float) -> None:
         if not self._is_answered and self.lists:
             self._is_answered = True
-            self._round_trip.answered(self._list_at, now, self.lists)
+            self._policy.answered(self._request.sent_at, now, self.lists)
             if self.lists == 1:
-                self._list_timeout = LIST_DELAY_FACTOR * (now - self._list_at)
+                self._list_timeout = self._request.later_timeout(now - self._request.sent_at)
 
     def _go_on(self, now: float) -> None:
         """Read what is missing, unless a running list will bring it."""
@@ -405,25 +376,19 @@ class Download(Operation[None]):
         self._turns.ask(self, now)
 
     def _ask_for_list(self, now: float) -> None:
-        self._list_at = now
+        self._request.sent(now)
         self._is_head_counted = self._has_looked = False
-        self._list_asked += 1
-        timeout = self._round_trip.repeat_timeout(self._list_asked)
-        if self._round_trip.smoothed is not None:
-            timeout += LIST_DELAY
-        growth = 2 if self._list_asked > LISTS_WITHOUT_BACKOFF else 1
-        self._list_wait = max(min(self._list_wait * growth, LIST_RETRY_INTERVAL_MAX), timeout)
         self._stream.is_awaited = True
         self._reads.is_idle = False
         ahead_at, self._ahead_at = self._ahead_at, None
-        if ahead_at is not None and now < ahead_at + timeout:
-            self._list_at = ahead_at
+        if ahead_at is not None and now < ahead_at + self._request.timeout:
+            self._request.sent_at = ahead_at
         else:
             self._request_list()
 
     def _request_list(self) -> None:
         self.lists += 1
-        copies = self._round_trip.copies(LIST_RISK, LIST_COPIES_MAX)
+        copies = self._request.copies
         if self._passes == 1 and not self._reads.pace.is_batched:
             copies = 1
         for _ in range(copies):
@@ -567,7 +532,7 @@ class Download(Operation[None]):
             return False
         if self._empty_passes >= EMPTY_LISTS_MAX or not self._turns.is_free:
             return False
-        trip = self._round_trip.smoothed or self._round_trip.timeout
+        trip = self._round_trip.smoothed or self._policy.timeout
         by_pass = self.count * self._stream.gap + trip + self._time_to_read(missing * self._stream_loss)
         if self._reads.pace.is_batched:
             by_pass += len(self._asked) / self._reads.pace.prospect  # the vehicle serves them before its list
@@ -585,10 +550,10 @@ class Download(Operation[None]):
         The last one to be answered needs about as many attempts as would lose all of them.
         """
         if missing < 1.0:
-            return missing * self._round_trip.timeout
+            return missing * self._policy.timeout
         loss = min(max(self._round_trip.seen_loss, 1.0 - (1.0 - self._stream_loss) ** 2), LOSS_MAX)
         tries = math.log(missing) / -math.log(loss) if loss > 0.0 else 0.0
-        return missing / (self._reads.pace.prospect * (1.0 - loss)) + tries * self._round_trip.timeout / 2
+        return missing / (self._reads.pace.prospect * (1.0 - loss)) + tries * self._policy.timeout / 2
 
     def _ask(self, index: int, now: float) -> None:
         self._lost.add(index)
@@ -615,17 +580,16 @@ class Download(Operation[None]):
         elif not isinstance(read.error, NoReply) or self._seems_dead(index, read):
             self.given_up.add(index)
             return
-        elif now - self._round_trip.heard_at >= SILENCE_MAX or self._reads.is_silent(now):
+        elif self._policy.is_gone(now) or self._reads.is_silent(now):
             self._give_up_the_rest()
         self._next = min(self._next, index)
 
     def _seems_dead(self, index: int, read: Read) -> bool:
         """Return whether reads sent together with it were answered too often for mere packet loss."""
         attempts, controls = self._tries.get(index, (0, 0))
-        attempts, controls = attempts + read.attempts, controls + read.controls
+        attempts, controls = attempts + read.attempts, controls + read.request.controls
         self._tries[index] = attempts, controls
-        answered = min(controls / max(attempts - 2, 1), 1.0)
-        return (1.0 - answered) ** attempts < DEAD_INDEX_RISK
+        return ReadRetries.is_dead_index(attempts, controls)
 
     def _finish_if_complete(self, now: float) -> None:
         if self.done or self.count is None or self._is_streaming or self._asked:

@@ -5,27 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Final
 
+from paramclient.protocol.requests.retry import LIST_REORDER_DEPTH, LIST_SILENCE_MIN, ListAttempts
 from paramclient.protocol.scheduler import Seen
 
-__all__ = ["PACE_VALUES_MIN", "JUMP_MAX", "LIST_REORDER_DEPTH", "LIST_SILENCE_MIN", "ListStream"]
+__all__ = ["JUMP_MAX", "PACE_VALUES_MIN", "ListStream"]
 
-LIST_REORDER_DEPTH: Final = 3
-"""Later values after which a missing one counts as lost, as in TCP's fast retransmit."""
 PACE_VALUES_MIN: Final = 20
 """Values after which the pace of the list is known."""
-QUIET_GAPS: Final = 3.0
-"""A list is over after a pause of this many of its longest gaps; a radio's pauses count among its gaps."""
-SILENCE_AT_PACE_MIN: Final = 0.06
-"""Seconds without a value after which a list may be over when its last values are due: PX4 sends every 20 ms,
-ArduPilot every 10 ms."""
-STREAM_PAUSE_MAX: Final = 0.5
-"""Seconds without a value after which a list that is not near its end may be over: ArduPilot's pauses for up
-to 0.4 s while it serves reads (measured)."""
-TAIL_LENGTH: Final = 24
-"""Final values that may all be lost: a list that is silent this close to its end is over, however many of its
-values are lost."""
-LIST_SILENCE_MIN: Final = 0.25
-"""Seconds without a value, at least, before that pace is known."""
 JUMP_MAX: Final = 40
 """Indices that the list may skip at once. A longer jump counts when the next value continues from there: PX4
 pushes changed parameters, with their index, into a running list."""
@@ -131,10 +117,8 @@ class ListStream:
         """
         if self.is_awaited:
             return self.heard_at + max(LIST_SILENCE_MIN, timeout)
-        if self._advances < PACE_VALUES_MIN:
-            return self.heard_at + max(LIST_SILENCE_MIN if left <= TAIL_LENGTH else STREAM_PAUSE_MAX, timeout)
-        shortest = SILENCE_AT_PACE_MIN if left <= TAIL_LENGTH else STREAM_PAUSE_MAX
-        return self.heard_at + max(QUIET_GAPS * self._longest, shortest)
+        longest = self._longest if self.is_at_pace else None
+        return self.heard_at + ListAttempts.silence_before_end(timeout, left, longest)
 
     def ends_at(self, last: int) -> float:
         """Return when the value of this index is expected, at the measured pace."""

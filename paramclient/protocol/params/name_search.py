@@ -9,10 +9,11 @@ from typing import Final
 
 from paramclient.errors import NoReply
 from paramclient.protocol.params.foreign_list import Following
-from paramclient.protocol.params.reads import BATCH_INTERVAL, KnownParams, Reads
+from paramclient.protocol.params.reads import KnownParams, Reads
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
+from paramclient.protocol.requests.retry import NameRetries
 from paramclient.protocol.wire import ParamError, ParamRequestRead, ParamValue
 
 __all__ = ["NameSearch", "NameSearches"]
@@ -20,22 +21,6 @@ __all__ = ["NameSearch", "NameSearches"]
 WINDOW_SIZE: Final = 18
 """Names requested at once. With the control, and one of an earlier window, they fit into the 20 requests that
 ArduPilot queues."""
-LOOKUP_TIME: Final = 0.01
-"""Seconds that ArduPilot takes to look up one request, at most: its simulation does so about every 5 ms
-(measured), boards every 1 ms. A request for an unknown parameter takes no longer."""
-NAME_LOSS_RISK: Final = 1e-6
-"""The probability that all requests of one name were lost, at the highest loss that the observations allow,
-below which the name counts as unknown."""
-NAME_LOSS_RISK_CLEAN: Final = 1e-3
-"""The same while nothing at all was lost: the link is then much better than that loss."""
-PASSES_MIN: Final = 2
-"""Unanswered requests of one name, at least, before the name counts as unknown."""
-CONTROL_RISK: Final = 0.01
-"""The probability of losing all controls of a window below which no further control is added."""
-CONTROLS_MAX: Final = 4
-"""Control reads of one window, at most."""
-CONTROLS_LOST_MAX: Final = 3
-"""Windows in a row without an answer to their control, after which the search gives up."""
 
 
 class NameSearch(Operation[None]):
@@ -89,7 +74,7 @@ class NameSearches(Machine):
         following: Following,
     ) -> None:
         self._target = context.target
-        self._round_trip = context.round_trip
+        self._retries = NameRetries(context.retry)
         self._reads = reads
         self._send = context.send
         self._table = table
@@ -100,8 +85,6 @@ class NameSearches(Machine):
         self._window: set[str] = set()
         self._controls: set[int] = set()
         self._controls_sent = 0
-        self._controls_lost = 0
-        self._sent_at = self._heard_at = -math.inf
 
     def __len__(self) -> int:
         return len(self._searches)
@@ -142,15 +125,10 @@ class NameSearches(Machine):
         passes = search.passes.pop(message.param_id, None)
         is_found = passes is not None
         if passes is not None:
-            for _ in range(passes):
-                self._round_trip.timed_out(1)  # exists: the unanswered request was lost
-            self._round_trip.answered(self._sent_at, now, 2)
-            self._heard_at = now
+            self._retries.name_answered(passes, now)
             self._window.discard(message.param_id)
         if message.param_index in self._controls and not self._is_listing(now):
-            is_sure = self._heard_at <= self._sent_at  # otherwise the vehicle may have served names first
-            self._round_trip.answered(self._sent_at, now, 1 if is_sure else 2)
-            self._controls_lost = 0
+            self._retries.control_answered(now)
             self._pass_over(search)
             self._send_window(search, now)
         elif is_found:
@@ -163,7 +141,7 @@ class NameSearches(Machine):
         search = self._searches[0]
         if search.passes.pop(message.param_id, None) is not None:
             search.unknown.add(message.param_id)
-            self._heard_at = now
+            self._retries.heard_at = now
             self._window.discard(message.param_id)
             self._go_on(search, now)
 
@@ -172,9 +150,8 @@ class NameSearches(Machine):
         if self.next_deadline() > now:
             return
         search = self._searches[0]
-        self._round_trip.timed_out(1)
-        self._controls_lost += 1
-        if self._controls_lost >= CONTROLS_LOST_MAX:
+        self._retries.control_timed_out()
+        if self._retries.is_hopeless:
             self._leave(search, now)
         else:
             self._waiting.extendleft(sorted(self._window, reverse=True))
@@ -184,10 +161,7 @@ class NameSearches(Machine):
         """Return when `tick` is due, or infinity."""
         if not self._searches:
             return math.inf
-        serving = 0.0
-        if self._reads.pace.is_batched:  # the next batch cannot begin before
-            serving = BATCH_INTERVAL + LOOKUP_TIME * len(self._window)
-        return max(self._sent_at, self._heard_at) + self._round_trip.timeout + serving
+        return self._retries.due_at(len(self._window), is_batched=self._reads.pace.is_batched)
 
     def resume(self, now: float) -> None:
         """Repeat what was in flight: the link is back."""
@@ -210,7 +184,7 @@ class NameSearches(Machine):
         search = self._searches[0]
         self._waiting = deque(search.passes)
         self._silent = []
-        self._controls_lost = 0
+        self._retries.restart()
         self._send_window(search, now)
 
     def _go_on(self, search: NameSearch, now: float) -> None:
@@ -220,8 +194,7 @@ class NameSearches(Machine):
 
     def _pass_over(self, search: NameSearch) -> None:
         """Count silent names after an answered control: they are lost, or do not exist."""
-        risk = NAME_LOSS_RISK if self._round_trip.seen_loss else NAME_LOSS_RISK_CLEAN
-        enough = max(PASSES_MIN, math.ceil(math.log(risk) / math.log(self._round_trip.feared_loss)))
+        enough = self._retries.passes_max
         for name in sorted(search.passes.keys() & self._window):
             search.passes[name] += 1
             if search.passes[name] < enough:
@@ -237,7 +210,7 @@ class NameSearches(Machine):
         if not self._waiting:
             self._waiting.extend(self._silent)
             self._silent = []
-        controls = self._round_trip.copies(CONTROL_RISK, CONTROLS_MAX)
+        controls = self._retries.controls
         most = WINDOW_SIZE - 2 * (controls - 1)  # requests of the window before may still be queued
         while self._waiting and len(self._window) < most:
             name = self._waiting.popleft()
@@ -246,7 +219,7 @@ class NameSearches(Machine):
                 self._send(ParamRequestRead(*self._target, name, -1))
         if self._window:
             search.attempts += 1
-            self._sent_at = now
+            self._retries.sent_at = now
             for _ in range(controls):
                 self._send_control()
         elif search.passes:  # the remaining names have been answered meanwhile

@@ -253,5 +253,5 @@ class Overhearing(Fetch):
 
     def _nothing(self, now: float) -> NoReply:
         system, component = self._target
-        what = f"the parameters of {system}/{component}, for which nobody was heard asking"
+        what = f"the parameters of {system}/{component}, which no other station has requested"
         return NoReply(what, attempts=0, waited=now - self.begun_at)

@@ -110,21 +110,21 @@ class FileObserver:
         if not read.blocks.received:
             return
         system, component = read.station
-        file = f"the parameter file that station {system}/{component} read"
+        file = f"parameter file that station {system}/{component} read"
         data = read.blocks.prefix
         try:
             if len(data) < HEADER_SIZE:
-                raise PackError("its first bytes were not heard", offset=0)
+                raise PackError("its first bytes were not received", offset=0)
             pack, number = decode_prefix(data)
             if count not in (None, pack.total) or pack.total > PARAMETERS_MAX:
-                raise PackError(f"it is of {pack.total} parameters, and the vehicle has {count}", offset=4)
+                raise PackError(f"it has {pack.total} parameters, and the vehicle has {count}", offset=4)
         except PackError as error:
-            self._note(f"Nothing was taken from {file}: {error}.")
+            self._note(f"The {file} was not used: {error}.")
             return
         self._came(ObservedPack(pack, _start_of(read.path), newer, read.began_at), now)
         if len(pack.entries) < number:
-            taken = f"{len(pack.entries)} of {number} parameters were taken from {file}"
-            self._note(f"{taken}: its bytes from {len(data)} on were not heard without a gap.")
+            taken = f"{len(pack.entries)} of {number} parameters were taken from the {file}"
+            self._note(f"{taken}: bytes from {len(data)} on are missing.")
 
     def _note(self, text: str) -> None:
         if len(self.notes) < NOTES_MAX:

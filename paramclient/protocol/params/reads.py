@@ -19,12 +19,7 @@ from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.requests.pacing import Pace, Share
-from paramclient.protocol.requests.round_trip import (
-    ATTEMPTS_MAX,
-    ATTEMPTS_MIN,
-    SAMPLE_WEIGHT,
-    SILENCE_MAX,
-)
+from paramclient.protocol.requests.retry import ReadAttempts, ReadRetries, RetryPolicy
 from paramclient.protocol.wire import PARAMETERS_MAX, ParamError, ParamRequestRead, ParamValue
 
 __all__ = ["Key", "Read", "Reads"]
@@ -37,26 +32,6 @@ CONTROL_INDEX: Final = 0
 be answered."""
 COPY_RESERVE: Final = 2.0
 """Requests that the pacing must still allow when a request is sent again early."""
-COPY_RISK: Final = 0.01
-"""The probability of no response below which early copies bring a read."""
-READ_COPIES_MAX: Final = 6
-"""Early copies of one request, at most: further ones gain little and take bandwidth."""
-COPY_TIMEOUTS_MAX: Final = 16
-"""Timeouts in a row, without any response between them, after which early copies are of no use."""
-TIMEOUTS_MAX: Final = 16
-"""Timeouts in a row, over at least twice `SILENCE_MAX`, after which a component with heartbeats counts as
-one that answers no reads: with two of three exchanges lost, this happens once in 650 times."""
-CONTROLS_MIN: Final = 3
-"""Answered control reads, at least, before a silent parameter counts as unknown."""
-LOSS_RISK: Final = 1e-6
-"""The probability of mere packet loss, by the outcome of the control reads, below which a silent parameter
-counts as unknown. Where many reads are silent, only control reads tell the link's loss."""
-CONTROLS_CERTAIN: Final = 4
-"""Answered control reads, at least, after which silence is due to the component and not to the link."""
-READS_PER_BATCH: Final = 5
-"""Reads that ArduPilot answers at once (measured)."""
-BATCH_INTERVAL: Final = 0.1
-"""Seconds from one such batch to the next (measured)."""
 
 
 class Read(Operation[ParamValue]):
@@ -65,27 +40,24 @@ class Read(Operation[ParamValue]):
     Attributes:
         key: name or index.
         holders: callers that wait for the response; at 0 the read is dropped.
-        attempts: requests sent.
-        copies: requests sent on top of the last one before it had timed out.
+        request: its attempts.
         is_of_caller: whether a caller waits for it, and not only a fetch.
-        controls: reads of existing parameters that were answered while this one stayed silent.
-        sent_at: when the last request was sent; infinity while none is in flight.
-        serving_time: seconds that the vehicle needs for the requests ahead of it; its timeout is no shorter.
         ask_again_at: when the request is sent again because the response may be older than a PARAM_SET;
             otherwise infinity.
     """
 
-    def __init__(self, key: Key, begun_at: float) -> None:
+    def __init__(self, key: Key, policy: RetryPolicy, begun_at: float) -> None:
         super().__init__(begun_at)
         self.key = key
-        self.sent_at = math.inf
-        self.serving_time = 0.0
+        self.request = ReadAttempts(policy)
         self.ask_again_at = math.inf
-        self.attempts = 0
-        self.copies = 0
         self.holders = 0
         self.is_of_caller = False
-        self.controls = 0
+
+    @property
+    def attempts(self) -> int:
+        """Requests sent."""
+        return self.request.count
 
 
 class KnownParams(Protocol):
@@ -132,8 +104,10 @@ class Reads(Machine):
         share: Share | None = None,
     ) -> None:
         self._target = context.target
-        self._round_trip = context.round_trip
+        self._policy = context.retry
+        self._retries = ReadRetries(context.retry)
         self._send = context.send
+        self._reschedule = context.reschedule
         self._table = table
         self._trace = context.trace
         self.asked = self.retries = 0
@@ -146,15 +120,9 @@ class Reads(Machine):
         self.answered_at = self.sent_at = -math.inf
         self.list_runs_again = False
         self.is_idle = True
-        self._silences = 0  # timeouts since the last response
-        self._silent_since = math.inf  # the first request since then
         self.list_until = -math.inf
         self.control = CONTROL_INDEX
-        self._control_at = math.inf
         self._control_index = CONTROL_INDEX  # of the control read in flight
-        self._control_attempts = 0
-        self._controls_sent = 0.0  # about the last fifty count
-        self._controls_answered = 0.0
 
     def __len__(self) -> int:
         return len(self._open)
@@ -176,7 +144,7 @@ class Reads(Machine):
         """Begin a read, or join an open one of the same parameter. Give it back with `release`."""
         read = self._open.get(key)
         if read is None:
-            read = Read(key, now)
+            read = Read(key, self._policy, now)
             self.asked += 1
             self._open[key] = read
             (self._urgent if urgent else self._patient).append(read)
@@ -184,14 +152,18 @@ class Reads(Machine):
             self._patient.remove(read)
             self._urgent.append(read)
         read.holders += 1
+        self._reschedule()
         self._send_waiting(now, may_copy=False)  # other reads may begin at the same moment
         return read
 
     def release(self, read: Read) -> None:
         """Give a read back. The last holder drops it."""
         read.holders -= 1
-        if read.holders <= 0 and self._open.get(read.key) is read:
-            self._drop(read)
+        if read.holders <= 0:
+            read.drop_callbacks()
+            if self._open.get(read.key) is read:
+                self._reschedule()
+                self._drop(read)
 
     def heard(self, message: ParamValue, now: float) -> None:
         """Process a PARAM_VALUE of the component, after the table has stored it."""
@@ -208,7 +180,7 @@ class Reads(Machine):
                     "%s/%s %s: answered %.3f s after try %s",
                     *self._target,
                     read.key,
-                    now - read.sent_at,
+                    now - read.request.sent_at,
                     read.attempts,
                 )
             self._drop(read)
@@ -221,10 +193,10 @@ class Reads(Machine):
         is_answer = False
         for key in (message.param_id, message.param_index):
             read = self._flying.get(key)
-            if read is not None and read.sent_at < math.inf:
+            if read is not None and read.request.sent_at < math.inf:
                 is_answer = True
                 self._count_answer(read, now)
-                read.sent_at = math.inf
+                read.request.sent_at = math.inf
                 read.ask_again_at = until
         self._hear_control(message.param_index, message.param_count, now, is_answer=is_answer)
 
@@ -236,17 +208,11 @@ class Reads(Machine):
         """
         if index < count <= PARAMETERS_MAX:
             self.control = index  # exists and is answered
-        if index == self._control_index and self._control_at < math.inf:
-            # a lost control read may have no read left that repeats it; then this is not its response
-            is_late = now - self._control_at > 2 * self._round_trip.timeout
-            attempts = self._control_attempts + is_late + is_answer
-            self._round_trip.answered(self._control_at, now, attempts)
-            self._control_at = math.inf
-            self._note_response(now)
+        if index == self._control_index and self._retries.is_control_awaited:
+            self._retries.control_answered(now, is_answer=is_answer)
+            self.answered_at = now
             if not self.list_runs_again:  # otherwise the list may have brought the value
-                self._controls_answered += 1
-                for read in self._flying.values():
-                    read.controls += read.attempts > 1
+                self._retries.count_control(read.request for read in self._flying.values())
 
     def refused(self, message: ParamError, now: float) -> None:
         """Process a PARAM_ERROR that may belong to a read."""
@@ -291,7 +257,7 @@ class Reads(Machine):
 
     def tick(self, now: float) -> None:
         """Repeat timed-out requests and give up reads that are out of attempts."""
-        timeout = self._round_trip.timeout
+        timeout = self._policy.timeout
         for read in [read for read in self._flying.values() if self._due_at(read) <= now]:
             if self._flying.get(read.key) is not read:
                 continue  # ended by the end of another read
@@ -299,10 +265,9 @@ class Reads(Machine):
                 read.ask_again_at = math.inf
                 self._again.append(read)
                 continue
-            self._silences += 1
-            if not (self.list_runs_again and isinstance(read.key, int)):
-                self._round_trip.timed_out(read.attempts)
-            if self._is_hopeless(read, now):
+            may_be_in_list = self.list_runs_again and isinstance(read.key, int)
+            self._retries.timed_out(read.request, tells_loss=not may_be_in_list)
+            if self._retries.is_hopeless(read.request, now, is_known=self._is_known(read.key)):
                 self._drop(read)
                 self._trace("%s/%s %s: given up after try %s", *self._target, read.key, read.attempts)
                 read.fail(self._timeout_error(read, now), now)
@@ -310,20 +275,18 @@ class Reads(Machine):
                 self._trace(
                     "%s/%s %s: no answer to try %s in %.3f s", *self._target, read.key, read.attempts, timeout
                 )
-                read.sent_at = math.inf
+                read.request.sent_at = math.inf
                 self._again.append(read)
         self._send_waiting(now)
 
     def is_silent(self, now: float) -> bool:
         """Return whether all requests have been unanswered for so long, and so often, that more are
         pointless."""
-        tries = min(self._round_trip.tries, ATTEMPTS_MAX)
-        return self._silences >= tries and now - self._silent_since >= SILENCE_MAX
+        return self._retries.is_silent(now)
 
     def forgive(self) -> None:
         """Reset the count of timeouts: the silence has another cause."""
-        self._silences = 0
-        self._silent_since = math.inf
+        self._retries.forgive()
 
     def next_deadline(self) -> float:
         """Return when `tick` is due, or infinity."""
@@ -338,11 +301,11 @@ class Reads(Machine):
 
     def resume(self, now: float) -> None:
         """Queue everything that was in flight again: the link is back."""
-        self._control_at = self._silent_since = math.inf
+        self._retries.resume()
         self._again.clear()
         for read in self._flying.values():
-            read.attempts -= 1
-            read.sent_at = read.ask_again_at = math.inf
+            read.request.uncount()
+            read.request.sent_at = read.ask_again_at = math.inf
             self._again.append(read)
         self._send_waiting(now)
 
@@ -363,54 +326,24 @@ class Reads(Machine):
 
     def _due_at(self, read: Read) -> float:
         """Return when a read in flight times out, or is sent again."""
-        timeout = max(self._round_trip.read_timeout(read.attempts), read.serving_time)
-        return min(read.sent_at + timeout, read.ask_again_at)
+        return min(read.request.due_at, read.ask_again_at)
 
     def _time_to_serve(self) -> float:
-        """Return the seconds until a request sent now is answered, given the requests in flight.
-
-        Requests that reach the vehicle are served in order: 12 in flight are served within three batches, and
-        the first batch may be a whole interval away.
-        """
-        in_flight = sum(1 + read.copies for read in self._flying.values() if read.sent_at < math.inf)
-        batches = math.ceil(in_flight / READS_PER_BATCH)
-        return (batches + 1) * BATCH_INTERVAL + self.pace.quickest
-
-    def _is_hopeless(self, read: Read, now: float) -> bool:
-        silent_for = now - self._silent_since
-        is_mute = read.attempts >= ATTEMPTS_MIN and silent_for >= 2 * SILENCE_MAX
-        if (self._silences >= ATTEMPTS_MAX and silent_for >= SILENCE_MAX) or (
-            self._silences >= TIMEOUTS_MAX and is_mute
-        ):
-            return True  # none of all these was answered
-        are_enough = read.controls >= CONTROLS_MIN and read.attempts >= ATTEMPTS_MIN
-        if are_enough and self._loss_probability(read.attempts) < LOSS_RISK:
-            return True
-        # half as many are enough if nothing has announced the parameter and the link serves others
-        weight = 2 if self._seems_unknown(read) else 1
-        return self._round_trip.is_hopeless(weight * read.attempts, now)
-
-    def _loss_probability(self, attempts: int) -> float:
-        """Return the probability that so many reads in a row get lost, from the outcome of the control reads.
-
-        Uses the rule of succession: ten answered of ten do not prove a link without loss, where so many reads
-        are open that the luckiest ten and the unluckiest read coincide.
-        """
-        lost = self._controls_sent - self._controls_answered
-        return math.prod(
-            (lost + 1 + before) / (self._controls_sent + 2 + before) for before in range(attempts)
-        )
+        """Return the seconds until a request sent now is answered, given the requests in flight."""
+        requests = [read.request for read in self._flying.values()]
+        in_flight = sum(1 + each.copies for each in requests if each.sent_at < math.inf)
+        return self._retries.serving_time(in_flight, self.pace.quickest)
 
     def _seems_unknown(self, read: Read) -> bool:
-        return read.controls >= CONTROLS_CERTAIN and not self._is_known(read.key)
+        return self._retries.seems_unknown(read.request, is_known=self._is_known(read.key))
 
     def _count_answer(self, read: Read, now: float) -> None:
         self._note_response(now)
         if self.list_runs_again and isinstance(read.key, int):
             return
-        is_sure = read.attempts + read.copies == 1 and read.sent_at < math.inf
-        self._round_trip.answered(read.sent_at, now, 1 if is_sure else read.attempts + 1)
-        self.pace.answered(now - read.sent_at if is_sure else None, now)
+        request = read.request
+        request.answered(now)
+        self.pace.answered(now - request.sent_at if request.is_measurable else None, now)
 
     def _note_response(self, now: float) -> None:
         self.answered_at = now
@@ -422,7 +355,7 @@ class Reads(Machine):
         what = name if name is not None else f"parameter {index}"
         if self._seems_unknown(read):
             return UnknownParameter(
-                f"{system}/{component} has no {what}: it keeps silent on it and answers other reads",
+                f"{system}/{component} has no {what}: it does not respond to it, and responds to other reads",
                 system=system,
                 component=component,
                 name=name,
@@ -440,15 +373,14 @@ class Reads(Machine):
         return not self._flying and self.answered_at >= self.sent_at
 
     def _transmit(self, read: Read, now: float, *, is_charged: bool = True) -> None:
-        read.attempts += 1
+        read.request.sent(now)
         self.retries += read.attempts > 1
-        read.copies = 0
-        read.sent_at = now
-        read.serving_time = self._time_to_serve() if self.pace.is_batched else 0.0
-        self._silent_since = min(self._silent_since, now)
+        read.request.serving_time = self._time_to_serve() if self.pace.is_batched else 0.0
+        self._retries.sent(now)
         self.pace.sent(now, is_charged=is_charged)
         self._request(read, now)
-        if read.key != self.control and read.attempts > (2 if self._is_known(read.key) else 1):
+        is_known = self._is_known(read.key)
+        if read.key != self.control and self._retries.needs_control(read.request, is_known=is_known):
             self._send_control(now)
 
     def _request(self, read: Read, now: float) -> None:
@@ -460,19 +392,11 @@ class Reads(Machine):
 
     def _send_control(self, now: float) -> None:
         """Send a control read, unless another one or a read of that index is in flight."""
-        if self._control_at < math.inf:
-            if now - self._control_at < self._round_trip.timeout:
-                return
-            self._round_trip.timed_out(self._control_attempts)
-            self._control_attempts += 1
-        else:
-            self._control_attempts = 1
+        if not self._retries.may_send_control(now):
+            return
         if not self._is_known(self.control):
             self.control = CONTROL_INDEX  # the vehicle has fewer parameters by now
-        self._control_at = now
         self._control_index = self.control
-        self._controls_sent = self._controls_sent * SAMPLE_WEIGHT + 1
-        self._controls_answered *= SAMPLE_WEIGHT
         self.pace.sent(now)
         self._send(ParamRequestRead(*self._target, "", self.control))
 
@@ -498,19 +422,20 @@ class Reads(Machine):
             and (read_again := self._copy_wanted()) is not None
             and self.pace.may_send(now, COPY_RESERVE)
         ):
-            read_again.copies += 1
+            read_again.request.copies += 1
             self.pace.sent(now)
             self._request(read_again, now)
 
     def _copy_wanted(self) -> Read | None:
         """Return a read for which a copy is worthwhile while its response may be on the way."""
-        if not self.is_idle or not self._flying or self._silences >= COPY_TIMEOUTS_MAX:
+        if not self.is_idle or not self._flying:
             return None
-        most = self._round_trip.copies(COPY_RISK, READ_COPIES_MAX + 1) - 1
+        most = self._retries.copies
         if not most:
             return None
-        fewest = min(self._flying.values(), key=lambda read: read.copies)
-        return fewest if fewest.copies < most and fewest.sent_at < math.inf else None
+        fewest = min(self._flying.values(), key=lambda read: read.request.copies)
+        is_in_flight = fewest.request.sent_at < math.inf
+        return fewest if fewest.request.copies < most and is_in_flight else None
 
     def _drop(self, read: Read) -> None:
         del self._open[read.key]

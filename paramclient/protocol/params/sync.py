@@ -20,6 +20,7 @@ from paramclient.protocol.params.table import NAMES_MAX, Table
 from paramclient.protocol.params.volatile_values import Refresh
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
+from paramclient.protocol.requests.retry import FILE_IN_USE_RETRY
 from paramclient.protocol.vehicle.presence import Presence
 from paramclient.protocol.wire import HASH_CHECK, ParamValue
 
@@ -44,10 +45,6 @@ IDLE_CHECK_INTERVAL: Final = 0.1
 """Seconds until the next look at whether the link is idle."""
 GAP_CHECK_INTERVAL: Final = 5.0
 """Seconds between two checks caused by gaps in the heartbeats, which are frequent on a bad link."""
-FILE_IN_USE_RETRY: Final = 5.0
-"""Seconds until the next attempt of a check that was skipped because another station has a file open.
-ArduPilot ends a session 3 s after its last reply to any station, so frequent attempts would keep an unused
-session open."""
 LOW_BANDWIDTH_GAP: Final = 0.1
 """Seconds between two values of the list that indicate a low-bandwidth mode: PX4's sends 8 values/s, a
 57600-baud radio carries 40."""
@@ -109,7 +106,7 @@ class Upkeep:
         """
         if listen_only or is_log:
             if interval or policy != Policy.AUTO:
-                raise UsageError("watch_interval and policy are for clients that ask; here nothing is sent")
+                raise UsageError("watch_interval and policy need requests, and the client only listens")
             return cls(policy=Policy.CACHE_ONLY, listens_only=True, is_log=is_log)
         try:
             policy = Policy(policy)

@@ -77,8 +77,8 @@ class Rereads(Machine):
     def tick(self, now: float) -> None:
         """Read the values that are due."""
         for name in self.authors.doubted(now):
-            if self._policy is Policy.AUTO and len(self._reads) < REREADS_MAX:
-                self._reads.ask(name, now, urgent=False)
+            if self._policy is Policy.AUTO:
+                self._read(name, now)
         if self.checks.next_deadline() <= now:
             self._read_due(now)
 
@@ -99,10 +99,15 @@ class Rereads(Machine):
         for name in names:
             if self._policy is not Policy.AUTO:
                 self._table.doubt_value(name)
-            elif len(self._reads) < REREADS_MAX:
-                self._reads.ask(name, now, urgent=False)
-            else:
+            elif not self._read(name, now):
                 self.checks.ask(name, now + READS_PAUSE)
+
+    def _read(self, name: str, now: float) -> bool:
+        """Request a value; return False if too many reads are open."""
+        is_free = len(self._reads) < REREADS_MAX
+        if is_free:
+            self._reads.ask(name, now, urgent=False)
+        return is_free
 
 
 class ValueChecks:

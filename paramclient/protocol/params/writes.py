@@ -32,6 +32,7 @@ from paramclient.protocol.params.write_resolution import note_on_small_change
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
+from paramclient.protocol.requests.retry import RetryPolicy, WriteAttempts
 from paramclient.protocol.wire import ParamError, ParamSet, ParamValue
 
 __all__ = ["SetResult", "Write", "Writes"]
@@ -76,6 +77,7 @@ class Write(Operation[SetResult]):
     """One PARAM_SET until its value is confirmed; see `Writes`.
 
     Attributes:
+        request: its attempts.
         settle: seconds from the acknowledgement until the value is read once more.
         is_forced: whether a value that the vehicle cannot store is sent anyway.
         acknowledged: the result so far, while the value is watched for `settle` seconds.
@@ -85,6 +87,7 @@ class Write(Operation[SetResult]):
         self,
         name: str,
         value: Value,
+        policy: RetryPolicy,
         begun_at: float,
         asker: str | None = None,
         *,
@@ -98,8 +101,7 @@ class Write(Operation[SetResult]):
         self.settle = settle
         self.is_forced = is_forced
         self.acknowledged: SetResult | None = None
-        self.attempts = 0
-        self.sent_at = math.inf
+        self.request = WriteAttempts(policy)
         self.number = 0  # the type that was sent
         self.wanted: Param | None = None
         self.before: Param | None = None
@@ -108,6 +110,11 @@ class Write(Operation[SetResult]):
         self.verify_at = math.inf
         self.read: Read | None = None
         self.was_retyped = False
+
+    @property
+    def attempts(self) -> int:
+        """PARAM_SETs sent."""
+        return self.request.count
 
 
 class WritePermission(Protocol):
@@ -160,7 +167,7 @@ class Writes(Machine):
     ) -> None:
         self._context = context
         self._target = context.target
-        self._round_trip = context.round_trip
+        self._policy = context.retry
         self._send = context.send
         self._reads = reads
         self._table = table
@@ -192,7 +199,7 @@ class Writes(Machine):
         force: bool = False,
     ) -> Write:
         """Begin a write, after the open ones to the same name."""
-        write = Write(name, value, now, asker, settle=settle, is_forced=force)
+        write = Write(name, value, self._policy, now, asker, settle=settle, is_forced=force)
         self.asked += 1
         queue = self.queues.setdefault(name, deque())
         queue.append(write)
@@ -255,12 +262,12 @@ class Writes(Machine):
                 self._begin(write, heard, now)
         elif write.wanted is not None and write.wanted.same_value(heard):
             is_sure = write.read is None and not write.is_answered
-            self._round_trip.answered(write.sent_at, now, write.attempts if is_sure else write.attempts + 1)
+            write.request.answered(now, is_sure=is_sure)
             self._succeed(write, now)
         else:
             if write.read is None:
                 write.is_answered = True
-                write.verify_at = min(write.verify_at, now + self._grace)
+                write.verify_at = min(write.verify_at, now + write.request.old_value_delay)
 
     def defer(self, message: ParamValue, until: float) -> None:
         """Process a PARAM_VALUE that may be older than the last change: it proves nothing.
@@ -291,7 +298,8 @@ class Writes(Machine):
         """Verify, repeat and give up writes; nothing while writes are not permitted."""
         if not self._permission.may_be_written:
             return
-        timeout = self._round_trip.timeout
+        # all by one timeout: the first of them may change it
+        overdue = {queue[0] for queue in self.queues.values() if queue[0].request.due_at <= now}
         for queue in list(self.queues.values()):
             if not queue:
                 continue
@@ -299,15 +307,14 @@ class Writes(Machine):
             if write.verify_at <= now:  # also for a watched write at the end of that time
                 write.verify_at = math.inf
                 self._read(write, now)
-            elif self._awaits_answer(write) and not write.is_answered and write.sent_at + timeout <= now:
-                self._round_trip.timed_out(write.attempts)
-                if self._round_trip.is_hopeless(write.attempts, now):
+            elif write in overdue and self._awaits_answer(write) and not write.is_answered:
+                write.request.timed_out()
+                if write.request.is_hopeless(now):
                     # reads in between have shown that nothing was applied
                     self._fail(write, self._not_applied(write, self._params[write.name]), now)
                     continue
                 self._transmit(write, now)
-                if write.attempts > 2 and not write.done:
-                    # the vehicle may be silent on this write only: read the value that it holds
+                if write.request.needs_read and not write.done:
                     self._read(write, now)
 
     def next_deadline(self) -> float:
@@ -315,12 +322,11 @@ class Writes(Machine):
         earliest = math.inf
         if not self.queues or not self._permission.may_be_written:
             return earliest
-        timeout = self._round_trip.timeout
         for queue in self.queues.values():
             write = queue[0]
             earliest = min(earliest, write.verify_at)
             if self._awaits_answer(write) and not write.is_answered:
-                earliest = min(earliest, write.sent_at + timeout)
+                earliest = min(earliest, write.request.due_at)
         return earliest
 
     def resume(self, now: float) -> None:
@@ -328,7 +334,7 @@ class Writes(Machine):
         for queue in list(self.queues.values()):
             if queue and self._awaits_answer(queue[0]):
                 if self._permission.may_be_written:
-                    queue[0].attempts -= 1
+                    queue[0].request.uncount()
                 self._transmit(queue[0], now)
 
     def lose(self, now: float) -> None:
@@ -348,11 +354,6 @@ class Writes(Machine):
                     self._reads.release(write.read)
                     write.read = None
                 write.fail(error_of(write), now)
-
-    @property
-    def _grace(self) -> float:
-        # an old response is at most about one round trip ahead of the valid one
-        return max(self._round_trip.timeout / 2, 0.05)
 
     def _active(self, name: str) -> Write | None:
         """Return the write whose PARAM_SET to this name is in flight and not acknowledged."""
@@ -383,7 +384,7 @@ class Writes(Machine):
             # the write is not meant for whichever vehicle is there now: it begins, or is overdue, once that
             # is known
             self.is_held = True
-            write.sent_at = -math.inf
+            write.request.sent_at = -math.inf
             write.is_answered = False
             write.verify_at = math.inf
             return
@@ -401,9 +402,8 @@ class Writes(Machine):
             self._fail(write, error, now)
             return
         write.wanted = Param(write.name, value, write.number, None, bits)
-        write.attempts += 1
+        write.request.sent(now)
         self.retries += write.attempts > 1
-        write.sent_at = now
         write.is_answered = False
         write.verify_at = math.inf
         self._send(ParamSet(*self._target, write.name, raw, write.number))
@@ -434,7 +434,7 @@ class Writes(Machine):
         is_made_again = write.made is not None and write.made.same_value(actual)
         if write.is_answered and is_made_again:
             self._succeed(write, now)
-        elif self._round_trip.is_hopeless(write.attempts, now):
+        elif write.request.is_hopeless(now):
             self._fail(write, self._not_applied(write, actual), now)
         else:
             is_old = write.before is not None and write.before.same_value(actual)

@@ -4,5 +4,6 @@
 `machine`: the lifecycle of these machines.
 `operation`: an operation with one result or error.
 `pacing`: the rate limit of requests.
-`round_trip`: round-trip time, timeouts, packet loss, number of attempts.
+`retry`: timeouts, number of attempts, backoff, and the end of every kind of request.
+`round_trip`: the measured round-trip time and packet loss.
 """

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
+from paramclient.protocol.requests.retry import RetryPolicy
 from paramclient.protocol.requests.round_trip import RoundTrip
 from paramclient.protocol.stats.trace import Trace, silent
 from paramclient.protocol.wire import MAV_AUTOPILOT_ARDUPILOTMEGA, MAV_AUTOPILOT_PX4, Message
@@ -26,9 +27,10 @@ class Context:
         target: system and component.
         send: takes each message for the component, in order.
         own: system and component that requests are sent as.
-        round_trip: the measured round-trip time and packet loss.
+        retry: when its requests count as lost, and when they are given up.
         trace: takes a line for each step.
         may_send: whether requests may be sent to it; false for listen-only links.
+        reschedule: called when a deadline may have changed although no message was received or sent.
         autopilot: MAV_AUTOPILOT of its heartbeat, None before the first one. Set by `Identification`.
         is_identifying: whether AUTOPILOT_VERSION is requested. Set by `Identification`.
         may_be_another: whether another vehicle may have taken its place since the identification, or has, and
@@ -36,7 +38,8 @@ class Context:
         serves_file: whether it serves its table as a file over MAVFTP, as far as known. Set by
             `Identification`.
         adds_defaults: whether it is known to serve that file with defaults. Set by `Identification`.
-        is_locating_metadata: whether COMPONENT_METADATA is requested. Set by `Descriptions`.
+        is_requesting_message: whether a message is requested, so that an acknowledgement is awaited. Set by
+            `MessageRequests`.
         has_hash: whether it has a `_HASH_CHECK`; None while unknown. Set by `Sync`.
         is_writing: whether a write is in progress. Set by `Writes`.
         is_fetching: whether a fetch is in progress. Set by `Fetches`.
@@ -45,18 +48,24 @@ class Context:
     target: tuple[int, int]
     send: Callable[[Message], None]
     own: tuple[int, int] = OWN_ADDRESS
-    round_trip: RoundTrip = field(default_factory=RoundTrip)
+    retry: RetryPolicy = field(default_factory=RetryPolicy)
     trace: Trace = silent
     may_send: bool = True
+    reschedule: Callable[[], None] = lambda: None
     autopilot: int | None = None
     is_identifying: bool = False
     may_be_another: bool = False
     serves_file: bool = False
     adds_defaults: bool = False
-    is_locating_metadata: bool = False
+    is_requesting_message: bool = False
     has_hash: bool | None = None
     is_writing: bool = False
     is_fetching: bool = False
+
+    @property
+    def round_trip(self) -> RoundTrip:
+        """The measured round-trip time and packet loss."""
+        return self.retry.round_trip
 
     @property
     def is_px4(self) -> bool:

@@ -40,6 +40,13 @@ class Operation(Generic[Result]):
             self.error = error
             self._end(now)
 
+    def drop_callbacks(self) -> None:
+        """Drop the callbacks: the operation was given up, and its end matters to no caller.
+
+        They refer to the operation, so that without this only a garbage collection would free it.
+        """
+        self.on_done.clear()
+
     def _end(self, now: float) -> None:
         self.done = True
         self.ended_at = now

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 from paramclient.protocol.wire import bears_key, checksum
 
-__all__ = ["FrameCutter", "Seen", "Sniffer"]
+__all__ = ["FrameCutter", "SeenFrame", "Sniffer"]
 
 UNPROVEN_BYTES_MAX: Final = 4096
 """Bytes of a stream without a proven frame that are kept until the following ones arrive."""
@@ -26,7 +26,7 @@ _SIGNED = 0x01
 _SIGNATURE_LENGTH = 13
 
 
-class Seen(NamedTuple):
+class SeenFrame(NamedTuple):
     """One frame.
 
     Attributes:
@@ -70,20 +70,20 @@ class Sniffer:
         self._stream = stream
         self._tail = b""
 
-    def receive(self, data: bytes) -> list[Seen]:
+    def receive(self, data: bytes) -> list[SeenFrame]:
         """Process received bytes and return the frames that are decided by now, in order."""
         seen, rest = self._scan(self._tail + data, final=not self._stream)
         self._tail = rest
         return seen
 
-    def flush(self) -> list[Seen]:
+    def flush(self) -> list[SeenFrame]:
         """Return the frames in the unfinished end: the stream has ended or was interrupted."""
         seen, self._tail = self._scan(self._tail, final=True)
         return seen
 
-    def _scan(self, data: bytes, *, final: bool) -> tuple[list[Seen], bytes]:
+    def _scan(self, data: bytes, *, final: bool) -> tuple[list[SeenFrame], bytes]:
         """Return the frames in `data`, and the undecided bytes at its end."""
-        seen: list[Seen] = []
+        seen: list[SeenFrame] = []
         explained = at = 0
         while (found := _MAGIC(data, at)) is not None:
             at = found.start()
@@ -104,9 +104,9 @@ class Sniffer:
             explained = at
         return seen, data[explained:]
 
-    def _explain(self, gap: bytes) -> list[Seen]:
+    def _explain(self, gap: bytes) -> list[SeenFrame]:
         """Classify the bytes between two proven frames; return the frames that nothing proves."""
-        seen: list[Seen] = []
+        seen: list[SeenFrame] = []
         at = 0
         while at < len(gap):
             frame = _frame_at(gap, at)
@@ -154,14 +154,14 @@ class FrameCutter:
         """Return the frames in the unfinished ends: the link is down, or closed."""
         return [data for peer in list(self._sniffers) for data in self.cut(b"", peer)]
 
-    def _clean(self, frames: list[Seen]) -> list[bytes]:
+    def _clean(self, frames: list[SeenFrame]) -> list[bytes]:
         return [seen.data for seen in frames if not bears_key(seen.data)]
 
 
 _MAGICS = (bytes((_MAGIC_V1,)), bytes((_MAGIC_V2,)))
 
 
-def _frame_at(data: bytes, at: int) -> Seen | None:
+def _frame_at(data: bytes, at: int) -> SeenFrame | None:
     """Return the frame by the header there, proven or not; None without one, or if it is cut off."""
     magic = data[at]
     if magic == _MAGIC_V1 and at + 6 <= len(data):
@@ -170,7 +170,7 @@ def _frame_at(data: bytes, at: int) -> Seen | None:
         known = checksum(message_id, b"") is not None
         whole = size + 8
         frame = data[at : at + whole]
-        return Seen(message_id, system, component, sequence, payload, 1, whole, False, known, frame)
+        return SeenFrame(message_id, system, component, sequence, payload, 1, whole, False, known, frame)
     if magic == _MAGIC_V2 and at + 10 <= len(data):
         size, flags, _, sequence, system, component = data[at + 1 : at + 7]
         message_id = int.from_bytes(data[at + 7 : at + 10], "little")
@@ -179,11 +179,11 @@ def _frame_at(data: bytes, at: int) -> Seen | None:
         known = flags in (0, _SIGNED) and checksum(message_id, b"") is not None
         is_signed = flags == _SIGNED
         frame = data[at : at + whole]
-        return Seen(message_id, system, component, sequence, payload, 2, whole, is_signed, known, frame)
+        return SeenFrame(message_id, system, component, sequence, payload, 2, whole, is_signed, known, frame)
     return None
 
 
-def _is_proven(data: bytes, at: int, frame: Seen) -> bool:
+def _is_proven(data: bytes, at: int, frame: SeenFrame) -> bool:
     crc_at = at + frame.size - 2 - (_SIGNATURE_LENGTH if frame.is_signed else 0)
     return checksum(frame.message_id, data[at + 1 : crc_at]) == int.from_bytes(
         data[crc_at : crc_at + 2], "little"

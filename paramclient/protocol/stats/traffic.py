@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from paramclient.protocol.stats.packet_loss import SequenceCheck
-from paramclient.protocol.stats.sniffer import Seen, Sniffer
+from paramclient.protocol.stats.sniffer import SeenFrame, Sniffer
 from paramclient.protocol.wire import HEARTBEAT_ID, Frame, Heartbeat, decode, message_name
 
 __all__ = ["ComponentTraffic", "MessageTraffic", "RadioStatus", "Traffic", "TrafficReport"]
@@ -207,7 +207,7 @@ class Traffic:
         if self._began is None:
             self._began = now
 
-    def _forget(self, peer: Hashable) -> list[Seen]:
+    def _forget(self, peer: Hashable) -> list[SeenFrame]:
         """Remove a peer's stream; return the frames in its unfinished end."""
         sniffer = self._sniffers.pop(peer)
         seen = sniffer.flush()
@@ -215,7 +215,7 @@ class Traffic:
         self._other_bytes += sniffer.other_bytes
         return seen
 
-    def _count(self, seen: Seen, peer: Hashable, now: float) -> None:
+    def _count(self, seen: SeenFrame, peer: Hashable, now: float) -> None:
         self._frames += 1
         if not seen.is_known:
             self._unknown += 1
@@ -247,7 +247,7 @@ class _Source:
         self._radio: RadioStatus | None = None
         self._late = 0  # of removed peers
 
-    def heard(self, seen: Seen, peer: Hashable, now: float) -> None:
+    def heard(self, seen: SeenFrame, peer: Hashable, now: float) -> None:
         self._heard_at = now
         self._version = seen.version
         self._signed += seen.is_signed
@@ -324,15 +324,15 @@ class _Recently:
 
     def __init__(self) -> None:
         self.total = 0
-        self._slices: deque[list[int]] = deque(maxlen=round(RATE_WINDOW / SLICE))  # number of the slice, sum
+        # number of the slice, sum; the garbage collector visits no tuples of numbers
+        self._slices: deque[tuple[int, int]] = deque(maxlen=round(RATE_WINDOW / SLICE))
 
     def add(self, now: float, amount: int) -> None:
         self.total += amount
         number = int(now / SLICE)
         if self._slices and self._slices[-1][0] == number:
-            self._slices[-1][1] += amount
-        else:
-            self._slices.append([number, amount])
+            amount += self._slices.pop()[1]
+        self._slices.append((number, amount))
 
     def of_late(self, now: float) -> int:
         first = _first_slice(now)

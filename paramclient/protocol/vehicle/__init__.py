@@ -3,7 +3,7 @@
 `boot_time_requests`: requests for SYSTEM_TIME.
 `boot_time_sampling`: reads of clocks in telemetry.
 `claims`: what one peer sends under an address.
-`commands`: COMMAND_LONG.
+`commands`: COMMAND_LONG, and the messages that are requested with it.
 `identification`: identity and parameter encoding.
 `kinds`: autopilots and vehicle types as text.
 `metadata_location`: COMPONENT_METADATA.

@@ -3,31 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import Final
 
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
+from paramclient.protocol.requests.retry import BASELINE_DELAY, CLOCK_FOLLOW_DELAY, ClockSchedule
+from paramclient.protocol.vehicle.commands import MessageRequests
 from paramclient.protocol.vehicle.presence import Presence
-from paramclient.protocol.wire import (
-    MAV_CMD_REQUEST_MESSAGE,
-    SYSTEM_TIME_ID,
-    CommandLong,
-)
+from paramclient.protocol.wire import SYSTEM_TIME_ID
 
 __all__ = ["ClockRequests"]
-
-BASELINE_DELAY: Final = 2.0
-"""Seconds after the identification of a component until its clock is requested: a component with telemetry,
-usually at least one message a second, has sent it by then."""
-REQUEST_INTERVAL: Final = 0.25
-"""Seconds between two requests at first. A booting ArduPilot acknowledges each, and sends SYSTEM_TIME when
-its main loop runs (measured: 1.8 to 2.6 s after it went off)."""
-FAST_REQUESTS_TIME: Final = 6.0
-"""Seconds for which requests are sent at that pace."""
-SLOW_REQUEST_INTERVAL: Final = 1.0
-"""Seconds between two requests after that, while a reboot on command is awaited, and between those for a
-baseline. No caller waits for the baseline, and where 250 lists run at once, the responses are queued behind
-the values."""
 
 
 class ClockRequests(Machine):
@@ -38,21 +22,21 @@ class ClockRequests(Machine):
     COMMAND_ACK names MAV_CMD_REQUEST_MESSAGE and not the message.
 
     Args:
-        context: the component's.
+        context, messages: the component's.
         presence: the component's; its `clock_at` says when its clock was received.
     """
 
     def __init__(
         self,
         context: Context,
+        messages: MessageRequests,
         presence: Presence,
     ) -> None:
         self._context = context
-        self._target = context.target
+        self._messages = messages
         self._presence = presence
-        self._send = context.send
         self._wanted_after = -math.inf  # wanted: a clock received after this
-        self._begun_at = -math.inf
+        self._schedule = ClockSchedule()
         self._request_at = math.inf
         self._is_following = False
 
@@ -62,16 +46,16 @@ class ClockRequests(Machine):
         A component known by one message may be a forged address, whose owner would receive the requests.
         """
         if self._request_at == math.inf:
-            self._begin(-math.inf, now + BASELINE_DELAY)
+            self._begin(-math.inf, ClockSchedule(now + BASELINE_DELAY, is_slow=True))
 
     def want(self, now: float) -> None:
         """Request the clock until it is received, for at most 6 s."""
         if not self._is_following:
-            self._begin(now, now)
+            self._begin(now, ClockSchedule(now))
 
     def follow(self, now: float) -> None:
         """Request the clock again and again: the component was told to reboot."""
-        self._begin(now, now + REQUEST_INTERVAL)
+        self._begin(now, ClockSchedule(now + CLOCK_FOLLOW_DELAY))
         self._is_following = True
 
     def stop_following(self) -> None:
@@ -93,26 +77,23 @@ class ClockRequests(Machine):
         if self.next_deadline() > now:
             return
         is_told = self._presence.clock_at > self._wanted_after
-        is_quick = now < self._begun_at + FAST_REQUESTS_TIME
-        if not self._is_following and (is_told or not is_quick):
+        if not self._is_following and (is_told or self._schedule.is_over(now)):
             self._request_at = math.inf
             return
         is_baseline = self._wanted_after == -math.inf and not self._is_following
-        pace = REQUEST_INTERVAL if is_quick and not is_baseline else SLOW_REQUEST_INTERVAL
+        pace = self._schedule.interval(now)
         self._request_at = now + pace
         if is_baseline and (self._presence.is_lost or self._presence.is_overdue(now)):
             return
         if now - self._presence.clock_at >= pace:  # otherwise its clock is received anyway
-            first = (float(SYSTEM_TIME_ID), *[0.0] * 6)
-            self._send(CommandLong(*self._target, MAV_CMD_REQUEST_MESSAGE, first))
+            self._messages.send(SYSTEM_TIME_ID)
 
     def next_deadline(self) -> float:
         """Return when `tick` is due, or infinity."""
-        is_requesting = self._context.is_identifying or self._context.is_locating_metadata
-        return math.inf if is_requesting else self._request_at
+        return math.inf if self._context.is_requesting_message else self._request_at
 
-    def _begin(self, wanted_after: float, at: float) -> None:
+    def _begin(self, wanted_after: float, schedule: ClockSchedule) -> None:
         if self._context.may_send:
             self._wanted_after = wanted_after
-            self._begun_at = at
-            self._request_at = at
+            self._schedule = schedule
+            self._request_at = schedule.begun_at

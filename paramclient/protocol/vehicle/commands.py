@@ -1,25 +1,59 @@
-"""COMMAND_LONG: retries until COMMAND_ACK reports the result."""
+"""COMMAND_LONG: retries until COMMAND_ACK reports the result, or until a requested message was received.
+
+Everything that MAV_CMD_REQUEST_MESSAGE requests is requested here.
+"""
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from typing import Final
 
 from paramclient.errors import CommandRefused, CommandResult, NoReply
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
-from paramclient.protocol.wire import CommandAck, CommandLong
+from paramclient.protocol.requests.retry import CommandAttempts, MessageAttempts
+from paramclient.protocol.wire import (
+    AUTOPILOT_VERSION_ID,
+    MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
+    MAV_CMD_REQUEST_MESSAGE,
+    CommandAck,
+    CommandLong,
+    message_name,
+)
 
-__all__ = ["Command", "Commands"]
+__all__ = ["Command", "Commands", "MessageRequest", "MessageRequests", "message_requests"]
 
-PROGRESS_TIMEOUT: Final = 10.0
-"""Seconds for which "in progress" is valid: a component repeats it while it works on a command, and then
-reports the result (MAVLink guide, "Command Protocol": the timeout restarts with each)."""
 CONFIRMATIONS_MAX: Final = 255
 """The largest value of the field that counts repetitions."""
+_OTHER_COMMANDS: Final = {AUTOPILOT_VERSION_ID: ((MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, 1.0),)}
+"""Other commands that request a message, each with its first parameter: older firmware knows no
+MAV_CMD_REQUEST_MESSAGE."""
+
+
+def command_long(
+    target: tuple[int, int], number: int, params: tuple[float, ...], confirmation: int = 0
+) -> CommandLong:
+    """Return the message of a command.
+
+    Args:
+        target: system and component.
+        number: MAV_CMD.
+        params: up to seven; the others are 0.
+        confirmation: how often it was sent before.
+    """
+    return CommandLong(*target, number, (*params, *[0.0] * (7 - len(params))), confirmation)
+
+
+def message_requests(target: tuple[int, int], message_id: int) -> tuple[CommandLong, ...]:
+    """Return the commands that request a message, the usual one first.
+
+    For senders without a component, or with a peer of their own; `MessageRequests` sends them to a component.
+    """
+    ways = ((MAV_CMD_REQUEST_MESSAGE, float(message_id)), *_OTHER_COMMANDS.get(message_id, ()))
+    return tuple(command_long(target, number, (first,)) for number, first in ways)
 
 
 class Command(Operation[None]):
@@ -27,20 +61,22 @@ class Command(Operation[None]):
 
     Attributes:
         number: MAV_CMD.
-        params: its seven parameters.
-        repeats: whether it is repeated automatically while it is not acknowledged.
-        attempts: how often it was sent.
-        sent_at: when it was sent last.
+        params: up to seven parameters; the others are 0.
+        request: its attempts.
     """
 
-    def __init__(self, number: int, params: tuple[float, ...], repeats: bool, begun_at: float) -> None:
+    def __init__(
+        self, number: int, params: tuple[float, ...], request: CommandAttempts, begun_at: float
+    ) -> None:
         super().__init__(begun_at)
         self.number = number
         self.params = params
-        self.repeats = repeats
-        self.attempts = 0
-        self.sent_at = math.inf
-        self.progress_at: float | None = None
+        self.request = request
+
+    @property
+    def attempts(self) -> int:
+        """How often it was sent."""
+        return self.request.count
 
 
 class Commands(Machine):
@@ -51,19 +87,13 @@ class Commands(Machine):
     timeout, with `confirmation` counted up, as often as a read would be.
 
     Args:
-        target: the component.
-        own: our system and component: acknowledgements to other addresses are ignored.
-        round_trip: the component's.
-        send: takes each message.
+        context: the component's. Acknowledgements to other stations are ignored.
     """
 
-    def __init__(
-        self,
-        context: Context,
-    ) -> None:
+    def __init__(self, context: Context) -> None:
         self._target = context.target
         self._addressees = (context.own, (0, 0))  # MAVLink 1 and older firmware name no addressee
-        self._round_trip = context.round_trip
+        self._policy = context.retry
         self._send = context.send
         self._queues: dict[int, deque[Command]] = {}
 
@@ -80,7 +110,8 @@ class Commands(Machine):
             repeats: whether to repeat it automatically while it is not acknowledged; otherwise only `repeat`
                 does.
         """
-        command = Command(number, (*params, *[0.0] * (7 - len(params))), repeats, now)
+        request = CommandAttempts(self._policy, repeats=repeats)
+        command = Command(number, params, request, now)
         queue = self._queues.setdefault(number, deque())
         queue.append(command)
         if len(queue) == 1:
@@ -90,9 +121,8 @@ class Commands(Machine):
     def repeat(self, command: Command, now: float) -> None:
         """Send a command in progress once more."""
         confirmation = min(command.attempts, CONFIRMATIONS_MAX)
-        command.attempts += 1
-        command.sent_at = now
-        self._send(CommandLong(*self._target, command.number, command.params, confirmation))
+        command.request.sent(now)
+        self._send(command_long(self._target, command.number, command.params, confirmation))
 
     def cancel(self, command: Command, now: float) -> None:
         """Cancel a command. A sent one cannot be recalled."""
@@ -106,10 +136,9 @@ class Commands(Machine):
         if queue is None or (message.target_system, message.target_component) not in self._addressees:
             return
         command = queue[0]
-        if command.progress_at is None:
-            self._round_trip.answered(command.sent_at, now, command.attempts)
+        command.request.answered(now)
         if message.result == CommandResult.IN_PROGRESS:
-            command.progress_at = now
+            command.request.progress_at = now
             return
         self._leave(command, now)
         if message.result == CommandResult.ACCEPTED:
@@ -121,25 +150,24 @@ class Commands(Machine):
         """Repeat or give up unacknowledged commands."""
         for queue in list(self._queues.values()):
             command = queue[0]
-            if self._due(command) > now:
+            if command.request.due_at > now:
                 continue
-            if command.progress_at is None:
-                self._round_trip.timed_out(command.attempts)
-                if not self._round_trip.is_hopeless(command.attempts, now):
-                    self.repeat(command, now)
-                    continue
-            self._leave(command, now)
-            command.fail(self._no_reply(command, now), now)
+            command.request.timed_out()
+            if command.request.is_hopeless(now):
+                self._leave(command, now)
+                command.fail(self._no_reply(command, now), now)
+            else:
+                self.repeat(command, now)
 
     def next_deadline(self) -> float:
         """Return when `tick` is due, or infinity."""
-        return min((self._due(queue[0]) for queue in self._queues.values()), default=math.inf)
+        return min((queue[0].request.due_at for queue in self._queues.values()), default=math.inf)
 
     def resume(self, now: float) -> None:
         """Repeat commands in progress: the link is back."""
         for queue in self._queues.values():
-            if queue[0].repeats:
-                queue[0].attempts -= 1
+            if queue[0].request.repeats:
+                queue[0].request.uncount()
                 self.repeat(queue[0], now)
 
     def lose(self, now: float, why: str = " (lost)") -> None:
@@ -149,11 +177,6 @@ class Commands(Machine):
     def fail_all(self, error: Exception, now: float) -> None:
         """End all commands with the error."""
         self._end_all(lambda command: error, now)
-
-    def _due(self, command: Command) -> float:
-        if command.progress_at is not None:
-            return command.progress_at + PROGRESS_TIMEOUT
-        return command.sent_at + self._round_trip.timeout if command.repeats else math.inf
 
     def _leave(self, command: Command, now: float) -> None:
         queue = self._queues[command.number]
@@ -174,3 +197,131 @@ class Commands(Machine):
         system, component = self._target
         awaited = f"COMMAND_ACK for command {command.number} from {system}/{component}{why}"
         return NoReply(awaited, attempts=command.attempts, waited=now - command.begun_at)
+
+
+class MessageRequest(Operation[None]):
+    """One message that is requested until it is received; see `MessageRequests`.
+
+    Attributes:
+        message_id: of the message.
+        request: its attempts.
+        refusals: results of the command that end the request with CommandRefused.
+    """
+
+    def __init__(
+        self, message_id: int, request: MessageAttempts, refusals: Container[int], begun_at: float
+    ) -> None:
+        super().__init__(begun_at)
+        self.message_id = message_id
+        self.request = request
+        self.refusals = refusals
+
+
+class MessageRequests(Machine):
+    """The messages that are requested from one component with MAV_CMD_REQUEST_MESSAGE.
+
+    An acknowledgement names the command and not the message. While several messages are requested, it
+    therefore ends none of them.
+
+    Args:
+        context: the component's. Acknowledgements to other stations are ignored.
+    """
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+        self._target = context.target
+        self._addressees = (context.own, (0, 0))  # MAVLink 1 and older firmware name no addressee
+        self._send = context.send
+        self._open: dict[int, MessageRequest] = {}
+
+    def begin(
+        self, message_id: int, request: MessageAttempts, now: float, *, refusals: Container[int] = ()
+    ) -> MessageRequest:
+        """Request a message until it is received, refused or given up; `end` ends that as well.
+
+        A request for this message that is open is replaced.
+
+        Args:
+            message_id: of the message.
+            request: how it is repeated.
+            now: the time.
+            refusals: results of the command that end the request with CommandRefused. After other refusals it
+                is repeated with another command, where there is one.
+        """
+        wanted = MessageRequest(message_id, request, refusals, now)
+        self._open[message_id] = wanted
+        self._context.is_requesting_message = True
+        self.repeat(wanted, now)
+        return wanted
+
+    def repeat(self, wanted: MessageRequest, now: float) -> None:
+        """Send a request in progress once more."""
+        ways = message_requests(self._target, wanted.message_id)
+        was_denied = wanted.request.is_denied
+        wanted.request.sent(now)
+        count = wanted.request.count
+        if was_denied:
+            ways = (ways[(count + 1) % len(ways)],)
+        elif count == 1:
+            ways = ways[:1]
+        for message in ways:  # after silence all: a request or its response may have been lost
+            self._send(message)
+
+    def send(self, message_id: int) -> None:
+        """Request a message once, with every command for it, without waiting for anything."""
+        for message in message_requests(self._target, message_id):
+            self._send(message)
+
+    def end(self, wanted: MessageRequest) -> None:
+        """Request a message no longer."""
+        if self._open.get(wanted.message_id) is wanted:
+            del self._open[wanted.message_id]
+            self._context.is_requesting_message = bool(self._open)
+            self._context.reschedule()  # clock requests wait for it, and no message follows
+
+    def received(self, message_id: int, now: float) -> None:
+        """Process the message: its request has succeeded."""
+        wanted = self._open.get(message_id)
+        if wanted is not None:
+            wanted.request.answered(now)
+            self.end(wanted)
+            wanted.finish(None, now)
+
+    def acknowledged(self, message: CommandAck, now: float) -> None:
+        """Process a COMMAND_ACK."""
+        if (message.target_system, message.target_component) not in self._addressees:
+            return
+        is_clear = len(self._open) == 1
+        for wanted in list(self._open.values()):
+            ways = message_requests(self._target, wanted.message_id)
+            if message.command not in [way.command for way in ways]:
+                continue
+            if message.result in wanted.refusals and is_clear:
+                wanted.request.answered(now)
+                self.end(wanted)
+                wanted.fail(CommandRefused(*self._target, message.command, message.result), now)
+            elif message.result == CommandResult.ACCEPTED:
+                wanted.request.accepted(now)
+            else:
+                wanted.request.denied(now)
+
+    def tick(self, now: float) -> None:
+        """Repeat or give up requests without a response."""
+        for wanted in list(self._open.values()):
+            if wanted.request.due_at > now:
+                continue
+            wanted.request.timed_out()
+            if wanted.request.is_hopeless(now):
+                self.end(wanted)
+                system, component = self._target
+                what = f"{message_name(wanted.message_id)} of {system}/{component}"
+                waited = now - wanted.begun_at
+                wanted.fail(NoReply(what, attempts=wanted.request.count, waited=waited), now)
+            else:
+                self.repeat(wanted, now)
+
+    def next_deadline(self) -> float:
+        """Return when `tick` is due, or infinity."""
+        if not self._open:
+            return math.inf
+        return min(wanted.request.due_at for wanted in self._open.values())

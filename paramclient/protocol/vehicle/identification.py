@@ -10,6 +10,8 @@ from paramclient.model.identity import Identity
 from paramclient.model.values import Encoding
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
+from paramclient.protocol.requests.retry import VersionAttempts
+from paramclient.protocol.vehicle.commands import MessageRequest, MessageRequests
 from paramclient.protocol.wire import (
     AUTOPILOT_VERSION_ID,
     CAPABILITY_FTP,
@@ -18,13 +20,8 @@ from paramclient.protocol.wire import (
     MAV_AUTOPILOT_ARDUPILOTMEGA,
     MAV_AUTOPILOT_INVALID,
     MAV_AUTOPILOT_PX4,
-    MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
-    MAV_CMD_REQUEST_MESSAGE,
-    MAV_RESULT_ACCEPTED,
     MAV_TYPE_GCS,
     AutopilotVersion,
-    CommandAck,
-    CommandLong,
     Heartbeat,
     HighLatency2,
 )
@@ -36,30 +33,11 @@ PX4_WITH_FILE: Final = 0x01120000
 ARDUPILOT_WITH_DEFAULTS: Final = 0x04040000
 """flight_sw_version of the first ArduPilot of which every build adds the defaults to that file: 4.4. They
 were added during the development of 4.3."""
-VERSION_ATTEMPTS: Final = 4
-"""Requests for AUTOPILOT_VERSION where nothing is known of the link, or after a refusal; many components
-(cameras, radios) never send one."""
 HEARTBEAT_WAIT: Final = 3.0
 """Seconds for which the encoding stays open after a version without encoding bits and before a heartbeat:
 autopilots send one every second."""
 ENCODING_CAPABILITIES: Final = CAPABILITY_PARAM_ENCODE_BYTEWISE | CAPABILITY_PARAM_ENCODE_C_CAST
 """The capability bits that tell the encoding."""
-VERSION_DELAY: Final = 0.1
-"""Seconds between the acknowledgement of the request and AUTOPILOT_VERSION; later, it counts as lost."""
-DOUBT_TIME_MIN: Final = 5.0
-"""Seconds, at least, for which a component that has sent it before is asked again: it may be booting."""
-DOUBT_REQUEST_INTERVAL: Final = 1.0
-"""Seconds between two requests after the usual number of them."""
-LATER_REQUEST_INTERVAL: Final = 5.0
-"""Seconds between two requests to a component that has sent its hardware id before and did not in that time,
-while it is not lost: its radio may have received nothing."""
-
-
-_COMMANDS: Final = (
-    (MAV_CMD_REQUEST_MESSAGE, float(AUTOPILOT_VERSION_ID)),
-    (MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, 1.0),
-)
-"""The commands that request AUTOPILOT_VERSION, and their first parameters."""
 
 
 def judge_encoding(
@@ -93,10 +71,14 @@ def judge_encoding(
 class Identification(Machine):
     """Follows a component's heartbeat, requests its AUTOPILOT_VERSION, and derives identity and encoding.
 
+    Args:
+        context, messages: the component's.
+        link: the link's name.
+        chosen: the encoding that the user has chosen, or None.
+
     Attributes:
         identity: the vehicle's identity; without a hardware id until AUTOPILOT_VERSION is received.
         known_at: when the version was received; minus infinity before.
-        attempts: requests since the identity was open.
         doubted_at: since when the identity is in doubt; minus infinity before the first doubt.
         settled: whether `identity` is as complete as it gets: the version was received, or never will be.
         autopilot, vehicle_type: of the heartbeat; None before the first.
@@ -106,13 +88,15 @@ class Identification(Machine):
     def __init__(
         self,
         context: Context,
+        messages: MessageRequests,
         link: str,
         chosen: Encoding | None,
     ) -> None:
         self._context = context
         self._target = context.target
-        self._round_trip = context.round_trip
-        self._send = context.send
+        self._messages = messages
+        self._attempts = VersionAttempts(context.retry)
+        self._request: MessageRequest | None = None
         self._chosen = chosen
         self._may_ask = context.may_send
         self.identity = Identity(context.target[0], link)
@@ -121,12 +105,7 @@ class Identification(Machine):
         self.autopilot: int | None = None
         self.vehicle_type: int | None = None
         self.capabilities: int | None = None
-        self.attempts = 0
         self.doubted_at = -math.inf
-        self._asked_at = -math.inf
-        self._asks_until = -math.inf  # regardless of the number of requests
-        self._denied_at = math.inf  # when the last of the commands was refused
-        self._lost_at = math.inf  # when the acknowledged response counts as lost
         self._beat_awaited_until = math.inf  # while a heartbeat may still tell the encoding
         self._heard_at = -math.inf
         self._was_doubted = False  # since the last version
@@ -134,14 +113,9 @@ class Identification(Machine):
         self._derive()
 
     @property
-    def was_away(self) -> bool:
-        """Whether another vehicle may have taken its place since the identification, or has and is being
-        identified."""
-        return self._context.may_be_another
-
-    @was_away.setter
-    def was_away(self, was_away: bool) -> None:
-        self._context.may_be_another = was_away
+    def attempts(self) -> int:
+        """Requests since the identity was open."""
+        return self._attempts.count
 
     @property
     def has_parameters(self) -> bool:
@@ -187,12 +161,12 @@ class Identification(Machine):
     def is_unconfirmed(self) -> bool:
         """Whether another vehicle may have taken its place, and its identity was requested without
         success."""
-        return self.was_away and not self._context.is_identifying and self._may_ask
+        return self._context.may_be_another and not self._context.is_identifying and self._may_ask
 
     @property
     def may_be_written(self) -> bool:
         """Whether it is certain which vehicle receives a write, and in which encoding."""
-        return self.encoding_is_certain and not self.was_away
+        return self.encoding_is_certain and not self._context.may_be_another
 
     @property
     def has_spoken(self) -> bool:
@@ -231,13 +205,12 @@ class Identification(Machine):
     def doubt(self, now: float) -> None:
         """Request the identity again: the component was lost, or has rebooted."""
         if self.has_parameters:
-            is_open = self._may_ask and (self.settled or self.was_away)
-            self.was_away = self.identity.uid is not None or is_open
+            is_open = self._may_ask and (self.settled or self._context.may_be_another)
+            self._context.may_be_another = self.identity.uid is not None or is_open
             self._was_doubted = self._was_doubted or self.settled
-            self.attempts = 0
             self.doubted_at = now
             if self.identity.uid is not None:
-                self._asks_until = now + DOUBT_TIME_MIN
+                self._attempts.insist(now)
             self._ask(now)
 
     def forget(self, now: float) -> None:
@@ -249,11 +222,10 @@ class Identification(Machine):
         self.autopilot = self.vehicle_type = self.capabilities = None
         self._beat_awaited_until = math.inf
         self._derive()
-        self.was_away = True
+        self._context.may_be_another = True
         self._was_doubted = False
-        self.attempts = 0
         self.doubted_at = now
-        self._asks_until = now + DOUBT_TIME_MIN
+        self._attempts.insist(now)
         self._ask(now)
 
     def version(self, message: AutopilotVersion, now: float) -> bool:
@@ -263,9 +235,8 @@ class Identification(Machine):
         replaced, and with any after a time in which the identity was in doubt.
         """
         was_unconfirmed = self.is_unconfirmed
-        if self._context.is_identifying:
-            self._round_trip.answered(self._asked_at, now, self.attempts)
-        self._context.is_identifying = self.was_away = False
+        self._messages.received(AUTOPILOT_VERSION_ID, now)
+        self._context.is_identifying = self._context.may_be_another = False
         system, _ = self._target
         before = self.identity
         self.identity = Identity.from_version(
@@ -296,79 +267,46 @@ class Identification(Machine):
     def ask_again(self, now: float) -> None:
         """Request the identity again, if it was ever received: another vehicle may have taken the address."""
         if self.identity.uid is not None and not self._context.is_identifying:
-            self.attempts = 0
             self._ask(now)
 
     def lose(self, now: float) -> None:
         """Stop requests to an identified component until it is heard again; other requests continue."""
-        if self.settled:
+        if self.settled and self._request is not None:
+            self._messages.end(self._request)
             self._context.is_identifying = False
 
-    def acknowledged(self, message: CommandAck, now: float) -> None:
-        """Process a COMMAND_ACK: after a refusal the other command is sent at once.
-
-        An accepted request is followed by the version at once, or the version was lost.
-        """
-        asked = (MAV_CMD_REQUEST_MESSAGE, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES)
-        if self._context.is_identifying and message.command in asked:
-            if message.result != MAV_RESULT_ACCEPTED:
-                self._denied_at = now
-            else:
-                self._lost_at = min(self._lost_at, now + VERSION_DELAY)
-
     def tick(self, now: float) -> None:
-        """Repeat the request, or give up."""
+        """Request the identity later once more, and stop waiting for a heartbeat."""
         if self._beat_awaited_until <= now:
             self._beat_awaited_until = math.inf
-        if self._next_request_at() <= now:
-            self._ask(now)
+        if self._later_at <= now:
+            self._attempts.sent_later(now)
+            self._messages.send(AUTOPILOT_VERSION_ID)
 
     def next_deadline(self) -> float:
         """Return when `tick` is due, or infinity."""
-        return min(self._next_request_at(), self._beat_awaited_until)
-
-    def _next_request_at(self) -> float:
-        """Return when to repeat the request, or infinity; it depends on the measured round trip."""
-        if self.is_unconfirmed:
-            return self._asked_at + LATER_REQUEST_INTERVAL if self._heard_at > self._asked_at else math.inf
-        if not self._context.is_identifying:
-            return math.inf
-        pause = self._round_trip.repeat_timeout(self.attempts)
-        if self.attempts >= self._tries and self._asked_at < self._asks_until:
-            pause = max(pause, DOUBT_REQUEST_INTERVAL)
-        return min(self._denied_at, self._lost_at, self._asked_at + pause)
+        return min(self._later_at, self._beat_awaited_until)
 
     @property
-    def _tries(self) -> int:
-        is_blind = self._round_trip.smoothed is None or self._denied_at < math.inf
-        return VERSION_ATTEMPTS if is_blind else self._round_trip.tries
+    def _later_at(self) -> float:
+        """When to request the identity after it was requested without success, or infinity."""
+        is_due = self.is_unconfirmed and self._heard_at > self._attempts.sent_at
+        return self._attempts.later_at if is_due else math.inf
 
     def _ask(self, now: float) -> None:
-        if not self._may_ask:
-            return
-        if self.is_unconfirmed and self.attempts:
-            self._request(now, _COMMANDS)
-            return
-        if self.attempts >= self._tries and now >= self._asks_until:
-            self._context.is_identifying = False
-            self.settled = True
-            self.was_away = self.was_away and self.identity.uid is not None
-            return
-        was_refused = self._denied_at < math.inf
-        self.attempts += 1
-        self._context.is_identifying = True
-        ways: tuple[tuple[int, float], ...] = _COMMANDS
-        if was_refused:
-            ways = (_COMMANDS[(self.attempts + 1) % 2],)
-        elif self.attempts == 1:
-            ways = _COMMANDS[:1]
-        self._request(now, ways)  # after silence both: a request or its response may have been lost
+        """Begin to request the identity, or begin again."""
+        self._attempts.restart()
+        if self._may_ask:
+            self._context.is_identifying = True
+            request = self._request = self._messages.begin(AUTOPILOT_VERSION_ID, self._attempts, now)
+            request.on_done.append(self._ended)
 
-    def _request(self, now: float, ways: tuple[tuple[int, float], ...]) -> None:
-        self._asked_at = now
-        self._denied_at = self._lost_at = math.inf
-        for command, first in ways:
-            self._send(CommandLong(*self._target, command, (first, *[0.0] * 6)))
+    def _ended(self) -> None:
+        """Process the end of the request: the version was received, or never will be."""
+        self._context.is_identifying = False
+        if self._request is not None and self._request.error is not None:
+            self.settled = True
+            self._context.may_be_another = self._context.may_be_another and self.identity.uid is not None
 
     def _derive(self) -> None:
         """Derive encoding and identity from what the component has sent."""

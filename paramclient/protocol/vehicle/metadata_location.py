@@ -6,20 +6,15 @@ MAV_CMD_REQUEST_MESSAGE requests COMPONENT_METADATA, which names a general file;
 
 from __future__ import annotations
 
-import math
 from typing import Final
 
 from paramclient.errors import CommandResult, NoReply
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
-from paramclient.protocol.wire import (
-    COMPONENT_METADATA_ID,
-    MAV_CMD_REQUEST_MESSAGE,
-    CommandAck,
-    CommandLong,
-    ComponentMetadata,
-)
+from paramclient.protocol.requests.retry import MessageAttempts
+from paramclient.protocol.vehicle.commands import MessageRequest, MessageRequests
+from paramclient.protocol.wire import COMPONENT_METADATA_ID, ComponentMetadata
 
 __all__ = ["DescriptionAsk", "Descriptions"]
 
@@ -31,33 +26,32 @@ class DescriptionAsk(Operation[ComponentMetadata | None]):
     """One request for the general file; its result is None where the component has none.
 
     Attributes:
-        attempts: requests sent.
+        request: its attempts, shared with parallel requests.
     """
 
-    def __init__(self, begun_at: float) -> None:
+    def __init__(self, request: MessageAttempts, begun_at: float) -> None:
         super().__init__(begun_at)
-        self.attempts = 0
+        self.request = request
+
+    @property
+    def attempts(self) -> int:
+        """Requests sent."""
+        return self.request.count
 
 
 class Descriptions(Machine):
     """Requests COMPONENT_METADATA of a component until it is received, refused or given up.
 
     Args:
-        context: the component's. While AUTOPILOT_VERSION is requested with the same command, a refusal is not
-            taken for one of COMPONENT_METADATA.
+        context, messages: the component's.
     """
 
-    def __init__(
-        self,
-        context: Context,
-    ) -> None:
-        self._context = context
+    def __init__(self, context: Context, messages: MessageRequests) -> None:
         self._target = context.target
-        self._own = context.own
-        self._round_trip = context.round_trip
-        self._send = context.send
+        self._policy = context.retry
+        self._messages = messages
         self._asks: list[DescriptionAsk] = []
-        self._asked_at = -math.inf
+        self._request: MessageRequest | None = None
 
     @property
     def is_asking(self) -> bool:
@@ -66,49 +60,28 @@ class Descriptions(Machine):
 
     def ask(self, now: float) -> DescriptionAsk:
         """Request the message; give the request back with `release`. Parallel requests share the response."""
-        ask = DescriptionAsk(now)
+        request = self._request
+        if request is None:
+            request = self._request = self._messages.begin(
+                COMPONENT_METADATA_ID, MessageAttempts(self._policy), now, refusals=NOT_SUPPORTED
+            )
+            request.on_done.append(self._ended)
+        ask = DescriptionAsk(request.request, now)
         self._asks.append(ask)
-        self._context.is_locating_metadata = True
-        if len(self._asks) == 1:
-            self._request(now)
-        else:
-            ask.attempts = self._asks[0].attempts
         return ask
 
     def release(self, ask: DescriptionAsk) -> None:
         """Give a request back."""
         if ask in self._asks:
             self._asks.remove(ask)
-            self._context.is_locating_metadata = self.is_asking
+            if not self._asks:
+                self._end()
 
     def heard(self, message: ComponentMetadata, now: float) -> None:
         """Process COMPONENT_METADATA; an empty address means none."""
-        if self._asks:
-            self._round_trip.answered(self._asked_at, now, self._asks[0].attempts)
-            self._finish(message if message.uri else None, now)
-
-    def acknowledged(self, message: CommandAck, now: float) -> None:
-        """Process a COMMAND_ACK: a refusal ends the request with None."""
-        is_ours = (message.target_system, message.target_component) in (self._own, (0, 0))
-        is_meant = message.command == MAV_CMD_REQUEST_MESSAGE and is_ours and not self._context.is_identifying
-        if self._asks and is_meant and message.result in NOT_SUPPORTED:
-            self._round_trip.answered(self._asked_at, now, self._asks[0].attempts)
-            self._finish(None, now)
-
-    def tick(self, now: float) -> None:
-        """Repeat the request, or give up."""
-        if self.next_deadline() > now:
-            return
-        first = self._asks[0]
-        self._round_trip.timed_out(first.attempts)
-        if self._round_trip.is_hopeless(first.attempts, now):
-            self._give_up("", now)
-        else:
-            self._request(now)
-
-    def next_deadline(self) -> float:
-        """Return when `tick` is due, or infinity."""
-        return self._asked_at + self._round_trip.timeout if self._asks else math.inf
+        self._messages.received(COMPONENT_METADATA_ID, now)
+        for ask in self._end():
+            ask.finish(message if message.uri else None, now)
 
     def lose(self, now: float) -> None:
         """End the request with NoReply: the component is lost."""
@@ -116,32 +89,34 @@ class Descriptions(Machine):
 
     def resume(self, now: float) -> None:
         """Repeat the request: the link is back."""
-        if self._asks:
-            self._request(now)
+        if self._request is not None:
+            self._messages.repeat(self._request, now)
 
     def fail_all(self, error: Exception, now: float) -> None:
         """End the request with the error."""
-        asks, self._asks = self._asks, []
-        self._context.is_locating_metadata = False
-        for ask in asks:
+        for ask in self._end():
             ask.fail(error, now)
+
+    def _ended(self) -> None:
+        """Process the end of the request without the message: a refusal ends it with None."""
+        request = self._request
+        if request is None or request.error is None:
+            return
+        if isinstance(request.error, NoReply):
+            self._give_up("", request.ended_at)
+        else:
+            for ask in self._end():
+                ask.finish(None, request.ended_at)
 
     def _give_up(self, why: str, now: float) -> None:
         what = f"COMPONENT_METADATA of {self._target[0]}/{self._target[1]}{why}"
-        asks, self._asks = self._asks, []
-        self._context.is_locating_metadata = False
-        for ask in asks:
+        for ask in self._end():
             ask.fail(NoReply(what, attempts=ask.attempts, waited=now - ask.begun_at), now)
 
-    def _request(self, now: float) -> None:
-        self._asked_at = now
-        for ask in self._asks:
-            ask.attempts += 1
-        first = (float(COMPONENT_METADATA_ID), *[0.0] * 6)
-        self._send(CommandLong(*self._target, MAV_CMD_REQUEST_MESSAGE, first))
-
-    def _finish(self, result: ComponentMetadata | None, now: float) -> None:
+    def _end(self) -> list[DescriptionAsk]:
+        """End the request and return the open asks."""
         asks, self._asks = self._asks, []
-        self._context.is_locating_metadata = False
-        for ask in asks:
-            ask.finish(result, now)
+        request, self._request = self._request, None
+        if request is not None:
+            self._messages.end(request)
+        return asks

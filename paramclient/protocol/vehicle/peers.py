@@ -9,14 +9,13 @@ from typing import Final, Protocol
 
 from paramclient.errors import ContestedAddress
 from paramclient.protocol.addresses import Peer
+from paramclient.protocol.requests.retry import PEER_RECHECKS, PEER_REQUESTS
 from paramclient.protocol.vehicle.claims import Claim, Verdict, compare, compare_in_turn
+from paramclient.protocol.vehicle.commands import message_requests
 from paramclient.protocol.vehicle.presence import LOST_AFTER, Presence
 from paramclient.protocol.wire import (
     AUTOPILOT_VERSION_ID,
-    MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
-    MAV_CMD_REQUEST_MESSAGE,
     SYSTEM_TIME_ID,
-    CommandLong,
     Message,
 )
 
@@ -25,20 +24,8 @@ __all__ = ["NO_PEER", "ComponentPeers", "Contest", "Host"]
 CLAIMS_MAX: Final = 8
 """Further peers that are followed for one component. Others are ignored until one of these has been silent
 for the heartbeat timeout."""
-IDENTITY_REQUESTS_MAX: Final = 4
-"""Identity requests to a further peer."""
-IDENTITY_REQUEST_PAUSES: Final = (0.5, 1.0, 1.5, 2.0)
-"""Seconds after each of them: 5 s in all, in which a radio with a round trip of 1 s and a packet loss of one
-half responds in three of four cases."""
-LATER_REQUEST_PAUSE: Final = 5.0
-"""Seconds between further requests to a peer that contests the address without a known difference: its radio
-may have received nothing. Not more often, as the peer may also be unrelated."""
-IDENTIFICATION_TIME: Final = sum(IDENTITY_REQUEST_PAUSES)
-"""Seconds until a further peer must have shown its identity where no request can be sent."""
 REVIEW_INTERVAL: Final = 0.25
 """Seconds between two reviews of the peers of a component with several."""
-RECHECK_INTERVAL: Final = 1.0
-"""Seconds between two requests for the hardware id of a peer that has just sent two different ones."""
 UID_GRACE: Final = 0.25
 """Seconds in which the peer with the address may still send its hardware id after another one was faster:
 over two paths to one vehicle the same message arrives twice."""
@@ -94,6 +81,10 @@ class Host(Protocol):
     @property
     def is_identified(self) -> bool:
         """Whether its identity is settled and not being requested."""
+
+    @abstractmethod
+    def reschedule(self) -> None:
+        """Take that `next_deadline` has changed."""
 
     @abstractmethod
     def read_clock(self, now: float) -> None:
@@ -216,6 +207,7 @@ class ComponentPeers:
             self.home = self.speaker = NO_PEER
             self.has_left = True
             self._look_at = min(self._look_at, now)
+            self._host.reschedule()
 
     def forget(self) -> None:
         """Forget all peers: the link is down, and comes back with other peers."""
@@ -261,6 +253,7 @@ class ComponentPeers:
                 return None
             claim = self._others[peer] = Claim(peer, now)
             self._look_at = now
+            self._host.reschedule()
         claim.heard_at = now
         return claim
 
@@ -288,6 +281,7 @@ class ComponentPeers:
         self._decide(difference, now)
         is_settled = not self._others and not self.is_unclear
         self._look_at = math.inf if is_settled else now + REVIEW_INTERVAL
+        self._host.reschedule()
 
     def _judge(self, claim: Claim, now: float) -> str:
         """Compare a further peer with the one that has the address; return the difference as text."""
@@ -301,7 +295,7 @@ class ComponentPeers:
             mine.uid.current,
         )
         is_unproven = claim.verdict is Verdict.OPEN or (claim.verdict is Verdict.OTHER and tells_nothing_else)
-        if is_unproven and self._may_ask and now >= claim.asked_at + _pause_after(claim.asks):
+        if is_unproven and self._may_ask and now >= claim.asked_at + PEER_REQUESTS.pause_after(claim.asks):
             claim.asks += 1
             self._ask(claim, now)
             self._host.read_clock(now)
@@ -313,11 +307,8 @@ class ComponentPeers:
     def _is_over(self, claim: Claim, now: float) -> bool:
         """Return whether everything was done to identify a further peer."""
         if not self._may_ask:
-            return now >= claim.first_at + IDENTIFICATION_TIME
-        has_had_all = (
-            claim.asks == IDENTITY_REQUESTS_MAX and now >= claim.asked_at + IDENTITY_REQUEST_PAUSES[-1]
-        )
-        return claim.asks > IDENTITY_REQUESTS_MAX or has_had_all
+            return now >= claim.first_at + PEER_REQUESTS.duration
+        return PEER_REQUESTS.is_over(claim.asks, claim.asked_at, now)
 
     def _decide(self, difference: str, now: float) -> None:
         """Begin a contest, or end it."""
@@ -439,32 +430,20 @@ class ComponentPeers:
         """Request identity and boot time from a peer."""
         claim.asked_at = now
         if claim.uid.current is None:
-            self._request(claim, AUTOPILOT_VERSION_ID)
-            if claim.asks > 1:
-                ask = CommandLong(*self._target, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, (1.0, *[0.0] * 6))
-                self._host.send_to(ask, claim.peer)
+            self._request(claim, AUTOPILOT_VERSION_ID, also_otherwise=claim.asks > 1)
         self._request(claim, SYSTEM_TIME_ID)
 
     def _ask_again(self, claim: Claim, now: float) -> None:
         """Request the hardware id of the peer with the address, which has just sent two."""
-        if self._may_ask and now >= claim.asked_at + RECHECK_INTERVAL:
+        if self._may_ask and now >= claim.asked_at + PEER_RECHECKS.later:
             claim.asked_at = now
             self._request(claim, AUTOPILOT_VERSION_ID)
 
-    def _request(self, claim: Claim, message_id: int) -> None:
-        command = CommandLong(*self._target, MAV_CMD_REQUEST_MESSAGE, (float(message_id), *[0.0] * 6))
-        self._host.send_to(command, claim.peer)
-
-
-def _pause_after(asks: int) -> float:
-    """Return the seconds until the next request, by the number of requests so far."""
-    return (
-        0.0
-        if not asks
-        else IDENTITY_REQUEST_PAUSES[asks - 1]
-        if asks < IDENTITY_REQUESTS_MAX
-        else LATER_REQUEST_PAUSE
-    )
+    def _request(self, claim: Claim, message_id: int, *, also_otherwise: bool = False) -> None:
+        """Request a message from a peer, also with the other commands for it if that is wanted."""
+        ways = message_requests(self._target, message_id)
+        for message in ways if also_otherwise else ways[:1]:
+            self._host.send_to(message, claim.peer)
 
 
 def _preference(claim: Claim) -> tuple[bool, float]:

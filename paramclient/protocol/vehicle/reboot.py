@@ -11,6 +11,7 @@ from paramclient.model.identity import Identity
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
+from paramclient.protocol.requests.retry import REBOOT_IDENTITY_REQUESTS
 from paramclient.protocol.vehicle.boot_time_requests import ClockRequests
 from paramclient.protocol.vehicle.commands import Command, Commands
 from paramclient.protocol.vehicle.identification import Identification
@@ -22,13 +23,6 @@ __all__ = ["Restart", "Restarts"]
 SAVING_TIME: Final = 2.5
 """Seconds from a write until the value survives a reboot: PX4 saves changed parameters up to 2 s later (its
 `param_autosave` waits 0.3 s, and saves at most every 2 s)."""
-SHUTDOWN_TIME_MAX: Final = 1.0
-"""Seconds after the command: a component that still sends heartbeats then has not executed it. PX4 goes down
-0.4 s after it has accepted, ArduPilot 0.2 s (their sources), and neither boots in so little time."""
-FIRST_HEARTBEAT_GRACE: Final = 0.5
-"""Seconds after such a heartbeat in which a clock may show that it was the first after a boot."""
-COMMANDS_MAX: Final = 5
-"""Unanswered commands to a component that is heard all the time."""
 CLOCK_TIMEOUT: Final = 2.5
 """Seconds after a silence in which SYSTEM_TIME, where the component sends it, shows the cause of the
 silence."""
@@ -44,8 +38,6 @@ all the time."""
 UNOBSERVED_TIMEOUT: Final = 10.0
 """Seconds after which an accepted reboot counts as done where nothing can show it: the component is heard
 without a gap, sends no clock, and no MAV_STATE_BOOT."""
-REBOOT_IDENTITY_INTERVAL: Final = 1.0
-"""Seconds between two identity requests to a component that is back."""
 
 
 class Restarts(Machine):
@@ -193,7 +185,6 @@ class Restart(Operation[None]):
         self._commands = commands
         self._who = who
         self._presence = presence
-        self._round_trip = context.round_trip
         self._saved_at = saved_at
         self._restarted = restarted
         self._clock_requests = clock_requests
@@ -254,7 +245,7 @@ class Restart(Operation[None]):
         command = self._command
         if command is None or self._back_at is not None:
             return
-        if min(silence, now - command.sent_at) >= self._presence.gap:
+        if min(silence, now - command.request.sent_at) >= self._presence.gap:
             self._heard_again_at = now
 
     def another(self, now: float) -> None:
@@ -289,19 +280,17 @@ class Restart(Operation[None]):
             if self._has_said_who(self._back_at):
                 return -math.inf, self._compare
             return (math.inf if who.is_asking else self._ask_at), self._ask
-        if self._clock_shows_it(command.sent_at):
+        if self._clock_shows_it(command.request.sent_at):
             return -math.inf, self._restarted
         if self._heard_again_at is not None:
             return self._heard_again_at + CLOCK_TIMEOUT, self._judge_silence
         if self._accepted_at is not None:
             due = max(self._accepted_at, presence.clock_at) + UNOBSERVED_TIMEOUT
             return (math.inf if presence.is_lost else due), self._restarted
-        if presence.beat_at >= command.sent_at + SHUTDOWN_TIME_MAX:
-            due = max(presence.beat_at + FIRST_HEARTBEAT_GRACE, command.sent_at + self._round_trip.timeout)
-            if self._numbering_began_at >= max(command.sent_at, presence.clock_at):
-                due = max(due, self._numbering_began_at + CLOCK_TIMEOUT)  # may have executed it
-            return due, self._repeat
-        return math.inf, self._repeat
+        due = command.request.reboot_due_at(presence.beat_at)
+        if self._numbering_began_at >= max(command.request.sent_at, presence.clock_at):
+            due = max(due, self._numbering_began_at + CLOCK_TIMEOUT)  # may have executed it
+        return due, self._repeat
 
     def _begin(self, now: float) -> None:
         self._before = self._who.identity
@@ -327,7 +316,7 @@ class Restart(Operation[None]):
     def _repeat(self, now: float) -> None:
         command = self._command
         assert command is not None
-        if command.done or command.attempts >= COMMANDS_MAX:
+        if command.done or command.request.is_reboot_hopeless:
             self.fail(NoReply(self.stage, attempts=command.attempts, waited=now - self.begun_at), now)
         else:
             self._commands.repeat(command, now)
@@ -347,7 +336,7 @@ class Restart(Operation[None]):
         return self._started_before is None or started_at >= self._started_before + BOOT_TIME_STEP
 
     def _ask(self, now: float) -> None:
-        self._ask_at = now + REBOOT_IDENTITY_INTERVAL
+        self._ask_at = now + REBOOT_IDENTITY_REQUESTS.later
         self._who.doubt(now)
 
     def _has_said_who(self, since: float) -> bool:

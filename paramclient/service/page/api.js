@@ -1,34 +1,34 @@
-/** The service: requests, and its stream of events. */
+/** Requests to the service, and its event stream. */
 
-/** What this page calls itself with every write, so that it knows its own changes among those of others. */
+/** Value of X-Asker in every request: the page recognizes its own changes by it. */
 export const ASKER = `page-${crypto.getRandomValues(new Uint16Array(1))[0].toString(16).padStart(4, "0")}`;
 const BASE = "/api/v1";
-const PATIENCE = 15_000;
+const REQUEST_TIMEOUT = 15_000;
 const PULSE = 10_000;
 const LONGEST_PAUSE = 10_000;
 const KINDS = ["hello", "component", "change", "params", "resynced", "progress", "job", "link", "gap"];
 
-/** What the service said went wrong, in a sentence; `status` 0 is a service that could not be reached. */
+/** An error of the service, with its text; `status` is 0 if the service cannot be reached. */
 export class Problem extends Error {
   constructor(status, document) {
     super(
       document?.detail ||
         document?.title ||
-        (status ? `The service answered ${status}.` : "The service cannot be reached."),
+        (status ? `The service responded with status ${status}.` : "The service cannot be reached."),
     );
     this.status = status;
     this.document = document ?? {};
   }
 }
 
-let askForToken = () => Promise.reject(new Problem(401, { detail: "A token is needed." }));
+let askForToken = () => Promise.reject(new Problem(401, { detail: "A token is required." }));
 
-/** Says who is asked for a token when the service wants one; what it gives ends when the page has it. */
+/** Sets the function that asks the user for a token; it resolves when the session has started. */
 export function onToken(ask) {
   askForToken = ask;
 }
 
-/** The address of a component's resource; of one that is in the cache alone (`is_kept`), of what is kept there. */
+/** Returns the path of a component's resource; for a component only in the cache (`is_kept`), that of its cached data. */
 export function at(component, what = "", query = {}) {
   if (component.is_kept) {
     const search = new URLSearchParams(query);
@@ -39,28 +39,28 @@ export function at(component, what = "", query = {}) {
 }
 
 /**
- * A request. Gives the JSON of the answer, or null where there is none. `body` is sent as JSON, a File as it is.
- * Where a token is wanted, the person is asked and the request made again.
+ * Sends a request and returns the JSON of the response, or null. `body` is sent as JSON, a File unchanged. If a token
+ * is required, asks the user and repeats the request.
  */
-export async function request(method, address, body, { patience = PATIENCE } = {}) {
-  const answer = await exchange(method, address, body, patience);
+export async function request(method, address, body, { timeout = REQUEST_TIMEOUT } = {}) {
+  const answer = await exchange(method, address, body, timeout);
   return isJson(answer) ? answer.json() : null;
 }
 
 export const get = (address) => request("GET", address);
 
-/** A file that is to be saved: its name and its content. */
-export async function download(address, patience) {
-  const answer = await exchange("GET", address, undefined, patience);
+/** Requests a file to save: its name and content. */
+export async function download(address, timeout) {
+  const answer = await exchange("GET", address, undefined, timeout);
   const [, name] = /filename="?([^";]+)/.exec(answer.headers.get("content-disposition") ?? "") ?? [];
   return { name: name ?? "parameters", content: await answer.blob() };
 }
 
 const isJson = (answer) => answer.status !== 204 && (answer.headers.get("content-type") ?? "").includes("json");
 
-async function exchange(method, address, body, patience) {
+async function exchange(method, address, body, timeout) {
   for (;;) {
-    const answer = await attempt(method, address, body, patience);
+    const answer = await attempt(method, address, body, timeout);
     if (answer.ok) return answer;
     if (answer.status !== 401 || address === "/session")
       throw new Problem(answer.status, isJson(answer) ? readable(await answer.json()) : null);
@@ -68,8 +68,8 @@ async function exchange(method, address, body, patience) {
   }
 }
 
-async function attempt(method, address, body, patience) {
-  const ends = AbortSignal.timeout(patience);
+async function attempt(method, address, body, timeout) {
+  const ends = AbortSignal.timeout(timeout);
   const options = { method, signal: ends, headers: { "X-Asker": ASKER }, cache: "no-store" };
   if (body instanceof Blob) {
     options.body = body;
@@ -81,20 +81,20 @@ async function attempt(method, address, body, patience) {
   try {
     return await fetch(BASE + address, options);
   } catch {
-    throw new Problem(0, ends.aborted ? { detail: `The service did not answer in ${patience / 1000} s.` } : null);
+    throw new Problem(0, ends.aborted ? { detail: `The service did not respond within ${timeout / 1000} s.` } : null);
   }
 }
 
-/** A list of what was wrong with a body, as a sentence. */
+/** Returns the errors of a body as one sentence. */
 function readable(document) {
   if (!Array.isArray(document?.detail)) return document;
   return { ...document, detail: document.detail.map((each) => each.msg).join("; ") };
 }
 
 /**
- * The stream of events. `begin()` is called whenever everything has to be loaded anew: at the start, after a gap,
- * and when the service is another run or has forgotten what was missed. `take(event)` gets every other event,
- * `standing(isOpen)` whether the service can be heard.
+ * Follows the event stream. Calls `begin()` if everything must be loaded: at the start, after a gap, and after a
+ * restart of the service. Calls `take(event)` with every other event, and `standing(isOpen)` when the connection opens
+ * or closes.
  */
 export class Stream {
   constructor({ begin, take, standing }) {
@@ -106,7 +106,7 @@ export class Stream {
     this.pause = 500;
     this.source = null;
     addEventListener("online", () => this.open());
-    setInterval(() => this.feel(), PULSE);
+    setInterval(() => this.checkConnection(), PULSE);
   }
 
   open() {
@@ -138,7 +138,7 @@ export class Stream {
     else this.take(event);
   }
 
-  /** The browser has given up: a token may be wanted, or nobody is there. */
+  /** Handles the end of the browser's attempts: a token may be required, or the service is not running. */
   again() {
     this.source?.close();
     this.waiting = setTimeout(async () => {
@@ -152,8 +152,8 @@ export class Stream {
     this.pause = Math.min(LONGEST_PAUSE, this.pause * 2);
   }
 
-  /** A network that goes away without a word closes nothing: the service is felt for now and then. */
-  async feel() {
+  /** Reconnects after a silence: a lost network does not close the connection. */
+  async checkConnection() {
     if (document.hidden || this.source?.readyState !== EventSource.OPEN) return;
     try {
       await fetch("/health", { signal: AbortSignal.timeout(PULSE / 2), cache: "no-store" });

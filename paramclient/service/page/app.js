@@ -1,4 +1,4 @@
-/** The page: joins what is known, what is shown, and what the person does. */
+/** The page: connects data, views and user actions. */
 
 import { Stream } from "./api.js";
 import { chooseOther, drawBanner } from "./compare.js";
@@ -37,7 +37,7 @@ function edit(row) {
   else editor.open(row, store.table.pending.get(row.name));
 }
 
-// what is shown
+// filters and views
 
 function matches(row) {
   if (shown.group && row.group !== shown.group) return false;
@@ -48,7 +48,7 @@ function matches(row) {
   );
 }
 
-/** Those whose name begins with what is searched for go first, then those with it in the name. */
+/** Sorts names that start with the search text before names that contain it. */
 function ranked(rows) {
   const [word] = shown.words;
   if (!word) return rows;
@@ -181,18 +181,18 @@ function drawEmpty(count, total) {
 
 function emptyText(count, total, component, table) {
   if (count) return "";
-  if (!component) return store.isHeard ? "No vehicle has been heard yet. It appears here by itself." : "";
+  if (!component) return store.isHeard ? "No vehicle found yet. Vehicles appear here automatically." : "";
   if (!total)
     return component.fetch
-      ? "The parameters are on their way."
+      ? "Loading the parameters."
       : table.isLoaded
-        ? `No parameters are known${component.is_kept ? "." : " yet. Fetch asks the vehicle for them."}`
+        ? `No parameters are known${component.is_kept ? "." : " yet. Fetch requests them from the vehicle."}`
         : "Loading …";
   if (shown.filter === "changed" && !shown.words.length)
     return table.sorted.some((row) => row.isChanged !== null)
-      ? "Nothing is changed from its default."
+      ? "All values are the firmware's defaults."
       : "The defaults of this vehicle are not known.";
-  return "Nothing fits what is searched for.";
+  return "No parameter matches the search.";
 }
 
 function drawBar() {
@@ -225,7 +225,7 @@ function drawBar() {
   }
 }
 
-/** Another choice of what is shown. */
+/** Handles a change of the filter. */
 function choose(change) {
   Object.assign(shown, change);
   grid.root.scrollTop = 0;
@@ -233,7 +233,7 @@ function choose(change) {
   drawTable();
 }
 
-// what the service says
+// events of the service
 
 store.on("all", () => {
   editor.close(false);
@@ -251,7 +251,7 @@ store.on("pending", draw);
 store.on("other", () => {
   shown.filter = store.table.other ? "differs" : "all";
   if (store.table.other) {
-    byId("search").value = ""; // else what was searched for before hides what differs
+    byId("search").value = ""; // the previous search would hide differences
     shown.words = [];
   }
   drawBanner();
@@ -300,15 +300,15 @@ const stream = new Stream({
       byId("away"),
       isOpen
         ? ""
-        : "The service does not answer. What is shown may be old; the page goes on by itself when it is back.",
+        : "The service does not respond. Shown values may be outdated. The page reconnects automatically.",
     );
     setText(byId("standing"), isOpen ? "" : "not connected");
-    if (isOpen && before === false) announce("The service answers again.");
+    if (isOpen && before === false) announce("The service responds again.");
     drawState();
   },
 });
 
-// what the person does
+// user actions
 
 byId("search").addEventListener("input", () => {
   choose({ words: byId("search").value.toLowerCase().split(/\s+/).filter(Boolean) });
@@ -339,7 +339,7 @@ function turnTheme() {
   try {
     localStorage.setItem("theme", theme);
   } catch {
-    // a browser that keeps nothing shows it until it is closed
+    // without storage the choice lasts until the page is closed
   }
 }
 
@@ -360,7 +360,7 @@ const KEYS = {
   u: () => grid.active && store.unstage(grid.active.name),
 };
 
-/** Puts another value of the row that the person stands on onto the list. */
+/** Stages another value of the selected row. */
 function take(valueOf) {
   const row = grid.active;
   const text = row && store.mayWrite ? valueOf(row) : null;

@@ -1,4 +1,4 @@
-/** Comparison with a file, an earlier state or another vehicle: choosing it, and taking values over from it. */
+/** Comparison with a file, an earlier state or another vehicle, and applying values from it. */
 
 import { Problem, at, get, request } from "./api.js";
 import { announce, button, byId, el, setText } from "./dom.js";
@@ -8,12 +8,12 @@ import { Caution, OUTCOMES, nameOf, told } from "./review.js";
 import { keyOf, store } from "./store.js";
 import { many, moment, numberText } from "./values.js";
 
-/** A file beyond that is no parameter file; the service takes no more either. */
+/** Maximum size of a parameter file in bytes, which is also the limit of the service. */
 const LARGEST_FILE = 2 * 2 ** 20;
-const PLAN_PATIENCE = 120_000;
+const PLAN_TIMEOUT = 120_000;
 const JOB_PAUSE = 300;
 
-/** Lets the person choose what to compare with; `file` was given already, by dropping it onto the page. */
+/** Asks what to compare with; `file` is a file dropped onto the page. */
 export async function chooseOther(file = null) {
   const { component } = store;
   if (!component) return;
@@ -42,7 +42,7 @@ export async function chooseOther(file = null) {
     el(
       "label",
       { class: "drop", for: "file" },
-      el("span", { text: "A parameter file of any ground station; it can be dropped onto the page as well." }),
+      el("span", { text: "A parameter file of any ground station. You can also drop it onto the page." }),
       input,
     ),
     el("h3", { text: "An earlier state" }),
@@ -58,7 +58,7 @@ export async function chooseOther(file = null) {
   });
 }
 
-/** What it is compared with, or null for nothing any more. */
+/** Sets the compared set, or null for no comparison. */
 export function setOther(other) {
   store.table.other = other;
   store.tell("other");
@@ -77,7 +77,7 @@ async function fillSnapshots(component, list, attempt) {
   try {
     const { snapshots } = await get(at(component, "/snapshots"));
     const kept = [...snapshots].sort((a, b) => b.id - a.id);
-    fill(list, kept, "No earlier state is kept.", (each) => [
+    fill(list, kept, "The cache has no earlier state.", (each) => [
       `${moment(each.at ?? each.time)}`,
       `${each.reason}, ${many(each.size, "parameter")}`,
       () =>
@@ -138,7 +138,7 @@ async function base64(file) {
   return btoa(text);
 }
 
-/** The line that says what it is compared with, and what can be done with it. */
+/** Shows the compared set and its actions. */
 export function drawBanner() {
   const banner = byId("banner");
   const { table } = store;
@@ -167,12 +167,12 @@ export function drawBanner() {
   );
 }
 
-/** Plans what would be sent to be as the other is, lets the person choose of it, applies what was chosen. */
+/** Plans the changes to the compared set, lets the user select values, and applies these. */
 export async function takeOver() {
   const { component, table } = store;
   const { other } = table;
   const fault = el("p", { class: "fault", role: "alert" });
-  const summary = el("p", { class: "summary", role: "status", text: "Working out what would be set …" });
+  const summary = el("p", { class: "summary", role: "status", text: "Planning the changes …" });
   const body = el("tbody");
   const apply = button("Apply", () => go(), { kind: "strong", disabled: true });
   const cancel = button("Not now", () => (hasBegun ? stop() : closeDialog()), { kind: "quiet" });
@@ -180,7 +180,7 @@ export async function takeOver() {
   const armed = new Caution(component, () => refresh());
   const all = el("input", {
     type: "checkbox",
-    "aria-label": "All that would be set",
+    "aria-label": "All planned changes",
     on: {
       change: () => {
         for (const line of lines)
@@ -258,7 +258,7 @@ export async function takeOver() {
     for (const line of chosen) {
       const row = result.params?.[line.name] ?? { status: ended.state === "done" ? "unchanged" : "failed" };
       const word = OUTCOMES[row.status] ?? { text: row.status, kind: "warn" };
-      const made = row.status === "adjusted" ? `The vehicle made ${numberText(row.actual, row.type)} of it. ` : "";
+      const made = row.status === "adjusted" ? `The vehicle changed it to ${numberText(row.actual, row.type)}. ` : "";
       line.remark.replaceChildren(
         el("b", { class: `outcome ${word.kind}`, text: word.text }),
         ` ${made}${row.reason ?? ""}`,
@@ -275,7 +275,7 @@ export async function takeOver() {
     }
     table.sent = { names: new Set(chosen.map((line) => line.name)), outcomes, at: Date.now() };
     const late = result.reboot_required ?? [];
-    summary.textContent = `${told(outcomes)}${late.length ? ` Counts from the next start of the vehicle on: ${late.join(", ")}.` : ""}`;
+    summary.textContent = `${told(outcomes)}${late.length ? ` Takes effect after a reboot of the vehicle: ${late.join(", ")}.` : ""}`;
     fault.textContent = result.error ?? ended.problem?.detail ?? "";
     announce(summary.textContent);
     store.tell("pending");
@@ -297,14 +297,14 @@ export async function takeOver() {
     { isHeld: () => hasBegun && !isOver, kind: "wide", focus: cancel },
   );
   try {
-    const plan = await request("POST", at(component, "/plan"), { wanted: other.source }, { patience: PLAN_PATIENCE });
+    const plan = await request("POST", at(component, "/plan"), { wanted: other.source }, { timeout: PLAN_TIMEOUT });
     lines = linesOf(plan, table, other, refresh);
     body.replaceChildren(...lines.map((line) => line.element));
     const count = lines.filter((line) => line.status === "set").length;
     const left = lines.length - count;
     summary.textContent = count
       ? `${many(count, "value")} would be set${left ? `; ${left} would be left out unless you choose them` : ""}.`
-      : "Nothing would be set.";
+      : "No value would be written.";
     refresh();
   } catch (error) {
     summary.textContent = "";
@@ -313,12 +313,12 @@ export async function takeOver() {
   await opened;
 }
 
-/** A pattern that means this name alone. */
+/** Returns a pattern that matches only this name. */
 const exactly = (name) => name.replace(/[*?[]/g, "[$&]");
 
-const PHASES = { reading: "Reading", writing: "Writing", rebooting: "Starting again" };
+const PHASES = { reading: "Reading", writing: "Writing", rebooting: "Rebooting" };
 
-/** The lines of a plan in the order in which they would be sent, then those that would be left out. */
+/** Returns the rows of a plan in their order of writing, then the skipped ones. */
 function linesOf(plan, table, other, refresh) {
   const staged = plan.stages.flatMap(({ purpose, steps }) =>
     steps.map(({ name }) => [name, purpose === "all other parameters" ? "" : purpose]),
@@ -372,7 +372,7 @@ function linesOf(plan, table, other, refresh) {
     });
 }
 
-/** Asks for a job until it is over; a service that cannot be reached for a while is asked on. */
+/** Polls a job until its end, also while the service is unreachable. */
 async function followJob(begun, tell) {
   for (;;) {
     try {

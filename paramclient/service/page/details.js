@@ -1,4 +1,4 @@
-/** All that is known of one parameter: what it does, how sure its value is, how it changed; and the form to edit it. */
+/** Details of one parameter: description, trust, history, and the form to edit it. */
 
 import { at, get } from "./api.js";
 import { button, byId, el, isNarrow } from "./dom.js";
@@ -29,7 +29,7 @@ export class Details {
     return !this.root.hidden;
   }
 
-  /** Shows a parameter; `isWanted` where the person asked for it, and is taken there. */
+  /** Shows a parameter; `isWanted` opens the panel and moves the focus to it. */
   open(row, isWanted) {
     if (!row) return;
     this.root.hidden = false;
@@ -42,7 +42,7 @@ export class Details {
       ).focus();
   }
 
-  /** The person stands on another row: what is open follows, what is closed stays so. */
+  /** Shows the selected row if the panel is open. */
   follow(row) {
     if (this.isOpen && row && !this.root.contains(document.activeElement)) this.open(row, false);
   }
@@ -97,7 +97,7 @@ export class Details {
     this.loadPast(row);
   }
 
-  /** The value has changed, or what is to be sent. */
+  /** Updates the value and its staged change. */
   refresh(row) {
     if (!this.isOpen || !row || row.name !== this.name) return;
     const { document: known, info } = row;
@@ -144,7 +144,7 @@ export class Details {
       if (this.name !== row.name) return;
       const entries = [...found.history].sort((a, b) => timeOf(b) - timeOf(a));
       this.past.replaceChildren(...entries.map((entry) => this.entry(entry, row)));
-      if (!entries.length) this.past.append(el("li", { class: "nothing", text: "No change is known." }));
+      if (!entries.length) this.past.append(el("li", { class: "nothing", text: "No changes recorded." }));
     } catch (error) {
       this.past.replaceChildren(el("li", { class: "nothing", text: error.message }));
     }
@@ -171,10 +171,10 @@ export class Details {
   }
 }
 
-/** When an entry of history was made, in unix seconds. */
+/** Returns the time of a history entry in unix seconds. */
 const timeOf = (entry) => entry.at ?? Date.parse(entry.time) / 1000;
 
-/** A value of a document that may be a parameter or a number alone. */
+/** Returns the value of a document, which is a parameter or a number. */
 export function valueText(value, type) {
   return value !== null && typeof value === "object" ? textOf({ type, ...value }) : numberText(value, type);
 }

@@ -1,4 +1,4 @@
-/** The dialogs: one at a time, with the browser's own keeping of the focus. */
+/** Dialogs: one at a time, with the browser's focus handling. */
 
 import { onToken, request } from "./api.js";
 import { button, byId, el } from "./dom.js";
@@ -6,7 +6,7 @@ import { button, byId, el } from "./dom.js";
 let asking = null;
 let end = () => {};
 
-/** Opens the dialog with this content; what it returns ends when it is closed. Esc closes unless `isHeld()`. */
+/** Opens the dialog with this content; the promise resolves when it is closed. Esc closes it unless `isHeld()`. */
 export function openDialog(title, content, buttons, { isHeld = () => false, kind = "", focus = null } = {}) {
   const dialog = byId("dialog");
   closeDialog();
@@ -35,13 +35,13 @@ export function openDialog(title, content, buttons, { isHeld = () => false, kind
   });
 }
 
-/** Ends it at once: the browser tells of its end later, when there may be another one. */
+/** Closes it immediately: the close event of the browser comes later, when another dialog may be open. */
 export function closeDialog() {
   byId("dialog").close();
   end();
 }
 
-/** Asks for the token; all who wait for one wait for the same answer. */
+/** Asks for the token. Simultaneous calls share one dialog. */
 function askForToken() {
   asking ??= ask().finally(() => {
     asking = null;
@@ -66,13 +66,13 @@ async function ask() {
             closeDialog();
           } catch (error) {
             fault.textContent =
-              error.status === 401 || error.status === 403 ? "The service does not know this token." : error.message;
+              error.status === 401 || error.status === 403 ? "The token is not valid for this service." : error.message;
             field.select();
           }
         },
       },
     },
-    el("p", { text: "This service is open to those who have a token. It is kept by the browser until it is closed." }),
+    el("p", { text: "This service requires a token. The browser keeps it until it is closed." }),
     el("label", { for: "token", text: "Token" }),
     field,
     fault,
@@ -83,7 +83,7 @@ async function ask() {
 
 onToken(askForToken);
 
-/** The keys, for those who ask. */
+/** Shows the keyboard shortcuts. */
 export function showKeys() {
   const keys = [
     ["/", "search"],

@@ -1,8 +1,8 @@
-/** Elements, made so that no text can become markup: whatever is shown goes in by `textContent`. */
+/** DOM elements. Texts are inserted by `textContent`, so that no text becomes markup. */
 
 /**
- * An element. `props` are attributes, but for `class`, `text`, `on` (listeners) and `data`; an attribute that
- * is false, null or undefined is left out. Children are elements or texts; null and false are passed over.
+ * Creates an element. `props` are attributes, except `class`, `text`, `on` (listeners) and `data`; attributes that are
+ * false, null or undefined are omitted. Children are elements or texts; null and false are skipped.
  */
 export function el(tag, props = {}, ...children) {
   const made = document.createElement(tag);
@@ -19,10 +19,10 @@ export function el(tag, props = {}, ...children) {
   return made;
 }
 
-/** The element of this id; the page always has it. */
+/** Returns the element with this id, which always exists. */
 export const byId = (id) => document.getElementById(id);
 
-/** One of the page's drawings, which say nothing that a text beside them does not say. */
+/** Returns a decorative icon of the page. */
 export function icon(name) {
   const svg = document.createElementNS(SVG, "svg");
   svg.setAttribute("viewBox", "0 0 16 16");
@@ -34,7 +34,7 @@ export function icon(name) {
   return svg;
 }
 
-/** A button that has a text, a drawing, or both; `label` names one that has a drawing alone. */
+/** Creates a button with a text, an icon, or both; `label` names a button with only an icon. */
 export function button(text, onclick, { kind = "", drawing = null, label = null, ...more } = {}) {
   return el(
     "button",
@@ -51,32 +51,32 @@ export function button(text, onclick, { kind = "", drawing = null, label = null,
   );
 }
 
-/** Sets a text only where it is another one, so that nothing is drawn or read out anew without need. */
+/** Sets a text if it differs, which avoids rendering and screen reader announcements. */
 export function setText(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
 
-/** Sets or takes away an attribute, under the same rule. */
+/** Sets or removes an attribute if it differs. */
 export function setAttribute(element, name, value) {
   if (value === null || value === undefined || value === false) {
     if (element.hasAttribute(name)) element.removeAttribute(name);
   } else if (element.getAttribute(name) !== String(value)) element.setAttribute(name, value);
 }
 
-/** Tells those who listen to the page rather than look at it. */
+/** Announces a text to screen readers. */
 export function announce(text) {
   const region = byId("spoken");
   region.append(el("p", { text }));
   while (region.children.length > MOST_SPOKEN) region.firstChild.remove();
 }
 
-/** Calls something once for all that happens until the next frame. */
+/** Returns a function that runs once per frame for all its calls. */
 export function onceAFrame(work) {
   let isDue = false;
   return () => {
     if (isDue) return;
     isDue = true;
-    // a page that is not looked at gets no frames, and is to be right all the same when it is looked at again
+    // a hidden page gets no frames, but must be current when it is shown again
     const begin = document.hidden ? (run) => setTimeout(run, HIDDEN_PAUSE) : requestAnimationFrame;
     begin(() => {
       isDue = false;
@@ -85,7 +85,7 @@ export function onceAFrame(work) {
   };
 }
 
-/** Whether there is room for the list alone, as on a phone. */
+/** Returns whether the screen has space for the list only, as on a phone. */
 export const isNarrow = () => matchMedia("(max-width: 760px)").matches;
 
 const SVG = "http://www.w3.org/2000/svg";

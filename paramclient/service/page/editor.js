@@ -1,4 +1,4 @@
-/** What a value is edited with: a number with its range, a list of named values, or boxes for the bits of a mask. */
+/** Editors of a value: a number with its range, a list of named values, or check boxes for bits. */
 
 import { button, byId, el, isNarrow } from "./dom.js";
 import { defaultOf, doubt, isFloat, maskOf, parse, rangeOf, sameText, textOf, textOfMask } from "./values.js";
@@ -6,8 +6,8 @@ import { defaultOf, doubt, isFloat, maskOf, parse, rangeOf, sameText, textOf, te
 const OTHER = "other";
 
 /**
- * A form for one parameter. `stage(text, send)` is told of a value that is good, `leave()` of the end. Gives the form;
- * its `first` gets the focus, and `refresh(row)` tells it that the value has changed meanwhile.
+ * Creates the form for one parameter. Calls `stage(text, send)` with a valid value and `leave()` at the end. In the
+ * result, `first` receives the focus, and `refresh(row)` handles a changed value.
  */
 export function editorOf(row, pending, { stage, leave, isCompact = true }) {
   const { info, type } = row;
@@ -65,12 +65,12 @@ export function editorOf(row, pending, { stage, leave, isCompact = true }) {
   form.first = input.first;
   form.refresh = (now) => {
     if (!sameText(now.text, before, type))
-      news.textContent = `Meanwhile it is ${now.text}${now.news ? `, by ${now.news.by}` : ""}.`;
+      news.textContent = `The vehicle now has ${now.text}${now.news ? `, by ${now.news.by}` : ""}.`;
   };
   return form;
 }
 
-/** Opens the form over the value of a row; gives what refreshes it. One is open at a time. */
+/** Opens the form over the value of a row, and returns a function that refreshes it. Only one form is open. */
 export class CellEditor {
   constructor({ grid, stage }) {
     this.grid = grid;
@@ -109,7 +109,7 @@ export class CellEditor {
     if (this.row && row) this.form.refresh(row);
   }
 
-  /** Keeps the form at its row, and on the screen. */
+  /** Positions the form at its row, within the screen. */
   place() {
     if (!this.row || isNarrow()) return;
     const cell = this.grid.place(this.row.name);
@@ -254,7 +254,7 @@ function boxes(row, value, say) {
   };
 }
 
-/** A number one step on, without the noise that adding fractions brings. */
+/** Returns the next number of a step, without rounding errors of added fractions. */
 function stepped(text, step, type) {
   if (!isFloat(type)) return String(BigInt(text) + BigInt(Math.round(step) || Math.sign(step)));
   const places = Math.max(decimals(text), decimals(String(step)));

@@ -1,6 +1,6 @@
 /**
- * The table: one scrolling list of which only the rows in sight exist. The grid itself has the focus and names the
- * row that it stands on, so that nothing that happens to rows can take the focus away.
+ * The table: a scrolling list with only its visible rows in the DOM. The grid has the focus and names the selected row,
+ * so that changes of rows do not move the focus.
  */
 
 import { byId, el, isNarrow, setAttribute, setText } from "./dom.js";
@@ -10,7 +10,7 @@ const SPARE = 10;
 const SETTLED = 120;
 
 export class Grid {
-  /** `open(row)` edits, `show(row)` tells all of it, `moved(row)` says where the person stands; `table()` is what is shown. */
+  /** `open(row)` edits, `show(row)` opens the details, `moved(row)` reports the selected row; `table()` is the shown table. */
   constructor({ table, open, show, moved }) {
     this.table = table;
     this.open = open;
@@ -32,7 +32,7 @@ export class Grid {
     this.measure();
   }
 
-  /** The row that the person stands on, or null. */
+  /** The selected row, or null. */
   get active() {
     return this.rows[this.index] ?? null;
   }
@@ -46,7 +46,7 @@ export class Grid {
     this.draw();
   }
 
-  /** Shows these rows; the person stays on the parameter they stood on, or near its place. */
+  /** Shows these rows; the selection stays on its parameter, or near its position. */
   set(rows) {
     this.rows = rows;
     const place = this.name === null ? -1 : rows.findIndex((row) => row.name === this.name);
@@ -61,7 +61,7 @@ export class Grid {
     setAttribute(this.root, "aria-rowcount", this.rows.length + 1);
   }
 
-  /** Draws what is in sight, or of that what has come into sight: rows that went out are used again for it. */
+  /** Renders the rows that have become visible, in the elements of rows that are no longer visible. */
   draw(isAnew = true) {
     const top = Math.max(0, this.root.scrollTop - this.top);
     const from = Math.max(0, Math.floor(top / this.height) - SPARE);
@@ -88,7 +88,7 @@ export class Grid {
     setAttribute(this.root, "aria-activedescendant", shown ? shown.row.id : null);
   }
 
-  /** Once it lies still, puts the rows into their order for those who read them one after the other. */
+  /** After scrolling, sorts the elements for screen readers. */
   settle() {
     const wanted = [...this.made].sort(([a], [b]) => a - b).map(([, made]) => made.row);
     if (wanted.some((row, place) => this.body.children[place] !== row)) this.body.prepend(...wanted);
@@ -161,7 +161,7 @@ export class Grid {
     );
   }
 
-  /** Goes to a row and keeps it in sight. */
+  /** Selects a row and scrolls it into view. */
   go(index) {
     if (!this.rows.length) return;
     this.index = Math.max(0, Math.min(this.rows.length - 1, index));
@@ -174,14 +174,14 @@ export class Grid {
     this.moved(this.active);
   }
 
-  /** Goes to a parameter by its name, if it is shown. */
+  /** Selects a parameter by name if it is shown. */
   find(name) {
     const index = this.rows.findIndex((row) => row.name === name);
     if (index >= 0) this.go(index);
     return index >= 0;
   }
 
-  /** Where a row's value stands on the screen; null out of sight. */
+  /** Returns the screen position of a row's value; null if it is not visible. */
   place(name) {
     for (const [index, made] of this.made) {
       if (this.rows[index]?.name === name) return made.value.getBoundingClientRect();
@@ -221,7 +221,7 @@ export class Grid {
   }
 }
 
-/** What the look of a row says, in words. */
+/** Describes the marks of a row in words. */
 function said(row, pending) {
   const words = [
     pending && `staged: ${pending.text}`,

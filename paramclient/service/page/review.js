@@ -1,4 +1,4 @@
-/** What is to be sent, looked at before it is; what became of each; and the way back. */
+/** Review of staged changes, their results, and undo. */
 
 import { Problem, at, request } from "./api.js";
 import { announce, button, el, setText } from "./dom.js";
@@ -8,8 +8,8 @@ import { keyOf, store } from "./store.js";
 import { defaultOf, doubt, many, meaningOf, sameText } from "./values.js";
 
 const AT_ONCE = 4;
-/** A write may be repeated for long on a bad link; the service says when it gives up. */
-const WRITE_PATIENCE = 120_000;
+/** Timeout of a write in milliseconds; on a lossy link the service retries for long and has its own timeout. */
+const WRITE_TIMEOUT = 120_000;
 
 export const OUTCOMES = {
   accepted: { text: "accepted", kind: "good" },
@@ -23,8 +23,8 @@ export const OUTCOMES = {
 };
 
 /**
- * What stands in the way of sending to an armed vehicle: a sentence, and a box to be ticked. It shows itself while
- * the vehicle is armed, also where that happens meanwhile; `change` is called when it may have made a difference.
+ * The confirmation for writes to an armed vehicle: a sentence and a check box, shown while the vehicle is armed.
+ * `change` is called after a change of either.
  */
 export class Caution {
   constructor(component, change) {
@@ -33,8 +33,8 @@ export class Caution {
     this.element = el(
       "div",
       { class: "armed", role: "alert", hidden: !this.isArmed },
-      el("p", {}, el("b", { text: "The vehicle is armed. " }), "Its motors may turn, and what is sent counts at once."),
-      el("label", {}, this.box, el("span", { text: "Send all the same" })),
+      el("p", {}, el("b", { text: "The vehicle is armed. " }), "Its motors may turn, and new values take effect immediately."),
+      el("label", {}, this.box, el("span", { text: "Send anyway" })),
     );
     store.whileShown(this.element, "armed", () => {
       this.element.hidden = !this.isArmed;
@@ -52,7 +52,7 @@ export class Caution {
   }
 }
 
-/** Shows what is pending, sends it when that is wanted, shows what became of it. */
+/** Shows the staged changes, writes them after confirmation, and shows the results. */
 export async function review() {
   const { component, table } = store;
   const changes = [...table.pending.values()].sort((a, b) => (a.name < b.name ? -1 : 1));
@@ -129,7 +129,7 @@ export async function review() {
     summary.textContent = said;
     announce(said);
     const late = sent.outcomes.filter((each) => each.isTaken && each.isLate).map((each) => each.name);
-    if (late.length) summary.append(el("br"), `Counts from the next start of the vehicle on: ${late.join(", ")}.`);
+    if (late.length) summary.append(el("br"), `Takes effect after a reboot of the vehicle: ${late.join(", ")}.`);
     const way =
       sent.outcomes.some((each) => each.isTaken) &&
       button(
@@ -154,16 +154,16 @@ export async function review() {
   });
 }
 
-/** Puts the values from before the last sending on the list, and shows it. Nothing is sent without a look. */
+/** Stages the values from before the last write and shows the review. Nothing is written without confirmation. */
 export function undo() {
   const { sent } = store.table;
   if (!sent) return;
   for (const each of sent.outcomes) if (each.isTaken) store.stage(each.name, each.before, each.restore);
   if (store.table.pending.size) review();
-  else announce("There is nothing to undo: the vehicle has the values from before.");
+  else announce("Nothing to undo: the vehicle has the previous values.");
 }
 
-/** How many of each outcome there were, in words. */
+/** Counts the results in words. */
 export function told(outcomes) {
   const counts = new Map();
   for (const { status } of outcomes) {
@@ -175,7 +175,7 @@ export function told(outcomes) {
   return `${sorted.map(([text, count]) => `${count} ${text}`).join(", ")}.`;
 }
 
-/** A vehicle as it is called. */
+/** Returns the display name of a vehicle. */
 export function nameOf(component) {
   return `${AUTOPILOTS[component.autopilot] ?? component.autopilot} ${component.system}/${component.component}`;
 }
@@ -188,7 +188,7 @@ const AUTOPILOTS = {
   unknown: "Unknown",
 };
 
-/** A change in the review. `follow()` says anew how it stands to the value that the vehicle has now. */
+/** A row of the review. `follow()` updates it with the vehicle's current value. */
 function lineOf(change, rowNow, drop) {
   const { name } = change;
   const now = el("td", { class: "now" });
@@ -211,15 +211,15 @@ function lineOf(change, rowNow, drop) {
   return { change, rowNow, element, remark, away, follow };
 }
 
-/** What speaks against a change, and what else there is to say of it. */
+/** Returns warnings and notes for a change. */
 function remarksOf({ text, before }, row) {
-  if (!row) return ["The vehicle does not have it any more.", ""];
+  if (!row) return ["The vehicle no longer has this parameter.", ""];
   const { info, type } = row;
   const remarks = [];
-  if (sameText(row.text, text, type)) remarks.push("The vehicle has that already.");
+  if (sameText(row.text, text, type)) remarks.push("The vehicle already has this value.");
   if (!sameText(row.text, before, type)) remarks.push(`It was ${before} when you edited it.`);
-  if (info?.reboot_required) remarks.push("Counts from the next start on.");
-  if (info?.is_read_only) remarks.push("The vehicle sets it by itself.");
+  if (info?.reboot_required) remarks.push("Takes effect after a reboot.");
+  if (info?.is_read_only) remarks.push("The vehicle sets it itself.");
   const standard = defaultOf(row.document);
   if (standard !== null && sameText(text, standard, type)) remarks.push("The default.");
   return [doubt(text, info, type), remarks.join(" ")];
@@ -229,7 +229,7 @@ function inWords(value, row) {
   const meaning = meaningOf(value, row?.info, row?.type);
   return `${value} ${meaning || (row?.info?.units ?? "")}`.trim();
 }
-/** Sends one change, and writes what became of it into its line. */
+/** Writes one change and shows its result in its row. */
 async function sendOne(component, { change, rowNow, element, remark, away }) {
   const { name, text, send } = change;
   const row = rowNow();
@@ -250,7 +250,7 @@ async function sendOne(component, { change, rowNow, element, remark, away }) {
       "PATCH",
       at(component, "/params"),
       { values: { [name]: send } },
-      { patience: WRITE_PATIENCE },
+      { timeout: WRITE_TIMEOUT },
     );
     const result = results[name];
     if (result?.problem) throw new Problem(result.problem.status, result.problem);
@@ -258,7 +258,7 @@ async function sendOne(component, { change, rowNow, element, remark, away }) {
     outcome.isTaken = true;
     outcome.reason =
       outcome.status === "adjusted"
-        ? `The vehicle made ${valueText(result.actual, row.type)} of ${text}.`
+        ? `The vehicle changed ${text} to ${valueText(result.actual, row.type)}.`
         : (result.reason ?? "");
   } catch (error) {
     outcome.status = error.document?.type?.endsWith(":no-reply") || !error.status ? "failed" : "refused";

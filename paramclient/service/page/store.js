@@ -1,21 +1,21 @@
-/** What the page knows: vehicles, tables, what is to be sent, what was sent. It draws nothing. */
+/** The state of the page: vehicles, tables, staged and written changes. Contains no rendering. */
 
 import { ASKER, at, get } from "./api.js";
 import { isChanged, meaningOf, sameText, textOf } from "./values.js";
 
-/** Changes of others are marked for so long, in milliseconds. */
+/** Milliseconds for which changes by other clients are highlighted. */
 export const NEWS_FOR = 600_000;
-/** Milliseconds until a table that could not be loaded is asked for again. */
+/** Milliseconds until a table is loaded again after an error. */
 const LOAD_AGAIN_AFTER = 2_000;
 const FEWEST_OF_A_GROUP = 2;
 export const OTHERS = "Others";
 
-/** Links have no names that begin so. */
+/** Prefix of the keys of cached vehicles; no link name starts with it. */
 const KEPT = "kept:";
 
 export const keyOf = (component) => `${component.link} ${component.system}/${component.component}`;
 
-/** One parameter as it is shown: the service's document, and what is worked out of it once. */
+/** One parameter as shown: the document of the service, and values derived from it. */
 class Row {
   constructor(document) {
     this.news = null;
@@ -36,7 +36,7 @@ class Row {
   }
 }
 
-/** The table of one component, and what somebody at this page has in mind for it. */
+/** The table of one component, and the changes staged for it. */
 class Table {
   constructor() {
     this.rows = new Map();
@@ -50,7 +50,7 @@ class Table {
     this.forget();
   }
 
-  /** Rows in the order of their names, each with its group. */
+  /** Rows sorted by name, each with its group. */
   get sorted() {
     if (!this.order) {
       this.order = [...this.rows.values()].sort((a, b) => (a.name < b.name ? -1 : a.name > b.name ? 1 : 0));
@@ -85,7 +85,7 @@ class Table {
     this.catchUp();
   }
 
-  /** Goes on with what was loaded before, if anything was. */
+  /** Continues with the previously loaded table, if any. */
   keep() {
     this.isLoaded = this.rows.size > 0;
     this.catchUp();
@@ -97,10 +97,10 @@ class Table {
     for (const event of early) this.change(event);
   }
 
-  /** Takes a change into the table; gives the row if it is news, or null. */
+  /** Applies a change to the table; returns the row if it has changed, or null. */
   change(event) {
     if (!this.isLoaded) {
-      this.early?.push(event); // while nothing is being loaded, all of it will be
+      this.early?.push(event); // without a load in progress, the next one includes the event
       return null;
     }
     if (event.seq <= this.seq) return null;
@@ -124,7 +124,7 @@ class Table {
     return row;
   }
 
-  /** How a row stands to what the table is compared with: "same", "differs", "here", "there", or null. */
+  /** Compares a row with the compared set: "same", "differs", "here", "there", or null. */
   standing(row) {
     if (!this.other) return null;
     const other = this.other.values.get(row.name);
@@ -133,7 +133,7 @@ class Table {
   }
 }
 
-/** Everything. Those who draw subscribe by `on(kind, listener)`, which gives what ends that. */
+/** The whole state. Views subscribe with `on(kind, listener)`, which returns a function that unsubscribes. */
 class Store {
   constructor() {
     this.me = { role: "read", name: "", read_only: true };
@@ -159,7 +159,7 @@ class Store {
       );
   }
 
-  /** The same for as long as an element is on the page. */
+  /** Subscribes while an element is in the page. */
   whileShown(element, kind, listener) {
     const end = this.on(kind, (what) => (element.isConnected ? listener(what) : end()));
   }
@@ -168,12 +168,12 @@ class Store {
     for (const listener of this.listeners.get(kind) ?? []) listener(what);
   }
 
-  /** The component that is looked at, or null. */
+  /** The selected component, or null. */
   get component() {
     return this.components.get(this.selected) ?? this.kept.get(this.selected) ?? null;
   }
 
-  /** Those that are in the cache and on no link, the one heard last first. */
+  /** Components in the cache that are on no link, the last heard first. */
   get unheard() {
     const heard = new Set([...this.components.values()].map((each) => `${each.component} ${each.key}`));
     return [...this.kept.values()].filter((each) => !heard.has(`${each.component} ${each.key}`));
@@ -187,7 +187,7 @@ class Store {
     return this.me.role === "write" && !this.me.read_only && !this.component?.is_kept;
   }
 
-  /** Loads what the service knows; what happens meanwhile is kept and taken in afterwards. */
+  /** Loads the state of the service; events during the load are applied afterwards. */
   async begin() {
     const load = ++this.loads;
     this.early = [];
@@ -212,7 +212,7 @@ class Store {
     await Promise.all([this.selected && this.loadTable(this.selected), this.loadKept()]);
   }
 
-  /** Who is in the cache; a service without one knows those only that it hears. */
+  /** Loads the vehicles in the cache; a service without a cache has only connected ones. */
   async loadKept() {
     let vehicles = [];
     try {
@@ -253,7 +253,7 @@ class Store {
     if (key === this.selected) this.tell("table");
   }
 
-  /** A table could not be loaded anew: what was known stays, with what has come since, and it is tried again. */
+  /** Handles a failed load: the table stays, with later events applied, and is loaded again. */
   keepTable(key, mayWork) {
     const table = this.tableOf(key);
     table.keep();
@@ -300,7 +300,7 @@ class Store {
       else this.components.delete(key);
       this.loadKept().catch(() => {});
       const table = this.tables.get(key);
-      if (table) table.isLoaded = false; // what was staged waits for the vehicle to come back
+      if (table) table.isLoaded = false; // staged changes wait for the vehicle's return
     } else {
       const document = event.component_doc;
       const before = this.components.get(key);
@@ -329,13 +329,13 @@ class Store {
     if (key === this.selected) this.tell("table");
   }
 
-  /** Several reasons to load a table anew, one after the other, are one. */
+  /** Combines simultaneous loads of a table. */
   reload(key) {
     clearTimeout(this.reloading);
     this.reloading = setTimeout(() => this.loadTable(key).catch(() => {}), 150);
   }
 
-  /** Puts a value on the list of what is to be sent; one that the vehicle has already goes off it. */
+  /** Stages a value; a value equal to the vehicle's is removed from the staged ones. */
   stage(name, text, send) {
     const row = this.table.rows.get(name);
     if (!row) return;
@@ -356,10 +356,10 @@ class Store {
 
 const NO_TABLE = new Table();
 
-/** One that the service does not know any more, and that somebody looks at: nobody is led to another unasked. */
+/** A selected component that the service has removed: the selection does not change without a user action. */
 const gone = (component) => ({ ...component, is_lost: true, is_armed: null, state: "lost", silence_s: 0, fetch: null });
 
-/** One that is in the cache, as those are that are heard: it is looked at, and nothing can be done with it. */
+/** A cached component in the shape of a connected one: it can be viewed, not changed. */
 const kept = (vehicle, { component, count, autopilot }) => ({
   link: KEPT + vehicle.key,
   system: vehicle.system,
@@ -376,7 +376,7 @@ const kept = (vehicle, { component, count, autopilot }) => ({
   fetch: null,
 });
 
-/** Who changed a value, in words. */
+/** Names the source of a change. */
 export function authorOf(by) {
   if (!by || by === "vehicle") return "the vehicle";
   if (by.includes(ASKER)) return "you";
@@ -384,7 +384,7 @@ export function authorOf(by) {
   return by.startsWith("us for ") ? by.slice(7) : by;
 }
 
-/** Autopilots go before cameras and the like. */
+/** Sorts autopilots before other components. */
 function first(components) {
   const keys = [...components.keys()];
   return keys.find((key) => components.get(key).component === 1) ?? keys[0] ?? null;

@@ -1,11 +1,11 @@
-// Runs before anything is drawn: dark or light as the person chose, else as the system says.
+// Runs before rendering: sets the dark or light theme, chosen by the user or the system.
 (() => {
   const system = matchMedia("(prefers-color-scheme: dark)");
   const kept = () => {
     try {
       return localStorage.getItem("theme");
     } catch {
-      return null; // a browser that keeps nothing
+      return null; // a browser without storage
     }
   };
   const show = () => {

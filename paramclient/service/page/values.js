@@ -1,4 +1,4 @@
-/** Values: as people read and write them, and when two are the same. */
+/** Values: formatting, parsing, comparison. */
 
 const BOUNDS = {
   INT8: [-(2n ** 7n), 2n ** 7n - 1n],
@@ -24,8 +24,8 @@ export const isFloat = (type) => type === "REAL32" || type === "REAL64";
 export const isWhole = (type) => type in BOUNDS;
 
 /**
- * A value in text: a float always with a point or an exponent, an integer with all its digits also where a
- * JavaScript number could not hold it (it is read from its bits).
+ * Formats a value: a float always with a point or an exponent, an integer with all digits, from its bits if a
+ * JavaScript number cannot represent it.
  */
 export function textOf(param) {
   if (param === null || param === undefined) return "";
@@ -37,14 +37,14 @@ export function textOf(param) {
   return numberText(value, type);
 }
 
-/** The same for a number that stands alone, as a default or a bound does. */
+/** Formats a number without bits, such as a default or a limit. */
 export function numberText(value, type) {
   if (typeof value !== "number") return String(value ?? "");
   const text = Object.is(value, -0) ? "-0" : String(type === "REAL32" ? shortest(value) : value);
   return isFloat(type) && /^-?\d+$/.test(text) ? `${text}.0` : text;
 }
 
-/** The shortest number that is the same float32: 0.07 for 0.07000000029802322. */
+/** Returns the shortest number with the same float32: 0.07 for 0.07000000029802322. */
 function shortest(value) {
   for (let digits = 1; digits < 9; digits++) {
     const short = Number(value.toPrecision(digits));
@@ -53,7 +53,7 @@ function shortest(value) {
   return value;
 }
 
-/** What a value means, in the words of its description: `Loiter`, `GPS | Baro`; "" where it is a number only. */
+/** Returns the meaning of a value from its metadata: `Loiter`, `GPS | Baro`; "" for a plain number. */
 export function meaningOf(text, info, type) {
   if (!info) return "";
   const named = info.values?.[text.replace(/\.0$/, "")];
@@ -67,7 +67,7 @@ export function meaningOf(text, info, type) {
   return [...names, ...(rest ? [`0x${rest.toString(16)}`] : [])].join(" | ");
 }
 
-/** The bits that a number stands for, or null where it has none. */
+/** Returns the bits of a number as an integer, or null. */
 export function maskOf(text, type) {
   const whole = text.replace(/\.0$/, "");
   if (!/^-?\d+$/.test(whole)) return null;
@@ -77,15 +77,15 @@ export function maskOf(text, type) {
   return bounds ? number & (bounds[1] - bounds[0]) : null;
 }
 
-/** The number of this type that has these bits, in text. */
+/** Formats the number of this type with these bits. */
 export function textOfMask(mask, type) {
   const bounds = BOUNDS[type];
   return String(bounds && bounds[0] < 0n && mask > bounds[1] ? mask - (bounds[1] - bounds[0] + 1n) : mask);
 }
 
 /**
- * What a person wrote, as a value of this type: `{text, send}`, where `send` is what the service is given, or
- * `{error}` with a sentence. Integers may be hexadecimal; a comma is taken for a point, as field keyboards have it.
+ * Parses an input as a value of this type: `{text, send}`, where `send` is the value for the service, or `{error}` with
+ * a sentence. Integers may be hexadecimal; a comma is a decimal point, as on many keyboards.
  */
 export function parse(written, type) {
   const text = written.trim();
@@ -105,20 +105,20 @@ export function parse(written, type) {
   if (word !== undefined) return { text: word, send: word };
   const plain = text.replace(",", ".");
   if (!/^[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d{1,3})?$/i.test(plain))
-    return { error: "That is no number; 12, -1.5, 1e-3, nan and inf are." };
+    return { error: "Not a number. Examples: 12, -1.5, 1e-3, nan, inf." };
   const number = type === "REAL64" ? Number(plain) : Math.fround(Number(plain));
   if (!Number.isFinite(number)) return { error: `${text} is more than a ${type} holds.` };
   return { text: numberText(Number(plain), type), send: Number(plain) };
 }
 
-/** What speaks against a value by the parameter's description, in a sentence; the vehicle has the last word. */
+/** Returns a warning about a value from its metadata; the vehicle decides. */
 export function doubt(text, info, type) {
   if (!info) return "";
   const units = info.units ? ` ${info.units}` : "";
   const number = Number(text);
   const as = (bound) => (type === "REAL32" ? Math.fround(bound) : bound);
   if (Number.isNaN(number))
-    return typeof info.minimum === "number" || typeof info.maximum === "number" ? "NaN is in no range." : "";
+    return typeof info.minimum === "number" || typeof info.maximum === "number" ? "NaN is outside every range." : "";
   if (typeof info.minimum === "number" && as(number) < as(info.minimum))
     return `Below the minimum of ${info.minimum}${units}.`;
   if (typeof info.maximum === "number" && as(number) > as(info.maximum))
@@ -126,7 +126,7 @@ export function doubt(text, info, type) {
   return "";
 }
 
-/** Whether two values in text are one value of this type; for a REAL32 when they round to the same one. */
+/** Returns whether two texts are the same value of this type; REAL32 values are rounded to float32. */
 export function sameText(a, b, type) {
   if (a === b) return true;
   if (isWhole(type) && /^-?\d+$/.test(a) && /^-?\d+$/.test(b)) return BigInt(a) === BigInt(b);
@@ -135,20 +135,20 @@ export function sameText(a, b, type) {
   return type === "REAL32" ? Math.fround(x) === Math.fround(y) : x === y;
 }
 
-/** Whether a parameter has another value than the firmware's default; null where that is not known. */
+/** Returns whether a value differs from the firmware's default; null if the default is unknown. */
 export function isChanged(param) {
   if (typeof param.is_default === "boolean") return !param.is_default;
   const standard = defaultOf(param);
   return standard === null ? null : !sameText(textOf(param), standard, param.type);
 }
 
-/** The firmware's default in text, or null where it is not known. */
+/** Formats the firmware's default; null if it is unknown. */
 export function defaultOf(param) {
   const standard = param.default ?? param.metadata?.default;
   return standard === null || standard === undefined ? null : numberText(standard, param.type);
 }
 
-/** A range in words: `0 to 12 1/s`. */
+/** Formats a range: `0 to 12 1/s`. */
 export function rangeOf(info) {
   const units = info?.units ? ` ${info.units}` : "";
   const [low, high] = [info?.minimum, info?.maximum];
@@ -157,7 +157,7 @@ export function rangeOf(info) {
   return high !== undefined ? `up to ${high}${units}` : "";
 }
 
-/** A duration as it is said: `4 s`, `3 min`, `2 h`. */
+/** Formats a duration: `4 s`, `3 min`, `2 h`. */
 export function span(seconds) {
   if (seconds < 90) return `${Math.max(0, Math.round(seconds))} s`;
   return seconds < 5400
@@ -167,7 +167,7 @@ export function span(seconds) {
       : `${Math.round(seconds / 86400)} days`;
 }
 
-/** A moment by the clock of who looks: the time today, else with the date. */
+/** Formats a local time: the time today, otherwise with the date. */
 export function moment(at) {
   const when = new Date(typeof at === "number" ? at * 1000 : at);
   const clock = when.toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", second: "2-digit" });

@@ -1,4 +1,4 @@
-/** The vehicles and how they are: the list at the side, the line on top, what can be done with one. */
+/** Vehicles and their states: the list, the status line, and the actions. */
 
 import { at, download, get, request } from "./api.js";
 import { announce, button, byId, el, setText } from "./dom.js";
@@ -17,12 +17,12 @@ const STATES = {
   contested: "contested: several vehicles have this address",
   lost: "lost",
 };
-/** A table that has to be fetched first. */
-const SAVE_PATIENCE = 180_000;
-/** A file of descriptions may have 100 kB, and the radio 2 kB a second. */
-const DESCRIPTION_PATIENCE = 300_000;
+/** Timeout in milliseconds for saving a table that must be fetched first. */
+const SAVE_TIMEOUT = 180_000;
+/** Timeout in milliseconds for metadata: a file may have 100 kB, and a radio 2 kB per second. */
+const DESCRIPTION_TIMEOUT = 300_000;
 const KINDS = { new: "idle", cached: "warn", partial: "warn", synced: "good", fetching: "busy", contested: "bad", lost: "bad" };
-/** The kinds of vehicle of MAV_TYPE that have parameters worth a name. */
+/** Display names of MAV_TYPE values of vehicles with parameters. */
 const TYPES = {
   1: "plane",
   2: "quadrotor",
@@ -43,7 +43,7 @@ const TYPES = {
 };
 const AWAY = { away: "link away", failed: "link failed", opening: "link opening" };
 
-/** How a component is, in words and as a kind of dot. */
+/** Returns the state of a component in words and as the kind of its dot. */
 export function stateOf(component) {
   if (component.is_kept) return { text: `in the cache, heard last ${moment(component.last_seen)}`, kind: "idle" };
   const link = store.links.get(component.link)?.state ?? component.link_state ?? "open";
@@ -64,15 +64,15 @@ export function drawVehicles() {
     (a, b) => a.system - b.system || a.component - b.component || (a.link < b.link ? -1 : 1),
   );
   const { unheard, component } = store;
-  if (component?.is_kept && !unheard.includes(component)) unheard.unshift(component); // it has come back meanwhile
+  if (component?.is_kept && !unheard.includes(component)) unheard.unshift(component); // connected again
   drawList(byId("vehicles"), components);
-  if (!components.length) byId("vehicles").append(el("li", { class: "nothing", text: "None heard yet." }));
+  if (!components.length) byId("vehicles").append(el("li", { class: "nothing", text: "None found yet." }));
   drawKept(unheard);
   drawChoice(components, unheard);
   drawVehicle(component);
 }
 
-/** There may be hundreds of them, of whom nothing changes by itself. */
+/** Renders cached vehicles separately: there may be hundreds, and they do not change. */
 function drawKept(unheard) {
   const box = byId("kept-box");
   const key = JSON.stringify([store.selected, unheard.map((each) => [keyOf(each), each.last_seen])]);
@@ -124,7 +124,7 @@ function drawChoice(components, unheard) {
   if (JSON.stringify(wanted) !== choice.dataset.shown) {
     choice.dataset.shown = JSON.stringify(wanted);
     const [heard, kept] = wanted.map((each) => each.map(([value, text]) => el("option", { value, text })));
-    choice.replaceChildren(...heard, ...(kept.length ? [el("optgroup", { label: "Not heard now" }, kept)] : []));
+    choice.replaceChildren(...heard, ...(kept.length ? [el("optgroup", { label: "Not connected" }, kept)] : []));
   }
   choice.hidden = !choice.options.length;
   choice.value = store.selected ?? "";
@@ -149,7 +149,7 @@ function drawVehicle(component) {
   drawFetch(component);
 }
 
-/** A version as AUTOPILOT_VERSION packs it: three bytes, then its kind. */
+/** Formats a version of AUTOPILOT_VERSION: three bytes, then its type. */
 const versionOf = (packed) => (packed ? `${packed >>> 24}.${(packed >> 16) & 255}.${(packed >> 8) & 255}` : null);
 
 function drawFetch(component) {
@@ -163,7 +163,7 @@ function drawFetch(component) {
   setText(byId("meter-text"), `${progressText(fetch)}${pace}`);
 }
 
-/** What can be done with a vehicle; made once for each role, and for those that are heard or not. */
+/** Returns the actions of a vehicle, created once for each role and for connected and cached vehicles. */
 export function drawActions() {
   const isHeard = !store.component?.is_kept;
   const actions = [
@@ -171,12 +171,12 @@ export function drawActions() {
     button("Save", save, { drawing: "save" }),
     button("Describe", describe, {
       drawing: "help",
-      label: "Ask the vehicle what its parameters mean",
+      label: "Load the descriptions of the parameters",
       id: "describe",
       hidden: true,
     }),
     store.mayWrite &&
-      button("Snapshot", keepState, { drawing: "keep", label: "Snapshot: keep the present state, to go back to" }),
+      button("Snapshot", keepState, { drawing: "keep", label: "Snapshot: record the current values for a later restore" }),
     isHeard && button("Fetch", fetchAll, { drawing: "refresh", label: "Fetch all parameters from the vehicle" }),
   ];
   byId("actions").replaceChildren(...actions.filter(Boolean));
@@ -193,7 +193,7 @@ async function fetchAll() {
   }
 }
 
-/** Gets descriptions of the parameters, from the vehicle, which may take a while over a radio, or from a file. */
+/** Loads parameter metadata, from the vehicle, which is slow over a radio, or from a file. */
 async function describe() {
   const { component } = store;
   const fault = el("p", { class: "fault", role: "alert" });
@@ -202,7 +202,7 @@ async function describe() {
     fault.textContent = "";
     state.textContent = "Reading …";
     try {
-      const { count } = await request(method, at(component, "/metadata"), body, { patience: DESCRIPTION_PATIENCE });
+      const { count } = await request(method, at(component, "/metadata"), body, { timeout: DESCRIPTION_TIMEOUT });
       await store.loadTable(keyOf(component));
       closeDialog();
       announce(`${many(count, "parameter")} described.`);
@@ -216,12 +216,12 @@ async function describe() {
     id: "file",
     on: { change: () => input.files[0] && attempt("PUT", input.files[0]) },
   });
-  const ask = button("Ask the vehicle", () => attempt("POST", {}), { kind: "strong" });
+  const ask = button("Load from the vehicle", () => attempt("POST", {}), { kind: "strong" });
   const content = el(
     "div",
     {},
     el("p", {
-      text: "Units, ranges and the names of values are not known here yet. A vehicle with PX4 can tell them; for others there is a file of their firmware.",
+      text: "Units, ranges and value names are not loaded yet. A vehicle with PX4 can send them; for others, use a file of their firmware.",
     }),
     el("h3", { text: "From a file" }),
     el(
@@ -241,7 +241,7 @@ async function describe() {
   );
 }
 
-/** Offers that where nothing is described. */
+/** Offers to load metadata if there is none. */
 export function offerDescriptions() {
   const { table } = store;
   const isWanted = table.isLoaded && table.rows.size && !store.component?.is_kept;
@@ -256,7 +256,7 @@ async function stopFetch() {
       (job) => job.kind === "fetch" && job.state === "running" && keyOf(job) === keyOf(component),
     );
     for (const job of running) await request("DELETE", `/jobs/${encodeURIComponent(job.id)}`);
-    if (!running.length) announce("The service fetches by itself; that cannot be stopped here.");
+    if (!running.length) announce("The service started this fetch; it cannot be stopped here.");
   } catch (error) {
     complain(error);
   }
@@ -265,14 +265,14 @@ async function stopFetch() {
 async function keepState() {
   try {
     await request("POST", at(store.component, "/snapshots"), { reason: "kept by hand" });
-    announce("The present state is kept.");
-    tellShortly("The present state is kept; Compare shows it.");
+    announce("Snapshot created.");
+    tellShortly("Snapshot created. Compare shows it.");
   } catch (error) {
     complain(error);
   }
 }
 
-/** Lets the person choose a form of file, and saves the table as one; what keeps it from that is told. */
+/** Asks for a file format and saves the table; shows an error. */
 async function save() {
   const { component } = store;
   let forms;
@@ -303,12 +303,12 @@ async function save() {
 
   async function take(form) {
     fault.textContent = "";
-    state.textContent = component.is_kept ? "Reading …" : "The vehicle is asked for all of it …";
+    state.textContent = component.is_kept ? "Reading …" : "Fetching all parameters from the vehicle …";
     try {
-      const { name, content } = await download(at(component, "/file", { form }), SAVE_PATIENCE);
+      const { name, content } = await download(at(component, "/file", { form }), SAVE_TIMEOUT);
       const address = URL.createObjectURL(content);
       el("a", { href: address, download: name }).click();
-      setTimeout(() => URL.revokeObjectURL(address), SAVE_PATIENCE);
+      setTimeout(() => URL.revokeObjectURL(address), SAVE_TIMEOUT);
       state.textContent = `Saved as ${name}.`;
     } catch (error) {
       state.textContent = "";
@@ -325,7 +325,7 @@ async function save() {
   );
 }
 
-/** Says what went wrong, where everybody sees it, until something else is said. */
+/** Shows an error until the next message. */
 export function complain(error) {
   tellShortly(error.message, true);
   announce(error.message);

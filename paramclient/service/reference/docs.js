@@ -1,4 +1,4 @@
-// The document of the API as a page. Text is only ever put in as text.
+// The API reference, rendered from the OpenAPI document. Texts are inserted only as text.
 
 const REF = "#/components/schemas/";
 
@@ -9,7 +9,7 @@ function make(name, text, ...children) {
   return element;
 }
 
-// A schema as one reads JSON: an object with the kind of each member beside its name.
+// Formats a schema like JSON: an object with the type of each member after its name.
 function written(schema, schemas, depth, seen) {
   const inner = "  ".repeat(depth + 1);
   const outer = "  ".repeat(depth);

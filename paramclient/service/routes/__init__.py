@@ -1,4 +1,4 @@
-"""What the service answers, room by room. A further one is a line here.
+"""The routes of the API.
 
 - `components`, `params`, `fetches`, `param_files`, `metadata`: components, parameters, fetches and jobs,
   parameter files, metadata.
@@ -36,3 +36,4 @@ ROUTERS: Final[tuple[APIRouter, ...]] = (
     history.router,
     events.router,
 )
+"""All routers of the application."""

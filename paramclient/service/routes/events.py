@@ -1,4 +1,4 @@
-"""What happens, as it happens: server-sent events, and the same over a WebSocket."""
+"""Routes of the event stream: server-sent events, and a WebSocket."""
 
 from __future__ import annotations
 
@@ -9,36 +9,36 @@ import anyio
 from fastapi import APIRouter, Header, Query, Response, WebSocket
 from starlette.types import Receive, Scope, Send
 
-from paramclient.service.event_feed import Listener, Place, Wanted
+from paramclient.service.event_feed import EventFilter, EventPosition, Listener
 from paramclient.service.hub import Hub
 from paramclient.service.problems import ServiceError
-from paramclient.service.route_context import LinkName, TheHub
+from paramclient.service.route_context import HubArgument, LinkName
 
 __all__ = ["router"]
 
-KEEPALIVE: Final = 2.0
-"""Seconds without an event after which a comment says that the service is still there."""
-SLOWEST: Final = 30.0
-"""Seconds in which a listener must have taken what it was sent; one that has not is left."""
-MOST_LISTENERS: Final = 1_000
-"""Streams that are open at once; each is a connection."""
-AWAY: Final = 1001
-"""The WebSocket's code for a server that ends (RFC 6455, section 7.4.1)."""
+KEEPALIVE_INTERVAL: Final = 2.0
+"""Seconds without an event after which a comment is sent."""
+LISTENER_SEND_TIMEOUT: Final = 30.0
+"""Seconds without progress after which a listener is disconnected."""
+LISTENERS_MAX: Final = 1_000
+"""Maximum number of open event streams; each is a connection."""
+GOING_AWAY: Final = 1001
+"""Close code of a WebSocket at the end of the service: going away (RFC 6455, section 7.4.1)."""
 
 router = APIRouter(prefix="/api/v1", tags=["events"])
 
-Types = Annotated[str | None, Query(max_length=200, description="Kinds of events, with commas between them.")]
-After = Annotated[str | None, Query(max_length=64, description="The id of the event that was seen last.")]
+Types = Annotated[str | None, Query(max_length=200, description="Types of events, separated by commas.")]
+After = Annotated[str | None, Query(max_length=64, description="Id of the last received event.")]
 Id = Annotated[int | None, Query(ge=0, le=255)]
 
 
 @router.get(
     "/events",
     response_class=Response,
-    responses={200: {"content": {"text/event-stream": {}}, "description": "Events, without an end"}},
+    responses={200: {"content": {"text/event-stream": {}}, "description": "An endless stream of events"}},
 )
 async def events(
-    hub: TheHub,
+    hub: HubArgument,
     types: Types = None,
     link: LinkName = None,
     system: Id = None,
@@ -46,9 +46,9 @@ async def events(
     after: After = None,
     last_event_id: Annotated[str | None, Header(max_length=64)] = None,
 ) -> Response:
-    """What happens from now on, or since the event that was seen last, as server-sent events."""
-    wanted = _wanted(types, link, system, component)
-    return _EventStream(_listener(hub, last_event_id or after, wanted))
+    """Return the events from now on, or after the last received event, as server-sent events."""
+    event_filter = _event_filter(types, link, system, component)
+    return _EventStream(_listener(hub, last_event_id or after, event_filter))
 
 
 @router.websocket("/ws")
@@ -60,21 +60,21 @@ async def websocket(
     component: Id = None,
     after: After = None,
 ) -> None:
-    """The same events as text frames."""
+    """Send the same events as text frames."""
     hub: Hub = socket.app.state.hub
-    listener = _listener(hub, after, _wanted(types, link, system, component))
+    listener = _listener(hub, after, _event_filter(types, link, system, component))
     await socket.accept()
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(_cancel_when, "websocket.disconnect", socket.receive, tasks.cancel_scope)
         with listener:
             await _send_texts(listener, socket.send_text)
-        with anyio.move_on_after(SLOWEST):
-            await socket.close(AWAY)
+        with anyio.move_on_after(LISTENER_SEND_TIMEOUT):
+            await socket.close(GOING_AWAY)
         tasks.cancel_scope.cancel()
 
 
 class _EventStream(Response):
-    """Events until the listener leaves, is too slow, or the service ends."""
+    """Sends events until the client disconnects or stalls for `LISTENER_SEND_TIMEOUT`, or the feed ends."""
 
     media_type = "text/event-stream"
 
@@ -94,34 +94,34 @@ class _EventStream(Response):
 
     async def _send_events(self, send: Send) -> None:
         listener = self._listener
-        chunk = _as_event(listener.place, listener.hello())
+        chunk = _as_event(listener.position, listener.hello())
         while True:
-            with anyio.move_on_after(SLOWEST) as patience:
+            with anyio.move_on_after(LISTENER_SEND_TIMEOUT) as patience:
                 await send({"type": "http.response.body", "body": chunk, "more_body": True})
             if patience.cancelled_caught:
                 return
             try:
-                news = await listener.next(KEEPALIVE)
+                news = await listener.next(KEEPALIVE_INTERVAL)
             except EOFError:
                 return
             if news is None:
-                chunk = f": \nid: {listener.place}\n\n".encode()
+                chunk = f": \nid: {listener.position}\n\n".encode()
                 continue
             batch, chunk = news
             if batch.missed:
-                chunk = _as_event(listener.place, listener.gap(batch.missed))
+                chunk = _as_event(listener.position, listener.gap(batch.missed))
 
 
 async def _send_texts(listener: Listener, send: Callable[[str], Awaitable[None]]) -> None:
     texts = [listener.hello()]
     while True:
-        with anyio.move_on_after(SLOWEST) as patience:
+        with anyio.move_on_after(LISTENER_SEND_TIMEOUT) as patience:
             for text in texts:
                 await send(text)
         if patience.cancelled_caught:
             return
         try:
-            news = await listener.next(KEEPALIVE)
+            news = await listener.next(KEEPALIVE_INTERVAL)
         except EOFError:
             return
         texts = []
@@ -138,19 +138,23 @@ async def _cancel_when(
     scope.cancel()
 
 
-def _wanted(types: str | None, link: str | None, system: int | None, component: int | None) -> Wanted:
+def _event_filter(
+    types: str | None, link: str | None, system: int | None, component: int | None
+) -> EventFilter:
     kinds = None if types is None else frozenset(filter(None, types.split(",")))
-    return Wanted(kinds, link, system, component)
+    return EventFilter(kinds, link, system, component)
 
 
-def _listener(hub: Hub, after: str | None, wanted: Wanted) -> Listener:
+def _listener(hub: Hub, after: str | None, event_filter: EventFilter) -> Listener:
     feed = hub.feed
-    if feed.is_over:
-        raise ServiceError(503, "closing", "The service is ending.")
-    if feed.listeners >= MOST_LISTENERS:
-        raise ServiceError(429, "too-many", f"{MOST_LISTENERS} streams of events are open already.")
-    return feed.listen(None if after is None else Place.read(after), wanted)
+    if feed.is_ended:
+        raise ServiceError(503, "closing", "The service is shutting down.")
+    if feed.listeners >= LISTENERS_MAX:
+        raise ServiceError(
+            429, "too-many", f"{LISTENERS_MAX} event streams are already open. Try again later."
+        )
+    return feed.listen(None if after is None else EventPosition.read(after), event_filter)
 
 
-def _as_event(place: Place, text: str) -> bytes:
-    return f"id: {place}\ndata: {text}\n\n".encode()
+def _as_event(position: EventPosition, text: str) -> bytes:
+    return f"id: {position}\ndata: {text}\n\n".encode()

@@ -1,4 +1,4 @@
-"""Fetches, and the jobs that they and other long work are."""
+"""Routes of fetches and jobs."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from paramclient.documents.job import JobDoc, JobsDoc
 from paramclient.documents.results import FetchedAllDoc, FetchResultDoc, SilentDoc
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.protocol.params.sampling import SAMPLE_SIZE
-from paramclient.service.answering import JSON, document_answer, written_out
 from paramclient.service.hub import Hub
 from paramclient.service.jobs import Job
 from paramclient.service.problems import problem_of
-from paramclient.service.reading import BodyRoute
+from paramclient.service.request_body import BodyRoute
+from paramclient.service.responses import JSON, document_response, encode_document
 from paramclient.service.route_context import (
+    HubArgument,
     LinkName,
     Seconds,
     Target,
-    TheHub,
-    answered,
-    asker_of,
+    author_of,
     holder_of,
-    may_write,
+    require_write,
+    run_until_disconnect,
 )
 
-__all__ = ["accepted", "awaited", "router"]
+__all__ = ["job_response", "wait_for_job", "router"]
 
 router = APIRouter(prefix="/api/v1", tags=["fetches"], route_class=BodyRoute)
 
 
-class Fetched(Body):
-    """How to bring a table up to date; see `Component.fetch_all`. With `wait` false the answer is a job."""
+class FetchRequest(Body):
+    """Options of a fetch; see `Component.fetch_all`. With `wait` false, the response is a job."""
 
     refresh: bool = False
     accept: Literal["verified", "sampled"] = "verified"
@@ -46,8 +46,8 @@ class Fetched(Body):
     wait: bool = True
 
 
-class EverybodyFetched(Body):
-    """How to bring the tables of all components up to date, or those of one system."""
+class FetchAllRequest(Body):
+    """Options of a fetch of all components, or of those of one system."""
 
     system: Annotated[int, Field(ge=1, le=255)] | None = None
     refresh: bool = False
@@ -57,15 +57,15 @@ class EverybodyFetched(Body):
 @router.post(
     "/components/{system}/{component}/fetch",
     response_model=FetchResultDoc,
-    responses={202: {"model": JobDoc, "description": "It is under way"}},
+    responses={202: {"model": JobDoc, "description": "The started job"}},
 )
 async def fetch(
-    request: Request, response: Response, hub: TheHub, target: Target, body: Fetched
+    request: Request, response: Response, hub: HubArgument, target: Target, body: FetchRequest
 ) -> FetchResultDoc | Response:
-    """Bring the whole table up to date. Those who ask at the same time share one download."""
-    job = hub.begin_fetch(
+    """Fetch the whole table. Simultaneous requests share one download."""
+    job = hub.start_fetch(
         target,
-        asker_of(request),
+        author_of(request),
         holder_of(request),
         refresh=body.refresh,
         accept=body.accept,
@@ -74,63 +74,63 @@ async def fetch(
         timeout=body.timeout_s,
     )
     if not body.wait:
-        return accepted(job)
-    result = await awaited(request, job)
+        return job_response(job)
+    result = await wait_for_job(request, job)
     assert isinstance(result, FetchResultDoc)
     return result
 
 
 @router.post("/fetch")
-async def fetch_everybody(
-    request: Request, hub: TheHub, body: EverybodyFetched, link: LinkName = None
+async def fetch_all(
+    request: Request, hub: HubArgument, body: FetchAllRequest, link: LinkName = None
 ) -> FetchedAllDoc:
-    """Bring the tables of everybody up to date, on all links side by side."""
-    return await answered(request, lambda: _fetch_everybody(hub, body, link), *hub.followed)
+    """Fetch the tables of all components, on all links in parallel."""
+    return await run_until_disconnect(request, lambda: _fetch_all(hub, body, link), *hub.followed)
 
 
 @router.get("/jobs", response_model=JobsDoc)
-async def jobs(hub: TheHub) -> Response:
-    """What is under way, and what was lately. Members of a result with more than 64 entries are left out."""
-    documents = hub.jobs.later_documents
+async def jobs(hub: HubArgument) -> Response:
+    """Return running and recent jobs. Members of a result with more than 64 entries are omitted."""
+    documents = hub.jobs.document_factories
 
     def write() -> bytes:
-        return written_out(JobsDoc(jobs=[]), jobs=(document() for document in documents))
+        return encode_document(JobsDoc(jobs=[]), jobs=(document() for document in documents))
 
-    return Response(await hub.aside(write), media_type=JSON)
+    return Response(await hub.run_in_thread(write), media_type=JSON)
 
 
 @router.get("/jobs/{job}", response_model=JobDoc)
-async def one_job(hub: TheHub, job: str) -> Response:
-    """One of them."""
-    return await document_answer(hub.aside, hub.jobs.later_document(job))
+async def one_job(hub: HubArgument, job: str) -> Response:
+    """Return one job."""
+    return await document_response(hub.run_in_thread, hub.jobs.document_factory(job))
 
 
 @router.delete("/jobs/{job}", status_code=204)
-async def cancel(request: Request, hub: TheHub, job: str) -> Response:
-    """Cancel it. A download goes on for as long as somebody else waits for it."""
+async def cancel(request: Request, hub: HubArgument, job: str) -> Response:
+    """Cancel a job. A download continues while another client waits for it."""
     found = hub.jobs.find(job)
     if found.kind != "fetch":
-        await may_write(request)
+        await require_write(request)
     found.cancel()
     return Response(status_code=204)
 
 
-async def awaited(request: Request, job: Job) -> object:
-    """What a job ends with, for somebody who waits; should they leave, it is cancelled."""
+async def wait_for_job(request: Request, job: Job) -> object:
+    """Wait for the result of a job, and cancel the job if the client disconnects."""
     try:
-        return await answered(request, job.wait, job.followed)
+        return await run_until_disconnect(request, job.wait, job.followed)
     finally:
-        job.cancel()  # it is over, or nobody wants it
+        job.cancel()  # no effect on an ended job
 
 
-def accepted(job: Job) -> Response:
-    """The answer to those who do not wait."""
+def job_response(job: Job) -> Response:
+    """Return the response for a client that does not wait."""
     content = job.document().model_dump_json()
     where = f"/api/v1/jobs/{job.id}"
     return Response(content, 202, headers={"Location": where}, media_type="application/json")
 
 
-async def _fetch_everybody(hub: Hub, body: EverybodyFetched, link: str | None) -> FetchedAllDoc:
+async def _fetch_all(hub: Hub, body: FetchAllRequest, link: str | None) -> FetchedAllDoc:
     results: list[FetchResultDoc] = []
     silent: list[SilentDoc] = []
     failures: list[ParamClientError] = []

@@ -1,4 +1,5 @@
-"""What was: history, snapshots and earlier states, of who is heard and of everyone in the cache."""
+"""Routes of earlier states: history and snapshots, of connected components and of all vehicles in the
+cache."""
 
 from __future__ import annotations
 
@@ -20,222 +21,230 @@ from paramclient.errors import UsageError
 from paramclient.files import FileForm
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import check_name
-from paramclient.service.answering import JSON, document_answer, written_out
-from paramclient.service.followed_component import Followed
+from paramclient.service.followed_component import FollowedComponent
 from paramclient.service.hub import Hub
 from paramclient.service.param_sources import (
-    FewPatterns,
-    GivenFile,
-    Moment,
-    cached,
-    key_of,
-    known_to,
-    parsed,
-    past,
-    state,
-    the_cache,
-    written,
+    LimitedPatterns,
+    Timestamp,
+    UploadedFile,
+    flush_cache,
+    load_cached_state,
+    load_cached_table,
+    load_state,
+    read_cache,
+    read_file,
+    require_cache,
+    wait_for_key,
 )
 from paramclient.service.problems import ServiceError
-from paramclient.service.reading import BodyRoute, long_request
-from paramclient.service.route_context import Target, TheHub, answered, may_write
-from paramclient.service.routes.param_files import Form, From, attachment, moment
+from paramclient.service.request_body import BodyRoute, long_request
+from paramclient.service.responses import JSON, document_response, encode_document
+from paramclient.service.route_context import HubArgument, Target, require_write, run_until_disconnect
+from paramclient.service.routes.param_files import Form, From, file_response, parse_state
 
 __all__ = ["router"]
 
 router = APIRouter(prefix="/api/v1", tags=["history"], route_class=BodyRoute)
 
-LONGEST_PAGE: Final = 1_000
-"""Lines of history in one answer."""
-A_PAGE: Final = 100
-MOST_NAMES: Final = 1_000
-"""Names and patterns that a fleet is compared in."""
-MOST_CELLS: Final = 250_000
-"""Names times vehicles of one comparison of a fleet: its answer has up to 30 MB."""
+HISTORY_PAGE_LINES_MAX: Final = 1_000
+"""Maximum number of lines of history in a response."""
+HISTORY_PAGE_LINES: Final = 100
+"""Default number of lines of history in a response."""
+FLEET_NAMES_MAX: Final = 1_000
+"""Maximum number of names and patterns of a fleet comparison."""
+FLEET_CELLS_MAX: Final = 250_000
+"""Maximum of names times vehicles of a fleet comparison: its response has up to 30 MB."""
 
-Key = Annotated[str, Path(max_length=400, description="As /vehicles names it, percent-encoded.")]
+Key = Annotated[str, Path(max_length=400, description="Key of the vehicle in /vehicles, percent-encoded.")]
 Id = Annotated[int, Path(ge=1, le=255)]
 Snapshot = Annotated[int, Path(ge=1, lt=1 << 62)]
 Name = Annotated[str | None, Query(max_length=16)]
-Limit = Annotated[int, Query(ge=1, le=LONGEST_PAGE)]
-Since = Annotated[Moment | None, Query(description="From this time on only.")]
-Before = Annotated[Moment | None, Query(description="Before this time only: `before` of the last answer.")]
-At = Annotated[Moment, Query(description="Unix seconds, or ISO 8601 with a zone.")]
+Limit = Annotated[int, Query(ge=1, le=HISTORY_PAGE_LINES_MAX)]
+Since = Annotated[Timestamp | None, Query(description="Only from this time on.")]
+Before = Annotated[
+    Timestamp | None, Query(description="Only before this time: `before` of the previous response.")
+]
+At = Annotated[Timestamp, Query(description="Unix seconds, or ISO 8601 with a zone.")]
 
 _FILE: Final[dict[int | str, dict[str, Any]]] = {
     200: {"content": {"application/octet-stream": {}}, "description": "The file"}
 }
 
 
-class SetDown(Body):
-    """What a snapshot is for, in words."""
+class SnapshotRequest(Body):
+    """Reason of a snapshot."""
 
     reason: Annotated[str, Field(min_length=1, max_length=200)]
 
 
-class FleetCompared(Body):
-    """What all vehicles are compared in: names and patterns, or what a file or values want of them."""
+class FleetDiffRequest(Body):
+    """Names and patterns to compare, or the wanted values in a file or in `values`."""
 
     names: (
         Annotated[
             tuple[Annotated[str, Field(min_length=1, max_length=64)], ...],
-            Field(max_length=MOST_NAMES, fail_fast=True),
-            FewPatterns,
+            Field(max_length=FLEET_NAMES_MAX, fail_fast=True),
+            LimitedPatterns,
         ]
         | None
     ) = None
-    file: GivenFile | None = None
-    values: Annotated[dict[str, int | float], InParts, Field(min_length=1, max_length=MOST_NAMES)] | None = (
-        None
-    )
+    file: UploadedFile | None = None
+    values: (
+        Annotated[dict[str, int | float], InParts, Field(min_length=1, max_length=FLEET_NAMES_MAX)] | None
+    ) = None
     component: Annotated[int, Field(ge=1, le=255)] | None = None
 
     @model_validator(mode="after")
-    def _is_one(self) -> FleetCompared:
+    def _is_one(self) -> FleetDiffRequest:
         if sum(each is not None for each in (self.names, self.file, self.values)) != 1:
-            raise ValueError("vehicles are compared either in names, with a file, or with values")
+            raise ValueError("a fleet comparison needs exactly one of `names`, `file` and `values`")
         return self
 
 
-# of who is heard
+# connected components
 
 
 @router.get("/components/{system}/{component}/history", response_model=HistoryDoc)
 async def history(
     request: Request,
-    hub: TheHub,
+    hub: HubArgument,
     target: Target,
     name: Name = None,
-    limit: Limit = A_PAGE,
+    limit: Limit = HISTORY_PAGE_LINES,
     since: Since = None,
     before: Before = None,
 ) -> Response:
-    """How the values of a component have changed, the newest last."""
-    return await answered(request, lambda: _history(hub, target, name, limit, since, before))
+    """Return the changes of values of a component, the newest last."""
+    return await run_until_disconnect(request, lambda: _history(hub, target, name, limit, since, before))
 
 
 @router.get("/components/{system}/{component}/snapshots")
-async def snapshots(request: Request, hub: TheHub, target: Target) -> SnapshotsDoc:
-    """What was set down of a component's table, the newest last."""
+async def snapshots(request: Request, hub: HubArgument, target: Target) -> SnapshotsDoc:
+    """Return the snapshots of a component, the newest last."""
 
     async def work() -> SnapshotsDoc:
         key = await _key(hub, target)
         return await _snapshots(hub, key, target.component.component)
 
-    return await answered(request, work)
+    return await run_until_disconnect(request, work)
 
 
-@router.post("/components/{system}/{component}/snapshots", status_code=201, dependencies=[Depends(may_write)])
-async def set_down(request: Request, hub: TheHub, target: Target, body: SetDown) -> SnapshotDoc:
-    """Set the table of a component down as it is known now, to have it again however it changes."""
+@router.post(
+    "/components/{system}/{component}/snapshots", status_code=201, dependencies=[Depends(require_write)]
+)
+async def create_snapshot(
+    request: Request, hub: HubArgument, target: Target, body: SnapshotRequest
+) -> SnapshotDoc:
+    """Create a snapshot of the currently known table of a component."""
 
     async def work() -> SnapshotDoc:
-        cache, key, component = the_cache(hub), await _key(hub, target), target.component.component
-        kept = await hub.aside(lambda: cache.snapshot(key, component, reason=body.reason))
+        cache, key, component = require_cache(hub), await _key(hub, target), target.component.component
+        kept = await hub.run_in_thread(lambda: cache.snapshot(key, component, reason=body.reason))
         return SnapshotDoc.of(kept, exact=True)
 
-    return await answered(request, work)
+    return await run_until_disconnect(request, work)
 
 
 @router.get("/components/{system}/{component}/snapshots/{snapshot}", response_model=WholeSnapshotDoc)
-async def one_snapshot(request: Request, hub: TheHub, target: Target, snapshot: Snapshot) -> Response:
-    """A snapshot with its parameters."""
+async def one_snapshot(request: Request, hub: HubArgument, target: Target, snapshot: Snapshot) -> Response:
+    """Return a snapshot with its parameters."""
 
     async def work() -> Response:
         return await _snapshot(hub, await _key(hub, target), target.component.component, snapshot)
 
-    return await answered(request, work)
+    return await run_until_disconnect(request, work)
 
 
 @router.get("/components/{system}/{component}/state", response_model=SetDoc)
-async def state_at(request: Request, hub: TheHub, target: Target, at: At) -> Response:
-    """The table of a component as it was at a time."""
+async def state_at(request: Request, hub: HubArgument, target: Target, at: At) -> Response:
+    """Return the table of a component at a time."""
 
     async def work() -> Response:
-        found = await state(hub, target, at)
-        return await document_answer(hub.aside, lambda: SetDoc.of(found))
+        found = await load_state(hub, target, at)
+        return await document_response(hub.run_in_thread, lambda: SetDoc.of(found))
 
-    return await answered(request, work)
+    return await run_until_disconnect(request, work)
 
 
-# of everyone in the cache
+# vehicles in the cache
 
 
 @router.get("/vehicles", response_model=VehiclesDoc)
-async def vehicles(hub: TheHub) -> Response:
-    """Every vehicle that was ever heard, the one heard last first, with what is kept of it."""
-    cache = the_cache(hub)
-    await written(hub)
-    known, tables = await hub.aside(lambda: (cache.vehicles(), cache.components()))
-    return await document_answer(
-        hub.aside, lambda: VehiclesDoc(vehicles=[VehicleDoc.of(each, tables) for each in known])
+async def vehicles(hub: HubArgument) -> Response:
+    """Return all vehicles in the cache with their tables, the last heard first."""
+    cache = require_cache(hub)
+    await flush_cache(hub)
+    known, tables = await hub.run_in_thread(lambda: (cache.vehicles(), cache.components()))
+    return await document_response(
+        hub.run_in_thread, lambda: VehiclesDoc(vehicles=[VehicleDoc.of(each, tables) for each in known])
     )
 
 
 @router.get("/vehicles/{key:path}/{component}/params", response_model=CachedTableDoc)
-async def kept_params(hub: TheHub, key: Key, component: Id) -> Response:
-    """The parameters of a vehicle as they were last known."""
-    table = await cached(hub, key, component)
-    return await document_answer(hub.aside, lambda: CachedTableDoc.of(table, kept=True))
+async def kept_params(hub: HubArgument, key: Key, component: Id) -> Response:
+    """Return the last known parameters of a vehicle."""
+    table = await load_cached_table(hub, key, component)
+    return await document_response(hub.run_in_thread, lambda: CachedTableDoc.of(table, kept=True))
 
 
 @router.get("/vehicles/{key:path}/{component}/history", response_model=HistoryDoc)
 async def kept_history(
-    hub: TheHub,
+    hub: HubArgument,
     key: Key,
     component: Id,
     name: Name = None,
-    limit: Limit = A_PAGE,
+    limit: Limit = HISTORY_PAGE_LINES,
     since: Since = None,
     before: Before = None,
 ) -> Response:
-    """How its values have changed, the newest last."""
-    await cached(hub, key, component)
+    """Return the changes of values of a vehicle, the newest last."""
+    await load_cached_table(hub, key, component)
     return await _page(hub, key, component, name, limit, since, before)
 
 
 @router.get("/vehicles/{key:path}/{component}/snapshots")
-async def kept_snapshots(hub: TheHub, key: Key, component: Id) -> SnapshotsDoc:
-    """What was set down of its table, the newest last."""
-    await cached(hub, key, component)
+async def kept_snapshots(hub: HubArgument, key: Key, component: Id) -> SnapshotsDoc:
+    """Return the snapshots of a vehicle, the newest last."""
+    await load_cached_table(hub, key, component)
     return await _snapshots(hub, key, component)
 
 
 @router.get("/vehicles/{key:path}/{component}/snapshots/{snapshot}", response_model=WholeSnapshotDoc)
-async def kept_snapshot(hub: TheHub, key: Key, component: Id, snapshot: Snapshot) -> Response:
-    """A snapshot with its parameters."""
-    await cached(hub, key, component)
+async def kept_snapshot(hub: HubArgument, key: Key, component: Id, snapshot: Snapshot) -> Response:
+    """Return a snapshot with its parameters."""
+    await load_cached_table(hub, key, component)
     return await _snapshot(hub, key, component, snapshot)
 
 
 @router.get("/vehicles/{key:path}/{component}/state", response_model=SetDoc)
-async def kept_state(hub: TheHub, key: Key, component: Id, at: At) -> Response:
-    """Its table as it was at a time."""
-    found = await past(hub, key, component, at)
-    return await document_answer(hub.aside, lambda: SetDoc.of(found))
+async def kept_state(hub: HubArgument, key: Key, component: Id, at: At) -> Response:
+    """Return the table of a vehicle at a time."""
+    found = await load_cached_state(hub, key, component, at)
+    return await document_response(hub.run_in_thread, lambda: SetDoc.of(found))
 
 
 @router.get("/vehicles/{key:path}/{component}/file", responses=_FILE, response_class=Response)
 async def kept_file(
-    hub: TheHub, key: Key, component: Id, form: Form = FileForm.QGC, source: From = "known"
+    hub: HubArgument, key: Key, component: Id, form: Form = FileForm.QGC, source: From = "known"
 ) -> Response:
-    """Its parameters as a file: as last known, if that is all of them, of a snapshot, or of a time."""
-    when = None if source == "known" else moment(source)
-    return await attachment(hub, await past(hub, key, component, when), form)
+    """Return the parameters of a vehicle as a file: the last known ones if complete, a snapshot, or those at
+    a time."""
+    when = None if source == "known" else parse_state(source)
+    return await file_response(hub, await load_cached_state(hub, key, component, when), form)
 
 
 @router.post("/fleet/diff", response_model=FleetDiffDoc)
-async def fleet_diff(request: Request, hub: TheHub, body: FleetCompared) -> Response:
-    """Compare all vehicles in the cache: in some parameters with each other, or with what is wanted."""
+async def fleet_diff(request: Request, hub: HubArgument, body: FleetDiffRequest) -> Response:
+    """Compare all vehicles in the cache with each other, or with wanted values."""
     with long_request(request):
         return await _fleet_diff(hub, body)
 
 
-async def _fleet_diff(hub: Hub, body: FleetCompared) -> Response:
-    cache = the_cache(hub)
+async def _fleet_diff(hub: Hub, body: FleetDiffRequest) -> Response:
+    cache = require_cache(hub)
     wanted: ParamSet | tuple[str, ...]
     if body.file is not None:
-        wanted = (await parsed(hub, body.file.read)).choose(body.component)
+        wanted = (await read_file(hub, body.file.read)).choose(body.component)
     elif body.values is not None:
         wanted = ParamSet(
             {name: WrittenParam(check_name(name), value) for name, value in body.values.items()}
@@ -243,36 +252,43 @@ async def _fleet_diff(hub: Hub, body: FleetCompared) -> Response:
     else:
         wanted = tuple(map(check_name, body.names or ()))
         if not wanted:
-            raise UsageError("name the parameters to compare")
-    await written(hub)
-    await hub.aside(cache.components)  # whether it can be read at all
-    found = await known_to(hub, lambda: cache.fleet_diff(wanted, component=body.component))
+            raise UsageError("give the names of the parameters to compare")
+    await flush_cache(hub)
+    await hub.run_in_thread(cache.components)  # raises an error for an unreadable cache
+    found = await read_cache(hub, lambda: cache.fleet_diff(wanted, component=body.component))
     cells = len(found.names) * len(found.vehicles)
-    if cells > MOST_CELLS:
-        few = MOST_CELLS // len(found.vehicles)
-        what = f"Of {len(found.vehicles)} vehicles, {few} names may be compared at once, not more."
-        raise ServiceError(413, "too-large", what, most=MOST_CELLS)
+    if cells > FLEET_CELLS_MAX:
+        few = FLEET_CELLS_MAX // len(found.vehicles)
+        what = f"At most {few} names can be compared among {len(found.vehicles)} vehicles."
+        raise ServiceError(413, "too-large", what, most=FLEET_CELLS_MAX)
     spreads = (NameSpreadDoc.of(each) for each in found.names)
     head = FleetDiffDoc(
         component=found.component, vehicles=len(found.vehicles), different=found.differs, names=[]
     )
-    return Response(await hub.read_aside(lambda: written_out(head, names=spreads)), media_type=JSON)
+    return Response(
+        await hub.run_in_file_thread(lambda: encode_document(head, names=spreads)), media_type=JSON
+    )
 
 
-async def _key(hub: Hub, target: Followed) -> str:
-    """The key under which a component is kept, when all that was heard of it is on the disk.
+async def _key(hub: Hub, target: FollowedComponent) -> str:
+    """Return the key of a component with a table in the cache, after all received values are in the cache.
 
     Raises:
-        ServiceError: there is no cache, or nothing of it in there yet.
+        ServiceError: there is no cache, or the cache has no table of the component.
     """
-    the_cache(hub)
-    key = await key_of(hub, target)
-    await cached(hub, key, target.component.component)
+    require_cache(hub)
+    key = await wait_for_key(hub, target)
+    await load_cached_table(hub, key, target.component.component)
     return key
 
 
 async def _history(
-    hub: Hub, target: Followed, name: str | None, limit: int, since: float | None, before: float | None
+    hub: Hub,
+    target: FollowedComponent,
+    name: str | None,
+    limit: int,
+    since: float | None,
+    before: float | None,
 ) -> Response:
     key = await _key(hub, target)
     return await _page(hub, key, target.component.component, name, limit, since, before)
@@ -287,42 +303,47 @@ async def _page(
     since: float | None,
     before: float | None,
 ) -> Response:
-    """The newest lines before a time; those of one moment stay together, as that tells the next page."""
-    cache = the_cache(hub)
+    """Return the newest lines before a time. Lines of one time stay on one page, because the time selects the
+    next page."""
+    cache = require_cache(hub)
     most = limit + 1 if before is None else HISTORY_LINES
-    lines = await hub.aside(lambda: cache.history(key, component, name, most, since))
+    lines = await hub.run_in_thread(lambda: cache.history(key, component, name, most, since))
     if before is not None:
         lines = [line for line in lines if line.at < before]
     page = lines[-limit:]
-    told = [] if name is not None else await _cut_off(hub, key, component, since, before)
+    cut_off = [] if name is not None else await _cut_off(hub, key, component, since, before)
     if len(page) == len(lines):
-        return await document_answer(hub.aside, partial(HistoryDoc.of, page, exact=True, cut_off=told))
-    if before is None and lines[0].at == page[0].at:  # there may be more of them
-        lines = await hub.aside(lambda: cache.history(key, component, name, HISTORY_LINES, since))
+        return await document_response(
+            hub.run_in_thread, partial(HistoryDoc.of, page, exact=True, cut_off=cut_off)
+        )
+    if before is None and lines[0].at == page[0].at:  # older lines may have the same time
+        lines = await hub.run_in_thread(lambda: cache.history(key, component, name, HISTORY_LINES, since))
     oldest = page[0].at
     page = [*_same_moment(lines[: len(lines) - len(page)], oldest), *page]
     if len(page) == len(lines):
-        return await document_answer(hub.aside, partial(HistoryDoc.of, page, exact=True, cut_off=told))
-    told = [note for note in told if note.at >= oldest]
-    return await document_answer(
-        hub.aside, partial(HistoryDoc.of, page, exact=True, before=oldest, cut_off=told)
+        return await document_response(
+            hub.run_in_thread, partial(HistoryDoc.of, page, exact=True, cut_off=cut_off)
+        )
+    cut_off = [note for note in cut_off if note.at >= oldest]
+    return await document_response(
+        hub.run_in_thread, partial(HistoryDoc.of, page, exact=True, before=oldest, cut_off=cut_off)
     )
 
 
 async def _cut_off(
     hub: Hub, key: str, component: int, since: float | None, before: float | None
 ) -> list[CutOff]:
-    """The set-ups of a component that were cut off in a time."""
+    """Return the interrupted set-ups of a component within a period."""
     begin, end = -math.inf if since is None else since, math.inf if before is None else before
     return [
         note
-        for note in await hub.cut_off()
+        for note in await hub.interrupted_setups()
         if (note.key, note.component) == (key, component) and begin <= note.at < end
     ]
 
 
 def _same_moment(lines: Sequence[HistoryEntry], at: float) -> Sequence[HistoryEntry]:
-    """The last lines that are all of one moment."""
+    """Return the last lines with this time."""
     count = 0
     while count < len(lines) and lines[-1 - count].at == at:
         count += 1
@@ -330,15 +351,15 @@ def _same_moment(lines: Sequence[HistoryEntry], at: float) -> Sequence[HistoryEn
 
 
 async def _snapshots(hub: Hub, key: str, component: int) -> SnapshotsDoc:
-    cache = the_cache(hub)
-    return SnapshotsDoc.of(await hub.aside(lambda: cache.snapshots(key, component)), exact=True)
+    cache = require_cache(hub)
+    return SnapshotsDoc.of(await hub.run_in_thread(lambda: cache.snapshots(key, component)), exact=True)
 
 
 async def _snapshot(hub: Hub, key: str, component: int, number: int) -> Response:
-    cache = the_cache(hub)
-    kept = await hub.aside(lambda: cache.snapshots(key, component))
+    cache = require_cache(hub)
+    kept = await hub.run_in_thread(lambda: cache.snapshots(key, component))
     for each in kept:
         if each.id == number:
-            found = await past(hub, key, component, number)
-            return await document_answer(hub.aside, partial(WholeSnapshotDoc.whole, each, found))
-    raise ServiceError(404, "unknown-snapshot", f"There is no snapshot {number} of it.")
+            found = await load_cached_state(hub, key, component, number)
+            return await document_response(hub.run_in_thread, partial(WholeSnapshotDoc.whole, each, found))
+    raise ServiceError(404, "unknown-snapshot", f"The component has no snapshot {number}.")

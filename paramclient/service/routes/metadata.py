@@ -1,4 +1,4 @@
-"""What firmwares say of their parameters: what is known here, what the vehicle says, what a file says."""
+"""Routes of parameter metadata: the known descriptions, those of the vehicle, those of a file."""
 
 from __future__ import annotations
 
@@ -10,14 +10,20 @@ from paramclient.documents.document import Body
 from paramclient.documents.param import DescribedDoc, InfosDoc
 from paramclient.metadata import Metadata, metadata_of, read_content
 from paramclient.model.patterns import NameChoice
-from paramclient.service.answering import document_answer
-from paramclient.service.followed_component import Followed
-from paramclient.service.param_sources import LONGEST_NAME, MOST_PATTERNS
+from paramclient.service.followed_component import FollowedComponent
+from paramclient.service.param_sources import FILE_NAME_LENGTH_MAX, PATTERNS_MAX
 from paramclient.service.problems import ServiceError
-from paramclient.service.reading import BodyRoute, long_request
-from paramclient.service.request import LARGEST_DESCRIPTION
-from paramclient.service.route_context import Seconds, Target, TheHub, answered, may_write
-from paramclient.service.routes.param_files import RAW_BODY, body_of
+from paramclient.service.request import METADATA_BYTES_MAX
+from paramclient.service.request_body import BodyRoute, long_request
+from paramclient.service.responses import document_response
+from paramclient.service.route_context import (
+    HubArgument,
+    Seconds,
+    Target,
+    require_write,
+    run_until_disconnect,
+)
+from paramclient.service.routes.param_files import RAW_BODY, read_body
 
 __all__ = ["router"]
 
@@ -26,56 +32,58 @@ router = APIRouter(
 )
 
 
-class Asked(Body):
-    """How long to wait for an answer."""
+class DescribeRequest(Body):
+    """Timeout of the vehicle's response."""
 
     timeout_s: Seconds = None
 
 
 @router.get("/metadata", response_model=InfosDoc)
 async def known_infos(
-    hub: TheHub,
+    hub: HubArgument,
     target: Target,
     names: Annotated[
-        list[str], Query(max_length=MOST_PATTERNS, description="Such as MC_*; any of them.")
+        list[str], Query(max_length=PATTERNS_MAX, description="Names or patterns such as MC_*.")
     ] = [],  # noqa: B006 - FastAPI copies it
 ) -> Response:
-    """What is known here of the parameters that the component has."""
+    """Return the known descriptions of the parameters of the component."""
     metadata = target.metadata
     if metadata is None:
-        raise ServiceError(404, "not-described", "Nothing is known here of what its parameters mean.")
+        raise ServiceError(404, "not-described", "The service has no metadata of the component's parameters.")
     known = list(target.component.params)
 
     def document() -> InfosDoc:
         chosen = NameChoice(names)
         return InfosDoc.of(metadata, [name for name in known if not names or chosen.has(name)])
 
-    return await document_answer(hub.aside, document)
+    return await document_response(hub.run_in_thread, document)
 
 
 @router.post("/metadata")
-async def described(request: Request, target: Target, body: Asked) -> DescribedDoc:
-    """Let the component describe its parameters. It is kept for its firmware."""
-    metadata = await answered(request, lambda: metadata_of(target.component, timeout=body.timeout_s), target)
+async def described(request: Request, target: Target, body: DescribeRequest) -> DescribedDoc:
+    """Fetch the descriptions from the component. They are cached for its firmware."""
+    metadata = await run_until_disconnect(
+        request, lambda: metadata_of(target.component, timeout=body.timeout_s), target
+    )
     if metadata is None:
-        raise ServiceError(404, "not-described", "The component does not describe its parameters.")
+        raise ServiceError(404, "not-described", "The component provides no metadata of its parameters.")
     return _take(target, metadata)
 
 
-@router.put("/metadata", dependencies=[Depends(may_write)], openapi_extra=RAW_BODY)
+@router.put("/metadata", dependencies=[Depends(require_write)], openapi_extra=RAW_BODY)
 async def described_by_file(
     request: Request,
-    hub: TheHub,
+    hub: HubArgument,
     target: Target,
-    name: Annotated[str, Query(max_length=LONGEST_NAME)] = "the file",
+    name: Annotated[str, Query(max_length=FILE_NAME_LENGTH_MAX)] = "the file",
 ) -> DescribedDoc:
-    """Take the descriptions of a file, for as long as the service runs."""
-    content = await body_of(request, LARGEST_DESCRIPTION)
+    """Use the descriptions in a file until the end of the service."""
+    content = await read_body(request, METADATA_BYTES_MAX)
     with long_request(request):
-        return _take(target, await hub.read_aside(lambda: read_content(content, source=name)))
+        return _take(target, await hub.run_in_file_thread(lambda: read_content(content, source=name)))
 
 
-def _take(target: Followed, metadata: Metadata) -> DescribedDoc:
+def _take(target: FollowedComponent, metadata: Metadata) -> DescribedDoc:
     target.metadata = metadata
-    target.tell("params", {"count": len(target.component.params)})
+    target.publish("params", {"count": len(target.component.params)})
     return DescribedDoc(count=len(metadata), source=metadata.source)

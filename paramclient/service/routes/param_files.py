@@ -1,4 +1,4 @@
-"""Parameter files: what a component has in any form, and what a file says."""
+"""Routes of parameter files: a component's parameters in any format, and parsing of files."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from paramclient.files.param_file import ENDINGS
 from paramclient.model.identity import autopilot_name
 from paramclient.model.paramset import ParamSet
 from paramclient.provision.vehicle_params import fetch_set, select_non_defaults
-from paramclient.service.answering import document_answer
 from paramclient.service.hub import Hub
 from paramclient.service.param_sources import (
-    LARGEST_UPLOAD,
-    LONGEST_NAME,
+    FILE_NAME_LENGTH_MAX,
+    PARAM_FILE_BYTES_MAX,
     check_size,
-    known_set,
-    read_upload,
-    state,
-    when_of,
+    current_set,
+    load_state,
+    parse_timestamp,
+    parse_upload,
 )
-from paramclient.service.reading import long_request
-from paramclient.service.route_context import Target, TheHub, answered
+from paramclient.service.request_body import long_request
+from paramclient.service.responses import document_response
+from paramclient.service.route_context import HubArgument, Target, run_until_disconnect
 
-__all__ = ["RAW_BODY", "attachment", "body_of", "moment", "router"]
+__all__ = ["RAW_BODY", "file_response", "read_body", "parse_state", "router"]
 
 router = APIRouter(prefix="/api/v1", tags=["files"])
 
-LONGEST_STEM: Final = 100
-"""Characters of the name of a file that is given, before its ending."""
+FILE_STEM_LENGTH_MAX: Final = 100
+"""Maximum number of characters of the name of a sent file, without its extension."""
 
-Form = Annotated[FileForm, Query(description="One of those that /forms says can be written.")]
+Form = Annotated[FileForm, Query(description="A writable format of /forms.")]
 From = Annotated[str, Query(alias="from", max_length=64, description="live, known, snapshot:ID, or a time.")]
 Id = Annotated[int | None, Query(ge=1, le=255)]
 
@@ -46,7 +46,7 @@ RAW_BODY: Final[dict[str, Any]] = {
         "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
     }
 }
-"""For the document of the API: the body is a file as it is."""
+"""OpenAPI description of a body that is a file."""
 
 _FILE: Final[dict[int | str, dict[str, Any]]] = {
     200: {"content": {"application/octet-stream": {}}, "description": "The file"}
@@ -55,93 +55,100 @@ _FILE: Final[dict[int | str, dict[str, Any]]] = {
 
 @router.get("/forms")
 async def forms() -> FormsDoc:
-    """The forms of parameter files. All of them are read."""
+    """Return the formats of parameter files. All can be read."""
     return FormsDoc(forms=[FormDoc.of(form) for form in FileForm])
 
 
 @router.get("/components/{system}/{component}/file", responses=_FILE, response_class=Response)
 async def file(
     request: Request,
-    hub: TheHub,
+    hub: HubArgument,
     target: Target,
     form: Form = FileForm.QGC,
     source: From = "live",
-    changed: Annotated[bool, Query(description="Only what differs from the firmware's defaults.")] = False,
+    changed: Annotated[
+        bool, Query(description="Only parameters that differ from the firmware's defaults.")
+    ] = False,
 ) -> Response:
-    """The parameters of a component as a file; `live` asks the vehicle. An incomplete table is not given."""
+    """Return the parameters of a component as a file; `live` fetches them from the vehicle. An incomplete
+    table is an error."""
 
     async def work() -> Response:
         if source not in ("live", "known"):
             if changed:
-                raise UsageError("what differs from the defaults is known of the present table alone")
-            return await attachment(hub, await state(hub, target, moment(source)), form)
+                raise UsageError("only the current table can be compared with the firmware's defaults")
+            return await file_response(hub, await load_state(hub, target, parse_state(source)), form)
         if source == "known":
-            found = await known_set(target, hub.aside)
+            found = await current_set(target, hub.run_in_thread)
         else:
-            found = await fetch_set(target.component, source=f"link {target.line.name}", run=hub.aside)
-        chosen = await hub.aside(lambda: select_non_defaults(found.set)) if changed else found.set
-        return await attachment(hub, chosen, form)
+            found = await fetch_set(
+                target.component, source=f"link {target.link.name}", run=hub.run_in_thread
+            )
+        chosen = await hub.run_in_thread(lambda: select_non_defaults(found.set)) if changed else found.set
+        return await file_response(hub, chosen, form)
 
-    return await answered(request, work, target)
+    return await run_until_disconnect(request, work, target)
 
 
 @router.post("/files", response_model=UploadedDoc, openapi_extra=RAW_BODY)
 async def files(
     request: Request,
-    hub: TheHub,
-    name: Annotated[str, Query(max_length=LONGEST_NAME, description="The ending may tell the form.")] = "",
+    hub: HubArgument,
+    name: Annotated[
+        str, Query(max_length=FILE_NAME_LENGTH_MAX, description="The extension can indicate the format.")
+    ] = "",
     form: Annotated[FileForm | None, Query()] = None,
     component: Id = None,
     system: Id = None,
 ) -> Response:
-    """Read a parameter file of any form; it is kept nowhere.
+    """Parse a parameter file of any format. The file is not stored.
 
-    Of a file with several components, `params` are those of the autopilot, or of the one that is named.
+    For a file with several components, `params` has those of the autopilot, or of the given component.
     """
-    data = await body_of(request, LARGEST_UPLOAD)
+    data = await read_body(request, PARAM_FILE_BYTES_MAX)
 
     def document() -> UploadedDoc:
-        found = read_upload(data, name, form)
+        found = parse_upload(data, name, form)
         return UploadedDoc.of(found, found.choose(component, system=system))
 
     with long_request(request):
-        return await document_answer(hub.read_aside, document)
+        return await document_response(hub.run_in_file_thread, document)
 
 
-def moment(text: str) -> float | int:
-    """What `from` says: the number of a snapshot as an int, a time as a float.
+def parse_state(text: str) -> float | int:
+    """Parse `from`: the number of a snapshot as an int, a time as a float.
 
     Raises:
-        UsageError: it is neither.
+        UsageError: the text is neither.
     """
     number = re.fullmatch("snapshot:([0-9]{1,18})", text)
     if number:
         return int(number[1])
     try:
-        at = when_of(text)
+        at = parse_timestamp(text)
     except ValueError as error:
         raise UsageError(f"from={text}: {error}") from None
     assert isinstance(at, float)
     return at
 
 
-async def attachment(hub: Hub, params: ParamSet, form: FileForm) -> Response:
-    """A set as a file of this form, with a name of its own.
+async def file_response(hub: Hub, params: ParamSet, form: FileForm) -> Response:
+    """Return a response with a set as a file of this format.
 
     Raises:
-        FileError: the form cannot say it.
+        FileError: the format cannot represent the set.
     """
     name = f"{_stem(params)}{_ending(form)}"
-    data = await hub.aside(lambda: dumps(params, form=form, target=name))
-    headers = {"content-disposition": f'attachment; filename="{name}"'}
+    data = await hub.run_in_thread(lambda: dumps(params, form=form, target=name))
+    headers = {"content-disposition": f'file_response; filename="{name}"'}
     return Response(data, media_type="application/octet-stream", headers=headers)
 
 
-async def body_of(request: Request, most: int) -> bytes:
-    """All of the body, if it has no more bytes than these.
+async def read_body(request: Request, most: int) -> bytes:
+    """Return the whole body.
 
     Raises:
-        ServiceError: it has.
+        ServiceError: 413, the body has more than `most` bytes.
     """
     data = bytearray()
     async for piece in request.stream():
@@ -151,11 +158,12 @@ async def body_of(request: Request, most: int) -> bytes:
 
 
 def _stem(params: ParamSet) -> str:
-    """Whose parameters and of when, in characters that are safe in a header and on every disk."""
+    """Return a file name with firmware, ids and time, in characters that are safe in headers and file
+    systems."""
     autopilot = "params" if params.identity is None else autopilot_name(params.identity.autopilot)
     ids = [str(each) for each in (params.system, params.component) if each is not None]
     at = time.strftime("%Y%m%d-%H%M%S", time.gmtime(time.time() if params.at is None else params.at))
-    return re.sub(r"[^A-Za-z0-9._-]", "_", "-".join([autopilot, *ids, at]))[:LONGEST_STEM]
+    return re.sub(r"[^A-Za-z0-9._-]", "_", "-".join([autopilot, *ids, at]))[:FILE_STEM_LENGTH_MAX]
 
 
 def _ending(form: FileForm) -> str:

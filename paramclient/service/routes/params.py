@@ -1,6 +1,6 @@
-"""The parameters of a component: as they are known, asked for, and written.
+"""Routes of parameters: known values, reads, writes.
 
-What is known goes out as it stands written in `following`; nothing is validated on the way.
+Known values are sent as encoded in `followed_component`, without validation.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from paramclient.errors import ParamClientError, UnknownParameter, UsageError
 from paramclient.model.params import copy_params
 from paramclient.model.patterns import NameChoice
 from paramclient.model.values import Param
-from paramclient.service.answering import JSON
-from paramclient.service.followed_component import Followed, param_text
-from paramclient.service.param_sources import MOST_PATTERNS, MOST_VALUES
+from paramclient.service.followed_component import FollowedComponent
+from paramclient.service.param_sources import PATTERNS_MAX, REQUEST_VALUES_MAX
 from paramclient.service.problems import problem_of
-from paramclient.service.reading import BodyRoute
+from paramclient.service.request_body import BodyRoute
+from paramclient.service.responses import JSON
 from paramclient.service.route_context import (
+    HubArgument,
     Seconds,
     Target,
-    TheHub,
-    ValueGiven,
-    answered,
-    asker_of,
-    may_write,
-    value_of,
+    ValueInput,
+    author_of,
+    require_write,
+    resolve_value,
+    run_until_disconnect,
 )
 
 if TYPE_CHECKING:
-    from paramclient.metadata import Metadata
+    from paramclient.metadata import Metadata, ParamInfo
 
 __all__ = ["router"]
 
@@ -48,29 +48,29 @@ router = APIRouter(
 )
 
 
-AT_ONCE: Final = 250
-"""Parameters that are written out before others are served: that takes 2.5 ms, and several tables may be
-asked for at once."""
+PARAMS_PER_TURN: Final = 250
+"""Number of parameters encoded in one turn of the event loop: 2.5 ms. Several tables may be requested at
+once."""
 
 Name = Annotated[str, Field(min_length=1, max_length=16)]
 
 
 class ParamsDoc(Document):
-    """Parameters by name, and the number of the event up to which they hold."""
+    """Parameters by name, and the number of the last event included."""
 
     run: str
     seq: int
     params: dict[str, ParamDoc]
 
 
-class Asked(Body):
-    """How long to wait for an answer."""
+class ReadByPathRequest(Body):
+    """Timeout of the vehicle's response."""
 
     timeout_s: Seconds = None
 
 
-class Read(Body):
-    """One parameter, by its name or by its index."""
+class ReadRequest(Body):
+    """One parameter, by name or index."""
 
     name: Name | None = None
     index: Annotated[int, Field(ge=0, le=65_535)] | None = None
@@ -80,32 +80,28 @@ class Read(Body):
 Settle = Annotated[
     float,
     Field(
-        ge=0, le=SETTLE_MAX, description="Seconds for which the value is watched; then it is read once more."
+        ge=0, le=SETTLE_MAX, description="Seconds for which the value is observed before it is read again."
     ),
 ]
-Force = Annotated[
-    bool, Field(description="Whether NaN and infinity are sent to autopilots that cannot store them.")
-]
+Force = Annotated[bool, Field(description="Send NaN and infinity to autopilots that cannot store them.")]
 
-Durable = Annotated[
-    bool, Field(description="Whether it is answered only when value and history are on the disk.")
-]
+Durable = Annotated[bool, Field(description="Respond after value and history are on the disk.")]
 
 
-class Write(Body):
+class WriteRequest(Body):
     """One value."""
 
-    value: ValueGiven
+    value: ValueInput
     settle_s: Settle = 0.0
     force: Force = False
     durable: Durable = False
     timeout_s: Seconds = None
 
 
-class WriteMany(Body):
+class WriteManyRequest(Body):
     """Several values, by name."""
 
-    values: Annotated[dict[Name, ValueGiven], InParts, Field(min_length=1, max_length=MOST_VALUES)]
+    values: Annotated[dict[Name, ValueInput], InParts, Field(min_length=1, max_length=REQUEST_VALUES_MAX)]
     settle_s: Settle = 0.0
     force: Force = False
     durable: Durable = False
@@ -114,27 +110,27 @@ class WriteMany(Body):
 
 @router.get("/params", responses={200: {"model": ParamsDoc}}, response_class=Response)
 async def known_params(
-    hub: TheHub,
+    hub: HubArgument,
     target: Target,
     names: Annotated[
-        list[str], Query(max_length=MOST_PATTERNS, description="Such as MC_*; any of them.")
+        list[str], Query(max_length=PATTERNS_MAX, description="Names or patterns such as MC_*.")
     ] = [],  # noqa: B006 - FastAPI copies it
     changed: Annotated[
-        bool, Query(description="Only those that differ from the firmware's default.")
+        bool, Query(description="Only parameters that differ from the firmware's default.")
     ] = False,
-    metadata: Annotated[bool, Query(description="With what is known beside the values.")] = False,
+    metadata: Annotated[bool, Query(description="Include the descriptions of the parameters.")] = False,
 ) -> Response:
-    """All that is known of the parameters, with no traffic."""
-    target.look()
-    place, table = hub.feed.place, copy_params(target.component.params)
-    chosen = await hub.aside(lambda: _named(table, names)) if names else list(table)
+    """Return all known parameters, without traffic."""
+    target.publish_changes()
+    place, table = hub.feed.position, copy_params(target.component.params)
+    chosen = await hub.run_in_thread(lambda: _named(table, names)) if names else list(table)
     head = f'{{"run":"{place.run}","seq":{place.seq},"params":{{'
     described = target.metadata if metadata else None
     if described is None:
         texts = await _texts(target, table, chosen, changed=changed)
         return Response(f"{head}{texts}}}}}", media_type=JSON)
     heard_at = {name: target.heard_at(name) for name in chosen}
-    texts = await hub.aside(
+    texts = await hub.run_in_thread(
         lambda: _texts_with_metadata(_params_of(table, chosen, changed=changed), described, heard_at)
     )
     return Response(f"{head}{texts}}}}}", media_type=JSON)
@@ -142,7 +138,7 @@ async def known_params(
 
 @router.get("/params/{name:path}", responses={200: {"model": ParamDoc}}, response_class=Response)
 async def known_param(target: Target, name: str) -> Response:
-    """What is known of one parameter, with no traffic."""
+    """Return one known parameter, without traffic."""
     param = target.component.params.get(name)
     if param is None:
         raise _unknown(target, name)
@@ -150,33 +146,33 @@ async def known_param(target: Target, name: str) -> Response:
 
 
 @router.post("/read", responses={200: {"model": ParamDoc}}, response_class=Response)
-async def read(request: Request, target: Target, body: Read) -> Response:
-    """Ask the vehicle for one parameter. The answer has the name that the vehicle gives it."""
+async def read(request: Request, target: Target, body: ReadRequest) -> Response:
+    """Read one parameter from the vehicle. The response has the name that the vehicle sends."""
     key = body.index if body.name is None else body.name
     if key is None or None not in (body.name, body.index):
-        raise UsageError("give either a name or an index")
+        raise UsageError("the body needs either `name` or `index`")
     return await _read(request, target, key, body.timeout_s)
 
 
 @router.post("/params/{name:path}/read", responses={200: {"model": ParamDoc}}, response_class=Response)
-async def read_by_path(request: Request, target: Target, name: str, body: Asked) -> Response:
-    """The same for one whose name can stand in an address; `#17` is the one with this index."""
+async def read_by_path(request: Request, target: Target, name: str, body: ReadByPathRequest) -> Response:
+    """Read one parameter whose name is in the path; `#17` is an index."""
     digits = name[1:] if name.startswith("#") else ""
     key = int(digits) if digits.isascii() and digits.isdecimal() and len(digits) <= 5 else name
     return await _read(request, target, key, body.timeout_s)
 
 
-@router.put("/params/{name:path}", dependencies=[Depends(may_write)])
-async def write(request: Request, target: Target, name: str, body: Write) -> SetResultDoc:
-    """Write one parameter, and prove by its value that the vehicle has taken it."""
-    asker = asker_of(request)
-    return await answered(request, lambda: _write(target, name, body.value, body, asker), target)
+@router.put("/params/{name:path}", dependencies=[Depends(require_write)])
+async def write(request: Request, target: Target, name: str, body: WriteRequest) -> SetResultDoc:
+    """Write one parameter, and verify the value that the vehicle reports."""
+    asker = author_of(request)
+    return await run_until_disconnect(request, lambda: _write(target, name, body.value, body, asker), target)
 
 
-@router.patch("/params", dependencies=[Depends(may_write)])
-async def write_many(request: Request, target: Target, body: WriteMany) -> SetManyDoc:
-    """Write several side by side. All are tried; the answer says of each what became of it."""
-    asker = asker_of(request)
+@router.patch("/params", dependencies=[Depends(require_write)])
+async def write_many(request: Request, target: Target, body: WriteManyRequest) -> SetManyDoc:
+    """Write several parameters in parallel. All are tried; the response has the result of each."""
+    asker = author_of(request)
     results: dict[str, SetResultDoc | NotSetDoc] = {}
 
     async def write_one(name: str) -> None:
@@ -190,20 +186,22 @@ async def write_many(request: Request, target: Target, body: WriteMany) -> SetMa
             for name in body.values:
                 tasks.start_soon(write_one, name)
 
-    await answered(request, work, target)
+    await run_until_disconnect(request, work, target)
     return SetManyDoc(results={name: results[name] for name in body.values})
 
 
-async def _read(request: Request, target: Followed, key: str | int, timeout: float | None) -> Response:
-    param = await answered(request, lambda: target.component.get(key, timeout=timeout), target)
-    target.was_heard(param.name)
+async def _read(
+    request: Request, target: FollowedComponent, key: str | int, timeout: float | None
+) -> Response:
+    param = await run_until_disconnect(request, lambda: target.component.get(key, timeout=timeout), target)
+    target.record_received(param.name)
     return Response(_text_with_metadata(target, param), media_type=JSON)
 
 
 async def _write(
-    target: Followed, name: str, given: ValueGiven, body: Write | WriteMany, asker: str
+    target: FollowedComponent, name: str, given: ValueInput, body: WriteRequest | WriteManyRequest, asker: str
 ) -> SetResultDoc:
-    value = await value_of(target, name, given)
+    value = await resolve_value(target, name, given)
     result = await target.component.set(
         name,
         value,
@@ -213,16 +211,19 @@ async def _write(
         durable=body.durable,
         asker=asker,
     )
-    target.was_heard(result.param.name)
+    target.record_received(result.param.name)
     return SetResultDoc.of(result)
 
 
-def _text_with_metadata(target: Followed, param: Param) -> str:
+def _text_with_metadata(target: FollowedComponent, param: Param) -> str:
     info = None if target.metadata is None else target.metadata.get(param.name)
     if info is None:
-        return target.text_of(param)
-    document = ParamDoc.kept(param, info, heard_at=target.heard_at(param.name), whole=True)
-    return document.model_dump_json()
+        return target.json_of(param)
+    return _described(param, info, target.heard_at(param.name))
+
+
+def _described(param: Param, info: ParamInfo | None, heard_at: float | None) -> str:
+    return ParamDoc.kept(param, info, heard_at=heard_at, whole=True).model_dump_json()
 
 
 def _named(known: Iterable[str], names: list[str]) -> list[str]:
@@ -231,19 +232,21 @@ def _named(known: Iterable[str], names: list[str]) -> list[str]:
 
 
 def _params_of(table: Mapping[str, Param], names: Iterable[str], *, changed: bool) -> Iterator[Param]:
-    """The parameters with these names, each made when it is needed: thousands at once are much to collect."""
+    """Yield the parameters with these names, each created on demand to keep garbage collections short."""
     for name in names:
         param = table.get(name)
         if param is not None and (not changed or param.is_changed):
             yield param
 
 
-async def _texts(target: Followed, table: Mapping[str, Param], names: Sequence[str], *, changed: bool) -> str:
-    """The members of a JSON object, a part at a time: others are served in between."""
+async def _texts(
+    target: FollowedComponent, table: Mapping[str, Param], names: Sequence[str], *, changed: bool
+) -> str:
+    """Return the members of a JSON object, encoded in parts between which other tasks run."""
     parts = []
-    for start in range(0, len(names), AT_ONCE):
-        params = _params_of(table, names[start : start + AT_ONCE], changed=changed)
-        parts.append(target.texts(params)[1:-1])
+    for start in range(0, len(names), PARAMS_PER_TURN):
+        params = _params_of(table, names[start : start + PARAMS_PER_TURN], changed=changed)
+        parts.append(target.object_of(params)[1:-1])
         await anyio.lowlevel.checkpoint()
     return ",".join(filter(None, parts))
 
@@ -251,19 +254,14 @@ async def _texts(target: Followed, table: Mapping[str, Param], names: Sequence[s
 def _texts_with_metadata(
     params: Iterable[Param], metadata: Metadata, heard_at: Mapping[str, float | None]
 ) -> str:
-    """The same with what is known of each; in any thread."""
+    """Return the members of a JSON object with descriptions, in any thread."""
     return ",".join(
-        f"{json.dumps(each.name)}:"
-        + (
-            param_text(each, heard_at[each.name])
-            if (info := metadata.get(each.name)) is None
-            else ParamDoc.kept(each, info, heard_at=heard_at[each.name], whole=True).model_dump_json()
-        )
+        f"{json.dumps(each.name)}:{_described(each, metadata.get(each.name), heard_at[each.name])}"
         for each in params
     )
 
 
-def _unknown(target: Followed, name: str) -> UnknownParameter:
+def _unknown(target: FollowedComponent, name: str) -> UnknownParameter:
     system, component = target.address
-    what = f"no parameter {name!r} of {system}/{component} is known here; it can be asked for"
+    what = f"{system}/{component} has no known parameter {name!r}. POST …/read requests it from the vehicle"
     return UnknownParameter(what, system=system, component=component, name=name)

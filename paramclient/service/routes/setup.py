@@ -1,4 +1,4 @@
-"""Set-ups: how a component compares, what would be sent to it, and sending that."""
+"""Routes of set-ups: comparing, planning, verifying, applying, restoring."""
 
 from __future__ import annotations
 
@@ -21,36 +21,44 @@ from paramclient.model.paramset import ParamSet
 from paramclient.provision import ApplyProgress, ApplyResult, ApplyRow, Plan, apply, overlay, prepare, restore
 from paramclient.provision.set_up import restore_categories
 from paramclient.provision.vehicle_params import NO_DEFAULTS, FetchedSet, fetch_set
-from paramclient.service.answering import document_answer
-from paramclient.service.followed_component import Followed
+from paramclient.service.followed_component import FollowedComponent
 from paramclient.service.hub import Hub
 from paramclient.service.jobs import Job, Kind
-from paramclient.service.param_sources import Moment, Number, Patterns, Source, known_set, resolved, state
+from paramclient.service.param_sources import (
+    Number,
+    Patterns,
+    Source,
+    Timestamp,
+    current_set,
+    load_state,
+    resolve_source,
+)
 from paramclient.service.problems import ServiceError
-from paramclient.service.reading import BodyRoute, long_request
+from paramclient.service.request_body import BodyRoute, long_request
+from paramclient.service.responses import JSON, document_response, encode_document
 from paramclient.service.route_context import (
+    HubArgument,
     Seconds,
     Target,
-    TheHub,
-    answered,
-    asker_of,
+    author_of,
     holder_of,
-    may_write,
+    require_write,
+    run_until_disconnect,
 )
-from paramclient.service.routes.fetches import accepted, awaited
+from paramclient.service.routes.fetches import job_response, wait_for_job
 
 __all__ = ["router"]
 
 router = APIRouter(prefix="/api/v1/components/{system}/{component}", tags=["set-ups"], route_class=BodyRoute)
 
-PROGRESS_INTERVAL: Final = 0.25
-"""Seconds between two events that tell how far a set-up is."""
+SETUP_PROGRESS_INTERVAL: Final = 0.25
+"""Seconds between two progress events of a set-up."""
 
 Result = TypeVar("Result")
 
 
-class Compared(Body):
-    """What to hold a component against; `known` is without asking the vehicle for anything."""
+class DiffRequest(Body):
+    """Parameters to compare with those of a component; `known` compares without requests to the vehicle."""
 
     wanted: Source
     base: Source | None = None
@@ -61,8 +69,8 @@ class Compared(Body):
     timeout_s: Seconds = None
 
 
-class Wanted(Body):
-    """What a component shall have: of `wanted`, with `over` laid over it, what `only` names."""
+class PlanRequest(Body):
+    """Wanted parameters: those of `wanted`, overlaid by `over`, limited to `only`."""
 
     wanted: Source
     over: Source | None = None
@@ -73,8 +81,8 @@ class Wanted(Body):
     timeout_s: Seconds = None
 
 
-class Applied(Wanted):
-    """The same, and how it is to be brought there; see `paramclient.provision.apply`."""
+class ApplyRequest(PlanRequest):
+    """Wanted parameters with options; see `paramclient.provision.apply`."""
 
     reboot: bool = False
     allow_armed: bool = False
@@ -84,11 +92,11 @@ class Applied(Wanted):
     wait: bool = True
 
 
-class Restored(Body):
-    """Which state is to come back: of a snapshot, of a time, or with neither that before the last apply."""
+class RestoreRequest(Body):
+    """State to restore: a snapshot, a time, or without both the state before the last apply."""
 
     snapshot: Number | None = None
-    at: Moment | None = None
+    at: Timestamp | None = None
     include: Patterns = ()
     reboot: bool = False
     allow_armed: bool = False
@@ -99,70 +107,75 @@ class Restored(Body):
     timeout_s: Seconds = None
 
     @model_validator(mode="after")
-    def _is_one(self) -> Restored:
+    def _is_one(self) -> RestoreRequest:
         if self.snapshot is not None and self.at is not None:
-            raise ValueError("a state is that of a snapshot or of a time, not of both")
+            raise ValueError("`snapshot` and `at` exclude each other")
         return self
 
     @property
     def when(self) -> int | float | None:
-        """The snapshot's number, a time, or None."""
+        """Return the number of the snapshot, the time, or None."""
         return self.at if self.snapshot is None else self.snapshot
 
 
 @router.post("/diff", response_model=DiffDoc)
-async def diff(request: Request, hub: TheHub, target: Target, body: Compared) -> Response:
-    """Compare parameters, as the left side, with those of a component, as the right one."""
+async def diff(request: Request, hub: HubArgument, target: Target, body: DiffRequest) -> Response:
+    """Compare given parameters (left) with those of a component (right)."""
     with long_request(request):
-        return await answered(request, lambda: _diff(hub, target, body), target)
+        return await run_until_disconnect(request, lambda: _diff(hub, target, body), target)
 
 
 @router.post("/plan", response_model=PlanDoc)
-async def plan(request: Request, hub: TheHub, target: Target, body: Wanted) -> Response:
-    """Work out what a set-up would send, in which order, and what not and why. Nothing is written."""
+async def plan(request: Request, hub: HubArgument, target: Target, body: PlanRequest) -> Response:
+    """Return which values a set-up would write, in which order, and which it would skip. Nothing is
+    written."""
     system, component = target.address
 
     async def work() -> Response:
         found = await _plan(hub, target, body)
-        return await document_answer(
-            hub.read_aside, lambda: PlanDoc.of(found, system=system, component=component, full=body.full)
+        return await document_response(
+            hub.run_in_file_thread,
+            lambda: PlanDoc.of(found, system=system, component=component, full=body.full),
         )
 
     with long_request(request):
-        return await answered(request, work, target)
+        return await run_until_disconnect(request, work, target)
 
 
 @router.post("/verify", response_model=VerifiedDoc)
-async def verify(request: Request, hub: TheHub, target: Target, body: Wanted) -> Response:
-    """Compare a component with what it should have. Nothing is written."""
+async def verify(request: Request, hub: HubArgument, target: Target, body: PlanRequest) -> Response:
+    """Compare a component with its wanted parameters. Nothing is written."""
     system, component = target.address
 
     async def work() -> Response:
         found = await _plan(hub, target, body)
-        return await document_answer(
-            hub.read_aside, lambda: VerifiedDoc.of(found, system=system, component=component, full=body.full)
+        return await document_response(
+            hub.run_in_file_thread,
+            lambda: VerifiedDoc.of(found, system=system, component=component, full=body.full),
         )
 
     with long_request(request):
-        return await answered(request, work, target)
+        return await run_until_disconnect(request, work, target)
 
 
 @router.post(
     "/apply",
     response_model=ApplyResultDoc | PlanDoc,
-    responses={202: {"model": JobDoc, "description": "It is under way"}},
-    dependencies=[Depends(may_write)],
+    responses={202: {"model": JobDoc, "description": "The started job"}},
+    dependencies=[Depends(require_write)],
 )
-async def apply_(request: Request, hub: TheHub, target: Target, body: Applied) -> Document | Response:
-    """Bring a component to the wanted values, in an order that works, and prove each of them.
+async def apply_(
+    request: Request, hub: HubArgument, target: Target, body: ApplyRequest
+) -> Document | Response:
+    """Write the wanted values in a working order, and verify each of them.
 
-    Whoever waits for it and leaves ends it; with `wait` false it goes on.
+    With `wait`, a disconnect of the client cancels the set-up; without, it continues.
     """
     if body.dry_run:
         return await plan(request, hub, target, body)
-    asker = asker_of(request)
+    asker = author_of(request)
 
-    async def work(tell: Callable[[ApplyProgress], None]) -> ApplyResult:
+    async def work(publish_progress: Callable[[ApplyProgress], None]) -> ApplyResult:
         return await apply(
             target.component,
             await _wanted(hub, target, body),
@@ -175,7 +188,7 @@ async def apply_(request: Request, hub: TheHub, target: Target, body: Applied) -
             durable=body.durable,
             timeout=body.timeout_s,
             asker=asker,
-            progress=tell,
+            progress=publish_progress,
         )
 
     job = _begin(hub, "apply", target, request, work, full=body.full)
@@ -185,22 +198,24 @@ async def apply_(request: Request, hub: TheHub, target: Target, body: Applied) -
 @router.post(
     "/restore",
     response_model=ApplyResultDoc | PlanDoc,
-    responses={202: {"model": JobDoc, "description": "It is under way"}},
-    dependencies=[Depends(may_write)],
+    responses={202: {"model": JobDoc, "description": "The started job"}},
+    dependencies=[Depends(require_write)],
 )
-async def restore_(request: Request, hub: TheHub, target: Target, body: Restored) -> Document | Response:
-    """Bring an earlier state of a component back, with its own identity and calibration."""
-    asker = asker_of(request)
+async def restore_(
+    request: Request, hub: HubArgument, target: Target, body: RestoreRequest
+) -> Document | Response:
+    """Restore an earlier state of a component, with its own identity and calibration."""
+    asker = author_of(request)
     if body.dry_run:
         with long_request(request):
-            found = await answered(request, lambda: _plan_back(hub, target, body), target)
+            found = await run_until_disconnect(request, lambda: _plan_back(hub, target, body), target)
         system, component = target.address
         return PlanDoc.of(found, system=system, component=component, full=body.full)
 
-    async def work(tell: Callable[[ApplyProgress], None]) -> ApplyResult:
+    async def work(publish_progress: Callable[[ApplyProgress], None]) -> ApplyResult:
         return await restore(
             target.component,
-            await state(hub, target, body.when),
+            await load_state(hub, target, body.when),
             include=body.include,
             info=target.metadata,
             reboot=body.reboot,
@@ -208,95 +223,108 @@ async def restore_(request: Request, hub: TheHub, target: Target, body: Restored
             force=body.force,
             timeout=body.timeout_s,
             asker=asker,
-            progress=tell,
+            progress=publish_progress,
         )
 
     job = _begin(hub, "restore", target, request, work, full=body.full)
     return await _result(request, job, waits=body.wait)
 
 
-async def _diff(hub: Hub, target: Followed, body: Compared) -> Response:
-    left = await resolved(hub, target, body.wanted)
+async def _diff(hub: Hub, target: FollowedComponent, body: DiffRequest) -> Response:
+    left = await resolve_source(hub, target, body.wanted)
     base = None
     if body.base is not None and not body.base.defaults:
-        base = await resolved(hub, target, body.base)
+        base = await resolve_source(hub, target, body.base)
     right = await _present(hub, target, body)
     if body.base is not None and body.base.defaults:
-        base = await hub.read_aside(lambda: defaults_of(left, right))
+        base = await hub.run_in_file_thread(lambda: defaults_of(left, right))
         if not base:
             raise UsageError(NO_DEFAULTS)
     if body.partial:
         whole = right
-        right = await hub.read_aside(
+        right = await hub.run_in_file_thread(
             lambda: replace(whole, params={name: each for name, each in whole.items() if name in left})
         )
     sets = [left, right] if base is None else [left, right, base]
     found = [*await _described(hub, target, sets), None][:3]
 
-    def document() -> DiffDoc:
+    def encode() -> bytes:
+        """Compare, and encode row by row: a full garbage collection of all rows would block every thread."""
         outcome = compare(left, right, base=base, names=body.only or None)
-        return DiffDoc.of(outcome, *found, everything=body.full)
+        rows = DiffDoc.rows(outcome, *found, everything=body.full)
+        return encode_document(DiffDoc.without_params(outcome), params=rows)
 
-    return await document_answer(hub.read_aside, document)
+    return Response(await hub.run_in_file_thread(encode), media_type=JSON)
 
 
-async def _present(hub: Hub, target: Followed, body: Compared) -> ParamSet:
-    """What the component has now."""
+async def _present(hub: Hub, target: FollowedComponent, body: DiffRequest) -> ParamSet:
+    """Return the current parameters of the component."""
     if body.known:
-        return (await known_set(target, hub.read_aside)).set
-    source = f"link {target.line.name}"
+        return (await current_set(target, hub.run_in_file_thread)).set
+    source = f"link {target.link.name}"
 
     async def work() -> FetchedSet:
-        return await fetch_set(target.component, source=source, run=hub.read_aside)
+        return await fetch_set(target.component, source=source, run=hub.run_in_file_thread)
 
     return (await _within(target, body.timeout_s, work)).set
 
 
-async def _described(hub: Hub, target: Followed, sets: list[ParamSet]) -> list[Metadata | None]:
-    """What is known of the parameters of each set: for its firmware, else of the component."""
+async def _described(hub: Hub, target: FollowedComponent, sets: list[ParamSet]) -> list[Metadata | None]:
+    """Return the descriptions for each set: those of its firmware, else of the component."""
     cache = hub.cache
     if cache is None:
         return [target.metadata] * len(sets)
     store = MetadataStore.beside(cache.path)
-    return [each or target.metadata for each in await hub.aside(lambda: store.known_of_sets(sets))]
+    return [each or target.metadata for each in await hub.run_in_thread(lambda: store.known_of_sets(sets))]
 
 
-async def _wanted(hub: Hub, target: Followed, body: Wanted) -> ParamSet:
-    """What the component shall have."""
-    found = await resolved(hub, target, body.wanted)
+async def _wanted(hub: Hub, target: FollowedComponent, body: PlanRequest) -> ParamSet:
+    """Return the wanted parameters."""
+    found = await resolve_source(hub, target, body.wanted)
     if body.over is not None:
-        found = overlay(found, await resolved(hub, target, body.over))
+        found = overlay(found, await resolve_source(hub, target, body.over))
     whole = found
-    return await hub.read_aside(lambda: whole.only(body.only)) if body.only else whole
+    return await hub.run_in_file_thread(lambda: whole.only(body.only)) if body.only else whole
 
 
-async def _plan(hub: Hub, target: Followed, body: Wanted) -> Plan:
+async def _plan(hub: Hub, target: FollowedComponent, body: PlanRequest) -> Plan:
     wanted = await _wanted(hub, target, body)
 
     async def work() -> Plan:
         include, info = body.include, target.metadata
         return await prepare(
-            target.component, wanted, include=include, info=info, force=body.force, run=hub.read_aside
+            target.component, wanted, include=include, info=info, force=body.force, run=hub.run_in_file_thread
         )
 
     return await _within(target, body.timeout_s, work)
 
 
-async def _plan_back(hub: Hub, target: Followed, body: Restored) -> Plan:
-    earlier = await state(hub, target, body.when)
+async def _plan_back(hub: Hub, target: FollowedComponent, body: RestoreRequest) -> Plan:
+    earlier = await load_state(hub, target, body.when)
 
     async def work() -> Plan:
         include = (*await restore_categories(target.component, earlier), *body.include)
         info = target.metadata
         return await prepare(
-            target.component, earlier, include=include, info=info, force=body.force, run=hub.read_aside
+            target.component,
+            earlier,
+            include=include,
+            info=info,
+            force=body.force,
+            run=hub.run_in_file_thread,
         )
 
     return await _within(target, body.timeout_s, work)
 
 
-async def _within(target: Followed, timeout: float | None, work: Callable[[], Awaitable[Result]]) -> Result:
-    """Do it in this time."""
+async def _within(
+    target: FollowedComponent, timeout: float | None, work: Callable[[], Awaitable[Result]]
+) -> Result:
+    """Run work with a timeout.
+
+    Raises:
+        NoReply: the timeout has expired.
+    """
     with anyio.move_on_after(timeout):
         return await work()
     system, component = target.address
@@ -306,58 +334,58 @@ async def _within(target: Followed, timeout: float | None, work: Callable[[], Aw
 def _begin(
     hub: Hub,
     kind: Kind,
-    target: Followed,
+    target: FollowedComponent,
     request: Request,
     work: Callable[[Callable[[ApplyProgress], None]], Awaitable[ApplyResult]],
     *,
     full: bool,
 ) -> Job:
-    """Begin to set a component up, as a job; one at a time, as two would undo each other's work.
+    """Start a set-up as a job; one at a time for each component, because two would undo each other's changes.
 
     Raises:
-        ServiceError: one is under way, or too many jobs are.
+        ServiceError: a set-up of the component is running, or too many jobs are running.
     """
     for other in hub.jobs.all:
         if other.state == "running" and other.kind != "fetch" and other.followed is target:
-            what = f"It is being set up already, by {other.asked_by}; see job {other.id}."
+            what = f"{other.asked_by} is already setting up this component in job {other.id}."
             raise ServiceError(409, "busy", what, job=other.id)
     system, component = target.address
 
     async def run(job: Job) -> Document:
         rows: dict[str, ApplyRow] = {}
-        told_at, told = -PROGRESS_INTERVAL, ""
+        published_at, published_phase = -SETUP_PROGRESS_INTERVAL, ""
 
-        def tell(progress: ApplyProgress) -> None:
-            nonlocal told_at, told
+        def publish_progress(progress: ApplyProgress) -> None:
+            nonlocal published_at, published_phase
             if progress.row is not None:
                 rows[progress.row.name] = progress.row.so_far
             job.progress = ApplyProgressDoc.of(progress)
-            if note is not None and not hub.is_closing:  # what then fails was not written
+            if note is not None and not hub.is_closing:  # failures after this are not recorded
                 note.note(done=progress.done, total=progress.total, key=target.key)
             now = anyio.current_time()
-            if progress.phase != told or now >= told_at + PROGRESS_INTERVAL:
-                told_at, told = now, progress.phase
-                hub.jobs.tell(job)
+            if progress.phase != published_phase or now >= published_at + SETUP_PROGRESS_INTERVAL:
+                published_at, published_phase = now, progress.phase
+                hub.jobs.publish(job)
 
-        note = await hub.note_setup(job)
+        note = await hub.record_setup(job)
         is_whole = False
         try:
-            result = await work(tell)
+            result = await work(publish_progress)
             is_whole = result.error is None
         except anyio.get_cancelled_exc_class():
             job.result = InterruptedDoc.of(rows.values(), system=system, component=component)
             raise
         finally:
             if note is not None:
-                await hub.end_note(note, is_cut_off=hub.is_closing and not is_whole)
+                await hub.end_setup_record(note, is_cut_off=hub.is_closing and not is_whole)
         return ApplyResultDoc.of(result, system=system, component=component, full=full)
 
-    return hub.jobs.begin(kind, target, run, asker_of(request), holder_of(request))
+    return hub.jobs.start(kind, target, run, author_of(request), holder_of(request))
 
 
 async def _result(request: Request, job: Job, *, waits: bool) -> Document | Response:
     if not waits:
-        return accepted(job)
-    result = await awaited(request, job)
+        return job_response(job)
+    result = await wait_for_job(request, job)
     assert isinstance(result, ApplyResultDoc)
     return result

@@ -14,18 +14,21 @@ from paramclient.errors import FileErrorCode, FileTransferError, LinkError, NoRe
 from paramclient.model.values import ParamType, crc32_px4
 from paramclient.protocol import wire
 from paramclient.protocol.ftp import DirectoryEntry, FileRead, FileTransfers, param_pck
-from paramclient.protocol.ftp.file_read import REOPENS_MAX, WINDOW_MIN
+from paramclient.protocol.ftp.file_read import WINDOW_MIN
 from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.ftp.param_pck import PackedParam
-from paramclient.protocol.ftp.transfer_job import (
+from paramclient.protocol.requests.context import Context
+from paramclient.protocol.requests.operation import Operation
+from paramclient.protocol.requests.retry import (
+    ATTEMPTS_MAX,
+    ATTEMPTS_MIN,
     BUSY_TIMEOUT,
     OPEN_FAILURES_MAX,
     OPENS_MAX,
+    REOPENS_MAX,
     SESSION_IDLE_TIME,
+    RetryPolicy,
 )
-from paramclient.protocol.requests.context import Context
-from paramclient.protocol.requests.operation import Operation
-from paramclient.protocol.requests.round_trip import ATTEMPTS_MAX, ATTEMPTS_MIN, RoundTrip
 from paramclient.protocol.wire import FileTransfer, Message
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
 from paramclient.sim.ftp import IDLE_LIMIT
@@ -44,10 +47,11 @@ class Desk:
 
     def __init__(self, *, keeps_session: bool = True) -> None:
         self.now = 5.0
-        self.round_trip = RoundTrip()
+        self.retry = RetryPolicy()
+        self.round_trip = self.retry.round_trip
         self.sent: list[Packet] = []
         autopilot = wire.MAV_AUTOPILOT_ARDUPILOTMEGA if keeps_session else None
-        self.context = Context((1, 1), self._send, OWN, self.round_trip, autopilot=autopilot)
+        self.context = Context((1, 1), self._send, OWN, self.retry, autopilot=autopilot)
         self.transfers = FileTransfers(self.context)
 
     def _send(self, message: Message) -> None:
@@ -57,9 +61,9 @@ class Desk:
 
     def lose_some(self) -> None:
         """Let the link count as one that loses a quarter of the requests, with a round trip of 1 ms."""
-        self.round_trip.answered(0.0, 0.001, 1)
-        self.round_trip.timed_out(1)
-        self.round_trip.answered(0.0, 0.001, 1)
+        self.retry.answered(0.0, 0.001, 1)
+        self.retry.timed_out(1)
+        self.retry.answered(0.0, 0.001, 1)
 
     def take(self) -> list[Packet]:
         sent, self.sent = self.sent, []
@@ -708,9 +712,9 @@ class TestSilence:
 
     def test_copies_of_a_read_do_not_make_patience_shorter(self) -> None:
         desk = Desk()
-        desk.round_trip.answered(0.0, 0.1, 1)
+        desk.retry.answered(0.0, 0.1, 1)
         for _ in range(20):
-            desk.round_trip.timed_out(1)
+            desk.retry.timed_out(1)
         read, burst = desk.opened()
         desk.answer(burst, b"x" * 239, offset=239)
         desk.answer(burst, code=FileErrorCode.EOF, offset=478, nth=2)
@@ -728,7 +732,7 @@ class TestSilence:
             desk.now += 0.001
             desk.answer(burst, b"x" * 239, offset=239 * block, nth=block + 1)
         desk.answer(burst, code=FileErrorCode.EOF, offset=239 * 199, nth=200)
-        desk.round_trip.answered(0.0, 0.1, 1)
+        desk.retry.answered(0.0, 0.1, 1)
         desk.pass_time(0.09)
         assert len(desk.take()) > 2 * WINDOW_MIN
         desk.pass_time(0.4)
@@ -892,7 +896,7 @@ class TestTurns:
 class TestHaste:
     def known_link(self) -> Desk:
         desk = Desk()
-        desk.round_trip.answered(0.0, 0.1, 1)
+        desk.retry.answered(0.0, 0.1, 1)
         return desk
 
     def test_on_a_known_link_the_burst_does_not_wait_for_the_open(self) -> None:
@@ -913,7 +917,7 @@ class TestHaste:
     def test_nor_where_requests_were_repeated_and_nothing_was_measured(self) -> None:
         """The round trip is longer than the first time-out: what came before got its answer too late."""
         desk = Desk()
-        desk.round_trip.answered(2.0, 2.5, 3)
+        desk.retry.answered(2.0, 2.5, 3)
         read = desk.transfers.read("a", desk.now)
         first, _, burst = desk.take()
         assert (burst.opcode, burst.session) == (Opcode.BURST_READ_FILE, first.session)
@@ -1049,7 +1053,7 @@ class TestHaste:
     def test_on_a_bad_link_requests_go_out_twice(self) -> None:
         desk = self.known_link()
         for _ in range(5):
-            desk.round_trip.timed_out(1)
+            desk.retry.timed_out(1)
         desk.transfers.read("a", desk.now)
         first, copy = desk.take()
         assert first == copy
@@ -1228,16 +1232,17 @@ class Ground:
         self.air = Air.symmetric([vehicle], **faults)
         self.overtakes = bool(faults.get("reorder"))
         self.now = 0.0
-        self.round_trip = RoundTrip()
+        self.retry = RetryPolicy()
+        self.round_trip = self.retry.round_trip
         if round_trip is not None:
-            self.round_trip.answered(0.0, round_trip, 1)
+            self.retry.answered(0.0, round_trip, 1)
         self.requests = 0
         self._outbox: list[Message] = []
         self._framer = wire.Framer(wire.DECODED_IDS, stream=False)
         is_ardupilot = isinstance(vehicle, ArduPilotVehicle)
         autopilot = wire.MAV_AUTOPILOT_ARDUPILOTMEGA if is_ardupilot else None
         self.transfers = FileTransfers(
-            Context((1, 1), self._outbox.append, OWN, self.round_trip, autopilot=autopilot)
+            Context((1, 1), self._outbox.append, OWN, self.retry, autopilot=autopilot)
         )
         self.air.tick(self.now)
 

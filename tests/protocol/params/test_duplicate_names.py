@@ -10,8 +10,8 @@ import pytest
 from paramclient import ParamClient
 from paramclient.model.values import ParamType
 from paramclient.protocol.params.duplicate_names import (
+    DUPLICATES_LISTED_MAX,
     EQUAL_RESPONSES_MIN,
-    NAMES_LISTED_MAX,
     RESPONSE_PAUSE,
     RESPONSES_MAX,
     Repeated,
@@ -19,7 +19,7 @@ from paramclient.protocol.params.duplicate_names import (
 )
 from paramclient.protocol.params.sync import SyncState
 from paramclient.protocol.params.table import Table
-from paramclient.protocol.requests.round_trip import RoundTrip
+from paramclient.protocol.requests.retry import RetryPolicy
 from paramclient.sim import Air, GenericVehicle, OtherStation, PX4Vehicle, SimParam, Vehicle
 from tests.protocol.params.test_reads import Desk
 from tests.simulation import Simulation, is_so, listing_ardupilot, param_value
@@ -128,7 +128,7 @@ def test_the_last_one_who_waits_ends_it() -> None:
 
 def repeated(desk: Desk, **names: tuple[int, ...]) -> tuple[Repeated, Table]:
     table = Table()
-    asking = Repeated(names, RoundTrip(), desk.reads, table, desk.now)
+    asking = Repeated(names, RetryPolicy(), desk.reads, table, desk.now)
     assert desk.take() == []
     desk.now = asking.next_deadline()
     asking.tick(desk.now)
@@ -182,8 +182,8 @@ def test_a_name_that_is_not_answered_leaves_it_open() -> None:
 
 
 def test_the_note_names_a_few() -> None:
-    names = {f"N{number}": (number, number + 100) for number in range(NAMES_LISTED_MAX + 2)}
-    note = Repeated(names, RoundTrip(), Desk().reads, Table(), 0.0).note
+    names = {f"N{number}": (number, number + 100) for number in range(DUPLICATES_LISTED_MAX + 2)}
+    note = Repeated(names, RetryPolicy(), Desk().reads, Table(), 0.0).note
     assert "N0 (indices 0, 100)" in note
     assert "N4 (indices 4, 104) and 2 more" in note
     assert "N5" not in note

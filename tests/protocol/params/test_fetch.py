@@ -332,7 +332,7 @@ def test_a_change_behind_the_streams_back(change_what_is_to_come: bool) -> None:
     assert result.complete
     if change_what_is_to_come:
         assert result.hash is None
-        assert "moved during the download" in result.notes[0]
+        assert "changed during the download" in result.notes[0]
     else:
         assert result.hash == before != vehicle.announced_hash()
 
@@ -425,12 +425,12 @@ def test_an_unproven_hash_is_confirmed_by_being_the_same_before_and_after() -> N
     world = Simulation(vehicle)
     result = world.fetch()
     assert result.hash == vehicle.announced_hash()
-    assert "could not be proven" in result.notes[0]
+    assert "are not verified" in result.notes[0]
     assert not world.machine.table.volatile_known
     go_on(world)
     result = world.fetch()
     assert result.source == "cache"
-    assert "could not be proven" in result.notes[0]
+    assert "are not verified" in result.notes[0]
 
 
 def test_after_a_hit_with_an_unproven_hash_everything_is_read_afresh() -> None:
@@ -496,7 +496,7 @@ def test_an_unproven_hash_without_one_before_stands_for_nothing() -> None:
     result = world.fetch()
     assert result.complete
     assert result.hash is None
-    assert "No hash was heard before" in result.notes[0]
+    assert "No hash was received before" in result.notes[0]
 
 
 def test_after_our_own_write_the_next_session_hits() -> None:

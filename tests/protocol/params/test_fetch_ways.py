@@ -8,10 +8,14 @@ import pytest
 
 from paramclient.protocol import wire
 from paramclient.protocol.ftp.packets import Opcode, Packet
-from paramclient.protocol.ftp.transfer_job import SESSION_IDLE_TIME
-from paramclient.protocol.params.fetch import FILE_OPEN_TIMEOUT, FILE_OPEN_TIMEOUT_SILENT, Fetch
+from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_notes import FILE_IN_USE
-from paramclient.protocol.requests.round_trip import FIRST_TIMEOUT
+from paramclient.protocol.requests.retry import (
+    FILE_OPEN_TIMEOUT,
+    FILE_OPEN_TIMEOUT_SILENT,
+    FIRST_TIMEOUT,
+    SESSION_IDLE_TIME,
+)
 from paramclient.protocol.wire import (
     CommandLong,
     FileTransfer,

@@ -264,7 +264,7 @@ def test_what_is_no_table_is_read_again_and_then_listed(kind: str) -> None:
     result = session.fetch()
     assert (result.source, server.opened) == ("stream", [FULL_PATH] * 2)
     assert is_whole(result, vehicle)
-    assert result.notes[0].startswith("The parameters did not come as a file, so they were listed: ")
+    assert result.notes[0].startswith("The parameters were downloaded as a list instead of a file: ")
     assert remembered(session) is False
     again = session.fetch()
     assert (again.source, again.notes, len(server.opened)) == ("stream", (), 2)
@@ -336,7 +336,7 @@ def test_a_server_that_keeps_silent_is_remembered_once_the_list_has_come() -> No
     session = Simulation(server)
     result = session.fetch()
     assert (result.source, is_whole(result, vehicle)) == ("stream", True)
-    assert "so they were listed: no reply" in result.notes[0]
+    assert "as a list instead of a file: no reply" in result.notes[0]
     assert remembered(session) is False
     opened = len(server.opened)
     assert session.fetch().source == "stream"

@@ -10,22 +10,26 @@ import pytest
 from paramclient.errors import LinkError, NoReply
 from paramclient.protocol.params import list_download as room
 from paramclient.protocol.params.list_download import (
-    COUNT_CHANGES_MAX,
-    EMPTY_LISTS_MAX,
-    LIST_ATTEMPTS_MIN,
-    LIST_COPIES_MAX,
-    LIST_RETRY_INTERVAL_MAX,
-    LIST_TIMEOUT,
     MISSING_WITHOUT_LIST_MAX,
     REQUESTED_INDICES_MAX,
     Download,
 )
-from paramclient.protocol.params.list_stream import JUMP_MAX, LIST_REORDER_DEPTH
+from paramclient.protocol.params.list_stream import JUMP_MAX
 from paramclient.protocol.params.reads import CONTROL_INDEX, Reads
 from paramclient.protocol.params.table import Table
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.pacing import REQUEST_SIZE, UPSTREAM_SHARE, VALUE_SIZE
-from paramclient.protocol.requests.round_trip import FIRST_TIMEOUT, RoundTrip
+from paramclient.protocol.requests.retry import (
+    COUNT_CHANGES_MAX,
+    EMPTY_LISTS_MAX,
+    FIRST_TIMEOUT,
+    LIST_ATTEMPTS_MIN,
+    LIST_COPIES_MAX,
+    LIST_REORDER_DEPTH,
+    LIST_RETRY_INTERVAL_MAX,
+    LIST_TIMEOUT,
+    RetryPolicy,
+)
 from paramclient.protocol.scheduler import Turns
 from paramclient.protocol.wire import (
     NO_INDEX,
@@ -47,10 +51,11 @@ class Desk:
     def __init__(self, *, listed: bool = False, round_trip: float | None = 0.02) -> None:
         self.now = 0.0
         self.sent: list[Message] = []
-        self.trip = RoundTrip()
+        self.retry = RetryPolicy()
+        self.trip = self.retry.round_trip
         for _ in range(100 if round_trip is not None else 0):
-            self.trip.answered(0.0, round_trip or 0.0, 1)
-        context = Context((1, 1), self.sent.append, round_trip=self.trip)
+            self.retry.answered(0.0, round_trip or 0.0, 1)
+        context = Context((1, 1), self.sent.append, retry=self.retry)
         self.reads = Reads(context, Table())
         self.turns = Turns()
         self.download = Download(context, self.reads, self.turns, 0.0, listed=listed)
@@ -190,8 +195,8 @@ def test_a_component_that_is_not_heard_either_is_given_up_sooner() -> None:
 def test_another_pass_is_asked_for_twice_at_once_on_a_link_that_loses() -> None:
     desk = Desk()
     for _ in range(100):
-        desk.trip.timed_out(1)
-        desk.trip.answered(0.0, 0.02, 1)
+        desk.retry.timed_out(1)
+        desk.retry.answered(0.0, 0.02, 1)
     desk.stream(range(50), count=1000)
     assert desk.take() == ["list"]
     desk.pass_time(0.6)

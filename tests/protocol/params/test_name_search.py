@@ -10,18 +10,17 @@ import pytest
 
 from paramclient.errors import LinkError, NoReply
 from paramclient.protocol.params.foreign_list import Following
-from paramclient.protocol.params.name_search import (
+from paramclient.protocol.params.name_search import WINDOW_SIZE, NameSearches
+from paramclient.protocol.params.reads import Reads
+from paramclient.protocol.requests.context import Context
+from paramclient.protocol.requests.retry import (
     CONTROL_RISK,
     CONTROLS_LOST_MAX,
     CONTROLS_MAX,
     NAME_LOSS_RISK,
     PASSES_MIN,
-    WINDOW_SIZE,
-    NameSearches,
+    RetryPolicy,
 )
-from paramclient.protocol.params.reads import Reads
-from paramclient.protocol.requests.context import Context
-from paramclient.protocol.requests.round_trip import RoundTrip
 from paramclient.protocol.wire import Message, ParamError, ParamRequestRead
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle
 from paramclient.sim.param_table import ek2_group
@@ -37,11 +36,12 @@ class Desk:
         self.now = 0.0
         self.sent: list[str | int] = []
         self.count: int | None = COUNT
-        self.round_trip = RoundTrip()
+        self.retry = RetryPolicy()
+        self.round_trip = self.retry.round_trip
         for _ in range(60):
-            self.round_trip.answered(0.0, 0.02, 1)
+            self.retry.answered(0.0, 0.02, 1)
         self.params: set[str] = set()
-        context = Context((1, 1), self._send, round_trip=self.round_trip)
+        context = Context((1, 1), self._send, retry=self.retry)
         self.reads = Reads(context, self)
         self.searches = NameSearches(context, self.reads, self, Following())
 
@@ -94,8 +94,8 @@ def test_what_is_silent_is_requested_again_with_each_control_and_then_unknown() 
 def test_the_more_is_lost_the_more_often_a_name_is_requested() -> None:
     desk = Desk()
     for _ in range(30):
-        desk.round_trip.timed_out(1)
-        desk.round_trip.answered(0.0, 0.02, 1)
+        desk.retry.timed_out(1)
+        desk.retry.answered(0.0, 0.02, 1)
     search = desk.searches.begin(["A"], 0.0)
     passes = 0
     while not search.done:
@@ -103,7 +103,7 @@ def test_the_more_is_lost_the_more_often_a_name_is_requested() -> None:
         passes += 1
     assert passes == math.ceil(math.log(NAME_LOSS_RISK) / math.log(desk.round_trip.feared_loss)) > PASSES_MIN
     desk.searches.begin(["A"], 0.0)
-    assert len(set(desk.take())) == 1 + desk.round_trip.copies(CONTROL_RISK, CONTROLS_MAX) > 2
+    assert len(set(desk.take())) == 1 + desk.retry.copies(CONTROL_RISK, CONTROLS_MAX) > 2
 
 
 def test_a_name_that_was_lost_is_found() -> None:

@@ -436,7 +436,7 @@ def test_of_a_file_with_a_gap_what_stands_before_it_is_taken(missing: int, tmp_p
     [told] = imported(log, tmp_path)
     note = (
         f"{len(pack.entries)} of {COUNT} parameters were taken from the parameter file that station 255/230 "
-        f"read: its bytes from {missing * BLOCK} on were not heard without a gap."
+        f"read: bytes from {missing * BLOCK} on are missing."
     )
     assert (told.params, told.complete, told.notes) == (len(pack.entries), False, (note,))
     assert as_rows(kept(tmp_path, told.key)) == EXPECTED[: len(pack.entries)]
@@ -473,7 +473,7 @@ def test_a_read_ends_in_many_ways(end: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("log", "note"),
     [
-        (FileLog().beat().open().burst(FILE, range(1, BLOCKS)).close(), "its first bytes were not heard"),
+        (FileLog().beat().open().burst(FILE, range(1, BLOCKS)).close(), "its first bytes were not received"),
         (FileLog().beat().open().burst(b"\x11" * 500).close(), "does not begin with 0x1111"),
         (FileLog().beat().open().burst(FILE + b"x").close(), "bytes are left over"),
         (
@@ -484,7 +484,7 @@ def test_a_read_ends_in_many_ways(end: str, tmp_path: Path) -> None:
             .value("A", 1, count=COUNT + 1)
             .burst(FILE, range(1, BLOCKS))
             .close(),
-            f"it is of {COUNT} parameters, and the vehicle has {COUNT + 1}",
+            f"it has {COUNT} parameters, and the vehicle has {COUNT + 1}",
         ),
     ],
 )
@@ -492,7 +492,7 @@ def test_of_what_cannot_be_trusted_nothing_is_taken(log: FileLog, note: str, tmp
     [told] = imported(log.wait(1.0).beat(), tmp_path)
     assert not told.complete
     [said] = told.notes
-    assert said.startswith("Nothing was taken from the parameter file that station 255/230 read: ")
+    assert said.startswith("The parameter file that station 255/230 read was not used: ")
     assert note in said
     if told.params:
         assert kept(tmp_path, told.key).keys() == {"A"}
@@ -535,7 +535,7 @@ def test_the_command_says_what_is_missing(tmp_path: Path, capsys: pytest.Capture
     assert f"f.tlog, 1/1: {found['notes'][0]}" in told.err
     nothing = FileLog().beat().open().burst(FILE, [1]).close().wait(1.0).beat().write(tmp_path / "n.tlog")
     assert run(["import", str(nothing), "--cache", cache]) == 0
-    assert "its first bytes were not heard" in capsys.readouterr().err
+    assert "its first bytes were not received" in capsys.readouterr().err
 
 
 # listening

@@ -14,23 +14,18 @@ from paramclient.errors import (
     TypeMismatch,
     UnknownParameter,
 )
-from paramclient.protocol.params.reads import (
-    CONTROL_INDEX,
-    CONTROLS_CERTAIN,
-    READ_COPIES_MAX,
-    Key,
-    Read,
-    Reads,
-)
+from paramclient.protocol.params.reads import CONTROL_INDEX, Key, Read, Reads
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.pacing import BURST_MIN, FIRST_RATE
-from paramclient.protocol.requests.round_trip import (
+from paramclient.protocol.requests.retry import (
     ATTEMPTS_MAX,
     ATTEMPTS_MIN,
+    CONTROLS_CERTAIN,
     FIRST_TIMEOUT,
     INITIAL_TIMEOUT,
+    READ_COPIES_MAX,
     SILENCE_MAX,
-    RoundTrip,
+    RetryPolicy,
 )
 from paramclient.protocol.wire import Message, ParamError, ParamRequestRead, ParamValue
 from paramclient.sim import Air, ArduPilotVehicle
@@ -44,11 +39,12 @@ class Desk:
 
     def __init__(self, *known: str, count: int = 100) -> None:
         self.now = 0.0
-        self.round_trip = RoundTrip()
+        self.retry = RetryPolicy()
+        self.round_trip = self.retry.round_trip
         self.sent: list[Key] = []
         self.params = set(known)
         self.count = count
-        self.reads = Reads(Context((1, 1), self._send, round_trip=self.round_trip), self)
+        self.reads = Reads(Context((1, 1), self._send, retry=self.retry), self)
 
     def _send(self, message: Message) -> None:
         assert isinstance(message, ParamRequestRead)
@@ -86,7 +82,7 @@ class Desk:
     def measure(self, round_trip: float = 0.02, answers: int = 60) -> None:
         """Let the link be known as a good one."""
         for _ in range(answers):
-            self.round_trip.answered(self.now, self.now + round_trip, 1)
+            self.retry.answered(self.now, self.now + round_trip, 1)
 
 
 def test_a_read_by_name_and_its_answer() -> None:
@@ -265,7 +261,7 @@ def test_on_an_idle_link_that_loses_a_request_is_doubled() -> None:
     desk = Desk("A")
     desk.measure(0.5)
     for _ in range(30):
-        desk.round_trip.timed_out(1)
+        desk.retry.timed_out(1)
     desk.ask("A")
     assert desk.take() == ["A"]
     desk.reads.tick(desk.now)  # when everything is asked for that is wanted at this moment
@@ -291,7 +287,7 @@ def test_while_a_list_comes_nothing_is_doubled() -> None:
     desk = Desk("A")
     desk.measure(0.5)
     for _ in range(30):
-        desk.round_trip.timed_out(1)
+        desk.retry.timed_out(1)
     desk.reads.is_idle = False
     desk.ask("A")
     assert desk.take() == ["A"]
@@ -359,8 +355,8 @@ def test_a_vehicle_that_answers_all_else_does_not_have_it(key: Key) -> None:
     desk.pass_time()
     assert isinstance(read.error, UnknownParameter)
     assert (read.error.name, read.error.index) == ((key, None) if isinstance(key, str) else (None, key))
-    assert read.controls >= CONTROLS_CERTAIN
-    assert read.attempts < desk.round_trip.tries
+    assert read.request.controls >= CONTROLS_CERTAIN
+    assert read.attempts < desk.retry.tries
     assert desk.now < 3.0
     assert desk.take().count(CONTROL_INDEX) >= CONTROLS_CERTAIN
 
@@ -379,9 +375,9 @@ def test_where_much_is_silent_the_controls_tell_how_good_the_link_is() -> None:
     desk.measure()
     for _ in range(60):  # other reads in vain have made the link look bad
         for _ in range(3):
-            desk.round_trip.timed_out(1)
-        desk.round_trip.answered(desk.now, desk.now + 0.02, 1)
-    assert desk.round_trip.tries > 30
+            desk.retry.timed_out(1)
+        desk.retry.answered(desk.now, desk.now + 0.02, 1)
+    assert desk.retry.tries > 30
     read = desk.ask(7)
     for _ in range(100):
         desk.pass_time(0.05)
@@ -399,7 +395,7 @@ def test_what_a_list_may_have_brought_is_no_answered_control() -> None:
     for _ in range(10):
         desk.pass_time(0.05)
         desk.hear("P0", index=CONTROL_INDEX)
-    assert read.controls == 0
+    assert read.request.controls == 0
 
 
 def test_without_answered_controls_nothing_is_called_unknown() -> None:
@@ -420,7 +416,7 @@ def test_a_control_that_was_lost_is_not_answered_by_what_passes_by_much_later() 
     assert read.done
     desk.now = 300.0
     desk.hear("ZERO", index=CONTROL_INDEX)
-    assert desk.round_trip.timeout == INITIAL_TIMEOUT
+    assert desk.retry.timeout == INITIAL_TIMEOUT
 
 
 @pytest.mark.parametrize(("count", "control"), [(20, 7), (5, CONTROL_INDEX)])
@@ -450,7 +446,7 @@ def test_index_0_has_the_index_heard_last_as_its_control() -> None:
         desk.reads.tick(desk.now)
         if desk.take()[-1:] == [7]:
             desk.hear("B", index=7)
-    assert read.controls >= CONTROLS_CERTAIN
+    assert read.request.controls >= CONTROLS_CERTAIN
     assert isinstance(read.error, NoReply)
     assert desk.now < 5.0
 
@@ -461,7 +457,7 @@ def test_answered_controls_end_what_stays_silent_soon() -> None:
     silent = [desk.ask(index) for index in range(20, 50)]
     desk.pass_time()
     assert all(isinstance(read.error, NoReply) for read in silent)
-    assert ATTEMPTS_MIN <= max(read.attempts for read in silent) <= ATTEMPTS_MIN + 1 < desk.round_trip.tries
+    assert ATTEMPTS_MIN <= max(read.attempts for read in silent) <= ATTEMPTS_MIN + 1 < desk.retry.tries
     assert desk.now < 10.0
 
 

@@ -271,7 +271,7 @@ def test_what_changed_since_leads_to_the_list() -> None:
     assert is_right(result, vehicle)
     assert result.resumed == 0
     assert requests(world)[0] == 1
-    assert any("could not be confirmed" in note for note in result.notes)
+    assert any("does not match" in note for note in result.notes)
     assert isinstance(vehicle, PX4Vehicle)
     assert result.hash == vehicle.announced_hash()
     assert {param.trust for param in result.params.values()} == {Trust.LIVE}
@@ -286,7 +286,7 @@ def test_without_a_hash_earlier_values_stay_what_they_are() -> None:
     assert result.complete
     assert result.resumed == there
     assert not result.is_confirmed
-    assert any(f"{there - 1} values are those of an earlier session" in note for note in result.notes)
+    assert any(f"{there - 1} values are from an earlier session" in note for note in result.notes)
     assert requests(world) == (0, SIZE - there + 1)
     assert not world.machine.sync.synced
     assert world.machine.state == "cached"

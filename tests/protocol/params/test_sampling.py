@@ -98,7 +98,7 @@ def test_what_does_not_agree_leads_to_the_whole_table(vehicle: GenericVehicle, w
     result = session.outcome(sampled(session, size=200))
     assert (result.source, result.complete, result.sampled) == ("stream", True, False)
     assert why in result.notes[0]
-    assert result.notes[0].startswith("The sample did not confirm the cached table: ")
+    assert result.notes[0].startswith("The sample does not match the cached table: ")
     assert bits(result.params) == bits(vehicle.params)
     assert session.machine.state == "synced"
 

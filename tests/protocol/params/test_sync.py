@@ -21,12 +21,12 @@ from paramclient.protocol.events import (
     ParamChanged,
     TableResynced,
 )
-from paramclient.protocol.params.fetch import FETCH_RESTARTS_MAX
 from paramclient.protocol.params.fetch_result import Policy
 from paramclient.protocol.params.reads import Read
 from paramclient.protocol.params.sync import GAP_CHECK_INTERVAL, WATCH_INTERVAL, SyncState, Upkeep
 from paramclient.protocol.params.sync_interval import RESERVE_SHARE
 from paramclient.protocol.params.writes import Write
+from paramclient.protocol.requests.retry import FETCH_RESTARTS_MAX
 from paramclient.protocol.station import Station
 from paramclient.protocol.vehicle.presence import LOST_AFTER
 from paramclient.protocol.wire import (
@@ -1028,7 +1028,7 @@ def test_hash_only_says_when_the_hash_is_another_one() -> None:
     world.run(1.0)
     result = world.fetch()
     assert (result.source, result.hash, result.params["P07"].value) == ("cache", None, 7)
-    assert "did not confirm" in result.notes[0]
+    assert "does not match" in result.notes[0]
     machine = world.machine
     assert state(world) is SyncState.UNSYNCED, "it is known not to agree"
     assert trusts(machine) == {Trust.CACHED}

@@ -14,14 +14,9 @@ from paramclient.protocol import wire
 from paramclient.protocol.ftp.packets import Opcode, Packet
 from paramclient.protocol.params.fetch import Check
 from paramclient.protocol.params.fetch_result import FetchResult
-from paramclient.protocol.params.sync import (
-    FILE_IN_USE_RETRY,
-    FOREIGN_CHECK_INTERVAL,
-    FOREIGN_SETTLING_TIME,
-    SyncState,
-    Upkeep,
-)
+from paramclient.protocol.params.sync import FOREIGN_CHECK_INTERVAL, FOREIGN_SETTLING_TIME, SyncState, Upkeep
 from paramclient.protocol.params.sync_interval import FETCHES_KEPT, PAUSE_MIN, CheckPace
+from paramclient.protocol.requests.retry import FILE_IN_USE_RETRY
 from paramclient.protocol.wire import CommandLong, FileTransfer, ParamRequestList, ParamRequestRead
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, SimParam, px4_table
 from tests.protocol.params.test_sync import INTERVAL, NAMES, PLAIN, TABLE, World, fetched, resynced, state

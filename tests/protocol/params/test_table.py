@@ -394,7 +394,7 @@ def rows_of(table: Table) -> dict[str, int | None]:
     overwritten = [StoredParam(each.param, 1.0, by=each.by) for each in table.overwritten]
     times = UnixTimes(1.0)
     heard = HeardParams(table.params.copy(), times, volatile=None, by={}, overwritten=overwritten)
-    return {f"{name} {row.type}": row.default_bits for name, row, *_ in heard.rows()}
+    return {f"{item.name} {item.type}": item.default_bits for item in heard}
 
 
 def test_what_was_overwritten_keeps_the_default_of_its_own_type() -> None:

@@ -11,10 +11,11 @@ from paramclient.model.values import ParamType, Trust
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import Event, EventMaker, ParamChanged
 from paramclient.protocol.params.change import Change
-from paramclient.protocol.params.reads import BATCH_INTERVAL, Read
+from paramclient.protocol.params.reads import Read
 from paramclient.protocol.params.sync import Upkeep
 from paramclient.protocol.params.value_check import DISTRUST_TIME, REPLACED_MAX, ValueChecks
 from paramclient.protocol.params.writes import Write
+from paramclient.protocol.requests.retry import BATCH_INTERVAL
 from paramclient.protocol.station import Station
 from paramclient.protocol.wire import (
     MAV_AUTOPILOT_ARDUPILOTMEGA,

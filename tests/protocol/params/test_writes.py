@@ -23,7 +23,7 @@ from paramclient.protocol.params.reads import Reads
 from paramclient.protocol.params.table import Table
 from paramclient.protocol.params.writes import Write, Writes
 from paramclient.protocol.requests.context import Context
-from paramclient.protocol.requests.round_trip import ATTEMPTS_MIN, INITIAL_TIMEOUT, RoundTrip
+from paramclient.protocol.requests.retry import ATTEMPTS_MIN, INITIAL_TIMEOUT, RetryPolicy
 from paramclient.protocol.wire import Message, ParamError, ParamRequestRead, ParamSet, ParamValue
 from tests.simulation import is_so, known, param_value
 
@@ -40,8 +40,9 @@ class Desk:
         self.may_be_written = True
         self.sent: list[Message] = []
         self.table = Table(encoding)
-        self.round_trip = RoundTrip()
-        self.context = Context((1, 1), self.sent.append, round_trip=self.round_trip)
+        self.retry = RetryPolicy()
+        self.round_trip = self.retry.round_trip
+        self.context = Context((1, 1), self.sent.append, retry=self.retry)
         self.reads = Reads(self.context, self.table)
         self.reads.is_idle = False
         self.writes = Writes(self.context, self.reads, self.table, permission=self)
@@ -265,7 +266,7 @@ def test_ardupilot_cuts_off_the_fraction() -> None:
 def test_an_old_value_passing_by_proves_nothing() -> None:
     desk = Desk()
     desk.knows("A", 1.0)
-    desk.round_trip.answered(0.0, 0.1, 1)
+    desk.retry.answered(0.0, 0.1, 1)
     write = desk.set("A", 2.0)
     desk.hear("A", 1.0, at=0.01)
     assert not write.done
@@ -423,7 +424,7 @@ def test_silence_on_the_write_alone_says_that_it_is_not_applied() -> None:
     desk = Desk(Encoding.C_CAST)
     desk.knows("A", 1.0)
     for _ in range(60):
-        desk.round_trip.answered(0.0, 0.02, 1)
+        desk.retry.answered(0.0, 0.02, 1)
     write = desk.set("A", math.nan)
     error = silent(desk, write, answering_reads=1.0)
     assert isinstance(error, ValueNotApplied)
@@ -438,7 +439,7 @@ def test_a_vehicle_that_answers_every_write_with_the_old_value_does_not_apply_it
     desk = Desk()
     desk.knows("A", 1.0)
     for _ in range(60):
-        desk.round_trip.answered(0.0, 0.02, 1)
+        desk.retry.answered(0.0, 0.02, 1)
     write = desk.set("A", 2.0)
     while not write.done:
         if desk.take():
@@ -450,7 +451,7 @@ def test_a_vehicle_that_answers_every_write_with_the_old_value_does_not_apply_it
 
 @pytest.mark.parametrize("tries", range(5, 9))
 def test_giving_up_may_take_other_writes_with_it(tries: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(RoundTrip, "tries", tries)
+    monkeypatch.setattr(RetryPolicy, "tries", tries)
     desk = Desk()
     desk.knows("A", 1.0)
     desk.knows("B", 1.0)

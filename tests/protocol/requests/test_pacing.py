@@ -16,6 +16,7 @@ from paramclient.protocol.requests.pacing import (
     Pace,
     Share,
 )
+from paramclient.protocol.requests.retry import RetryPolicy
 from paramclient.protocol.requests.round_trip import RoundTrip
 
 
@@ -87,16 +88,16 @@ def test_it_stays_near_what_is_served() -> None:
 
 @pytest.mark.parametrize("silent", [0, 64])
 def test_one_that_serves_batches_is_never_asked_faster_than_it_serves(silent: int) -> None:
-    round_trip = RoundTrip()
+    policy = RetryPolicy()
     for number in range(100):
         if number < silent:
-            round_trip.timed_out(1)
+            policy.timed_out(1)
         else:
-            round_trip.answered(0.0, 0.02, 1)
-    pace = Pace(round_trip)
+            policy.answered(0.0, 0.02, 1)
+    pace = Pace(policy.round_trip)
     pace.is_batched = True
     serve(pace, 3.0, 0.02)
-    assert pace.rate == pytest.approx(BATCHED_RATE / (1.0 - round_trip.seen_loss) ** 0.5)
+    assert pace.rate == pytest.approx(BATCHED_RATE / (1.0 - policy.round_trip.seen_loss) ** 0.5)
     assert pace.prospect == pace.rate
     assert (pace.rate > BATCHED_RATE) is (silent > 0)
 
@@ -168,13 +169,13 @@ def test_something_may_always_be_asked_even_on_the_slowest_link(gap: float) -> N
 
 
 def test_what_the_component_drops_does_not_pass_for_a_bad_link() -> None:
-    trip = RoundTrip()
-    pace = Pace(trip)
+    policy = RetryPolicy()
+    pace = Pace(policy.round_trip)
     pace.stream_seen(0.0001)  # the list lost nothing
     for _ in range(200):
-        trip.timed_out(1)
-        trip.timed_out(1)
-        trip.answered(0.0, 0.02, 1)
+        policy.timed_out(1)
+        policy.timed_out(1)
+        policy.answered(0.0, 0.02, 1)
     now = 0.0
     answers: list[float] = []
     while now < 2.0:  # it answers one of three, at once

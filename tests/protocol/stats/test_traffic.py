@@ -22,7 +22,7 @@ from paramclient.protocol.stats.packet_loss import (
     REORDER_DEPTH,
     SequenceCheck,
 )
-from paramclient.protocol.stats.sniffer import UNPROVEN_BYTES_MAX, Seen, Sniffer
+from paramclient.protocol.stats.sniffer import UNPROVEN_BYTES_MAX, SeenFrame, Sniffer
 from paramclient.protocol.stats.traffic import RATE_WINDOW, ComponentTraffic, Traffic
 from paramclient.protocol.wire import Framer, Heartbeat
 from paramclient.sim import Air, FaultyLink, PX4Vehicle
@@ -64,7 +64,7 @@ def damaged(sequence: int = 0) -> bytes:
     return whole[:-1] + bytes((whole[-1] ^ 1,))
 
 
-def sniffed(data: Iterable[bytes], *, stream: bool = True) -> tuple[list[Seen], Sniffer]:
+def sniffed(data: Iterable[bytes], *, stream: bool = True) -> tuple[list[SeenFrame], Sniffer]:
     sniffer = Sniffer(stream=stream)
     seen = [each for chunk in data for each in sniffer.receive(chunk)]
     return seen + sniffer.flush(), sniffer
@@ -76,7 +76,7 @@ def sniffed(data: Iterable[bytes], *, stream: bool = True) -> tuple[list[Seen], 
 def test_a_frame_is_seen_with_all_that_counts() -> None:
     data = frame(30, 7, system=3, component=4)
     [seen], _ = sniffed([data])
-    assert seen == Seen(30, 3, 4, 7, bytes(range(1, 29)), 2, 40, False, True, data)
+    assert seen == SeenFrame(30, 3, 4, 7, bytes(range(1, 29)), 2, 40, False, True, data)
     [seen], _ = sniffed([frame(30, 7, version=1)])
     assert (seen.version, seen.size, seen.is_signed) == (1, 36, False)
     [seen], _ = sniffed([signed()])

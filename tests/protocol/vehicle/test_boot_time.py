@@ -14,15 +14,16 @@ from paramclient.protocol.events import ComponentRebooted, Event, EventMaker
 from paramclient.protocol.params.boot_values import MEASURING_TIME, MEASURING_UPTIME_MAX
 from paramclient.protocol.params.sync import Upkeep
 from paramclient.protocol.requests.context import Context
-from paramclient.protocol.station import Station
-from paramclient.protocol.vehicle.boot_time_requests import (
+from paramclient.protocol.requests.retry import (
     BASELINE_DELAY,
+    CLOCK_REQUEST_INTERVAL,
     FAST_REQUESTS_TIME,
-    REQUEST_INTERVAL,
     SLOW_REQUEST_INTERVAL,
-    ClockRequests,
 )
+from paramclient.protocol.station import Station
+from paramclient.protocol.vehicle.boot_time_requests import ClockRequests
 from paramclient.protocol.vehicle.boot_time_sampling import SAMPLE_TIME, ClockSampling
+from paramclient.protocol.vehicle.commands import MessageRequests
 from paramclient.protocol.vehicle.presence import Presence
 from paramclient.protocol.wire import (
     MAV_AUTOPILOT_ARDUPILOTMEGA,
@@ -68,7 +69,7 @@ class Requests:
             self.sent.append(self.now)
 
         self.context = Context((1, 1), send, may_send=may_send)
-        self.requests = ClockRequests(self.context, self.presence)
+        self.requests = ClockRequests(self.context, MessageRequests(self.context), self.presence)
 
     def run(self, until: float) -> list[float]:
         """Give the requests that are sent until then."""
@@ -113,7 +114,7 @@ def test_a_clock_that_does_not_come_is_given_up() -> None:
     desk = Requests()
     desk.requests.want(desk.now)
     assert desk.run(60.0) == [
-        REQUEST_INTERVAL * turn for turn in range(int(FAST_REQUESTS_TIME / REQUEST_INTERVAL))
+        CLOCK_REQUEST_INTERVAL * turn for turn in range(int(FAST_REQUESTS_TIME / CLOCK_REQUEST_INTERVAL))
     ]
 
 
@@ -131,8 +132,8 @@ def test_after_the_command_to_restart_it_is_asked_until_it_is_back() -> None:
     desk = Requests()
     desk.requests.follow(desk.now)
     sent = desk.run(20.0)
-    assert sent[0] == REQUEST_INTERVAL
-    assert sent[:20] == [REQUEST_INTERVAL * (turn + 1) for turn in range(20)]
+    assert sent[0] == CLOCK_REQUEST_INTERVAL
+    assert sent[:20] == [CLOCK_REQUEST_INTERVAL * (turn + 1) for turn in range(20)]
     assert sent[-1] - sent[-2] == SLOW_REQUEST_INTERVAL
     desk.tell(100_000)  # it is still there: that is not the end
     assert desk.run(22.5) != []
@@ -143,10 +144,10 @@ def test_after_the_command_to_restart_it_is_asked_until_it_is_back() -> None:
 
 def test_another_message_that_is_requested_goes_first() -> None:
     desk = Requests()
-    desk.context.is_identifying = True
+    desk.context.is_requesting_message = True
     desk.requests.want(desk.now)
     assert desk.run(1.0) == []
-    desk.context.is_identifying = False
+    desk.context.is_requesting_message = False
     assert desk.run(1.1) == [1.0]
 
 

@@ -8,8 +8,8 @@ import pytest
 
 from paramclient import CommandRefused, CommandResult, LinkError, NoReply, Refused
 from paramclient.protocol.requests.context import Context
-from paramclient.protocol.requests.round_trip import RoundTrip
-from paramclient.protocol.vehicle.commands import PROGRESS_TIMEOUT, Command, Commands
+from paramclient.protocol.requests.retry import PROGRESS_TIMEOUT, RetryPolicy
+from paramclient.protocol.vehicle.commands import Command, Commands
 from paramclient.protocol.wire import CommandAck, CommandLong, Message
 from tests.simulation import is_so
 
@@ -23,9 +23,10 @@ class Desk:
 
     def __init__(self) -> None:
         self.sent: list[CommandLong] = []
-        self.round_trip = RoundTrip()
+        self.retry = RetryPolicy()
+        self.round_trip = self.retry.round_trip
         self.round_trip.heard_at = 0.0
-        self.commands = Commands(Context((1, 1), self.take, OWN, self.round_trip))
+        self.commands = Commands(Context((1, 1), self.take, OWN, self.retry))
 
     def take(self, message: Message) -> None:
         assert isinstance(message, CommandLong)
@@ -84,7 +85,7 @@ def test_a_result_that_is_not_known_keeps_its_number() -> None:
 def test_what_is_not_answered_is_sent_again_and_counted() -> None:
     desk = Desk()
     command = desk.commands.begin(NUMBER, (), 0.0)
-    timeout = desk.round_trip.timeout
+    timeout = desk.retry.timeout
     desk.commands.tick(timeout * 0.9)
     assert command.attempts == 1
     desk.run(timeout * 2.5)
@@ -194,7 +195,7 @@ def test_a_link_that_is_back_brings_it_at_once() -> None:
     command = desk.commands.begin(NUMBER, (), 0.0)
     desk.commands.resume(5.0)
     assert len(desk.sent) == 2
-    assert (command.attempts, command.sent_at) == (1, 5.0)
+    assert (command.attempts, command.request.sent_at) == (1, 5.0)
 
 
 @pytest.mark.parametrize("is_lost", [True, False])

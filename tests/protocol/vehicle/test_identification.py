@@ -9,14 +9,15 @@ import pytest
 
 from paramclient.model.values import Encoding
 from paramclient.protocol.requests.context import Context
-from paramclient.protocol.requests.round_trip import FIRST_TIMEOUT, RoundTrip
-from paramclient.protocol.vehicle.identification import (
+from paramclient.protocol.requests.retry import (
     DOUBT_REQUEST_INTERVAL,
     DOUBT_TIME_MIN,
+    FIRST_TIMEOUT,
     VERSION_ATTEMPTS,
-    Identification,
-    judge_encoding,
+    RetryPolicy,
 )
+from paramclient.protocol.vehicle.commands import MessageRequests
+from paramclient.protocol.vehicle.identification import Identification, judge_encoding
 from paramclient.protocol.wire import (
     AUTOPILOT_VERSION_ID,
     CAPABILITY_PARAM_ENCODE_BYTEWISE,
@@ -38,6 +39,7 @@ from paramclient.protocol.wire import (
 )
 from tests.simulation import is_so
 
+OWN = (255, 190)
 PX4 = Heartbeat(2, MAV_AUTOPILOT_PX4)
 ARDUPILOT = Heartbeat(2, MAV_AUTOPILOT_ARDUPILOTMEGA)
 CAMERA = Heartbeat(30, MAV_AUTOPILOT_INVALID)
@@ -51,8 +53,18 @@ class Desk:
 
     def __init__(self, chosen: Encoding | None = None) -> None:
         self.sent: list[Message] = []
-        self.trip = RoundTrip()
-        self.who = Identification(Context((1, 1), self.sent.append, round_trip=self.trip), "udpin:x", chosen)
+        self.retry = RetryPolicy()
+        self.trip = self.retry.round_trip
+        self.context = Context((1, 1), self.sent.append, OWN, self.retry)
+        self.messages = MessageRequests(self.context)
+        self.who = Identification(self.context, self.messages, "udpin:x", chosen)
+
+    def tick(self, now: float) -> None:
+        self.messages.tick(now)
+        self.who.tick(now)
+
+    def next_deadline(self) -> float:
+        return min(self.messages.next_deadline(), self.who.next_deadline())
 
     def beat(self, heartbeat: Heartbeat, now: float = 0.0) -> None:
         self.who.heartbeat(heartbeat)
@@ -67,8 +79,8 @@ class Desk:
 
     def let_it_be(self) -> None:
         """Let every request go unanswered."""
-        while (deadline := self.who.next_deadline()) < math.inf:
-            self.who.tick(deadline)
+        while (deadline := self.next_deadline()) < math.inf:
+            self.tick(deadline)
 
 
 # the chain of evidence
@@ -158,11 +170,11 @@ def test_it_is_asked_for_its_version_once() -> None:
     desk.beat(PX4, 1.1)
     assert len(desk.sent) == 1
     assert is_so(not desk.who.settled)
-    desk.who.acknowledged(CommandAck(MAV_CMD_REQUEST_MESSAGE, MAV_RESULT_ACCEPTED), 1.2)
-    assert desk.who.next_deadline() > 1.2
+    desk.messages.acknowledged(CommandAck(MAV_CMD_REQUEST_MESSAGE, MAV_RESULT_ACCEPTED), 1.2)
+    assert desk.next_deadline() > 1.2
     assert desk.who.version(AutopilotVersion(CAPABILITY_PARAM_ENCODE_BYTEWISE, uid=7), 1.2) is False
     assert desk.who.settled
-    assert desk.who.next_deadline() == math.inf
+    assert desk.next_deadline() == math.inf
     assert desk.trip.smoothed == pytest.approx(0.2)
     identity = desk.who.identity
     assert (identity.system, identity.link, identity.uid) == (1, "udpin:x", "0000000000000007")
@@ -172,7 +184,7 @@ def test_it_is_asked_for_its_version_once() -> None:
 def test_both_ways_to_ask_are_tried_in_turn_and_then_it_is_let_be() -> None:
     desk = Desk()
     desk.beat(CAMERA)
-    assert desk.who.next_deadline() == FIRST_TIMEOUT
+    assert desk.next_deadline() == FIRST_TIMEOUT
     desk.let_it_be()
     both = [MAV_CMD_REQUEST_MESSAGE, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES]
     assert desk.commands() == [MAV_CMD_REQUEST_MESSAGE, *both * (VERSION_ATTEMPTS - 1)]
@@ -186,22 +198,32 @@ def test_both_ways_to_ask_are_tried_in_turn_and_then_it_is_let_be() -> None:
 def test_a_refusal_leads_to_the_other_way_at_once() -> None:
     desk = Desk()
     desk.beat(PX4)
-    desk.who.acknowledged(CommandAck(MAV_CMD_REQUEST_MESSAGE, MAV_RESULT_UNSUPPORTED), 0.1)
-    assert desk.who.next_deadline() == 0.1
-    desk.who.tick(0.1)
+    desk.messages.acknowledged(CommandAck(MAV_CMD_REQUEST_MESSAGE, MAV_RESULT_UNSUPPORTED), 0.1)
+    assert desk.next_deadline() == 0.1
+    desk.tick(0.1)
     assert desk.commands() == [MAV_CMD_REQUEST_MESSAGE, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES]
+
+
+def test_a_refusal_to_another_station_means_nothing() -> None:
+    desk = Desk()
+    desk.beat(PX4)
+    before = desk.next_deadline()
+    desk.messages.acknowledged(CommandAck(MAV_CMD_REQUEST_MESSAGE, MAV_RESULT_UNSUPPORTED, 254, 190), 0.1)
+    assert desk.next_deadline() == before
+    desk.messages.acknowledged(CommandAck(MAV_CMD_REQUEST_MESSAGE, MAV_RESULT_UNSUPPORTED, *OWN), 0.1)
+    assert desk.next_deadline() == 0.1
 
 
 def test_refusals_of_other_things_and_refusals_that_come_late_mean_nothing() -> None:
     desk = Desk()
     desk.beat(PX4)
-    before = desk.who.next_deadline()
-    desk.who.acknowledged(CommandAck(400, MAV_RESULT_UNSUPPORTED), 0.1)
-    assert desk.who.next_deadline() == before
+    before = desk.next_deadline()
+    desk.messages.acknowledged(CommandAck(400, MAV_RESULT_UNSUPPORTED), 0.1)
+    assert desk.next_deadline() == before
     desk.who.version(AutopilotVersion(0, uid=7), 0.2)
-    desk.who.acknowledged(CommandAck(MAV_CMD_REQUEST_MESSAGE, MAV_RESULT_UNSUPPORTED), 0.3)
-    assert desk.who.next_deadline() == math.inf
-    desk.who.tick(5.0)
+    desk.messages.acknowledged(CommandAck(MAV_CMD_REQUEST_MESSAGE, MAV_RESULT_UNSUPPORTED), 0.3)
+    assert desk.next_deadline() == math.inf
+    desk.tick(5.0)
     assert len(desk.commands()) == 1
 
 
@@ -240,15 +262,15 @@ def test_a_version_that_tells_no_encoding_waits_for_a_heartbeat() -> None:
         desk.who.version(AutopilotVersion(ARDUPILOT_BITS), 10.1)
         assert is_so(not desk.who.may_be_written)
         if heartbeat is None:  # one that never sends any keeps to the standard
-            desk.who.tick(13.0)
+            desk.tick(13.0)
             assert is_so(not desk.who.may_be_written)
-            assert desk.who.next_deadline() == 13.1
-            desk.who.tick(13.1)
+            assert desk.next_deadline() == 13.1
+            desk.tick(13.1)
         else:
             desk.who.heartbeat(heartbeat)
         assert is_so(desk.who.may_be_written)
         assert desk.who.encoding is encoding
-        assert desk.who.next_deadline() == math.inf
+        assert desk.next_deadline() == math.inf
 
 
 def test_a_version_that_tells_the_encoding_waits_for_no_heartbeat() -> None:
@@ -299,19 +321,19 @@ def test_an_answer_that_never_comes_again_leaves_what_is_known() -> None:
 def test_one_that_was_away_is_asked_for_five_seconds_and_not_more_than_once_a_second_in_the_end() -> None:
     desk = settled(7)
     for _ in range(50):
-        desk.trip.answered(0.0, 0.02, 1)  # a quick link, on which five tries take half a second
+        desk.retry.answered(0.0, 0.02, 1)  # a quick link, on which five tries take half a second
     desk.who.doubt(30.0)
     times = [30.0]
-    while (deadline := desk.who.next_deadline()) < math.inf:
+    while (deadline := desk.next_deadline()) < math.inf:
         assert is_so(desk.who.is_doubted)
         assert not desk.who.may_be_written
         times.append(deadline)
-        desk.who.tick(deadline)
-    usual = desk.trip.tries
+        desk.tick(deadline)
+    usual = desk.retry.tries
     assert times[-1] >= 30.0 + DOUBT_TIME_MIN
     assert all(after - before >= DOUBT_REQUEST_INTERVAL for before, after in pairwise(times[usual - 1 : -1]))
     assert len(times) <= usual + DOUBT_TIME_MIN / DOUBT_REQUEST_INTERVAL + 2
     assert desk.who.is_unconfirmed, "it has not said that it is the same"
     assert not desk.who.may_be_written
     desk.who.version(AutopilotVersion(0, uid=7), 60.0)
-    assert not is_so(desk.who.was_away)
+    assert not is_so(desk.context.may_be_another)

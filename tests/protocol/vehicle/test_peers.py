@@ -12,6 +12,7 @@ from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ComponentContested, ComponentReplaced, ComponentUncontested, Event
 from paramclient.protocol.params.sync import Upkeep
+from paramclient.protocol.requests.retry import PEER_REQUESTS, PEER_REQUESTS_MAX
 from paramclient.protocol.station import Station
 from paramclient.protocol.vehicle import peers as room
 from paramclient.protocol.vehicle.presence import LOST_AFTER
@@ -198,7 +199,7 @@ def test_waiting_callers_get_the_error() -> None:
 @pytest.mark.parametrize("other", [{"uid": 2}, {"uid": None}, {"booted_at": -40.0}, {"uid": 0}])
 def test_two_of_one_kind_are_told_apart_by_id_and_clock(other: dict[str, object]) -> None:
     net = Net(a=Speaker(PX4), b=Speaker(PX4, start=0.5, **other))  # type: ignore[arg-type]
-    net.run(room.IDENTIFICATION_TIME + 2.0)
+    net.run(PEER_REQUESTS.duration + 2.0)
     assert net.kinds() == ["Contested"]
     net.run(20.0)
     assert net.kinds() == ["Contested"], "told once"
@@ -233,10 +234,10 @@ def test_heartbeats_at_20_hz_divert_no_request() -> None:
     forger.say(CommandAck(400, 0, 255, 190))
     net.run(0.2)
     assert write.result is None, "its answer does not count"
-    net.run(room.IDENTIFICATION_TIME)
+    net.run(PEER_REQUESTS.duration)
     assert net.kinds() == ["Contested"]
     asked = [each for each in forger.heard if isinstance(each, CommandLong)]
-    assert len(asked) <= 3 * room.IDENTITY_REQUESTS_MAX
+    assert len(asked) <= 3 * PEER_REQUESTS_MAX
     assert net.machine.table.params["P"].value == 1.0
 
 
@@ -247,7 +248,7 @@ def test_requests_go_to_the_peer_that_gives_the_hardware_id() -> None:
     net.run(1.0)
     assert net.machine.peers.home == "vehicle"
     assert net.machine.who.identity.uid == f"{1:016x}"
-    net.run(room.IDENTIFICATION_TIME + 2.0)
+    net.run(PEER_REQUESTS.duration + 2.0)
     assert net.kinds() == ["Contested"]
 
 
@@ -366,9 +367,9 @@ def test_a_path_that_could_not_answer_at_first_is_proven_later(monkeypatch: pyte
     net = Net(a=Speaker(), b=second)
     with monkeypatch.context() as deaf:
         deaf.setattr(second, "receive", lambda data, now: None)
-        net.run(room.IDENTIFICATION_TIME + 3.0)
+        net.run(PEER_REQUESTS.duration + 3.0)
         assert net.kinds() == ["Contested"]
-    net.run(room.LATER_REQUEST_PAUSE + 1.0)
+    net.run(PEER_REQUESTS.later + 1.0)
     assert net.kinds() == ["Contested", "Uncontested"]
     assert net.machine.peers.contest is None
     net.run(20.0)
@@ -378,12 +379,12 @@ def test_a_path_that_could_not_answer_at_first_is_proven_later(monkeypatch: pyte
 def test_an_unidentified_peer_stays_contested_and_is_asked_rarely() -> None:
     stranger = Speaker(uid=None, booted_at=None, every=0.5)
     net = Net(a=Speaker(), b=stranger)
-    net.run(room.IDENTIFICATION_TIME + 1.0)
+    net.run(PEER_REQUESTS.duration + 1.0)
     stranger.heard.clear()
     net.run(60.0)
     assert net.kinds() == ["Contested"]
     asked = [message for message in stranger.heard if isinstance(message, wire.CommandLong)]
-    assert len(asked) <= 3 * (60.0 / room.LATER_REQUEST_PAUSE + 1)
+    assert len(asked) <= 3 * (60.0 / PEER_REQUESTS.later + 1)
 
 
 def test_a_vehicle_without_id_and_clock_may_have_two_paths() -> None:
@@ -393,7 +394,7 @@ def test_a_vehicle_without_id_and_clock_may_have_two_paths() -> None:
         a=Speaker(camera, uid=None, booted_at=None),
         b=Speaker(camera, uid=None, booted_at=None, start=0.4),
     )
-    net.run(room.IDENTIFICATION_TIME + 5.0)
+    net.run(PEER_REQUESTS.duration + 5.0)
     assert net.kinds() == []
 
 
@@ -627,7 +628,7 @@ def test_one_that_stays_and_gives_no_id_is_another_vehicle() -> None:
     hold(net, "P", "Q")
     net.run(1.2)
     write = net.machine.write("P", 5.0, net.now)
-    net.run(3.5 + room.IDENTIFICATION_TIME + 1.0 - net.now)
+    net.run(3.5 + PEER_REQUESTS.duration + 1.0 - net.now)
     assert isinstance(write.error, NoReply)
     assert not any(isinstance(each, ParamSet) for each in net.peers["b"].heard)
     assert net.machine.peers.home == "b"
@@ -731,7 +732,7 @@ def test_another_kind_that_gives_no_id_is_not_written_to() -> None:
     assert isinstance(write.error, NoReply)
     assert net.station.is_doubted(net.machine)
     port._heartbeats, port.uid = (PX4,), 1
-    net.run(room.LATER_REQUEST_PAUSE + 3.0)
+    net.run(PEER_REQUESTS.later + 3.0)
     assert not net.station.is_doubted(net.machine)
     assert any(isinstance(each, ComponentReplaced) for each in net.events), "what came meanwhile is not its"
 
@@ -852,7 +853,7 @@ def test_a_component_at_the_peer_of_a_rival_is_neither_kept_nor_written_to() -> 
     other = camera(net, "b", 9.0)
     assert net.station.is_doubted(other)
     assert not other.may_be_written
-    net.run(room.IDENTIFICATION_TIME)
+    net.run(PEER_REQUESTS.duration)
     assert net.machine.peers.contest is not None
     with pytest.raises(ContestedAddress):
         other.write("CAM", 1.0, net.now)

@@ -24,8 +24,9 @@ from paramclient import (
 from paramclient.client.link_component import REBOOT_TIMEOUT
 from paramclient.client.local import local
 from paramclient.protocol import wire
+from paramclient.protocol.requests.retry import REBOOT_COMMANDS_MAX
 from paramclient.protocol.system_id_change import OLD_ID_SILENCE_MIN
-from paramclient.protocol.vehicle.reboot import COMMANDS_MAX, SAVING_TIME, UNOBSERVED_TIMEOUT
+from paramclient.protocol.vehicle.reboot import SAVING_TIME, UNOBSERVED_TIMEOUT
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle, Vehicle
 from tests.shell import FlakyLink, Tap, a_client, generic, outcome, residue, swiftly, tasks_beside
 from tests.simulation import is_so
@@ -185,7 +186,7 @@ async def test_a_vehicle_that_hears_nothing_is_given_up() -> None:
         tap.is_deaf = True
         error = await outcome(component.reboot())
         assert isinstance(error, NoReply)
-        assert error.attempts == COMMANDS_MAX
+        assert error.attempts == REBOOT_COMMANDS_MAX
         assert "the restart of 1/1" in str(error)
         assert residue(component) == []
 

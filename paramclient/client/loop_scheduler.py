@@ -1,4 +1,4 @@
-"""Fair sharing of one event loop among the links that are read in it."""
+"""The scheduler of an event loop: shares it fairly among the links that are read in it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from typing import Final
 import anyio
 from anyio.lowlevel import RunVar
 
-__all__ = ["EventLoopShare"]
+from paramclient.protocol.scheduler import Scheduler
+
+__all__ = ["LoopScheduler"]
 
 TURN_MAX: Final = 0.003
 """Seconds of processing received datagrams after which a reader yields to other tasks. The last value of a
@@ -22,12 +24,13 @@ BACKLOG_VALIDITY: Final = 0.02
 BURST_LISTS_MAX: Final = 24
 """Lists arriving in bursts on all links together, above which no link starts a second one: 24 lists use all
 CPU time of the program."""
-RECHECK_INTERVAL: Final = 0.01
-"""Seconds until a link that waits for other links checks them again."""
 
 
-class EventLoopShare:
-    """State shared by the link readers of one event loop; see `of_this_loop`.
+class LoopScheduler:
+    """The scheduler of the links of one event loop; see `of_this_loop`.
+
+    It sets the limits of `paramclient.protocol.scheduler.Scheduler`, the scheduler of the components of one
+    link.
 
     Attributes:
         turn: held by a reader that processes many datagrams. The reader yields to the event loop before it
@@ -42,22 +45,26 @@ class EventLoopShare:
         self._awaited: dict[object, int] = {}  # by reader: number of requested lists without a burst yet
 
     @staticmethod
-    def of_this_loop() -> EventLoopShare:
+    def of_this_loop() -> LoopScheduler:
         """Return the instance of the running event loop."""
         try:
-            return _share.get()
+            return _scheduler.get()
         except LookupError:
-            _share.set(share := EventLoopShare())
-            return share
+            _scheduler.set(scheduler := LoopScheduler())
+            return scheduler
 
     def joined(self, reader: object) -> None:
         """Register a reader."""
         self._readers.add(reader)
 
-    @property
-    def has_others(self) -> bool:
-        """Whether more than one reader is registered."""
-        return len(self._readers) > 1
+    def needs_turns(self, datagrams: int, scheduler: Scheduler) -> bool:
+        """Return whether a reader processes its datagrams in turns: they are many, or there are other links.
+
+        Args:
+            datagrams: number of datagrams of one read.
+            scheduler: the scheduler of the link.
+        """
+        return datagrams >= TURN_DATAGRAMS_MIN or (len(self._readers) > 1 and scheduler.is_waiting)
 
     def came(self, reader: object, datagrams: int) -> None:
         """Record the number of datagrams of one read. The reader calls `taken` after processing them."""
@@ -76,6 +83,22 @@ class EventLoopShare:
         self._behind.pop(reader, None)
         self._bursts.pop(reader, None)
         self._awaited.pop(reader, None)
+
+    def limit_lists(self, reader: object, scheduler: Scheduler, now: float, *, is_behind: bool) -> None:
+        """Set the limits of a link's lists that follow from the lists and backlogs of all links.
+
+        Args:
+            reader: the reader of the link.
+            scheduler: the scheduler of the link.
+            now: time of the event loop.
+            is_behind: whether the link itself has a backlog.
+        """
+        turns = scheduler.turns
+        if is_behind:
+            scheduler.lists_max = 1
+        else:
+            scheduler.lists_max = self.most_lists(reader, turns.bursts, now, awaited=turns.awaited(now))
+        scheduler.is_crowded = self.is_busy_without(reader)
 
     def most_lists(self, reader: object, bursts: int, now: float, *, awaited: int = 0) -> float:
         """Return the number of lists that a link may download in parallel, at least 1.
@@ -100,4 +123,4 @@ class EventLoopShare:
         return any(bursts for each, bursts in self._bursts.items() if each is not reader)
 
 
-_share: RunVar[EventLoopShare] = RunVar("paramclient event loop share")
+_scheduler: RunVar[LoopScheduler] = RunVar("paramclient event loop scheduler")

@@ -1,4 +1,4 @@
-"""What the command that serves does for the process that it has alone."""
+"""Full garbage collections of a process that serves skip the components that are followed."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import gc
 
 import pytest
 
-from paramclient.cli import serve as serve_room
-from paramclient.cli.serve import COLLECTED_COMPONENTS_MAX, Collections
+from paramclient.service import garbage_collection
+from paramclient.service.garbage_collection import COLLECTED_COMPONENTS_MAX, ComponentFreezer
 
 
 def test_collections_go_through_no_components_that_stay(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -15,14 +15,14 @@ def test_collections_go_through_no_components_that_stay(monkeypatch: pytest.Monk
     collections = 0
     monkeypatch.setattr(gc, "freeze", lambda: calls.append("freeze"))
     monkeypatch.setattr(gc, "unfreeze", lambda: calls.append("unfreeze"))
-    monkeypatch.setattr(serve_room, "_full_collections", lambda: collections)
+    monkeypatch.setattr(garbage_collection, "_full_collections", lambda: collections)
 
     def after(followed: range) -> list[str]:
         calls.clear()
-        sparing.look(set(followed))
+        freezer.check(set(followed))
         return calls
 
-    sparing = Collections()
+    freezer = ComponentFreezer()
     assert after(range(COLLECTED_COMPONENTS_MAX - 1)) == []
     assert after(range(COLLECTED_COMPONENTS_MAX)) == ["freeze"]
     assert after(range(2 * COLLECTED_COMPONENTS_MAX - 1)) == []
@@ -36,6 +36,6 @@ def test_collections_go_through_no_components_that_stay(monkeypatch: pytest.Monk
 
 
 def test_full_collections_are_counted() -> None:
-    before = serve_room._full_collections()
+    before = garbage_collection._full_collections()
     gc.collect()
-    assert serve_room._full_collections() > before
+    assert garbage_collection._full_collections() > before

@@ -1,0 +1,80 @@
+"""Responses with documents, encoded in a worker thread, a long member entry by entry."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, Final
+
+from fastapi import Response
+
+from paramclient.documents.document import Document
+from paramclient.provision.runner import Runner
+from paramclient.service.event_feed import COMPACT_SEPARATORS
+
+__all__ = ["JSON", "document_response", "encode_document"]
+
+JSON: Final = "application/json"
+"""Media type of JSON."""
+LONG_MEMBER_ENTRIES: Final = 64
+"""Maximum number of entries of a member that is encoded at once."""
+
+
+async def document_response(run: Runner, make: Callable[[], Document], *, status: int = 200) -> Response:
+    """Return a response with a document.
+
+    Args:
+        run: runs the work, such as `Hub.run_in_thread`.
+        make: creates the document.
+        status: HTTP status code.
+
+    Raises:
+        Exception: any exception of `make`.
+    """
+    return Response(await run(lambda: encode_document(make())), status, media_type=JSON)
+
+
+def encode_document(document: Document, **entries: Iterable[Document | tuple[str, Document]]) -> bytes:
+    """Encode a document as JSON, with the result of `model_dump_json`.
+
+    `model_dump_json` would hold the GIL for long with thousands of entries.
+
+    Args:
+        document: the document.
+        entries: iterables that replace members of this name, lists or objects; those of an object with the
+            names of its entries. Each entry is created, encoded and released before the next one.
+    """
+    return ("{" + ",".join(filter(None, _members(document, entries))) + "}").encode()
+
+
+def _members(
+    document: Document, entries: dict[str, Iterable[Document | tuple[str, Document]]]
+) -> Iterator[str]:
+    for name, field in type(document).model_fields.items():
+        key = json.dumps(field.serialization_alias or name)
+        if name in entries:
+            is_object = isinstance(getattr(document, name), dict)
+            texts = ",".join(map(_encode_entry, entries[name]))
+            yield f"{key}:{{{texts}}}" if is_object else f"{key}:[{texts}]"
+            continue
+        content = getattr(document, name)
+        if isinstance(content, dict) and len(content) > LONG_MEMBER_ENTRIES:
+            pairs = [f"{json.dumps(str(each))}:{_json(value)}" for each, value in content.items()]
+            yield f"{key}:{{{','.join(pairs)}}}"
+        elif isinstance(content, list) and len(content) > LONG_MEMBER_ENTRIES:
+            yield f"{key}:[{','.join(map(_json, content))}]"
+        else:
+            yield document.model_dump_json(include={name})[1:-1]
+
+
+def _encode_entry(entry: Document | tuple[str, Document]) -> str:
+    if isinstance(entry, Document):
+        return entry.model_dump_json()
+    name, document = entry
+    return f"{json.dumps(name)}:{document.model_dump_json()}"
+
+
+def _json(content: Any) -> str:
+    if isinstance(content, Document):
+        return content.model_dump_json()
+    return json.dumps(content, allow_nan=False, separators=COMPACT_SEPARATORS)
