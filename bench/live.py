@@ -187,7 +187,7 @@ class Vehicle:
 def rows() -> Iterator[Row]:
     """Yield all rows in the order of the output."""
     clean = partial(time_fetch, conditions=CLEAN)
-    yield Row("ArduPilot, clean, one right after the other", "ardupilot", clean, 0.45, 0.6, pause=0.0)
+    yield Row("ArduPilot by file, clean, without a pause", "ardupilot", clean, 0.45, 0.6, pause=0.0)
     for refuses, way, bounds in (
         (False, "file", {0.05: (0.8, 1.3), 0.20: (1.1, 2.0)}),
         (True, "list", {0.05: (2.3, 3.5), 0.20: (3.8, 6.0)}),
@@ -203,7 +203,7 @@ def rows() -> Iterator[Row]:
         yield Row(
             f"PX4, {loss:.0%} lost", "px4", partial(time_fetch, conditions=conditions), median, worst, 0.0
         )
-    yield Row(f"PX4, {GETS} gets one after the other", "px4", time_gets, 0.2, 0.4, 0.0)
+    yield Row(f"PX4, {GETS} gets in sequence", "px4", time_gets, 0.2, 0.4, 0.0)
     for kind, title in (("ardupilot", "ArduPilot"), ("px4", "PX4")):
         yield Row(f"{title}, command: start to the value of one get", kind, time_command, 0.6, 0.9, 0.0)
 
@@ -401,7 +401,7 @@ async def time_rows(
 
 def table(timings: Sequence[Timing]) -> Iterator[str]:
     """Yield the lines of the Markdown table, and of the problems."""
-    yield "| real autopilot | median | worst | promised |"
+    yield "| real autopilot | median | worst | limit (median / worst) |"
     yield "|---|---|---|---|"
     for each in timings:
         promise = f"{each.promised_median:g} / {each.promised_worst:g}{'' if each.is_met else ' missed'}"

@@ -5,7 +5,8 @@
 Simulated PX4 and ArduPilot vehicles communicate over real UDP on loopback, each in its own process, over a
 link with packet loss in both directions. Every client starts without a cache and first receives a heartbeat;
 its time is measured from the request to the last value. The values are compared with those of the vehicle. An
-ArduPilot "by file" also serves its table over MAVFTP, and clients that support it download the file.
+ArduPilot "by file" also serves its table over MAVFTP, and clients that support it download the file. "By
+list", it does not.
 
 With `--live`, the vehicle is the one on this link, real or in its firmware's own simulation; the relay of
 `tests/live/relay.py` drops the datagrams and, except in the rows "by file", refuses MAVFTP. Nothing is
@@ -110,7 +111,13 @@ class Case:
 
     @property
     def name(self) -> str:
-        return f"{self.kind}{' by file' if self.by_file else ''} {self.link}"
+        return f"{self.title} {self.link}"
+
+    @property
+    def title(self) -> str:
+        """The kind of vehicle, and for one that may serve a file, how its table is downloaded."""
+        way = " by file" if self.by_file else " by list" if self.kind.endswith("ArduPilot") else ""
+        return f"{self.kind}{way}"
 
     @property
     def link(self) -> str:
@@ -308,13 +315,11 @@ def print_table(
         for client in clients:
             outcomes = results.get((client, case))
             if outcomes is None:
-                cells.append("has no way by file")
+                cells.append("not supported")
             else:
                 cells.append(cell(outcomes, ours) + "".join(mark(notes, note) for note in remarks(outcomes)))
         count = len(case.truth)
-        print(
-            f"| {case.kind}{' by file' if case.by_file else ''}, {count}, {case.link} | {' | '.join(cells)} |"
-        )
+        print(f"| {case.title}, {count}, {case.link} | {' | '.join(cells)} |")
     if notes:
         print()
     for number, note in enumerate(notes, 1):

@@ -405,11 +405,14 @@ class NoReply(ParamClientError, TimeoutError):
         awaited: the expected response, in words.
         attempts: the number of requests sent (0 if there is no request for it).
         waited: seconds from the first request to giving up.
+
+    Args:
+        hint: what was received instead and the likely cause, in sentences, for the message.
     """
 
-    def __init__(self, awaited: str, *, attempts: int, waited: float) -> None:
+    def __init__(self, awaited: str, *, attempts: int, waited: float, hint: str = "") -> None:
         tries = f" after {attempts} {'try' if attempts == 1 else 'tries'}" if attempts else ""
-        super().__init__(f"no reply: {awaited}{tries} in {waited:.1f} s")
+        super().__init__(f"no reply: {awaited}{tries} in {waited:.1f} s{'. ' if hint else ''}{hint}")
         self.awaited = awaited
         self.attempts = attempts
         self.waited = waited

@@ -97,8 +97,8 @@ def test_peers_prints_a_table_of_who_got_everything() -> None:
     assert head == "| vehicle, parameters, loss | paramclient | pymavlink, the usual loop |"
     seconds = r"\d+\.\d\d \(\d+\.\d\)"
     assert re.fullmatch(rf"\| PX4, 903, clean \| {seconds} \| {seconds} \|", rows[0]), text
-    assert re.fullmatch(rf"\| ArduPilot, 1382, clean \| {seconds} \| {seconds} \|", rows[1]), text
-    assert re.fullmatch(rf"\| ArduPilot by file, 1382, clean \| {seconds} \| has no .* \|", rows[2]), text
+    assert re.fullmatch(rf"\| ArduPilot by list, 1382, clean \| {seconds} \| {seconds} \|", rows[1]), text
+    assert re.fullmatch(rf"\| ArduPilot by file, 1382, clean \| {seconds} \| not supported \|", rows[2]), text
     assert re.search(r"\d{4}-\d\d-\d\d, \d+ cores, .*Python \S+, load [\d.]+ to [\d.]+", text), text
 
 
@@ -115,7 +115,7 @@ def test_live_prints_the_rows_of_a_vehicle_and_what_is_promised() -> None:
     with flying(PX4Vehicle(table={"MC_ROLL_P": 6.5, "MC_AIRMODE": 3})) as link:
         text = bench("live", link, "--kind", "px4", "--seeds", "2", "--row", "clean", "--row", "command")
     head, _, *rows = text.splitlines()[:4]
-    assert head == "| real autopilot | median | worst | promised |"
+    assert head == "| real autopilot | median | worst | limit (median / worst) |"
     figures = r"\d+\.\d\d \| \d+\.\d\d \|"
     assert re.fullmatch(rf"\| PX4, clean \| {figures} 0\.95 / 1 \|", rows[0]), text
     assert re.fullmatch(rf"\| PX4, command: .* \| {figures} 0\.6 / 0\.9(?: missed)? \|", rows[1]), text

@@ -9,7 +9,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import redirect_stdout
+from contextlib import contextmanager, redirect_stdout
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -58,6 +58,8 @@ COMMANDS = [
 COMMANDS += ["apply", "verify", "restore", "import", "serve", "token"]
 
 LINK = re.compile(r"\]\(([^)#\s]*)(?:#([^)\s]*))?\)")
+SERVICE = "http://127.0.0.1:8765"
+"""The address of a service in programs."""
 HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
 
 
@@ -65,12 +67,16 @@ def blocks(page: Path, language: str) -> list[str]:
     return [code for kind, code in FENCE.findall(page.read_text(encoding="utf-8")) if kind == language]
 
 
-def programs() -> Iterator[object]:
-    """Every whole Python program; what begins with `async with` is a piece of one."""
+def programs() -> Iterator[tuple[str, str]]:
+    """Every Python program of the pages, with its name."""
     for page in PAGES:
         for number, code in enumerate(blocks(page, "python"), start=1):
-            if not code.startswith("async with"):
-                yield pytest.param(code, id=f"{name_of(page)}-{number}")
+            yield f"{name_of(page)}-{number}", code
+
+
+def needs_service(code: str) -> bool:
+    """Return whether a program is a client of a service."""
+    return SERVICE in code
 
 
 def commands() -> list[list[str]]:
@@ -100,26 +106,63 @@ def run(*arguments: str, cwd: Path | None = None, **environment: str) -> str:
     return done.stdout
 
 
-@pytest.mark.parametrize("program", [*programs()])
+@contextmanager
+def serving(*arguments: str, cwd: Path) -> Iterator[str]:
+    """Run a service in a process of its own; its address."""
+    words = ["-m", "paramclient", "serve", *arguments, "--listen", "127.0.0.1:0"]
+    with subprocess.Popen(
+        [sys.executable, *words],
+        cwd=cwd,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        encoding="utf-8",
+    ) as process:
+        try:
+            assert process.stdout is not None
+            found = re.fullmatch(r"serving on (\S+)\n", process.stdout.readline())
+            assert found
+            yield found[1]
+        finally:
+            process.terminate()
+
+
+@pytest.mark.parametrize(
+    "program", [pytest.param(code, id=name) for name, code in programs() if not needs_service(code)]
+)
 def test_a_program_runs(program: str, tmp_path: Path) -> None:
     folders = {"XDG_CACHE_HOME": str(tmp_path), "XDG_STATE_HOME": str(tmp_path)}
     run("-W", "error", "-c", program, cwd=tmp_path, **folders)
 
 
-def test_the_first_example_runs(tmp_path: Path) -> None:
-    """The five lines of the README, with a vehicle that needs no radio."""
+def test_the_programs_over_a_service_run(tmp_path: Path) -> None:
+    found = [code for _, code in programs() if needs_service(code)]
+    assert found
+    with serving("sim:px4", "--no-cache", cwd=tmp_path) as address:
+        for code in found:
+            run("-W", "error", "-c", code.replace(SERVICE, address), cwd=tmp_path)
+
+
+def test_programs_are_typed(tmp_path: Path) -> None:
+    for name, code in programs():
+        file = tmp_path / f"{re.sub(r'[^a-z0-9]', '_', name.lower())}.py"
+        file.write_text(code, encoding="utf-8")
+    settings = ["--config-file", str(ROOT / "pyproject.toml"), "--cache-dir", str(ROOT / ".mypy_cache")]
+    files = sorted(map(str, tmp_path.glob("*.py")))
+    assert len(files) == len(list(programs()))
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", *settings, "--no-error-summary", *files],
+        cwd=ROOT,
+        capture_output=True,
+        encoding="utf-8",
+        timeout=300,
+        check=False,
+    )
+    assert (done.stdout.replace(f"{tmp_path}/", ""), done.stderr) == ("", "")
+
+
+def test_the_first_example_prints_what_its_comments_say(tmp_path: Path) -> None:
     (example,) = blocks(ROOT / "README.md", "python")
-    assert len(example.splitlines()) == 5
-    assert '"udpin:0.0.0.0:14550"' in example
-    lines = [
-        "import asyncio",
-        "from paramclient import ParamClient",
-        "async def main():",
-        *(f"    {line}" for line in example.replace("udpin:0.0.0.0:14550", "sim:px4").splitlines()),
-        "    print(len(result.params), roll, done, sep=', ')",
-        "asyncio.run(main())",
-    ]
-    printed = run("-W", "error", "-c", "\n".join(lines), XDG_CACHE_HOME=str(tmp_path))
+    printed = run("-W", "error", "-c", example, XDG_CACHE_HOME=str(tmp_path))
     assert printed == "903, MC_ROLL_P = 4.0, MC_ROLL_P = 6.0\n"
 
 

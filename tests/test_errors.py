@@ -153,6 +153,7 @@ def test_no_reply_has_attempts_and_duration(attempts: int, text: str) -> None:
     error = NoReply("A", attempts=attempts, waited=1.49)
     assert str(error) == text
     assert (error.awaited, error.attempts, error.waited) == ("A", attempts, 1.49)
+    assert str(NoReply("A", attempts=attempts, waited=1.49, hint="B.")) == f"{text}. B."
 
 
 def test_a_link_error_has_the_links_name() -> None:

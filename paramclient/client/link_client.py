@@ -15,7 +15,7 @@ import anyio
 import anyio.abc
 
 from paramclient.cache import ParamCache
-from paramclient.client.arguments import COMPONENT_TIMEOUT, address_in_words
+from paramclient.client.arguments import COMPONENT_TIMEOUT, address_in_words, silence_in_words
 from paramclient.client.cache_writer import WriteThrough, choose_cache
 from paramclient.client.component import Component
 from paramclient.client.events import Events, public_event
@@ -322,9 +322,7 @@ class LinkClient(LocalClient):
             if found is not None:
                 await found.wait_for_cache()
         if found is None:
-            waited = anyio.current_time() - began
-            wanted = address_in_words(system, component, peer) + refused_in_words(self.signing_report())
-            raise NoReply(wanted, attempts=0, waited=waited)
+            raise self._not_received(address_in_words(system, component, peer), began)
         return found
 
     async def only_component(
@@ -358,11 +356,19 @@ class LinkClient(LocalClient):
                 await self._components[machine.address].wait_for_cache()
         if machine is not None:
             return self._components[machine.address]
-        wanted = address_in_words(system, component, peer) + refused_in_words(self.signing_report())
+        wanted = address_in_words(system, component, peer)
         if choice.due < math.inf:
             wanted += f", then {LOOK_TIME} s without another vehicle"
+            raise NoReply(wanted, attempts=0, waited=anyio.current_time() - began)
+        raise self._not_received(wanted, began)
 
-        raise NoReply(wanted, attempts=0, waited=anyio.current_time() - began)
+    def _not_received(self, wanted: str, began: float) -> NoReply:
+        """Return the error of a component that was not received, with what was received instead."""
+        refused = refused_in_words(self.signing_report())
+        addresses = [(machine.system, machine.component) for machine in self.station.components.values()]
+        hint = "" if refused else silence_in_words(self._link.name, addresses, self.station.bytes_received)
+        waited = anyio.current_time() - began
+        return NoReply(f"{wanted}{refused}", attempts=0, waited=waited, hint=hint)
 
     async def successor(
         self, component: Component, system: int, *, timeout: float | None = COMPONENT_TIMEOUT

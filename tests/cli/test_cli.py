@@ -1077,7 +1077,10 @@ def test_a_bad_link_name_lists_the_accepted_forms(command: Command) -> None:
 def test_a_missing_vehicle_is_exit_code_3(live_command: Command) -> None:
     outcome = live_command("fetch", "udpin:127.0.0.1:0", "--timeout", 0.1, "--no-cache", "--json")
     assert (outcome.code, outcome.out) == (3, "")
-    assert outcome.err == "paramclient: no reply: an autopilot in 0.1 s\n"
+    assert outcome.err == (
+        "paramclient: no reply: an autopilot in 0.1 s. Nothing was received on udpin:127.0.0.1:0. "
+        "Is the vehicle sending to this port?\n"
+    )
 
 
 def test_a_vehicle_without_answers_is_exit_code_3(command: Command, put: Callable[[Endpoint], str]) -> None:

@@ -7,6 +7,7 @@ import gc
 import logging
 import math
 import os
+import re
 import socket
 import threading
 import time
@@ -495,6 +496,31 @@ async def test_a_component_that_is_not_there(wanted: dict[str, Any], words: str)
         with pytest.raises(NoReply):
             await client.component(**wanted)
         assert round(anyio.current_time() - began, 3) == arguments.COMPONENT_TIMEOUT
+
+
+@direct_only("a service reports the states of its links")
+@swiftly
+async def test_a_component_that_is_not_there_and_what_was_received_instead() -> None:
+    async with a_client(generic(autopilot=wire.MAV_AUTOPILOT_INVALID)) as client:
+        with pytest.raises(NoReply, match=rf"Received on {re.escape(client.link.name)} so far: 1/1\.$"):
+            await client.component(timeout=2.5)
+
+
+@pytest.mark.parametrize(
+    ("link", "components", "count", "words"),
+    [
+        ("udpin:a:1", [], 0, "Nothing was received on udpin:a:1. Is the vehicle sending to this port?"),
+        ("sim:px4", [], 0, "Nothing was received on sim:px4."),
+        ("tcp:a:1", [], 1500, "1,500 bytes were received on tcp:a:1, but no valid MAVLink frame."),
+        ("serial:a:1", [], 2, "2 bytes were received on serial:a:1, but no valid MAVLink frame. {}"),
+        ("a", [(2, 1), (1, 1), (1, 1)], 40, "Received on a so far: 1/1, 2/1."),
+        ("a", [(n, 1) for n in range(1, 8)], 40, "Received on a so far: 1/1, 2/1, 3/1, 4/1, 5/1 and 2 more."),
+    ],
+)
+@direct_only("opens no client")
+def test_a_silent_link_in_words(link: str, components: list[tuple[int, int]], count: int, words: str) -> None:
+    expected = words.format("Check the cable and the baud rate.")
+    assert arguments.silence_in_words(link, components, count) == expected
 
 
 # Reading and writing
