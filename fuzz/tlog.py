@@ -20,7 +20,8 @@ from paramclient.links import tlog
 from paramclient.links.names import LinkKind, LinkSpec
 from paramclient.links.replay import ReplayLink
 from paramclient.links.tlog import Record, open_log, read_records
-from paramclient.logs.telemetry import ImportedTable, import_log
+from paramclient.logs.imported_table import ImportedTable
+from paramclient.logs.telemetry import import_log
 from paramclient.model.values import Encoding, bits_of, decode
 from paramclient.protocol import wire
 from paramclient.protocol.wire import NO_INDEX, Framer, Message

@@ -16,7 +16,10 @@ from paramclient.cli.options import CacheOptions
 from paramclient.cli.output import print_document, print_table, report
 from paramclient.errors import ParamClientError
 from paramclient.links import LinkKind, parse_link
-from paramclient.logs.telemetry import ImportedTable, import_log
+from paramclient.logs.imported_table import ImportedTable
+from paramclient.logs.onboard import is_onboard_log
+from paramclient.logs.onboard_import import import_onboard_log
+from paramclient.logs.telemetry import import_log
 from paramclient.model.identity import autopilot_name
 from paramclient.model.notation import hash_text
 
@@ -26,13 +29,13 @@ _DEFAULTS: Final = CacheOptions()
 
 
 async def import_(file: Path, /, *files: Path, options: CacheOptions = _DEFAULTS) -> ExitCode:
-    """Import telemetry logs into the cache: vehicles, tables and changes, with the times of the logs.
+    """Import logs into the cache: vehicles, tables and changes, with the times of the logs.
 
     Later values in the cache are kept, so neither order nor repetition matters. All files are tried even if
     one cannot be read.
 
     Args:
-        file: A telemetry log (.tlog).
+        file: A telemetry log (.tlog), or an on-board log of ArduPilot (.bin) or PX4 (.ulg).
         files: Further logs.
     """
     found: list[tuple[Path, ImportedTable]] = []
@@ -40,7 +43,7 @@ async def import_(file: Path, /, *files: Path, options: CacheOptions = _DEFAULTS
     with ParamCache(options.cache) as cache:
         for each in (file, *files):
             try:
-                tables = await import_log(each, cache)
+                tables = await _import(each, cache)
             except ParamClientError as error:
                 report(str(error))
                 code = max(code, code_of(error))
@@ -59,6 +62,12 @@ async def import_(file: Path, /, *files: Path, options: CacheOptions = _DEFAULTS
         columns = ["file", "component", "autopilot", "params", "complete", "hash", "key"]
         print_table(columns, (_cells(*each) for each in found), right="params")
     return code
+
+
+async def _import(path: Path, cache: ParamCache) -> tuple[ImportedTable, ...]:
+    if is_onboard_log(path):
+        return (await import_onboard_log(path, cache),)
+    return await import_log(path, cache)
 
 
 @contextmanager

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from paramclient.client.component import Component
     from paramclient.client.events import Rebooted, Uncontested
     from paramclient.links.ports import SerialPort
-    from paramclient.logs.telemetry import ImportedTable
+    from paramclient.logs.imported_table import ImportedTable
     from paramclient.metadata import ParamInfo
     from paramclient.model.paramset import ParamSet
     from paramclient.model.values import Param, Value

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
-from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
@@ -15,6 +14,7 @@ import anyio.lowlevel
 from paramclient.cache import CachedComponent, ParamCache, TableUpdate
 from paramclient.client.cache_writer import CACHE_FLUSH_INTERVAL, WriteThrough
 from paramclient.links.tlog import Record, open_log, read_records
+from paramclient.logs.imported_table import ImportedTable
 from paramclient.model.identity import Identity
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import (
@@ -28,36 +28,12 @@ from paramclient.protocol.params.sync import Upkeep
 from paramclient.protocol.station import Address, Station
 from paramclient.protocol.wire import AUTOPILOT_VERSION_ID, HEARTBEAT_ID, Framer
 
-__all__ = ["ImportedTable", "import_log"]
+__all__ = ["import_log"]
 
 RECORDS_PER_CHECKPOINT: Final = 1_000
 """Frames between two checkpoints, at which other tasks can run: a few milliseconds."""
 LOG_PEER: Final = "log"
 """The only peer of a log."""
-
-
-@dataclass(frozen=True, slots=True)
-class ImportedTable:
-    """The imported table of one component.
-
-    Attributes:
-        key: the key of the vehicle's tables in the cache.
-        system, component: its address.
-        autopilot: MAV_AUTOPILOT of its heartbeat, or None.
-        params: the number of received parameters.
-        complete: whether the table is complete.
-        hash: the PX4 hash that confirms the table at the end of the log, or None.
-        notes: parts that were skipped of files that a ground station read over MAVFTP, in sentences.
-    """
-
-    key: str
-    system: int
-    component: int
-    autopilot: int | None
-    params: int
-    complete: bool
-    hash: int | None
-    notes: tuple[str, ...] = ()
 
 
 async def import_log(path: str | os.PathLike[str], cache: ParamCache) -> tuple[ImportedTable, ...]:

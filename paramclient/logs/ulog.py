@@ -5,6 +5,7 @@ The format is documented in the PX4 guide, "ULog File Format"; pyulog parses it.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -38,9 +39,11 @@ GPS_FIX_MIN: Final = 3
 """`fix_type` from which the time is valid: a 3D fix."""
 GPS_TOPICS: Final = ("vehicle_gps_position", "sensor_gps")
 """Topics with the UTC time; the second in newer versions, if the first is not logged."""
+FULLY_READ_SIZE_MAX: Final = 256 << 20
+"""Bytes up to which all topics are read, which takes as much memory. A change has no time of its own in the
+file, and takes that of the last data before it; of a larger file only `CLOCK_TOPICS` are read for that."""
 CLOCK_TOPICS: Final = ("vehicle_attitude", "vehicle_status", "cpuload")
-"""Topics that are read for their time alone: a change of a parameter has none of its own in the file, and
-takes that of the last data before it. vehicle_attitude is logged at 20 Hz or more."""
+"""Topics that every flight has; vehicle_attitude is logged at 20 Hz or more."""
 
 _GUID: Final = re.compile(r"[0-9a-f]{36}")
 
@@ -56,7 +59,8 @@ def read_ulog(path: str) -> OnboardLog:
     """
     try:
         with Path(path).open("rb") as file:
-            log = ULog(file, [*GPS_TOPICS, *CLOCK_TOPICS])
+            is_small = os.fstat(file.fileno()).st_size <= FULLY_READ_SIZE_MAX
+            log = ULog(file, None if is_small else [*GPS_TOPICS, *CLOCK_TOPICS])
     except ULogException as error:
         raise FileError(f"cannot be read as a ULog file: {error}", source=path) from error
     initial, refused = _initial(log)

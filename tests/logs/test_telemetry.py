@@ -26,7 +26,8 @@ from paramclient.cli import run
 from paramclient.links import LinkKind, ReplayLink, create_link, parse_link
 from paramclient.links.replay import PAUSE_MAX
 from paramclient.links.tlog import FIRST_FRAME_OFFSET_MAX
-from paramclient.logs.telemetry import ImportedTable, import_log
+from paramclient.logs.imported_table import ImportedTable
+from paramclient.logs.telemetry import import_log
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param
 from paramclient.protocol import wire

@@ -11,7 +11,8 @@ import pytest
 
 from paramclient import ParamCache, ParamClient, ParamType, SyncState
 from paramclient.cli import run
-from paramclient.logs.telemetry import ImportedTable, import_log
+from paramclient.logs.imported_table import ImportedTable
+from paramclient.logs.telemetry import import_log
 from paramclient.model.values import Param, bits_of
 from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine

@@ -1,0 +1,117 @@
+"""Import of on-board logs into a cache, with the times of the log."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from typing import Final
+
+import anyio.to_thread
+
+from paramclient.cache import ParamCache, StoredParam, TableUpdate
+from paramclient.errors import FileError, UsageError
+from paramclient.logs.imported_table import ImportedTable
+from paramclient.logs.logged_params import OnboardLog
+from paramclient.logs.onboard import read_onboard_log
+from paramclient.model.paramset import WrittenParam
+from paramclient.model.values import Param, ParamType, Trust, bits_of, from_bits
+
+__all__ = ["import_onboard_log"]
+
+AUTOPILOT_COMPONENT: Final = 1
+"""MAV_COMP_ID_AUTOPILOT1: an on-board log has the parameters of the autopilot only."""
+
+
+async def import_onboard_log(path: str | os.PathLike[str], cache: ParamCache) -> ImportedTable:
+    """Import the parameters of an on-board log into a cache, in one transaction.
+
+    Each value and each change has the time of the log. Later observations in the cache stay unchanged, so
+    logs may be imported in any order and repeatedly. A log does not tell whether it has all parameters of the
+    vehicle: the table is complete only after a fetch. A dataflash log has no types: they are those of the
+    vehicle's cached table, else those that most cached vehicles of the same autopilot have, else REAL32.
+
+    Args:
+        path: the log.
+        cache: the cache to write to.
+
+    Raises:
+        FileError: as from `read_onboard_log`; or the log has no UTC time or no system id.
+        UsageError: a ULog file, and pyulog is not installed.
+        CacheError: the cache cannot be written.
+    """
+    log = await anyio.to_thread.run_sync(read_onboard_log, path)
+    return await anyio.to_thread.run_sync(partial(_store, log, cache))
+
+
+def _store(log: OnboardLog, cache: ParamCache) -> ImportedTable:
+    identity = log.identity
+    if log.boot_time is None:
+        raise FileError(
+            "not imported: the log has no UTC time, as no GPS receiver had a fix, so its values cannot be "
+            "ordered with those in the cache. show, diff and save can read it",
+            source=log.source,
+        )
+    if not identity.system:
+        raise FileError("not imported: the log has no system id", source=log.source)
+    types = _types(log, cache)
+    update = partial(
+        TableUpdate, identity=identity, component=AUTOPILOT_COMPONENT, autopilot=identity.autopilot
+    )
+    at = log.boot_time + log.began
+    initial = [StoredParam(_param(written, types), at) for written in log.initial.values()]
+    updates = [update(at=at, params=initial)]
+    for change in log.changes:
+        first = log.initial.get(change.name, WrittenParam(change.name, change.value))
+        at = log.boot_time + change.time
+        param = _param(replace(first, value=change.value), types)
+        updates.append(update(at=at, params=[StoredParam(param, at)]))
+    cache.merge(updates)
+    notes = log.notes
+    if untyped := sum(param.type is None and name not in types for name, param in log.initial.items()):
+        notes += (f"the log has no types: {untyped} parameters that no cached table has are REAL32",)
+    return ImportedTable(
+        identity.key,
+        identity.system,
+        AUTOPILOT_COMPONENT,
+        identity.autopilot,
+        params=len(log.at_end()),
+        complete=False,
+        hash=None,
+        notes=notes,
+    )
+
+
+def _types(log: OnboardLog, cache: ParamCache) -> Mapping[str, ParamType | int]:
+    """Return types by name: those of the vehicle's cached table, else the most frequent ones."""
+    if all(param.type is not None for param in log.initial.values()):
+        return {}
+    own: dict[str, ParamType | int] = {}
+    others: dict[str, Counter[ParamType | int]] = {}
+    for summary in cache.components():
+        table = cache.load(summary.key, summary.component)
+        if table is None or table.autopilot != log.identity.autopilot:
+            continue
+        if summary.key == log.identity.key and summary.component == AUTOPILOT_COMPONENT:
+            own = {name: param.type for name, param in table.params.items()}
+        for name, param in table.params.items():
+            others.setdefault(name, Counter())[param.type] += 1
+    return {name: types.most_common(1)[0][0] for name, types in others.items()} | own
+
+
+def _param(written: WrittenParam, types: Mapping[str, ParamType | int]) -> Param:
+    """Return a logged value as a parameter; as a REAL32 if its type is unknown or cannot hold it."""
+    kind = types.get(written.name, ParamType.REAL32) if written.type is None else written.type
+    try:
+        bits = written.bits_as(kind)
+    except UsageError:
+        kind = ParamType.REAL32
+        bits = written.bits_as(kind)
+    default = None
+    if written.default is not None:
+        with suppress(UsageError):
+            default = from_bits(bits_of(written.default, kind), kind)
+    return Param(written.name, from_bits(bits, kind), kind, None, bits, Trust.CACHED, default)

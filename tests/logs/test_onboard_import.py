@@ -1,0 +1,138 @@
+"""Import of on-board logs into a cache: identity, types, times, history, order."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import anyio
+import pytest
+
+from paramclient import ParamCache, ParamType, read_file
+from paramclient.cache import StoredParam, TableUpdate
+from paramclient.errors import FileError
+from paramclient.logs.onboard import read_onboard_log
+from paramclient.logs.onboard_import import import_onboard_log
+from paramclient.model.identity import Identity
+from paramclient.model.values import Param
+from tests.commands import Command, in_process
+from tests.logs.test_onboard import BOOT, COMMON, FIX, flight, written
+from tests.logs.writers import dataflash
+
+DATA = Path(__file__).parent.parent / "data"
+KEY = "uid:430038001551383133303832" + "00" * 6
+LATER = [("PARM", 60_000_000, "ATC_RAT_RLL_P", 0.2, math.nan)]
+
+
+@pytest.fixture
+def cache(tmp_path: Path) -> ParamCache:
+    return ParamCache(tmp_path / "cache.sqlite3")
+
+
+def hold(cache: ParamCache, param: Param, at: float, key: str = KEY) -> None:
+    identity = Identity(7, "udpin:x", key.removeprefix("uid:"), autopilot=3, vehicle_type=2)
+    cache.save(
+        [TableUpdate(identity=identity, component=1, autopilot=3, at=at, params=[StoredParam(param, at)])]
+    )
+
+
+def test_values_and_changes_have_the_times_of_the_log(cache: ParamCache, tmp_path: Path) -> None:
+    path = written(tmp_path, dataflash([*COMMON, FIX, *LATER]))
+    anyio.run(import_onboard_log, path, cache)
+    table = cache.load(KEY, 1)
+    assert table is not None
+    assert (table.system, table.autopilot, table.complete) == (7, 3, False)
+    assert table.params["ATC_RAT_RLL_P"].value == pytest.approx(0.2)
+    assert table.params["ATC_RAT_RLL_P"].default == pytest.approx(0.135)
+    assert table.heard_at["ATC_RAT_RLL_P"] == pytest.approx(BOOT + 60, abs=0.01)
+    assert table.heard_at["ARMING_CHECK"] == pytest.approx(BOOT + 1, abs=0.01)
+    (line,) = table.history()
+    assert line.name == "ATC_RAT_RLL_P"
+    assert line.old.value == pytest.approx(0.135)
+    assert line.at == pytest.approx(BOOT + 60, abs=0.01)
+
+
+def test_later_values_in_the_cache_are_kept_and_repetition_changes_nothing(
+    cache: ParamCache, tmp_path: Path
+) -> None:
+    hold(cache, Param("ATC_RAT_RLL_P", 0.3, ParamType.REAL32, 5, 0x3E99999A), BOOT + 1000)
+    path = written(tmp_path, dataflash([*COMMON, FIX, *LATER]))
+    states = []
+    for _ in range(2):
+        anyio.run(import_onboard_log, path, cache)
+        table = cache.load(KEY, 1)
+        assert table is not None
+        assert table.params["ATC_RAT_RLL_P"].value == pytest.approx(0.3)
+        assert table.params["ARMING_CHECK"].value == 1
+        states.append((dict(table.params), table.history()))
+    assert states[0] == states[1]
+
+
+def test_types_come_from_the_cached_table_then_from_other_vehicles(cache: ParamCache, tmp_path: Path) -> None:
+    hold(cache, Param("ARMING_CHECK", 1, ParamType.INT32, 2, 1), BOOT - 1000)
+    hold(cache, Param("SYSID_THISMAV", 3, ParamType.INT16, 1, 3), BOOT - 1000, "uid:aabbccddeeff")
+    path = written(tmp_path, dataflash([*COMMON, FIX]))
+    result = anyio.run(import_onboard_log, path, cache)
+    table = cache.load(KEY, 1)
+    assert table is not None
+    types = {name: param.type for name, param in table.params.items()}
+    assert types == {
+        "ARMING_CHECK": ParamType.INT32,
+        "SYSID_THISMAV": ParamType.INT16,
+        "ATC_RAT_RLL_P": ParamType.REAL32,
+    }
+    assert isinstance(table.params["SYSID_THISMAV"].value, int)
+    assert table.history() == []
+    assert result.notes == ("the log has no types: 1 parameters that no cached table has are REAL32",)
+
+
+def test_a_log_without_time_or_system_is_refused(cache: ParamCache, tmp_path: Path) -> None:
+    with pytest.raises(FileError, match="no UTC time"):
+        anyio.run(import_onboard_log, written(tmp_path, dataflash(COMMON)), cache)
+    nameless = [each for each in COMMON if each[2] != "SYSID_THISMAV"]
+    with pytest.raises(FileError, match="no system id"):
+        anyio.run(import_onboard_log, written(tmp_path, dataflash([*nameless, FIX])), cache)
+    assert cache.components() == []
+
+
+def test_the_command_imports_logs_of_all_kinds(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, cache: ParamCache
+) -> None:
+    command: Command = in_process(capsys)
+    writer = flight()
+    writer.gps(1_000_000, (BOOT + 1) * 1_000_000, 3)
+    quad = written(tmp_path, bytes(writer.data), "flight.ulg")
+    logs = (DATA / "ardupilot_flight.bin", quad, DATA / "px4_full_download.tlog")
+    done = command("import", *logs, "--cache", cache.place, "--json")
+    assert done.code == 0, done.err
+    tables = json.loads(done.out)["tables"]
+    assert [(each["autopilot"], each["params"]) for each in tables[:2]] == [("ardupilot", 1382), ("px4", 5)]
+    assert len(tables) == 3
+    refused = command("import", DATA / "px4_flight.ulg", "--cache", cache.place)
+    assert (refused.code, "no UTC time" in refused.err) == (2, True)
+
+
+def test_a_log_of_a_real_copter() -> None:
+    log = read_onboard_log(DATA / "ardupilot_flight.bin")
+    assert (len(log.initial), log.notes) == (1382, ())
+    assert all(param.default is not None for param in log.initial.values())
+    identity = log.identity
+    assert (identity.system, identity.vehicle_type, identity.git_hash) == (1, 2, "fbb78585")
+    assert identity.firmware == 0x04060000
+    assert log.boot_time == pytest.approx(1795415873.79, abs=0.01)
+    assert [change.name for change in log.changes if change.name.startswith("ATC")] == ["ATC_RAT_RLL_P"]
+    assert (
+        len(log.initial.keys() & read_file(DATA / "ardupilot_param_withdefaults.pck").choose().keys()) > 1300
+    )
+
+
+def test_a_log_of_a_real_px4() -> None:
+    log = read_onboard_log(DATA / "px4_flight.ulg")
+    assert (len(log.initial), log.notes) == (850, ())
+    identity = log.identity
+    assert (identity.system, identity.vehicle_type, identity.git_hash) == (4, 2, "a70a5583931d3294")
+    assert log.initial["MAV_SYS_ID"].type == ParamType.INT32
+    changed = [name for name, param in log.initial.items() if param.default != param.value]
+    assert len(changed) == 49
+    assert {"MAV_SYS_ID", "SYS_AUTOSTART"} <= set(changed)
