@@ -21,11 +21,10 @@ from paramclient.logs.logged_params import LoggedChange, OnboardLog, log_link
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import Value, check_name, shortest_float
+from paramclient.protocol.wire import MAV_AUTOPILOT_ARDUPILOTMEGA
 
 __all__ = ["read_dataflash"]
 
-AUTOPILOT: Final = 3
-"""MAV_AUTOPILOT_ARDUPILOTMEGA."""
 VEHICLE_TYPES: Final = {
     "ArduCopter": 2,
     "ArduPlane": 1,
@@ -146,7 +145,7 @@ class _Messages:
                 system=system,
                 link=log_link(path),
                 uid=self._uid,
-                autopilot=AUTOPILOT,
+                autopilot=MAV_AUTOPILOT_ARDUPILOTMEGA,
                 vehicle_type=self._vehicle_type,
                 firmware=self._firmware,
                 git_hash=self._git_hash,

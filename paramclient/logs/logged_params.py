@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from paramclient.files.param_file import LogForm
+from paramclient.files.param_file import AUTOPILOT, LogForm
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import Value
@@ -78,7 +78,7 @@ class OnboardLog:
     def _set(self, params: Mapping[str, WrittenParam], time: float) -> ParamSet:
         return ParamSet(
             params,
-            component=1,
+            component=AUTOPILOT,
             system=self.identity.system or None,
             identity=self.identity,
             at=self.unix_time(time),

@@ -8,12 +8,12 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from typing import Final
 
 import anyio.to_thread
 
 from paramclient.cache import ParamCache, StoredParam, TableUpdate
 from paramclient.errors import FileError, UsageError
+from paramclient.files.param_file import AUTOPILOT
 from paramclient.logs.imported_table import ImportedTable
 from paramclient.logs.logged_params import OnboardLog
 from paramclient.logs.onboard import read_onboard_log
@@ -21,9 +21,6 @@ from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import Param, ParamType, Trust, bits_of, from_bits
 
 __all__ = ["import_onboard_log"]
-
-AUTOPILOT_COMPONENT: Final = 1
-"""MAV_COMP_ID_AUTOPILOT1: an on-board log has the parameters of the autopilot only."""
 
 
 async def import_onboard_log(path: str | os.PathLike[str], cache: ParamCache) -> ImportedTable:
@@ -58,9 +55,7 @@ def _store(log: OnboardLog, cache: ParamCache) -> ImportedTable:
     if not identity.system:
         raise FileError("not imported: the log has no system id", source=log.source)
     types = _types(log, cache)
-    update = partial(
-        TableUpdate, identity=identity, component=AUTOPILOT_COMPONENT, autopilot=identity.autopilot
-    )
+    update = partial(TableUpdate, identity=identity, component=AUTOPILOT, autopilot=identity.autopilot)
     at = log.boot_time + log.began
     initial = [StoredParam(_param(written, types), at) for written in log.initial.values()]
     updates = [update(at=at, params=initial)]
@@ -76,7 +71,7 @@ def _store(log: OnboardLog, cache: ParamCache) -> ImportedTable:
     return ImportedTable(
         identity.key,
         identity.system,
-        AUTOPILOT_COMPONENT,
+        AUTOPILOT,
         identity.autopilot,
         params=len(log.at_end()),
         complete=False,
@@ -95,7 +90,7 @@ def _types(log: OnboardLog, cache: ParamCache) -> Mapping[str, ParamType | int]:
         table = cache.load(summary.key, summary.component)
         if table is None or table.autopilot != log.identity.autopilot:
             continue
-        if summary.key == log.identity.key and summary.component == AUTOPILOT_COMPONENT:
+        if summary.key == log.identity.key and summary.component == AUTOPILOT:
             own = {name: param.type for name, param in table.params.items()}
         for name, param in table.params.items():
             others.setdefault(name, Counter())[param.type] += 1

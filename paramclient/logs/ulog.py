@@ -20,11 +20,10 @@ from paramclient.logs.logged_params import LoggedChange, OnboardLog, log_link
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import ParamType, check_name
+from paramclient.protocol.wire import MAV_AUTOPILOT_PX4
 
 __all__ = ["read_ulog"]
 
-AUTOPILOT: Final = 12
-"""MAV_AUTOPILOT_PX4."""
 SYSTEM_ID_NAME: Final = "MAV_SYS_ID"
 """The parameter that contains the system id."""
 VEHICLE_TYPE_NAME: Final = "MAV_TYPE"
@@ -136,7 +135,7 @@ def _identity(info: Mapping[str, Any], params: Mapping[str, WrittenParam], path:
         system=system if 0 < system < 256 else 0,
         link=log_link(path),
         uid=guid if _GUID.fullmatch(guid) else None,
-        autopilot=AUTOPILOT,
+        autopilot=MAV_AUTOPILOT_PX4,
         vehicle_type=_integer(params, VEHICLE_TYPE_NAME),
         firmware=_number(info, "ver_sw_release"),
         git_hash=_text(info, "ver_sw")[:GIT_HASH_DIGITS],
