@@ -36,6 +36,8 @@ burst."""
 HELD_UP_MIN: Final = 0.02
 """Event-loop latency in seconds, from which the sender counts a deadline as missed because the program was
 busy or did not run. Data received meanwhile is read before any request times out."""
+ARRIVAL_STEP: Final = 0.0002
+"""Seconds between uncertain arrival times of two reads: more than the error of the conversion to unix time."""
 READ_GAP_MIN: Final = 0.05
 """Seconds without a read, although the program ran, above which the arrival time of received data is
 uncertain: more than a pause and the turns of other links take."""
@@ -127,6 +129,7 @@ class LinkTask:
         self._read_at = -math.inf
         self._due = math.inf  # next deadline of the sender
         self._held_up_at = -math.inf  # last time at which the sender ran late by more than `READ_GAP_MIN`
+        self._arrived_at = -math.inf  # arrival time of the last chunk of a link that does not report it
         self._unseen = 0.0  # seconds of suspend since the last read that the loop's clock has left out
         self._is_taking = False  # whether the reader processes data, or waits for its turn to do so
         self._suspend = SuspendDetector()
@@ -189,7 +192,8 @@ class LinkTask:
 
         If the link does not report arrival times and the reader was late, the time is uncertain. Each chunk
         then gets the time at which the link was last drained, so that no value counts as newer than a value
-        that another program has observed since.
+        that another program has observed since. It is `ARRIVAL_STEP` later than that of the chunks before, if
+        it would be earlier: otherwise an older value of the same parameter could count as the newer one.
 
         Args:
             count: number of chunks.
@@ -203,7 +207,9 @@ class LinkTask:
             return [min(max(at, now - longest), now) for at in arrived_at]
         was_held_up = now - self._held_up_at < READ_GAP_MIN or now - self._due > READ_GAP_MIN
         is_late = was_held_up or asked_at - drained_at > READ_GAP_MIN
-        return [now - longest if is_late else now] * count
+        at = now - longest if is_late else now
+        self._arrived_at = max(at, min(self._arrived_at + ARRIVAL_STEP, now))
+        return [self._arrived_at] * count
 
     async def _take_turns(
         self, chunks: Iterator[tuple[tuple[Peer, bytes], float]], loop: LoopScheduler

@@ -8,7 +8,6 @@ import sys
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager, closing
 from pathlib import Path
-from typing import Any
 
 import anyio
 import pytest
@@ -479,9 +478,9 @@ class Asking(Station):
         self.came[data] = moment
         return False
 
-    def tick(self, *_: Any, **__: Any) -> None: ...
+    def tick(self, now: float) -> None: ...
 
-    def next_deadline(self, *, everyone: bool = True) -> float:
+    def next_deadline(self) -> float:
         return anyio.current_time() + 0.1
 
 
@@ -535,6 +534,7 @@ async def test_what_was_read_late_is_no_newer_than_the_last_look() -> None:
         link.arrive(b"3")
         await anyio.sleep(0.01)
         assert [came[b"2"], came[b"3"]] == pytest.approx([now] * 2, abs=0.001), "the buffer was full"
+        assert came[b"3"] > came[b"2"] + 0.0001, "of two values the one that came later is the newer one"
         await anyio.sleep(0.01)
         link.arrive(b"4")
         late = anyio.current_time()
