@@ -1,4 +1,4 @@
-"""Duration of downloads on good and bad links, compared with an oracle, in simulated time.
+"""Duration of downloads on good and bad links, compared with an oracle, and of sets, in simulated time.
 
 A run is the session of a program without a cache: it knows nothing of the vehicle until the first heartbeat,
 and then begins the fetch. The time from the heartbeat on is measured, identification included.
@@ -26,11 +26,16 @@ from oracle import FILE_FRAME, TellingLink, file_oracle_time, oracle_time
 
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_result import FetchResult
+from paramclient.protocol.params.write_batch import SetStatus
 from paramclient.protocol.station import Station
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, Vehicle
 
 LIMIT = 600.0
 """Maximum simulated seconds of a run, after which it counts as endless."""
+SET_VALUES = 200
+"""Values of a row that sets them."""
+SET_TIME_MAX = {"PX4": 1.5, "ArduPilot": 2.0}
+"""Seconds for them with a round trip of 100 ms and 5 % loss."""
 UDP_FILE_RATE = 48_500.0
 """Bytes per second of a MAVFTP burst of an ArduPilot on UDP (measured)."""
 UDP_READ_RATE = 3 * UDP_FILE_RATE
@@ -50,6 +55,7 @@ class Row:
         limit: the highest acceptable time in seconds.
         vehicles: number of vehicles on the link. Several are compared with as many single downloads.
         file_rate: bytes per second of a burst of the vehicle's file, if it serves one.
+        sets: whether values are set instead of downloaded; there is no oracle then.
     """
 
     name: str
@@ -60,6 +66,7 @@ class Row:
     limit: float = math.inf
     vehicles: int = 1
     file_rate: float | None = None
+    sets: bool = False
 
 
 @dataclass(frozen=True)
@@ -110,6 +117,7 @@ def rows() -> Iterator[Row]:
             faults = {"loss": loss, "delay": 0.075, "rate": 5760.0, "queue": 1024.0}
             yield Row(f"five {kind} on one radio 57600 {loss:.0%}", radio, served, faults, 1.1, vehicles=5)
     yield from file_rows()
+    yield from set_rows()
 
 
 def file_rows() -> Iterator[Row]:
@@ -136,8 +144,71 @@ def file_rows() -> Iterator[Row]:
         yield Row(name, radio, 5760 / FILE_FRAME, faults, bound, limit, file_rate=5760.0)
 
 
+def set_rows() -> Iterator[Row]:
+    """Yield the rows that set values instead of downloading them."""
+    table = {f"VALUE_{number:03}": float(number) for number in range(SET_VALUES)}
+    for kind, make in (("PX4", PX4Vehicle), ("ArduPilot", ArduPilotVehicle)):
+        for loss in (0.0, 0.05, 0.2):
+            limit = SET_TIME_MAX[kind] if loss <= 0.05 else math.inf
+            yield Row(
+                f"set {SET_VALUES} values of {kind} UDP 100 ms {loss:.0%}",
+                partial(make, table=table),
+                0.0,
+                {"loss": loss, "delay": 0.05},
+                math.inf,
+                limit,
+                sets=True,
+            )
+
+
+def set_values(row: Row, seed: int) -> Run:
+    """Set all values of the vehicle of a row, whose table is known; there is no oracle."""
+    vehicle = row.make()
+    links = (FaultyLink(**row.faults, seed=2 * seed), FaultyLink(**row.faults, seed=2 * seed + 1))
+    air = Air([vehicle], uplink=links[0], downlink=links[1])
+    station = Station(link="bench", is_stream=False)
+    now = 0.0
+
+    def step() -> None:
+        nonlocal now
+        for data, _ in station.data_to_send():
+            air.receive(data, now)
+        deadline = air.next_deadline()
+        now = max(min(station.next_deadline(), math.inf if deadline is None else deadline), now + 1e-7)
+        air.tick(now)
+        for data in air.data_to_send():
+            station.receive(data, None, now)
+        station.tick(now)
+
+    air.tick(now)
+    while (1, 1) not in station.components:
+        step()
+    machine = station.components[1, 1]
+    fetch = machine.begin_fetch(now)
+    while not fetch.done:
+        step()
+    machine.end_fetch(fetch, now)
+    began, up, down, requests = now, station.bytes_sent, station.bytes_received, vehicle.requests.total()
+    wanted = {f"VALUE_{number:03}": number + 0.5 for number in range(SET_VALUES)}
+    batch = machine.write_many(list(wanted.items()), now)
+    while not batch.done and now < LIMIT:
+        step()
+    machine.write_batches.end(batch, now)
+    return Run(
+        batch.ended_at - began,
+        all(outcome.status is SetStatus.ACCEPTED for outcome in batch.ended)
+        and all(vehicle.params[name].value == value for name, value in wanted.items()),
+        station.bytes_sent - up,
+        station.bytes_received - down,
+        vehicle.requests.total() - requests,
+        math.nan,
+    )
+
+
 def download(row: Row, seed: int) -> Run:
     """Run a row with this library; return the run with the oracle's time."""
+    if row.sets:
+        return set_values(row, seed)
     if row.vehicles == 1:
         return fetch(row, seed, oracle(row, seed))
     alone = replace(row, vehicles=1)

@@ -84,12 +84,13 @@ from paramclient.model.comparison import (
 from paramclient.model.identity import Identity
 from paramclient.model.params import ParamMap
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import Encoding, Param, ParamType, Trust
+from paramclient.model.values import Encoding, Param, ParamType, Settable, Trust
 from paramclient.protocol.ftp import DirectoryEntry
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.fetch_result import FetchResult, Policy, Progress
 from paramclient.protocol.params.sampling import Sample
 from paramclient.protocol.params.sync import SyncState
+from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome, SetStatus
 from paramclient.protocol.params.writes import SetResult
 from paramclient.protocol.stats.traffic import ComponentTraffic, MessageTraffic, RadioStatus, TrafficReport
 from paramclient.protocol.vehicle.peers import Contest
@@ -162,7 +163,11 @@ __all__ = [
     "Refused",
     "Resynced",
     "Sample",
+    "SetManyResult",
+    "SetOutcome",
     "SetResult",
+    "SetStatus",
+    "Settable",
     "Signing",
     "SigningKey",
     "SigningPolicy",

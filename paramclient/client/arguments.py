@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Final
 
 from paramclient.errors import UsageError
-from paramclient.model.values import check_name, is_portable_name
-from paramclient.protocol.wire import PARAMETERS_MAX
+from paramclient.model.values import Settable, Value, check_name, check_value, is_portable_name
+from paramclient.protocol.wire import HASH_CHECK, PARAMETERS_MAX
 
 __all__ = [
     "COMPONENT_TIMEOUT",
@@ -18,6 +18,7 @@ __all__ = [
     "check_asked",
     "check_asked_name",
     "check_settle",
+    "check_writes",
     "silence_in_words",
 ]
 
@@ -66,6 +67,21 @@ def check_asked_name(name: str) -> str:
             " a letter, no space and none of # , ; = ; it begins with neither @ nor / and does not end with :"
         )
     return name
+
+
+def check_writes(values: Mapping[str, Settable] | Iterable[tuple[str, Settable]]) -> list[tuple[str, Value]]:
+    """Check names and values to write, and return them as pairs.
+
+    Raises:
+        UsageError: a name is not valid or is that of the hash, or a value is not valid.
+    """
+    pairs = values.items() if isinstance(values, Mapping) else values
+    checked = []
+    for name, value in pairs:
+        if check_asked_name(name) == HASH_CHECK:
+            raise UsageError(f"{HASH_CHECK} is read-only: it is the hash of the parameters, not a parameter")
+        checked.append((name, check_value(value)))
+    return checked
 
 
 def check_accepted(accept: str, sample: int) -> None:

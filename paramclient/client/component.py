@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from typing import SupportsFloat, SupportsIndex
+from collections.abc import Callable, Iterable, Mapping
 
 from paramclient.client.subscription import Changes
 from paramclient.model.identity import Identity
 from paramclient.model.params import ParamMap
-from paramclient.model.values import Encoding, Param
+from paramclient.model.values import Encoding, Param, Settable
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.params.fetch_result import FetchResult, Progress
 from paramclient.protocol.params.sampling import SAMPLE_SIZE
 from paramclient.protocol.params.sync import SyncState
+from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome
 from paramclient.protocol.params.writes import SetResult
 from paramclient.protocol.vehicle.peers import Contest
 from paramclient.protocol.wire import SigningKey
@@ -148,7 +148,7 @@ class Component(ABC):
     async def set(
         self,
         name: str,
-        value: SupportsIndex | SupportsFloat | bytes,
+        value: Settable,
         *,
         timeout: float | None = None,
         settle: float = 0.0,
@@ -191,6 +191,53 @@ class Component(ABC):
             NotDurable: the vehicle has accepted the value, but it could not be written to the disk.
             CacheError: with `durable`, the disk cannot be written; nothing was sent.
             LinkError: the link failed, or the client was closed.
+        """
+
+    @abstractmethod
+    async def set_many(
+        self,
+        values: Mapping[str, Settable] | Iterable[tuple[str, Settable]],
+        *,
+        progress: Callable[[SetOutcome], None] | None = None,
+        timeout: float | None = None,
+        settle: float = 0.0,
+        force: bool = False,
+        durable: bool = False,
+        asker: str | None = None,
+    ) -> SetManyResult:
+        """Write many parameters in one call, and verify each as `set` does.
+
+        Several writes are in flight at a time, as many as the vehicle serves. Writes to one name run in the
+        order given. A parameter that shows or hides others, such as `*_ENABLE`, is written alone: all writes
+        before it end first, and those after it begin afterwards. A value that is refused does not stop the
+        others.
+
+        If the vehicle is lost, the link fails, three writes in a row get no response or the timeout is over,
+        the call returns what was done: each value that was sent and not acknowledged is *unknown*, each other
+        one *not tried*, and `error` of the result has the cause. After cancellation it is unknown whether the
+        vehicle has the values that were sent.
+
+        Args:
+            values: values by name, or pairs of name and value; a name may occur in several pairs. Values are
+                as in `set`.
+            progress: called with each outcome in the order of their arrival, from this task. Over a service,
+                they arrive together.
+            timeout: seconds for the whole call; None: no limit besides the number of attempts.
+            settle: seconds as in `set`, for which each value is watched; the other writes go on meanwhile.
+            force, asker: as in `set`.
+            durable: return only after all values and history entries are synced to the disk. If that fails,
+                the `error` of the result and of each outcome is NotDurable.
+
+        Returns:
+            One outcome for each value, in the order given: accepted, adjusted, refused, unknown or not tried.
+
+        Raises:
+            UsageError: a name, a value or another argument is not valid, or the client only listens. Nothing
+                was written.
+            NoReply: the vehicle is lost already. Nothing was written.
+            ContestedAddress: several vehicles use its address. Nothing was written.
+            CacheError: with `durable`, the disk cannot be written; nothing was sent.
+            LinkError: the link had failed already, or the client was closed.
         """
 
     @abstractmethod

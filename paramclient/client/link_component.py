@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import random
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
-from typing import SupportsFloat, SupportsIndex, TypeVar
+from typing import TypeVar
 
 import anyio
 
@@ -16,8 +16,8 @@ from paramclient.client.arguments import (
     address_in_words,
     check_accepted,
     check_asked,
-    check_asked_name,
     check_settle,
+    check_writes,
 )
 from paramclient.client.component import Component
 from paramclient.client.local import LocalClient, LocalComponent
@@ -26,7 +26,7 @@ from paramclient.client.subscription import Changes
 from paramclient.errors import CacheError, NoReply, NotDurable, ParamClientError, UsageError
 from paramclient.model.identity import Identity, autopilot_name
 from paramclient.model.params import ParamMap
-from paramclient.model.values import Encoding, Param, check_value, decode, known_type
+from paramclient.model.values import Encoding, Param, Settable, decode, known_type
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ParamChanged, ParamsMoved
@@ -37,12 +37,12 @@ from paramclient.protocol.params.fetch_result import FetchResult, Progress, Samp
 from paramclient.protocol.params.passive import PASSIVE_TIMEOUT
 from paramclient.protocol.params.sampling import SAMPLE_SIZE
 from paramclient.protocol.params.sync import SyncState
+from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome, WriteBatch
 from paramclient.protocol.params.writes import SetResult
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.station import Station
 from paramclient.protocol.vehicle.peers import Contest
 from paramclient.protocol.wire import (
-    HASH_CHECK,
     MAV_MODE_FLAG_SAFETY_ARMED,
     NO_INDEX,
     ParamValue,
@@ -187,7 +187,7 @@ class LinkComponent(LocalComponent):
     async def set(
         self,
         name: str,
-        value: SupportsIndex | SupportsFloat | bytes,
+        value: Settable,
         *,
         timeout: float | None = None,
         settle: float = 0.0,
@@ -196,8 +196,7 @@ class LinkComponent(LocalComponent):
         asker: str | None = None,
     ) -> SetResult:
         """See `Component.set`."""
-        if check_asked_name(name) == HASH_CHECK:
-            raise UsageError(f"{HASH_CHECK} is read-only: it is the hash of the parameters, not a parameter")
+        ((name, checked),) = check_writes([(name, value)])
         machine = self.machine
         self.client.check_open()
         machine.check_uncontested()
@@ -205,7 +204,7 @@ class LinkComponent(LocalComponent):
             await self._wait_until_kept()
         write = machine.write(
             name,
-            check_value(value),
+            checked,
             anyio.current_time(),
             check_asker(asker),
             settle=check_settle(settle),
@@ -217,14 +216,84 @@ class LinkComponent(LocalComponent):
         finally:
             machine.writes.cancel(write, anyio.current_time())
         if durable:
-            try:
-                await self.client.cache_writer.write_durably(machine)
-            except CacheError as error:
-                what = (
-                    f"{self.system}/{self.component} has accepted {name}, but it is not on the disk: {error}"
-                )
-                raise NotDurable(what) from error
+            await self._write_durably(name)
         return result
+
+    async def set_many(
+        self,
+        values: Mapping[str, Settable] | Iterable[tuple[str, Settable]],
+        *,
+        progress: Callable[[SetOutcome], None] | None = None,
+        timeout: float | None = None,
+        settle: float = 0.0,
+        force: bool = False,
+        durable: bool = False,
+        asker: str | None = None,
+    ) -> SetManyResult:
+        """See `Component.set_many`."""
+        pairs = check_writes(values)
+        machine = self.machine
+        self.client.check_open()
+        machine.check_uncontested()
+        if durable:
+            await self._wait_until_kept()
+        began = anyio.current_time()
+        batch = machine.write_many(pairs, began, check_asker(asker), settle=check_settle(settle), force=force)
+        try:
+            outcomes = await self._wait_for_batch(batch, timeout, progress)
+        finally:
+            machine.write_batches.end(batch, anyio.current_time())
+        failure = batch.failure
+        if durable and (done := [outcome.name for outcome in outcomes if outcome.is_set]):
+            try:
+                await self._write_durably(f"{len(done)} values")
+            except NotDurable as error:
+                failure = failure or error
+                outcomes = tuple(replace(each, error=error) if each.is_set else each for each in outcomes)
+        elapsed = anyio.current_time() - began
+        return SetManyResult(self.system, self.component, outcomes, failure, elapsed)
+
+    async def _wait_for_batch(
+        self, batch: WriteBatch, timeout: float | None, progress: Callable[[SetOutcome], None] | None
+    ) -> tuple[SetOutcome, ...]:
+        """Wait until a batch ends, or give it up at the timeout; report the outcomes as they arrive."""
+        reported = 0
+
+        def report() -> None:
+            nonlocal reported
+            for outcome in batch.ended[reported:]:
+                reported += 1
+                if progress is not None:
+                    progress(outcome)
+
+        self.wake()
+        with anyio.move_on_after(timeout):
+            while not batch.done:
+                news = anyio.Event()
+                batch.on_outcome = news.set
+                report()
+                await news.wait()
+        now = anyio.current_time()
+        if not batch.done:
+            what = f"PARAM_SET to {self.system}/{self.component} before the timeout"
+            batch.give_up(NoReply(what, attempts=batch.attempts, waited=now - batch.begun_at), now)
+        report()
+        return _outcome(batch)
+
+    async def _write_durably(self, what: str) -> None:
+        """Sync the values of the component to the disk.
+
+        Args:
+            what: what the vehicle has accepted, for NotDurable.
+
+        Raises:
+            NotDurable: the disk cannot be written.
+        """
+        try:
+            await self.client.cache_writer.write_durably(self.machine)
+        except CacheError as error:
+            address = f"{self.system}/{self.component}"
+            raise NotDurable(f"{address} has accepted {what}, but it is not on the disk: {error}") from error
 
     async def fetch_all(
         self,

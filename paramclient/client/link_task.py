@@ -37,7 +37,7 @@ HELD_UP_MIN: Final = 0.02
 """Event-loop latency in seconds, from which the sender counts a deadline as missed because the program was
 busy or did not run. Data received meanwhile is read before any request times out."""
 ARRIVAL_STEP: Final = 0.0002
-"""Seconds between uncertain arrival times of two reads: more than the error of the conversion to unix time."""
+"""Seconds between uncertain arrival times of two reads: more than the error of conversion to unix time."""
 READ_GAP_MIN: Final = 0.05
 """Seconds without a read, although the program ran, above which the arrival time of received data is
 uncertain: more than a pause and the turns of other links take."""

@@ -124,12 +124,17 @@ class SetResultDoc(Document):
 
 
 class NotSetDoc(Document):
-    """The error of a write that failed."""
+    """The error of a write that failed; see `SetOutcome`.
 
+    With status `accepted` or `adjusted`, the vehicle has acknowledged the value, and it is not on the disk.
+    """
+
+    status: str
     problem: Problem
 
 
 class SetManyDoc(Document):
-    """The results of several writes by name."""
+    """The results of several writes by name, and why not all were tried."""
 
     results: dict[str, SetResultDoc | NotSetDoc]
+    problem: Maybe[Problem] = None

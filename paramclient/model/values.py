@@ -24,6 +24,7 @@ __all__ = [
     "Encoding",
     "Param",
     "ParamType",
+    "Settable",
     "Trust",
     "Value",
     "as_sent",
@@ -47,6 +48,9 @@ __all__ = [
 Value: TypeAlias = int | float | bytes
 """A parameter's value. `bytes` only where the four wire bytes cannot be decoded as a number of the type: a
 64-bit type in the byte-wise encoding, an unknown type, a C-cast float that the integer type cannot hold."""
+
+Settable: TypeAlias = SupportsIndex | SupportsFloat | bytes
+"""A value that can be set: a number, also of another library, or the four wire bytes."""
 
 NAME_LENGTH = 16
 """Bytes in param_id. Shorter names end with a NUL, names of 16 bytes have none."""
@@ -231,7 +235,7 @@ def is_portable_name(name: str) -> bool:
     return _portable(name) is not None
 
 
-def check_value(value: SupportsIndex | SupportsFloat | bytes) -> Value:
+def check_value(value: Settable) -> Value:
     """Convert a caller's value to an int, a float or four raw bytes; else raise UsageError.
 
     Numbers of other libraries (numpy's, Decimal) are converted with `__index__` or `__float__`. Text is

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Final, Protocol
 
 from paramclient.errors import NoReply, ParamClientError, UsageError
+from paramclient.model.group_switches import is_group_switch
 from paramclient.model.identity import Identity, autopilot_name, reason_against_non_finite
 from paramclient.model.params import unpack_fields
 from paramclient.model.values import (
@@ -35,6 +36,7 @@ from paramclient.protocol.params.sync_interval import CheckPace
 from paramclient.protocol.params.table import Room, Table
 from paramclient.protocol.params.value_check import Rereads
 from paramclient.protocol.params.volatile_values import Refresh
+from paramclient.protocol.params.write_batch import BatchRules, WriteBatch, WriteBatches
 from paramclient.protocol.params.writes import Write, Writes
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
@@ -206,6 +208,7 @@ class ComponentMachine:
         self.table = Table(self.who.encoding, room)
         self.reads = Reads(context, self.table, scheduler.turns.share)
         self.writes = Writes(context, self.reads, self.table, permission=self)
+        self.write_batches = WriteBatches(target)
         self.presence = Presence()
         self.peers = ComponentPeers(target, self, may_ask=context.may_send)
         self.files = FileTransfers(context)
@@ -255,7 +258,7 @@ class ComponentMachine:
         self._machines: tuple[Machine, ...] = (
             *(self.reads, self.name_searches, self.sync, self.writes, self.files, self.commands),
             *(self.restarts, self.fetches, self.messages, self.who, self.descriptions),
-            *(self.clock_requests, self.start_values, self.rereads),
+            *(self.clock_requests, self.start_values, self.rereads, self.write_batches),
         )
         """Each machine stands behind those that it uses or calls. They end in reverse order: a machine does
         not take the end of another one for a result, and is not called after its own end."""
@@ -697,6 +700,38 @@ class ComponentMachine:
         write.on_done.append(lambda: self._write_ended(write))
         return write
 
+    def write_many(
+        self,
+        pairs: Sequence[tuple[str, Value]],
+        now: float,
+        asker: str | None = None,
+        *,
+        settle: float = 0.0,
+        force: bool = False,
+    ) -> WriteBatch:
+        """Write several parameters; end the batch with `write_batches.end`.
+
+        Args:
+            pairs: names and values, in order.
+            now, asker, settle, force: as in `write`.
+
+        Raises:
+            UsageError: nothing may be sent.
+            NoReply: the component is lost. Nothing was sent.
+        """
+        self.check_present(f"PARAM_SET to {self.system}/{self.component}", now)
+
+        def begin(name: str, value: Value, at: float) -> Write:
+            return self.write(name, value, at, asker, settle=settle, force=force)
+
+        number = self.who.autopilot
+        autopilot = "" if number is None else autopilot_name(number)
+
+        def is_switch(name: str) -> bool:
+            return is_group_switch(self.spelling(name), autopilot)
+
+        return self.write_batches.begin(pairs, BatchRules(begin, self.writes.cancel, is_switch), now)
+
     def begin_restart(self, now: float, *, returns: bool = True) -> Restart:
         """Reboot the component, or join the reboot in progress; give it back with `end_restart`.
 
@@ -911,7 +946,7 @@ class ComponentMachine:
         self.commands.lose(now, ": another vehicle has this address now")
         self.name_searches.lose(now)
         what = f"writes to {self.system}/{self.component}: another vehicle has this address now"
-        self.writes.fail_all(NoReply(what, attempts=0, waited=0.0), now)
+        self._fail_writes(NoReply(what, attempts=0, waited=0.0), now)
         if self.fetch is not None:
             self.fetch.restart(now)
 
@@ -1023,7 +1058,11 @@ class ComponentMachine:
             if each.who.is_unconfirmed:
                 what = f"{each.system}/{each.component} has not said since it was away which vehicle it is"
                 waited = now - each.who.doubted_at
-                self.writes.fail_all(NoReply(what, attempts=each.who.attempts, waited=waited), now)
+                self._fail_writes(NoReply(what, attempts=each.who.attempts, waited=waited), now)
+
+    def _fail_writes(self, error: ParamClientError, now: float) -> None:
+        self.write_batches.fail_all(error, now)
+        self.writes.fail_all(error, now)
 
     def _doubt_identity(self, now: float) -> None:
         """Doubt the table: another vehicle may respond by now."""

@@ -12,6 +12,7 @@ from importlib import resources
 from typing import Any, Final
 
 from paramclient.errors import UsageError
+from paramclient.model.group_switches import is_group_switch
 from paramclient.model.patterns import NameChoice
 
 __all__ = ["CATEGORIES", "OUT_OF_RANGE", "READ_ONLY", "ApplyRule", "ApplyRules", "Choice", "rules_for"]
@@ -53,14 +54,16 @@ class ApplyRule:
 
 
 class ApplyRules:
-    """The entries of `apply_rules.toml` for one autopilot.
+    """The entries of `apply_rules.toml` for one autopilot, and its group switches.
 
     Attributes:
         entries: the entries by section of the file.
+        autopilot: "px4" or "ardupilot"; any other one for both.
     """
 
-    def __init__(self, entries: Mapping[str, Sequence[ApplyRule]]) -> None:
+    def __init__(self, entries: Mapping[str, Sequence[ApplyRule]], autopilot: str) -> None:
         self.entries = entries
+        self.autopilot = autopilot
         self._patterns = {
             section: [(_pattern(rule.names), rule) for rule in rules] for section, rules in entries.items()
         }
@@ -90,7 +93,7 @@ class ApplyRules:
 
     def reveals(self, name: str) -> bool:
         """Return whether a change of the parameter may show or hide other parameters."""
-        return self._first("reveals", name) is not None
+        return is_group_switch(name, self.autopilot)
 
     def is_last(self, name: str) -> bool:
         """Return whether a change of the parameter may end the connection, so that it is written last."""
@@ -170,7 +173,7 @@ def rules_for(autopilot: str) -> ApplyRules:
             for entry in entries
             if not known or entry["autopilot"] == autopilot
         ]
-    return ApplyRules(found)
+    return ApplyRules(found, autopilot)
 
 
 def _read() -> dict[str, list[dict[str, Any]]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final
@@ -23,12 +23,13 @@ from paramclient.errors import (
     Refused,
     UsageError,
     VehicleArmed,
-    VehicleError,
 )
 from paramclient.model.identity import SHARED_UIDS, Identity
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Value
 from paramclient.protocol.params.change_origin import check_asker
+from paramclient.protocol.params.write_batch import SetOutcome, SetStatus
+from paramclient.protocol.requests.pacing import WRITES_MAX
 from paramclient.provision.apply_rules import READ_ONLY, rules_for
 from paramclient.provision.inspection import (
     POLL_INTERVAL,
@@ -55,13 +56,9 @@ from paramclient.provision.results import ApplyProgress, ApplyResult, ApplyRow, 
 
 __all__ = ["ApplyOptions", "ApplyRun"]
 
-CONCURRENT_WRITES_MAX: Final = 10
-"""Writes in flight at a time: the number of reads that ArduPilot's queue holds without dropping any."""
 WRITE_ATTEMPTS_MAX: Final = 2
 """Times that a value is written if the vehicle acknowledges it and later holds another value: a write of
 another parameter may have changed it."""
-UNANSWERED_WRITES_MAX: Final = 3
-"""Consecutive writes without an acknowledgement after which the run ends."""
 DEFAULT_SYSTEM_ID: Final = 1
 """The system id of a PX4 after SYS_AUTOCONFIG: its start script does not keep MAV_SYS_ID."""
 VERIFY_DELAY: Final = 1.2
@@ -151,7 +148,6 @@ class ApplyRun:
         self._reboots = 0
         self._written_before_reboot: set[str] = set()  # values that the last reboot should have kept
         self._next_system_id: int | None = None  # the vehicle's system id after the next reboot
-        self._unanswered = 0  # consecutive writes without an acknowledgement
         self._error: ParamClientError | None = None
 
     async def prepare(self) -> None:
@@ -335,66 +331,73 @@ class ApplyRun:
         )
 
     async def _write_stage(self, stage: Stage) -> None:
-        """Write the values of a stage: concurrently, or one by one if they may end the connection."""
-        steps = iter(stage.steps)
-        if stage.is_last:
-            await self._write_steps(steps)
-        else:
-            async with anyio.create_task_group() as writing:
-                for _ in range(CONCURRENT_WRITES_MAX):
-                    writing.start_soon(self._write_steps, steps)
-        if self._error is not None:
-            raise self._error
+        """Write the values of a stage: many at a time, or one by one if they may end the connection."""
+        if not stage.is_last:
+            await self._write(stage.steps)
+            return
+        for step in stage.steps:
+            if self._rules.is_system_id(step.name):
+                await self._write_system_id(step)
+            else:
+                await self._write([step])
 
-    async def _write_steps(self, steps: Iterator[Step]) -> None:
-        """Write the steps that the iterator still has, until a write fails."""
-        for step in steps:
-            if self._error is not None:
-                return
-            try:
-                if self._rules.is_system_id(step.name):
-                    await self._write_system_id(step)
-                else:
-                    await self._write(step)
-            except (NoReply, LinkError) as error:
-                self._error = error
+    async def _write(self, steps: Sequence[Step]) -> None:
+        """Write values in order, many at a time.
 
-    async def _write(self, step: Step) -> None:
+        Raises:
+            ParamClientError: not all values were tried.
+        """
         self._is_verified = False
-        self.sent.add(step.name)
+        by_name = {step.name: step for step in steps}
+        before = frozenset(self.sent)
+        ended = 0
+
+        def take(outcome: SetOutcome) -> None:
+            nonlocal ended
+            ended += 1
+            self.sent.update(step.name for step in steps[: ended + WRITES_MAX])
+            self._take(by_name[outcome.name], outcome)
+
+        self.sent.update(step.name for step in steps[:WRITES_MAX])
         try:
-            done = await self._component.set(
-                step.name, step.value, force=self._options.force, asker=self._options.asker
+            done = await self._component.set_many(
+                [(step.name, step.value) for step in steps],
+                force=self._options.force,
+                asker=self._options.asker,
+                progress=take,
             )
-        except (VehicleError, UsageError) as error:
-            self._unanswered = 0
+        except ParamClientError:
+            self.sent &= before
+            raise
+        finally:
+            self._written_at = anyio.current_time()
+        self.sent -= {outcome.name for outcome in done.of(SetStatus.NOT_TRIED)} - before
+        if done.error is not None:
+            raise done.error
+        for outcome in done.of(SetStatus.NOT_TRIED):
+            self._record(by_name[outcome.name], ApplyStatus.FAILED, None, str(outcome.error))
+
+    def _take(self, step: Step, outcome: SetOutcome) -> None:
+        """Record the outcome of a write."""
+        done, error = outcome.result, outcome.error
+        if done is not None:
+            self._count_write(step)
+            self._notes[step.name] = done.note
+            if self._is_action(step.name) and self._rules.resets(step.name):
+                self._next_system_id = DEFAULT_SYSTEM_ID
+            if done.adjusted:
+                self._record(step, ApplyStatus.ADJUSTED, done.actual, "the vehicle changed the value")
+            else:
+                self._report("writing", self._make_row(step, ApplyStatus.SET, done.actual, done.note))
+        elif outcome.status is SetStatus.REFUSED:
             is_read_only = isinstance(error, Refused) and error.code == ParamErrorCode.READ_ONLY
             if is_read_only and self._options.skips_read_only:
                 reason = "left out: the vehicle reports that it is read-only"
                 self._record(step, ApplyStatus.SKIPPED, step.before, reason, READ_ONLY)
             else:
                 self._record(step, ApplyStatus.REFUSED, step.before, str(error))
-            return
-        except NoReply as error:
-            self._unanswered += 1
+        elif outcome.status is SetStatus.UNKNOWN:
             self._record(step, ApplyStatus.FAILED, None, str(error))
-            if self._unanswered >= UNANSWERED_WRITES_MAX:
-                raise
-            return
-        except LinkError as error:
-            self._record(step, ApplyStatus.FAILED, None, str(error))
-            raise
-        finally:
-            self._written_at = anyio.current_time()
-        self._unanswered = 0
-        self._count_write(step)
-        self._notes[step.name] = done.note
-        if self._is_action(step.name) and self._rules.resets(step.name):
-            self._next_system_id = DEFAULT_SYSTEM_ID
-        if done.adjusted:
-            self._record(step, ApplyStatus.ADJUSTED, done.actual, "the vehicle changed the value")
-        else:
-            self._report("writing", self._make_row(step, ApplyStatus.SET, done.actual, done.note))
 
     async def _write_system_id(self, step: Step) -> None:
         """Set the system id, and continue with the vehicle under its new one."""
@@ -405,7 +408,7 @@ class ApplyRun:
             self._record(step, ApplyStatus.SKIPPED, step.before, reason, WRONG)
             return
         if self._rules.needs_reboot(step.name):
-            await self._write(step)
+            await self._write([step])
             if step.name in self.written:
                 self._next_system_id = system
             return

@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any, Protocol, SupportsFloat, SupportsIndex
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, Final, Protocol
 
 import anyio
 
-from paramclient.client.arguments import check_accepted, check_asked, check_asked_name, check_settle
+from paramclient.client.arguments import (
+    check_accepted,
+    check_asked,
+    check_asked_name,
+    check_settle,
+    check_writes,
+)
 from paramclient.client.component import Component
 from paramclient.client.local import not_given
 from paramclient.client.subscription import Changes
+from paramclient.errors import LinkError, NoReply, ParamClientError
 from paramclient.model.identity import Identity
 from paramclient.model.params import ParamMap
-from paramclient.model.values import Encoding, Param, check_value
+from paramclient.model.values import Encoding, Param, Settable, Value, check_value
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.params.fetch_result import FetchResult, Progress
 from paramclient.protocol.params.sampling import SAMPLE_SIZE
 from paramclient.protocol.params.sync import SyncState
+from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome, SetStatus
 from paramclient.protocol.params.writes import SetResult
 from paramclient.protocol.vehicle.peers import Contest
 from paramclient.protocol.wire import PARAMETERS_MAX, SigningKey
@@ -27,6 +35,7 @@ from paramclient.remote.decoding import (
     fetch_result_of,
     hash_of,
     param_of,
+    set_outcome_of,
     set_result_of,
     understood,
     value_as_sent,
@@ -36,6 +45,10 @@ from paramclient.remote.mirrored_component import MirroredComponent
 from paramclient.remote.problems import error_of
 
 __all__ = ["RemoteComponent", "Service", "mirrored_of"]
+
+VALUES_PER_REQUEST_MAX: Final = 1000
+"""Values in one request: a service accepts 10,000, and a lost response leaves the outcome of all of them
+unknown."""
 
 
 class Service(Protocol):
@@ -204,7 +217,7 @@ class RemoteComponent(Component):
     async def set(
         self,
         name: str,
-        value: SupportsIndex | SupportsFloat | bytes,
+        value: Settable,
         *,
         timeout: float | None = None,
         settle: float = 0.0,
@@ -241,6 +254,82 @@ class RemoteComponent(Component):
             done = set_result_of(result, requested)
         self._mirrored.mirror.confirm(done.param)
         return done
+
+    async def set_many(
+        self,
+        values: Mapping[str, Settable] | Iterable[tuple[str, Settable]],
+        *,
+        progress: Callable[[SetOutcome], None] | None = None,
+        timeout: float | None = None,
+        settle: float = 0.0,
+        force: bool = False,
+        durable: bool = False,
+        asker: str | None = None,
+    ) -> SetManyResult:
+        """See `Component.set_many`.
+
+        A request has each name once, and at most `VALUES_PER_REQUEST_MAX` values; more are sent in several
+        requests, one after the other. If a response is lost, its writes are not sent again, and their
+        outcome is unknown.
+        """
+        pairs = check_writes(values)
+        options: dict[str, Any] = {}
+        if check_settle(settle):
+            options["settle_s"] = settle
+        if force:
+            options["force"] = True
+        if durable:
+            options["durable"] = True
+        if self.state == "lost":
+            what = f"PARAM_SET to {self.system}/{self.component} (lost)"
+            raise NoReply(what, attempts=0, waited=self.silence)
+        began = anyio.current_time()
+        outcomes: list[SetOutcome] = []
+        failure: ParamClientError | None = None
+        for part in _requests_of(pairs):
+            if failure is not None:
+                done = [SetOutcome(*pair, SetStatus.NOT_TRIED, error=failure) for pair in part]
+            else:
+                left = None if timeout is None else began + timeout - anyio.current_time()
+                try:
+                    done, failure = await self._set_part(part, options, left)
+                except ParamClientError as error:
+                    is_open = isinstance(error, (NoReply, LinkError))  # the service may have written them
+                    if not is_open and not outcomes:
+                        raise
+                    failure = error
+                    status = SetStatus.UNKNOWN if is_open else SetStatus.NOT_TRIED
+                    done = [SetOutcome(*pair, status, error=error) for pair in part]
+            for outcome in done:
+                outcomes.append(outcome)
+                if progress is not None:
+                    progress(outcome)
+        elapsed = anyio.current_time() - began
+        return SetManyResult(self.system, self.component, tuple(outcomes), failure, elapsed)
+
+    async def _set_part(
+        self, pairs: Sequence[tuple[str, Value]], options: Mapping[str, Any], timeout: float | None
+    ) -> tuple[list[SetOutcome], ParamClientError | None]:
+        """Write values with different names in one request."""
+        answer = await self._service.ask(
+            self._mirrored,
+            "params",
+            {"values": {name: value_as_sent(value) for name, value in pairs}, **options},
+            timeout,
+            f"PARAM_SET to {self.system}/{self.component}",
+            method="PATCH",
+            is_write=True,
+        )
+        with understood(self._service.name):
+            results = answer.document["results"]
+            link = self._service.name
+            outcomes = [set_outcome_of(results[name], name, value, link) for name, value in pairs]
+            problem = answer.document.get("problem")
+            failure = None if problem is None else error_of(problem, status=problem["status"], link=link)
+        for outcome in outcomes:
+            if outcome.result is not None:
+                self._mirrored.mirror.confirm(outcome.result.param)
+        return outcomes, failure
 
     async def fetch_all(
         self,
@@ -302,6 +391,18 @@ class RemoteComponent(Component):
         if (ended := self._service.connection.ended) is not None:
             changes.end(ended)
         return changes
+
+
+def _requests_of(pairs: Iterable[tuple[str, Value]]) -> Iterator[list[tuple[str, Value]]]:
+    """Divide pairs, in order, into requests that have each name once."""
+    part: dict[str, Value] = {}
+    for name, value in pairs:
+        if name in part or len(part) == VALUES_PER_REQUEST_MAX:
+            yield list(part.items())
+            part = {}
+        part[name] = value
+    if part:
+        yield list(part.items())
 
 
 def mirrored_of(component: Component) -> MirroredComponent:

@@ -17,7 +17,9 @@ from paramclient.model.notation import parse_value
 from paramclient.model.values import Param, Value
 from paramclient.protocol.params.fetch_result import FetchResult, Progress
 from paramclient.protocol.params.sampling import Sample
+from paramclient.protocol.params.write_batch import SetOutcome, SetStatus
 from paramclient.protocol.params.writes import SetResult
+from paramclient.remote.problems import error_of
 
 __all__ = [
     "Document",
@@ -28,6 +30,7 @@ __all__ = [
     "param_of",
     "params_of",
     "progress_of",
+    "set_outcome_of",
     "set_result_of",
     "stats_of",
     "understood",
@@ -159,6 +162,16 @@ def set_result_of(document: Document, requested: Value) -> SetResult:
         document["attempts"],
         document.get("note", ""),
     )
+
+
+def set_outcome_of(document: Document, name: str, requested: Value, link: str) -> SetOutcome:
+    """Return the outcome of one of several writes."""
+    problem = document.get("problem")
+    if problem is None:
+        result = set_result_of(document, requested)
+        return SetOutcome(name, requested, SetStatus(result.status), result)
+    error = error_of(problem, status=problem["status"], link=link)
+    return SetOutcome(name, requested, SetStatus(document["status"]), error=error)
 
 
 def stats_of(documents: list[Document]) -> ClientStats:

@@ -63,6 +63,8 @@ CALLS: dict[str, Call] = {
     "get": lambda client, component: component.get("PARAM_01"),
     "get by index": lambda client, component: component.get(5, timeout=9),
     "set": lambda client, component: component.set("PARAM_01", 77),
+    "set_many": lambda client, component: component.set_many(dict.fromkeys(FEW, 7), progress=seen),
+    "set_many in order": lambda client, component: component.set_many([("PARAM_01", 1), ("PARAM_01", 2)]),
     "fetch_all": lambda client, component: component.fetch_all(),
     "fetch_all anew": lambda client, component: component.fetch_all(refresh=True, timeout=9, progress=seen),
     "changes": first_change,

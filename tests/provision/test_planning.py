@@ -10,6 +10,7 @@ import pytest
 
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata, ParamInfo
+from paramclient.model.group_switches import ARDUPILOT_SWITCHES, PX4_SWITCHES, is_group_switch
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import Encoding, Param, ParamType, Value, bits_of, from_bits
@@ -18,7 +19,7 @@ from paramclient.provision.apply_rules import OUT_OF_RANGE, READ_ONLY, ApplyRule
 from paramclient.provision.planning import SUGGESTIONS_MAX
 from paramclient.sim.param_table import SimParam, ardupilot_table, ek2_group, px4_table
 
-SECTIONS = ("left_out", "frame", "resets", "reveals", "last", "system_id", "reboot")
+SECTIONS = ("left_out", "frame", "resets", "last", "system_id", "reboot")
 
 
 @dataclass(frozen=True)
@@ -474,3 +475,14 @@ def test_every_glob_of_the_list_matches_or_is_listed_in_elsewhere(section: str, 
             hits = fnmatch.filter(names, glob)
             assert bool(hits) is (glob not in rule.elsewhere), f"{section}: {glob} hits {hits}"
     assert set(rules_for(autopilot).entries) == set(SECTIONS)
+
+
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+def test_every_pattern_of_a_group_switch_matches_or_is_known_to_match_elsewhere(autopilot: str) -> None:
+    table = px4_table() if autopilot == "px4" else (*ardupilot_table(), *ek2_group())
+    patterns = PX4_SWITCHES if autopilot == "px4" else ARDUPILOT_SWITCHES
+    unmatched = {glob for glob in patterns if not fnmatch.filter([row.name for row in table], glob)}
+    assert unmatched == ({"CA_SV_CS_COUNT", "UAVCAN_ENABLE"} if autopilot == "px4" else set())
+    assert is_group_switch("EKF2_EN" if autopilot == "px4" else "BATT_MONITOR", autopilot)
+    assert is_group_switch("BATT_MONITOR", "px4") is False
+    assert is_group_switch("BATT_MONITOR", "generic")

@@ -25,6 +25,7 @@
 `table`: the parameters, their trust and their hash.
 `value_check`: values that may be older than a change.
 `volatile_values`: reads of the values that a hash does not cover.
+`write_batch`: many PARAM_SETs in one call.
 `write_resolution`: changes too small for PX4 to save.
 `writes`: PARAM_SET.
 """

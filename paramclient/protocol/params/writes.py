@@ -81,6 +81,7 @@ class Write(Operation[SetResult]):
         settle: seconds from the acknowledgement until the value is read once more.
         is_forced: whether a value that the vehicle cannot store is sent anyway.
         acknowledged: the result so far, while the value is watched for `settle` seconds.
+        on_acknowledged: called with the time when that begins.
     """
 
     def __init__(
@@ -101,6 +102,7 @@ class Write(Operation[SetResult]):
         self.settle = settle
         self.is_forced = is_forced
         self.acknowledged: SetResult | None = None
+        self.on_acknowledged: list[Callable[[float], None]] = []
         self.request = WriteAttempts(policy)
         self.number = 0  # the type that was sent
         self.wanted: Param | None = None
@@ -458,6 +460,8 @@ class Writes(Machine):
                 write.read = None
             write.acknowledged = result
             write.verify_at = now + write.settle
+            for callback in write.on_acknowledged:
+                callback(now)
             return
         self._leave(write, now)
         write.finish(result, now)

@@ -14,14 +14,15 @@ import anyio.lowlevel
 from fastapi import APIRouter, Depends, Query, Request, Response
 from pydantic import Field
 
-from paramclient.client.arguments import SETTLE_MAX
+from paramclient.client.arguments import SETTLE_MAX, check_writes
 from paramclient.documents.document import Body, Document, InParts
 from paramclient.documents.param import ParamDoc
 from paramclient.documents.results import NotSetDoc, SetManyDoc, SetResultDoc
 from paramclient.errors import ParamClientError, UnknownParameter, UsageError
 from paramclient.model.params import copy_params
 from paramclient.model.patterns import NameChoice
-from paramclient.model.values import Param
+from paramclient.model.values import Param, Value
+from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome, SetStatus
 from paramclient.service.followed_component import FollowedComponent
 from paramclient.service.param_sources import PATTERNS_MAX, REQUEST_VALUES_MAX
 from paramclient.service.problems import problem_of
@@ -171,23 +172,43 @@ async def write(request: Request, target: Target, name: str, body: WriteRequest)
 
 @router.patch("/params", dependencies=[Depends(require_write)])
 async def write_many(request: Request, target: Target, body: WriteManyRequest) -> SetManyDoc:
-    """Write several parameters in parallel. All are tried; the response has the result of each."""
+    """Write several parameters in order, many at a time, and verify each. The response has each result.
+
+    A refused value does not stop the others. After the loss of the vehicle or the timeout, `problem` says why
+    the remaining values were not tried.
+    """
     asker = author_of(request)
     results: dict[str, SetResultDoc | NotSetDoc] = {}
+    resolved: dict[str, Value] = {}
 
-    async def write_one(name: str) -> None:
+    async def resolve(name: str) -> None:
         try:
-            results[name] = await _write(target, name, body.values[name], body, asker)
+            value = await resolve_value(target, name, body.values[name])
+            ((_, resolved[name]),) = check_writes({name: value})
         except ParamClientError as error:
-            results[name] = NotSetDoc(problem=problem_of(error))
+            status = SetStatus.REFUSED if isinstance(error, UsageError) else SetStatus.NOT_TRIED
+            results[name] = NotSetDoc(status=status, problem=problem_of(error))
 
-    async def work() -> None:
+    async def work() -> SetManyResult:
         async with anyio.create_task_group() as tasks:
             for name in body.values:
-                tasks.start_soon(write_one, name)
+                tasks.start_soon(resolve, name)
+        return await target.component.set_many(
+            [(name, resolved[name]) for name in body.values if name in resolved],
+            timeout=body.timeout_s,
+            settle=body.settle_s,
+            force=body.force,
+            durable=body.durable,
+            asker=asker,
+        )
 
-    await run_until_disconnect(request, work, target)
-    return SetManyDoc(results={name: results[name] for name in body.values})
+    done = await run_until_disconnect(request, work, target)
+    for outcome in done.outcomes:
+        results[outcome.name] = _document_of(outcome)
+        if outcome.result is not None:
+            target.record_received(outcome.result.param.name)
+    problem = None if done.error is None else problem_of(done.error)
+    return SetManyDoc(results={name: results[name] for name in body.values}, problem=problem)
 
 
 async def _read(
@@ -198,8 +219,15 @@ async def _read(
     return Response(_text_with_metadata(target, param), media_type=JSON)
 
 
+def _document_of(outcome: SetOutcome) -> SetResultDoc | NotSetDoc:
+    if outcome.error is not None:
+        return NotSetDoc(status=outcome.status, problem=problem_of(outcome.error))
+    assert outcome.result is not None
+    return SetResultDoc.of(outcome.result)
+
+
 async def _write(
-    target: FollowedComponent, name: str, given: ValueInput, body: WriteRequest | WriteManyRequest, asker: str
+    target: FollowedComponent, name: str, given: ValueInput, body: WriteRequest, asker: str
 ) -> SetResultDoc:
     value = await resolve_value(target, name, given)
     result = await target.component.set(

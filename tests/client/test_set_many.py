@@ -1,0 +1,365 @@
+"""Many writes in one call: all that go through are kept, and each that does not has its own outcome."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from unittest import mock
+
+import anyio
+import pytest
+
+from paramclient import (
+    CacheError,
+    Component,
+    LinkError,
+    NoReply,
+    NotDurable,
+    Param,
+    ParamType,
+    Refused,
+    SetOutcome,
+    SetStatus,
+    UnknownParameter,
+    UsageError,
+)
+from paramclient.client.cache_writer import WriteThrough
+from paramclient.protocol import wire
+from paramclient.protocol.requests.pacing import WRITES_MAX
+from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam, Vehicle
+from tests import shell
+from tests.shell import VALUES, FlakyLink, Tap, a_client, generic, residue, small_px4, swiftly
+from tests.ways import direct_only, pytest_generate_tests, way
+
+__all__ = ["pytest_generate_tests", "way"]
+
+MANY: dict[str, int | float] = {f"MANY_{number:03}": float(number) for number in range(200)}
+NEW: dict[str, int | float] = {name: value + 0.5 for name, value in MANY.items()}
+GROUP: dict[str, float] = {"GRP_A": 1.0, "GRP_B": 2.0}
+
+
+def with_group() -> ArduPilotVehicle:
+    """An ArduPilot that shows two parameters after GRP_ENABLE."""
+    table = [SimParam("GRP_ENABLE", ParamType.INT8, 0)]
+    table += [SimParam(f"PARAM_{number}", ParamType.REAL32, 0.0) for number in range(6)]
+    return ArduPilotVehicle(table=table, groups={"GRP_ENABLE": GROUP}, live=(), ftp=False)
+
+
+def values_of(params: Mapping[str, Param], names: Mapping[str, object]) -> dict[str, object]:
+    return {name: params[name].value for name in names}
+
+
+def left_of(component: Component) -> list[object]:
+    """What is still registered, but for the read of the hash that follows the writes."""
+    hashes = ["1 reads"] if wire.HASH_CHECK in shell.machine_of(component).reads else []
+    return [each for each in residue(component) if each not in hashes]
+
+
+@pytest.mark.parametrize("kind", [PX4Vehicle, ArduPilotVehicle])
+@pytest.mark.parametrize("seed", range(3))
+@swiftly
+async def test_all_values_are_set_on_a_link_that_loses_packets(
+    kind: Callable[..., Vehicle], seed: int
+) -> None:
+    vehicle = kind(table=MANY)
+    async with a_client(Air.symmetric([vehicle], delay=0.05, loss=0.05, seed=seed)) as client:
+        component = await client.component()
+        await component.fetch_all()
+        result = await component.set_many(NEW)
+        assert result.is_complete
+        assert result.error is None
+        assert [each.name for each in result.outcomes] == list(NEW)
+        assert result.counts == {SetStatus.ACCEPTED: 200}
+        assert result["MANY_007"].result is not None
+        assert result["MANY_007"].result.actual == 7.5
+        assert result.elapsed < 3.0
+        assert values_of(vehicle.params, NEW) == values_of(component.params, NEW) == NEW
+        assert not left_of(component)
+
+
+@swiftly
+async def test_each_value_has_an_outcome_of_its_own() -> None:
+    vehicle = ArduPilotVehicle(
+        table={**{name: float(value) for name, value in VALUES.items()}, "COUNT": 3},
+        read_only=["PARAM_03"],
+        live=(),
+        ftp=False,
+        param_error=True,
+    )
+    wanted = {"PARAM_01": 5.0, "NO_SUCH": 1.0, "COUNT": 7.6, "PARAM_03": 9.0, "PARAM_04": float("nan")}
+    seen: list[SetOutcome] = []
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        await component.fetch_all()
+        result = await component.set_many({**wanted, "PARAM_05": 6.0}, progress=seen.append)
+        assert {each.name: each.status for each in result.outcomes} == {
+            "PARAM_01": "accepted",
+            "NO_SUCH": "refused",
+            "COUNT": "adjusted",
+            "PARAM_03": "refused",
+            "PARAM_04": "refused",
+            "PARAM_05": "accepted",
+        }
+        assert isinstance(result["NO_SUCH"].error, UnknownParameter)
+        assert isinstance(result["PARAM_03"].error, Refused)
+        assert isinstance(result["PARAM_04"].error, UsageError)
+        assert [each.name for each in result.of(SetStatus.ADJUSTED)] == ["COUNT"]
+        assert result["COUNT"].requested == 7.6
+        assert result["COUNT"].result is not None
+        assert result["COUNT"].result.actual == vehicle.params["COUNT"].value
+        assert result.error is None
+        assert not result.is_complete
+        assert sorted(map(str, seen)) == sorted(map(str, result.outcomes))
+        with pytest.raises(KeyError):
+            result["PARAM_02"]
+
+
+@swiftly
+async def test_values_of_one_name_are_set_in_order() -> None:
+    tap = Tap(generic())
+    async with a_client(tap) as client:
+        component = await client.component()
+        await component.fetch_all()
+        result = await component.set_many(
+            [("PARAM_01", 5), ("PARAM_02", 1), ("PARAM_01", 6), ("PARAM_01", 4)]
+        )
+        assert result.is_complete
+        assert [each.requested for each in result.outcomes] == [5, 1, 6, 4]
+        assert result["PARAM_01"].requested == 4
+        assert component.params["PARAM_01"].value == 4
+        sent = [each.raw[0] for each in tap.messages(wire.ParamSet) if each.param_id == "PARAM_01"]
+        assert sent == [5, 6, 4]
+
+
+@swiftly
+async def test_a_switch_of_a_group_is_a_barrier() -> None:
+    vehicle = with_group()
+    tap = Tap(Air.symmetric([vehicle], delay=0.05))
+    wanted = {"PARAM_1": 1.0, "PARAM_2": 2.0, "GRP_ENABLE": 1, "GRP_A": 5.0, "PARAM_3": 3.0, "GRP_B": 6.0}
+    async with a_client(tap) as client:
+        component = await client.component()
+        await component.fetch_all()
+        result = await component.set_many(wanted)
+        assert result.is_complete, result.outcomes
+        assert values_of(vehicle.params, wanted) == wanted
+    sent = [(at, each.param_id) for at, _, each in tap.heard if isinstance(each, wire.ParamSet)]
+    assert [name for _, name in sent][:3] == ["PARAM_1", "PARAM_2", "GRP_ENABLE"]
+    times = {name: at for at, name in sent}
+    assert times["PARAM_2"] - times["PARAM_1"] < 0.01
+    assert times["GRP_ENABLE"] - times["PARAM_2"] > 0.1
+    assert min(times["GRP_A"], times["PARAM_3"]) - times["GRP_ENABLE"] > 0.1
+
+
+@direct_only("counts the writes in flight")
+@swiftly
+async def test_so_many_writes_are_in_flight_as_the_vehicle_serves() -> None:
+    tap = Tap(Air.symmetric([PX4Vehicle(table=MANY)], delay=0.2))
+    async with a_client(tap) as client:
+        component = await client.component()
+        await component.fetch_all()
+        result = await component.set_many(NEW)
+        assert result.is_complete
+        assert result.elapsed < 4.5
+    first: dict[str, float] = {}
+    for at, _, each in tap.heard:
+        if isinstance(each, wire.ParamSet):
+            first.setdefault(each.param_id, at)  # a few are repeated early
+    times = list(first.values())
+    assert len(times) == 200
+    bursts = [sum(start <= at < start + 0.35 for at in times) for start in times]
+    assert bursts[0] == 10
+    assert max(bursts) == WRITES_MAX
+
+
+@swiftly
+async def test_a_lost_vehicle_ends_the_call_and_nothing_is_lost() -> None:
+    tap = Tap(Air.symmetric([PX4Vehicle(table=MANY)], delay=0.05))
+    seen: list[SetOutcome] = []
+
+    def take(outcome: SetOutcome) -> None:
+        seen.append(outcome)
+
+    async with a_client(tap) as client:
+        component = await client.component()
+        await component.fetch_all()
+
+        async def fall_silent() -> None:
+            while len(tap.messages(wire.ParamSet)) < 50:  # noqa: ASYNC110 - nobody tells
+                await asyncio.sleep(0.01)
+            tap.is_deaf = tap.is_mute = True
+
+        silencing = asyncio.create_task(fall_silent())
+        result = await component.set_many(NEW, progress=take)
+        await silencing
+        assert isinstance(result.error, NoReply)
+        counts = result.counts
+        assert counts[SetStatus.ACCEPTED] >= 10
+        assert counts[SetStatus.UNKNOWN] >= 10
+        assert counts[SetStatus.NOT_TRIED] >= 100
+        assert sum(counts.values()) == len(seen) == 200
+        for each in result.outcomes:
+            assert each.is_set is (each.error is None)
+        assert all(isinstance(each.error, NoReply) for each in result.of(SetStatus.UNKNOWN))
+        assert not left_of(component)
+        with pytest.raises(NoReply):
+            await component.set_many(NEW)
+
+
+@swiftly
+async def test_a_link_that_fails_ends_the_call_and_nothing_is_lost() -> None:
+    link = FlakyLink(Air.symmetric([PX4Vehicle(table=MANY)], delay=0.05))
+    async with a_client(link) as client:
+        component = await client.component()
+        await component.fetch_all()
+        dropping = asyncio.create_task(drop(link))
+        result = await component.set_many(NEW)
+        await dropping
+        assert isinstance(result.error, (LinkError, NoReply))
+        assert result.counts[SetStatus.ACCEPTED] >= 10
+        assert result.counts[SetStatus.NOT_TRIED] >= 100
+        assert not left_of(component)
+
+
+async def drop(link: FlakyLink) -> None:
+    await asyncio.sleep(0.25)
+    await link.drop(stays_away=True)
+
+
+@swiftly
+async def test_a_vehicle_that_answers_no_write_ends_the_call() -> None:
+    class Unwilling(GenericVehicle):
+        def _on_set(self, request: wire.ParamSet, sender: wire.Frame) -> None:
+            return
+
+        def _on_read(self, request: wire.ParamRequestRead, sender: wire.Frame) -> None:
+            return
+
+    async with a_client(Unwilling(table=MANY)) as client:
+        component = await client.component()
+        await component.fetch_all()
+        result = await component.set_many(NEW)
+        assert isinstance(result.error, NoReply)
+        assert result.counts[SetStatus.UNKNOWN] == 12
+        assert result.counts[SetStatus.NOT_TRIED] == 188
+
+
+@swiftly
+async def test_the_timeout_is_that_of_the_whole_call() -> None:
+    tap = Tap(Air.symmetric([PX4Vehicle(table=MANY)], delay=0.05))
+    async with a_client(tap) as client:
+        component = await client.component()
+        await component.fetch_all()
+        result = await component.set_many(NEW, timeout=0.25)
+        assert 0.2 < result.elapsed < 0.4
+        assert isinstance(result.error, NoReply)
+        assert result.counts[SetStatus.ACCEPTED] >= 10
+        assert result.counts[SetStatus.UNKNOWN] >= 10
+        assert result.counts[SetStatus.NOT_TRIED] >= 100
+        assert not left_of(component)
+        sent = len(tap.messages(wire.ParamSet))
+        await asyncio.sleep(1.0)
+        assert len(tap.messages(wire.ParamSet)) == sent
+        assert (await component.set_many(NEW)).is_complete
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"PARAM_01": 1, "no name": 1}, "no name"),
+        ({"PARAM_01": 1, "PARAM_02": "two"}, "two"),
+        ({"PARAM_01": 1, "_HASH_CHECK": 1}, "read-only"),
+    ],
+)
+@swiftly
+async def test_nothing_is_sent_if_an_argument_is_wrong(values: dict[str, int], message: str) -> None:
+    tap = Tap(small_px4())
+    async with a_client(tap) as client:
+        component = await client.component()
+        with pytest.raises(UsageError, match=message):
+            await component.set_many(values)
+        with pytest.raises(UsageError, match="settle"):
+            await component.set_many({"PARAM_01": 1}, settle=-1)
+        await asyncio.sleep(1.0)
+        assert not tap.messages(wire.ParamSet)
+
+
+@swiftly
+async def test_no_values_are_no_writes() -> None:
+    async with a_client(small_px4()) as client:
+        component = await client.component()
+        result = await component.set_many({})
+        assert result.outcomes == ()
+        assert result.is_complete
+
+
+@swiftly
+async def test_values_are_watched_while_others_are_written() -> None:
+    vehicle = PX4Vehicle(table=MANY)
+    async with a_client(Air.symmetric([vehicle], delay=0.05)) as client:
+        component = await client.component()
+        await component.fetch_all()
+        result = await component.set_many(NEW, settle=1.2)
+        assert result.is_complete
+        assert 1.2 < result.elapsed < 4.0
+        assert not left_of(component)
+
+
+@direct_only("a service reports the outcomes together")
+@swiftly
+async def test_an_error_of_progress_cancels_the_call() -> None:
+    tap = Tap(Air.symmetric([PX4Vehicle(table=MANY)], delay=0.05))
+
+    def fail(outcome: SetOutcome) -> None:
+        raise RuntimeError(outcome.name)
+
+    async with a_client(tap) as client:
+        component = await client.component()
+        await component.fetch_all()
+        with pytest.raises(RuntimeError, match="MANY_000"):
+            await component.set_many(NEW, progress=fail)
+        assert not left_of(component)
+        await asyncio.sleep(0.1)  # what was to be sent already is sent
+        sent = len(tap.messages(wire.ParamSet))
+        await asyncio.sleep(1.0)
+        assert len(tap.messages(wire.ParamSet)) == sent < 60
+
+
+@direct_only("the cache is that of the client")
+@swiftly
+async def test_values_that_are_not_on_the_disk_are_reported_as_such(tmp_path: Path) -> None:
+    async with a_client(small_px4(), cache=tmp_path / "cache") as client:
+        component = await client.component()
+        await component.fetch_all()
+        assert (await component.set_many({"PARAM_01": 2}, durable=True)).is_complete
+        failing = mock.AsyncMock(side_effect=CacheError("disk I/O error"))
+        with mock.patch.object(WriteThrough, "write_durably", failing):
+            result = await component.set_many({"PARAM_01": 3, "NO_SUCH": 1, "PARAM_02": 4}, durable=True)
+        assert isinstance(result.error, NotDurable)
+        assert isinstance(result["PARAM_02"].error, NotDurable)
+        assert result["PARAM_02"].status is SetStatus.ACCEPTED
+        assert result["PARAM_02"].is_set
+        assert isinstance(result["NO_SUCH"].error, UnknownParameter)
+        assert not result.is_complete
+    with pytest.raises(UsageError, match="durable"):
+        async with a_client(small_px4()) as client:
+            await (await client.component()).set_many({"PARAM_01": 2}, durable=True)
+
+
+@direct_only("the outcome of a request that the client gave up is not told")
+@swiftly
+async def test_two_calls_at_once_both_end() -> None:
+    vehicle = PX4Vehicle(table=MANY)
+    async with a_client(Air.symmetric([vehicle], delay=0.05, loss=0.1)) as client:
+        component = await client.component()
+        await component.fetch_all()
+        results = []
+
+        async def set_all(values: Mapping[str, int | float]) -> None:
+            results.append(await component.set_many(values))
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(set_all, NEW)
+            tasks.start_soon(set_all, dict(reversed(MANY.items())))
+        assert all(result.is_complete for result in results)
+        assert values_of(vehicle.params, NEW) == values_of(component.params, NEW)
