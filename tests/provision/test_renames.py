@@ -23,7 +23,7 @@ from paramclient.provision import (
     verify_all,
 )
 from paramclient.provision.inspection import wait_for_identity
-from paramclient.sim import ArduPilotVehicle
+from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
 from tests.shell import a_client, swiftly
 
 RENAMES = Renames(
@@ -258,3 +258,15 @@ async def test_the_plan_of_a_vehicle_names_its_firmware_if_the_file_has_another_
         made = await prepare(component, written({"OTHER": 1}, older))
         assert made.firmware_note == "the file is of ArduPilot 4.5.7, the vehicle has 4.6.0-dev"
         assert (await verify(component, written({"OTHER": 1}, own))).firmware_note == ""
+
+
+@swiftly
+async def test_the_other_name_is_read_although_the_vehicle_does_not_list_it() -> None:
+    """PX4 lists no parameters that it does not use yet, and takes them by name."""
+    rows = [SimParam(name, ParamType.INT32, 1) for name in ("LISTED", "NEW_NAME")]
+    vehicle = PX4Vehicle(table=rows, not_in_use=["NEW_NAME"])
+    renames = Renames([Rename("OLD_NAME", "NEW_NAME")])
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        made = await prepare(component, written({"OLD_NAME": 2}), renames=renames)
+        assert [(step.name, step.value) for step in made.steps] == [("NEW_NAME", 2)]
