@@ -71,7 +71,7 @@ from paramclient.errors import (
     VehicleArmed,
     VehicleError,
 )
-from paramclient.files import FileForm, ParamFile, read_file, write_file
+from paramclient.files import FileForm, ParamFile, read_file, read_renames, write_file
 from paramclient.model.comparison import (
     Comparison,
     Difference,
@@ -84,6 +84,7 @@ from paramclient.model.comparison import (
 from paramclient.model.identity import Identity
 from paramclient.model.params import ParamMap
 from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.renames import Rename, Renames
 from paramclient.model.values import Encoding, Param, ParamType, Settable, Trust
 from paramclient.protocol.ftp import DirectoryEntry
 from paramclient.protocol.params.change import Change
@@ -161,6 +162,8 @@ __all__ = [
     "RadioStatus",
     "Refusal",
     "Refused",
+    "Rename",
+    "Renames",
     "Resynced",
     "Sample",
     "SetManyResult",
@@ -194,6 +197,7 @@ __all__ = [
     "key_from_environment",
     "read_key",
     "read_file",
+    "read_renames",
     "same_value",
     "write_file",
 ]

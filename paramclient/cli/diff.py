@@ -12,7 +12,7 @@ from paramclient.cli.metadata import MetadataChoice, from_file, known_of_sets, m
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import Coloured, print_document, print_table, printable, say
 from paramclient.cli.param_rows import described, value_text
-from paramclient.cli.sources import resolve_all
+from paramclient.cli.sources import read_rules, resolve_all
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.comparison import Comparison, Difference, Moved, Standing, compare, defaults_of
@@ -38,6 +38,7 @@ async def diff(
     only: Annotated[tuple[str, ...], Parameter(show_default=False)] = (),
     partial: bool = False,
     everything: Annotated[bool, Parameter(name="--all")] = False,
+    renames: str | None = None,
     metadata: MetadataChoice = None,
     options: LinkOptions = _OPTIONS,
 ) -> ExitCode:
@@ -53,15 +54,19 @@ async def diff(
         only: Compare only this name or pattern, such as "MC_*". May be given several times.
         partial: Leave out parameters that only the right side has.
         everything: Also print parameters that do not differ.
+        renames: A YAML file of names that firmware versions have changed. A parameter that only one side has
+            is compared with that of its other name.
         metadata: A file that describes parameters. Default: the stored metadata of the vehicles' firmware.
     """
     chosen = from_file(metadata, offline=True)
+    rules = read_rules(renames)
     third_source = [] if base is None or base == DEFAULTS else [base]
     first, second, *third = await resolve_all([left, right, *third_source], options)
-    before = _defaults(first, second) if base == DEFAULTS else next(iter(third), None)
+    known = first if rules is None else rules.apply_to(first, second)
+    before = _defaults(known, second) if base == DEFAULTS else next(iter(third), None)
     if partial:
-        second = replace(second, params={name: second[name] for name in second if name in first})
-    outcome = compare(first, second, base=before, names=only or None)
+        second = replace(second, params={name: second[name] for name in second if name in known})
+    outcome = compare(first, second, base=before, names=only or None, renames=rules)
     sides = _Sides(first, second, before, options, chosen)
     shown = [entry for entry in outcome.entries if everything or entry.is_news]
     if options.json:
@@ -99,9 +104,10 @@ class _Sides:
         self.left, self.right, self.base = [*found, None][:3]
         self.is_known = any(each is not None for each in found)
 
-    def units(self, name: str) -> str:
+    def units(self, entry: Difference) -> str:
         """Return the units of a parameter, or ""."""
-        return units_of(self.left, name) or units_of(self.right, name)
+        right_name = entry.name if entry.renamed is None else entry.renamed.name
+        return units_of(self.left, entry.name) or units_of(self.right, right_name)
 
 
 # Tables
@@ -130,7 +136,7 @@ def _cells(entry: Difference, sides: _Sides, *, has_base: bool) -> list[object]:
         None if left is None else Coloured(left, style if entry.moved in (Moved.LEFT, *together) else ""),
         None if right is None else Coloured(right, style if entry.moved in (Moved.RIGHT, *together) else ""),
         *([base] if has_base else []),
-        *([sides.units(entry.name)] if sides.is_known else []),
+        *([sides.units(entry)] if sides.is_known else []),
         Coloured(_word(entry), style),
         *([entry.moved or "unknown"] if has_base else []),
     ]
@@ -155,6 +161,10 @@ def _with_bits(param: WrittenParam | None) -> str | None:
 def _word(entry: Difference) -> str:
     """Return the comparison of an entry in words."""
     more = []
+    if entry.renamed is not None:
+        is_converted = entry.left is not None and entry.renamed.value != entry.left.value
+        value = f", where left is {value_text(entry.renamed)}" if is_converted else ""
+        more.append(f"{entry.renamed.name} on the right{value}")
     if entry.types_differ:
         more.append(" and ".join(_type(each) for each in (entry.left, entry.right)))
     if entry.is_rounding:

@@ -123,7 +123,7 @@ def _applied_cells(row: ApplyRow) -> Cells:
     return [
         row.name,
         _text(row.before, row),
-        _text(row.wanted.value, row),
+        _text(row.target.value, row),
         _text(row.actual, row),
         Coloured(row.status, _STYLES[row.status]),
         _why(row),
@@ -135,6 +135,7 @@ def _applied_cells(row: ApplyRow) -> Cells:
 
 def show_planned(plans: Mapping[NamedVehicle, Plan], *, reboot: bool, full: bool) -> None:
     """Print the values that would be sent, in their order, and the reasons for all others."""
+    _say_firmware(plans)
     _print(
         ["stage", "name", "before", "wanted", "status", "reason"],
         {vehicle: _planned_rows(plan, reboot=reboot, full=full) for vehicle, plan in plans.items()},
@@ -168,8 +169,9 @@ def _planned_rows(plan: Plan, *, reboot: bool, full: bool) -> Iterator[Cells]:
     has_started = False
     for number, stage in enumerate(plan.stages, start=1):
         for step in stage.steps:
+            row = plan.rows[step.wanted.name]
             reason = stage.purpose + (", takes effect after a reboot" if step.needs_reboot else "")
-            yield [number, *_planned_cells(plan.rows[step.name])[:-1], reason]
+            yield [number, *_planned_cells(row)[:-1], "; ".join(filter(None, (_vehicle_name(row), reason)))]
         if reboot and stage.reboot_first:
             has_started = True
             yield [number, None, None, None, Coloured("reboot", "yellow"), "the vehicle reboots"]
@@ -184,7 +186,7 @@ def _planned_cells(row: PlanRow) -> Cells:
     return [
         row.name,
         _text(row.before, row),
-        _text(row.wanted.value, row),
+        _text(row.target.value, row),
         Coloured(row.status, _PLAN_STYLES[row.status]),
         _why(row),
     ]
@@ -199,6 +201,7 @@ def _is_notable(row: PlanRow) -> bool:
 
 def show_verified(plans: Mapping[NamedVehicle, Plan], *, full: bool) -> None:
     """Print the parameters that differ; all parameters if `full`."""
+    _say_firmware(plans)
     _print(
         ["name", "wanted", "now", "is", "reason"],
         {
@@ -230,10 +233,10 @@ def _verified_cells(row: PlanRow) -> Cells:
     standing = row.standing
     return [
         row.name,
-        _text(row.wanted.value, row),
+        _text(row.target.value, row),
         _text(row.before, row),
         Coloured(standing, _STANDING_STYLES[standing]),
-        _like(row) if standing == "missing" else _why(row),
+        f"{row.rename_note} {_like(row)}".strip() if standing == "missing" else _why(row),
     ]
 
 
@@ -281,12 +284,23 @@ def _print(
         print_table([*([] if is_one else ["vehicle"]), *columns], rows, right=f"before wanted now {right}")
 
 
+def _say_firmware(plans: Mapping[NamedVehicle, Plan]) -> None:
+    """Print a line for each vehicle that has another firmware version than the file."""
+    for vehicle, plan in plans.items():
+        if plan.firmware_note:
+            say(printable(f"{vehicle.label}: {plan.firmware_note}"))
+
+
 def _text(value: Value | None, row: ApplyRow | PlanRow) -> str | None:
     return None if value is None else format_value(*typed(value, row.type))
 
 
 def _why(row: ApplyRow | PlanRow) -> str:
-    return f"{row.reason} {_like(row)}".strip()
+    return "; ".join(filter(None, (_vehicle_name(row), f"{row.reason} {_like(row)}".strip())))
+
+
+def _vehicle_name(row: ApplyRow | PlanRow) -> str:
+    return "" if row.renamed is None else f"{row.renamed.name} on this vehicle"
 
 
 def _like(row: ApplyRow | PlanRow) -> str:

@@ -36,7 +36,7 @@ from paramclient.cli.results import (
     show_verified,
     verified_doc,
 )
-from paramclient.cli.sources import is_file, open_file
+from paramclient.cli.sources import is_file, open_file, read_rules
 from paramclient.cli.targets import (
     Address,
     Source,
@@ -96,6 +96,7 @@ async def apply(
     all_vehicles: AllVehicles = False,
     expect: Count = None,
     dry_run: bool = False,
+    renames: str | None = None,
     metadata: MetadataChoice = None,
     full: bool = False,
     yes: bool = False,
@@ -126,6 +127,8 @@ async def apply(
         all_vehicles: Set up all vehicles on the link, concurrently.
         expect: With --all, wait for this number of vehicles, and fail with fewer.
         dry_run: Print the values that would be sent, and send none of them.
+        renames: A YAML file of names that firmware versions have changed. A parameter that the vehicle does
+            not have is taken as that of its other name.
         metadata: A file that describes parameters, or vehicle to download the vehicle's own metadata: for
             the ranges of values, and for parameters that take effect after a reboot.
         full: Also print parameters that are unchanged or left out.
@@ -134,6 +137,7 @@ async def apply(
     check_pattern("--overlay", over, all_vehicles=all_vehicles)
     check_pattern("--backup", backup, all_vehicles=all_vehicles)
     chosen = from_file(metadata)
+    rules = read_rules(renames)
     values = Source(file, over, options, only=True)
     await values.open()
     async with targets(url, options, all_vehicles=all_vehicles, expect=expect, only=True) as found:
@@ -143,7 +147,9 @@ async def apply(
         show = _Output(found, as_json=options.json, is_fleet=all_vehicles, full=full)
 
         async def plans() -> tuple[dict[NamedVehicle, Plan], dict[NamedVehicle, ParamClientError]]:
-            compared = verify_all(found.vehicles, wanted, include=include, info=info, force=force)
+            compared = verify_all(
+                found.vehicles, wanted, include=include, info=info, force=force, renames=rules
+            )
             fleet = await _within(found, compared)
             return show.by_vehicle(fleet.results), show.by_vehicle(fleet.errors)
 
@@ -164,6 +170,7 @@ async def apply(
                 allow_armed=allow_armed,
                 skip_invalid=skip_invalid,
                 force=force,
+                renames=rules,
                 durable=durable,
                 backup=None if backup is None else lambda each: backups[each.system, each.component],
                 timeout=found.deadline.left(),
@@ -182,6 +189,7 @@ async def verify(
     over: Annotated[str | None, Parameter(name="--overlay")] = None,
     all_vehicles: AllVehicles = False,
     expect: Count = None,
+    renames: str | None = None,
     metadata: MetadataChoice = None,
     full: bool = False,
     options: LinkOptions = _OPTIONS,
@@ -199,19 +207,23 @@ async def verify(
             for the vehicle's ids.
         all_vehicles: Compare all vehicles on the link, concurrently.
         expect: With --all, wait for this number of vehicles, and fail with fewer.
+        renames: A YAML file of names that firmware versions have changed. A parameter that the vehicle does
+            not have is taken as that of its other name.
         metadata: A file that describes parameters, or vehicle to download the vehicle's own metadata: for
             the ranges of values, and for parameters that take effect after a reboot.
         full: Also print parameters that have the wanted value or are left out.
     """
     check_pattern("--overlay", over, all_vehicles=all_vehicles)
     chosen = from_file(metadata)
+    rules = read_rules(renames)
     values = Source(file, over, options, only=False)
     await values.open()
     async with targets(url, options, all_vehicles=all_vehicles, expect=expect, only=False) as found:
         wanted = await values.wanted(found.vehicles)
         info = await _described(found, metadata, chosen)
         show = _Output(found, as_json=options.json, is_fleet=all_vehicles, full=full)
-        fleet = await _within(found, verify_all(found.vehicles, wanted, include=include, info=info))
+        compared = verify_all(found.vehicles, wanted, include=include, info=info, renames=rules)
+        fleet = await _within(found, compared)
         return show.verified(show.by_vehicle(fleet.results), show.by_vehicle(fleet.errors))
 
 

@@ -26,12 +26,13 @@ from paramclient.cli.output import progress_bar, report
 from paramclient.cli.session import Deadline, connect
 from paramclient.client.component import Component
 from paramclient.errors import UnknownVehicle, UsageError
-from paramclient.files import ParamFile, read_file
+from paramclient.files import ParamFile, read_file, read_renames
 from paramclient.files.param_file import AUTOPILOT
 from paramclient.links import FORMS, parse_link
 from paramclient.links.names import names_service
 from paramclient.logs.onboard import is_onboard_log, read_onboard_log
 from paramclient.model.paramset import ParamSet
+from paramclient.model.renames import Renames
 from paramclient.protocol.params.fetch_result import FetchResult
 from paramclient.provision.vehicle_params import FetchedSet, collect_set, incomplete_error, load_cached_set
 
@@ -42,6 +43,7 @@ __all__ = [
     "is_file",
     "names_vehicle",
     "open_file",
+    "read_rules",
     "resolve",
     "resolve_all",
     "tables_in",
@@ -173,6 +175,15 @@ def open_file(path: str) -> ParamFile:
     for note in file.notes:
         report(f"{path}: {note}")
     return file
+
+
+def read_rules(path: str | None) -> Renames | None:
+    """Read the file of --renames; return None without the option.
+
+    Raises:
+        FileError: the file cannot be read, or is invalid.
+    """
+    return None if path is None else read_renames(path)
 
 
 def choose(file: ParamFile, component: int | None, system: int | None) -> ParamSet:

@@ -20,7 +20,11 @@ __all__ = ["DiffDoc", "DifferenceDoc"]
 
 
 class DifferenceDoc(Document):
-    """The comparison of one name; see `Difference`."""
+    """The comparison of one name; see `Difference`.
+
+    If the right side has the parameter under another name, `right_name` is that name, and `renamed` has the
+    left value as it compares with the right one.
+    """
 
     standing: Standing = Field(validation_alias="is", serialization_alias="is")
     types_differ: bool
@@ -30,6 +34,8 @@ class DifferenceDoc(Document):
     base: WrittenParamDoc | None
     moved: Moved | None
     units: Maybe[str] = None
+    renamed: Maybe[WrittenParamDoc] = None
+    right_name: Maybe[str] = None
 
     @classmethod
     def of(
@@ -40,7 +46,9 @@ class DifferenceDoc(Document):
         base: Metadata | None = None,
     ) -> DifferenceDoc:
         """Return the document of a `Difference`, with the metadata of each side."""
-        infos = [side.find(entry.name) for side in (left, right) if side is not None]
+        right_name = entry.name if entry.renamed is None else entry.renamed.name
+        sides = ((left, entry.name), (right, right_name))
+        infos = [side.find(name) for side, name in sides if side is not None]
         return cls(
             standing=entry.standing,
             types_differ=entry.types_differ,
@@ -50,6 +58,8 @@ class DifferenceDoc(Document):
             base=None if entry.base is None else WrittenParamDoc.compared(entry.base, base),
             moved=entry.moved,
             units=next((info.units for info in infos if info is not None and info.units), None),
+            renamed=None if entry.renamed is None else WrittenParamDoc.compared(entry.renamed, right),
+            right_name=None if entry.renamed is None else right_name,
         )
 
 

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from pydantic import Field
 
-from paramclient.documents.document import Document, Scalar
+from paramclient.documents.document import Document, Maybe, Scalar
+from paramclient.model.identity import version_text
 from paramclient.model.notation import typed, value_json
 from paramclient.model.values import Value, type_name
 from paramclient.provision.planning import PlanStatus, RowStanding
@@ -24,6 +25,7 @@ __all__ = [
     "ApplyProgressDoc",
     "ApplyResultDoc",
     "FailedVehicleDoc",
+    "FirmwareDoc",
     "FleetSetupDoc",
     "InterruptedDoc",
     "PlanDoc",
@@ -74,6 +76,21 @@ class StageDoc(Document):
         )
 
 
+class FirmwareDoc(Document):
+    """The firmware versions of the file and the vehicle; see `Plan.firmware_note`."""
+
+    file: str
+    vehicle: str
+
+    @classmethod
+    def of(cls, plan: Plan) -> FirmwareDoc | None:
+        """Return the document of the versions of a plan; None unless they differ."""
+        before, own = plan.wanted.identity, plan.identity
+        if before is None or own is None or not plan.firmware_note:
+            return None
+        return cls(file=version_text(before.firmware), vehicle=version_text(own.firmware))
+
+
 class PlanRowDoc(Document):
     """The planned action for one parameter; see `PlanRow`."""
 
@@ -84,6 +101,7 @@ class PlanRowDoc(Document):
     category: str
     reason: str
     nearest: list[str]
+    vehicle_name: Maybe[str] = None
 
     @classmethod
     def of(cls, row: PlanRow) -> PlanRowDoc:
@@ -92,7 +110,11 @@ class PlanRowDoc(Document):
 
 
 class PlanDoc(Document):
-    """The plan of a set-up; see `Plan`. `extra` is the number of the vehicle's other parameters."""
+    """The plan of a set-up; see `Plan`.
+
+    `extra` is the number of the vehicle's other parameters. The names of `params` are those of the file, and
+    the names of `stages` those of the vehicle.
+    """
 
     system: int
     component: int
@@ -102,6 +124,7 @@ class PlanDoc(Document):
     params: dict[str, PlanRowDoc]
     extra: int
     reboot_for: list[str]
+    firmware: Maybe[FirmwareDoc] = None
 
     @classmethod
     def of(cls, plan: Plan, *, system: int, component: int, full: bool = False) -> PlanDoc:
@@ -122,6 +145,7 @@ class PlanDoc(Document):
             },
             extra=len(plan.extra),
             reboot_for=list(plan.reboot_for),
+            firmware=FirmwareDoc.of(plan),
         )
 
 
@@ -135,6 +159,7 @@ class VerifiedRowDoc(Document):
     category: str
     reason: str
     nearest: list[str]
+    vehicle_name: Maybe[str] = None
 
     @classmethod
     def of(cls, row: PlanRow) -> VerifiedRowDoc:
@@ -150,6 +175,7 @@ class VerifiedDoc(Document):
     met: bool
     counts: dict[RowStanding, int]
     params: dict[str, VerifiedRowDoc]
+    firmware: Maybe[FirmwareDoc] = None
 
     @classmethod
     def of(cls, plan: Plan, *, system: int, component: int, full: bool = False) -> VerifiedDoc:
@@ -164,6 +190,7 @@ class VerifiedDoc(Document):
             met=plan.is_met,
             counts={standing: sum(row.standing is standing for row in rows) for standing in RowStanding},
             params={row.name: VerifiedRowDoc.of(row) for row in rows if full or not row.is_met},
+            firmware=FirmwareDoc.of(plan),
         )
 
 
@@ -178,6 +205,7 @@ class AppliedRowDoc(Document):
     category: str
     reason: str
     nearest: list[str]
+    vehicle_name: Maybe[str] = None
 
     @classmethod
     def of(cls, row: ApplyRow) -> AppliedRowDoc:
@@ -312,10 +340,11 @@ def _members(row: ApplyRow | PlanRow) -> dict[str, Any]:
     return {
         "type": None if row.type is None else type_name(row.type),
         "before": _value(row.before, row),
-        "wanted": value_json(*typed(row.wanted.value, row.type)),
+        "wanted": value_json(*typed(row.target.value, row.type)),
         "category": row.category,
         "reason": row.reason,
         "nearest": list(row.nearest),
+        "vehicle_name": None if row.renamed is None else row.renamed.name,
     }
 
 

@@ -2,11 +2,23 @@
 
 - `formats`, `param_file`, `disk`: the format of a file, its content, reading and replacing it.
 - `line_formats`, `script`, `param_pck`, `document_format`, `document_schema`: one module for each kind.
+- `rename_file`: files of names that firmware versions have changed.
 - `text`, `includes`, `yamltext`: lines and bad lines, `@include` lines, YAML with JSON's rules.
 """
 
 from paramclient.files.disk import read_file, write_file
 from paramclient.files.formats import LARGEST_FILE, dumps, loads
 from paramclient.files.param_file import FileForm, ParamFile
+from paramclient.files.rename_file import loads_renames, read_renames
 
-__all__ = ["LARGEST_FILE", "FileForm", "ParamFile", "dumps", "loads", "read_file", "write_file"]
+__all__ = [
+    "LARGEST_FILE",
+    "FileForm",
+    "ParamFile",
+    "dumps",
+    "loads",
+    "loads_renames",
+    "read_file",
+    "read_renames",
+    "write_file",
+]

@@ -15,7 +15,7 @@ from paramclient.files.formats import LARGEST_FILE, Content, dumps, loads
 from paramclient.files.includes import Includes
 from paramclient.files.param_file import FileForm, ParamFile, as_form, form_of_name
 
-__all__ = ["read_file", "write_file"]
+__all__ = ["read_bytes", "read_file", "write_file"]
 
 if sys.platform == "win32":
     _OPEN_FLAGS: Final = os.O_BINARY | os.O_NOINHERIT  # text mode would convert line ends
@@ -44,15 +44,24 @@ def read_file(path: str | os.PathLike[str], *, form: FileForm | str | None = Non
     """
     source = os.fspath(path)
     form = None if form is None else as_form(form)
+    data = read_bytes(source)
+    return loads(data, source=source, form=form, includes=Includes.of(source, _read, size_max=LARGEST_FILE))
+
+
+def read_bytes(source: str) -> bytes:
+    """Return the content of a file, at most one byte more than `LARGEST_FILE`.
+
+    Raises:
+        FileError: the file cannot be read, or is not a regular file.
+    """
     try:
-        data = _read(source)
+        return _read(source)
     except FileError:
         raise  # is a ValueError too, and has its path already
     except OSError as error:
         raise FileError(f"cannot be read: {error.strerror}", source=source) from error
     except ValueError as error:  # a NUL in the path
         raise FileError(f"cannot be read: {error}", source=source) from error
-    return loads(data, source=source, form=form, includes=Includes.of(source, _read, size_max=LARGEST_FILE))
 
 
 def write_file(

@@ -5,5 +5,6 @@ words.
   identity.
 - `comparison`, `patterns`, `notation`: comparison of sets, selection of names, JSON notation.
 - `group_switches`: parameters that others depend on.
+- `renames`: names that firmware versions have changed, and the conversion of their values.
 - `wording`: counts and lists of names in messages.
 """

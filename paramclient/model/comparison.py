@@ -13,6 +13,7 @@ from enum import StrEnum
 from paramclient.errors import UsageError
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.patterns import NameChoice
+from paramclient.model.renames import Renames
 from paramclient.model.values import ParamType, Value, bits_of, from_bits, same_bits
 
 __all__ = [
@@ -53,11 +54,14 @@ class Difference:
     """The comparison of one name.
 
     Attributes:
-        name: param_id.
+        name: param_id; that of the left side, if the right side has the parameter under another name.
         left, right: the parameter on each side, or None; at least one is not None.
-        base: the parameter in the base, or None.
+        base: the parameter in the base, or None; under the name and with the value for the right side, if
+            left and right have different names.
         standing: how left and right compare, by value alone (see `types_differ`).
         moved: which side differs from the base; None without a base, or if the base lacks the name.
+        renamed: the left parameter under the name and with the value for the right side, if the right side
+            has another name (see `Renames`); else None.
     """
 
     name: str
@@ -66,6 +70,7 @@ class Difference:
     base: WrittenParam | None
     standing: Standing
     moved: Moved | None
+    renamed: WrittenParam | None = None
 
     @property
     def is_same(self) -> bool:
@@ -79,11 +84,12 @@ class Difference:
     @property
     def types_differ(self) -> bool:
         """Whether both sides have a type and the types differ. `INT32 1` equals `REAL32 1.0`."""
+        left = self._left
         return (
-            self.left is not None
+            left is not None
             and self.right is not None
-            and None not in (self.left.type, self.right.type)
-            and self.left.type != self.right.type
+            and None not in (left.type, self.right.type)
+            and left.type != self.right.type
         )
 
     @property
@@ -93,9 +99,9 @@ class Difference:
         A vehicle with the C-cast encoding reports integers beyond 24 bits rounded this way, so the values
         may be equal on board. Only a packed parameter file holds the exact value.
         """
-        if self.standing is not Standing.DIFFERENT or self.left is None or self.right is None:
+        if self.standing is not Standing.DIFFERENT or self._left is None or self.right is None:
             return False
-        left, right = self.left.value, self.right.value
+        left, right = self._left.value, self.right.value
         if not (isinstance(left, int) and isinstance(right, int)):
             return False
         rounded = _bits(left, ParamType.REAL32)
@@ -104,6 +110,11 @@ class Difference:
             and rounded == _bits(right, ParamType.REAL32)
             and from_bits(rounded, ParamType.REAL32) in (left, right)
         )
+
+    @property
+    def _left(self) -> WrittenParam | None:
+        """The left parameter as it compares with the right one."""
+        return self.left if self.renamed is None else self.renamed
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +157,12 @@ class Comparison:
 
 
 def compare(
-    left: ParamSet, right: ParamSet, *, base: ParamSet | None = None, names: Iterable[str] | None = None
+    left: ParamSet,
+    right: ParamSet,
+    *,
+    base: ParamSet | None = None,
+    names: Iterable[str] | None = None,
+    renames: Renames | None = None,
 ) -> Comparison:
     """Compare two sets with `same_value`.
 
@@ -155,15 +171,25 @@ def compare(
             Names that only the base has are ignored.
         names: names or shell patterns (`MC_*`, `SERVO?_TRIM`), case-sensitive, to compare only the names
             that match.
+        renames: names that firmware versions have changed. A left parameter that the right side does not
+            have is compared with the right one of its other name. A name that both sides have is compared
+            as it is.
 
     Raises:
         UsageError: a pattern matches no name of either side. Without this error, a misspelt name would
-            compare as equal.
+            compare as equal. Or two names of one side are one parameter of the other side.
     """
+    renamed: Mapping[str, WrittenParam] = {}
+    if renames is not None:
+        renamed = renames.renamed(left, right)
+        renames.renamed(right, left)  # raises for two right names of one left parameter
+    paired = {param.name for param in renamed.values()}
     chosen = left.keys() | right.keys()
     if names is not None:
-        chosen = _chosen(chosen, [names] if isinstance(names, str) else names)
-    return Comparison(left, right, base, tuple(_hold(name, left, right, base) for name in sorted(chosen)))
+        matching = _chosen(chosen, [names] if isinstance(names, str) else names)
+        chosen = matching | {name for name, param in renamed.items() if param.name in matching}
+    entries = (_hold(name, left, right, base, renamed.get(name), renames) for name in sorted(chosen - paired))
+    return Comparison(left, right, base, tuple(entries))
 
 
 def non_defaults(params: ParamSet) -> ParamSet:
@@ -224,11 +250,32 @@ def _chosen(known: Collection[str], patterns: Iterable[str]) -> set[str]:
     return chosen
 
 
-def _hold(name: str, left: ParamSet, right: ParamSet, base: ParamSet | None) -> Difference:
-    ours, theirs = left.get(name), right.get(name)
-    before = None if base is None else base.get(name)
+def _hold(
+    name: str,
+    left: ParamSet,
+    right: ParamSet,
+    base: ParamSet | None,
+    renamed: WrittenParam | None,
+    renames: Renames | None,
+) -> Difference:
+    ours = left.get(name) if renamed is None else renamed
+    theirs = right.get(name if renamed is None else renamed.name)
+    before = None if base is None else _in_base(name, base, renamed, renames)
     standing = _standing(ours, theirs)
-    return Difference(name, ours, theirs, before, standing, _moved(ours, theirs, before, standing))
+    moved = _moved(ours, theirs, before, standing)
+    return Difference(name, left.get(name), theirs, before, standing, moved, renamed)
+
+
+def _in_base(
+    name: str, base: ParamSet, renamed: WrittenParam | None, renames: Renames | None
+) -> WrittenParam | None:
+    """Return the base's parameter under the name and with the value for the right side, or None."""
+    shared = name if renamed is None else renamed.name
+    before = base.get(shared)
+    if before is not None or renames is None:
+        return before
+    other = renames.find(shared, base)
+    return None if other is None else renames.convert(base[other], shared)
 
 
 def _standing(left: WrittenParam | None, right: WrittenParam | None) -> Standing:

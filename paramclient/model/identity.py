@@ -5,7 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-__all__ = ["SHARED_UIDS", "Identity", "autopilot_name", "hardware_id", "reason_against_non_finite"]
+__all__ = [
+    "SHARED_UIDS",
+    "Identity",
+    "autopilot_name",
+    "hardware_id",
+    "reason_against_non_finite",
+    "version_difference",
+    "version_text",
+]
 
 SHARED_UIDS: Final = frozenset({"4954414c44494e4f"})
 """Hardware ids that several vehicles share: every simulated PX4 reports this one (measured). The system id
@@ -17,6 +25,10 @@ _AGAINST_NON_FINITE = {
     "ardupilot": "ArduPilot ignores NaN and infinity, and does not answer",
 }
 _AUTOPILOTS = {0: "generic", 3: "ardupilot", 8: "no autopilot", 12: "px4"}
+_BRANDS = {3: "ArduPilot", 12: "PX4"}
+_FIRMWARE_TYPES = ((255, ""), (192, "-rc"), (128, "-beta"), (64, "-alpha"), (0, "-dev"))
+"""The types of a firmware by the lowest byte of flight_sw_version from which on they apply
+(FIRMWARE_VERSION_TYPE in common.xml)."""
 _HEX_DIGITS = frozenset(b"0123456789abcdefABCDEF")
 
 
@@ -146,3 +158,22 @@ def autopilot_name(number: int) -> str:
 def reason_against_non_finite(autopilot: str) -> str:
     """Return why NaN and infinity must not be sent to an autopilot, given by name; "" if they may be."""
     return _AGAINST_NON_FINITE.get(autopilot, "")
+
+
+def version_text(firmware: int) -> str:
+    """Return a flight_sw_version as text: `4.6.0`, or `4.6.0-beta` if it is no official release."""
+    number = ".".join(str(firmware >> shift & 0xFF) for shift in (24, 16, 8))
+    kind = next(name for lowest, name in _FIRMWARE_TYPES if firmware & 0xFF >= lowest)
+    return f"{number}{kind}"
+
+
+def version_difference(file: Identity, vehicle: Identity) -> str:
+    """Return the sentence that names the firmware versions of a file and a vehicle, if both are known.
+
+    "" if they are the same version, or one is unknown.
+    """
+    own, other = version_text(file.firmware), version_text(vehicle.firmware)
+    if 0 in (file.firmware, vehicle.firmware) or own == other:
+        return ""
+    autopilot = _BRANDS.get(file.autopilot, "version")
+    return f"the file is of {autopilot} {own}, the vehicle has {other}"

@@ -26,6 +26,7 @@ from paramclient.errors import (
 )
 from paramclient.model.identity import SHARED_UIDS, Identity
 from paramclient.model.paramset import ParamSet
+from paramclient.model.renames import Renames
 from paramclient.model.values import Value
 from paramclient.protocol.params.change_origin import check_asker
 from paramclient.protocol.params.write_batch import SetOutcome, SetStatus
@@ -39,6 +40,7 @@ from paramclient.provision.inspection import (
     read_hidden,
     reread,
     wait_for_identity,
+    with_other_names,
 )
 from paramclient.provision.planning import (
     MISSING,
@@ -90,6 +92,7 @@ class ApplyOptions:
     allow_armed: bool
     skip_invalid: bool
     force: bool
+    renames: Renames | None = None
     durable: bool = False
     backup: str | os.PathLike[str] | None
     asker: str | None
@@ -110,9 +113,10 @@ class ApplyRun:
     Attributes:
         inspection: the latest inspection of the vehicle.
         plan: the plan that follows from it.
-        rows: rows of parameters whose outcome is known before the vehicle is read again.
-        sent: parameters for which a PARAM_SET may have been sent.
-        written: number of acknowledged writes by parameter.
+        rows: rows of parameters whose outcome is known before the vehicle is read again, by the vehicle's
+            names.
+        sent: parameters for which a PARAM_SET may have been sent, as the vehicle names them.
+        written: number of acknowledged writes by parameter, as the vehicle names it.
     """
 
     inspection: Inspection
@@ -129,6 +133,7 @@ class ApplyRun:
                 options,
                 include=(*wanted.include, *options.include),
                 force=options.force or wanted.force,
+                renames=wanted.renames if options.renames is None else options.renames,
             )
             wanted = wanted.wanted
         self._wanted = wanted
@@ -263,8 +268,8 @@ class ApplyRun:
 
     def _pending_system_id(self) -> int | None:
         """Return the system id that is set and takes effect after a reboot, or None."""
-        for name, row in self.plan.rows.items():
-            is_set = row.status is PlanStatus.UNCHANGED and self._rules.is_system_id(name)
+        for row in self.plan.rows.values():
+            is_set = row.status is PlanStatus.UNCHANGED and self._rules.is_system_id(row.target.name)
             if is_set and isinstance(row.before, int) and row.before != self._component.system:
                 return row.before
         return None
@@ -286,7 +291,13 @@ class ApplyRun:
         self._report("reading")
         absent = self.inspection.absent if self._first is not None else frozenset[str]()
         self._inspected_at = anyio.current_time()
-        self.inspection = await inspect(self._component, self._wanted, absent, whole=self._first is None)
+        self.inspection = await inspect(
+            self._component,
+            self._wanted,
+            absent,
+            renames=self._options.renames,
+            whole=self._first is None,
+        )
         self._check_same_vehicle()
         self._replan()
         self._is_verified = True
@@ -297,7 +308,7 @@ class ApplyRun:
         Always reads the table if a switch may have revealed parameters whose names are not known.
         """
         rows = [*self.plan.of(PlanStatus.SET), *self.plan.of(PlanStatus.UNCHANGED)]
-        names = [row.name for row in rows]
+        names = [row.target.name for row in rows]
         if self.plan.of(PlanStatus.LATER) or not self.inspection.is_reading_faster(len(names)):
             await self._inspect()
             return
@@ -311,10 +322,11 @@ class ApplyRun:
     async def _read_revealed(self, done: Stage) -> None:
         """Read by name the parameters that a stage may have revealed. This verifies no write."""
         self._report("reading")
-        names = [row.name for row in self.plan.of(PlanStatus.LATER)]
+        later = [row.name for row in self.plan.of(PlanStatus.LATER)]
+        names = with_other_names(later, (), self._options.renames)
         if self._component.autopilot == "ardupilot":  # a switch reveals the names with its own prefix
             groups = tuple(step.name.rpartition("_")[0] for step in done.steps)
-            names = [name for name in names if name.startswith(groups)]
+            names = tuple(name for name in names if name.startswith(groups))
         self.inspection = await read_hidden(self._component, self.inspection, names)
         self._check_same_vehicle()
         self._replan()
@@ -328,6 +340,7 @@ class ApplyRun:
             self._options.include,
             self._options.info,
             force=self._options.force,
+            renames=self._options.renames,
         )
 
     async def _write_stage(self, stage: Stage) -> None:
@@ -582,8 +595,9 @@ class ApplyRun:
     def _make_row(
         self, step: Step, status: ApplyStatus, actual: Value | None, reason: str = "", category: str = ""
     ) -> ApplyRow:
-        wanted = self._wanted[step.name]
-        return ApplyRow(wanted, status, self._before(step.name), actual, step.type, category, reason)
+        renamed = None if step.name == step.wanted.name else self.plan.rows[step.wanted.name].renamed
+        before = self._before(step.name)
+        return ApplyRow(step.wanted, status, before, actual, step.type, category, reason, (), renamed)
 
     def _before(self, name: str) -> Value | None:
         held = None if self._first is None else self._first.table.get(name)
@@ -597,7 +611,7 @@ class ApplyRun:
 
     def _final_row(self, planned: PlanRow) -> ApplyRow:
         """Return the row of a parameter at the end of the run."""
-        name, actual = planned.name, planned.before
+        name, actual = planned.target.name, planned.before
 
         def row(status: ApplyStatus, reason: str = "", category: str = "") -> ApplyRow:
             return ApplyRow(
@@ -609,6 +623,7 @@ class ApplyRun:
                 category,
                 reason,
                 planned.nearest,
+                planned.renamed,
             )
 
         if planned.status is PlanStatus.UNCHANGED:
@@ -623,7 +638,7 @@ class ApplyRun:
         if planned.status in (PlanStatus.SKIPPED, PlanStatus.INVALID):
             return row(ApplyStatus.SKIPPED, planned.reason, planned.category)
         if planned.status is PlanStatus.LATER:
-            return row(ApplyStatus.SKIPPED, "not on this vehicle", MISSING)
+            return row(ApplyStatus.SKIPPED, planned.reason_missing, MISSING)
         if name not in self.sent:
             return row(ApplyStatus.FAILED, "not reached")
         if not self._is_verified:

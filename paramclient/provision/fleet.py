@@ -12,6 +12,7 @@ import anyio
 from paramclient.client.component import Component
 from paramclient.errors import ParamClientError, UsageError
 from paramclient.model.paramset import ParamSet
+from paramclient.model.renames import Renames
 from paramclient.provision.inspection import verify
 from paramclient.provision.planning import ParamInfo, Plan
 from paramclient.provision.results import ApplyProgress, ApplyResult, FleetApplied, FleetVerified
@@ -35,6 +36,7 @@ async def apply_all(
     allow_armed: bool = False,
     skip_invalid: bool = False,
     force: bool = False,
+    renames: Renames | None = None,
     durable: bool = False,
     backup: Callable[[Component], str | os.PathLike[str]] | None = None,
     timeout: float | None = None,
@@ -48,7 +50,7 @@ async def apply_all(
         components: the vehicles.
         wanted: one set for all vehicles, or a set for each by (system, component) or by a call. `overlay`
             combines a shared set with one of a single vehicle.
-        include, reboot, allow_armed, skip_invalid, force, durable, timeout, asker: as in `apply`.
+        include, reboot, allow_armed, skip_invalid, force, renames, durable, timeout, asker: as in `apply`.
         info: returns the metadata for a vehicle.
         backup: returns the name of a vehicle's backup file.
         progress, before_writing: as in `apply`, with the vehicle as first argument.
@@ -72,6 +74,7 @@ async def apply_all(
             allow_armed=allow_armed,
             skip_invalid=skip_invalid,
             force=force,
+            renames=renames,
             durable=durable,
             backup=None if backup is None else backup(component),
             timeout=timeout,
@@ -90,6 +93,7 @@ async def verify_all(
     include: str | Iterable[str] = (),
     info: Callable[[Component], Mapping[str, ParamInfo] | None] | None = None,
     force: bool = False,
+    renames: Renames | None = None,
 ) -> FleetVerified:
     """`verify` several vehicles concurrently.
 
@@ -99,7 +103,7 @@ async def verify_all(
 
     async def one(component: Component, own: ParamSet) -> Plan:
         described = None if info is None else info(component)
-        return await verify(component, own, include=given, info=described, force=force)
+        return await verify(component, own, include=given, info=described, force=force, renames=renames)
 
     return FleetVerified(*await _run_concurrently(components, wanted, one))
 

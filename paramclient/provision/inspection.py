@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Container, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final, Self
@@ -15,6 +15,7 @@ from paramclient.client.local import local
 from paramclient.errors import LinkError, NoReply, UsageError, VehicleError
 from paramclient.model.params import copy_params
 from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.renames import Renames
 from paramclient.model.values import Param, ParamType, Trust, check_name
 from paramclient.protocol.params.fetch_result import FetchResult
 from paramclient.protocol.params.name_search import NameSearch
@@ -34,6 +35,7 @@ __all__ = [
     "plan_for",
     "prepare",
     "verify",
+    "with_other_names",
 ]
 
 SETUP_IDENTITY_TIMEOUT: Final = 10.0
@@ -85,6 +87,7 @@ async def inspect(
     wanted: ParamSet,
     absent: frozenset[str] = frozenset(),
     *,
+    renames: Renames | None = None,
     whole: bool = False,
     run: Runner = run_here,
 ) -> Inspection:
@@ -100,6 +103,7 @@ async def inspect(
         component: the vehicle.
         wanted: the wanted parameters.
         absent: names that the vehicle is known not to have, unless they are listed by now.
+        renames: other names of the wanted parameters, which are read if the table lacks the wanted name.
         whole: read all unconfirmed parameters, not only the wanted ones.
         run: runs the computations that take long for a large table.
 
@@ -124,16 +128,15 @@ async def inspect(
         table = {name: param for name, param in listed.items() if param.trust is not Trust.CACHED}
         is_whole = fetched.complete and len(table) == len(listed)
         hidden = absent_names
+        names = with_other_names(wanted, table, renames)
         if is_whole and autopilot == "ardupilot":
-            hidden = absent_names | _in_no_hidden_group(table, wanted).difference(after)
+            hidden = absent_names | _in_no_hidden_group(table, names).difference(after)
         missing = frozenset(fetched.missing)
         given_up = {name for name, param in table.items() if param.index in missing}
         live = {name for name, param in before.items() if param.trust is Trust.LIVE}
         unconfirmed = given_up | live.intersection(table, not_covered)
         known = absent | hidden | shown.keys()
-        to_read = [
-            name for name in wanted if name in unconfirmed or (name not in table and name not in known)
-        ]
+        to_read = [name for name in names if name in unconfirmed or (name not in table and name not in known)]
         if whole:
             to_read += unconfirmed.difference(to_read)
         return table, is_whole, hidden, given_up, to_read
@@ -211,13 +214,14 @@ async def prepare(
     include: str | Iterable[str] = (),
     info: Mapping[str, ParamInfo] | None = None,
     force: bool = False,
+    renames: Renames | None = None,
     run: Runner = run_here,
 ) -> Plan:
     """Return the plan of what `apply` would send to a vehicle, and in which order. Only reads.
 
     Args:
         component: the vehicle.
-        wanted, include, info, force: as in `plan`.
+        wanted, include, info, force, renames: as in `plan`.
         run: runs long computations: a plan of thousands of parameters takes a second.
 
     Raises:
@@ -231,8 +235,10 @@ async def prepare(
     # errors in `wanted` are raised before the vehicle is read
     await run(lambda: plan({}, wanted, include=given, autopilot=autopilot))
     await wait_for_identity(component)
-    inspection = await inspect(component, wanted, run=run)
-    return await run(lambda: plan_for(component, inspection.table, wanted, given, info, force=force))
+    inspection = await inspect(component, wanted, renames=renames, run=run)
+    return await run(
+        lambda: plan_for(component, inspection.table, wanted, given, info, force=force, renames=renames)
+    )
 
 
 async def verify(
@@ -242,6 +248,7 @@ async def verify(
     include: str | Iterable[str] = (),
     info: Mapping[str, ParamInfo] | None = None,
     force: bool = False,
+    renames: Renames | None = None,
 ) -> Plan:
     """Compare a vehicle with the wanted parameters. Only reads.
 
@@ -250,7 +257,7 @@ async def verify(
 
     Arguments and errors as in `prepare`.
     """
-    return await prepare(component, wanted, include=include, info=info, force=force)
+    return await prepare(component, wanted, include=include, info=info, force=force, renames=renames)
 
 
 def plan_for(
@@ -261,6 +268,7 @@ def plan_for(
     info: Mapping[str, ParamInfo] | None,
     *,
     force: bool,
+    renames: Renames | None,
 ) -> Plan:
     """Return the plan for a vehicle that has this table."""
     return plan(
@@ -271,7 +279,18 @@ def plan_for(
         autopilot=component.autopilot,
         encoding=component.encoding,
         force=force,
+        renames=renames,
     )
+
+
+def with_other_names(names: Iterable[str], held: Container[str], renames: Renames | None) -> tuple[str, ...]:
+    """Return names, each followed by its other names unless it is among `held`; each name once."""
+    found: dict[str, None] = {}
+    for name in names:
+        found[name] = None
+        if renames is not None and name not in held:
+            found.update(dict.fromkeys(renames.other_names(name)))
+    return tuple(found)
 
 
 def _current_values(
@@ -400,7 +419,7 @@ def _probably_hidden(component: Component, wanted: ParamSet) -> frozenset[str]:
     return unheard if len(unheard) <= EARLY_READS_MAX else frozenset()
 
 
-def _in_no_hidden_group(table: Mapping[str, Param], wanted: ParamSet) -> frozenset[str]:
+def _in_no_hidden_group(table: Mapping[str, Param], wanted: Iterable[str]) -> frozenset[str]:
     """Return wanted names that an ArduPilot cannot have: neither listed nor in a hidden group.
 
     While the switch of a group, a listed INT8, is 0, the list leaves out the parameters of that group; their
@@ -408,7 +427,7 @@ def _in_no_hidden_group(table: Mapping[str, Param], wanted: ParamSet) -> frozens
 
     Args:
         table: the whole list.
-        wanted: the wanted parameters.
+        wanted: the wanted names.
     """
     switches = [name for name, param in table.items() if param.type is ParamType.INT8 and param.value == 0]
     hidden = {start for name in switches for start in _starts(name)}

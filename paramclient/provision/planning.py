@@ -6,13 +6,14 @@ import math
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final, Protocol
 
 from paramclient.errors import UsageError
-from paramclient.model.identity import Identity, autopilot_name, reason_against_non_finite
+from paramclient.model.identity import Identity, autopilot_name, reason_against_non_finite, version_difference
 from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.renames import Renames
 from paramclient.model.values import (
     Encoding,
     Param,
@@ -41,6 +42,8 @@ __all__ = [
     "plan",
 ]
 
+NOT_ON_VEHICLE: Final = "not on this vehicle"
+"""The reason of a parameter that the vehicle does not have."""
 MISSING: Final = "missing"
 """The category of a parameter that the vehicle does not have."""
 WRONG: Final = "wrong"
@@ -115,6 +118,10 @@ class PlanRow:
             `WRONG`; else "".
         reason: the reason for the status as a sentence; may be "".
         nearest: for a parameter that the vehicle does not have, the most similar names, most similar first.
+        renamed: the wanted parameter under the vehicle's name and with the value for it, if the vehicle has
+            the parameter under another name (see `Renames`); else None.
+        rename_note: for a parameter that the vehicle has under none of its names, words that name the other
+            ones; else "".
     """
 
     wanted: WrittenParam
@@ -124,16 +131,28 @@ class PlanRow:
     category: str = ""
     reason: str = ""
     nearest: tuple[str, ...] = ()
+    renamed: WrittenParam | None = None
+    rename_note: str = ""
 
     @property
     def name(self) -> str:
-        """The param_id."""
+        """The param_id in the file."""
         return self.wanted.name
+
+    @property
+    def target(self) -> WrittenParam:
+        """The wanted parameter with the name and the value that the vehicle is to have."""
+        return self.wanted if self.renamed is None else self.renamed
+
+    @property
+    def reason_missing(self) -> str:
+        """The reason of a parameter that the vehicle does not have."""
+        return "; ".join(filter(None, (NOT_ON_VEHICLE, self.rename_note)))
 
     @property
     def differs(self) -> bool:
         """Whether the vehicle has another value than the wanted one, or no such parameter."""
-        return self.before is None or not _is_same(self.wanted.value, self.before, self.type)
+        return self.before is None or not _is_same(self.target.value, self.before, self.type)
 
     @property
     def standing(self) -> RowStanding:
@@ -151,13 +170,14 @@ class PlanRow:
 
     def __str__(self) -> str:
         kind = ParamType.REAL32 if self.type is None else self.type
-        wanted = format_value(self.wanted.value, kind)
+        wanted = format_value(self.target.value, kind)
+        name = self.name if self.renamed is None else f"{self.name} (here {self.renamed.name})"
         if self.status is PlanStatus.UNCHANGED:
-            return f"{self.name} = {wanted}"
+            return f"{name} = {wanted}"
         change = wanted if self.before is None else f"{format_value(self.before, kind)} -> {wanted}"
         like = f" (did you mean {', '.join(self.nearest)}?)" if self.nearest else ""
         why = f": {self.reason}{like}" if self.reason else ""
-        return f"{self.name} {change}, {self.status}{why}"
+        return f"{name} {change}, {self.status}{why}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,18 +185,20 @@ class Step:
     """One value to write.
 
     Attributes:
-        name: param_id.
+        name: param_id on the vehicle.
         value: the value to send.
         type: the vehicle's type of the parameter, which PARAM_SET carries.
         before: the value that the vehicle has.
         needs_reboot: whether the change takes effect after a reboot.
+        wanted: the parameter as the file has it, possibly with another name (see `Renames`).
     """
 
     name: str
     value: Value
     type: ParamType | int
     before: Value
-    needs_reboot: bool = False
+    needs_reboot: bool
+    wanted: WrittenParam
 
     def __str__(self) -> str:
         change = f"{format_value(self.before, self.type)} -> {format_value(self.value, self.type)}"
@@ -216,6 +238,7 @@ class Plan:
         include: categories and globs that are included although the list leaves them out.
         identity: the vehicle of the plan, if `current` names it.
         force: whether to send values that the autopilot cannot store.
+        renames: the names that firmware versions have changed, or None.
         unstarted: switches that are on and whose group is missing: they take effect after a reboot, and the
             vehicle may not have rebooted since they were set.
     """
@@ -228,6 +251,13 @@ class Plan:
     identity: Identity | None = None
     unstarted: tuple[str, ...] = ()
     force: bool = False
+    renames: Renames | None = None
+
+    @property
+    def firmware_note(self) -> str:
+        """The firmware versions of the file and the vehicle, as a sentence; "" unless they differ."""
+        before, own = self.wanted.identity, self.identity
+        return "" if before is None or own is None else version_difference(before, own)
 
     @property
     def steps(self) -> list[Step]:
@@ -267,6 +297,7 @@ def plan(
     autopilot: str | None = None,
     encoding: Encoding | None = None,
     force: bool = False,
+    renames: Renames | None = None,
 ) -> Plan:
     """Return what must be set on a vehicle so that it has the wanted values. Sends nothing.
 
@@ -287,10 +318,12 @@ def plan(
         autopilot: "px4" or "ardupilot"; None if `current` names it, or to use the lists of both.
         encoding: the encoding of values; None for that of the autopilot.
         force: allow NaN and infinity for every autopilot.
+        renames: names that firmware versions have changed. A wanted parameter that is not in `current` is
+            planned under its other name, if `current` has that one.
 
     Raises:
-        UsageError: an element of `include` is neither a category nor a glob, or `current` and `wanted` are
-            of different components or autopilots.
+        UsageError: an element of `include` is neither a category nor a glob; `current` and `wanted` are of
+            different components or autopilots; or two wanted names are one parameter of `current`.
     """
     identity = None
     if isinstance(current, ParamSet):
@@ -313,13 +346,15 @@ def plan(
         autopilot or "",
         vehicle_type=None if identity is None else identity.vehicle_type,
         force=force,
+        renames=renames or Renames(),
     )
     rows = {name: planner.row(each) for name, each in wanted.items()}
     stages = planner.stages(rows)
     unstarted = planner.unstarted(rows)
     rows = planner.settle_missing(rows, stages)
-    extra = tuple(name for name in current if name not in wanted)
-    return Plan(wanted, rows, stages, extra, given, identity, unstarted, force)
+    named = {row.target.name for row in rows.values()}
+    extra = tuple(name for name in current if name not in named)
+    return Plan(wanted, rows, stages, extra, given, identity, unstarted, force, renames)
 
 
 def overlay(base: ParamSet, over: ParamSet) -> ParamSet:
@@ -386,9 +421,13 @@ class _Planner:
         *,
         vehicle_type: int | None,
         force: bool,
+        renames: Renames,
     ) -> None:
         self._current = current
-        self._wanted = wanted
+        self._renames = renames
+        self._renamed = renames.renamed(wanted, current)
+        targets = (self._renamed.get(name, param) for name, param in wanted.items())
+        self._targets = {param.name: param for param in targets}
         self._vehicle_type = vehicle_type
         self._rules = rules
         self._choice = choice
@@ -401,30 +440,38 @@ class _Planner:
 
     def row(self, wanted: WrittenParam) -> PlanRow:
         """Return the row of one parameter; `settle_missing` completes rows of missing parameters."""
-        name = wanted.name
+        renamed = self._renamed.get(wanted.name)
+        target = wanted if renamed is None else renamed
+        name = target.name
         held: Param | WrittenParam | None = self._current.get(name)
         before = None if held is None else held.value
-        kind = wanted.type if held is None or held.type is None else held.type
+        kind = target.type if held is None or held.type is None else held.type
+        note = self._renames.missing_note(wanted.name) if before is None else ""
 
         def verdict(status: PlanStatus, category: str = "", reason: str = "") -> PlanRow:
-            return PlanRow(wanted, status, before, kind, category, reason)
+            return PlanRow(wanted, status, before, kind, category, reason, (), renamed, note)
 
-        rule = self._rules.left_out(name, self._value_to_be)
-        if rule is not None and not self._choice.has(name, rule.category):
-            return verdict(PlanStatus.SKIPPED, rule.category, f"left out: it {rule.reason}")
+        def includes(category: str) -> bool:
+            return any(self._choice.has(each, category) for each in (name, wanted.name))
+
+        for each in dict.fromkeys((name, wanted.name)):  # the list may know only one of two names
+            rule = self._rules.left_out(each, self._value_to_be)
+            if rule is not None and not includes(rule.category):
+                return verdict(PlanStatus.SKIPPED, rule.category, f"left out: it {rule.reason}")
         if before is None:
-            return verdict(PlanStatus.LATER, MISSING, "not on this vehicle")
-        if _is_same(wanted.value, before, kind):
+            return verdict(PlanStatus.LATER, MISSING)
+        if _is_same(target.value, before, kind):
             return verdict(PlanStatus.UNCHANGED)
         info = self._info.get(name)
-        if info is not None and info.is_read_only and not self._choice.has(name, READ_ONLY):
+        if info is not None and info.is_read_only and not includes(READ_ONLY):
             return verdict(PlanStatus.SKIPPED, READ_ONLY, "left out: it can only be read")
-        wrong = self._find_fault(name, wanted.value, kind, info)
-        if wrong is None and isinstance(wanted.value, bytes) and not isinstance(before, bytes):
-            wrong = WRONG, f"{format_value(wanted.value)} are raw bytes, and the vehicle has a number"
-        if wrong is None or (wrong[0] == OUT_OF_RANGE and self._choice.has(name, OUT_OF_RANGE)):
+        wrong = self._find_fault(name, target.value, kind, info)
+        if wrong is None and isinstance(target.value, bytes) and not isinstance(before, bytes):
+            wrong = WRONG, f"{format_value(target.value)} are raw bytes, and the vehicle has a number"
+        if wrong is None or (wrong[0] == OUT_OF_RANGE and includes(OUT_OF_RANGE)):
             return verdict(PlanStatus.SET)
-        return verdict(PlanStatus.INVALID, *wrong)
+        category, reason = wrong
+        return verdict(PlanStatus.INVALID, category, reason if renamed is None else f"as {name}, {reason}")
 
     def stages(self, rows: Mapping[str, PlanRow]) -> tuple[Stage, ...]:
         """Return the stages, in order."""
@@ -453,10 +500,15 @@ class _Planner:
 
     def unstarted(self, rows: Mapping[str, PlanRow]) -> tuple[str, ...]:
         """Return switches whose missing group may appear after a reboot."""
-        missing = [name for name, row in rows.items() if row.status is PlanStatus.LATER]
+        missing = [
+            each
+            for name, row in rows.items()
+            if row.status is PlanStatus.LATER
+            for each in (name, *self._renames.other_names(name))
+        ]
         return tuple(
             name
-            for name, row in rows.items()
+            for name, row in ((row.target.name, row) for row in rows.values())
             if row.status is PlanStatus.UNCHANGED
             and row.before != 0
             and (self._rules.reveals(name) or self._rules.chooses_frame(name))
@@ -474,15 +526,14 @@ class _Planner:
         if len(names) > SUGGESTIONS_MAX:
             nearest: Mapping[str, tuple[str, ...]] = {}
         else:
-            nearest = {name: nearest_names(name, self._current.keys() - rows.keys()) for name in names}
+            unnamed = self._current.keys() - self._targets.keys()
+            nearest = {name: nearest_names(name, unnamed) for name in names}
         settled = dict(rows)
         for name in names:
-            settled[name] = PlanRow(
-                rows[name].wanted,
-                PlanStatus.LATER if may_appear else PlanStatus.SKIPPED,
-                type=rows[name].type,
-                category=MISSING,
-                reason=rows[name].reason + (", unless a step reveals it" if may_appear else ""),
+            settled[name] = replace(
+                rows[name],
+                status=PlanStatus.LATER if may_appear else PlanStatus.SKIPPED,
+                reason=rows[name].reason_missing + (", unless a step reveals it" if may_appear else ""),
                 nearest=nearest.get(name, ()),
             )
         return settled
@@ -519,11 +570,12 @@ class _Planner:
     def _step(self, row: PlanRow) -> Step:
         assert row.before is not None, "only parameters that the vehicle has are set"
         kind = ParamType.REAL32 if row.type is None else row.type
-        return Step(row.name, row.wanted.value, kind, row.before, self._needs_reboot(row.name))
+        name, value = row.target.name, row.target.value
+        return Step(name, value, kind, row.before, self._needs_reboot(name), row.wanted)
 
     def _value_to_be(self, name: str) -> Value | None:
         """Return the wanted value of a parameter, or else its present value."""
-        param: Param | WrittenParam | None = self._wanted.get(name) or self._current.get(name)
+        param: Param | WrittenParam | None = self._targets.get(name) or self._current.get(name)
         return None if param is None else param.value
 
     def _needs_reboot(self, name: str) -> bool:

@@ -47,7 +47,7 @@ class ApplyRow:
         type: the vehicle's type of the parameter; None if unknown.
         category: as in `PlanRow`, for skipped parameters.
         reason: the reason for the status as a sentence; may be "".
-        nearest: as in `PlanRow`.
+        nearest, renamed: as in `PlanRow`.
     """
 
     wanted: WrittenParam
@@ -58,11 +58,17 @@ class ApplyRow:
     category: str = ""
     reason: str = ""
     nearest: tuple[str, ...] = ()
+    renamed: WrittenParam | None = None
 
     @property
     def name(self) -> str:
-        """The param_id."""
+        """The param_id in the file."""
         return self.wanted.name
+
+    @property
+    def target(self) -> WrittenParam:
+        """The wanted parameter with the name and the value that the vehicle is to have."""
+        return self.wanted if self.renamed is None else self.renamed
 
     @property
     def is_as_wanted(self) -> bool:
@@ -80,10 +86,11 @@ class ApplyRow:
 
     def __str__(self) -> str:
         kind = ParamType.REAL32 if self.type is None else self.type
-        value = self.wanted.value if self.actual is None else self.actual
+        value = self.target.value if self.actual is None else self.actual
+        name = self.name if self.renamed is None else f"{self.name} (here {self.renamed.name})"
         why = f": {self.reason}" if self.reason else ""
         like = f" (did you mean {', '.join(self.nearest)}?)" if self.nearest else ""
-        return f"{self.name} = {format_value(value, kind)}, {self.status}{why}{like}"
+        return f"{name} = {format_value(value, kind)}, {self.status}{why}{like}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ import anyio
 from paramclient.client.component import Component
 from paramclient.errors import UsageError
 from paramclient.model.paramset import ParamSet
+from paramclient.model.renames import Renames
 from paramclient.provision.apply_rules import OUT_OF_RANGE
 from paramclient.provision.execution import ApplyOptions, ApplyRun
 from paramclient.provision.inspection import wait_for_identity
@@ -37,6 +38,7 @@ async def apply(
     allow_armed: bool = False,
     skip_invalid: bool = False,
     force: bool = False,
+    renames: Renames | None = None,
     durable: bool = False,
     backup: str | os.PathLike[str] | None = None,
     timeout: float | None = None,
@@ -61,14 +63,16 @@ async def apply(
 
     Args:
         component: the vehicle.
-        wanted: the wanted parameters; or a plan, from which the wanted parameters and `include` are used. The
-            plan is computed again from the vehicle's present values.
+        wanted: the wanted parameters; or a plan, from which the wanted parameters, `include` and `renames`
+            are used. The plan is computed again from the vehicle's present values.
         include: as in `plan`; added to the `include` of a plan.
         info: as in `plan`.
         reboot: reboot the vehicle if values take effect after a reboot.
         allow_armed: continue if the vehicle is armed.
         skip_invalid: skip invalid values and write the remaining ones.
         force: as in `plan`.
+        renames: as in `plan`; None for those of a plan. After each stage that reveals parameters, the other
+            names are looked up again.
         durable: return only when the values and their history are on the disk and survive a power loss; if
             that fails, `error` of the result is a CacheError.
         backup: a file for the state before the first write; its name determines the file format, see
@@ -95,6 +99,7 @@ async def apply(
         allow_armed=allow_armed,
         skip_invalid=skip_invalid,
         force=force,
+        renames=renames,
         durable=durable,
         backup=backup,
         asker=asker,

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from paramclient.errors import UsageError
 from paramclient.model.comparison import Comparison, Moved, Standing, compare, defaults_of, same_value
 from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.renames import Rename, Renames
 from paramclient.model.values import Encoding, Param, ParamType, Value, bits_of, decode, from_bits
 
 INT32, REAL32, REAL64 = ParamType.INT32, ParamType.REAL32, ParamType.REAL64
@@ -244,3 +245,85 @@ def test_defaults_of_leaves_out_unknown_and_differing_defaults() -> None:
     moved = {entry.name: entry.moved for entry in compare(old, new, base=base).entries}
     assert moved == {"A": Moved.BOTH, "B": None, "C": None, "D": Moved.RIGHT}
     assert len(defaults_of(of(A=1))) == 0
+
+
+# Renamed parameters
+
+CENTIMETRES = Renames([Rename("OLD", "NEW", 0.01), Rename("NEW", "NEWEST")], "names.yaml")
+
+
+def test_a_parameter_is_compared_with_that_of_its_other_name() -> None:
+    outcome = compare(of(OLD=750, A=1), of(NEW=7.5, A=1), renames=CENTIMETRES)
+    assert outcome.is_same
+    assert [entry.name for entry in outcome.entries] == ["A", "OLD"]
+    entry = outcome.entries[1]
+    assert entry.left == WrittenParam("OLD", 750)
+    assert entry.right == WrittenParam("NEW", 7.5)
+    assert entry.renamed == WrittenParam("NEW", 7.5)
+    back = compare(of(NEWEST=7.0), of(OLD=750), renames=CENTIMETRES)
+    assert [(each.name, each.standing) for each in back.entries] == [("NEWEST", Standing.DIFFERENT)]
+    assert back.entries[0].renamed == WrittenParam("OLD", 700)
+
+
+def test_a_name_of_both_sides_is_compared_as_it_is() -> None:
+    (entry, other) = compare(of(OLD=1, NEW=1), of(OLD=1, NEW=1), renames=CENTIMETRES).entries
+    assert entry.renamed is None
+    assert other.renamed is None
+
+
+@pytest.mark.parametrize("is_mirrored", [False, True])
+def test_two_names_of_one_side_that_are_one_parameter_of_the_other_are_an_error(is_mirrored: bool) -> None:
+    sides = [of(OLD=1, NEW=1), of(NEWEST=1)]
+    left, right = reversed(sides) if is_mirrored else sides
+    with pytest.raises(UsageError, match="OLD and NEW are both NEWEST by names"):
+        compare(left, right, renames=CENTIMETRES)
+
+
+def test_names_choose_a_renamed_parameter_by_either_name() -> None:
+    for name in ("OLD", "NEW"):
+        outcome = compare(of(OLD=1, A=1), of(NEW=1, A=2), names=name, renames=CENTIMETRES)
+        assert [entry.name for entry in outcome.entries] == ["OLD"]
+
+
+@pytest.mark.parametrize(
+    ("base", "moved"),
+    [
+        (of(OLD=750), Moved.RIGHT),
+        (of(NEW=7.0), Moved.LEFT),
+        (of(NEWEST=8), Moved.CONFLICT),
+        (of(OLD=1, NEW=7.0), Moved.LEFT),
+        (of(A=1), None),
+    ],
+)
+def test_a_base_is_compared_under_any_of_the_names(base: ParamSet, moved: Moved | None) -> None:
+    (entry,) = compare(of(OLD=750), of(NEW=7.0), base=base, renames=CENTIMETRES).entries
+    assert entry.moved is moved
+
+
+def test_a_factor_takes_the_type_of_the_old_name_and_a_new_name_alone_keeps_it() -> None:
+    left = ParamSet({name: WrittenParam(name, 100, INT32) for name in ("OLD", "X")})
+    right = ParamSet({"NEW": WrittenParam("NEW", 1.0, REAL32), "Y": WrittenParam("Y", 100.0, REAL32)})
+    renames = Renames([Rename("OLD", "NEW", 0.01), Rename("X", "Y")])
+    outcome = compare(left, right, renames=renames)
+    assert outcome.is_same
+    assert [entry.types_differ for entry in outcome.entries] == [False, True]
+
+
+@given(SETS, SETS, st.permutations("ABCDEFGH"), st.sampled_from([1, 0.5, -2]))
+def test_renamed_parameters_compare_alike_in_both_directions(
+    left: ParamSet, right: ParamSet, names: list[str], factor: float
+) -> None:
+    first, second, third, fourth, *_ = names
+    renames = Renames([Rename(first, second), Rename(third, fourth, factor), Rename(second, third)])
+    try:
+        there = compare(left, right, renames=renames)
+    except UsageError:
+        with pytest.raises(UsageError):
+            compare(right, left, renames=renames)
+        return
+    back = compare(right, left, renames=renames)
+    pairs = {(entry.left and entry.left.name, entry.right and entry.right.name) for entry in there.entries}
+    assert {
+        (entry.right and entry.right.name, entry.left and entry.left.name) for entry in back.entries
+    } == pairs
+    assert len(there.entries) == len(back.entries)

@@ -1,0 +1,185 @@
+"""--renames of the subcommands apply, verify and diff, and the line about firmware versions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from paramclient import ParamSet, ParamType, WrittenParam, write_file
+from paramclient.model.identity import Identity
+from paramclient.model.values import Value
+from paramclient.sim import ArduPilotVehicle, Endpoint
+from tests.commands import Command, Put, behind, in_process, leaping
+
+TABLE: dict[str, Value | tuple[ParamType, Value]] = {
+    "WP_SPD": 10.0,
+    "RTL_ALT_M": (ParamType.INT16, 15),
+    "OTHER": 1.0,
+}
+RULES = """\
+- {old: WPNAV_SPEED, new: WP_SPD, factor: 0.01}
+- {old: RTL_ALT, new: RTL_ALT_M, factor: 0.01}
+- {old: GONE, new: GONE_TOO}
+"""
+FILE = "WPNAV_SPEED,750\nRTL_ALT,1500\n"
+NOT_HERE = "renamed to GONE_TOO in names.yaml, which this vehicle does not have either"
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Run the command line in this process, on simulated time, in a folder with `names.yaml`."""
+    leaping(monkeypatch)
+    monkeypatch.chdir(tmp_path)
+    Path("names.yaml").write_text(RULES)
+    return in_process(capsys, "--cache", str(tmp_path / "cache.sqlite3"))
+
+
+@pytest.fixture
+def put(monkeypatch: pytest.MonkeyPatch) -> Put:
+    """Connect every URL to simulated vehicles; return a URL."""
+    return behind(monkeypatch, "udpin:0.0.0.0:14550")
+
+
+def copter(**options: Any) -> ArduPilotVehicle:
+    return ArduPilotVehicle(table=TABLE, live=(), **options)
+
+
+def file(text: str = FILE, name: str = "quad.param") -> str:
+    Path(name).write_text(text)
+    return name
+
+
+def older_file(**values: Value) -> str:
+    """Write a file of ArduPilot 4.5.7."""
+    identity = Identity(1, "udp", autopilot=3, firmware=0x040507FF)
+    params = {name: WrittenParam(name, value) for name, value in values.items()}
+    write_file("older.json", ParamSet(params, system=1, component=1, identity=identity))
+    return "older.json"
+
+
+def test_apply_writes_under_the_name_of_the_vehicle(command: Command, put: Callable[[Endpoint], str]) -> None:
+    vehicle = copter()
+    outcome = command("apply", put(vehicle), file(), "--renames", "names.yaml", "--full")
+    assert outcome.code == 0
+    assert outcome.rows[1:] == [
+        ["WPNAV_SPEED", "10.0", "7.5", "7.5", "set", "WP_SPD on this vehicle"],
+        ["RTL_ALT", "15", "15", "15", "unchanged", "RTL_ALT_M on this vehicle"],
+    ]
+    assert vehicle.values["WP_SPD"] == 7.5
+    assert command("verify", put(vehicle), file(), "--renames", "names.yaml").code == 0
+
+
+def test_apply_prints_the_name_of_the_vehicle_as_json(
+    command: Command, put: Callable[[Endpoint], str]
+) -> None:
+    told = command("apply", put(copter()), file(), "--renames", "names.yaml", "--json").json
+    row = told["params"]["WPNAV_SPEED"]
+    assert (row["vehicle_name"], row["wanted"], row["actual"], row["status"]) == ("WP_SPD", 7.5, 7.5, "set")
+
+
+def test_a_dry_run_shows_the_steps_under_both_names(command: Command, put: Callable[[Endpoint], str]) -> None:
+    vehicle = copter()
+    outcome = command("apply", put(vehicle), file(), "--renames", "names.yaml", "--dry-run")
+    reason = "WP_SPD on this vehicle; all other parameters"
+    assert outcome.rows[1:] == [["1", "WPNAV_SPEED", "10.0", "7.5", "set", reason]]
+    told = command("apply", put(vehicle), file(), "--renames", "names.yaml", "--dry-run", "--json").json
+    assert [step["name"] for step in told["stages"][0]["steps"]] == ["WP_SPD"]
+    assert told["params"]["WPNAV_SPEED"]["vehicle_name"] == "WP_SPD"
+    assert "firmware" not in told
+    assert vehicle.requests["PARAM_SET"] == 0
+
+
+def test_a_missing_parameter_names_its_other_name(command: Command, put: Callable[[Endpoint], str]) -> None:
+    vehicle, wanted = copter(), file("GONE,1\n")
+    outcome = command("apply", put(vehicle), wanted, "--renames", "names.yaml")
+    assert outcome.code == 1
+    assert outcome.rows[1:] == [["GONE", "1", "skipped", f"not on this vehicle; {NOT_HERE}"]]
+    outcome = command("verify", put(vehicle), wanted, "--renames", "names.yaml")
+    assert outcome.rows[1:] == [["GONE", "1", "missing", NOT_HERE]]
+    assert command("verify", put(vehicle), wanted).rows[1:] == [["GONE", "1", "missing"]]
+
+
+def test_values_that_do_not_fit_and_names_that_collide_send_nothing(
+    command: Command, put: Callable[[Endpoint], str]
+) -> None:
+    vehicle = copter()
+    outcome = command("apply", put(vehicle), file("RTL_ALT,1550\n"), "--renames", "names.yaml")
+    assert outcome.code == 2
+    assert "RTL_ALT: as RTL_ALT_M, 15.5 is not a whole number, and the parameter is INT16" in outcome.err
+    outcome = command("apply", put(vehicle), file(FILE + "WP_SPD,1\n"), "--renames", "names.yaml")
+    assert outcome.code == 2
+    assert "are both WP_SPD by names.yaml; remove one of the two" in outcome.err
+    assert vehicle.requests["PARAM_SET"] == 0
+
+
+@pytest.mark.parametrize("subcommand", ["apply", "verify", "diff"])
+def test_a_bad_file_of_names_is_an_error_with_its_line(
+    command: Command, put: Callable[[Endpoint], str], subcommand: str
+) -> None:
+    bad = file("- {old: A, new: B}\n- {old: C, new: D, factor: 0}\n", "bad.yaml")
+    outcome = command(subcommand, put(copter()), file(), "--renames", bad)
+    assert outcome.code == 2
+    assert "bad.yaml:2: the factor of C is 0" in outcome.err
+
+
+@pytest.mark.parametrize("words", [("verify",), ("apply", "--dry-run")], ids=["verify", "dry run"])
+def test_firmware_versions_that_differ_are_named_first(
+    command: Command, put: Callable[[Endpoint], str], words: tuple[str, ...]
+) -> None:
+    subcommand, *options = words
+    wanted = older_file(OTHER=2.0)
+    outcome = command(subcommand, put(copter()), wanted, *options)
+    first = "1/1 ardupilot: the file is of ArduPilot 4.5.7, the vehicle has 4.6.0-dev\n"
+    assert outcome.err.startswith(first)
+    told = command(subcommand, put(copter()), wanted, *options, "--json").json
+    assert told["firmware"] == {"file": "4.5.7", "vehicle": "4.6.0-dev"}
+    same = replace(Identity(1, "udp", autopilot=3), firmware=67502080)
+    write_file("same.json", ParamSet({"OTHER": WrittenParam("OTHER", 2.0)}, identity=same))
+    assert "firmware" not in command(subcommand, put(copter()), "same.json", *options, "--json").json
+
+
+def test_diff_compares_parameters_under_their_other_names(command: Command) -> None:
+    old = file("WPNAV_SPEED,750\nRTL_ALT,1500\nOTHER,1\n", "old.param")
+    new = file("WP_SPD,7.0\nRTL_ALT_M,15\nOTHER,1\nMORE,2\n", "new.param")
+    outcome = command("diff", old, new, "--renames", "names.yaml", "--all")
+    assert outcome.code == 1
+    assert outcome.rows[1:] == [
+        ["MORE", "2", "only right"],
+        ["OTHER", "1", "1", "same"],
+        ["RTL_ALT", "1500", "15", "same, RTL_ALT_M on the right, where left is 15"],
+        ["WPNAV_SPEED", "750", "7.0", "different, WP_SPD on the right, where left is 7.5"],
+    ]
+    outcome = command("diff", new, old, "--renames", "names.yaml", "--all", "--partial")
+    assert outcome.rows[1:] == [
+        ["MORE", "2", "only left"],
+        ["OTHER", "1", "1", "same"],
+        ["RTL_ALT_M", "15", "1500", "same, RTL_ALT on the right, where left is 1500"],
+        ["WP_SPD", "7.0", "750", "different, WPNAV_SPEED on the right, where left is 700"],
+    ]
+    outcome = command("diff", old, new, "--renames", "names.yaml", "--partial", "--only", "RTL_ALT_M")
+    assert outcome.code == 0
+
+
+def test_diff_prints_both_names_as_json(command: Command) -> None:
+    old, new = file("WPNAV_SPEED,750\n", "old.param"), file("WP_SPD,7.0\n", "new.param")
+    told = command("diff", old, new, "--renames", "names.yaml", "--json").json
+    (row,) = told["params"].values()
+    assert (row["is"], row["right_name"], row["renamed"]["value"]) == ("different", "WP_SPD", 7.5)
+    assert (row["left"]["value"], row["right"]["value"]) == (750, 7.0)
+
+
+def test_diff_knows_the_defaults_of_renamed_parameters(command: Command) -> None:
+    def side(name: str, value: float, default: float) -> str:
+        param = WrittenParam(name, value, ParamType.REAL32, default)
+        write_file(f"{name}.json", ParamSet({name: param}))
+        return f"{name}.json"
+
+    left, right = side("WPNAV_SPEED", 750.0, 1000.0), side("WP_SPD", 10.0, 10.0)
+    outcome = command("diff", left, right, "--renames", "names.yaml", "--base", "defaults")
+    (row,) = outcome.rows[1:]
+    assert row[0] == "WPNAV_SPEED"
+    assert row[-1] == "left"

@@ -1,0 +1,272 @@
+"""Set-ups with files whose names the vehicle's firmware has changed: plans, `apply`, `verify`, versions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import pytest
+
+from paramclient import InvalidParameters, ParamSet, ParamType, Rename, Renames, UsageError, WrittenParam
+from paramclient.model.identity import Identity, version_text
+from paramclient.model.values import Encoding, Param, Value, bits_of
+from paramclient.provision import (
+    MISSING,
+    WRONG,
+    ApplyStatus,
+    PlanStatus,
+    apply,
+    apply_all,
+    plan,
+    prepare,
+    verify,
+    verify_all,
+)
+from paramclient.provision.inspection import wait_for_identity
+from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
+from tests.shell import a_client, swiftly
+
+RENAMES = Renames(
+    [
+        Rename("WPNAV_SPEED", "WP_SPD", 0.01),
+        Rename("RTL_ALT", "RTL_ALT_M", 0.01),
+        Rename("EK1_TYPE", "EK2_GPS_TYPE"),
+        Rename("EK1_ENABLE", "EK2_ENABLE"),
+        Rename("INS_OLD", "INS_ACCOFFS_X"),
+        Rename("SYSID_THISMAV", "MAV_SYSID"),
+    ],
+    "names.yaml",
+)
+TABLE: dict[str, Value | tuple[ParamType, Value]] = {
+    "WP_SPD": 10.0,
+    "RTL_ALT_M": (ParamType.INT16, 15),
+    "INS_ACCOFFS_X": 0.5,
+    "EK2_ENABLE": (ParamType.INT8, 0),
+    "OTHER": 1.0,
+}
+GROUP: dict[str, Value | tuple[ParamType, Value]] = {"EK2_GPS_TYPE": (ParamType.INT8, 0)}
+NOT_HERE = "in names.yaml, which this vehicle does not have either"
+
+
+def written(values: Mapping[str, Value], identity: Identity | None = None) -> ParamSet:
+    params = {name: WrittenParam(name, value) for name, value in values.items()}
+    return ParamSet(params, identity=identity, source="a file")
+
+
+def held(**values: Value | tuple[ParamType, Value]) -> dict[str, Param]:
+    """Return a vehicle's table; an entry without a type is a REAL32."""
+    table: dict[str, Param] = {}
+    for name, entry in values.items():
+        kind, value = entry if isinstance(entry, tuple) else (ParamType.REAL32, entry)
+        table[name] = Param(name, value, kind, len(table), bits_of(value, kind))
+    return table
+
+
+def copter() -> ArduPilotVehicle:
+    return ArduPilotVehicle(table=TABLE, groups={"EK2_ENABLE": GROUP}, live=())
+
+
+# Plans
+
+
+def test_a_renamed_parameter_is_planned_under_the_name_of_the_vehicle() -> None:
+    made = plan(held(**TABLE), written({"WPNAV_SPEED": 750, "RTL_ALT": 1500}), renames=RENAMES)
+    (step,) = made.steps
+    assert (step.name, step.value, step.before, step.wanted.name) == ("WP_SPD", 7.5, 10.0, "WPNAV_SPEED")
+    row = made.rows["WPNAV_SPEED"]
+    assert (row.status, row.wanted.value, row.target.value) == (PlanStatus.SET, 750, 7.5)
+    assert str(row) == "WPNAV_SPEED (here WP_SPD) 10.0 -> 7.5, set"
+    assert made.rows["RTL_ALT"].status is PlanStatus.UNCHANGED
+    assert str(made.rows["RTL_ALT"]) == "RTL_ALT (here RTL_ALT_M) = 15"
+    assert made.extra == ("INS_ACCOFFS_X", "EK2_ENABLE", "OTHER")
+    assert not row.is_met
+    assert made.rows["RTL_ALT"].is_met
+
+
+def test_a_newer_name_is_planned_under_the_older_one_of_the_vehicle() -> None:
+    made = plan(held(WPNAV_SPEED=1000.0), written({"WP_SPD": 7.5}), renames=RENAMES)
+    assert [(step.name, step.value) for step in made.steps] == [("WPNAV_SPEED", 750)]
+
+
+def test_a_name_that_the_vehicle_has_is_not_touched() -> None:
+    made = plan(held(WPNAV_SPEED=5.0, WP_SPD=10.0), written({"WPNAV_SPEED": 750}), renames=RENAMES)
+    assert [(step.name, step.value) for step in made.steps] == [("WPNAV_SPEED", 750)]
+    assert made.rows["WPNAV_SPEED"].renamed is None
+
+
+def test_two_wanted_names_of_one_parameter_are_an_error() -> None:
+    with pytest.raises(UsageError, match="WP_SPD and WPNAV_SPEED of a file are both WP_SPD by names"):
+        plan(held(**TABLE), written({"WPNAV_SPEED": 750, "WP_SPD": 7.5}), renames=RENAMES)
+
+
+def test_a_converted_value_that_is_not_whole_is_invalid_for_an_integer() -> None:
+    made = plan(held(**TABLE), written({"RTL_ALT": 1550}), renames=RENAMES, encoding=Encoding.C_CAST)
+    row = made.rows["RTL_ALT"]
+    assert (row.status, row.category) == (PlanStatus.INVALID, WRONG)
+    assert row.reason == "as RTL_ALT_M, 15.5 is not a whole number, and the parameter is INT16"
+
+
+def test_a_missing_parameter_names_its_other_name() -> None:
+    made = plan(held(OTHER=1.0), written({"WPNAV_SPEED": 750, "WP_X": 1}), renames=RENAMES)
+    row = made.rows["WPNAV_SPEED"]
+    assert (row.status, row.category) == (PlanStatus.SKIPPED, MISSING)
+    assert row.reason == f"not on this vehicle; renamed to WP_SPD {NOT_HERE}"
+    assert made.rows["WP_X"].reason == "not on this vehicle"
+    made = plan(held(OTHER=1.0), written({"WP_SPD": 7.5}), renames=RENAMES)
+    assert made.rows["WP_SPD"].reason == f"not on this vehicle; renamed from WPNAV_SPEED {NOT_HERE}"
+
+
+def test_a_parameter_is_left_out_by_either_of_its_names() -> None:
+    wanted = written({"INS_OLD": 0.25})
+    made = plan(held(**TABLE), wanted, renames=RENAMES, autopilot="ardupilot")
+    assert (made.rows["INS_OLD"].status, made.rows["INS_OLD"].category) == (PlanStatus.SKIPPED, "calibration")
+    for include in ("INS_OLD", "INS_ACCOFFS_X", "calibration"):
+        made = plan(held(**TABLE), wanted, renames=RENAMES, autopilot="ardupilot", include=include)
+        assert [step.name for step in made.steps] == ["INS_ACCOFFS_X"]
+    back = plan(held(INS_OLD=0.5), written({"INS_ACCOFFS_X": 0.25}), renames=RENAMES, autopilot="ardupilot")
+    assert back.rows["INS_ACCOFFS_X"].category == "calibration"
+
+
+def test_the_order_goes_by_the_names_of_the_vehicle() -> None:
+    made = plan(
+        held(**TABLE),
+        written({"WPNAV_SPEED": 750, "EK1_ENABLE": 1, "EK1_TYPE": 3}),
+        renames=RENAMES,
+        autopilot="ardupilot",
+    )
+    assert [[step.name for step in stage.steps] for stage in made.stages] == [["EK2_ENABLE"], ["WP_SPD"]]
+    assert made.rows["EK1_TYPE"].status is PlanStatus.LATER
+
+
+# Firmware versions
+
+
+def at(firmware: int, autopilot: int = 3) -> Identity:
+    return Identity(1, "udp", "aa00", autopilot, firmware=firmware)
+
+
+@pytest.mark.parametrize(
+    ("file", "vehicle", "note"),
+    [
+        (at(0x040507FF), at(0x040600FF), "the file is of ArduPilot 4.5.7, the vehicle has 4.6.0"),
+        (at(0x040600FF), at(0x04060000), "the file is of ArduPilot 4.6.0, the vehicle has 4.6.0-dev"),
+        (at(0x01100080, 12), at(0x011000FF, 12), "the file is of PX4 1.16.0-beta, the vehicle has 1.16.0"),
+        (at(0x01000000, 0), at(0x02000000, 0), "the file is of version 1.0.0-dev, the vehicle has 2.0.0-dev"),
+        (at(0x040600FF), at(0x040600FF), ""),
+        (at(0), at(0x040600FF), ""),
+        (at(0x040600FF), at(0), ""),
+        (None, at(0x040600FF), ""),
+    ],
+)
+def test_a_plan_names_firmware_versions_that_differ(
+    file: Identity | None, vehicle: Identity, note: str
+) -> None:
+    assert plan(written({"A": 1}, vehicle), written({"A": 1}, file)).firmware_note == note
+
+
+def test_a_plan_for_a_bare_table_knows_no_firmware() -> None:
+    assert plan(held(A=1.0), written({"A": 1}, at(0x040507FF))).firmware_note == ""
+
+
+@pytest.mark.parametrize(
+    ("firmware", "text"), [(0x040600C0, "4.6.0-rc"), (0x04060040, "4.6.0-alpha"), (0x040600FE, "4.6.0-rc")]
+)
+def test_the_type_of_a_firmware_is_part_of_its_version(firmware: int, text: str) -> None:
+    assert version_text(firmware) == text
+
+
+# Vehicles
+
+
+@swiftly
+async def test_apply_writes_and_verifies_under_the_name_of_the_vehicle() -> None:
+    vehicle = copter()
+    wanted = written({"WPNAV_SPEED": 750, "RTL_ALT": 2500, "OTHER": 2, "NO_SUCH": 1})
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        assert not (await verify(component, wanted, renames=RENAMES)).is_met
+        made = await prepare(component, wanted, renames=RENAMES)
+        result = await apply(component, made)
+        assert {name: (row.status, row.before, row.actual) for name, row in result.rows.items()} == {
+            "WPNAV_SPEED": (ApplyStatus.SET, 10.0, 7.5),
+            "RTL_ALT": (ApplyStatus.SET, 15, 25),
+            "OTHER": (ApplyStatus.SET, 1.0, 2.0),
+            "NO_SUCH": (ApplyStatus.SKIPPED, None, None),
+        }
+        assert str(result.rows["RTL_ALT"]) == "RTL_ALT (here RTL_ALT_M) = 25, set"
+        assert "WP_SPD" not in result.extra
+        again = await apply(component, wanted.only(["WPNAV_SPEED", "RTL_ALT"]), renames=RENAMES)
+        assert again.complete
+        assert {row.status for row in again.rows.values()} == {ApplyStatus.UNCHANGED}
+        without = await verify(component, wanted)
+        assert without.rows["WPNAV_SPEED"].reason == "not on this vehicle"
+    assert vehicle.values["WP_SPD"] == 7.5
+    assert vehicle.values["RTL_ALT_M"] == 25
+
+
+@swiftly
+async def test_names_are_looked_up_again_after_a_stage_that_reveals_parameters() -> None:
+    vehicle = copter()
+    wanted = written({"EK1_ENABLE": 1, "EK1_TYPE": 3})
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        made = await prepare(component, wanted, renames=RENAMES)
+        result = await apply(component, wanted, renames=RENAMES)
+        assert result.complete
+        assert {row.status for row in result.rows.values()} == {ApplyStatus.SET}
+        row = result.rows["EK1_TYPE"]
+        assert row.renamed is not None
+        assert (row.renamed.name, row.actual) == ("EK2_GPS_TYPE", 3)
+        assert made.rows["EK1_ENABLE"].target.name == "EK2_ENABLE"
+    assert vehicle.values["EK2_GPS_TYPE"] == 3
+
+
+@swiftly
+async def test_apply_refuses_a_converted_value_that_is_invalid_under_the_name_of_the_file() -> None:
+    vehicle = copter()
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        with pytest.raises(InvalidParameters) as error:
+            await apply(component, written({"RTL_ALT": 1550}), renames=RENAMES)
+        assert error.value.problems == {
+            "RTL_ALT": "as RTL_ALT_M, 15.5 is not a whole number, and the parameter is INT16"
+        }
+        with pytest.raises(UsageError, match="both WP_SPD"):
+            await apply(component, written({"WPNAV_SPEED": 1, "WP_SPD": 1}), renames=RENAMES)
+    assert vehicle.requests["PARAM_SET"] == 0
+
+
+@swiftly
+async def test_fleets_are_set_up_with_renames() -> None:
+    vehicle = copter()
+    wanted = written({"WPNAV_SPEED": 750})
+    async with a_client(vehicle) as client:
+        await client.component()
+        vehicles = list(client.components.values())
+        assert (await apply_all(vehicles, wanted, renames=RENAMES)).complete
+        assert (await verify_all(vehicles, wanted, renames=RENAMES)).is_met
+        assert not (await verify_all(vehicles, wanted)).is_met
+
+
+@swiftly
+async def test_the_plan_of_a_vehicle_names_its_firmware_if_the_file_has_another_one() -> None:
+    async with a_client(copter()) as client:
+        component = await client.component()
+        await wait_for_identity(component)
+        own = component.identity
+        older = replace(own, firmware=0x040507FF)
+        made = await prepare(component, written({"OTHER": 1}, older))
+        assert made.firmware_note == "the file is of ArduPilot 4.5.7, the vehicle has 4.6.0-dev"
+        assert (await verify(component, written({"OTHER": 1}, own))).firmware_note == ""
+
+
+@swiftly
+async def test_the_other_name_is_read_although_the_vehicle_does_not_list_it() -> None:
+    """PX4 lists no parameters that it does not use yet, and takes them by name."""
+    rows = [SimParam(name, ParamType.INT32, 1) for name in ("LISTED", "NEW_NAME")]
+    vehicle = PX4Vehicle(table=rows, not_in_use=["NEW_NAME"])
+    renames = Renames([Rename("OLD_NAME", "NEW_NAME")])
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        made = await prepare(component, written({"OLD_NAME": 2}), renames=renames)
+        assert [(step.name, step.value) for step in made.steps] == [("NEW_NAME", 2)]
