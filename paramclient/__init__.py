@@ -86,7 +86,7 @@ from paramclient.model.params import ParamMap
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import Encoding, Param, ParamType, Trust
 from paramclient.protocol.ftp import DirectoryEntry
-from paramclient.protocol.params.change import Change
+from paramclient.protocol.params.change import Added, Change, Removed
 from paramclient.protocol.params.fetch_result import FetchResult, Policy, Progress
 from paramclient.protocol.params.sampling import Sample
 from paramclient.protocol.params.sync import SyncState
@@ -97,6 +97,7 @@ from paramclient.protocol.wire import Refusal, SigningKey, SigningPolicy, Signin
 from paramclient.version import __version__
 
 __all__ = [
+    "Added",
     "AmbiguousVehicle",
     "AnotherVehicle",
     "CacheError",
@@ -160,6 +161,7 @@ __all__ = [
     "RadioStatus",
     "Refusal",
     "Refused",
+    "Removed",
     "Resynced",
     "Sample",
     "SetResult",
