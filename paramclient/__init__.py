@@ -87,7 +87,7 @@ from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.renames import Rename, Renames
 from paramclient.model.values import Encoding, Param, ParamType, Settable, Trust
 from paramclient.protocol.ftp import DirectoryEntry
-from paramclient.protocol.params.change import Change
+from paramclient.protocol.params.change import Added, Change, Removed
 from paramclient.protocol.params.fetch_result import FetchResult, Policy, Progress
 from paramclient.protocol.params.sampling import Sample
 from paramclient.protocol.params.sync import SyncState
@@ -99,6 +99,7 @@ from paramclient.protocol.wire import Refusal, SigningKey, SigningPolicy, Signin
 from paramclient.version import __version__
 
 __all__ = [
+    "Added",
     "AmbiguousVehicle",
     "AnotherVehicle",
     "CacheError",
@@ -162,6 +163,7 @@ __all__ = [
     "RadioStatus",
     "Refusal",
     "Refused",
+    "Removed",
     "Rename",
     "Renames",
     "Resynced",

@@ -118,6 +118,7 @@ def test_it_passes_on_a_simulated_ardupilot(
         *SET_UPS,
         "set, a fraction for an integer",
         "a group shown and hidden",
+        "a group shown and hidden, no fetch",
         "apply, a group that is hidden",
         "fetch by list, 5% loss, 100 ms",
     )
@@ -126,7 +127,7 @@ def test_it_passes_on_a_simulated_ardupilot(
     printed = capsys.readouterr().out
     found = results(printed)
     assert set(found.values()) <= {"ok", "slower"}, printed
-    assert len(found) == len(EVERYWHERE) + len(SET_UPS) + 5
+    assert len(found) == len(EVERYWHERE) + len(SET_UPS) + 6
     assert code == 0
     assert f"GRIP_ENABLE: {len(before)}, {len(before) + 2}, {len(before)} parameters" in printed
     assert vehicle.values == before

@@ -57,7 +57,7 @@ from paramclient.metadata import Metadata
 from paramclient.model.notation import hash_text, time_text
 from paramclient.model.values import Param, ParamType, Trust, Value, check_name, format_value, type_name
 from paramclient.model.wording import first_of
-from paramclient.protocol.params.change import Change
+from paramclient.protocol.params.change import Added, Change, Removed
 from paramclient.protocol.params.fetch_result import FetchResult, Policy
 from paramclient.protocol.params.sampling import SAMPLE_SIZE, Sample
 
@@ -544,7 +544,8 @@ async def _print_changes_and_events(
     async with aclosing(_merged(changes, events)) as news:
         async for each in news:
             if isinstance(each, Change):
-                if each.old is None and (known is None or each.name in known):
+                is_first = each.old is None and not isinstance(each, Added)
+                if is_first and (known is None or each.name in known):
                     known = known and known - {each.name}
                     continue
                 if wanted and each.name not in wanted:
@@ -596,6 +597,10 @@ def _change_text(change: Change) -> str:
         "none" if param is None else format_value(param.value, param.type)
         for param in (change.old, change.new)
     )
+    if isinstance(change, Added):
+        return f"{change.name}  added: {new}  ({change.by})"
+    if isinstance(change, Removed):
+        return f"{change.name}  removed, was {old}  ({change.by})"
     return f"{change.name}  {old} -> {new}  ({change.by})"
 
 

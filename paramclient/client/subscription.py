@@ -9,7 +9,7 @@ from typing import Final, Generic, TypeVar
 import anyio
 
 from paramclient.errors import ParamClientError
-from paramclient.protocol.params.change import Change
+from paramclient.protocol.params.change import Added, Change
 
 __all__ = ["Changes", "Subscription"]
 
@@ -68,7 +68,8 @@ class Changes(Subscription[Change]):
         """Add a change, or merge it with the queued change of the same parameter."""
         earlier = self._waiting.pop(item.name, None)
         if earlier is not None:
-            item = Change(item.name, earlier.old, item.new, item.by)
+            is_added = isinstance(earlier, Added)
+            item = Change.between(item.name, earlier.old, item.new, item.by, is_added=is_added)
             old, new = item.old, item.new
             if (old is None and new is None) or (old is not None and new is not None and old.same_value(new)):
                 return

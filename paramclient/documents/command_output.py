@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from paramclient.client.events import Contested, Found, Lost, Resynced
 from paramclient.documents.component import ContestDoc
@@ -12,6 +12,7 @@ from paramclient.documents.param import ParamDoc
 from paramclient.model.identity import autopilot_name
 from paramclient.model.notation import hash_text, rounded, time_text, value_json
 from paramclient.model.values import ParamType
+from paramclient.protocol.params.change import Added, Change, Removed
 
 if TYPE_CHECKING:
     from paramclient.client.component import Component
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from paramclient.metadata import ParamInfo
     from paramclient.model.paramset import ParamSet
     from paramclient.model.values import Param, Value
-    from paramclient.protocol.params.change import Change
     from paramclient.protocol.params.fetch_result import FetchResult
     from paramclient.protocol.params.sampling import Sample
 
@@ -191,13 +191,14 @@ class SetsDoneDoc(Document):
 
 
 class ChangeLineDoc(Document):
-    """One line of `watch`: a changed value."""
+    """One line of `watch`: a changed value, or an added or removed parameter."""
 
     time: str
     name: str
     old: Scalar | None
     new: Scalar | None
     by: str
+    kind: Literal["changed", "added", "removed"]
 
     @classmethod
     def of(cls, change: Change, at: float) -> ChangeLineDoc:
@@ -206,7 +207,12 @@ class ChangeLineDoc(Document):
             None if param is None else value_json(param.value, param.type)
             for param in (change.old, change.new)
         )
-        return cls(time=time_text(at), name=change.name, old=old, new=new, by=change.by)
+        kind: Literal["changed", "added", "removed"] = "changed"
+        if isinstance(change, Removed):
+            kind = "removed"
+        elif isinstance(change, Added):
+            kind = "added"
+        return cls(time=time_text(at), name=change.name, old=old, new=new, by=change.by, kind=kind)
 
 
 class EventLineDoc(Document):

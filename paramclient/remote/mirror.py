@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from paramclient.model.values import Param, Trust
-from paramclient.protocol.params.change import Change
+from paramclient.protocol.params.change import Added, Change
 from paramclient.protocol.params.table import NAMES_MAX
 
 __all__ = ["LOADING_CHANGES_MAX", "Mirror"]
@@ -93,9 +93,11 @@ class Mirror:
         if new is None:
             self._told.pop(name, None)
             self.params.pop(name, None)
-            return None if old is None else Change(name, old, None, by)
+            return None if old is None else Change.between(name, old, None, by)
         self._told[name] = self.params[name] = new
-        return None if old is not None and old.same_value(new) else Change(name, old, new, by)
+        if old is not None and old.same_value(new):
+            return None
+        return Change.between(name, old, new, by, is_added=isinstance(change, Added))
 
     def confirm(self, param: Param) -> None:
         """Update the trust of a parameter from a response, if the value is equal."""
@@ -129,9 +131,10 @@ class Mirror:
 
 
 def _differences(before: Mapping[str, Param], now: Mapping[str, Param]) -> list[Change]:
-    gone = [Change(name, old, None) for name, old in before.items() if name not in now]
+    """Return the changes between two loads. Names that only the later one has are `Added` to a table."""
+    gone = [Change.between(name, old, None) for name, old in before.items() if name not in now]
     moved = [
-        Change(name, before.get(name), new)
+        Change.between(name, before.get(name), new, is_added=bool(before))
         for name, new in now.items()
         if (old := before.get(name)) is None or not old.same_value(new)
     ]

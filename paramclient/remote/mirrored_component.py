@@ -118,11 +118,12 @@ class MirroredComponent:
             asker: name of this client at the service, for changes by its own writes.
         """
         old, new, by = event["old"], event["new"], str(event["by"])
-        change = Change(
+        change = Change.between(
             str(event["name"]),
             None if old is None else param_of(old, event["name"]),
             None if new is None else param_of(new, event["name"]),
             "us" if asker and by == f"us for {asker}" else by,
+            is_added=event.get("kind") == "added",
         )
         if (made := self.mirror.take(event["seq"], change)) is not None:
             self._publish(made)

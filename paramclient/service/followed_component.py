@@ -17,7 +17,7 @@ from paramclient.documents.param import ParamDoc
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.model.params import as_params, held_of
 from paramclient.model.values import Param, Trust
-from paramclient.protocol.params.change import Change
+from paramclient.protocol.params.change import Added, Change
 
 if TYPE_CHECKING:
     from paramclient.metadata import Metadata
@@ -185,7 +185,7 @@ class FollowedComponent:
             if new.trust is not Trust.CACHED:
                 self._heard_at[name] = _now()
         self._texts.pop(name, None)
-        self._publish_change(old, new, by)
+        self._publish_change(old, new, by, is_added=isinstance(change, Added))
 
     def handle_end(self, error: ParamClientError | None) -> None:
         """Handle the end of its events: it was removed, or its client is closed."""
@@ -228,13 +228,17 @@ class FollowedComponent:
                 self._heard_at[name] = now
         self._texts.clear()
 
-    def _publish_change(self, old: Param | None, new: Param | None, by: str) -> None:
+    def _publish_change(
+        self, old: Param | None, new: Param | None, by: str, *, is_added: bool = False
+    ) -> None:
+        kind = "removed" if new is None else "added" if is_added else "changed"
         heard_at = None if new is None else self._heard_at.get(new.name)
 
         def write() -> str:
             before = "null" if old is None else param_json(old, None)
             after = "null" if new is None else param_json(new, heard_at)
-            return f'"name":{json.dumps(name)},"old":{before},"new":{after},"by":{json.dumps(by)}'
+            members = f'"name":{json.dumps(name)},"old":{before},"new":{after},"by":{json.dumps(by)}'
+            return f'{members},"kind":"{kind}"'
 
         known = new or old
         assert known is not None, "a change has an old or a new value"

@@ -644,11 +644,17 @@ def test_watch_prints_lines_of_json_as_values_change(live_command: Command, tmp_
         done = live_command("set", url, "MC_PITCH_P", 7, "MC_ROLL_P", "nan", "--force", "--no-cache")
         assert done.code == 0
         change = strict(line_of(watching.stdout))
-        assert list(change) == ["time", "name", "old", "new", "by"]
+        assert list(change) == ["time", "name", "old", "new", "by", "kind"]
         at = datetime.fromisoformat(change.pop("time"))
         assert before.timestamp() - 0.001 <= at.timestamp() <= time.time()
         assert at.utcoffset() is not None
-        assert change == {"name": "MC_ROLL_P", "old": 4.0, "new": "NaN", "by": "vehicle"}
+        assert change == {
+            "name": "MC_ROLL_P",
+            "old": 4.0,
+            "new": "NaN",
+            "by": "vehicle",
+            "kind": "changed",
+        }
         watching.send_signal(signal.SIGINT)
         outcome = ended(watching)
     assert (outcome.code, outcome.out, outcome.err) == (130, "", "")
@@ -687,6 +693,22 @@ def test_watch_prints_changes_since_the_cache_was_written(
     assert watched.code == 0
     change = watched.json
     assert (change["name"], change["old"], change["new"]) == ("B", 2, 3)
+
+
+def test_watch_prints_added_and_removed_parameters(live_command: Command) -> None:
+    def line_about(name: str) -> str:
+        while (line := line_of(watching.stdout).partition("  ")[2]).split()[0] != name:
+            pass
+        return line
+
+    with simulated("ardupilot") as url, process("watch", url, "--no-cache") as watching:
+        assert line_of(watching.stderr) == "watching 1382 parameters of 1/1 ardupilot\n"
+        assert live_command("set", url, "EK2_ENABLE", 1, "--no-cache").code == 0
+        assert line_about("EK2_GPS_TYPE") == "EK2_GPS_TYPE  added: 0  (vehicle)\n"
+        assert live_command("set", url, "EK2_ENABLE", 0, "--no-cache").code == 0
+        assert line_about("EK2_GPS_TYPE") == "EK2_GPS_TYPE  removed, was 0  (vehicle)\n"
+        watching.send_signal(signal.SIGTERM)
+        ended(watching)
 
 
 def vehicle_lost_and_found() -> PX4Vehicle:
@@ -736,7 +758,7 @@ async def test_watch_prints_events_of_the_vehicle(
     assert lost == {"event": "lost", **where, "silence_s": pytest.approx(5.0, abs=0.1)}
     assert found == {"event": "found", **where, "silence_s": pytest.approx(9.0, abs=1.5)}
     assert rebooted == {"event": "rebooted", **where}
-    assert change == {"name": "B", "old": 2, "new": 3, "by": "vehicle"}
+    assert change == {"name": "B", "old": 2, "new": 3, "by": "vehicle", "kind": "changed"}
     assert resynced == {"event": "resynced", **where, "changed": ["B"], "hash": resynced["hash"]}
     assert re.fullmatch("[0-9a-f]{8}", resynced["hash"])
 

@@ -12,7 +12,9 @@ import anyio
 import pytest
 
 from paramclient import (
+    Added,
     CacheError,
+    Change,
     ClientClosed,
     Component,
     Event,
@@ -25,6 +27,7 @@ from paramclient import (
     ParamClient,
     Policy,
     Rebooted,
+    Removed,
     Resynced,
     SyncState,
     Trust,
@@ -162,6 +165,43 @@ async def test_an_interval_that_is_given_goes_for_lists_too() -> None:
         with anyio.fail_after(21.0):
             assert (await anext(changes)).name == "PARAM_01"
             assert await anext(events) == Resynced(component, ("PARAM_01",), None)
+
+
+@swiftly
+@pytest.mark.parametrize("ftp", [True, False], ids=["file", "list"])
+async def test_parameters_that_appear_are_added_and_can_be_set(path: Path, ftp: bool) -> None:
+    group = {f"GRIP_{number}": number for number in range(5)}
+    vehicle = ArduPilotVehicle(
+        table={**VALUES, "GRIP_ENABLE": 0}, groups={"GRIP_ENABLE": group}, ftp=ftp, live=()
+    )
+    async with a_client(vehicle, cache=path) as client:
+        component = await client.component()
+        await component.fetch_all()
+        changes = component.changes()
+        await component.set("GRIP_ENABLE", 1)
+        assert (await component.set("GRIP_2", 20)).status == "accepted"
+        with anyio.fail_after(3.0):
+            told = [await anext(changes)]
+            while len(told) < 6:
+                each = await anext(changes)
+                told += [] if each.name in {every.name for every in told} else [each]
+        assert [(type(each), each.name) for each in told][:2] == [(Change, "GRIP_ENABLE"), (Added, "GRIP_2")]
+        assert {each.name for each in told if isinstance(each, Added)} == group.keys()
+        await until(lambda: component.sync_state is SyncState.SYNCED)
+        assert bits(component.params) == bits(vehicle.params)
+        await asyncio.sleep(1.0)
+        await component.set("GRIP_ENABLE", 0)
+        with anyio.fail_after(3.0):
+            while not isinstance(gone := await anext(changes), Removed):
+                pass
+        assert gone.new is None
+        await until(lambda: component.sync_state is SyncState.SYNCED)
+        assert component.params.keys() == vehicle.params.keys()
+        key = component.identity.key
+    with ParamCache(path) as cache:
+        kept = cache.load(key, 1)
+    assert kept is not None
+    assert (kept.count, kept.params.keys()) == (len(VALUES) + 1, vehicle.params.keys())
 
 
 @swiftly

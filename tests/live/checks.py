@@ -14,7 +14,18 @@ from typing import Final
 
 import anyio
 
-from paramclient import Component, FetchResult, Ftp, ParamCache, ParamClient, Rebooted
+from paramclient import (
+    Added,
+    Change,
+    Changes,
+    Component,
+    FetchResult,
+    Ftp,
+    ParamCache,
+    ParamClient,
+    Rebooted,
+    Removed,
+)
 from paramclient.client.events import Events
 from paramclient.client.local import local
 from paramclient.errors import (
@@ -37,7 +48,7 @@ from paramclient.protocol.wire import AUTOPILOT_VERSION_ID, message_name
 from paramclient.provision import MISSING, ApplyStatus, apply, restore, verify
 from tests.live.choice import another_value
 from tests.live.journal import check_disarmed
-from tests.live.relay import FILE_TRANSFER_ID, LIST_REQUEST_ID, Conditions
+from tests.live.relay import CLEAN, FILE_TRANSFER_ID, LIST_REQUEST_ID, Conditions
 from tests.live.session import HEARING_TIMEOUT, Check, CheckFailed, Measured, Session, Skip
 
 __all__ = ["checks"]
@@ -54,7 +65,11 @@ READS: Final = 10
 FRACTION: Final = 0.1
 """What is added to a float32 parameter so that its value has to be rounded."""
 SEEN_TIMEOUT: Final = 3.0
-"""Seconds in which another session has to learn of a change."""
+"""Seconds in which another session has to learn of a change, and this one of a group."""
+COLLECTED_AFTER: Final = 0.5
+"""Seconds without a further parameter of a group, after which all are told."""
+SETTLED_AFTER: Final = 1.5
+"""Seconds between a fetch and a switch: the next fetch begins at least 1 s after the last one."""
 PARAMETER_FILE: Final = "@PARAM/param.pck"
 HEARTBEATS: Final = 15
 """Datagrams beside the blocks of a file that comes once: banner, heartbeats, and answers to requests."""
@@ -136,6 +151,15 @@ def checks(*, reboots: bool) -> Iterator[Check]:
         writes=True,
         kinds=("ardupilot",),
     )
+    for name, conditions in (("", CLEAN), (", without the file", Conditions(refuses_files=True))):
+        yield Check(
+            f"a group shown and hidden, no fetch{name}",
+            partial(follow_group, conditions=conditions),
+            "its members added and removed in changes()",
+            {"ardupilot": 2.0},
+            writes=True,
+            kinds=("ardupilot",),
+        )
     yield Check(
         "set, a change too small to save",
         set_small,
@@ -573,6 +597,56 @@ async def show_group(session: Session) -> Measured:
             await session.check_fetched(vehicle, hidden)
             return Measured(f"{switch}: {whole.count}, {shown.count}, {hidden.count} parameters")
     raise Skip(f"none of these shows a group: {', '.join(tried)}" if tried else "no switch of a group is off")
+
+
+async def follow_group(session: Session, *, conditions: Conditions = CLEAN) -> Measured:
+    """Switch a group on and off; `changes()` must tell of it without a fetch."""
+    tried: list[str] = []
+    async with session.under(conditions), session.client() as vehicle:
+        await vehicle.fetch_all(timeout=SLOWEST_FETCH)
+        before = vehicle.params.keys()
+        for switch in session.choice.groups:
+            await anyio.sleep(SETTLED_AFTER)
+            changes = vehicle.changes()
+            began = time.monotonic()
+            await session.journal.set(vehicle, switch, 1)
+            added = await collect(changes, Added)
+            seconds = time.monotonic() - began - COLLECTED_AFTER
+            if not added:
+                tried.append(switch)
+                await put_back(session, vehicle)
+                continue
+            count, names = vehicle.count, set(added)
+            await put_back(session, vehicle)
+            removed = await collect(changes, Removed)
+            if names != removed.keys() or not vehicle.params.keys() <= before | names:
+                raise CheckFailed(f"{switch}: {sorted(names)} added, {sorted(removed)} removed")
+            await session.journal.set(vehicle, switch, 1)
+            name, param = next(iter(added.items()))
+            held = await vehicle.set(name, param.value)
+            await put_back(session, vehicle)
+            if held.status != "accepted":
+                raise CheckFailed(f"{name}, just shown, was set: {held}")
+            told = f"{switch}: {len(added)} added in {seconds:.2f} s, {count} parameters, and removed"
+            return Measured(told, seconds)
+    raise Skip(f"none of these shows a group: {', '.join(tried)}" if tried else "no switch of a group is off")
+
+
+async def collect(changes: Changes, kind: type[Change]) -> dict[str, Param]:
+    """Return the parameters in changes of this kind, until none has come for a while."""
+    found: dict[str, Param] = {}
+    timeout = SEEN_TIMEOUT
+    while True:
+        change = None
+        with anyio.move_on_after(timeout):
+            while not isinstance(change := await anext(changes), kind):
+                pass
+        if change is None or not isinstance(change, kind):
+            return found
+        param = change.new or change.old
+        assert param is not None, "a change has an old or a new value"
+        found[change.name] = param
+        timeout = COLLECTED_AFTER
 
 
 async def set_small(session: Session) -> Measured:

@@ -14,9 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from paramclient import (
+    Added,
     AnotherVehicle,
     CacheError,
     Change,
+    Changes,
     CommandRefused,
     Component,
     InvalidParameters,
@@ -27,6 +29,7 @@ from paramclient import (
     ParamClientError,
     ParamType,
     Refused,
+    Removed,
     Trust,
     TypeMismatch,
     UnknownParameter,
@@ -332,7 +335,39 @@ def test_a_first_table_is_no_change_and_a_later_one_tells_what_is_different() ->
         Change("B", param(2, name="B"), param(5, name="B")),
         Change("D", None, param(6, name="D")),
     ]
+    assert [type(each) for each in changes] == [Removed, Change, Added]
     assert list(mirror.params) == ["A", "B", "D"]
+
+
+def test_what_comes_and_goes_is_told_as_such() -> None:
+    mirror = Mirror()
+    loaded(mirror, 1)
+    assert type(mirror.take(2, Change("A", None, param(1)))) is Change, "the service receives the table"
+    assert type(mirror.take(3, Added("B", None, param(1, name="B")))) is Added
+    assert type(mirror.take(4, Added("B", None, param(2, name="B")))) is Change, "it is here"
+    assert type(mirror.take(5, Change("B", param(2, name="B"), None))) is Removed
+
+
+def test_a_slow_listener_receives_the_sum_of_what_came_and_went() -> None:
+    changes = Changes()
+    for change in (
+        Added("A", None, param(1)),
+        Change("A", param(1), param(2), "us"),
+        Added("B", None, param(1, name="B")),
+        Removed("B", param(1, name="B"), None),
+        Removed("C", param(1, name="C"), None),
+        Added("C", None, param(2, name="C")),
+        Change("D", None, param(1, name="D")),
+        Change("D", param(1, name="D"), param(2, name="D")),
+    ):
+        changes.push(change)
+    told = [changes._take() for _ in range(4)]
+    assert [each and (type(each), each.name) for each in told] == [
+        (Added, "A"),
+        (Change, "C"),
+        (Change, "D"),
+        None,
+    ]
 
 
 def test_a_change_of_trust_alone_is_none() -> None:

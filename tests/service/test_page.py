@@ -395,6 +395,18 @@ def test_what_others_change_is_marked_and_takes_no_focus_away(sight: Sight, benc
 
 
 @needs_browser
+def test_parameters_that_come_and_go_are_announced(visit: Callable[..., Sight], bench: Bench) -> None:
+    sight = visit(bench.url, "ArduPilot 2/1")
+    sight.find("EK2_GPS_TYPE")
+    bench.ask("PATCH", "/components/2/1/params?link=ardupilot", {"values": {"EK2_ENABLE": 1}})
+    expect(sight.row("EK2_GPS_TYPE")).to_have_class(re.compile("news"))
+    expect(sight.spoken).to_contain_text("52 parameters were added.")
+    bench.ask("PATCH", "/components/2/1/params?link=ardupilot", {"values": {"EK2_ENABLE": 0}})
+    expect(sight.row("EK2_GPS_TYPE")).to_have_count(0)
+    expect(sight.spoken).to_contain_text("52 parameters were removed.")
+
+
+@needs_browser
 def test_a_stale_edit_says_so_in_the_review(sight: Sight, bench: Bench) -> None:
     sight.stage("MC_ROLLRATE_P", "0.2")
     bench.do(bench.px4.set_param, "MC_ROLLRATE_P", 0.25)

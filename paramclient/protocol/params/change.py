@@ -1,11 +1,11 @@
-"""A change of one parameter in a table."""
+"""Changes of the parameters in a table: values, added and removed parameters."""
 
 from __future__ import annotations
 
 from paramclient.model.params import Held, held_of, param_of
 from paramclient.model.values import Param, Value
 
-__all__ = ["Change"]
+__all__ = ["Added", "Change", "Removed"]
 
 _new = tuple.__new__  # the constructor of a tuple ends in this call and takes several times as long
 
@@ -13,7 +13,8 @@ _new = tuple.__new__  # the constructor of a tuple ends in this call and takes s
 class Change(tuple[str, Held | None, Held | None, str, Value | None, Value | None]):
     """One parameter that appeared, changed its value or was removed.
 
-    Each first value makes a change; the parameters in it are therefore built only on access.
+    Each first value makes a change; the parameters in it are therefore built only on access. `Added` and
+    `Removed` are the changes of the table itself.
 
     Args:
         name: param_id.
@@ -29,6 +30,20 @@ class Change(tuple[str, Held | None, Held | None, str, Value | None, Value | Non
         before, now = (None if each is None else held_of(each) for each in (old, new))
         defaults = (None if each is None else each.default for each in (new, old))
         return _new(cls, (name, before, now, by, *defaults))
+
+    @staticmethod
+    def between(
+        name: str, old: Param | None, new: Param | None, by: str = "vehicle", *, is_added: bool = False
+    ) -> Change:
+        """Return the change of a parameter as the class that it belongs to.
+
+        Args:
+            name, old, new, by: as for `Change`.
+            is_added: whether a parameter without `old` is new on the vehicle, rather than received first.
+        """
+        if new is None:
+            return Removed(name, old, new, by)
+        return (Added if is_added and old is None else Change)(name, old, new, by)
 
     def __getnewargs__(self) -> tuple[str, Param | None, Param | None, str]:
         return self.name, self.old, self.new, self.by
@@ -63,4 +78,21 @@ class Change(tuple[str, Held | None, Held | None, str, Value | None, Value | Non
         return hash(self[:4])
 
     def __repr__(self) -> str:
-        return f"Change(name={self.name!r}, old={self.old!r}, new={self.new!r}, by={self.by!r})"
+        members = f"name={self.name!r}, old={self.old!r}, new={self.new!r}, by={self.by!r}"
+        return f"{type(self).__name__}({members})"
+
+
+class Added(Change):
+    """A parameter that the vehicle has and the table lacked when it was complete last.
+
+    A value that a `set` of *_ENABLE reveals is one, and so is a parameter outside the vehicle's list that is
+    read by name. The first values of a table that was never complete are plain changes.
+    """
+
+    __slots__ = ()
+
+
+class Removed(Change):
+    """A parameter that the vehicle no longer has."""
+
+    __slots__ = ()

@@ -196,6 +196,7 @@ class Sync(Machine):
         self._check_at = math.inf
         self._checked_at = -math.inf
         self._is_checking = False
+        self._has_count_moved = False  # since the last complete fetch
         self._volatile_at = -math.inf  # when values outside the hash may be read again
         self._reads_volatile = False  # after a match of the requested hash
         self._resync: Fetch | None = None
@@ -258,9 +259,13 @@ class Sync(Machine):
             self.announced = replace(announced, at=_EXPIRED)
 
     def count_moved(self, now: float) -> None:
-        """Process a changed count: the table has changed."""
+        """Process a changed count: the table has changed.
+
+        Without a hash, the table is fetched, by list where it does not come as a file.
+        """
         self._mark_unsynced()
         if self._is_kept_up:
+            self._has_count_moved = not self.expects_hash
             pause = 0.0 if self.expects_hash else self._check_pace.shortest_pause
             self._check_at = min(self._check_at, max(now, self._checked_at + pause))
 
@@ -302,6 +307,7 @@ class Sync(Machine):
         if not complete:
             self._mark_unsynced()
         self.synced = complete
+        self._has_count_moved &= not complete
         self._was_synced |= complete or result.has_moved
         self._moved_by_us_alone = result.hash is not None
         self._settled(now, now if result.hash is not None else now - result.elapsed)
@@ -320,7 +326,7 @@ class Sync(Machine):
         self.announced = None
         self._context.has_hash = None
         self.synced = self._was_synced = self._moved_by_us_alone = False
-        self._was_marked_unsynced = False
+        self._was_marked_unsynced = self._has_count_moved = False
         self.stop()
 
     # requests
@@ -451,11 +457,12 @@ class Sync(Machine):
         elif self.expects_hash:
             self._reads_volatile = self._is_kept_up
             self.ask(now)
-        elif self._check_at < math.inf:
+        elif self._check_at < math.inf or self._has_count_moved:
             if self._files.is_in_use(now):
                 self._check_at = min(self._check_at, now + FILE_IN_USE_RETRY)
             else:
-                self._begin_resync(now, Check(may_list=self._check_pace.may_list))
+                may_list = self._check_pace.may_list or self._has_count_moved
+                self._begin_resync(now, Check(may_list=may_list))
 
     def _plan_check(self, now: float, known_at: float) -> None:
         """Plan the next check to end an interval after the moment of the known table."""
@@ -513,6 +520,9 @@ class Sync(Machine):
             self._host.end_fetch(fetch, fetch.ended_at)
             if isinstance(fetch.error, FileTransferError) and fetch.error.code in BUSY:
                 self._check_at = min(self._check_at, fetch.ended_at + FILE_IN_USE_RETRY)
+            elif self._has_count_moved:
+                pause = max(GAP_CHECK_INTERVAL, self._check_pace.shortest_pause)
+                self._check_at = min(self._check_at, fetch.ended_at + pause)
 
         if fetch.done:
             ended()

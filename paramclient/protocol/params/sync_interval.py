@@ -108,7 +108,8 @@ class CheckPace:
     @property
     def shortest_pause(self) -> float:
         """Seconds from the end of one fetch to a check, at least, for any reason."""
-        return max(PAUSE_MIN, self._time * (1.0 / CHOSEN_SHARE - 1.0))
+        times = self._times.get("ftp") or self._times.get("stream") or (0.0,)
+        return max(PAUSE_MIN, median_low(times) * (1.0 / CHOSEN_SHARE - 1.0))
 
     @property
     def _time(self) -> float:

@@ -39,7 +39,7 @@ from paramclient.model.values import (
     known_type,
 )
 from paramclient.protocol.ftp.param_pck import Pack
-from paramclient.protocol.params.change import Change
+from paramclient.protocol.params.change import Added, Change, Removed
 from paramclient.protocol.params.change_origin import is_ours
 from paramclient.protocol.params.hash_exclusions import hash_of
 from paramclient.protocol.wire import NO_INDEX, PARAMETERS_MAX, ParamValue
@@ -144,6 +144,7 @@ class Table:
         self.volatile: frozenset[str] = frozenset()
         self.volatile_known = False
         self.complete = False
+        self._was_complete = False  # before the count changed
         self.displaced: set[str] = set()
         self.doubts = 0
         self.passed_over: dict[str, frozenset[int]] = {}
@@ -232,7 +233,7 @@ class Table:
             self.dirty[name] = by
             if self._hash is not None:
                 self._invalidate_hash(name)
-            return _new(Change, (name, None, new, by, None, None))
+            return _new(self._kind_of_first, (name, None, new, by, None, None))
         return self._update(name, old, message, by, moment, is_exact=is_exact)
 
     def with_known_type(self, message: ParamValue) -> ParamValue:
@@ -350,7 +351,8 @@ class Table:
             return None
         self._record_change(name, old, "vehicle", before, seen_at)
         self._invalidate_hash(name)
-        return _new(Change, (name, old, new, "vehicle", initial, before))
+        kind = self._kind_of_first if old is None else Change
+        return _new(kind, (name, old, new, "vehicle", initial, before))
 
     def take_pack(self, pack: Pack, moment: float, newer: Collection[str], *, start: int = 0) -> list[Change]:
         """Store the entries of a packed parameter file and return the changes.
@@ -506,6 +508,7 @@ class Table:
     def move(self, count: int) -> None:
         """Take a changed count: all indices become invalid."""
         if self.count is not None:
+            self._was_complete |= self.complete
             self.complete = False
             self.passed_over.clear()
             for name, held in self._held.items():
@@ -590,12 +593,17 @@ class Table:
         self.volatile = frozenset()
         self.volatile_known = False
         self.count = None
-        self.complete = False
+        self.complete = self._was_complete = False
         return changes
 
     def forget_defaults(self) -> None:
         """Remove the defaults: they belong to another firmware."""
         self._defaults.clear()
+
+    @property
+    def _kind_of_first(self) -> type[Change]:
+        """The class of the change by the first value of a name."""
+        return Added if self.complete or self._was_complete else Change
 
     @property
     def is_provable(self) -> bool:
@@ -707,7 +715,7 @@ class Table:
 
     def _remove(self, names: Collection[str]) -> list[Change]:
         """Remove these names."""
-        changes = []
+        changes: list[Change] = []
         for name in names:
             held = self._held.pop(name)
             default = self._defaults.pop(name, None)
@@ -721,7 +729,7 @@ class Table:
                     self.gone[name] = self._latest
             if self._hash is not None:
                 self._invalidate_hash(name)
-            changes.append(_new(Change, (name, held, None, "vehicle", None, default)))
+            changes.append(_new(Removed, (name, held, None, "vehicle", None, default)))
         self._room.taken -= len(changes)
         return changes
 

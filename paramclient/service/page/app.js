@@ -262,21 +262,29 @@ store.on("armed", (component) =>
 );
 store.on("lost", (component) => announce(`${nameOf(component)} ${component.is_lost ? "is lost" : "is heard again"}.`));
 
+/** Describes news of one or several rows in one sentence for each kind. */
+function wordsOf(news) {
+  const of = (kind) => news.filter((each) => each.kind === kind);
+  const said = ["changed", "added", "removed"].map((kind) => {
+    const all = of(kind);
+    const [first] = all;
+    if (all.length > 1) return `${all.length} parameters were ${kind}${kind === "changed" ? " by others" : ""}.`;
+    if (!first) return "";
+    return kind === "changed" ? `${first.name} is ${first.text} now, by ${first.by}.` : `${first.name} was ${kind}.`;
+  });
+  return said.filter(Boolean).join(" ");
+}
+
 const news = [];
 store.on("news", ({ key, row }) => {
   if (key !== store.selected) return;
   if (!news.length) {
     setTimeout(() => {
-      const [first] = news;
-      announce(
-        news.length === 1
-          ? `${first.name} is ${first.text} now, by ${first.news?.by}.`
-          : `${news.length} parameters were changed by others.`,
-      );
+      announce(wordsOf(news));
       news.length = 0;
     }, 1000);
   }
-  news.push(row);
+  news.push({ name: row.name, text: row.text, ...row.news });
 });
 setInterval(() => {
   for (const table of store.tables.values())

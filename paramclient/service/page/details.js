@@ -4,7 +4,7 @@ import { at, get } from "./api.js";
 import { button, byId, el, isNarrow } from "./dom.js";
 import { editorOf } from "./editor.js";
 import { authorOf, store } from "./store.js";
-import { defaultOf, meaningOf, moment, numberText, parse, rangeOf, span, textOf } from "./values.js";
+import { defaultOf, meaningOf, moment, newsText, numberText, parse, rangeOf, span, textOf } from "./values.js";
 
 const MOST_HISTORY = 20;
 const TRUST = {
@@ -108,7 +108,7 @@ export class Details {
       !row.news
         ? ""
         : el("em", {
-            text: `was ${row.news.before}, changed ${span((Date.now() - row.news.at) / 1000)} ago by ${row.news.by}`,
+            text: newsText(row.news, `${span((Date.now() - row.news.at) / 1000)} ago`),
           }),
     );
     const standard = defaultOf(known);

@@ -4,7 +4,7 @@
  */
 
 import { byId, el, isNarrow, setAttribute, setText } from "./dom.js";
-import { defaultOf, textOf } from "./values.js";
+import { defaultOf, newsText, textOf } from "./values.js";
 
 const SPARE = 10;
 const SETTLED = 120;
@@ -157,7 +157,9 @@ export class Grid {
     setAttribute(
       element,
       "title",
-      row.news ? `${row.news.before} → ${textOf(row.document)}, changed by ${row.news.by}` : null,
+      row.news?.kind === "changed"
+        ? `${row.news.before} → ${textOf(row.document)}, changed by ${row.news.by}`
+        : (row.news?.kind ?? null),
     );
   }
 
@@ -226,7 +228,7 @@ function said(row, pending) {
   const words = [
     pending && `staged: ${pending.text}`,
     row.isChanged && "changed from default",
-    row.news && `was ${row.news.before}, changed by ${row.news.by}`,
+    row.news && newsText(row.news),
     row.document.trust === "cached" && "from the cache, not confirmed",
   ];
   return words.filter(Boolean).join("; ") || null;

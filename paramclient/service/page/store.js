@@ -97,7 +97,7 @@ class Table {
     for (const event of early) this.change(event);
   }
 
-  /** Applies a change to the table; returns the row if it has changed, or null. */
+  /** Applies a change to the table; returns the row if it was changed, added or removed, or null. */
   change(event) {
     if (!this.isLoaded) {
       this.early?.push(event); // without a load in progress, the next one includes the event
@@ -108,19 +108,23 @@ class Table {
     if (event.new === null) {
       this.rows.delete(event.name);
       this.forget();
-      return null;
+      if (row) row.news = { at: Date.now(), by: authorOf(event.by), kind: "removed" };
+      return row ?? null;
     }
     const document = { name: event.name, ...event.new };
     if (!row) {
-      this.rows.set(event.name, new Row(document));
+      const added = new Row(document);
+      this.rows.set(event.name, added);
       this.forget();
-      return null;
+      if (event.kind !== "added") return null;
+      added.news = { at: Date.now(), by: authorOf(event.by), kind: "added" };
+      return added;
     }
     const before = row.text;
     const isTrust = event.old && sameText(textOf(event.old), textOf(event.new), row.type);
     row.take(document);
     if (isTrust || sameText(before, row.text, row.type)) return null;
-    row.news = { at: Date.now(), by: authorOf(event.by), before };
+    row.news = { at: Date.now(), by: authorOf(event.by), kind: "changed", before };
     return row;
   }
 

@@ -174,4 +174,10 @@ export function moment(at) {
   return when.toDateString() === new Date().toDateString() ? clock : `${when.toLocaleDateString()} ${clock}`;
 }
 
+/** Describes what happened to a parameter; `when` is such as "5 s ago". */
+export function newsText(news, when = "") {
+  const ago = when && ` ${when}`;
+  return news.kind === "changed" ? `was ${news.before}, changed${ago} by ${news.by}` : `${news.kind}${ago}`;
+}
+
 export const many = (count, what) => `${count} ${what}${count === 1 ? "" : "s"}`;
