@@ -21,6 +21,7 @@ import anyio
 
 from paramclient.errors import UsageError
 from paramclient.protocol.params.change_origin import ASKER_LENGTH_MAX
+from paramclient.service.body_limits import METADATA_BYTES_MAX, SESSION_BODY_BYTES_MAX
 from paramclient.service.body_memory import BodyMemory, BodyReservation
 from paramclient.service.client_address import is_in_networks, is_loopback, parse_network
 from paramclient.service.log_limit import LogLimit
@@ -34,7 +35,6 @@ from paramclient.service.quota import (
 from paramclient.service.request import (
     BEARER_CHALLENGE,
     HOST_PATTERN,
-    METADATA_BYTES_MAX,
     SESSION_PATH,
     Request,
     RequestDenied,
@@ -58,8 +58,6 @@ Receive: TypeAlias = Callable[[], Awaitable[Message]]
 Send: TypeAlias = Callable[[Message], Awaitable[None]]
 App: TypeAlias = Callable[[Scope, Receive, Send], Awaitable[None]]
 
-SESSION_BODY_BYTES_MAX: Final = 1_024
-"""Maximum size in bytes of a body that starts a session: the only body accepted without a token."""
 BODY_TIMEOUT: Final = 60.0
 """Timeout in seconds for receiving a body."""
 SEND_CHUNK_BYTES: Final = 65_536

@@ -6,14 +6,10 @@ from collections import Counter
 from types import TracebackType
 from typing import Final
 
+from paramclient.service.body_limits import HOLDER_BODY_BYTES_MAX, TOTAL_BODY_BYTES_MAX
 from paramclient.service.request import RequestDenied
 
-__all__ = ["TOTAL_BODY_BYTES_MAX", "HOLDER_BODY_BYTES_MAX", "BodyMemory", "BodyReservation"]
-
-TOTAL_BODY_BYTES_MAX: Final = 64 * 1024 * 1024
-"""Maximum number of bytes of all bodies that are received or whose requests are in progress."""
-HOLDER_BODY_BYTES_MAX: Final = 16 * 1024 * 1024
-"""Maximum number of bytes of the bodies of one holder. Four holders can occupy the total."""
+__all__ = ["BodyMemory", "BodyReservation"]
 
 
 class BodyMemory:

@@ -30,8 +30,8 @@ from paramclient.provision.vehicle_params import (
     load_state_before_apply,
     set_maker,
 )
+from paramclient.service.body_limits import PARAM_FILE_BYTES_MAX
 from paramclient.service.problems import ServiceError
-from paramclient.service.request import PARAM_FILE_BYTES_MAX
 from paramclient.service.request_body import check_line_lengths, check_separators
 from paramclient.service.route_context import Bits, ValueInput, parse_value, resolve_value
 
@@ -48,7 +48,6 @@ __all__ = [
     "Number",
     "Patterns",
     "Source",
-    "PARAM_FILE_BYTES_MAX",
     "FILE_NAME_LENGTH_MAX",
     "PATTERNS_MAX",
     "REQUEST_VALUES_MAX",

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final, TypeAlias
 from urllib.parse import unquote
 
+from paramclient.service.body_limits import BODY_BYTES_MAX_BY_PATH, PLAIN_BODY_BYTES_MAX
 from paramclient.service.client_address import (
     Network,
     client_behind,
@@ -20,8 +21,6 @@ from paramclient.service.client_address import (
 __all__ = [
     "BEARER_CHALLENGE",
     "HOST_PATTERN",
-    "METADATA_BYTES_MAX",
-    "PARAM_FILE_BYTES_MAX",
     "SESSION_PATH",
     "RequestDenied",
     "Request",
@@ -36,16 +35,6 @@ HEADER_BYTES_MAX: Final = 16 * 1024
 """Maximum size of all headers of a request in bytes. Browsers send about 1 kB."""
 TARGET_BYTES_MAX: Final = 8 * 1024
 """Maximum size of path and query in bytes."""
-PLAIN_BODY_BYTES_MAX: Final = 64 * 1024
-"""Maximum size in bytes of a body without values or files."""
-VALUES_BODY_BYTES_MAX: Final = 3 * 1024 * 1024
-"""Maximum size in bytes of a body with values, or with files in JSON: the largest file in base64, and other
-members."""
-PARAM_FILE_BYTES_MAX: Final = 2 * 1024 * 1024
-"""Maximum size of a parameter file in bytes: ten thousand parameters in the longest format. Parsing a larger
-file would take half of the processor for more than some seconds."""
-METADATA_BYTES_MAX: Final = 8 * 1024 * 1024
-"""Maximum size of a metadata file in bytes: ArduPilot's file of one vehicle has half of it."""
 
 SESSION_PATH: Final = "/api/v1/session"
 """Path of the sessions of browsers."""
@@ -63,16 +52,6 @@ UNIQUE_HEADERS: Final = (
     *(b"sec-fetch-site", b"sec-fetch-mode", b"sec-fetch-dest", b"x-asker"),
 )
 """Headers that must not be repeated: the application could use another value than the access checks."""
-BODY_BYTES_MAX_BY_PATH: Final = {
-    ("POST", "apply"): VALUES_BODY_BYTES_MAX,
-    ("POST", "diff"): VALUES_BODY_BYTES_MAX,
-    ("POST", "plan"): VALUES_BODY_BYTES_MAX,
-    ("POST", "verify"): VALUES_BODY_BYTES_MAX,
-    ("PATCH", "params"): VALUES_BODY_BYTES_MAX,
-    ("POST", "files"): PARAM_FILE_BYTES_MAX,
-    ("PUT", "metadata"): METADATA_BYTES_MAX,
-}
-"""Maximum size in bytes of bodies with values or files, by method and the last part of the path."""
 _LARGE_GETS: Final = frozenset(
     {
         *("components", "file", "history", "jobs", "metadata", "metrics", "openapi.json", "params"),

@@ -17,31 +17,18 @@ from fastapi.routing import APIRoute
 from pydantic import ValidationError
 
 from paramclient.documents.document import Body
+from paramclient.service.body_limits import DIGITS_MAX, LINE_BYTES_MAX, SEPARATORS_MAX, SHORT_BODY_BYTES_MAX
 from paramclient.service.problems import FAULTS_MAX, ServiceError
 
 if TYPE_CHECKING:
     from paramclient.service.hub import Hub
 
 __all__ = [
-    "SEPARATORS_MAX",
-    "SHORT_BODY_BYTES_MAX",
     "BodyRoute",
     "check_line_lengths",
     "check_separators",
     "long_request",
 ]
-
-SHORT_BODY_BYTES_MAX: Final = 4096
-"""Maximum size in bytes of a body that is parsed in the event loop, which is faster than a thread."""
-SEPARATORS_MAX: Final = 60_000
-"""Maximum number of commas, opening brackets and line ends of a body or file, which bounds its values,
-members and lines. A file of eight thousand parameters in JSON, the longest format, has 56,000."""
-DIGITS_MAX: Final = 128
-"""Maximum number of consecutive digits in a JSON body. Parsing 4,300 digits takes 0.6 ms with the GIL
-held."""
-LINE_BYTES_MAX: Final = 16_384
-"""Maximum length in bytes of a line of a file that is not JSON: each line is searched for comments at
-once."""
 
 
 class BodyRoute(APIRoute):

@@ -17,7 +17,7 @@ import pytest
 
 from paramclient.client import signing
 from paramclient.errors import UsageError
-from paramclient.service import body_memory
+from paramclient.service import body_limits, body_memory
 from paramclient.service.access import AccessMiddleware, AccessSettings, may_write
 from paramclient.service.request import SESSION_PATH
 from paramclient.service.tokens import (
@@ -1087,7 +1087,7 @@ async def test_one_holder_takes_no_room_from_others() -> None:
         await until(lambda: len(answers) == 45)
         assert {answer.problem for answer in answers} == {"too-many"}
         assert {answer.status for answer in answers} == {429}
-        assert str(body_memory.HOLDER_BODY_BYTES_MAX).encode() in answers[0].body
+        assert str(body_limits.HOLDER_BODY_BYTES_MAX).encode() in answers[0].body
         assert answers[0].headers["retry-after"] == "1"
         others = await door.request("POST", "/api/v1/components/1/1/diff", body=megabyte, token=BEN)
         assert others.status == 200

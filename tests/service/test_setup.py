@@ -24,9 +24,8 @@ from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType
 from paramclient.protocol import wire
 from paramclient.service import AccessSettings, Hub, Settings, Tokens, create_app
-from paramclient.service.param_sources import PARAM_FILE_BYTES_MAX
+from paramclient.service.body_limits import LINE_BYTES_MAX, PARAM_FILE_BYTES_MAX
 from paramclient.service.quota import LONG_REQUESTS_OF_HOLDER_MAX
-from paramclient.service.request_body import LINE_BYTES_MAX
 from paramclient.service.routes.param_files import file_response
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
 from paramclient.sim.vehicle import Vehicle

@@ -47,10 +47,10 @@ from paramclient.service import (
 )
 from paramclient.service import hub as hub_room
 from paramclient.service.access import AccessMiddleware
+from paramclient.service.body_limits import DIGITS_MAX, LINE_BYTES_MAX, PARAM_FILE_BYTES_MAX, SEPARATORS_MAX
 from paramclient.service.event_feed import BATCH_EVENTS_MAX
 from paramclient.service.link import COMPONENTS_PER_TURN
 from paramclient.service.param_sources import (
-    PARAM_FILE_BYTES_MAX,
     PATTERNS_MAX,
     REQUEST_NAMES_MAX,
     REQUEST_VALUES_MAX,
@@ -58,7 +58,6 @@ from paramclient.service.param_sources import (
 )
 from paramclient.service.problems import ServiceError
 from paramclient.service.quota import LARGE_GETS_OF_HOLDER_MAX, LONG_REQUESTS_OF_HOLDER_MAX, Quota
-from paramclient.service.request_body import DIGITS_MAX, LINE_BYTES_MAX, SEPARATORS_MAX
 from paramclient.service.responses import encode_document
 from paramclient.service.route_context import run_until_disconnect
 from paramclient.service.routes import params as params_room

@@ -10,10 +10,10 @@ from paramclient.documents.document import Body
 from paramclient.documents.param import DescribedDoc, InfosDoc
 from paramclient.metadata import Metadata, metadata_of, read_content
 from paramclient.model.patterns import NameChoice
+from paramclient.service.body_limits import METADATA_BYTES_MAX
 from paramclient.service.followed_component import FollowedComponent
 from paramclient.service.param_sources import FILE_NAME_LENGTH_MAX, PATTERNS_MAX
 from paramclient.service.problems import ServiceError
-from paramclient.service.request import METADATA_BYTES_MAX
 from paramclient.service.request_body import BodyRoute, long_request
 from paramclient.service.responses import document_response
 from paramclient.service.route_context import (

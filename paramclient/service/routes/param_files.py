@@ -15,10 +15,10 @@ from paramclient.files.param_file import ENDINGS
 from paramclient.model.identity import autopilot_name
 from paramclient.model.paramset import ParamSet
 from paramclient.provision.vehicle_params import fetch_set, select_non_defaults
+from paramclient.service.body_limits import PARAM_FILE_BYTES_MAX
 from paramclient.service.hub import Hub
 from paramclient.service.param_sources import (
     FILE_NAME_LENGTH_MAX,
-    PARAM_FILE_BYTES_MAX,
     check_size,
     current_set,
     load_state,
