@@ -1,4 +1,4 @@
-"""PARAM_REQUEST_READ: timeouts, retries, pacing, and detection of unknown parameters."""
+"""PARAM_REQUEST_READ: order, pacing and outcomes. For timeouts and retries see `requests.retry`."""
 
 from __future__ import annotations
 
@@ -231,13 +231,7 @@ class Reads(Machine):
         words = ParamErrorCode.name_of(message.error)
         what = name if name is not None else f"parameter {index}"
         if message.error == ParamErrorCode.DOES_NOT_EXIST:
-            return UnknownParameter(
-                f"{system}/{component} has no {what}",
-                system=system,
-                component=component,
-                name=name,
-                index=index,
-            )
+            return self._unknown(key)
         if message.error == ParamErrorCode.TYPE_MISMATCH:
             return TypeMismatch(
                 f"{system}/{component} refuses {what}: {words}",
@@ -350,18 +344,15 @@ class Reads(Machine):
         self.forgive()
 
     def _timeout_error(self, read: Read, now: float) -> Exception:
-        system, component = self._target
-        name, index = (read.key, None) if isinstance(read.key, str) else (None, read.key)
-        what = name if name is not None else f"parameter {index}"
         if self._seems_unknown(read):
-            return UnknownParameter(
-                f"{system}/{component} has no {what}: it does not respond to it, and responds to other reads",
-                system=system,
-                component=component,
-                name=name,
-                index=index,
-            )
+            return self._unknown(read.key, ": it did not respond to reads of it, and responds to other reads")
         return NoReply(self._name(read.key), attempts=read.attempts, waited=now - read.begun_at)
+
+    def _unknown(self, key: Key, reason: str = "") -> UnknownParameter:
+        system, component = self._target
+        name, index = (key, None) if isinstance(key, str) else (None, key)
+        text = f"{system}/{component} has no {f'parameter {index}' if name is None else name}{reason}"
+        return UnknownParameter(text, system=system, component=component, name=name, index=index)
 
     def _name(self, key: Key) -> str:
         what = key if isinstance(key, str) else f"parameter {key}"
