@@ -13,10 +13,10 @@ from paramclient.links.link import Peer, reason
 from paramclient.links.names import LinkSpec
 from paramclient.links.tlog import Record, open_log, read_records
 
-__all__ = ["ReplayLink"]
+__all__ = ["LOG_PEER", "ReplayLink"]
 
 LOG_PEER: Final = "log"
-"""The only peer of a `ReplayLink`."""
+"""The only peer of a log."""
 RECORDS_PER_READ: Final = 256
 """Frames that one `receive` returns at most, so that other tasks run in between."""
 PAUSE_MAX: Final = 60.0

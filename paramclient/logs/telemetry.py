@@ -13,6 +13,7 @@ import anyio.lowlevel
 
 from paramclient.cache import CachedComponent, ParamCache, TableUpdate
 from paramclient.client.cache_writer import CACHE_FLUSH_INTERVAL, WriteThrough
+from paramclient.links.replay import LOG_PEER
 from paramclient.links.tlog import Record, open_log, read_records
 from paramclient.logs.imported_table import ImportedTable
 from paramclient.model.identity import Identity
@@ -32,8 +33,6 @@ __all__ = ["import_log"]
 
 RECORDS_PER_CHECKPOINT: Final = 1_000
 """Frames between two checkpoints, at which other tasks can run: a few milliseconds."""
-LOG_PEER: Final = "log"
-"""The only peer of a log."""
 
 
 async def import_log(path: str | os.PathLike[str], cache: ParamCache) -> tuple[ImportedTable, ...]:
