@@ -20,15 +20,15 @@ from paramclient.protocol.ftp import FileRead
 from paramclient.protocol.params import change_origin, table
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_result import Policy, Sampled
-from paramclient.protocol.params.passive import Overhearing
+from paramclient.protocol.params.passive import PassiveFetch
 from paramclient.protocol.params.reads import Read
-from paramclient.protocol.params.sync import Upkeep
+from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.params.writes import Write
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.station import Station
 from paramclient.protocol.stats import traffic
-from paramclient.protocol.vehicle.metadata_location import DescriptionAsk
-from paramclient.protocol.vehicle.reboot import Restart
+from paramclient.protocol.vehicle.metadata_location import MetadataRequest
+from paramclient.protocol.vehicle.reboot import Reboot
 from paramclient.protocol.wire import HASH_CHECK, NO_INDEX, Framer, Message
 
 __all__ = ["LONGEST", "run"]
@@ -88,7 +88,7 @@ class _Session:
         self.is_paused = False
         self.listens = options >= LISTENS
         policy = Policy.CACHE_ONLY if self.listens else policy
-        self.upkeep = Upkeep(
+        self.upkeep = SyncSettings(
             interval, without_hash=bool(options & 2), policy=policy, listens_only=self.listens
         )
         self.station = Station(
@@ -122,7 +122,7 @@ class _Session:
         if self.is_paused:
             self.interrupt()
             self.settle()
-        endless = (Restart, Overhearing)
+        endless = (Reboot, PassiveFetch)
         for machine, operation in self.operations:
             if isinstance(operation, endless):
                 self.give_back(machine, operation)
@@ -251,7 +251,7 @@ class _Session:
             case wire.ParamRequestList():
                 for index in range(8):
                     self.hear(self.entry(system, index, 8), system, component)
-            case wire.ParamSet(param_id=name, raw=raw, param_type=kind):
+            case wire.ParamSetMessage(param_id=name, raw=raw, param_type=kind):
                 self.hear(wire.ParamValue(name, raw, kind, 8, NO_INDEX), system, component)
             case wire.CommandLong(command=command):
                 self.hear(wire.CommandAck(command, self.draw.number() % 7, *OWN), system, component)
@@ -313,7 +313,7 @@ class _Session:
     def foreign_set(self) -> None:
         draw = self.draw
         system, component = draw.one_of(SYSTEMS), draw.one_of(COMPONENTS)
-        self.hear(wire.ParamSet(system, component, self.name(system), draw.take(4), 9))
+        self.hear(wire.ParamSetMessage(system, component, self.name(system), draw.take(4), 9))
 
     def raw(self) -> None:
         data = self.draw.take(self.draw.number() % 48)
@@ -361,9 +361,9 @@ class _Session:
                 machine.reads.release(operation)
             case Write():
                 machine.writes.cancel(operation, self.now)
-            case DescriptionAsk():
+            case MetadataRequest():
                 machine.descriptions.release(operation)
-            case Restart():
+            case Reboot():
                 machine.end_restart(operation, self.now)
             case _:
                 machine.files.release(operation, self.now)  # type: ignore[arg-type]  # all other kinds are handled above

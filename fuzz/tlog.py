@@ -22,7 +22,7 @@ from paramclient.links.replay import ReplayLink
 from paramclient.links.tlog import Record, open_log, read_records
 from paramclient.logs.imported_table import ImportedTable
 from paramclient.logs.telemetry import import_log
-from paramclient.model.values import Encoding, bits_of, decode
+from paramclient.model.values import Encoding, bits_of, decode_value
 from paramclient.protocol import wire
 from paramclient.protocol.wire import NO_INDEX, Framer, Message
 
@@ -104,7 +104,7 @@ def _check_import(kept: ParamCache, tables: Sequence[ImportedTable], records: Se
         table = kept.load(summary.key, summary.component)
         assert table is not None
         words = {
-            (spelt, kind, bits_of(decode(raw, kind, encoding)[0], kind))
+            (spelt, kind, bits_of(decode_value(raw, kind, encoding)[0], kind))
             for (_, component), each in said.items()
             if component == summary.component
             for name, kind, raw in each
@@ -199,7 +199,7 @@ def _message(draw: Draw) -> Message:
         case 1:
             return wire.AutopilotVersion(0, 0x01110000, bytes(8), uid=draw.number() % 3)
         case 2:
-            return wire.ParamSet(1, 1, name, raw, draw.one_of(KINDS))
+            return wire.ParamSetMessage(1, 1, name, raw, draw.one_of(KINDS))
         case 3:
             return wire.SystemTime(0, draw.one_of((0, 1000, 1_000_000)))
         case 4:

@@ -6,7 +6,7 @@ import struct
 from collections.abc import Sequence
 from typing import TypeVar
 
-from paramclient.model.values import Encoding, ParamType, Value, encode
+from paramclient.model.values import Encoding, ParamType, Value, encode_value
 from paramclient.protocol import wire
 from paramclient.sim import Endpoint
 
@@ -31,14 +31,14 @@ def read(name: str = "", index: int = -1, *, system: int = 1, component: int = 1
 
 def write(
     name: str, value: float, kind: int, *, cast: bool = False, system: int = 1, component: int = 1
-) -> wire.ParamSet:
-    raw = encode(value, kind, Encoding.C_CAST if cast else Encoding.BYTEWISE)
-    return wire.ParamSet(system, component, name, raw, kind)
+) -> wire.ParamSetMessage:
+    raw = encode_value(value, kind, Encoding.C_CAST if cast else Encoding.BYTEWISE)
+    return wire.ParamSetMessage(system, component, name, raw, kind)
 
 
-def cast(name: str, value: float, kind: int = ParamType.REAL32) -> wire.ParamSet:
+def cast(name: str, value: float, kind: int = ParamType.REAL32) -> wire.ParamSetMessage:
     """Return a PARAM_SET in ArduPilot's encoding, for every value."""
-    return wire.ParamSet(1, 1, name, struct.pack("<f", value), kind)
+    return wire.ParamSetMessage(1, 1, name, struct.pack("<f", value), kind)
 
 
 class Station:

@@ -22,7 +22,7 @@ from paramclient.protocol.wire import (
     ParamError,
     ParamRequestList,
     ParamRequestRead,
-    ParamSet,
+    ParamSetMessage,
     ParamValue,
     StatusText,
     SystemTime,
@@ -135,7 +135,7 @@ def _escape_codes(liar: LiarVehicle, asked: Message | None) -> Iterable[Message]
 
 def _others_answers(liar: LiarVehicle, asked: Message | None) -> Iterable[Message]:
     """Answers for system 1, under our own address."""
-    if isinstance(asked, ParamRequestRead | ParamSet):
+    if isinstance(asked, ParamRequestRead | ParamSetMessage):
         yield _value(asked.param_id or "P0", 0x7FFFFFFF, 4, NO_INDEX)
         yield ParamError(1, 1, asked.param_id, -1, 1)
     yield FileTransfer(0, *OWN, bytes((next(liar.numbers) % 256, 0, 1, 128, 4, 15, 1, 0)).ljust(251, b"\0"))

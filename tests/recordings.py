@@ -264,7 +264,7 @@ def _answers(message: wire.Message, request: wire.Message) -> bool:
             )
         case wire.ParamRequestRead(param_index=index) if index >= 0:
             return isinstance(message, wire.ParamValue) and message.param_index == index
-        case wire.ParamRequestRead(param_id=wanted) | wire.ParamSet(param_id=wanted):
+        case wire.ParamRequestRead(param_id=wanted) | wire.ParamSetMessage(param_id=wanted):
             return isinstance(message, wire.ParamValue) and message.param_id.upper() == wanted.upper()
         case wire.FileTransfer():
             packet = Packet.unpack(request.payload)

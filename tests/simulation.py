@@ -8,7 +8,7 @@ from functools import partial
 from typing import TypedDict, TypeVar
 
 from paramclient.errors import ParamClientError
-from paramclient.model.values import Encoding, Param, ParamType, Trust, Value, encode
+from paramclient.model.values import Encoding, Param, ParamType, Trust, Value, encode_value
 from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import Event
@@ -44,7 +44,7 @@ def param_value(
     encoding: Encoding = Encoding.BYTEWISE,
 ) -> ParamValue:
     """A PARAM_VALUE as a component would send it."""
-    return ParamValue(name, encode(value, kind, encoding), kind, count, index)
+    return ParamValue(name, encode_value(value, kind, encoding), kind, count, index)
 
 
 def known(
@@ -53,7 +53,7 @@ def known(
     """A parameter as the cache may have kept it: INT32 or REAL32 by its value, unless it is said."""
     if kind is None:
         kind = ParamType.INT32 if isinstance(value, int) else ParamType.REAL32
-    raw = encode(value, kind, Encoding.BYTEWISE)[: kind.size]
+    raw = encode_value(value, kind, Encoding.BYTEWISE)[: kind.size]
     return Param(name, value, kind, index, int.from_bytes(raw, "little"), Trust.CACHED)
 
 
@@ -180,7 +180,7 @@ class Simulation:
 
     def meet(self) -> ComponentMachine:
         """Wait until it is settled who 1/1 is."""
-        self.until(lambda: (1, 1) in self.station.components and self.machine.who.settled)
+        self.until(lambda: (1, 1) in self.station.components and self.machine.identification.settled)
         return self.machine
 
     def outcome(self, operation: Operation[Result], limit: float = 120.0) -> Result:

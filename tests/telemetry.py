@@ -8,7 +8,7 @@ from typing import Self
 
 from paramclient.errors import FileErrorCode
 from paramclient.links.tlog import packed_time
-from paramclient.model.values import Encoding, ParamType, encode
+from paramclient.model.values import Encoding, ParamType, encode_value
 from paramclient.protocol import wire
 from paramclient.protocol.ftp.packets import Opcode, Packet
 from tests.simulation import param_value
@@ -63,8 +63,8 @@ class Log:
         return self.tell(name, **{name: value})
 
     def set(self, name: str, value: int) -> Self:
-        raw = encode(value, ParamType.INT32, Encoding.BYTEWISE)
-        self.say(wire.ParamSet(1, 1, name, raw, ParamType.INT32), system=255, component=190)
+        raw = encode_value(value, ParamType.INT32, Encoding.BYTEWISE)
+        self.say(wire.ParamSetMessage(1, 1, name, raw, ParamType.INT32), system=255, component=190)
         return self.change(name, value)
 
     def write(self, path: Path) -> Path:
@@ -171,13 +171,13 @@ class FileLog(Log):
 
     def value(self, name: str, value: float, *, count: int, kind: ParamType = ParamType.INT16) -> Self:
         """Add an unsolicited PARAM_VALUE of ArduPilot."""
-        raw = encode(value, kind, Encoding.C_CAST)
+        raw = encode_value(value, kind, Encoding.C_CAST)
         self.say(wire.ParamValue(name, raw, kind, count, wire.NO_INDEX))
         return self
 
     def made_up(self, values: Sequence[tuple[str, float]]) -> Self:
         """Add MAVProxy's record of a file that it has read: not from the vehicle, all REAL32, at one time."""
         for index, (name, value) in enumerate(values):
-            raw = encode(float(value), ParamType.REAL32, Encoding.C_CAST)
+            raw = encode_value(float(value), ParamType.REAL32, Encoding.C_CAST)
             self.say(wire.ParamValue(name, raw, ParamType.REAL32, len(values), index), component=190)
         return self

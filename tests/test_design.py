@@ -187,6 +187,7 @@ def test_no_module_imports_itself_through_others() -> None:
 
 COUNTERPARTS = {
     "app": "the application: of the command line, of the service",
+    "apply": "the set-up of a vehicle: the command, its route",
     "ardupilot": "what is ArduPilot's: its metadata, its simulated vehicle",
     "check": "the check of a vehicle: the command and its document",
     "client": "the client: over a link, over a service",
@@ -206,7 +207,6 @@ COUNTERPARTS = {
     "problems": "errors of the service: told by it, understood by its client",
     "px4": "what is PX4's: its metadata, its simulated vehicle",
     "results": "results: of a set-up, as documents, printed",
-    "setup": "the set-up of a vehicle: the command, its document, its route",
     "signing": "MAVLink signing: frames, keys of a client, the command",
     "traffic": "traffic on a link: counted, as a document",
 }
@@ -227,7 +227,6 @@ SAME_NAME_CONSTANTS = {"MIGRATIONS": "the schema of each store"}
 
 SAME_NAME_CLASSES = {
     "ParamInfo": "the metadata of a parameter, and what a plan needs of it (a Protocol)",
-    "ParamSet": "a set of parameters for users, and the message PARAM_SET",
 }
 """Classes of one name, and the reason."""
 

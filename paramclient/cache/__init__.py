@@ -17,13 +17,13 @@
 - `reconciliation`: new observations reconciled with the stored table and history, by time.
 - `records`: records that the cache stores and returns.
 - `sqlite_schema`: schema of the file.
-- `setups`: notes about running and interrupted set-ups.
+- `interrupted_setups`: notes about running and interrupted set-ups.
 - `shared`: a shared database with its local copy.
 - `snapshots`: snapshots, and tables at an earlier time.
 - `sqlite`: SQLite transactions.
 - `sqlite_file`: the SQLite file: opening, checks, replacement of a damaged one.
 - `store`: `ParamCache`, the public class.
-- `stored_param`: the stored form of a parameter, and its columns in both databases.
+- `param_columns`: the stored form of a parameter, and its columns in both databases.
 - `tables`: tables and their history.
 - `transaction`: `Session`, one transaction in SQL.
 - `transfer`: copies of tables between stores.
@@ -32,7 +32,9 @@
 from __future__ import annotations
 
 from paramclient.cache.fleet import FleetDiff, FleetValue, FleetVehicle, Holder, NameSpread
+from paramclient.cache.interrupted_setups import CutOff, RunningSetup, SetupNotes
 from paramclient.cache.observed_table import HeardParams, UnixTimes
+from paramclient.cache.param_columns import BY_VEHICLE, StoredParam
 from paramclient.cache.records import (
     BY_US,
     CacheChange,
@@ -46,10 +48,8 @@ from paramclient.cache.records import (
     TableUpdate,
     by_station,
 )
-from paramclient.cache.setups import CutOff, RunningSetup, SetupNotes
 from paramclient.cache.snapshots import CLOCK_SLACK, SNAPSHOTS
 from paramclient.cache.store import ParamCache, default_path
-from paramclient.cache.stored_param import BY_VEHICLE, StoredParam
 from paramclient.cache.tables import HISTORY_LINES
 from paramclient.cache.transfer import CopyResult
 

@@ -14,7 +14,7 @@ from fnmatch import fnmatchcase
 from typing import Final, TypeAlias
 
 from paramclient.cache.cells import cells
-from paramclient.cache.stored_param import read_param
+from paramclient.cache.param_columns import read_param
 from paramclient.cache.transaction import Session
 from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import Param, same_bits

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
+from paramclient.cache.param_columns import BY_VEHICLE, StoredParam
 from paramclient.cache.records import CachedSummary, CachedVehicle, TableUpdate
-from paramclient.cache.stored_param import BY_VEHICLE, StoredParam
 from paramclient.cache.tables import HISTORY_LINES, applied, check_times, hashed, save
 from paramclient.cache.transaction import Line, Session
 
@@ -24,20 +24,20 @@ def merge(
     based_on: Mapping[tuple[str, int], float],
 ) -> None:
     """Write earlier updates, in the order of their times; see `ParamCache.merge`."""
-    tables: dict[tuple[str, int], _Past] = {}
+    tables: dict[tuple[str, int], _TableMerge] = {}
     for update in updates:
         check_times(update)
         key = (update.identity.key, update.component)
         past = tables.get(key)
         if past is None:
-            past = tables[key] = _Past(session, based_on.get(key))
+            past = tables[key] = _TableMerge(session, based_on.get(key))
         past.take(update)
     for past in tables.values():
         past.finish()
 
 
 @dataclass
-class _Past:
+class _TableMerge:
     """Merge of the updates of one table.
 
     Attributes:
@@ -112,7 +112,7 @@ class _Past:
         """Extend the first and last time of the vehicle by the time of an update."""
         if vehicle is not None:
             first, last = min(vehicle.first_seen, update.at), max(vehicle.last_seen, update.at)
-            self.session.seen(vehicle.key, first, last)
+            self.session.set_seen_times(vehicle.key, first, last)
 
     def _bring_in(self, update: TableUpdate, table: CachedSummary) -> None:
         """Merge an older update: only values without a later observation change the table."""
@@ -141,7 +141,7 @@ class _Past:
             self.session.put_table(self.owner, before, after)
             if hashed(before) != hashed(after):
                 self.session.describe(self.owner, hash=None)
-        self.session.add_births(self.owner, births)
+        self.session.record_added_names(self.owner, births)
         self.lines += changes
 
     def _line(self, old: StoredParam, new: StoredParam) -> Iterator[Line]:
@@ -155,7 +155,7 @@ class _Past:
     def _lines(self, name: str, after: float, until: float) -> list[Line]:
         """Return the new values of a parameter in a period, from its history lines."""
         assert self.owner is not None
-        return self.session.became(self.owner, name, after, until)
+        return self.session.values_between(self.owner, name, after, until)
 
 
 def _standing(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import overload
 
-from paramclient.cache.stored_param import StoredParam, StoredTable
+from paramclient.cache.param_columns import StoredParam, StoredTable
 from paramclient.model.params import Params
 
 __all__ = ["HeardParams", "UnixTimes"]

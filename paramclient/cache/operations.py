@@ -126,7 +126,7 @@ class StoreSnapshot(StoreOperation[Snapshot]):
             new = TableUpdate(
                 identity=self.vehicle, component=self.component, autopilot=autopilot, at=self.at
             )
-            owner = session.make(new)
+            owner = session.upsert_table(new)
         [(_, kept)] = session.summaries(key, self.component)
         identity = kept.identity if isinstance(self.vehicle, str) else self.vehicle
         shown = self.resolved(session)

@@ -11,13 +11,13 @@ from typing import Any, Final, TypeVar
 
 from paramclient.cache.cells import Damaged, identity_cells, read_identity
 from paramclient.cache.operations import Merge, Save, StoreOperation, StoreSnapshot
+from paramclient.cache.param_columns import COLUMN_NAMES, StoredParam
 from paramclient.cache.records import TableState, TableUpdate
 from paramclient.cache.snapshots import read_written, written_cells
 from paramclient.cache.sqlite import SqliteSession
 from paramclient.cache.sqlite_file import Database
-from paramclient.cache.stored_param import COLUMN_NAMES, StoredParam
 from paramclient.cache.transaction import Session
-from paramclient.cache.transfer import WholeTable, put_shots, put_whole
+from paramclient.cache.transfer import TableDump, put_snapshots, put_whole
 from paramclient.model.paramset import ParamSet
 
 __all__ = ["QueuedOperation", "LocalCopy", "packed", "unpacked"]
@@ -123,7 +123,7 @@ class LocalCopy:
 
         return self._write(work) if self.exists else []
 
-    def arrived(self, entries: Sequence[QueuedOperation], tables: Iterable[_Key]) -> None:
+    def mark_delivered(self, entries: Sequence[QueuedOperation], tables: Iterable[_Key]) -> None:
         """Remove executed operations from the queue, and mark these tables as stale."""
 
         def work(session: SqliteSession) -> None:
@@ -150,7 +150,7 @@ class LocalCopy:
 
         return self._write(work) if self.exists else {}
 
-    def goes_on(self, key: _Key, revision: int | None) -> None:
+    def set_copied_revision(self, key: _Key, revision: int | None) -> None:
         """Set the copied revision of a table; None if it is no longer a copy."""
 
         def work(session: SqliteSession) -> None:
@@ -161,7 +161,7 @@ class LocalCopy:
 
         self._write(work)
 
-    def mirror(self, key: _Key, whole: WholeTable | None, revision: int | None) -> None:
+    def mirror(self, key: _Key, whole: TableDump | None, revision: int | None) -> None:
         """Replace a table with that of the database; None removes it."""
 
         def work(session: SqliteSession) -> None:
@@ -170,7 +170,7 @@ class LocalCopy:
                 session.connection.execute("DELETE FROM mirrored WHERE (vehicle, component) = (?, ?)", key)
             else:
                 owner = put_whole(session, whole)
-                put_shots(session, owner, whole)
+                put_snapshots(session, owner, whole)
                 session.connection.execute("REPLACE INTO mirrored VALUES (?, ?, ?)", (*key, revision))
 
         self._write(work)

@@ -26,7 +26,7 @@ from operator import itemgetter, lt
 from typing import Any, Final, NamedTuple, TypeVar
 
 from paramclient.cache.cells import YEAR_10000, Damaged, are_times
-from paramclient.cache.stored_param import COLUMN_NAMES, COLUMNS, StoredParam, StoredTable
+from paramclient.cache.param_columns import COLUMN_NAMES, COLUMNS, StoredParam, StoredTable
 from paramclient.errors import UsageError
 
 __all__ = ["Packed", "pack", "packed_row", "row_checksum", "unpack"]

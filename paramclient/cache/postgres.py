@@ -19,8 +19,7 @@ from uuid import uuid4
 from paramclient.cache.cells import Damaged, cells
 from paramclient.cache.database_url import DatabaseAddress
 from paramclient.cache.operations import StoreOperation
-from paramclient.cache.postgres_schema import CHANNEL, MIGRATIONS, SCHEMA
-from paramclient.cache.stored_param import (
+from paramclient.cache.param_columns import (
     COLUMN_NAMES,
     COLUMNS,
     StoredParam,
@@ -28,6 +27,7 @@ from paramclient.cache.stored_param import (
     checksum,
     read_rows,
 )
+from paramclient.cache.postgres_schema import CHANNEL, MIGRATIONS, SCHEMA
 from paramclient.cache.transaction import Session
 from paramclient.cache.transfer import LOCAL_NUMBERS_MIN
 from paramclient.errors import CacheError, UsageError

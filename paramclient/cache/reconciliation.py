@@ -21,9 +21,9 @@ from dataclasses import dataclass, field, replace
 from paramclient.cache import tables
 from paramclient.cache.cells import time_cell
 from paramclient.cache.merge import SAME_CHANGE_MAX
+from paramclient.cache.param_columns import BY_VEHICLE, StoredParam
 from paramclient.cache.records import CachedSummary, TableState, TableUpdate
 from paramclient.cache.snapshots import CLOCK_SLACK
-from paramclient.cache.stored_param import BY_VEHICLE, StoredParam
 from paramclient.cache.tables import (
     applied,
     check_times,
@@ -35,7 +35,7 @@ from paramclient.cache.tables import (
 )
 from paramclient.cache.transaction import Line, NumberedLine, Session
 
-__all__ = ["Past", "reconcile"]
+__all__ = ["TableHistory", "reconcile"]
 
 
 def reconcile(session: Session, updates: Iterable[TableUpdate], present: float | None = None) -> None:
@@ -52,7 +52,7 @@ def reconcile(session: Session, updates: Iterable[TableUpdate], present: float |
 
 
 @dataclass
-class Past:
+class TableHistory:
     """The history of a table from some time on, into which observations are inserted.
 
     Attributes:
@@ -60,13 +60,13 @@ class Past:
         known_since: time since which the states of the table are known, or None.
         births: by name, the time at which it appeared or, for a changed parameter of the first table, at
             which its first value was observed; the earliest of these times.
-        new_births: new or earlier times from the inserted observations.
+        new_added_names: new or earlier times from the inserted observations.
     """
 
     lines: list[tuple[int | None, Line]]
     known_since: float | None = None
     births: Mapping[str, float] = field(default_factory=dict)
-    new_births: dict[str, float] = field(default_factory=dict)
+    new_added_names: dict[str, float] = field(default_factory=dict)
 
     def observe(
         self, seen: StoredParam, kept: StoredParam | None, *, ahead: Sequence[int | None] | None = None
@@ -96,7 +96,7 @@ class Past:
             if is_known or not is_new:
                 self._insert((at, name, by, *kept.value, *seen.value))
             else:
-                self.new_births[name] = at
+                self.new_added_names[name] = at
             self._insert((kept.heard_at, name, BY_VEHICLE, *seen.value, *kept.value))
             return
         number, (later, _, later_by, *values) = self.lines[place]
@@ -105,7 +105,7 @@ class Past:
             return
         born = self._born(name)
         if born is not None and at < born <= later and not is_known:  # it was `old` at `born`
-            self.new_births[name] = at
+            self.new_added_names[name] = at
             self._insert((born, name, BY_VEHICLE, *seen.value, *old), before=place)
             return
         if seen.has_value(new):
@@ -118,7 +118,7 @@ class Past:
 
     def _born(self, name: str, default: float | None = None) -> float | None:
         """Return the recorded time before which a name is unknown; a new record is the earlier one."""
-        return self.new_births.get(name, self.births.get(name, default))
+        return self.new_added_names.get(name, self.births.get(name, default))
 
     def add(self, line: Line) -> None:
         """Insert a line by its time."""
@@ -139,10 +139,10 @@ def _reconcile(session: Session, update: TableUpdate, present: float) -> None:
         update = replace(update, identity=vehicle.identity)
     forget_other_firmware(session, update.identity)
     found = next(iter(session.summaries(key, update.component)), None)
-    owner = session.make(update)
+    owner = session.upsert_table(update)
     if vehicle is not None:
         last = vehicle.last_seen if vehicle.last_seen <= horizon else at
-        session.seen(key, min(vehicle.first_seen, at), max(last, at))
+        session.set_seen_times(key, min(vehicle.first_seen, at), max(last, at))
     table = None if found is None else found[1]
     is_late = False
     if table is not None:
@@ -196,7 +196,7 @@ def _write_values(
     after, lines, births = applied(part, before, stays.union(item.name for item in older))
     if len(after) != len(before) or after != before:
         session.put_table(owner, before, after)
-    session.add_births(owner, births)
+    session.record_added_names(owner, births)
     if lines:
         session.add_first_times(owner, _first_changes(session, owner, before, dict(births), lines))
     _write_past(session, owner, older, lines, seen)
@@ -325,13 +325,13 @@ def _write_past(
     kept: list[NumberedLine] = session.lines_from(owner, since)
     ahead = max((place for place, (_, line) in enumerate(kept, 1) if line[0] > seen.horizon), default=0)
     kept = kept[ahead:]
-    past = Past(list(kept), known_since, session.first_times(owner))
+    past = TableHistory(list(kept), known_since, session.first_times(owner))
     for item in older:
         became = session.last_became(owner, item.name, since)
         past.observe(item, seen.rows.get(item.name), ahead=became)
     for line in lines:  # after the observations, which refer to the rows before these changes
         past.add(line)
-    session.add_first_times(owner, past.new_births.items())
+    session.add_first_times(owner, past.new_added_names.items())
     if past.lines == kept:
         return
     if past.lines[: len(kept)] == kept:

@@ -9,7 +9,7 @@ from itertools import compress
 from types import MappingProxyType
 from typing import Final
 
-from paramclient.cache.stored_param import StoredParam, StoredTable
+from paramclient.cache.param_columns import StoredParam, StoredTable
 from paramclient.model.identity import Identity, autopilot_name
 from paramclient.model.params import ParamMap
 from paramclient.model.paramset import ParamSet

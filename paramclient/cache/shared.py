@@ -30,7 +30,7 @@ from paramclient.cache.outbox import LocalCopy, QueuedOperation
 from paramclient.cache.postgres import PostgresDatabase, Revisions, Unavailable
 from paramclient.cache.records import CacheChange, Snapshot
 from paramclient.cache.transaction import Session
-from paramclient.cache.transfer import LOCAL_NUMBERS_MIN, JoinTable, take_whole
+from paramclient.cache.transfer import LOCAL_NUMBERS_MIN, MergeTable, take_whole
 from paramclient.errors import CacheError, UsageError
 
 if TYPE_CHECKING:
@@ -136,7 +136,7 @@ class _Link:
     # calls of the store
     def read(self, work: Callable[[Session], T]) -> T:
         for is_second in (False, True):
-            if not self._meet(at_once=is_second):
+            if not self._ensure_connected(at_once=is_second):
                 break
             try:
                 return self._database.read(work)
@@ -145,12 +145,12 @@ class _Link:
         return self.local.read(work)
 
     def do(self, operation: StoreOperation[Any]) -> Any:
-        self._meet()
+        self._ensure_connected()
         with self._writing:
             self._number += 1
             number = self._number
             for is_second in (False, True):
-                if not self._meet(at_once=is_second):
+                if not self._ensure_connected(at_once=is_second):
                     break
                 try:
                     [result], before, after = self._database.write([(operation, self._writer, number)])
@@ -160,7 +160,7 @@ class _Link:
                     self._lose(error)
                 else:
                     return self._copy_done(operation, result, before, after)
-            if isinstance(operation, Remove | JoinTable):
+            if isinstance(operation, Remove | MergeTable):
                 raise CacheError(
                     f"{self.away or 'the database is not connected'}; repeat the call after the reconnection"
                 )
@@ -175,12 +175,12 @@ class _Link:
             if not self._is_here:
                 return
             self._wanted.add(key)
-        self._ring()
+        self._wake_listener()
 
     def subscribe(self, told: Callable[[CacheChange], None]) -> Callable[[], None]:
         self._subscribers.append(told)
         with suppress(CacheError):  # other calls report it; the subscription works after a reconnection
-            self._meet()
+            self._ensure_connected()
 
         def end() -> None:
             with suppress(ValueError):
@@ -190,7 +190,7 @@ class _Link:
 
     def close(self) -> None:
         self._is_closed = True
-        self._ring()
+        self._wake_listener()
         with self._reaching:
             thread = self._thread
         if thread is not None and thread is not threading.current_thread():
@@ -206,7 +206,7 @@ class _Link:
 
     # connection to the database
 
-    def _meet(self, *, at_once: bool = False) -> bool:
+    def _ensure_connected(self, *, at_once: bool = False) -> bool:
         """Return whether the database is connected. Connect on the first call, or if `at_once` is given.
 
         Raises:
@@ -245,14 +245,14 @@ class _Link:
                 with self._writing:  # otherwise new operations could be queued faster than executed
                     self._deliver()
                     revisions = self._database.revisions()
-                    self._take_up(listener, revisions)
+                    self._use_connection(listener, revisions)
             except BaseException:
                 listener.close()
                 raise
         except Unavailable as error:
             self._lose(error)
 
-    def _take_up(self, listener: psycopg.Connection[tuple[Any, ...]], revisions: Revisions) -> None:
+    def _use_connection(self, listener: psycopg.Connection[tuple[Any, ...]], revisions: Revisions) -> None:
         kept = self._kept()
         if self.away is not None:
             _log.warning("the database %s is connected again", self._address.place)
@@ -266,7 +266,7 @@ class _Link:
             old.close()
         if before:
             self._tell({key for key in {*before, *revisions} if before.get(key) != revisions.get(key)})
-        self._ring()
+        self._wake_listener()
 
     def _begin_copy(self) -> None:
         try:
@@ -298,7 +298,9 @@ class _Link:
             self.local.refuse(entries[0], str(error))
             return
         # the tables are copied again: other stations may have written meanwhile
-        self.local.arrived(entries, [key for each in entries for key in _touched(each.operation, after)])
+        self.local.mark_delivered(
+            entries, [key for each in entries for key in _touched(each.operation, after)]
+        )
 
     def _lose(self, error: Unavailable) -> None:
         with self._state:
@@ -310,7 +312,7 @@ class _Link:
             meanwhile = f"using the local copy {copy.path}" if copy.exists else "reconnecting"
             _log.warning("%s; %s", error, meanwhile)
         self._database.close()
-        self._ring()
+        self._wake_listener()
 
     # the local copy
 
@@ -321,13 +323,13 @@ class _Link:
         touched = set(_touched(operation, before | after))
         stale = touched
         try:
-            if not isinstance(operation, JoinTable):
+            if not isinstance(operation, MergeTable):
                 kept = self.local.revisions()
                 number = result.id if isinstance(result, Snapshot) else None
                 self.local.do(operation if number is None else _numbered(operation, number))
                 stale = {key for key in touched if kept.get(key) != before.get(key)}
                 for key in touched - stale:
-                    self.local.goes_on(key, after.get(key))
+                    self.local.set_copied_revision(key, after.get(key))
         except (CacheError, UsageError) as error:
             self._warn_of_copy(error)
         with self._state:
@@ -338,7 +340,7 @@ class _Link:
                     self._revisions.pop(key, None)
             self._wanted |= stale
         if stale:
-            self._ring()
+            self._wake_listener()
         return result
 
     def _mirror(self) -> None:
@@ -398,7 +400,7 @@ class _Link:
         deadline = time.monotonic() + pause
         while not self._is_closed and not self._is_here and (left := deadline - time.monotonic()) > 0:
             selector.select(left)
-            self._silence()
+            self._drain_wakeup()
 
     def _hear(self, selector: selectors.BaseSelector, listener: psycopg.Connection[tuple[Any, ...]]) -> None:
         """Wait for a notification of the database or a wake-up, and process the notifications."""
@@ -410,7 +412,7 @@ class _Link:
                     selector.select()
             finally:
                 selector.unregister(file)
-            self._silence()
+            self._drain_wakeup()
             told = [_news(each.payload) for each in listener.notifies(timeout=0)]
         except Exception as error:  # after any error, the connection is unusable
             if listener is self._listener and self._is_here and not self._is_closed:
@@ -437,11 +439,11 @@ class _Link:
                 except Exception:
                     _log.exception("a listener of the cache failed")
 
-    def _ring(self) -> None:
+    def _wake_listener(self) -> None:
         with suppress(OSError):
             self._ringer.send(b"!")
 
-    def _silence(self) -> None:
+    def _drain_wakeup(self) -> None:
         with suppress(OSError):
             self._bell.recv(4096)
 

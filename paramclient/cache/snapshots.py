@@ -21,8 +21,8 @@ from datetime import UTC, datetime
 from typing import Any, Final
 
 from paramclient.cache.cells import Damaged, identity_cells, read_identity, time_cell
+from paramclient.cache.param_columns import StoredParam, read_param
 from paramclient.cache.records import Snapshot
-from paramclient.cache.stored_param import StoredParam, read_param
 from paramclient.cache.transaction import Session
 from paramclient.errors import NotInCache
 from paramclient.model.identity import Identity

@@ -11,9 +11,9 @@ from typing import Any, ClassVar, Final, TypeVar
 from paramclient.cache.cells import Damaged, cells
 from paramclient.cache.operations import StoreOperation
 from paramclient.cache.packed_table import Packed, packed_row, row_checksum
+from paramclient.cache.param_columns import StoredParam, StoredTable, checksum
 from paramclient.cache.records import CacheChange
 from paramclient.cache.sqlite_file import Database
-from paramclient.cache.stored_param import StoredParam, StoredTable, checksum
 from paramclient.cache.transaction import Session
 
 __all__ = ["SqliteSession", "SqliteStore"]

@@ -8,7 +8,7 @@ from typing import Final, TypeAlias
 
 from paramclient.cache.cells import Damaged
 from paramclient.cache.packed_table import packed_row, row_checksum
-from paramclient.cache.stored_param import checksum, read_rows
+from paramclient.cache.param_columns import checksum, read_rows
 from paramclient.errors import UsageError
 
 __all__ = ["MIGRATIONS", "Step"]

@@ -14,8 +14,8 @@ from typing import Final
 from paramclient.cache import snapshots
 from paramclient.cache.cells import are_times, time_cell
 from paramclient.cache.observed_table import HeardParams
+from paramclient.cache.param_columns import BY_VEHICLE, StoredParam
 from paramclient.cache.records import CachedComponent, HistoryEntry, TableState, TableUpdate
-from paramclient.cache.stored_param import BY_VEHICLE, StoredParam
 from paramclient.cache.transaction import Line, Session
 from paramclient.model.identity import Identity
 
@@ -43,7 +43,7 @@ def save(session: Session, updates: Iterable[TableUpdate]) -> None:
     for update in updates:
         forget_other_firmware(session, update.identity)
         snapshots.watch_clock(session, update.identity.key, update.component, time_cell(update.at))
-        owner = session.make(update)
+        owner = session.upsert_table(update)
         before: Mapping[str, StoredParam] = {}
         after = before
         if update.params or update.removed or update.replace:  # otherwise it has only the state of the table
@@ -51,7 +51,7 @@ def save(session: Session, updates: Iterable[TableUpdate]) -> None:
             after, lines, births = applied(update, before)
             if len(after) != len(before) or after != before:
                 session.put_table(owner, before, after)
-            session.add_births(owner, births)
+            session.record_added_names(owner, births)
             write_lines(session, owner, lines)
         if update.table is not None:
             write_state(session, owner, update.table)

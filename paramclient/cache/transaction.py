@@ -11,8 +11,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar, Final, TypeAlias
 
 from paramclient.cache.cells import cells, identity_cells, read_identity, time_cell
+from paramclient.cache.param_columns import StoredParam, StoredTable, checksum, read_param
 from paramclient.cache.records import CachedSummary, CachedVehicle, HistoryEntry, SnapshotSummary, TableUpdate
-from paramclient.cache.stored_param import StoredParam, StoredTable, checksum, read_param
 
 __all__ = ["Line", "NumberedLine", "Session"]
 
@@ -41,7 +41,7 @@ class Session(ABC):
 
     # vehicles and their tables
 
-    def make(self, update: TableUpdate) -> int:
+    def upsert_table(self, update: TableUpdate) -> int:
         """Write the vehicle and component of an update, and return the id of the table, which may be new."""
         at = time_cell(update.at)
         key = update.identity.key
@@ -96,7 +96,7 @@ class Session(ABC):
             found.append(CachedVehicle(key, read_identity(row[3:]), first, last, known))
         return found
 
-    def seen(self, key: str, first: float, last: float) -> None:
+    def set_seen_times(self, key: str, first: float, last: float) -> None:
         """Set the first and last time at which a vehicle was seen."""
         self._do("UPDATE vehicle SET first_seen = ?, last_seen = ? WHERE key = ?", (first, last, key))
 
@@ -260,7 +260,7 @@ class Session(ABC):
             )
             self._do("UPDATE birth SET line = ? WHERE owner = ? AND line = ?", (place, owner, line))
 
-    def became(self, owner: int, name: str, after: float, until: float) -> list[tuple[Any, ...]]:
+    def values_between(self, owner: int, name: str, after: float, until: float) -> list[tuple[Any, ...]]:
         """Return the new values of a parameter's lines in a period: type, bits, is_raw."""
         return self._all(
             "SELECT new_type, new_bits, new_is_raw FROM history"
@@ -316,7 +316,7 @@ class Session(ABC):
                 (owner, owner),
             )
 
-    def add_births(self, owner: int, births: Iterable[tuple[str, float]]) -> None:
+    def record_added_names(self, owner: int, births: Iterable[tuple[str, float]]) -> None:
         """Record new names after the last line, if the states of the table are known."""
         _, _, known_since = self.described(owner)
         if known_since is not None:
@@ -337,12 +337,12 @@ class Session(ABC):
         found = self._all("SELECT name, min(at) FROM birth WHERE owner = ? GROUP BY name", (owner,))
         return dict(cells(row, "sf") for row in found)
 
-    def births(self, owner: int) -> list[tuple[str, int, float]]:
+    def added_names(self, owner: int) -> list[tuple[str, int, float]]:
         """Return name, number of the preceding line and time of every recorded name."""
         found = self._all("SELECT name, line, at FROM birth WHERE owner = ? ORDER BY line, name", (owner,))
         return [(name, line, at) for name, line, at in (cells(row, "sif") for row in found)]
 
-    def setbacks(self, owner: int) -> list[tuple[float, float]]:
+    def clock_rollbacks(self, owner: int) -> list[tuple[float, float]]:
         """Return the periods, from and until, that the clock has passed twice."""
         found = self._all("SELECT since, until FROM setback WHERE owner = ? ORDER BY id", (owner,))
         return [(since, until) for since, until in (cells(row, "ff") for row in found)]

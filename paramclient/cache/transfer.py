@@ -8,9 +8,9 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from paramclient.cache.operations import StoreOperation
+from paramclient.cache.param_columns import StoredParam
 from paramclient.cache.records import CachedSummary, CachedVehicle, TableState, TableUpdate
 from paramclient.cache.snapshots import SNAPSHOTS
-from paramclient.cache.stored_param import StoredParam
 from paramclient.cache.tables import HISTORY_LINES, hashed, write_state
 from paramclient.cache.transaction import Line, Session
 from paramclient.errors import CacheError, UsageError
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CopyResult",
-    "JoinTable",
+    "MergeTable",
     "LOCAL_NUMBERS_MIN",
     "StoredSnapshot",
-    "WholeTable",
+    "TableDump",
     "copy_store",
-    "put_shots",
+    "put_snapshots",
     "put_whole",
     "take_whole",
 ]
@@ -51,7 +51,7 @@ class StoredSnapshot:
 
 
 @dataclass(frozen=True)
-class WholeTable:
+class TableDump:
     """All stored data of one table.
 
     Attributes:
@@ -60,8 +60,8 @@ class WholeTable:
         known_since: time since which its states are known, or None.
         rows: its parameters by name.
         lines: its history lines, in order.
-        births: name, time, and number of history lines at the appearance of the name.
-        setbacks: periods, from and until, that the clock has passed twice.
+        added_names: name, time, and number of history lines at the appearance of the name.
+        clock_rollbacks: periods, from and until, that the clock has passed twice.
         shots: its snapshots by number.
     """
 
@@ -70,11 +70,11 @@ class WholeTable:
     known_since: float | None
     rows: Mapping[str, StoredParam]
     lines: tuple[Line, ...]
-    births: tuple[tuple[str, float, int], ...]
-    setbacks: tuple[tuple[float, float], ...]
+    added_names: tuple[tuple[str, float, int], ...]
+    clock_rollbacks: tuple[tuple[float, float], ...]
     shots: Mapping[int, StoredSnapshot]
 
-    def lacks(self, other: WholeTable) -> str | None:
+    def lacks(self, other: TableDump) -> str | None:
         """Return what this table lacks of another one; None if it has all of it, or later data."""
         for name, row in other.rows.items():
             mine = self.rows.get(name)
@@ -113,10 +113,10 @@ class CopyResult:
 
 
 @dataclass(frozen=True)
-class JoinTable(StoreOperation[None]):
+class MergeTable(StoreOperation[None]):
     """Merge a whole table into a store: the later observation of a value counts."""
 
-    whole: WholeTable
+    whole: TableDump
 
     @property
     def tables(self) -> Iterable[tuple[str, int | None]]:
@@ -162,7 +162,7 @@ def copy_store(
         if found is None:
             continue  # it was removed meanwhile
         if _lacking(target, found) is not None:
-            target.do(JoinTable(found))
+            target.do(MergeTable(found))
             lacking = _lacking(target, found)
             if lacking is not None:
                 raise CacheError(
@@ -177,7 +177,7 @@ def copy_store(
 
 def take_whole(
     session: Session, key: str, component: int, having: Collection[int] = frozenset()
-) -> WholeTable | None:
+) -> TableDump | None:
     """Return all stored data of a table; None if there is none.
 
     Args:
@@ -200,7 +200,7 @@ def take_whole(
     order = {number: place for place, (number, _) in enumerate(numbered, start=1)}
     births = tuple(
         (name, at, max((place for number, place in order.items() if number <= line), default=0))
-        for name, line, at in session.births(owner)
+        for name, line, at in session.added_names(owner)
     )
     shots = {}
     for summary in session.snapshots(key, component):
@@ -210,24 +210,24 @@ def take_whole(
         if not isinstance(blob, bytes) or not isinstance(crc, int):
             raise CacheError(f"snapshot {summary.id} of {key}, component {component}, is damaged")
         shots[summary.id] = StoredSnapshot(tuple(row), None if summary.id in having else blob, crc)
-    return WholeTable(
+    return TableDump(
         vehicle,
         table,
         known_since,
         session.table(owner),
         tuple(line for _, line in numbered),
         births,
-        tuple(session.setbacks(owner)),
+        tuple(session.clock_rollbacks(owner)),
         shots,
     )
 
 
-def put_whole(session: Session, whole: WholeTable) -> int:
+def put_whole(session: Session, whole: TableDump) -> int:
     """Replace a table in a store, except its snapshots. Return its id."""
     table = whole.table
     known = next(iter(session.vehicles(table.key)), None)
     last = whole.vehicle if known is None or known.last_seen <= whole.vehicle.last_seen else known
-    owner = session.make(
+    owner = session.upsert_table(
         TableUpdate(
             identity=last.identity,
             component=table.component,
@@ -236,18 +236,18 @@ def put_whole(session: Session, whole: WholeTable) -> int:
         )
     )
     first = whole.vehicle.first_seen if known is None else min(known.first_seen, whole.vehicle.first_seen)
-    session.seen(table.key, first, last.last_seen)
+    session.set_seen_times(table.key, first, last.last_seen)
     session.put_table(owner, None, whole.rows)
-    numbers = session.put_past(owner, whole.lines, whole.setbacks)
+    numbers = session.put_past(owner, whole.lines, whole.clock_rollbacks)
     session.put_births(
-        owner, [(name, at, numbers[place - 1] if place else 0) for name, at, place in whole.births]
+        owner, [(name, at, numbers[place - 1] if place else 0) for name, at, place in whole.added_names]
     )
     write_state(session, owner, _state(table))
     session.describe(owner, known_since=whole.known_since)
     return owner
 
 
-def put_shots(session: Session, owner: int, whole: WholeTable) -> None:
+def put_snapshots(session: Session, owner: int, whole: TableDump) -> None:
     """Replace the snapshots of a table by those of another store, with equal numbers."""
     there = {each.id for each in session.snapshots(whole.table.key, whole.table.component)}
     session.drop_snapshots(there - whole.shots.keys())
@@ -256,13 +256,13 @@ def put_shots(session: Session, owner: int, whole: WholeTable) -> None:
             session.add_snapshot(owner, shot.row, shot.blob, shot.crc, number)
 
 
-def _lacking(target: Store, whole: WholeTable) -> str | None:
+def _lacking(target: Store, whole: TableDump) -> str | None:
     key, component = whole.table.key, whole.table.component
     there = target.read(lambda session: take_whole(session, key, component))
     return "everything" if there is None else there.lacks(whole)
 
 
-def _joined(there: WholeTable, new: WholeTable) -> WholeTable:
+def _joined(there: TableDump, new: TableDump) -> TableDump:
     """Return the union of one table of two stores, without snapshots.
 
     If one of them continues the other, earlier states remain available. If both have changes of their own,
@@ -280,7 +280,7 @@ def _joined(there: WholeTable, new: WholeTable) -> WholeTable:
     for whole in (there, new):
         if set(lines) == set(whole.lines) and whole is later:
             return replace(whole, table=table, rows=rows)
-    return WholeTable(
+    return TableDump(
         later.vehicle,
         table,
         max(there.table.updated_at, new.table.updated_at),

@@ -256,7 +256,7 @@ _add(
 )
 _add(
     _app,
-    "setup:apply",
+    "apply:apply",
     "udpin:0.0.0.0:14550 quad.params --dry-run",
     "udpin:0.0.0.0:14550 quad.params --reboot --backup before.yaml",
     "udpin:0.0.0.0:14550 fleet.param --all --overlay 'own/{system}.param'",
@@ -265,14 +265,14 @@ _add(
 )
 _add(
     _app,
-    "setup:verify",
+    "apply:verify",
     "udpin:0.0.0.0:14550 quad.params",
     "udpin:0.0.0.0:14550 fleet.param --all --expect 5",
     arguments="URL FILE",
 )
 _add(
     _app,
-    "setup:restore",
+    "apply:restore",
     "udpin:0.0.0.0:14550 --dry-run",
     "udpin:0.0.0.0:14550 '2h ago'",
     "udpin:0.0.0.0:14550 before.yaml",

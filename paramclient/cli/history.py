@@ -11,10 +11,10 @@ from cyclopts.validators import Number
 
 from paramclient.cache import CutOff, HistoryEntry, ParamCache, SetupNotes, SnapshotSummary
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.moments import parse_time
 from paramclient.cli.options import CacheOptions, Id
 from paramclient.cli.output import print_document, print_table
 from paramclient.cli.sources import tables_in
+from paramclient.cli.time_arguments import parse_time
 from paramclient.errors import UsageError
 from paramclient.model.notation import hash_text, time_text
 from paramclient.model.values import Param, check_name, format_value

@@ -62,7 +62,7 @@ from paramclient.protocol.params.fetch_result import FetchResult, Policy
 from paramclient.protocol.params.sampling import SAMPLE_SIZE, Sample
 
 if TYPE_CHECKING:
-    from paramclient.documents.command_output import FetchOutputDoc, SetDoneDoc
+    from paramclient.documents.command_output import FetchOutputDoc, WriteOutputDoc
     from paramclient.documents.document import Document
 
 __all__ = ["fetch", "get", "set_", "watch"]
@@ -163,9 +163,9 @@ async def get(
         if described is None:
             described = await known_of_session(session, metadata)
     if options.json:
-        from paramclient.documents.param import GotDoc  # only here: loads pydantic
+        from paramclient.documents.param import ReadOutputDoc  # only here: loads pydantic
 
-        print_document(GotDoc.of(params, described, errors))
+        print_document(ReadOutputDoc.of(params, described, errors))
     elif params and described is None:
         print_table(_COLUMNS, map(_cells, params), right="value index")
     elif params and described is not None:
@@ -226,9 +226,9 @@ async def set_(
             f"{client.bytes_received:,} bytes received, {client.bytes_sent:,} sent"
         )
     if options.json:
-        from paramclient.documents.command_output import SetsDoneDoc  # only here: loads pydantic
+        from paramclient.documents.command_output import WritesOutputDoc  # only here: loads pydantic
 
-        print_document(SetsDoneDoc(results=[outcome.document(described) for outcome in outcomes]))
+        print_document(WritesOutputDoc(results=[outcome.document(described) for outcome in outcomes]))
     else:
         print_table(
             ["name", "requested", "actual", "status"],
@@ -455,11 +455,11 @@ class _Written:
     param: Param | None = None
     note: str = ""
 
-    def document(self, metadata: Metadata | None) -> SetDoneDoc:
+    def document(self, metadata: Metadata | None) -> WriteOutputDoc:
         """Return the JSON document."""
-        from paramclient.documents.command_output import SetDoneDoc  # only here: loads pydantic
+        from paramclient.documents.command_output import WriteOutputDoc  # only here: loads pydantic
 
-        return SetDoneDoc.of(
+        return WriteOutputDoc.of(
             self.name,
             self.type,
             self.requested,

@@ -19,7 +19,7 @@ from paramclient.cli.sources import check_link, choose, collect_confirmed, is_fi
 from paramclient.client.component import Component
 from paramclient.errors import UsageError
 from paramclient.files import FileForm, write_file
-from paramclient.files.param_file import AUTOPILOT, address, form_of_name
+from paramclient.files.param_file import AUTOPILOT, address, format_of_name
 from paramclient.model.paramset import ParamSet
 from paramclient.model.wording import counted
 from paramclient.protocol.params.fetch_result import FetchResult
@@ -57,7 +57,7 @@ async def save(
         all_: Write all components of the vehicle, if the file format can hold several.
         refresh: Download all parameters even if the cache is up to date.
     """
-    form = form_of_name(str(file)) if form is None else form
+    form = format_of_name(str(file)) if form is None else form
     if form is FileForm.PX4_SCRIPT:
         raise UsageError("start scripts of PX4 cannot be written, only read; choose another file format")
     if all_ and options.component is not None:

@@ -182,10 +182,10 @@ def _refused(address: tuple[int, int], failure: str) -> VehicleError:
 
 def _show(options: SigningTarget, vehicle: Component, key: SigningKey | None) -> None:
     if options.json:
-        from paramclient.documents.command_output import SignsDoc  # only here: loads pydantic
+        from paramclient.documents.command_output import SigningOutputDoc  # only here: loads pydantic
 
         print_document(
-            SignsDoc(
+            SigningOutputDoc(
                 system=vehicle.system,
                 component=vehicle.component,
                 autopilot=vehicle.autopilot,

@@ -15,7 +15,7 @@ __all__ = [
     "SETTLE_MAX",
     "address_in_words",
     "check_accepted",
-    "check_asked",
+    "check_requested_name",
     "check_asked_name",
     "check_settle",
     "check_writes",
@@ -42,7 +42,7 @@ _CAUSES: Final = {
 """Likely causes of a silent link, by the first part of its name."""
 
 
-def check_asked(name: str | int) -> None:
+def check_requested_name(name: str | int) -> None:
     """Check that a parameter can have this name or index.
 
     Raises:

@@ -105,7 +105,7 @@ class WriteThrough:
         self._now = now
         self._owned = owned
         self._worker = Worker("paramclient cache")
-        self._kept: dict[ComponentMachine, _Kept] = {}
+        self._kept: dict[ComponentMachine, _CachedComponent] = {}
         self._flushing = anyio.Lock()
         self._failure: CacheError | UsageError | None = None  # None after a successful write
         self._failures = 0
@@ -158,7 +158,7 @@ class WriteThrough:
         return self._tables.get((system, component), False)
 
     def follow(self, machine: ComponentMachine, identity: Identity) -> bool:
-        """Update the identity of a cached component. Return False if `bring` must load its table first.
+        """Update the identity of a cached component. Return False if `load_cached` must load its table first.
 
         If the identity is that of another vehicle, the values queued for the previous vehicle are discarded.
         """
@@ -167,7 +167,7 @@ class WriteThrough:
             kept.identity = identity
             return True
         if kept is not None:
-            self.let_go(machine)
+            self.discard_queued(machine)
         return False
 
     async def bring(self, machine: ComponentMachine, identity: Identity) -> bool:
@@ -180,14 +180,14 @@ class WriteThrough:
             return False
         self._bringing.add(machine)
         try:
-            while self._has_room(machine, identity):
+            while self._has_capacity(machine, identity):
                 cached = await self._load(machine, identity)
                 logger.debug("cached under %s/%s: %s", identity.key, machine.component, cached or "nothing")
                 current = self._identity_of(machine)
                 if current is None or (current.key == identity.key and self.follow(machine, current)):
                     return False
                 if current.key == identity.key:
-                    if self._has_room(machine, current):  # another component may have used the room meanwhile
+                    if self._has_capacity(machine, current):  # others may have used it meanwhile
                         self._keep(machine, current, cached)
                     break
                 identity = current  # another vehicle has replaced it meanwhile
@@ -196,10 +196,10 @@ class WriteThrough:
             self._bringing.discard(machine)
 
     def is_bringing(self, machine: ComponentMachine) -> bool:
-        """Return whether `bring` is running for a component."""
+        """Return whether `load_cached` is running for a component."""
         return machine in self._bringing
 
-    async def keep_late(self, machine: ComponentMachine) -> None:
+    async def save_on_close(self, machine: ComponentMachine) -> None:
         """Write the table of a component that closes before its identity was settled or its cache loaded.
 
         A component may never report its identity. Its table is written if it is complete.
@@ -210,7 +210,7 @@ class WriteThrough:
         identity = known or machine.identity
         if not self.follow(machine, identity):
             cached = await self._load(machine, identity)
-            if self._has_room(machine, identity):
+            if self._has_capacity(machine, identity):
                 self._keep(machine, identity, cached)
 
     def synced(self, machine: ComponentMachine, *, is_whole: bool) -> None:
@@ -221,14 +221,14 @@ class WriteThrough:
             if is_whole:
                 kept.whole_at = kept.proven_at
 
-    def let_go(self, machine: ComponentMachine) -> None:
+    def discard_queued(self, machine: ComponentMachine) -> None:
         """Discard the queued values of a component: several vehicles use its address, or did until now."""
         self._kept.pop(machine, None)
         machine.table.take_dirty()
         machine.table.take_overwritten()
         machine.table.take_gone()
 
-    def part_with(self, machine: ComponentMachine) -> None:
+    def remove_component(self, machine: ComponentMachine) -> None:
         """Remove a component that is no longer followed."""
         self._kept.pop(machine, None)
 
@@ -309,7 +309,7 @@ class WriteThrough:
             raise CacheError(why)
 
     async def _flush(self, *, is_last: bool) -> bool:
-        portion: list[_News] = []
+        portion: list[_PendingUpdates] = []
         size = 0
         times = self._present_times()
         fetches = sum(machine.fetch is not None for machine in self._kept)
@@ -329,7 +329,7 @@ class WriteThrough:
                 portion, size = [], 0
         return await self._write(portion)
 
-    def _is_for_later(self, kept: _Kept) -> bool:
+    def _is_for_later(self, kept: _CachedComponent) -> bool:
         """Return whether a running fetch delivers more values that are written together later."""
         fetch, table = kept.machine.fetch, kept.machine.table
         if fetch is None:
@@ -339,7 +339,7 @@ class WriteThrough:
         began_at = fetch.first_value_at if fetch.first_value_at < math.inf else fetch.begun_at
         return anyio.current_time() < max(kept.written_at, began_at) + DOWNLOAD_INTERVAL
 
-    async def _write(self, news: list[_News]) -> bool:
+    async def _write(self, news: list[_PendingUpdates]) -> bool:
         """Write the collected updates. Return False if the write failed."""
         cache = self._cache
         if cache is None or not news:
@@ -396,7 +396,7 @@ class WriteThrough:
     async def _save(self, cache: ParamCache, updates: list[TableUpdate]) -> bool:
         return await self._run(partial(_save, cache, updates, self._clock)) is not None
 
-    def _has_room(self, machine: ComponentMachine, identity: Identity) -> bool:
+    def _has_capacity(self, machine: ComponentMachine, identity: Identity) -> bool:
         """Return whether the table of a vehicle may be cached, within the limits of the session."""
         address = (machine.system, machine.component)
         twins = [each for each in self._kept.values() if _is_twin(each, machine, identity)]
@@ -431,7 +431,7 @@ class WriteThrough:
     def _keep(self, machine: ComponentMachine, identity: Identity, cached: CachedComponent | None) -> None:
         table = machine.table
         whole_at = self._now() + table.slept if table.complete else None
-        kept = _Kept(machine, identity, whole_at=whole_at, written_at=anyio.current_time())
+        kept = _CachedComponent(machine, identity, whole_at=whole_at, written_at=anyio.current_time())
         self._kept[machine] = kept
         for name in table.params:
             table.dirty.setdefault(name, "vehicle")
@@ -483,7 +483,7 @@ class WriteThrough:
             return {}
         return {name: min(at - ahead, now) for name, at in cached.heard_at.items()}
 
-    def _news_of(self, kept: _Kept, times: UnixTimes) -> list[_News]:
+    def _news_of(self, kept: _CachedComponent, times: UnixTimes) -> list[_PendingUpdates]:
         """Return the updates of a table since the last write, and mark them as written."""
         machine, table = kept.machine, kept.machine.table
         if self._is_doubted(machine):
@@ -508,7 +508,7 @@ class WriteThrough:
         update = TableUpdate(
             identity=kept.identity,
             component=machine.component,
-            autopilot=machine.who.autopilot or 0,
+            autopilot=machine.identification.autopilot or 0,
             at=times.at,
             table=state,
             params=HeardParams(
@@ -528,9 +528,9 @@ class WriteThrough:
             replace=is_whole,
             whole_at=None if whole_at is None else times(whole_at - table.slept),
         )
-        return [_News(kept, dirty, overwritten, gone, changed, params, update, proven_at, whole_at)]
+        return [_PendingUpdates(kept, dirty, overwritten, gone, changed, params, update, proven_at, whole_at)]
 
-    def _state(self, machine: ComponentMachine, kept: _Kept) -> TableState:
+    def _state(self, machine: ComponentMachine, kept: _CachedComponent) -> TableState:
         table = machine.table
         return TableState(
             hash=table.hash if table.complete else None,
@@ -571,7 +571,7 @@ class WriteThrough:
 
 
 @dataclass(slots=True)
-class _Kept:
+class _CachedComponent:
     """State of a cached component.
 
     Attributes:
@@ -594,10 +594,10 @@ class _Kept:
 
 
 @dataclass(slots=True)
-class _News:
+class _PendingUpdates:
     """Updates of one component in a write, kept to queue them again after a failure."""
 
-    kept: _Kept
+    kept: _CachedComponent
     dirty: dict[str, str]
     overwritten: list[Observation]
     gone: dict[str, float]
@@ -614,7 +614,9 @@ class _News:
             kept.proven_at = self.proven_at
         if kept.whole_at is None:
             kept.whole_at = self.whole_at
-        kept.machine.table.give_back(self.dirty, self.overwritten, self.gone, self.changed, self.params)
+        kept.machine.table.restore_unwritten(
+            self.dirty, self.overwritten, self.gone, self.changed, self.params
+        )
         kept.state = None
 
 
@@ -635,7 +637,7 @@ def choose_cache(
     return ParamCache(None if cache is None or cache is True else cache)
 
 
-def _is_twin(kept: _Kept, machine: ComponentMachine, identity: Identity) -> bool:
+def _is_twin(kept: _CachedComponent, machine: ComponentMachine, identity: Identity) -> bool:
     """Return whether a cached component has equal ids and identity at another peer."""
     other = kept.machine
     has_equal_ids = (other.system, other.component) == (machine.system, machine.component)

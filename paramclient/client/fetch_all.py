@@ -20,7 +20,7 @@ from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_result import FetchResult, Progress
 from paramclient.protocol.station import Address, Peer, Station
 
-__all__ = ["FetchTogether", "FetchedAll"]
+__all__ = ["FleetFetch", "FetchedAll"]
 
 SILENT_TIMEOUT: Final = 1.0
 """Minimum timeout in seconds for a component without any response, once another fetch has ended."""
@@ -55,7 +55,7 @@ class FetchedAll:
         return all(result.complete for result in self.results.values())
 
 
-class FetchTogether:
+class FleetFetch:
     """The fetches of all components of one system, or of every system.
 
     Args:
@@ -141,7 +141,7 @@ class FetchTogether:
         ready: dict[tuple[int, Peer], list[ComponentMachine]] = {}
         for address, component in self._components.items():
             machine = component.machine
-            if address in self._fetches or not machine.who.has_parameters:
+            if address in self._fetches or not machine.identification.has_parameters:
                 continue
             if self._system not in (None, machine.system) or (machine.presence.is_lost and not machine.fetch):
                 continue
@@ -263,7 +263,7 @@ class FetchTogether:
         if fetch.done or answered_at < math.inf:
             del self._unanswered[address]
             if answered_at < math.inf:
-                took = answered_at - fetch.begun_at - fetch.held_up(now)
+                took = answered_at - fetch.begun_at - fetch.queue_wait(now)
                 self._longest_answer = max(self._longest_answer, took)
         elif presence.is_overdue(now):
             self._unheard_at[address] = now
@@ -271,6 +271,6 @@ class FetchTogether:
     def _is_mute(self, address: Address, fetch: Fetch, now: float, timeout: float) -> bool:
         """Return whether a component sends messages, but no response to its fetch for this many seconds."""
         presence = self._station.components[address].presence
-        since = max(fetch.begun_at + fetch.held_up(now), self._unheard_at.get(address, -math.inf))
+        since = max(fetch.begun_at + fetch.queue_wait(now), self._unheard_at.get(address, -math.inf))
         is_heard = presence.heard_at >= since or presence.is_lost or not presence.has_beaten
         return is_heard and now - since >= timeout

@@ -11,7 +11,7 @@ import anyio
 from paramclient.client.component import Component
 from paramclient.client.local import local
 from paramclient.protocol.ftp import FILE_SIZE_MAX, DirectoryEntry, FileTransfers
-from paramclient.protocol.ftp.transfer_job import Job
+from paramclient.protocol.ftp.transfer_job import FileTransferJob
 
 __all__ = ["Ftp"]
 
@@ -131,7 +131,7 @@ class Ftp:
 
     async def _wait(
         self,
-        job: Job[Result],
+        job: FileTransferJob[Result],
         what: str,
         timeout: float | None,
         tell: Callable[[], None] | None = None,

@@ -19,7 +19,7 @@ from paramclient.client.arguments import COMPONENT_TIMEOUT, address_in_words, si
 from paramclient.client.cache_writer import WriteThrough, choose_cache
 from paramclient.client.component import Component
 from paramclient.client.events import Events, public_event
-from paramclient.client.fetch_all import FetchedAll, FetchTogether
+from paramclient.client.fetch_all import FetchedAll, FleetFetch
 from paramclient.client.files import Ftp
 from paramclient.client.link_component import LinkComponent, fetch_timeout
 from paramclient.client.link_task import LinkTask
@@ -50,10 +50,10 @@ from paramclient.protocol.events import (
     TableResynced,
 )
 from paramclient.protocol.params.fetch_result import Policy, Progress
-from paramclient.protocol.params.sync import Upkeep
+from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.station import Station
 from paramclient.protocol.stats.traffic import TrafficReport
-from paramclient.protocol.system_id_change import SEARCH_INTERVAL, Succession
+from paramclient.protocol.system_id_change import SEARCH_INTERVAL, SystemIdSearch
 from paramclient.protocol.vehicle_selection import LOOK_TIME, VehicleChoice
 from paramclient.protocol.wire import SigningKey, SigningReport
 
@@ -130,7 +130,7 @@ class LinkClient(LocalClient):
             system=options.system,
             component=options.component,
             encoding=options.encoding,
-            upkeep=Upkeep.chosen(
+            upkeep=SyncSettings.chosen(
                 options.watch_interval, options.policy, listen_only=options.listen_only, is_log=is_log
             ),
             split_peers=options.split_peers,
@@ -209,7 +209,7 @@ class LinkClient(LocalClient):
         return ClientStats.of(self.station, downloads=self._downloads, cache_hits=self._cache_hits)
 
     def __repr__(self) -> str:
-        state = "away" if self.link_task.is_away else "open"
+        state = "away" if self.link_task.is_disconnected else "open"
         state = "closed" if self._tasks is None or self.link_task.ended is not None else state
         return f"<ParamClient {self._link.name} {state}, {counted(len(self._components), 'component')}>"
 
@@ -236,8 +236,8 @@ class LinkClient(LocalClient):
         await tasks.__aenter__()
         self._tasks = tasks
         self.opened_at = self.station.listening_since = anyio.current_time()
-        tasks.start_soon(self._outlast, self.link_task.read, name="paramclient reader")
-        tasks.start_soon(self._outlast, self.link_task.send, name="paramclient sender")
+        tasks.start_soon(self._run_until_files_closed, self.link_task.read, name="paramclient reader")
+        tasks.start_soon(self._run_until_files_closed, self.link_task.send, name="paramclient sender")
         tasks.start_soon(self.cache_writer.run, name="paramclient cache writer")
         self._beside.start(tasks)
         if self._keeper is not None:
@@ -277,7 +277,7 @@ class LinkClient(LocalClient):
             try:
                 await self._link.close()
                 for machine in self.station.components.values():
-                    await self.cache_writer.keep_late(machine)
+                    await self.cache_writer.save_on_close(machine)
             finally:
                 try:
                     await self.cache_writer.close()
@@ -350,7 +350,7 @@ class LinkClient(LocalClient):
                     break
                 with anyio.move_on_after(None if choice.due == math.inf else choice.due - now):
                     await news.wait()
-                await self.link_task.read_up(choice.due)
+                await self.link_task.wait_for_reader(choice.due)
                 self.check_open()
             if machine is not None:
                 await self._components[machine.address].wait_for_cache()
@@ -377,7 +377,7 @@ class LinkClient(LocalClient):
         self.check_open()
         began = anyio.current_time()
         machine = local(component).machine
-        search = Succession(machine, machine.address_in(system))
+        search = SystemIdSearch(machine, machine.address_in(system))
         with anyio.move_on_after(timeout):
             while not search.look(self.station.components, anyio.current_time()):
                 self.wake()
@@ -401,7 +401,7 @@ class LinkClient(LocalClient):
         self.station.check_refresh(refresh)
         timeout = fetch_timeout(self.station, timeout)
         began = anyio.current_time()
-        together = FetchTogether(self.station, self._components, system, refresh=refresh)
+        together = FleetFetch(self.station, self._components, system, refresh=refresh)
         return await together.run(
             self.check_open,
             self.wake,
@@ -449,12 +449,12 @@ class LinkClient(LocalClient):
             if isinstance(event, ComponentHeard):
                 self._meet(machine)
             elif isinstance(event, ComponentLost | ComponentFound) and self._splits_peers:
-                self._pass_place_on(machine, is_lost=isinstance(event, ComponentLost))
+                self._transfer_cache_entry(machine, is_lost=isinstance(event, ComponentLost))
             elif isinstance(event, ComponentContested):
-                self.cache_writer.let_go(machine)
+                self.cache_writer.discard_queued(machine)
                 logger.warning("%s: %s", self._link.name, event.contest.error)
             elif isinstance(event, ComponentUncontested | ComponentReplaced):
-                self.cache_writer.let_go(machine)
+                self.cache_writer.discard_queued(machine)
             elif isinstance(event, ComponentIdentified):
                 self.link_task.tell()
                 for component in self._components.values():
@@ -499,13 +499,13 @@ class LinkClient(LocalClient):
         assert self._tasks is not None, "no message arrives before"
         self._tasks.start_soon(self._load, component, identity)
 
-    def _pass_place_on(self, machine: ComponentMachine, *, is_lost: bool) -> None:
+    def _transfer_cache_entry(self, machine: ComponentMachine, *, is_lost: bool) -> None:
         """Pass the cache entry of a lost component to one with equal ids at another peer.
 
         The vehicle may have returned at another peer. The cache has one table for equal ids.
         """
         if is_lost:
-            self.cache_writer.let_go(machine)
+            self.cache_writer.discard_queued(machine)
         for component in self._components.values():
             other = component.machine
             if (other.system, other.component) == (machine.system, machine.component) and (
@@ -554,7 +554,7 @@ class LinkClient(LocalClient):
             ):
                 await self.link_task.news.wait()
 
-    async def _outlast(self, work: Callable[[], Awaitable[None]]) -> None:
+    async def _run_until_files_closed(self, work: Callable[[], Awaitable[None]]) -> None:
         """Run a task until file sessions are closed, also if a scope around the client is cancelled."""
         if self.link_task.ended is None:
             with anyio.CancelScope(shield=True) as scope:
@@ -594,7 +594,7 @@ class LinkClient(LocalClient):
             carrier.tell()
 
         self.wake()
-        while files.is_closing and not (carrier.is_away or carrier.ended or machine.presence.is_lost):
+        while files.is_closing and not (carrier.is_disconnected or carrier.ended or machine.presence.is_lost):
             if tell not in files.on_closed:
                 files.on_closed.append(tell)
             await carrier.news.wait()

@@ -15,7 +15,7 @@ from paramclient.client.arguments import (
     PROGRESS_CALL_INTERVAL,
     address_in_words,
     check_accepted,
-    check_asked,
+    check_requested_name,
     check_settle,
     check_writes,
 )
@@ -26,12 +26,12 @@ from paramclient.client.subscription import Changes
 from paramclient.errors import CacheError, NoReply, NotDurable, ParamClientError, UsageError
 from paramclient.model.identity import Identity, autopilot_name
 from paramclient.model.params import ParamMap
-from paramclient.model.values import Encoding, Param, Settable, decode, known_type
+from paramclient.model.values import Encoding, Param, Settable, decode_value, known_type
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ParamChanged, ParamsMoved
 from paramclient.protocol.params.change import Change
-from paramclient.protocol.params.change_origin import check_asker
+from paramclient.protocol.params.change_origin import check_author
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_result import FetchResult, Progress, Sampled
 from paramclient.protocol.params.passive import PASSIVE_TIMEOUT
@@ -91,7 +91,7 @@ class LinkComponent(LocalComponent):
     @property
     def autopilot(self) -> str:
         """See `Component.autopilot`."""
-        number = self.machine.who.autopilot
+        number = self.machine.identification.autopilot
         return "unknown" if number is None else autopilot_name(number)
 
     @property
@@ -107,7 +107,7 @@ class LinkComponent(LocalComponent):
     @property
     def encoding_reason(self) -> str:
         """See `Component.encoding_reason`."""
-        return self.machine.who.encoding_reason
+        return self.machine.identification.encoding_reason
 
     @property
     def count(self) -> int | None:
@@ -171,7 +171,7 @@ class LinkComponent(LocalComponent):
 
     async def get(self, name: str | int, *, timeout: float | None = None) -> Param:
         """See `Component.get`."""
-        check_asked(name)
+        check_requested_name(name)
         machine = self.machine
         self.client.check_open()
         read = machine.read(name, anyio.current_time())
@@ -206,7 +206,7 @@ class LinkComponent(LocalComponent):
             name,
             checked,
             anyio.current_time(),
-            check_asker(asker),
+            check_author(asker),
             settle=check_settle(settle),
             force=force,
         )
@@ -238,7 +238,9 @@ class LinkComponent(LocalComponent):
         if durable:
             await self._wait_until_kept()
         began = anyio.current_time()
-        batch = machine.write_many(pairs, began, check_asker(asker), settle=check_settle(settle), force=force)
+        batch = machine.write_many(
+            pairs, began, check_author(asker), settle=check_settle(settle), force=force
+        )
         try:
             outcomes = await self._wait_for_batch(batch, timeout, progress)
         finally:
@@ -451,7 +453,7 @@ class LinkComponent(LocalComponent):
 
     def forget(self) -> None:
         """End all streams with NoReply: the component is lost and no longer followed."""
-        self.client.cache_writer.part_with(self.machine)
+        self.client.cache_writer.remove_component(self.machine)
         silence = anyio.current_time() - self.machine.presence.heard_at
         awaited = f"{address_in_words(self.system, self.component)} (lost)"
         self.end(NoReply(awaited, attempts=0, waited=silence))
@@ -535,7 +537,7 @@ def _outcome(operation: Operation[Result]) -> Result:
 
 def _param_of(message: ParamValue, encoding: Encoding) -> Param:
     """Return the parameter of a PARAM_VALUE outside the table: a hash, or a removed or duplicate name."""
-    value, bits = decode(message.raw, message.param_type, encoding)
+    value, bits = decode_value(message.raw, message.param_type, encoding)
     index = None if message.param_index == NO_INDEX else message.param_index
     return Param(message.param_id, value, known_type(message.param_type), index, bits)
 

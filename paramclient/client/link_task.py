@@ -33,7 +33,7 @@ PAUSE_DATAGRAMS_MAX: Final = 64
 """Maximum number of datagrams in one pause at the rate of the last read; a pause is shorter on a busier link.
 It is an eighth of the default Linux socket buffer (see `paramclient.links.udp`), which leaves room for a
 burst."""
-HELD_UP_MIN: Final = 0.02
+LOOP_LATENCY_MIN: Final = 0.02
 """Event-loop latency in seconds, from which the sender counts a deadline as missed because the program was
 busy or did not run. Data received meanwhile is read before any request times out."""
 ARRIVAL_STEP: Final = 0.0002
@@ -46,15 +46,15 @@ READER_TIME: Final = 0.002
 iteration of the event loop is enough."""
 READER_ITERATIONS: Final = 4
 """Iterations of the event loop that the sender leaves to the reader before each deadline. A program that was
-blocked until shortly after a deadline misses it by less than `HELD_UP_MIN`, while received data is still
+blocked until shortly after a deadline misses it by less than `LOOP_LATENCY_MIN`, while received data is still
 unread."""
 TIMEOUT_DELAY_MAX: Final = 3.0
 """Maximum seconds for which timeouts wait for the reader, on a link with a growing backlog."""
 LINK_TIMEOUT: Final = 10.0
 """Seconds for which calls wait for a reconnection before they fail with the error of the link."""
-BACKOFF_MIN: Final = 0.25
+RECONNECT_BACKOFF_MIN: Final = 0.25
 """Seconds before the first attempt to reopen a link; doubled after each attempt."""
-BACKOFF_MAX: Final = 5.0
+RECONNECT_BACKOFF_MAX: Final = 5.0
 """Maximum seconds between two attempts to reopen a link."""
 FORWARDED_PER_TURN: Final = 16
 """Maximum number of frames of another program sent before frames of this client are sent again."""
@@ -96,7 +96,7 @@ class LinkTask:
             another program.
 
     Attributes:
-        is_away: whether the link is disconnected and being reopened.
+        is_disconnected: whether the link is disconnected and being reopened.
         broken: the error that calls raise now, or None.
         ended: the error that all calls raise permanently, or None.
         news: set, and replaced, when data was received, the link drops or the calls fail.
@@ -112,7 +112,7 @@ class LinkTask:
         taps: Sequence[Tap] = (),
         may_rest: bool = True,
     ) -> None:
-        self.is_away = False
+        self.is_disconnected = False
         self.broken: LinkError | None = None
         self.ended: LinkError | None = None
         self.news = anyio.Event()
@@ -139,11 +139,11 @@ class LinkTask:
         """Receive data and reconnect, until the link fails permanently or cancellation."""
         loop = LoopScheduler.of_this_loop()
         async with self._reading:
-            loop.joined(self)
+            loop.register(self)
             try:
                 await self._read(loop)
             finally:
-                loop.left(self)
+                loop.unregister(self)
 
     async def _read(self, loop: LoopScheduler) -> None:
         self._is_taking, self._behind_since = False, math.inf
@@ -156,7 +156,7 @@ class LinkTask:
                 if not self._link.reconnects:
                     self._end(error)
                     return
-                await self._reopen(error)
+                await self._reconnect(error)
                 drained_at = anyio.current_time()
                 continue
             now = anyio.current_time()
@@ -166,7 +166,7 @@ class LinkTask:
             is_news = not chunks
             if not chunks:
                 self._station.over(now)
-            loop.came(self, len(chunks))
+            loop.record_read(self, len(chunks))
             self._behind_since = (
                 math.inf if len(chunks) < BACKLOG_DATAGRAMS_MIN else min(self._behind_since, now)
             )
@@ -178,7 +178,7 @@ class LinkTask:
                 self._is_taking = False
             is_news |= self._take(rest, math.inf)
             now = self._read_at = anyio.current_time()
-            loop.taken(self, now)
+            loop.record_processed(self, now)
             if is_news:
                 self._dispatch()
                 self.tell()
@@ -249,7 +249,7 @@ class LinkTask:
             try:
                 await self._send(loop)
             finally:
-                loop.left(self)
+                loop.unregister(self)
 
     async def _send(self, loop: LoopScheduler) -> None:
         station = self._station
@@ -286,7 +286,7 @@ class LinkTask:
             now = anyio.current_time()
             if now - due > READ_GAP_MIN:
                 self._held_up_at = now
-            if self._behind_since < math.inf or now - due > HELD_UP_MIN:
+            if self._behind_since < math.inf or now - due > LOOP_LATENCY_MIN:
                 await anyio.sleep(READER_TIME)
             elif now >= due:
                 for _ in range(READER_ITERATIONS):
@@ -294,7 +294,7 @@ class LinkTask:
 
     def send_for_another(self, frame: bytes) -> None:
         """Queue a frame of another program for every peer. Drop it if the queue is full or the link away."""
-        if len(self._of_others) < FORWARDED_QUEUE_MAX and not self.is_away:
+        if len(self._of_others) < FORWARDED_QUEUE_MAX and not self.is_disconnected:
             self._of_others.append(frame)
             self._station.overhear(frame, anyio.current_time())
             self._something_to_send.set()
@@ -312,14 +312,14 @@ class LinkTask:
         """Detect suspend of the computer, or a stopped process."""
         self._look_at_the_clock(anyio.current_time())
 
-    async def read_up(self, due: float) -> None:
+    async def wait_for_reader(self, due: float) -> None:
         """Wait until received data has been read, if the reader has a backlog or this call is late.
 
         Args:
             due: time at which the caller was due to continue.
         """
         now = anyio.current_time()
-        while now - due > HELD_UP_MIN or self._is_behind(now):
+        while now - due > LOOP_LATENCY_MIN or self._is_behind(now):
             await anyio.sleep(READER_TIME)
             now, due = anyio.current_time(), math.inf
 
@@ -330,7 +330,7 @@ class LinkTask:
 
     def _is_behind(self, now: float) -> bool:
         """Return whether received data is still unread, so that no request may time out."""
-        return self._is_taking or self._behind_since <= now < self._read_at + HELD_UP_MIN
+        return self._is_taking or self._behind_since <= now < self._read_at + LOOP_LATENCY_MIN
 
     async def _transmit(self, data: bytes, peer: Peer | None) -> None:
         for tap in self._taps:
@@ -345,7 +345,7 @@ class LinkTask:
         if unseen is not None:
             logger.info("%s: the computer was suspended or the process stopped", self._link.name)
             self._unseen += unseen
-            self._station.stood_still(unseen, now)
+            self._station.handle_suspend(unseen, now)
             self.wake()
 
     async def _rest(self, seconds: float) -> None:
@@ -354,21 +354,21 @@ class LinkTask:
         with anyio.move_on_after(seconds):
             await self._sent.wait()
 
-    async def _reopen(self, error: LinkError) -> None:
+    async def _reconnect(self, error: LinkError) -> None:
         """Reopen the link with backoff, without a time limit. Calls fail after `LINK_TIMEOUT`."""
         logger.warning("%s; reconnecting", error)
-        self.is_away = True
+        self.is_disconnected = True
         self.tell()
         self._of_others.clear()
         self._station.pause()
         for tap in self._taps:
             tap.pause()
         deadline = anyio.current_time() + LINK_TIMEOUT
-        backoff = BACKOFF_MIN
+        backoff = RECONNECT_BACKOFF_MIN
         while True:
             left = deadline - anyio.current_time()
             await anyio.sleep(min(backoff, left) if left > 0 else backoff)
-            backoff = min(backoff * 2, BACKOFF_MAX)
+            backoff = min(backoff * 2, RECONNECT_BACKOFF_MAX)
             try:
                 await self._link.open()
             except LinkError as again:
@@ -376,7 +376,7 @@ class LinkTask:
                     self.fail_calls(again)
             else:
                 logger.info("%s: reconnected", self._link.name)
-                self.is_away = False
+                self.is_disconnected = False
                 self.broken = None
                 self._station.resume(anyio.current_time())
                 self.wake()

@@ -53,7 +53,7 @@ class LoopScheduler:
             _scheduler.set(scheduler := LoopScheduler())
             return scheduler
 
-    def joined(self, reader: object) -> None:
+    def register(self, reader: object) -> None:
         """Register a reader."""
         self._readers.add(reader)
 
@@ -66,18 +66,19 @@ class LoopScheduler:
         """
         return datagrams >= TURN_DATAGRAMS_MIN or (len(self._readers) > 1 and scheduler.is_waiting)
 
-    def came(self, reader: object, datagrams: int) -> None:
-        """Record the number of datagrams of one read. The reader calls `taken` after processing them."""
+    def record_read(self, reader: object, datagrams: int) -> None:
+        """Record the number of datagrams of one read. The reader calls `record_processed` after processing
+        them."""
         self._behind.pop(reader, None)
         if datagrams >= BACKLOG_DATAGRAMS_MIN:
             self._behind[reader] = math.inf
 
-    def taken(self, reader: object, now: float) -> None:
+    def record_processed(self, reader: object, now: float) -> None:
         """Record that the reader has processed its datagrams."""
         if reader in self._behind:
             self._behind[reader] = now + BACKLOG_VALIDITY
 
-    def left(self, reader: object) -> None:
+    def unregister(self, reader: object) -> None:
         """Remove a reader."""
         self._readers.discard(reader)
         self._behind.pop(reader, None)

@@ -30,7 +30,7 @@ TIMESTAMP_RESERVE: Final = 60 * UNITS_PER_SECOND
 this many."""
 TIMESTAMP_RESERVE_MIN: Final = TIMESTAMP_RESERVE // 2
 """Remaining timestamp units at which a new limit is written."""
-CHECK_INTERVAL: Final = 5.0
+TIMESTAMP_CHECK_INTERVAL: Final = 5.0
 """Seconds between two checks of the remaining timestamps."""
 LINK_IDS: Final = 256
 """Number of link ids: a signature has 8 bits for it."""
@@ -152,7 +152,7 @@ class TimestampKeeper:
     async def run(self) -> None:
         """Write new limits ahead of use, until cancelled."""
         while True:
-            await anyio.sleep(CHECK_INTERVAL)
+            await anyio.sleep(TIMESTAMP_CHECK_INTERVAL)
             await self._keep()
 
     async def close(self) -> None:

@@ -101,7 +101,7 @@ class Worker:
 
     def _main(self) -> None:
         while (call := self._calls.get()) is not None:
-            call.work_it_out()
+            call.run()
 
 
 class _Call(Generic[Result]):
@@ -115,7 +115,7 @@ class _Call(Generic[Result]):
         self._token = anyio.lowlevel.current_token()
         waiting[self] = None
 
-    def work_it_out(self) -> None:
+    def run(self) -> None:
         """Do it, in the thread."""
         done: Future[Result] = Future()
         try:

@@ -139,9 +139,9 @@ class _Diagnosis:
             system=component.system,
             component=component.component,
             autopilot=component.autopilot,
-            vehicle_type=_vehicle_type(machine.who.vehicle_type),
+            vehicle_type=_vehicle_type(machine.identification.vehicle_type),
             identity=identity,
-            has_version=machine.who.firmware is not None,
+            has_version=machine.identification.firmware is not None,
             encoding=component.encoding,
             encoding_reason=component.encoding_reason,
             is_armed=component.is_armed,
@@ -165,7 +165,7 @@ class _Diagnosis:
     async def _wait_for_identity(self) -> None:
         """Wait until AUTOPILOT_VERSION was received or finally refused, at most `VERSION_TIMEOUT`."""
         with anyio.move_on_after(self._left(VERSION_TIMEOUT)):
-            while not self._local.machine.who.settled:
+            while not self._local.machine.identification.settled:
                 await self._local.client.link_task.news.wait()
 
     async def _measure_round_trips(self) -> tuple[float, ...]:
@@ -198,7 +198,7 @@ class _Diagnosis:
 
     async def _read_hash(self) -> int | str:
         """Return the vehicle's present hash, or the reason why there is none."""
-        if self._local.machine.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA:
+        if self._local.machine.identification.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA:
             return "ArduPilot has no parameter hash"
         try:
             param = await self._component.get(HASH_CHECK, timeout=self._left(MEASURE_TIMEOUT))
@@ -285,7 +285,7 @@ class _Diagnosis:
 
     async def _check_files(self) -> FileService:
         machine = self._local.machine
-        capabilities = machine.who.capabilities
+        capabilities = machine.identification.capabilities
         is_announced = None if capabilities is None else bool(capabilities & CAPABILITY_FTP)
         ftp = self._client.ftp(self._component)
         entries: tuple[str, ...] | None = None

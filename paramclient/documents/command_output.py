@@ -37,9 +37,9 @@ __all__ = [
     "ResyncedLineDoc",
     "SavedDoc",
     "SavedSetDoc",
-    "SetDoneDoc",
-    "SetsDoneDoc",
-    "SignsDoc",
+    "WriteOutputDoc",
+    "WritesOutputDoc",
+    "SigningOutputDoc",
     "SilenceLineDoc",
     "TrustedSampleDoc",
 ]
@@ -135,7 +135,7 @@ class FetchOutputDoc(Document):
         )
 
 
-class SetDoneDoc(Document):
+class WriteOutputDoc(Document):
     """The outcome of one write; `reason` is the cause of a failure, `note` a remark on it."""
 
     name: str
@@ -159,7 +159,7 @@ class SetDoneDoc(Document):
         reason: str = "",
         note: str = "",
         info: ParamInfo | None = None,
-    ) -> SetDoneDoc:
+    ) -> WriteOutputDoc:
         """Return the document of a write.
 
         Args:
@@ -184,10 +184,10 @@ class SetDoneDoc(Document):
         )
 
 
-class SetsDoneDoc(Document):
+class WritesOutputDoc(Document):
     """The outcomes of several writes, in their order."""
 
-    results: list[SetDoneDoc]
+    results: list[WriteOutputDoc]
 
 
 class ChangeLineDoc(Document):
@@ -262,7 +262,7 @@ class ResyncedLineDoc(EventLineDoc):
     hash: str | None
 
 
-class SignsDoc(Document):
+class SigningOutputDoc(Document):
     """Whether a vehicle signs its frames now, and the fingerprint of the key."""
 
     system: int

@@ -9,7 +9,7 @@ from paramclient.documents.document import Document, Maybe
 if TYPE_CHECKING:
     from paramclient.client.stats import ClientStats
 
-__all__ = ["HealthDoc", "HealthLinkDoc", "LinkDoc", "LinksDoc", "MeDoc", "StatsDoc"]
+__all__ = ["HealthDoc", "HealthLinkDoc", "LinkDoc", "LinksDoc", "TokenHolderDoc", "StatsDoc"]
 
 
 class StatsDoc(Document):
@@ -81,7 +81,7 @@ class HealthDoc(Document):
     links: Maybe[list[HealthLinkDoc]] = None
 
 
-class MeDoc(Document):
+class TokenHolderDoc(Document):
     """The caller: the name of the token and its role. If `read_only`, the service allows no writes.
 
     `asker` is the author of the caller's changes in the history.

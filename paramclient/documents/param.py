@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from paramclient.metadata import Metadata, ParamInfo
     from paramclient.model.paramset import WrittenParam
 
-__all__ = ["DescribedDoc", "GotDoc", "InfoDoc", "InfosDoc", "ParamDoc", "WrittenParamDoc"]
+__all__ = ["DescribedDoc", "ReadOutputDoc", "InfoDoc", "InfosDoc", "ParamDoc", "WrittenParamDoc"]
 
 _TYPES: Final = dict(ParamType.__members__)
 """The types by name."""
@@ -172,7 +172,7 @@ class WrittenParamDoc(Document):
         return cls.of(param).model_copy(update={"default": None, "comment": None, "text": text})
 
 
-class GotDoc(Document):
+class ReadOutputDoc(Document):
     """Requested parameters by name, and the errors of those that were not received."""
 
     params: dict[str, ParamDoc]
@@ -181,7 +181,7 @@ class GotDoc(Document):
     @classmethod
     def of(
         cls, params: Iterable[Param], metadata: Metadata | None, errors: Mapping[str, ParamClientError]
-    ) -> GotDoc:
+    ) -> ReadOutputDoc:
         """Return the document of parameters with all their metadata, and of errors by name."""
         return cls(
             params={

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from paramclient.files import ParamFile
     from paramclient.model.paramset import ParamSet
 
-__all__ = ["FileDoc", "FormDoc", "FormsDoc", "OriginDoc", "SetDoc", "UploadedDoc"]
+__all__ = ["FileDoc", "FormatDoc", "FormatsDoc", "OriginDoc", "SetDoc", "UploadedDoc"]
 
 
 class OriginDoc(Document):
@@ -95,7 +95,7 @@ class UploadedDoc(Document):
         )
 
 
-class FormDoc(Document):
+class FormatDoc(Document):
     """A format of parameter files: its file name endings, and whether it can be written."""
 
     name: str
@@ -104,7 +104,7 @@ class FormDoc(Document):
     writes: bool
 
     @classmethod
-    def of(cls, form: FileForm) -> FormDoc:
+    def of(cls, form: FileForm) -> FormatDoc:
         """Return the document of a file format."""
         return cls(
             name=form.value,
@@ -114,10 +114,10 @@ class FormDoc(Document):
         )
 
 
-class FormsDoc(Document):
+class FormatsDoc(Document):
     """The formats of parameter files."""
 
-    forms: list[FormDoc]
+    forms: list[FormatDoc]
 
 
 _TITLES: Final = {

@@ -13,7 +13,7 @@ from typing import Final
 from paramclient.errors import FileError
 from paramclient.files.formats import LARGEST_FILE, Content, dumps, loads
 from paramclient.files.includes import Includes
-from paramclient.files.param_file import FileForm, ParamFile, as_form, form_of_name
+from paramclient.files.param_file import FileForm, ParamFile, format_of_name, parse_format
 
 __all__ = ["read_bytes", "read_file", "write_file"]
 
@@ -43,7 +43,7 @@ def read_file(path: str | os.PathLike[str], *, form: FileForm | str | None = Non
         UsageError: unknown format.
     """
     source = os.fspath(path)
-    form = None if form is None else as_form(form)
+    form = None if form is None else parse_format(form)
     data = read_bytes(source)
     return loads(data, source=source, form=form, includes=Includes.of(source, _read, size_max=LARGEST_FILE))
 
@@ -85,7 +85,7 @@ def write_file(
         UsageError: unknown format.
     """
     source = os.fspath(path)
-    form = form_of_name(source) if form is None else as_form(form)
+    form = format_of_name(source) if form is None else parse_format(form)
     data = dumps(content, form=form, target=source)
     try:
         _replace(Path(os.path.realpath(source)), data, source)

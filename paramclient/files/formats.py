@@ -9,7 +9,7 @@ from typing import Final, TypeAlias
 from paramclient.errors import FileError, UsageError
 from paramclient.files import document_format, line_formats, param_pck, script
 from paramclient.files.includes import Includes
-from paramclient.files.param_file import AUTOPILOT, ENDINGS, FileForm, ParamFile, address, as_form
+from paramclient.files.param_file import AUTOPILOT, ENDINGS, FileForm, ParamFile, address, parse_format
 from paramclient.files.text import decode_text, lines_of, time_of
 from paramclient.model.identity import autopilot_name
 from paramclient.model.paramset import ParamSet
@@ -52,7 +52,7 @@ def loads(
         FileError: unknown format, damaged, or without parameters. The error names up to 20 bad lines.
         UsageError: unknown format name.
     """
-    form = None if form is None else as_form(form)
+    form = None if form is None else parse_format(form)
     if len(data) > LARGEST_FILE:
         raise FileError(f"a parameter file has at most {LARGEST_FILE} bytes", source=source)
     if not data:
@@ -92,7 +92,7 @@ def dumps(content: Content, *, form: FileForm | str | None = None, target: str =
         form = content.form
     if form is None:
         raise UsageError("give the format in which to write the parameters")
-    form = as_form(form)
+    form = parse_format(form)
     try:
         around = _as_file(content, form)
         sets = [each for each in around.sets if each]

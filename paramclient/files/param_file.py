@@ -19,8 +19,8 @@ __all__ = [
     "ParamFile",
     "TooManyParams",
     "address",
-    "as_form",
-    "form_of_name",
+    "parse_format",
+    "format_of_name",
 ]
 
 AUTOPILOT: Final = 1
@@ -132,7 +132,7 @@ def address(params: ParamSet) -> str:
     return "/".join("?" if each is None else str(each) for each in (params.system, params.component))
 
 
-def as_form(form: FileForm | str) -> FileForm:
+def parse_format(form: FileForm | str) -> FileForm:
     """Return the format with this name.
 
     Raises:
@@ -144,7 +144,7 @@ def as_form(form: FileForm | str) -> FileForm:
         raise UsageError(f"unknown file format {form!r}; the formats are {_listed(FileForm)}") from None
 
 
-def form_of_name(name: str) -> FileForm:
+def format_of_name(name: str) -> FileForm:
     """Return the format for the extension of a file's name.
 
     Raises:

@@ -25,7 +25,7 @@ from paramclient.protocol.events import (
     ComponentReplaced,
     Fetched,
 )
-from paramclient.protocol.params.sync import Upkeep
+from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.station import Address, Station
 from paramclient.protocol.wire import AUTOPILOT_VERSION_ID, HEARTBEAT_ID, Framer
 
@@ -83,7 +83,9 @@ class _Import:
         self._heartbeats = said[HEARTBEAT_ID]
         self._versions = said[AUTOPILOT_VERSION_ID]
         self._at = 0.0
-        self._station = Station(link=name, is_stream=False, upkeep=Upkeep.chosen(None, "auto", is_log=True))
+        self._station = Station(
+            link=name, is_stream=False, upkeep=SyncSettings.chosen(None, "auto", is_log=True)
+        )
         self._writer = _LogWriter(
             cache,
             identity_of=self._identity_of,
@@ -133,9 +135,9 @@ class _Import:
                         if each.system == machine.system:
                             await self._bring(each)
                 elif isinstance(event, ComponentReplaced):
-                    writer.let_go(machine)
+                    writer.discard_queued(machine)
                 elif isinstance(event, ComponentForgotten):
-                    writer.part_with(machine)
+                    writer.remove_component(machine)
                 elif isinstance(event, Fetched) and event.result.complete:
                     writer.synced(machine, is_whole=event.result.source != "cache")
 
@@ -157,7 +159,7 @@ class _Import:
             identity.key,
             machine.system,
             machine.component,
-            machine.who.autopilot,
+            machine.identification.autopilot,
             params=len(machine.table.params),
             complete=complete,
             hash=machine.table.hash if complete else None,

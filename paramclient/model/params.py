@@ -18,13 +18,13 @@ from paramclient.model.wording import counted
 __all__ = [
     "CACHED",
     "LIVE",
-    "NOWHERE",
+    "COMPACT_NO_INDEX",
     "VERIFIED",
-    "Held",
+    "CompactParam",
     "ParamMap",
     "Params",
     "copy_params",
-    "held_of",
+    "compact_param",
     "is_listed",
     "iter_unpack_fields",
     "as_params",
@@ -38,7 +38,7 @@ __all__ = [
     "with_trust_number",
 ]
 
-Held: TypeAlias = bytes
+CompactParam: TypeAlias = bytes
 """A parameter in compact form, without name and default; see `pack_fields` and `unpack_fields`."""
 
 LIVE: Final = 0
@@ -47,7 +47,7 @@ VERIFIED: Final = 1
 """`Trust.VERIFIED` in the compact form."""
 CACHED: Final = 2
 """`Trust.CACHED` in the compact form."""
-NOWHERE: Final = -1
+COMPACT_NO_INDEX: Final = -1
 """The index, in the compact form, of a parameter without an index."""
 
 _LAYOUT = struct.Struct("<QBBBi")
@@ -61,7 +61,7 @@ _TRUST_AT: Final = 10
 """Offset of the trust in the compact form, in bytes."""
 _INDEX_AT: Final = 11
 """Offset of the index in the compact form, in bytes."""
-_NO_INDEX: Final = NOWHERE.to_bytes(4, "little", signed=True)
+_NO_INDEX: Final = COMPACT_NO_INDEX.to_bytes(4, "little", signed=True)
 _TRUSTS: Final = (Trust.LIVE, Trust.VERIFIED, Trust.CACHED)
 _NUMBERS: Final = {trust: number for number, trust in enumerate(_TRUSTS)}
 _KNOWN_TYPES: Final = tuple(map(known_type, range(256)))
@@ -81,11 +81,11 @@ class Params(MutableMapping[str, Param]):
 
     def __init__(
         self,
-        held: dict[str, Held] | None = None,
+        held: dict[str, CompactParam] | None = None,
         defaults: dict[str, Value] | None = None,
         moments: dict[str, float] | None = None,
     ) -> None:
-        self.held: dict[str, Held] = {} if held is None else held
+        self.held: dict[str, CompactParam] = {} if held is None else held
         self.defaults: dict[str, Value] = {} if defaults is None else defaults
         self.moments: dict[str, float] = {} if moments is None else moments
 
@@ -93,7 +93,7 @@ class Params(MutableMapping[str, Param]):
         return param_of(name, self.held[name], self.defaults.get(name))
 
     def __setitem__(self, name: str, param: Param) -> None:
-        self.held[name] = held_of(param)
+        self.held[name] = compact_param(param)
         if param.default is None:
             self.defaults.pop(name, None)
         else:
@@ -174,9 +174,9 @@ def copy_params(params: Mapping[str, Param]) -> Mapping[str, Param]:
     return shown.copy() if isinstance(shown, Params) else dict(shown)
 
 
-def held_of(param: Param) -> Held:
+def compact_param(param: Param) -> CompactParam:
     """Return a parameter in compact form."""
-    index = NOWHERE if param.index is None else param.index
+    index = COMPACT_NO_INDEX if param.index is None else param.index
     return pack_fields(param.bits, param.type, isinstance(param.value, bytes), number_of(param.trust), index)
 
 
@@ -185,35 +185,35 @@ def number_of(trust: Trust) -> int:
     return _NUMBERS[trust]
 
 
-def param_of(name: str, held: Held, default: Value | None = None) -> Param:
+def param_of(name: str, held: CompactParam, default: Value | None = None) -> Param:
     """Return the `Param` of a compact parameter."""
     bits, number, is_raw, trust, place = unpack_fields(held)
     value = from_bits(bits, number, is_raw=is_raw)
-    index = None if place == NOWHERE else place
+    index = None if place == COMPACT_NO_INDEX else place
     return Param(name, value, _KNOWN_TYPES[number], index, bits, _TRUSTS[trust], default)
 
 
-def trust_of(held: Held) -> int:
+def trust_of(held: CompactParam) -> int:
     """Return the number of a compact parameter's trust."""
     return held[_TRUST_AT]
 
 
-def with_trust_number(held: Held, trust: int) -> Held:
+def with_trust_number(held: CompactParam, trust: int) -> CompactParam:
     """Return a compact parameter with another trust."""
     return held[:_TRUST_AT] + bytes((trust,)) + held[_INDEX_AT:]
 
 
-def is_listed(held: Held) -> bool:
+def is_listed(held: CompactParam) -> bool:
     """Return whether a compact parameter has an index."""
     return held[_INDEX_AT:] != _NO_INDEX
 
 
-def with_index(held: Held, place: int) -> Held:
+def with_index(held: CompactParam, place: int) -> CompactParam:
     """Return a compact parameter with another index."""
     return held[:_INDEX_AT] + place.to_bytes(4, "little", signed=True)
 
 
-def same_held(one: Held, other: Held) -> bool:
+def same_held(one: CompactParam, other: CompactParam) -> bool:
     """Return whether both have the same value in the same type, as `Param.same_value` defines it."""
     if one[:_TRUST_AT] == other[:_TRUST_AT]:
         return True

@@ -32,8 +32,8 @@ __all__ = [
     "check_name",
     "check_value",
     "crc32_px4",
-    "decode",
-    "encode",
+    "decode_value",
+    "encode_value",
     "format_value",
     "from_bits",
     "hash_chunk",
@@ -189,7 +189,8 @@ _set_name, _set_value, _set_type, _set_index, _set_bits, _set_trust, _set_defaul
     vars(Param)[each.name].__set__ for each in fields(Param)
 )
 
-# Constants for `decode`, which runs for every received value: enumeration members are slower than numbers.
+# Constants for `decode_value`, which runs for every received value: enumeration members are slower than
+# numbers.
 _REAL32 = int(ParamType.REAL32)
 _REAL64 = int(ParamType.REAL64)
 _BYTEWISE = Encoding.BYTEWISE
@@ -257,7 +258,7 @@ def check_value(value: Settable) -> Value:
     raise UsageError(f"a parameter value is a number, not {type(value).__name__}")
 
 
-def decode(raw: bytes, number: int, encoding: Encoding) -> tuple[Value, int]:
+def decode_value(raw: bytes, number: int, encoding: Encoding) -> tuple[Value, int]:
     """Decode the four wire bytes of a value.
 
     Args:
@@ -273,7 +274,7 @@ def decode(raw: bytes, number: int, encoding: Encoding) -> tuple[Value, int]:
 
 
 def bits_of_wire(raw: bytes, number: int, encoding: Encoding) -> tuple[int, bool]:
-    """Return the bits of a value, as `decode` does, and whether the value stays raw bytes."""
+    """Return the bits of a value, as `decode_value` does, and whether the value stays raw bytes."""
     bits = int.from_bytes(raw, "little")
     if number == _REAL32:
         return bits, False
@@ -292,7 +293,7 @@ def bits_of_wire(raw: bytes, number: int, encoding: Encoding) -> tuple[int, bool
     return bits, True
 
 
-def encode(value: Value, number: int, encoding: Encoding) -> bytes:
+def encode_value(value: Value, number: int, encoding: Encoding) -> bytes:
     """Encode a value in the four wire bytes.
 
     Raises:
@@ -337,8 +338,8 @@ def encode(value: Value, number: int, encoding: Encoding) -> bytes:
 def as_sent(bits: int, number: int, encoding: Encoding) -> bytes:
     """Return the four wire bytes with which a vehicle reports a value of these bits and this type.
 
-    Not the inverse of `decode`: a C-casting vehicle rounds integers beyond 24 bits to the next float32, and
-    a message holds only the first four bytes of an 8-byte type.
+    Not the inverse of `decode_value`: a C-casting vehicle rounds integers beyond 24 bits to the next float32,
+    and a message holds only the first four bytes of an 8-byte type.
     """
     if encoding is Encoding.C_CAST and number in _BOUNDS:
         return struct.pack("<f", from_bits(bits, number))
@@ -383,7 +384,7 @@ def bits_of(value: Value, number: int) -> int:
         except struct.error:
             raise UsageError(f"{value} is beyond the range of REAL64") from None
     size = ParamType(number).size if 1 <= number <= ParamType.REAL64 else 4
-    return int.from_bytes(encode(value, number, Encoding.BYTEWISE)[:size], "little")
+    return int.from_bytes(encode_value(value, number, Encoding.BYTEWISE)[:size], "little")
 
 
 def same_bits(number: int, a: int, b: int) -> bool:

@@ -18,38 +18,38 @@ from paramclient.model.values import (
     Trust,
     Value,
     as_sent,
-    encode,
+    encode_value,
     is_portable_name,
 )
 from paramclient.protocol.addresses import Address, Peer, PeerAddress, peer_in_words
 from paramclient.protocol.ftp import FileTransfers
-from paramclient.protocol.params.boot_values import StartValues
+from paramclient.protocol.params.boot_values import BootValues
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.fetch import Check, Fetch
 from paramclient.protocol.params.fetch_queue import Fetches
-from paramclient.protocol.params.fetch_result import FetchResult, Means, Policy, Sampled
-from paramclient.protocol.params.foreign_list import Following
+from paramclient.protocol.params.fetch_result import FetchContext, FetchResult, Policy, Sampled
+from paramclient.protocol.params.foreign_list import ForeignList
 from paramclient.protocol.params.name_search import NameSearch, NameSearches
 from paramclient.protocol.params.reads import Key, Read, Reads
-from paramclient.protocol.params.sync import Sync, SyncState, Upkeep
-from paramclient.protocol.params.sync_interval import CheckPace
-from paramclient.protocol.params.table import Room, Table
+from paramclient.protocol.params.sync import Sync, SyncSettings, SyncState
+from paramclient.protocol.params.sync_interval import SyncInterval
+from paramclient.protocol.params.table import NameQuota, Table
 from paramclient.protocol.params.value_check import Rereads
-from paramclient.protocol.params.volatile_values import Refresh
+from paramclient.protocol.params.volatile_values import VolatileReads
 from paramclient.protocol.params.write_batch import BatchRules, WriteBatch, WriteBatches
 from paramclient.protocol.params.writes import Write, Writes
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.scheduler import Scheduler
-from paramclient.protocol.stats.trace import Trace, silent
-from paramclient.protocol.vehicle.boot_time_requests import ClockRequests
-from paramclient.protocol.vehicle.claims import Claim, Verdict
+from paramclient.protocol.stats.trace import Trace, discard
+from paramclient.protocol.vehicle.boot_time_requests import BootTimeRequests
+from paramclient.protocol.vehicle.claims import Claim, PeerRelation
 from paramclient.protocol.vehicle.commands import Commands, MessageRequests
 from paramclient.protocol.vehicle.identification import Identification
-from paramclient.protocol.vehicle.metadata_location import Descriptions
+from paramclient.protocol.vehicle.metadata_location import MetadataRequests
 from paramclient.protocol.vehicle.peers import NO_PEER, ComponentPeers, Contest
 from paramclient.protocol.vehicle.presence import Presence
-from paramclient.protocol.vehicle.reboot import Restart, Restarts
+from paramclient.protocol.vehicle.reboot import Reboot, Reboots
 from paramclient.protocol.wire import (
     HASH_CHECK,
     MAV_AUTOPILOT_ARDUPILOTMEGA,
@@ -129,7 +129,7 @@ class ComponentMachine:
         upkeep: what is done for its table without a request of the user.
         companions: the components of its vehicle, to which it adds itself; None for a vehicle with one.
         read_clock: enables `boot_clock` calls with clocks from its telemetry for a while; see
-            `ClockSampling`.
+            `BootTimeSampling`.
         peer: its peer, where components are told apart by peer; otherwise None.
         scheduler: the scheduler of the link; None for a link with one component.
         room: the name count shared by the tables of the link; None likewise.
@@ -141,7 +141,7 @@ class ComponentMachine:
             peer.
         version: the MAVLink version of its frames.
         context: the facts about it that its machines share.
-        who: its identity and encoding.
+        identification: its identity and encoding.
         table: its parameters.
         retry: when its requests count as lost.
         round_trip: round-trip time and loss of its responses.
@@ -176,16 +176,16 @@ class ComponentMachine:
         observer: ComponentObserver,
         send_to: Callable[[Message, Peer], None] | None = None,
         encoding: Encoding | None = None,
-        upkeep: Upkeep | None = None,
+        upkeep: SyncSettings | None = None,
         companions: list[ComponentMachine] | None = None,
         read_clock: Callable[[float], None] = lambda now: None,
         peer: Peer | None = None,
         scheduler: Scheduler | None = None,
-        room: Room | None = None,
-        trace: Trace = silent,
+        room: NameQuota | None = None,
+        trace: Trace = discard,
     ) -> None:
         target = (system, component)
-        upkeep = upkeep or Upkeep()
+        upkeep = upkeep or SyncSettings()
         self.system = system
         self.component = component
         self.address: Address = target if peer is None else PeerAddress(system, component, peer)
@@ -204,27 +204,32 @@ class ComponentMachine:
         self.retry = context.retry
         self.round_trip = context.round_trip
         self.messages = MessageRequests(context)
-        self.who = Identification(context, self.messages, link, encoding)
-        self.table = Table(self.who.encoding, room)
+        self.identification = Identification(context, self.messages, link, encoding)
+        self.table = Table(self.identification.encoding, room)
         self.reads = Reads(context, self.table, scheduler.turns.share)
         self.writes = Writes(context, self.reads, self.table, permission=self)
         self.write_batches = WriteBatches(target)
         self.presence = Presence()
         self.peers = ComponentPeers(target, self, may_ask=context.may_send)
         self.files = FileTransfers(context)
-        check_pace = CheckPace(upkeep.interval, is_chosen=upkeep.without_hash)
+        check_pace = SyncInterval(upkeep.interval, is_chosen=upkeep.without_hash)
         self.sync = Sync(
             context, self.reads, self.table, upkeep, check_pace, self.presence, self.files, host=self
         )
-        self.descriptions = Descriptions(context, self.messages)
+        self.descriptions = MetadataRequests(context, self.messages)
         self.commands = Commands(context)
-        self.clock_requests = ClockRequests(context, self.messages, self.presence)
-        self.start_values = StartValues(context, self.reads, self.table, self.sync)
-        self.restarts = Restarts(
-            context, self.commands, self.who, self.presence, self.clock_requests, self._restart_noticed
+        self.clock_requests = BootTimeRequests(context, self.messages, self.presence)
+        self.start_values = BootValues(context, self.reads, self.table, self.sync)
+        self.restarts = Reboots(
+            context,
+            self.commands,
+            self.identification,
+            self.presence,
+            self.clock_requests,
+            self._restart_noticed,
         )
-        self.following = Following()
-        means = Means(
+        self.following = ForeignList()
+        means = FetchContext(
             context,
             self.reads,
             self.table,
@@ -257,7 +262,7 @@ class ComponentMachine:
         self.writes.left_open = self._authors.foreign_set
         self._machines: tuple[Machine, ...] = (
             *(self.reads, self.name_searches, self.sync, self.writes, self.files, self.commands),
-            *(self.restarts, self.fetches, self.messages, self.who, self.descriptions),
+            *(self.restarts, self.fetches, self.messages, self.identification, self.descriptions),
             *(self.clock_requests, self.start_values, self.rereads, self.write_batches),
         )
         """Each machine stands behind those that it uses or calls. They end in reverse order: a machine does
@@ -279,14 +284,14 @@ class ComponentMachine:
     @property
     def identity(self) -> Identity:
         """The identity of the vehicle, as far as this component has sent it."""
-        return self.who.identity
+        return self.identification.identity
 
     @property
     def may_be_written(self) -> bool:
         """Whether it is certain which vehicle receives a write, and in which encoding."""
         home = self.peers.home
         is_open = any(each.context.may_be_another or each.peers.is_rival(home) for each in self._autopilots())
-        return self.who.may_be_written and not is_open
+        return self.identification.may_be_written and not is_open
 
     @property
     def may_use_file(self) -> bool:
@@ -315,7 +320,7 @@ class ComponentMachine:
 
     def _autopilots(self) -> Iterator[ComponentMachine]:
         """Yield the autopilot of its vehicle, where that is another component."""
-        return (each for each in self._companions if each is not self and each.who.is_autopilot)
+        return (each for each in self._companions if each is not self and each.identification.is_autopilot)
 
     @property
     def is_restarting(self) -> bool:
@@ -325,7 +330,7 @@ class ComponentMachine:
     @property
     def is_identified(self) -> bool:
         """Whether its identity is settled and not being requested."""
-        return self.who.settled and not self.who.is_asking
+        return self.identification.settled and not self.identification.is_asking
 
     def read_clock(self, now: float) -> None:
         """Have clocks in its telemetry read for a while."""
@@ -351,7 +356,7 @@ class ComponentMachine:
         return SyncState.LOST if self.presence.is_lost else self.sync.state
 
     @property
-    def refresh(self) -> Refresh | None:
+    def refresh(self) -> VolatileReads | None:
         """The reads of volatile values in progress after a hash match, or None."""
         return self.sync.refresh
 
@@ -372,7 +377,7 @@ class ComponentMachine:
         is_asked = len(self.reads) > in_background or len(self.writes) > 0 or not self.files.is_idle
         is_asked = is_asked or len(self.commands) > 0 or self.restarts.current is not None
         is_asked = is_asked or self.descriptions.is_asking or len(self.name_searches) > 0
-        return is_asked or self.fetch is not None or self.who.is_asking
+        return is_asked or self.fetch is not None or self.identification.is_asking
 
     @property
     def is_settling(self) -> bool:
@@ -412,10 +417,10 @@ class ComponentMachine:
             if self.fetches.overheard is not None:
                 self.fetches.overheard.file.tick(now)  # in a log the time advances with messages only
         elif isinstance(message, AutopilotVersion):
-            before = self.who.firmware
-            if self.who.version(message, now):
+            before = self.identification.firmware
+            if self.identification.version(message, now):
                 self._vehicle_replaced(now)
-            elif before not in (None, self.who.firmware):
+            elif before not in (None, self.identification.firmware):
                 self.fetches.updated(now)
         elif isinstance(message, ParamError):
             addressee = (message.target_system, message.target_component)
@@ -442,16 +447,16 @@ class ComponentMachine:
         elif isinstance(message, HighLatency2):
             self._kind_told(message, now)
             self.presence.high_latency()
-        self.who.heard(now)
+        self.identification.heard(now)
         self._follow_identity(now)
 
     def _kind_told(self, message: Heartbeat | HighLatency2, now: float) -> None:
         """Process a changed autopilot or vehicle type: another vehicle, or the same one with other
         firmware."""
-        if self.who.heartbeat(message) and self.who.settled:
+        if self.identification.heartbeat(message) and self.identification.settled:
             self._doubt()
             self.sync.check(now)
-            self.who.doubt(now)
+            self.identification.doubt(now)
 
     def receive_contested(self, message: Message, now: float, *, version: int = 2) -> None:
         """Process a message while several vehicles use the address: it only shows that one is there."""
@@ -471,7 +476,7 @@ class ComponentMachine:
             moment: when it came from the link, if earlier; None for `now`.
         """
         self._heard(now, version)
-        who = self.who
+        who = self.identification
         who.heard(now)
         name, _, number, count, index = message
         if not is_portable_name(name):
@@ -510,7 +515,7 @@ class ComponentMachine:
                 self._receive_ambiguous(message, until, now)
                 return
         came_at = now if moment is None else moment
-        change = table.hear(message, by, came_at, is_exact=is_wanted)
+        change = table.store_value(message, by, came_at, is_exact=is_wanted)
         if change is not None:
             authors.changed(name, now, is_ours)
             self._note_replaced(change, message, now)
@@ -557,7 +562,7 @@ class ComponentMachine:
         """Remember the value before a change. PX4 has none in flight: its responses have the present
         value."""
         old = change[1]
-        if old is not None and self.who.autopilot != MAV_AUTOPILOT_PX4:
+        if old is not None and self.identification.autopilot != MAV_AUTOPILOT_PX4:
             bits, number, *_ = unpack_fields(old)
             raw = as_sent(bits, number, self.table.encoding)
             self._checks.replaced(change.name, number, raw, message, now, self.reads.sent_at)
@@ -689,12 +694,12 @@ class ComponentMachine:
         """
         self.check_present(f"PARAM_SET {name} to {self.system}/{self.component}", now)
         for each in (self, *self._autopilots()):
-            if each.who.is_unconfirmed:
-                each.who.doubt(now)
+            if each.identification.is_unconfirmed:
+                each.identification.doubt(now)
         name = self.spelling(name)
         known = self.table.params.get(name)
         if known is not None and known.trust is not Trust.CACHED and self.may_be_written:
-            encode(value, known.type, self.table.encoding)
+            encode_value(value, known.type, self.table.encoding)
         self.writes.check_finite(name, value, force=force)
         write = self.writes.set(name, value, now, asker, settle=settle, force=force)
         write.on_done.append(lambda: self._write_ended(write))
@@ -724,7 +729,7 @@ class ComponentMachine:
         def begin(name: str, value: Value, at: float) -> Write:
             return self.write(name, value, at, asker, settle=settle, force=force)
 
-        number = self.who.autopilot
+        number = self.identification.autopilot
         autopilot = "" if number is None else autopilot_name(number)
 
         def is_switch(name: str) -> bool:
@@ -732,12 +737,12 @@ class ComponentMachine:
 
         return self.write_batches.begin(pairs, BatchRules(begin, self.writes.cancel, is_switch), now)
 
-    def begin_restart(self, now: float, *, returns: bool = True) -> Restart:
+    def begin_restart(self, now: float, *, returns: bool = True) -> Reboot:
         """Reboot the component, or join the reboot in progress; give it back with `end_restart`.
 
         Args:
             now: the time.
-            returns: whether it comes back under its address, see `Restart`.
+            returns: whether it comes back under its address, see `Reboot`.
 
         Raises:
             NoReply: the component is lost. Nothing was sent.
@@ -749,7 +754,7 @@ class ComponentMachine:
         self.start_values.stop()
         return self.restarts.begin(now, returns=returns)
 
-    def end_restart(self, restart: Restart, now: float) -> None:
+    def end_restart(self, restart: Reboot, now: float) -> None:
         """Give a reboot back. The last holder ends it; whether the command takes effect is then unknown."""
         self.reschedule()
         self.restarts.end(restart, now)
@@ -794,7 +799,7 @@ class ComponentMachine:
     def spelling(self, name: str) -> str:
         """Return the vehicle's spelling of a name. ArduPilot accepts any case; its own names are in
         capitals."""
-        return _in_capitals(name) if self.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA else name
+        return _in_capitals(name) if self.identification.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA else name
 
     def check_present(self, what: str, now: float) -> None:
         """Check that requests can be sent to it.
@@ -825,15 +830,15 @@ class ComponentMachine:
 
     # peers
 
-    def peer_moved(self, claim: Claim, now: float, verdict: Verdict) -> None:
+    def peer_moved(self, claim: Claim, now: float, verdict: PeerRelation) -> None:
         """Take another peer as the one with the address, and request its identity."""
-        if verdict is Verdict.OTHER:
+        if verdict is PeerRelation.OTHER:
             self._replaced(now)
         else:
-            if verdict is Verdict.OPEN:
+            if verdict is PeerRelation.OPEN:
                 self._doubt()
                 self.sync.check(now)
-            self.who.doubt(now)
+            self.identification.doubt(now)
         self._take_claim(claim, now)
         self.clock_requests.want(now)
 
@@ -847,7 +852,7 @@ class ComponentMachine:
         """Request the identity of the one vehicle with the address, before anything of it counts."""
         if is_same:
             self._doubt()
-            self.who.doubt(now)
+            self.identification.doubt(now)
             what = f"the components of system {self.system}: the vehicle is being identified"
             self._forget_companions(NoReply(what, attempts=0, waited=0.0), now)
         else:
@@ -861,17 +866,17 @@ class ComponentMachine:
     def _forget_companions(self, error: ParamClientError, now: float) -> None:
         """Forget the autopilot's other components after a contest: their messages may be of either
         vehicle."""
-        if self.who.is_autopilot:
+        if self.identification.is_autopilot:
             for each in self._companions:
-                if each is not self and each.who.has_parameters:
+                if each is not self and each.identification.has_parameters:
                     each.fail_all(error, now)
                     each.become_another(now)
 
     def _replaced(self, now: float) -> None:
         """Forget the vehicle: another one uses the address. An autopilot takes its vehicle's components with
         it."""
-        is_autopilot = self.who.is_autopilot
-        self.who.forget(now)
+        is_autopilot = self.identification.is_autopilot
+        self.identification.forget(now)
         if is_autopilot:
             self._vehicle_replaced(now)
         else:
@@ -921,7 +926,7 @@ class ComponentMachine:
                 self._doubt()
                 self.sync.check(now)
             elif self.identity.uid is not None:
-                self.who.doubt(now)  # another vehicle may have been plugged in
+                self.identification.doubt(now)  # another vehicle may have been plugged in
             self._was_silent(silence, now)
         for machine in self._machines:
             machine.resume(now)
@@ -942,7 +947,7 @@ class ComponentMachine:
         self.following.forget()
         self._checks.clear()
         self._known_as = None
-        self.restarts.another(now)
+        self.restarts.vehicle_replaced(now)
         self.commands.lose(now, ": another vehicle has this address now")
         self.name_searches.lose(now)
         what = f"writes to {self.system}/{self.component}: another vehicle has this address now"
@@ -951,7 +956,11 @@ class ComponentMachine:
             self.fetch.restart(now)
 
     def __repr__(self) -> str:
-        kind = "unknown" if self.who.autopilot is None else autopilot_name(self.who.autopilot)
+        kind = (
+            "unknown"
+            if self.identification.autopilot is None
+            else autopilot_name(self.identification.autopilot)
+        )
         return f"<ComponentMachine {self.system}/{self.component} {kind} {self.state}>"
 
     def _heard(self, now: float, version: int) -> None:
@@ -968,7 +977,7 @@ class ComponentMachine:
     def _count_moved(self, count: int, now: float) -> None:
         if self.table.count is not None:
             self.sync.count_moved(now)
-        self.table.move(count)
+        self.table.change_count(count)
 
     def _doubt(self) -> None:
         """Doubt everything known: it counts again when the vehicle has confirmed it."""
@@ -995,13 +1004,13 @@ class ComponentMachine:
             presence.since = now
         if presence.is_lost:
             presence.is_lost = False
-            self.reads.forgive()  # its cause has nothing to do with the silence before
+            self.reads.reset_timeouts()  # its cause has nothing to do with the silence before
             self._observer.found(self, silence)
             self.sync.check(now)
-            self.who.doubt(now)
+            self.identification.doubt(now)
         elif presence.was_away(silence) and silence < math.inf:
-            self.who.doubt(now)
-        self.restarts.silent(silence, now)
+            self.identification.doubt(now)
+        self.restarts.silence_ended(silence, now)
         if presence.has_beaten:  # without heartbeats, no message is ever overdue
             self.sync.silence(now)
 
@@ -1022,7 +1031,7 @@ class ComponentMachine:
         self.following.forget()
         self.rereads.clear()
         self.sync.check(now)
-        self.who.doubt(now)
+        self.identification.doubt(now)
         self.restarts.rebooted(now)
         if not by_clock:
             self.clock_requests.want(now)
@@ -1031,17 +1040,17 @@ class ComponentMachine:
 
     def _follow_identity(self, now: float) -> None:
         """Apply the results of the identification."""
-        self._report(self.table.use_encoding(self.who.encoding))
-        autopilot = self.who.autopilot
+        self._report(self.table.use_encoding(self.identification.encoding))
+        autopilot = self.identification.autopilot
         self.reads.pace.is_batched = autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA
         name = autopilot_name(MAV_AUTOPILOT_PX4 if autopilot is None else autopilot)  # may be one
         self.writes.against_non_finite = reason_against_non_finite(name)
         if self.fetch is not None:
             self.fetch.look(now)
-        if self.who.settled and self._known_as != self.identity.key:
+        if self.identification.settled and self._known_as != self.identity.key:
             self._known_as = self.identity.key
             self._observer.identified(self)
-            if self.who.is_autopilot:
+            if self.identification.is_autopilot:
                 self.clock_requests.want_baseline(now)
         for each in self._companions:
             if each.writes.queues:
@@ -1055,10 +1064,10 @@ class ComponentMachine:
             self.writes.proceed(now)
             return
         for each in (self, *self._autopilots()):
-            if each.who.is_unconfirmed:
+            if each.identification.is_unconfirmed:
                 what = f"{each.system}/{each.component} has not said since it was away which vehicle it is"
-                waited = now - each.who.doubted_at
-                self._fail_writes(NoReply(what, attempts=each.who.attempts, waited=waited), now)
+                waited = now - each.identification.doubted_at
+                self._fail_writes(NoReply(what, attempts=each.identification.attempts, waited=waited), now)
 
     def _fail_writes(self, error: ParamClientError, now: float) -> None:
         self.write_batches.fail_all(error, now)
@@ -1066,8 +1075,8 @@ class ComponentMachine:
 
     def _doubt_identity(self, now: float) -> None:
         """Doubt the table: another vehicle may respond by now."""
-        if self.who.settled and now - self.who.known_at > IDENTITY_VALID_TIME:
-            self.who.ask_again(now)
+        if self.identification.settled and now - self.identification.known_at > IDENTITY_VALID_TIME:
+            self.identification.ask_again(now)
 
     def _moved(self, changes: list[Change]) -> None:
         """Report changes that a fetch has found without a PARAM_VALUE."""

@@ -9,9 +9,9 @@ from heapq import heapify, heappop, heappush
 from itertools import islice
 from typing import Final, NamedTuple, Protocol
 
-from paramclient.protocol.requests.pacing import Share
+from paramclient.protocol.requests.pacing import LinkBandwidth
 
-__all__ = ["Scheduled", "Scheduler", "Seen", "Stream", "Turns"]
+__all__ = ["Scheduled", "Scheduler", "ListStatistics", "QueuedList", "ListAdmission"]
 
 TICKED_COMPONENTS_MAX: Final = 64
 """Components handled in one `tick`, which takes a few milliseconds. For more, `tick` is due again at once."""
@@ -60,7 +60,7 @@ PACE_DROP: Final = 0.8
 """The share of their former pace below which the earlier lists indicate a lack of bandwidth."""
 
 
-class Seen(NamedTuple):
+class ListStatistics(NamedTuple):
     """The statistics of a list since its request.
 
     Attributes:
@@ -76,7 +76,7 @@ class Seen(NamedTuple):
     is_bursty: bool
 
 
-class Stream(Protocol):
+class QueuedList(Protocol):
     """A list download that needs a turn.
 
     Attributes:
@@ -93,10 +93,10 @@ class Stream(Protocol):
     def begin(self, now: float) -> None:
         """Request the list: its turn begins."""
 
-    def seen(self) -> Seen: ...
+    def seen(self) -> ListStatistics: ...
 
 
-class Turns:
+class ListAdmission:
     """Gives the lists of one link their turns.
 
     A single list begins at once. Others begin when the running lists have shown their pace and the last ones
@@ -112,7 +112,7 @@ class Turns:
     """
 
     def __init__(self) -> None:
-        self.share = Share()
+        self.share = LinkBandwidth()
         self._are_bursty = False  # whether the lists judged last come in bursts: on a fast link
         self._now = -math.inf
         self._limit = 1
@@ -123,13 +123,13 @@ class Turns:
         self._begun_at = -math.inf  # when a turn began last
         self._crowded_at = -math.inf  # when several lists ran last
         self._is_crowded = False  # whether other links have lists too
-        self._lone: Stream | None = None  # the last list that ran alone
+        self._lone: QueuedList | None = None  # the last list that ran alone
         self._lone_at = -math.inf  # when that was
-        self._waiting: dict[Stream, None] = {}
-        self._running: dict[Stream, Seen] = {}  # with their statistics when the newest began to arrive
-        self._newest: set[Stream] = set()
+        self._waiting: dict[QueuedList, None] = {}
+        self._running: dict[QueuedList, ListStatistics] = {}  # as the newest began to arrive
+        self._newest: set[QueuedList] = set()
         self._marked_at: float | None = None  # when that was
-        self._paces: dict[Stream, float] = {}  # at the last look
+        self._paces: dict[QueuedList, float] = {}  # at the last look
         self._came = self._passed = 0  # of all lists while there was enough bandwidth
 
     @property
@@ -146,19 +146,19 @@ class Turns:
         """Return the number of lists about to start: nothing was received of them, within their timeout."""
         return sum(stream.is_awaited and stream.silent_at > now for stream in self._running)
 
-    def ask(self, stream: Stream, now: float) -> None:
-        """Request a turn; `Stream.begin` is called at once or later. Give it back with `give_back`."""
+    def ask(self, stream: QueuedList, now: float) -> None:
+        """Request a turn; `QueuedList.begin` is called at once or later. Give it back with `release`."""
         self._now = now
         if not self._running and now - self._idle_since > MEASUREMENT_LIFETIME:
             self._limit = 1
             self._failures = self._came = self._passed = self._shown = 0
             self._again_at = -math.inf
-        if not self._waiting and self._room() > 0:
+        if not self._waiting and self._free_slots() > 0:
             self._begin(stream, now)
         else:
             self._waiting[stream] = None
 
-    def has_begun(self, stream: Stream) -> None:
+    def has_begun(self, stream: QueuedList) -> None:
         """Record a list that was requested without a turn."""
         self._running[stream] = _NOTHING
         is_one_more = len(self._running) > self._shown  # otherwise it replaces a finished list
@@ -166,7 +166,7 @@ class Turns:
             self._newest.add(stream)
             self._marked_at = None
 
-    def give_back(self, stream: Stream, *, is_cut: bool = False) -> None:
+    def release(self, stream: QueuedList, *, is_cut: bool = False) -> None:
         """Give a turn back. The next list begins with the next `tick`.
 
         Args:
@@ -183,11 +183,11 @@ class Turns:
         if not self._running:
             self._idle_since = self._now
 
-    def is_beside_others(self, stream: Stream) -> bool:
+    def is_beside_others(self, stream: QueuedList) -> bool:
         """Return whether other lists run, also on other links that share the event loop."""
         return self._is_crowded or any(each is not stream and not each.is_awaited for each in self._running)
 
-    def beside_others_at(self, stream: Stream) -> float:
+    def beside_others_at(self, stream: QueuedList) -> float:
         """Return when another list ran last."""
         return max(self._crowded_at, -math.inf if self._lone is stream else self._lone_at)
 
@@ -213,7 +213,7 @@ class Turns:
             self._newest.update(coming if self._are_bursty else self._running)
         if self._newest:
             self._look(now)
-        begins = min(self._room(), len(self._waiting))
+        begins = min(self._free_slots(), len(self._waiting))
         begins = int(min(begins, most - self._active()))
         for _ in range(begins):
             stream = next(iter(self._waiting))
@@ -226,7 +226,7 @@ class Turns:
         if not self._waiting:
             return math.inf
         if self._active() < self._limit:
-            return self._now if self._room() > 0 else self._next_at
+            return self._now if self._free_slots() > 0 else self._next_at
         times = [stream.silent_at for stream in self._running if stream.silent_at > self._now]
         if not self._newest:
             # lists in bursts are judged on arrival: while all are awaited, nothing is due
@@ -242,7 +242,7 @@ class Turns:
         self._paces.clear()
         self._marked_at = None
 
-    def _begin(self, stream: Stream, now: float) -> None:
+    def _begin(self, stream: QueuedList, now: float) -> None:
         self.has_begun(stream)
         self._begun_at = now
         stream.begin(now)
@@ -255,7 +255,7 @@ class Turns:
         """When the next list begins beside many lists in bursts."""
         return self._begun_at + START_INTERVAL_BURSTY * len(self._running)
 
-    def _room(self) -> int:
+    def _free_slots(self) -> int:
         """Return how many lists may begin now."""
         room = self._limit - self._active()
         if self._are_bursty:
@@ -337,7 +337,7 @@ class Turns:
         return rise > max(LOSS_RISE_MIN, LOSS_RISE_DEVIATIONS * deviation)
 
 
-_NOTHING = Seen(0, 0, 0.0, False)
+_NOTHING = ListStatistics(0, 0, 0.0, False)
 
 
 class Scheduled(Protocol):
@@ -376,7 +376,7 @@ class Scheduler:
     """
 
     def __init__(self) -> None:
-        self.turns = Turns()
+        self.turns = ListAdmission()
         self.lists_max = math.inf
         self.is_crowded = False
         self._now = -math.inf

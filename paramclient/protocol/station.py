@@ -18,13 +18,13 @@ from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_result import Policy
 from paramclient.protocol.params.list_download import present_of
 from paramclient.protocol.params.passive_file import acknowledges_open, opens_parameter_file
-from paramclient.protocol.params.sync import Upkeep
-from paramclient.protocol.params.table import Room
+from paramclient.protocol.params.sync import SyncSettings
+from paramclient.protocol.params.table import NameQuota
 from paramclient.protocol.requests.retry import HEARTBEAT_REQUESTS
 from paramclient.protocol.scheduler import Scheduler
-from paramclient.protocol.stats.trace import Told, Trace, silent
+from paramclient.protocol.stats.trace import LazyMessageText, Trace, discard
 from paramclient.protocol.stats.traffic import Traffic
-from paramclient.protocol.vehicle.boot_time_sampling import ClockSampling
+from paramclient.protocol.vehicle.boot_time_sampling import BootTimeSampling
 from paramclient.protocol.vehicle.commands import message_requests
 from paramclient.protocol.vehicle.peers import NO_PEER
 from paramclient.protocol.wire import (
@@ -44,7 +44,7 @@ from paramclient.protocol.wire import (
     HighLatency2,
     Message,
     ParamRequestList,
-    ParamSet,
+    ParamSetMessage,
     ParamValue,
     SetupSigning,
     Signer,
@@ -122,10 +122,10 @@ class Station:
         system: int = 255,
         component: int = 190,
         encoding: Encoding | None = None,
-        upkeep: Upkeep | None = None,
+        upkeep: SyncSettings | None = None,
         split_peers: bool = False,
         counts_traffic: bool = False,
-        trace: Trace = silent,
+        trace: Trace = discard,
     ) -> None:
         self.traffic = Traffic(is_stream=is_stream) if counts_traffic else None
         self.link = link
@@ -145,7 +145,7 @@ class Station:
         self._upkeep = upkeep
         # for datagrams of all peers
         self._framer = Framer(HANDLED_IDS, occasional=_TELEMETRY_CLOCKS, stream=False)
-        self._clock_sampling = ClockSampling(self._take_clocks)
+        self._clock_sampling = BootTimeSampling(self._take_clocks)
         self._framers: dict[Peer, Framer] = {}  # for streams
         self._outbox: list[tuple[bytes, Peer | None]] = []
         self._events: list[Event] = []
@@ -160,7 +160,7 @@ class Station:
         self.scheduler = Scheduler()
         self._splits = split_peers
         self._of_vehicle: dict[tuple[int, Peer], list[ComponentMachine]] = {}
-        self._room = Room()
+        self._room = NameQuota()
         self._early_requests: deque[tuple[FileTransfer, Address]] = deque(maxlen=EARLY_REQUESTS_MAX)
         self._full_until = -math.inf
         self._awaits_autopilot = not self.listens_only  # none was received yet
@@ -246,7 +246,7 @@ class Station:
         PARAM_SET."""
         for frame in Framer(_SETS, stream=False).receive(data):
             message = decode(frame)
-            if isinstance(message, ParamSet):
+            if isinstance(message, ParamSetMessage):
                 self._receive_foreign_set(message, (frame.system, frame.component), now)
 
     def tick(self, now: float) -> None:
@@ -309,7 +309,7 @@ class Station:
         for machine in self.components.values():
             machine.resume(now)
 
-    def stood_still(self, unseen: float, now: float) -> None:
+    def handle_suspend(self, unseen: float, now: float) -> None:
         """Process a time in which this program did not run, as in a system suspend: silence then means
         nothing.
 
@@ -363,7 +363,7 @@ class Station:
         """Return the identity of a component's vehicle, which its autopilot has sent; None while it is
         open."""
         autopilot = self.autopilot_of(*machine.vehicle) or machine
-        return autopilot.identity if autopilot.who.settled else None
+        return autopilot.identity if autopilot.identification.settled else None
 
     def is_doubted(self, machine: ComponentMachine) -> bool:
         """Return whether it is in doubt which vehicle a component belongs to.
@@ -387,10 +387,10 @@ class Station:
             peer: its peer, with `split_peers`; otherwise None.
         """
         first = self.components.get(self._key(system, AUTOPILOT_COMPONENT, peer))
-        if first is not None and first.who.is_autopilot:
+        if first is not None and first.identification.is_autopilot:
             return first
         for machine in self._of_vehicle.get((system, peer), ()):
-            if machine.who.is_autopilot:
+            if machine.identification.is_autopilot:
                 return machine
         return None
 
@@ -409,9 +409,9 @@ class Station:
         for machine in self.at_peer(peer):
             if system not in (None, machine.system):
                 continue
-            if component is None and machine.who.is_autopilot:
+            if component is None and machine.identification.is_autopilot:
                 return self.autopilot_of(*machine.vehicle) or machine
-            if component == machine.component and machine.who.has_spoken:
+            if component == machine.component and machine.identification.has_response:
                 return machine
         return None
 
@@ -442,7 +442,9 @@ class Station:
         has_file = any(machine.fetches.may_use_file() for machine in machines)
         if len(machines) > 1 and may_list and is_new and is_fresh and not has_file:
             system = machines[0].system
-            known = [each for each in self._of_vehicle[machines[0].vehicle] if each.who.has_parameters]
+            known = [
+                each for each in self._of_vehicle[machines[0].vehicle] if each.identification.has_parameters
+            ]
             have_one_peer = len({machine.peers.home for machine in machines}) == 1
             if len(known) == len(machines) and have_one_peer:
                 for machine in machines:
@@ -520,7 +522,7 @@ class Station:
         Args:
             machine: the component with the address, or None where none is known.
         """
-        return machine is None or (self.listens_only and not machine.who.has_parameters)
+        return machine is None or (self.listens_only and not machine.identification.has_parameters)
 
     def _receive_other(self, frame: Frame, peer: Peer, now: float, moment: float | None) -> None:
         """Process a frame that is not a value of a known component."""
@@ -529,7 +531,7 @@ class Station:
             return
         if isinstance(message, Heartbeat | HighLatency2) and message.autopilot != MAV_AUTOPILOT_INVALID:
             self._awaits_autopilot = False
-        if isinstance(message, ParamSet):
+        if isinstance(message, ParamSetMessage):
             self._receive_foreign_set(message, sender, now)
             return
         if isinstance(message, FileTransfer):
@@ -538,7 +540,7 @@ class Station:
         machine = self.components.get(address) or self._meet(sender, peer, message, now)
         if machine is None:
             return
-        if not machine.who.has_parameters:
+        if not machine.identification.has_parameters:
             machine.peers.follow(peer)
         elif not machine.peers.hears(message, peer, now):
             if machine.peers.contest is not None and peer == machine.peers.home:
@@ -556,7 +558,9 @@ class Station:
         """Process the time since boot in a telemetry frame. Trailing zeros may be cut off."""
         at = _TELEMETRY_CLOCKS[number]
         boot_ms = int.from_bytes(payload[at : at + 4], "little")
-        if machine.who.has_parameters and not machine.peers.hears_clock(number, boot_ms, peer, now):
+        if machine.identification.has_parameters and not machine.peers.hears_clock(
+            number, boot_ms, peer, now
+        ):
             return
         machine.boot_clock(number, boot_ms, now)
         if machine.restarts.current is None and not machine.peers.wants_clocks:
@@ -572,7 +576,7 @@ class Station:
     def _meet(self, sender: Address, peer: Peer, message: Message, now: float) -> ComponentMachine | None:
         """Add a component on its first message; only messages that show parameters make one."""
         is_sign = isinstance(message, Heartbeat | HighLatency2 | ParamValue)
-        if not (is_sign or self._is_awaited_file(message, sender)) or not self._has_room(now):
+        if not (is_sign or self._is_awaited_file(message, sender)) or not self._has_capacity(now):
             return None
         system, component = sender
         address = self._key(system, component, peer)
@@ -610,7 +614,7 @@ class Station:
                 machine.foreign_file_request(request, station, now)
         return machine
 
-    def _has_room(self, now: float) -> bool:
+    def _has_capacity(self, now: float) -> bool:
         """Return whether one more component can be followed.
 
         At the limit, the first lost component without parameters and waiting requests is removed: a sender of
@@ -640,7 +644,7 @@ class Station:
         self._foreign += machine.peers.foreign
         self._reporter.forgotten(machine)
 
-    def _receive_foreign_set(self, message: ParamSet, sender: Address, now: float) -> None:
+    def _receive_foreign_set(self, message: ParamSetMessage, sender: Address, now: float) -> None:
         station = f"station {sender[0]}/{sender[1]}"
         for machine in self.components.values():
             is_target = message.target_component in (machine.component, COMP_ID_ALL)
@@ -665,7 +669,7 @@ class Station:
 
     def _takes(self, machine: ComponentMachine, peer: Peer, now: float) -> bool:
         """Return whether to accept a message that cannot tell vehicles apart."""
-        if not machine.who.has_parameters:
+        if not machine.identification.has_parameters:
             machine.peers.follow(peer)
             return True
         return machine.peers.takes(peer, now)
@@ -687,7 +691,7 @@ class Station:
     def _send(self, message: Message, address: Address, version: int) -> None:
         peer = self._peer_of(address)
         if not self.listens_only and peer is not NO_PEER:
-            self._trace("to system %s: %s", address[0], Told(message))
+            self._trace("to system %s: %s", address[0], LazyMessageText(message))
             self._transmit(message, peer, version)
 
     def _transmit(self, message: Message, peer: Peer | None, version: int) -> None:

@@ -10,7 +10,7 @@ from paramclient.errors import AnotherVehicle
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.requests.retry import SUCCESSOR_REQUESTS
 
-__all__ = ["SEARCH_INTERVAL", "Succession"]
+__all__ = ["SEARCH_INTERVAL", "SystemIdSearch"]
 
 SEARCH_INTERVAL: Final = 0.5
 """Seconds until the next look when no message was received."""
@@ -19,7 +19,7 @@ OLD_ID_SILENCE_MIN: Final = 3.0
 while it is heard under the new one: two heartbeats did not come."""
 
 
-class Succession:
+class SystemIdSearch:
     """The search for a component under another address.
 
     Args:
@@ -69,4 +69,4 @@ class Succession:
     def _ask_again(self, found: ComponentMachine, now: float) -> None:
         if now >= self._ask_at:
             self._ask_at = now + SUCCESSOR_REQUESTS.later
-            found.who.doubt(now)
+            found.identification.doubt(now)

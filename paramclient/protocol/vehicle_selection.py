@@ -74,7 +74,7 @@ class VehicleChoice:
         if self._system is not None and self._component is not None:
             address = (self._system, self._component)
             found = [each for each in machines if (each.system, each.component) == address]
-            found = [each for each in found if each.who.has_spoken]
+            found = [each for each in found if each.identification.has_response]
             return self._decided(found, found, now, listening_since, needs_look=self._is_spread)
         autopilots = _autopilots(machines)
         if self._system is not None:
@@ -85,7 +85,7 @@ class VehicleChoice:
         if self._component is None:
             return self._decided(autopilots, autopilots, now, listening_since)
         found = [each for each in machines if each.component == self._component]
-        found = [each for each in found if each.who.has_spoken and not each.presence.is_lost]
+        found = [each for each in found if each.identification.has_response and not each.presence.is_lost]
         return self._decided(found, [*autopilots, *found], now, listening_since)
 
     def _decided(
@@ -134,24 +134,27 @@ class VehicleChoice:
 
 def vehicle_in_words(machine: ComponentMachine) -> str:
     """Return address, autopilot and kind of vehicle: `1/1 PX4 quadrotor`."""
-    kind = kind_in_words(machine.who.autopilot, machine.who.vehicle_type)
+    kind = kind_in_words(machine.identification.autopilot, machine.identification.vehicle_type)
     return f"{machine.system}/{machine.component} {kind}".rstrip()
 
 
 def _autopilots(machines: Iterable[ComponentMachine]) -> list[ComponentMachine]:
     """Return the autopilots that are not lost, without peripherals that claim to be one."""
-    found = [each for each in machines if each.who.is_autopilot and not each.presence.is_lost]
+    found = [each for each in machines if each.identification.is_autopilot and not each.presence.is_lost]
     return [each for each in found if not _is_peripheral(each)] or found
 
 
 def _is_peripheral(machine: ComponentMachine) -> bool:
-    return machine.who.autopilot == MAV_AUTOPILOT_GENERIC and machine.who.vehicle_type in _PERIPHERALS
+    return (
+        machine.identification.autopilot == MAV_AUTOPILOT_GENERIC
+        and machine.identification.vehicle_type in _PERIPHERALS
+    )
 
 
 def _one_of_each(machines: Iterable[ComponentMachine]) -> list[ComponentMachine]:
     """Return one component of each vehicle: its autopilot if known, component 1 before others."""
     first: dict[tuple[str, int], ComponentMachine] = {}
-    for each in sorted(machines, key=lambda each: (not each.who.is_autopilot, each.component)):
+    for each in sorted(machines, key=lambda each: (not each.identification.is_autopilot, each.component)):
         first.setdefault((each.identity.link, each.system), each)
     return list(first.values())
 

@@ -2,7 +2,7 @@
 
 - `planning`: the values to write, their order, and the reason for each parameter that is not written.
 - `inspection`: read what a vehicle has; `prepare` and `verify`.
-- `set_up`: `apply` and `restore`; `execution` runs them, `results` holds their results.
+- `apply_restore`: `apply` and `restore`; `execution` runs them, `results` holds their results.
 - `fleet`: `apply_all` and `verify_all` for several vehicles.
 - `vehicle_params`: parameters of a vehicle or of the cache as a set.
 - `apply_rules`, `similar_names`, `runner`: special parameters, mistyped names, long computations.
@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+from paramclient.provision.apply_restore import apply, restore
 from paramclient.provision.apply_rules import CATEGORIES
 from paramclient.provision.fleet import apply_all, verify_all
 from paramclient.provision.inspection import prepare, verify
@@ -34,7 +35,6 @@ from paramclient.provision.results import (
     FleetApplied,
     FleetVerified,
 )
-from paramclient.provision.set_up import apply, restore
 
 __all__ = [
     "CATEGORIES",

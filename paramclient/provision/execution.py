@@ -28,7 +28,7 @@ from paramclient.model.identity import SHARED_UIDS, Identity
 from paramclient.model.paramset import ParamSet
 from paramclient.model.renames import Renames
 from paramclient.model.values import Value
-from paramclient.protocol.params.change_origin import check_asker
+from paramclient.protocol.params.change_origin import check_author
 from paramclient.protocol.params.write_batch import SetOutcome, SetStatus
 from paramclient.protocol.requests.pacing import WRITES_MAX
 from paramclient.provision.apply_rules import READ_ONLY, rules_for
@@ -124,7 +124,7 @@ class ApplyRun:
     _first_identity: Identity
 
     def __init__(self, component: Component, wanted: ParamSet | Plan, options: ApplyOptions) -> None:
-        check_asker(options.asker)
+        check_author(options.asker)
         self._component = component
         self._plan_identity: Identity | None = None
         if isinstance(wanted, Plan):

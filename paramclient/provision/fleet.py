@@ -13,10 +13,10 @@ from paramclient.client.component import Component
 from paramclient.errors import ParamClientError, UsageError
 from paramclient.model.paramset import ParamSet
 from paramclient.model.renames import Renames
+from paramclient.provision.apply_restore import apply
 from paramclient.provision.inspection import verify
 from paramclient.provision.planning import ParamInfo, Plan
 from paramclient.provision.results import ApplyProgress, ApplyResult, FleetApplied, FleetVerified
-from paramclient.provision.set_up import apply
 
 __all__ = ["apply_all", "verify_all"]
 

@@ -20,7 +20,7 @@ from paramclient.model.values import (
     ParamType,
     Value,
     bits_of,
-    encode,
+    encode_value,
     format_value,
     same_bits,
     type_name,
@@ -546,7 +546,7 @@ class _Planner:
             return WRONG, "a system id is a number from 1 to 255"
         if kind is not None:
             try:
-                encode(value, kind, self._encoding)
+                encode_value(value, kind, self._encoding)
             except UsageError as error:
                 return WRONG, str(error)
             if isinstance(value, float) and kind < ParamType.REAL32 and not value.is_integer():

@@ -9,8 +9,8 @@ import anyio
 
 from paramclient.client.arguments import (
     check_accepted,
-    check_asked,
     check_asked_name,
+    check_requested_name,
     check_settle,
     check_writes,
 )
@@ -29,18 +29,18 @@ from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome, S
 from paramclient.protocol.params.writes import SetResult
 from paramclient.protocol.vehicle.peers import Contest
 from paramclient.protocol.wire import PARAMETERS_MAX, SigningKey
-from paramclient.remote.connection import Connection, telling
+from paramclient.remote.connection import Connection, run_with_progress
 from paramclient.remote.decoding import (
     Document,
+    decode_errors,
     fetch_result_of,
     hash_of,
     param_of,
     set_outcome_of,
     set_result_of,
-    understood,
     value_as_sent,
 )
-from paramclient.remote.http import Answer
+from paramclient.remote.http import ServiceResponse
 from paramclient.remote.mirrored_component import MirroredComponent
 from paramclient.remote.problems import error_of
 
@@ -72,7 +72,7 @@ class Service(Protocol):
         *,
         method: str = "POST",
         is_write: bool = False,
-    ) -> Answer:
+    ) -> ServiceResponse:
         """Request something about a component, and wait until its effect is in the mirror.
 
         Args:
@@ -84,7 +84,7 @@ class Service(Protocol):
             ParamClientError: as from `Connection.ask`.
         """
 
-    async def given(self, answer: Answer) -> Component:
+    async def component_of_response(self, answer: ServiceResponse) -> Component:
         """Return the component of a response, with its table."""
 
 
@@ -203,13 +203,13 @@ class RemoteComponent(Component):
 
     async def get(self, name: str | int, *, timeout: float | None = None) -> Param:
         """See `Component.get`."""
-        check_asked(name)
+        check_requested_name(name)
         body = {"name": name} if isinstance(name, str) else {"index": name}
         what = name if isinstance(name, str) else f"parameter {name}"
         answer = await self._service.ask(
             self._mirrored, "read", body, timeout, f"{what} of {self.system}/{self.component}"
         )
-        with understood(self._service.name):
+        with decode_errors(self._service.name):
             param = param_of(answer.document)
         self._mirrored.mirror.confirm(param)
         return param
@@ -247,7 +247,7 @@ class RemoteComponent(Component):
             method="PATCH",
             is_write=True,
         )
-        with understood(self._service.name):
+        with decode_errors(self._service.name):
             (result,) = answer.document["results"].values()
             if (problem := result.get("problem")) is not None:
                 raise error_of(problem, status=problem["status"], link=self._service.name)
@@ -320,7 +320,7 @@ class RemoteComponent(Component):
             method="PATCH",
             is_write=True,
         )
-        with understood(self._service.name):
+        with decode_errors(self._service.name):
             results = answer.document["results"]
             link = self._service.name
             outcomes = [set_outcome_of(results[name], name, value, link) for name, value in pairs]
@@ -353,15 +353,15 @@ class RemoteComponent(Component):
             assert progress is not None
             progress(self._mirrored.progress_since(before))
 
-        async def fetch() -> Answer:
+        async def fetch() -> ServiceResponse:
             awaited = f"the parameters of {self.system}/{self.component}"
             answer = await self._service.ask(self._mirrored, "fetch", body, timeout, awaited)
-            with understood(self._service.name):
+            with decode_errors(self._service.name):
                 self._mirrored.end_progress(answer.document["received"], answer.document["count"])
             return answer
 
-        answer = await telling(fetch, None if progress is None else tell)
-        with understood(self._service.name):
+        answer = await run_with_progress(fetch, None if progress is None else tell)
+        with decode_errors(self._service.name):
             return fetch_result_of(answer.document, self.params, anyio.current_time() - began)
 
     async def refreshed(self, *, timeout: float | None = None) -> None:
@@ -376,7 +376,7 @@ class RemoteComponent(Component):
         """See `Component.reboot`."""
         body = {} if system is None else {"system": system}
         awaited = f"the restart of {self.system}/{self.component}"
-        return await self._service.given(
+        return await self._service.component_of_response(
             await self._service.ask(self._mirrored, "reboot", body, timeout, awaited, is_write=True)
         )
 

@@ -12,10 +12,10 @@ import anyio
 from paramclient.client import link_task
 from paramclient.client.arguments import PROGRESS_CALL_INTERVAL
 from paramclient.errors import ClientClosed, LinkError, NoReply, ParamClientError
-from paramclient.remote.decoding import understood
-from paramclient.remote.http import Answer, Place, Requests, Unreached
+from paramclient.remote.decoding import decode_errors
+from paramclient.remote.http import Requests, ServiceResponse, ServiceUnreachable, StreamPosition
 
-__all__ = ["Connection", "Follower", "telling"]
+__all__ = ["Connection", "EventSink", "run_with_progress"]
 
 SERVICE_MARGIN: Final = 5.0
 """Seconds after a timeout in which the response still arrives, as the service applies the timeout itself."""
@@ -30,7 +30,7 @@ T = TypeVar("T")
 logger = logging.getLogger(__name__)
 
 
-class Follower(Protocol):
+class EventSink(Protocol):
     """Receiver of the events of a service. Its calls must neither block nor raise."""
 
     def take(self, event: Mapping[str, Any]) -> None:
@@ -65,12 +65,12 @@ class Connection:
         news: set, and replaced, when events have arrived or an attribute has changed.
     """
 
-    def __init__(self, requests: Requests, follower: Follower) -> None:
+    def __init__(self, requests: Requests, follower: EventSink) -> None:
         self.is_away = True
         self.broken: LinkError | None = None
         self.ended: LinkError | None = None
         self.failed: ParamClientError | None = None
-        self.place: Place | None = None
+        self.place: StreamPosition | None = None
         self.news = anyio.Event()
         self._requests = requests
         self._follower = follower
@@ -82,7 +82,7 @@ class Connection:
         while True:
             try:
                 await self._listen()
-            except Unreached as failure:
+            except ServiceUnreachable as failure:
                 error: ParamClientError = failure.error
             except ParamClientError as refusal:
                 error = refusal
@@ -103,7 +103,7 @@ class Connection:
         waits_for_ever: bool = False,
         link: str | None = None,
         is_write: bool = False,
-    ) -> Answer:
+    ) -> ServiceResponse:
         """Send a request and wait for the response, also across a reconnection.
 
         Cancellation closes the request.
@@ -138,7 +138,7 @@ class Connection:
                     asked_at = anyio.current_time()
                     try:
                         return await self._requests.ask(method, path, sent, link=link)
-                    except Unreached as failure:
+                    except ServiceUnreachable as failure:
                         if is_write and failure.may_be_done:
                             raise self._unknown(awaited, failure) from failure.error.__cause__
                         now = anyio.current_time()
@@ -147,7 +147,7 @@ class Connection:
                         failing_since = min(failing_since, now)
                         if now - failing_since >= link_task.LINK_TIMEOUT:
                             raise failure.error from failure.error.__cause__
-                        await anyio.sleep(link_task.BACKOFF_MIN)
+                        await anyio.sleep(link_task.RECONNECT_BACKOFF_MIN)
             finally:
                 self._scopes.discard(scope)
         self.check_open()
@@ -200,8 +200,8 @@ class Connection:
                     self.tell()
 
     def _take(self, event: Mapping[str, Any]) -> None:
-        with understood(self._requests.name):
-            self.place = Place(str(event["run"]), int(event["seq"]))
+        with decode_errors(self._requests.name):
+            self.place = StreamPosition(str(event["run"]), int(event["seq"]))
             if event["type"] == "hello":
                 self._arrive(is_resumed=bool(event["resumed"]))
             elif event["type"] == "gap":
@@ -227,7 +227,7 @@ class Connection:
             logger.warning("%s; reconnecting", error)
             self.is_away = True
             self._deadline = now + link_task.LINK_TIMEOUT
-            self._backoff = link_task.BACKOFF_MIN
+            self._backoff = link_task.RECONNECT_BACKOFF_MIN
             self._follower.leave()
             self.tell()
         elif now >= self._deadline:
@@ -236,7 +236,7 @@ class Connection:
             self._fail_calls()
         left = self._deadline - now
         await anyio.sleep(min(self._backoff, left) if left > 0 else self._backoff)
-        self._backoff = min(self._backoff * 2, link_task.BACKOFF_MAX)
+        self._backoff = min(self._backoff * 2, link_task.RECONNECT_BACKOFF_MAX)
 
     async def _is_reached(self, deadline: float) -> bool:
         """Wait until the service is connected. Return False at the deadline."""
@@ -249,7 +249,7 @@ class Connection:
         self.check_open()
         return True
 
-    def _unknown(self, what: str, failure: Unreached) -> LinkError:
+    def _unknown(self, what: str, failure: ServiceUnreachable) -> LinkError:
         return LinkError(f"{failure.error}; it is unknown whether {what} was done", link=self._requests.name)
 
     def _fail_calls(self) -> None:
@@ -258,7 +258,7 @@ class Connection:
         self.tell()
 
 
-async def telling(work: Callable[[], Awaitable[T]], tell: Callable[[], None] | None) -> T:
+async def run_with_progress(work: Callable[[], Awaitable[T]], tell: Callable[[], None] | None) -> T:
     """Run `work`, and call `tell` from this task about ten times a second, and once at the end."""
     if tell is None:
         return await work()

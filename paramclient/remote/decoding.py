@@ -33,7 +33,7 @@ __all__ = [
     "set_outcome_of",
     "set_result_of",
     "stats_of",
-    "understood",
+    "decode_errors",
     "value_as_sent",
 ]
 
@@ -44,7 +44,7 @@ _IDENTITY: Final = {"link": (str,), "git_hash": (str,), "uid": (str, NoneType)}
 
 
 @contextmanager
-def understood(name: str) -> Iterator[None]:
+def decode_errors(name: str) -> Iterator[None]:
     """Context for decoding documents: errors become LinkError.
 
     Args:

@@ -23,12 +23,12 @@ from paramclient.remote.bounded import (
     checked_document,
     decoder_of,
 )
-from paramclient.remote.decoding import understood
+from paramclient.remote.decoding import decode_errors
 from paramclient.remote.problems import error_of
 from paramclient.remote.service_address import CLIENT_TOKEN_VARIABLE, ServiceAddress
 from paramclient.version import __version__
 
-__all__ = ["Answer", "Place", "Requests", "Unreached"]
+__all__ = ["ServiceResponse", "StreamPosition", "Requests", "ServiceUnreachable"]
 
 PREFIX: Final = "/api/v1"
 """Path of the API."""
@@ -47,7 +47,7 @@ KEEPALIVE_OPTIONS: Final = {"TCP_KEEPIDLE": 5, "TCP_KEEPINTVL": 2, "TCP_KEEPCNT"
 """TCP keepalive, in seconds and probes: it detects a lost network while a response takes minutes."""
 
 
-class Place(NamedTuple):
+class StreamPosition(NamedTuple):
     """Position in the events of one run of a service.
 
     Attributes:
@@ -59,7 +59,7 @@ class Place(NamedTuple):
     seq: int
 
     @classmethod
-    def read(cls, text: str | None) -> Place | None:
+    def read(cls, text: str | None) -> StreamPosition | None:
         """Parse `RUN-SEQ`; None for any other text."""
         run, dash, seq = (text or "").rpartition("-")
         is_one = dash and seq.isdecimal() and len(run) + len(seq) < PLACE_LENGTH_MAX
@@ -70,7 +70,7 @@ class Place(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class ServiceResponse:
     """Response of a service.
 
     Attributes:
@@ -79,10 +79,10 @@ class Answer:
     """
 
     document: Any
-    place: Place | None
+    place: StreamPosition | None
 
 
-class Unreached(Exception):
+class ServiceUnreachable(Exception):
     """The service has not responded.
 
     Attributes:
@@ -145,7 +145,7 @@ class Requests:
         *,
         link: str | None = None,
         timeout: float | None = None,
-    ) -> Answer:
+    ) -> ServiceResponse:
         """Send a request and return its response. Cancellation closes the request.
 
         Args:
@@ -163,16 +163,16 @@ class Requests:
         query = {} if link is None else {"link": link}
         async with self._sent(method, path, body, query, None, timeout) as response:
             content = await self._read(response)
-            place = Place.read(response.headers.get("X-Seq"))
+            place = StreamPosition.read(response.headers.get("X-Seq"))
             if response.is_success and not content:
-                return Answer(None, place)
+                return ServiceResponse(None, place)
             document = self._document(response, content)
             if not response.is_success:
                 raise self._error(response, document)
-            return Answer(document, place)
+            return ServiceResponse(document, place)
 
     @asynccontextmanager
-    async def events(self, after: Place | None) -> AsyncIterator[AsyncIterator[list[Any]]]:
+    async def events(self, after: StreamPosition | None) -> AsyncIterator[AsyncIterator[list[Any]]]:
         """Open the stream of events after a position, or from now on, and yield them in batches.
 
         Raises:
@@ -297,15 +297,17 @@ class Requests:
         if problem.get("error") == "ClientClosed" or str(problem.get("type")).endswith(":closing"):
             raise self._unreached("the service is closing", None)
         try:
-            with understood(self.name):
+            with decode_errors(self.name):
                 return error_of(problem, status=status, link=self.name)
         except LinkError:
             return self._foreign()
 
-    def _unreached(self, words: str, cause: Exception | None, *, may_be_done: bool = True) -> Unreached:
+    def _unreached(
+        self, words: str, cause: Exception | None, *, may_be_done: bool = True
+    ) -> ServiceUnreachable:
         error = LinkError(f"{self.name}: {words}", link=self.name)
         error.__cause__ = cause
-        return Unreached(error, may_be_done=may_be_done)
+        return ServiceUnreachable(error, may_be_done=may_be_done)
 
     def _foreign(self) -> LinkError:
         return LinkError(f"{self.name} responds, but not as a service of paramclient", link=self.name)

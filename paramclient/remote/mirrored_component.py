@@ -169,7 +169,7 @@ class MirroredComponent:
         self.table_was_loaded([])
         self.is_gone = True
 
-    def come_back(self, document: Document, seq: int) -> None:
+    def mark_found(self, document: Document, seq: int) -> None:
         """Mark the component as present: the service knows it, for the first time or again."""
         if self.is_gone:
             self.is_gone = False

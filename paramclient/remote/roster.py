@@ -15,12 +15,12 @@ from paramclient.client.events import Contested, Event, Events, Found, Lost, Reb
 from paramclient.errors import LinkError, NoReply, ParamClientError
 from paramclient.remote.component import RemoteComponent
 from paramclient.remote.connection import Connection
-from paramclient.remote.decoding import Document, hash_of, params_of, understood
-from paramclient.remote.http import Answer, Place, Requests, Unreached
+from paramclient.remote.decoding import Document, decode_errors, hash_of, params_of
+from paramclient.remote.http import Requests, ServiceResponse, ServiceUnreachable, StreamPosition
 from paramclient.remote.mirrored_component import Key, MirroredComponent, key_of
 from paramclient.remote.problems import NotHeard
 
-__all__ = ["Roster"]
+__all__ = ["ServiceComponents"]
 
 REDISCOVERY_TIMEOUT: Final = 2.5
 """Timeout in seconds for a component at a restarted service: a component sends a heartbeat once a second."""
@@ -40,8 +40,8 @@ LOAD_RETRY_INTERVAL: Final = 1.0
 logger = logging.getLogger(__name__)
 
 
-class Roster:
-    """Follows the events of a service; see `Follower`.
+class ServiceComponents:
+    """Follows the events of a service; see `EventSink`.
 
     The list of components and each table are loaded after the event stream has opened, and again after lost
     events.
@@ -73,7 +73,7 @@ class Roster:
         self._gone: dict[Key, MirroredComponent] = {}
 
     def take(self, event: Document) -> None:
-        """See `Follower`."""
+        """See `EventSink`."""
         kind = event["type"]
         if kind == "link":
             self.are_links_stale.set()
@@ -96,17 +96,17 @@ class Roster:
                 mirrored.take_progress(event)
 
     def leave(self) -> None:
-        """See `Follower`."""
+        """See `EventSink`."""
         for mirrored in self.components.values():
             mirrored.mirror.leave()
 
     def resume(self) -> None:
-        """See `Follower`."""
+        """See `EventSink`."""
         for mirrored in self.components.values():
             mirrored.mirror.resume()
 
     def begin_anew(self) -> None:
-        """See `Follower`."""
+        """See `EventSink`."""
         self._is_list_stale = True
         for mirrored in self.components.values():
             mirrored.seq = -1  # another run of the service has new event numbers
@@ -119,7 +119,7 @@ class Roster:
             if known is not None:
                 self._forget(known)
             return
-        mirrored = known or self.meet(event["component_doc"], event["seq"])
+        mirrored = known or self.add_component(event["component_doc"], event["seq"])
         state = mirrored.component.state
         mirrored.take_document(event["component_doc"], event["seq"])
         if mirrored.component.state != state and mirrored.component.state in UNTRUSTED_STATES:
@@ -149,7 +149,7 @@ class Roster:
         for events in list(self.subscriptions):
             events.push(event)
 
-    def meet(self, document: Document, seq: int) -> MirroredComponent:
+    def add_component(self, document: Document, seq: int) -> MirroredComponent:
         """Return the component of a document, which is created if it is new.
 
         Args:
@@ -167,7 +167,7 @@ class Roster:
             mirrored = self._gone.pop(key, None) or MirroredComponent(
                 document, seq, partial(RemoteComponent, self), self.publish
             )
-            mirrored.come_back(document, seq)
+            mirrored.mark_found(document, seq)
             self.components[key] = mirrored
             self._stale[key] = mirrored
             self.connection.tell()
@@ -195,7 +195,7 @@ class Roster:
     async def until_current(
         self,
         mirrored: MirroredComponent | None,
-        place: Place | None,
+        place: StreamPosition | None,
         *,
         timeout: float | None = MIRROR_TIMEOUT,
     ) -> None:
@@ -225,19 +225,21 @@ class Roster:
                 await connection.news.wait()
                 connection.check_open()
 
-    async def given(self, answer: Answer) -> Component:
+    async def component_of_response(self, answer: ServiceResponse) -> Component:
         """Return the component of a response, with its table."""
         return (await self.mirror_for(answer)).component
 
-    async def mirror_for(self, answer: Answer, timeout: float | None = MIRROR_TIMEOUT) -> MirroredComponent:
+    async def mirror_for(
+        self, answer: ServiceResponse, timeout: float | None = MIRROR_TIMEOUT
+    ) -> MirroredComponent:
         """Return the mirrored component of a response, with its table.
 
         Args:
             answer: a response with the document of a component.
             timeout: seconds to wait for the table; None waits without limit.
         """
-        with understood(self.name):
-            found = self.meet(answer.document, -1 if answer.place is None else answer.place.seq)
+        with decode_errors(self.name):
+            found = self.add_component(answer.document, -1 if answer.place is None else answer.place.seq)
         await self.until_current(found, answer.place, timeout=timeout)
         return found
 
@@ -252,7 +254,7 @@ class Roster:
         method: str = "POST",
         is_write: bool = False,
         waits_for_ever: bool = False,
-    ) -> Answer:
+    ) -> ServiceResponse:
         """See `Service.ask` and `Connection.ask`."""
         began = anyio.current_time()
         request = partial(
@@ -295,7 +297,7 @@ class Roster:
                     await self.load_list()
                 else:
                     await self._load(next(iter(self._stale.values())))
-            except (Unreached, ParamClientError) as error:
+            except (ServiceUnreachable, ParamClientError) as error:
                 logger.info("%s: a table could not be loaded, retrying in 1 s: %s", self.name, error)
                 await anyio.sleep(LOAD_RETRY_INTERVAL)
 
@@ -308,7 +310,7 @@ class Roster:
         self._is_list_stale = False
         try:
             answer = await self._snapshot("/components", None)
-            with understood(self.name):
+            with decode_errors(self.name):
                 self._take_list(answer["components"], answer["seq"])
         except BaseException:
             self._is_list_stale = True
@@ -320,7 +322,7 @@ class Roster:
         listed = [document for document in documents if self._link in (None, document["link"])]
         self.components = {key: before[key] for document in listed if (key := key_of(document)) in before}
         for document in listed:
-            mirrored = self.meet(document, seq)
+            mirrored = self.add_component(document, seq)
             mirrored.take_document(document, seq)
             mirrored.announce_first()
         for key, mirrored in before.items():
@@ -337,7 +339,7 @@ class Roster:
         except NoReply:
             self._forget(mirrored)
             return
-        with understood(self.name):
+        with decode_errors(self.name):
             changes = mirrored.mirror.load(answer["seq"], params_of(answer["params"]))
         if changes is not None:
             self._stale.pop(mirrored.key, None)
@@ -353,7 +355,7 @@ class Roster:
         asked = await self._requests.ask("GET", path, link=link, timeout=SNAPSHOT_TIMEOUT)
         answer: Document = asked.document
         place = self.connection.place
-        with understood(self.name):
+        with decode_errors(self.name):
             is_of_run = place is not None and answer["run"] == place.run
         if not is_of_run:
             raise LinkError(f"{self.name}: the service has restarted", link=self.name)

@@ -33,13 +33,13 @@ from paramclient.protocol.addresses import Address
 from paramclient.protocol.params.fetch_result import Progress
 from paramclient.protocol.wire import AUTOPILOT_COMPONENT
 from paramclient.remote.component import mirrored_of
-from paramclient.remote.connection import telling
-from paramclient.remote.decoding import Document, fetch_result_of, stats_of, understood
-from paramclient.remote.http import Answer, Requests, Unreached
+from paramclient.remote.connection import run_with_progress
+from paramclient.remote.decoding import Document, decode_errors, fetch_result_of, stats_of
+from paramclient.remote.http import Requests, ServiceResponse, ServiceUnreachable
 from paramclient.remote.link import ServiceLink
 from paramclient.remote.mirrored_component import Key, MirroredComponent, key_of
 from paramclient.remote.problems import error_of
-from paramclient.remote.roster import Roster
+from paramclient.remote.roster import ServiceComponents
 from paramclient.remote.service_address import ServiceAddress, chosen_token
 
 __all__ = ["ServiceClient"]
@@ -73,7 +73,7 @@ class ServiceClient:
         self._service = ServiceLink(address.name)
         self._chosen = address.link
         self._requests = Requests(address, chosen_token(token), transport)
-        self._roster = Roster(self._requests, address.link)
+        self._roster = ServiceComponents(self._requests, address.link)
         self._connection = self._roster.connection
         self._subscriptions = self._roster.subscriptions
         self._tasks: anyio.abc.TaskGroup | None = None
@@ -162,7 +162,7 @@ class ServiceClient:
             tasks.start_soon(self._load_stats_when_wanted, name="paramclient statistics")
         except BaseException as error:
             await self._leave(tasks)
-            if isinstance(error, Unreached):
+            if isinstance(error, ServiceUnreachable):
                 raise error.error from error.error.__cause__
             if isinstance(error, TimeoutError) and not isinstance(error, ParamClientError):
                 name = self._service.name
@@ -278,7 +278,7 @@ class ServiceClient:
         answer = await self._roster.ask(
             mirrored, "successor", {"system": system}, timeout, awaited, waits_for_ever=True
         )
-        return await self._roster.given(answer)
+        return await self._roster.component_of_response(answer)
 
     async def fetch_all(
         self,
@@ -297,7 +297,7 @@ class ServiceClient:
             assert progress is not None
             progress({key[1:]: each.progress_since(before.get(key, 0)) for key, each in told})
 
-        async def fetch() -> Answer:
+        async def fetch() -> ServiceResponse:
             whose = "any component" if system is None else f"any component of system {system}"
             answer = await self._connection.ask(
                 "POST",
@@ -307,7 +307,7 @@ class ServiceClient:
                 timeout=timeout,
                 link=self._chosen,
             )
-            with understood(self._service.name):
+            with decode_errors(self._service.name):
                 ended = [
                     (key_of(each), each["received"], each["count"]) for each in answer.document["results"]
                 ]
@@ -319,9 +319,9 @@ class ServiceClient:
             await self._look_at_links()
             return answer
 
-        answer = await telling(fetch, None if progress is None else tell)
+        answer = await run_with_progress(fetch, None if progress is None else tell)
         elapsed = anyio.current_time() - began
-        with understood(self._service.name):
+        with decode_errors(self._service.name):
             known = self._roster.components
             results = {
                 key[1:]: fetch_result_of(each, known[key].component.params, elapsed)
@@ -347,7 +347,7 @@ class ServiceClient:
     async def _learn_who_we_are(self) -> None:
         with suppress(LinkError):  # an older service has no such resource
             answer = await self._requests.ask("GET", "/me")
-            with understood(self._service.name):
+            with decode_errors(self._service.name):
                 self._roster.asker = str(answer.document.get("asker", ""))
 
     async def _load_links(self) -> None:
@@ -357,7 +357,7 @@ class ServiceClient:
             UsageError: the link in the address does not exist.
         """
         answer = await self._requests.ask("GET", "/links")
-        with understood(self._service.name):
+        with decode_errors(self._service.name):
             links = [each for each in answer.document["links"] if self._chosen in (None, each["name"])]
             stats_of([each["stats"] for each in links if each["stats"] is not None])
             names = ", ".join(str(each["name"]) for each in answer.document["links"])
@@ -367,7 +367,7 @@ class ServiceClient:
 
     async def _look_at_links(self) -> None:
         """Load the links and their counters, and ignore errors."""
-        with suppress(Unreached, ParamClientError):
+        with suppress(ServiceUnreachable, ParamClientError):
             await self._load_links()
 
     async def _load_stats_when_wanted(self) -> None:

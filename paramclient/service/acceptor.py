@@ -14,7 +14,7 @@ import anyio
 import anyio.abc
 
 from paramclient.service import connections
-from paramclient.service.connection_slots import ConnectionSlot, ConnectionSlots, Stage
+from paramclient.service.connection_slots import ConnectionSlot, ConnectionSlots, ConnectionStage
 from paramclient.service.log_limit import LogLimit
 
 __all__ = ["Acceptor"]
@@ -51,7 +51,7 @@ class Acceptor:
         self,
         listener: socket.socket,
         slots: ConnectionSlots,
-        protocol: Callable[[ConnectionSlot], connections.Connection],
+        protocol: Callable[[ConnectionSlot], connections.ServiceConnection],
         *,
         tls: ssl.SSLContext | None,
         limit: LogLimit,
@@ -111,7 +111,7 @@ class Acceptor:
                     await anyio.wait_readable(connection)
                     if not connection.recv(1, socket.MSG_PEEK):
                         return  # closed without a request
-                    slot.stage = Stage.STARTED
+                    slot.stage = ConnectionStage.STARTED
                     protocol = self._protocol(slot)
                     is_handed_over = True  # the transport closes the socket in all cases
                     options = {} if self._tls is None else _timeouts(self._tls)

@@ -20,7 +20,7 @@ from typing import Any, Final, TypeAlias
 import anyio
 
 from paramclient.errors import UsageError
-from paramclient.protocol.params.change_origin import ASKER_LENGTH_MAX
+from paramclient.protocol.params.change_origin import AUTHOR_LENGTH_MAX
 from paramclient.service.body_limits import METADATA_BYTES_MAX, SESSION_BODY_BYTES_MAX
 from paramclient.service.body_memory import BodyMemory, BodyReservation
 from paramclient.service.client_address import is_in_networks, is_loopback, parse_network
@@ -43,8 +43,8 @@ from paramclient.service.request import (
 from paramclient.service.tokens import (
     SESSION_LIFETIME,
     WRONG_TOKEN_DELAY,
-    Holder,
     Sessions,
+    TokenHolder,
     Tokens,
     WrongTokens,
 )
@@ -262,7 +262,7 @@ class AccessMiddleware:
 
     # Authentication and permissions
 
-    async def _authenticate(self, request: Request) -> Holder | None:
+    async def _authenticate(self, request: Request) -> TokenHolder | None:
         """Return the holder of the token or session; None for a public request without one.
 
         Raises:
@@ -286,7 +286,7 @@ class AccessMiddleware:
             )
         return holder
 
-    async def _authenticate_token(self, token: bytes, address: str, tokens: Tokens) -> Holder:
+    async def _authenticate_token(self, token: bytes, address: str, tokens: Tokens) -> TokenHolder:
         """Return the holder of a token, with a delay after many wrong tokens from its address.
 
         The delay applies to valid tokens too: otherwise a missing response would reveal a wrong token. Valid
@@ -314,7 +314,7 @@ class AccessMiddleware:
             401, "unauthenticated", "The token is not valid for this service.", BEARER_CHALLENGE
         )
 
-    def _check_role(self, request: Request, holder: Holder | None) -> None:
+    def _check_role(self, request: Request, holder: TokenHolder | None) -> None:
         """Reject a change without permission to write."""
         if not request.is_change:
             return
@@ -332,7 +332,7 @@ class AccessMiddleware:
             raise RequestDenied(403, "forbidden", "This token only allows reading.")
 
     async def _session(
-        self, request: Request, receive: Receive, response: _Response, holder: Holder | None
+        self, request: Request, receive: Receive, response: _Response, holder: TokenHolder | None
     ) -> None:
         """Start or end the session of a browser."""
         if request.has_body or request.method == "POST":
@@ -480,7 +480,7 @@ class _Response:
         return [*kept, *ours]
 
 
-def _author_of(request: Request, holder: Holder | None) -> str:
+def _author_of(request: Request, holder: TokenHolder | None) -> str:
     """Return the author of changes for the history: `anna@10.0.0.2 (content of X-Asker)`."""
     who = "local" if holder is None else f"{holder.name}@{request.address}"
     given = request.header(b"x-asker")
@@ -491,10 +491,10 @@ def _author_of(request: Request, holder: Holder | None) -> str:
         raise RequestDenied(
             400, "bad-request", f"X-Asker must have 1 to {CLIENT_NAME_LENGTH_MAX} printable ASCII characters."
         )
-    return f"{who} ({client})"[:ASKER_LENGTH_MAX]
+    return f"{who} ({client})"[:AUTHOR_LENGTH_MAX]
 
 
-def _quota_holder(request: Request, holder: Holder | None) -> str:
+def _quota_holder(request: Request, holder: TokenHolder | None) -> str:
     """Return the holder of the quotas of a request: the token's holder, or the address without tokens."""
     return f"the address {request.network}" if holder is None else f"the token {holder.name}"
 
@@ -554,9 +554,9 @@ def _is_loopback_only(listen: str) -> bool:
 
 
 _LOOPBACK_NAMES: Final = frozenset({"localhost"})
-_LOCAL: Final = Holder("local", "write")
+_LOCAL: Final = TokenHolder("local", "write")
 """Holder of requests without tokens."""
-_FOREIGN: Final = Holder("local", "read")
+_FOREIGN: Final = TokenHolder("local", "read")
 """Holder of requests of foreign pages without tokens, which run in a browser on this computer."""
 _SECRET_HEADERS: Final = frozenset({b"authorization", b"cookie"})
 _AMBIGUOUS_STATUSES: Final = (400, 414, 431)

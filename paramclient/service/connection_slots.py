@@ -12,7 +12,7 @@ from paramclient.service.client_address import client_network, is_loopback
 if sys.platform != "win32":
     import resource
 
-__all__ = ["ConnectionSlot", "ConnectionSlots", "Stage", "connection_limit"]
+__all__ = ["ConnectionSlot", "ConnectionSlots", "ConnectionStage", "connection_limit"]
 
 SERVICE_CONNECTIONS_MAX: Final = 512
 """Maximum number of connections: some hundred event listeners, and half of the 1,024 files that a process may
@@ -24,7 +24,7 @@ LOOPBACK_RESERVED: Final = 32
 """Number of connections reserved for this computer, so that an administrator can always connect."""
 
 
-class Stage(IntEnum):
+class ConnectionStage(IntEnum):
     """Progress of a connection. If no slot is free, a connection of the lowest stage is closed first."""
 
     SILENT = 0
@@ -51,16 +51,16 @@ class ConnectionSlot:
         self.is_reserved = is_reserved
         self.close: Callable[[], object] = _nothing
         self._slots = slots
-        self._stage = Stage.SILENT
+        self._stage = ConnectionStage.SILENT
         self._is_released = False
 
     @property
-    def stage(self) -> Stage:
+    def stage(self) -> ConnectionStage:
         """Return the progress of the connection."""
         return self._stage
 
     @stage.setter
-    def stage(self, stage: Stage) -> None:
+    def stage(self, stage: ConnectionStage) -> None:
         if stage is not self._stage and not self._is_released:
             del self._slots.at[self._stage][self]
             self._stage = stage
@@ -92,7 +92,7 @@ class ConnectionSlots:
         is_local: Callable[[str], bool] | None = None,
         is_proxy: Callable[[str], bool] = lambda _: False,
     ) -> None:
-        self.at: dict[Stage, dict[ConnectionSlot, None]] = {stage: {} for stage in Stage}
+        self.at: dict[ConnectionStage, dict[ConnectionSlot, None]] = {stage: {} for stage in ConnectionStage}
         self._most = connection_limit() if most is None else most
         self._remote_max = self._most - min(LOOPBACK_RESERVED, self._most // 4)
         self._is_local = is_loopback if is_local is None else is_local
@@ -118,7 +118,7 @@ class ConnectionSlots:
         if is_full and not self._close_one(None, spare_local=not is_local):
             return None
         slot = ConnectionSlot(self, client, is_reserved=is_local)
-        self.at[Stage.SILENT][slot] = None
+        self.at[ConnectionStage.SILENT][slot] = None
         self._counts[client] = self._counts.get(client, 0) + 1
         self._remote_count += not is_local
         return slot
@@ -138,7 +138,7 @@ class ConnectionSlots:
 
     def _close_one(self, client: str | None, *, spare_local: bool = False) -> bool:
         """Close the oldest connection of the lowest stage. Return False if all have requests in progress."""
-        for stage in (Stage.SILENT, Stage.STARTED, Stage.IDLE):
+        for stage in (ConnectionStage.SILENT, ConnectionStage.STARTED, ConnectionStage.IDLE):
             for slot in self.at[stage]:
                 if client in (None, slot.client) and not (spare_local and slot.is_reserved):
                     slot.release()

@@ -11,9 +11,9 @@ import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
-from paramclient.service.connection_slots import ConnectionSlot, Stage
+from paramclient.service.connection_slots import ConnectionSlot, ConnectionStage
 
-__all__ = ["Connection", "WebSocketConnection"]
+__all__ = ["ServiceConnection", "WebSocketConnection"]
 
 REQUEST_HEAD_TIMEOUT: Final = 10.0
 """Timeout in seconds for the head of a request, from the start of the connection or its first byte."""
@@ -85,7 +85,7 @@ class _StallTimer:
             self.start()
 
 
-class Connection(H11Protocol, _LimitedReads):
+class ServiceConnection(H11Protocol, _LimitedReads):
     """An HTTP connection, until it becomes a WebSocket; see `WebSocketConnection`.
 
     Args:
@@ -118,7 +118,7 @@ class Connection(H11Protocol, _LimitedReads):
         if _is_closed(self.transport):
             return
         if self.transport.get_protocol() is not self:  # the connection has become a WebSocket
-            self._slot.stage = Stage.ACTIVE
+            self._slot.stage = ConnectionStage.ACTIVE
             self._stop_timers()
         elif self.conn.their_state is not h11.IDLE:
             self._stop_head_timer()
@@ -141,7 +141,7 @@ class Connection(H11Protocol, _LimitedReads):
     def on_response_complete(self) -> None:
         super().on_response_complete()
         if self.cycle.response_complete:
-            self._slot.stage = Stage.IDLE
+            self._slot.stage = ConnectionStage.IDLE
         self._stall.start()
 
     def pause_writing(self) -> None:
@@ -174,7 +174,7 @@ class Connection(H11Protocol, _LimitedReads):
 
     def _stop_head_timer(self) -> None:
         if self.cycle is not None and not self.cycle.response_complete:
-            self._slot.stage = Stage.ACTIVE
+            self._slot.stage = ConnectionStage.ACTIVE
         if self._head is not None:
             self._head.cancel()
             self._head = None

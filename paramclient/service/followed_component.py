@@ -15,7 +15,7 @@ from paramclient.client.subscription import Changes
 from paramclient.documents.component import ComponentDoc, ProgressDoc
 from paramclient.documents.param import ParamDoc
 from paramclient.errors import NoReply, ParamClientError
-from paramclient.model.params import as_params, held_of
+from paramclient.model.params import as_params, compact_param
 from paramclient.model.values import Param, Trust
 from paramclient.protocol.params.change import Added, Change
 
@@ -112,7 +112,9 @@ class FollowedComponent:
 
     def _is_published(self, param: Param) -> bool:
         published, name = self._published, param.name
-        return published.held.get(name) == held_of(param) and published.defaults.get(name) == param.default
+        return (
+            published.held.get(name) == compact_param(param) and published.defaults.get(name) == param.default
+        )
 
     def object_of(self, params: Iterable[Param]) -> str:
         """Return parameters as one JSON object, by name."""

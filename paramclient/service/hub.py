@@ -322,7 +322,7 @@ class Hub:
                     with anyio.move_on_after(None if choice.due == math.inf else choice.due - now):
                         await _wait_for_any([*news, self._closing])
                 for _, client in clients:
-                    await client.link_task.read_up(choice.due)
+                    await client.link_task.wait_for_reader(choice.due)
         awaited = address_in_words(system, component)
         if choice.due < math.inf:
             awaited += f", then {LOOK_TIME} s without another vehicle"
@@ -368,7 +368,11 @@ class Hub:
             await followed.component.wait_for_cache()
             await self._load_cached(followed)
         machine = followed.component.machine
-        is_due = machine.who.has_parameters and machine.fetch is None and machine.sync_state == "unsynced"
+        is_due = (
+            machine.identification.has_parameters
+            and machine.fetch is None
+            and machine.sync_state == "unsynced"
+        )
         if self._fetches and is_due and not client.station.listens_only:
             with suppress(ServiceError):  # the maximum number of jobs is running
                 self.start_fetch(followed, SERVICE_AUTHOR)

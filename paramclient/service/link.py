@@ -36,7 +36,7 @@ REOPEN_BACKOFF: Final = 0.25
 """Seconds before the second attempt to open a link. The backoff is doubled after each attempt."""
 REOPEN_BACKOFF_MAX: Final = 5.0
 """Maximum number of seconds between two attempts to open a link."""
-CHECK_INTERVAL: Final = 0.2
+LINK_STATE_CHECK_INTERVAL: Final = 0.2
 """Seconds between two checks for changes without an event: states, progress."""
 CHECKS_PER_VALUE_CHECK: Final = 5
 """Number of checks of which one includes all values."""
@@ -192,7 +192,7 @@ class ServiceLink:
         """Publish changes without an event, until the link has failed permanently."""
         checks = 0
         while not self._ended.is_set():
-            with anyio.move_on_after(CHECK_INTERVAL):
+            with anyio.move_on_after(LINK_STATE_CHECK_INTERVAL):
                 await self._ended.wait()
             checks += 1
             self._check_link_state()
@@ -213,7 +213,7 @@ class ServiceLink:
         if client is None:
             return
         task = local_client(client).link_task
-        if task.is_away:
+        if task.is_disconnected:
             error = self.error if task.broken is None else str(task.broken)
             self._set_state("away", error or f"{self.name} is disconnected and reconnects")
         elif self.state == "away":

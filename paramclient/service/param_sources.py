@@ -47,7 +47,7 @@ __all__ = [
     "Timestamp",
     "Number",
     "Patterns",
-    "Source",
+    "WantedParams",
     "FILE_NAME_LENGTH_MAX",
     "PATTERNS_MAX",
     "REQUEST_VALUES_MAX",
@@ -180,7 +180,7 @@ class CachedSource(Body):
     at: Timestamp | None = None
 
 
-class Source(Body):
+class WantedParams(Body):
     """A parameter set of a request. Exactly one member is given.
 
     `snapshot` (its number) and `at` (a time) are earlier states of the component in the path, `component` is
@@ -197,7 +197,7 @@ class Source(Body):
     defaults: Literal[True] | None = None
 
     @model_validator(mode="after")
-    def _is_one(self) -> Source:
+    def _is_one(self) -> WantedParams:
         if len(self.model_fields_set) != 1 or None in (getattr(self, name) for name in self.model_fields_set):
             raise ValueError(
                 f"a source needs exactly one of these members: {', '.join(type(self).model_fields)}"
@@ -232,7 +232,7 @@ def _has_no_lines(data: bytes, form: FileForm | None) -> bool:
     return is_packed(data) or data.removeprefix(BOM_UTF8).lstrip().startswith(b"{")
 
 
-async def resolve_source(hub: Hub, target: FollowedComponent, source: Source) -> ParamSet:
+async def resolve_source(hub: Hub, target: FollowedComponent, source: WantedParams) -> ParamSet:
     """Return the parameter set of a source.
 
     Fetches the whole table of another connected component.

@@ -17,7 +17,7 @@ from paramclient.errors import LinkError, UsageError
 from paramclient.service.acceptor import Acceptor
 from paramclient.service.app import Settings, create_app
 from paramclient.service.connection_slots import ConnectionSlot, ConnectionSlots
-from paramclient.service.connections import Connection, WebSocketConnection
+from paramclient.service.connections import ServiceConnection, WebSocketConnection
 from paramclient.service.hub import Hub
 from paramclient.service.log_limit import LogLimit
 from paramclient.service.tls import tls_of
@@ -90,9 +90,9 @@ class _Server(uvicorn.Server):
         self.started = True
         self.is_ready.set()
 
-    def protocol(self, slot: ConnectionSlot) -> Connection:
+    def protocol(self, slot: ConnectionSlot) -> ServiceConnection:
         """Return the protocol of a new connection."""
-        return Connection(
+        return ServiceConnection(
             slot, config=self.config, server_state=self.server_state, app_state=self.lifespan.state
         )
 
@@ -194,7 +194,7 @@ def _config(app: ASGIApp, listening: Listening) -> uvicorn.Config:
     return uvicorn.Config(
         app,
         lifespan="off",
-        http=Connection,
+        http=ServiceConnection,
         ws=WebSocketConnection,
         ws_max_size=WEBSOCKET_MESSAGE_BYTES_MAX,
         ws_per_message_deflate=False,

@@ -19,7 +19,7 @@ from paramclient.service.client_address import client_network
 
 __all__ = [
     "WrongTokens",
-    "Holder",
+    "TokenHolder",
     "Role",
     "Sessions",
     "Tokens",
@@ -70,7 +70,7 @@ WRONG_TOKEN_ADDRESSES_MAX: Final = 1_024
 
 
 @dataclass(frozen=True, slots=True)
-class Holder:
+class TokenHolder:
     """Holder of a token.
 
     Attributes:
@@ -92,7 +92,7 @@ class Tokens:
         UsageError: there are none or too many, or two have the same name or token.
     """
 
-    def __init__(self, digests: Iterable[tuple[Holder, bytes]]) -> None:
+    def __init__(self, digests: Iterable[tuple[TokenHolder, bytes]]) -> None:
         self._digests = tuple(digests)
         names = [holder.name for holder, _ in self._digests]
         if not 1 <= len(names) <= TOKENS_MAX:
@@ -102,7 +102,7 @@ class Tokens:
         if len({digest for _, digest in self._digests}) < len(names):
             raise UsageError("two names have the same token; the history could not distinguish them")
 
-    def holder(self, token: bytes) -> Holder | None:
+    def holder(self, token: bytes) -> TokenHolder | None:
         """Return the holder of a token, or None, in constant time."""
         digest = _digest(token)
         found = None
@@ -230,9 +230,9 @@ class Sessions:
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
-        self._open: dict[bytes, tuple[Holder, float]] = {}
+        self._open: dict[bytes, tuple[TokenHolder, float]] = {}
 
-    def begin(self, holder: Holder) -> str:
+    def begin(self, holder: TokenHolder) -> str:
         """Start a session. Return the value of its cookie, which is not kept."""
         now = self._clock()
         self._open = {key: each for key, each in self._open.items() if each[1] > now}
@@ -243,7 +243,7 @@ class Sessions:
         self._open[_digest(text.encode())] = (holder, now + SESSION_LIFETIME)
         return text
 
-    def holder(self, text: bytes) -> Holder | None:
+    def holder(self, text: bytes) -> TokenHolder | None:
         """Return the holder of a session, or None if it is unknown or expired."""
         holder, until = self._open.get(_digest(text), (None, 0.0))
         return holder if until > self._clock() else None
@@ -295,7 +295,7 @@ class WrongTokens:
         return len(self._wrong)
 
 
-def _of_line(words: list[str]) -> tuple[Holder, bytes]:
+def _of_line(words: list[str]) -> tuple[TokenHolder, bytes]:
     """Parse the words of a line. Errors contain no word: any of them could be the token.
 
     Raises:
@@ -307,9 +307,9 @@ def _of_line(words: list[str]) -> tuple[Holder, bytes]:
     if not _NAME.fullmatch(name):
         raise UsageError("a name must have 1 to 32 letters, digits, dots, hyphens and underscores")
     if role == "read":
-        holder = Holder(name, "read")
+        holder = TokenHolder(name, "read")
     elif role == "write":
-        holder = Holder(name, "write")
+        holder = TokenHolder(name, "write")
     else:
         raise UsageError("the second word is the permission: read or write")
     if token.startswith(DIGEST_PREFIX):

@@ -200,7 +200,7 @@ class ArduPilotVehicle(Vehicle):
             if self._ready and self._read_at == math.inf:
                 self._read_at = self._next(_SLOT)
 
-    def _on_set(self, request: wire.ParamSet, sender: wire.Frame) -> None:
+    def _on_set(self, request: wire.ParamSetMessage, sender: wire.Frame) -> None:
         entry = self._find(request.param_id)
         (value,) = struct.unpack("<f", request.raw)
         if entry is None:
@@ -299,7 +299,7 @@ class ArduPilotVehicle(Vehicle):
             self._answer_reads()
             self._read_at = self._read_at + _SLOT if self._ready else math.inf
         super()._work(now)
-        self._mind_list(now)
+        self._process_backlog(now)
         if self._answer_at <= now:
             self._answer_at = math.inf
             for entry in self._answers.values():
@@ -330,7 +330,7 @@ class ArduPilotVehicle(Vehicle):
             self._read_at = math.inf
         super()._send_list(now)
 
-    def _mind_list(self, now: float) -> None:
+    def _process_backlog(self, now: float) -> None:
         """Process received messages, after the list has occupied the main loop."""
         if self._window_at == math.inf:
             return

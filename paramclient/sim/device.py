@@ -332,7 +332,7 @@ class Device(ABC):
             message,
             wire.ParamRequestRead
             | wire.ParamRequestList
-            | wire.ParamSet
+            | wire.ParamSetMessage
             | wire.CommandLong
             | wire.FileTransfer
             | wire.SetupSigning,
@@ -392,7 +392,7 @@ class Device(ABC):
 _NAMES = {
     wire.ParamRequestRead: "PARAM_REQUEST_READ",
     wire.ParamRequestList: "PARAM_REQUEST_LIST",
-    wire.ParamSet: "PARAM_SET",
+    wire.ParamSetMessage: "PARAM_SET",
     wire.CommandLong: "COMMAND_LONG",
     wire.FileTransfer: "FILE_TRANSFER_PROTOCOL",
     wire.SetupSigning: "SETUP_SIGNING",

@@ -26,7 +26,7 @@ class BytewiseVehicle(Vehicle):
         elif not self._is_dead(entry):
             self._send_value(entry)
 
-    def _on_set(self, request: wire.ParamSet, sender: wire.Frame) -> None:
+    def _on_set(self, request: wire.ParamSetMessage, sender: wire.Frame) -> None:
         entry = self._find(request.param_id)
         if entry is None:
             self._refuse(ParamErrorCode.DOES_NOT_EXIST, request, sender)
@@ -37,7 +37,7 @@ class BytewiseVehicle(Vehicle):
             self._write(entry, int.from_bytes(request.raw[:size], "little"))
             self._send_value(entry)
 
-    def _on_wrong_type(self, entry: Entry, request: wire.ParamSet, sender: wire.Frame) -> None:
+    def _on_wrong_type(self, entry: Entry, request: wire.ParamSetMessage, sender: wire.Frame) -> None:
         if self._param_error:
             self._refuse(ParamErrorCode.TYPE_MISMATCH, request, sender)
         else:

@@ -78,7 +78,7 @@ class OtherStation:
         while self._sets and self._started_at + self._sets[0][0] <= now:
             row = self._sets.pop(0)[1]
             raw = Entry(row, 0, self._encoding).raw
-            self._send(wire.ParamSet(*self._target, row.name, raw, row.type))
+            self._send(wire.ParamSetMessage(*self._target, row.name, raw, row.type))
 
     def next_deadline(self) -> float | None:
         """Return the time of the next work; None before the first call."""

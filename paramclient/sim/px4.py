@@ -278,14 +278,14 @@ class PX4Vehicle(BytewiseVehicle):
         else:
             super()._on_read(request, sender)
 
-    def _on_set(self, request: wire.ParamSet, sender: wire.Frame) -> None:
+    def _on_set(self, request: wire.ParamSetMessage, sender: wire.Frame) -> None:
         if request.param_id != wire.HASH_CHECK:
             super()._on_set(request, sender)
         elif self.announced_hash() is not None:
             self._position = None
             self._hash_next = False
 
-    def _on_wrong_type(self, entry: Entry, request: wire.ParamSet, sender: wire.Frame) -> None:
+    def _on_wrong_type(self, entry: Entry, request: wire.ParamSetMessage, sender: wire.Frame) -> None:
         self._refuse(ParamErrorCode.TYPE_MISMATCH, request, sender)
 
     def _write(self, entry: Entry, bits: int) -> None:

@@ -211,7 +211,7 @@ class Vehicle(Device):
         """Handle PARAM_REQUEST_READ."""
 
     @abstractmethod
-    def _on_set(self, request: wire.ParamSet, sender: wire.Frame) -> None:
+    def _on_set(self, request: wire.ParamSetMessage, sender: wire.Frame) -> None:
         """Handle PARAM_SET."""
 
     @abstractmethod
@@ -271,7 +271,7 @@ class Vehicle(Device):
             self._on_read(message, sender)
         elif isinstance(message, wire.ParamRequestList):
             self._on_list()
-        elif isinstance(message, wire.ParamSet):
+        elif isinstance(message, wire.ParamSetMessage):
             self._on_set(message, sender)
         elif isinstance(message, wire.FileTransfer) and self._ftp is not None:
             self._ftp.receive(message.payload, (sender.system, sender.component), self._now)
@@ -374,7 +374,7 @@ class Vehicle(Device):
         self._send(wire.ParamValue(entry.name, entry.raw, entry.type if kind is None else kind, count, index))
 
     def _refuse(
-        self, code: ParamErrorCode, request: wire.ParamRequestRead | wire.ParamSet, sender: wire.Frame
+        self, code: ParamErrorCode, request: wire.ParamRequestRead | wire.ParamSetMessage, sender: wire.Frame
     ) -> None:
         """Send PARAM_ERROR, if this vehicle supports it."""
         if self._param_error:

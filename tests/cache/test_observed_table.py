@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from paramclient.cache import HeardParams, StoredParam, UnixTimes
 from paramclient.cache.cells import Damaged
 from paramclient.cache.packed_table import Packed, pack
-from paramclient.cache.stored_param import StoredTable
+from paramclient.cache.param_columns import StoredTable
 from paramclient.model.params import Params
-from paramclient.model.values import Encoding, Param, ParamType, Trust, decode, from_bits, known_type
+from paramclient.model.values import Encoding, Param, ParamType, Trust, decode_value, from_bits, known_type
 from tests.caches import cells
 
 AT = 1_795_000_000.5
@@ -25,7 +25,7 @@ def tables(draw: st.DrawFn) -> Params:
     for place, name in enumerate(draw(st.lists(st.text("AB_é", min_size=1, max_size=3), unique=True))):
         number = draw(st.integers(0, 12))
         raw = draw(st.binary(min_size=4, max_size=4))
-        value, bits = decode(raw, number, draw(st.sampled_from(Encoding)))
+        value, bits = decode_value(raw, number, draw(st.sampled_from(Encoding)))
         if number in (ParamType.INT64, ParamType.UINT64) and draw(st.booleans()):
             bits = draw(st.integers(0, 2**64 - 1))
             value = from_bits(bits, number)

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from paramclient.cache import ParamCache, StoredParam, packed_table, sqlite
 from paramclient.cache.cells import Damaged
 from paramclient.cache.packed_table import Packed, pack, packed_row, row_checksum, unpack
-from paramclient.cache.stored_param import COLUMN_NAMES, COLUMNS, Column, StoredTable
+from paramclient.cache.param_columns import COLUMN_NAMES, COLUMNS, Column, StoredTable
 from paramclient.cache.transaction import Session
 from paramclient.errors import UsageError
 from paramclient.model.values import ParamType

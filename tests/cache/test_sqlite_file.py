@@ -29,9 +29,9 @@ from hypothesis import strategies as st
 from paramclient.cache import HISTORY_LINES, ParamCache, StoredParam, lock, sqlite_file
 from paramclient.cache.cells import Damaged
 from paramclient.cache.packed_table import unpack
+from paramclient.cache.param_columns import checksum
 from paramclient.cache.sqlite_file import APPLICATION_ID, Database
 from paramclient.cache.sqlite_schema import MIGRATIONS
-from paramclient.cache.stored_param import checksum
 from paramclient.errors import CacheError, UnknownVehicle
 from paramclient.model.identity import Identity
 from paramclient.model.values import ParamType

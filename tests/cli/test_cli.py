@@ -394,7 +394,7 @@ class Unchanging(GenericVehicle):
 class Mistyped(GenericVehicle):
     """A vehicle that reports a wrong type for every set."""
 
-    def _on_set(self, request: wire.ParamSet, sender: wire.Frame) -> None:
+    def _on_set(self, request: wire.ParamSetMessage, sender: wire.Frame) -> None:
         self._refuse(ParamErrorCode.TYPE_MISMATCH, request, sender)
 
 

@@ -326,7 +326,7 @@ class Watch:
 
     def written_after(self) -> float:
         assert self.first_heard is not None
-        first = next(at for at, _, message in self.tap.heard if isinstance(message, wire.ParamSet))
+        first = next(at for at, _, message in self.tap.heard if isinstance(message, wire.ParamSetMessage))
         return first - self.first_heard
 
 

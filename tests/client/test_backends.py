@@ -153,7 +153,7 @@ async def test_a_second_vehicle_is_looked_for() -> None:
 
 
 async def test_a_tcp_connection_that_drops_is_opened_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(link_task, "BACKOFF_MIN", 0.01)
+    monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MIN", 0.01)
     vehicle, scope = generic(stream=True, **QUICK), anyio.CancelScope()
     listening = create_link("tcpin:127.0.0.1:0")
     async with beside() as tasks:
@@ -169,7 +169,7 @@ async def test_a_tcp_connection_that_drops_is_opened_again(monkeypatch: pytest.M
 
 
 async def test_a_serial_port_that_is_unplugged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(link_task, "BACKOFF_MIN", 0.01)
+    monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MIN", 0.01)
     vehicle = generic(stream=True, **QUICK)
     with Cable(tmp_path) as cable:
         async with beside() as tasks, a_client(cable.link) as client:
@@ -429,7 +429,7 @@ async def test_a_link_that_fails_reaches_everyone(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(link_task, "LINK_TIMEOUT", 0.05)
-    monkeypatch.setattr(link_task, "BACKOFF_MIN", 0.01)
+    monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MIN", 0.01)
     link = FlakyLink(generic(**QUICK))
     async with beside(), a_client(link) as client:
         component = await client.component()

@@ -620,7 +620,7 @@ async def test_what_another_station_changes_is_kept_with_its_name(path: Path) ->
         component = await client.component()
         await component.fetch_all()
         await asyncio.sleep(1.0)
-        message = wire.ParamSet(1, 1, "PARAM_01", (55).to_bytes(4, "little"), 6)
+        message = wire.ParamSetMessage(1, 1, "PARAM_01", (55).to_bytes(4, "little"), 6)
         radio.other = [wire.encode(message, system=254, component=190, sequence=0)]
         await anext(component.changes())
         await component.set("PARAM_02", 22)

@@ -600,7 +600,8 @@ async def test_writes_to_one_name_are_done_in_order_and_others_beside() -> None:
         assert all(result.status == "accepted" and result.attempts == 1 for result in results)
         assert anyio.current_time() - began < 0.65, "three round trips, and not six"
     sent = [
-        (message.param_id, int.from_bytes(message.raw, "little")) for message in tap.messages(wire.ParamSet)
+        (message.param_id, int.from_bytes(message.raw, "little"))
+        for message in tap.messages(wire.ParamSetMessage)
     ]
     assert [value for name, value in sent if name == "PARAM_01"] == [10, 11, 12]
     assert vehicle.param("PARAM_01").value == 12
@@ -615,7 +616,7 @@ async def test_a_write_learns_the_type_first() -> None:
         assert (result.status, result.requested, result.actual, result.attempts) == ("accepted", 2, 2.0, 1)
         assert result.param == await component.get("PARAM_03")
         await component.set("PARAM_03", 3)
-    assert [message.param_type for message in tap.messages(wire.ParamSet)] == [ParamType.REAL32] * 2
+    assert [message.param_type for message in tap.messages(wire.ParamSetMessage)] == [ParamType.REAL32] * 2
     assert len(tap.messages(wire.ParamRequestRead)) - len(reads_of_hash(tap)) == 2, (
         "once to learn, once to get"
     )
@@ -676,7 +677,7 @@ class Stubborn(GenericVehicle):
 class Retyping(GenericVehicle):
     """It calls its parameters REAL32 when they are read, and INT32 when they are written."""
 
-    def _on_set(self, request: wire.ParamSet, sender: wire.Frame) -> None:
+    def _on_set(self, request: wire.ParamSetMessage, sender: wire.Frame) -> None:
         kind = ParamType.REAL32 if request.param_type == ParamType.INT32 else ParamType.INT32
         self._send(wire.ParamValue(request.param_id, request.raw, kind, 24, 1))
 
@@ -742,7 +743,7 @@ async def test_a_value_that_turns_out_not_to_fit_is_not_written() -> None:
         component = await client.component()
         with pytest.raises(UsageError):
             await component.set("PARAM_01", 1.5)
-        assert not tap.messages(wire.ParamSet)
+        assert not tap.messages(wire.ParamSetMessage)
 
 
 # Time-outs
@@ -1144,7 +1145,7 @@ async def test_changes_by_other_stations_are_told_from_the_vehicles_own() -> Non
         component = await client.component()
         await component.fetch_all()
         changes = component.changes()
-        message = wire.ParamSet(1, 1, "PARAM_01", (55).to_bytes(4, "little"), ParamType.INT32)
+        message = wire.ParamSetMessage(1, 1, "PARAM_01", (55).to_bytes(4, "little"), ParamType.INT32)
         radio.other.append(wire.encode(message, system=254, component=190, sequence=0))
         change = await anext(changes)
         assert (change.name, change.by) == ("PARAM_01", "station 254/190")
@@ -1338,8 +1339,8 @@ async def test_a_tcp_connection_that_breaks_during_a_download() -> None:
 @pytest.mark.asyncio
 async def test_a_tcp_server_that_stays_away(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(link_task, "LINK_TIMEOUT", 0.3)
-    monkeypatch.setattr(link_task, "BACKOFF_MIN", 0.05)
-    monkeypatch.setattr(link_task, "BACKOFF_MAX", 0.1)
+    monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MIN", 0.05)
+    monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MAX", 0.1)
     served = Served(generic(stream=True), "tcpin")
     async with asyncio.timeout(PATIENCE), served, a_client(f"tcp:127.0.0.1:{served.port}") as client:
         component = await client.component()

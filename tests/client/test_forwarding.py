@@ -19,7 +19,7 @@ from paramclient.client.client import implementation_of
 from paramclient.client.link_client import LinkClient
 from paramclient.links import Peer, create_link
 from paramclient.links.tlog import read_records
-from paramclient.model.values import Encoding, encode
+from paramclient.model.values import Encoding, encode_value
 from paramclient.protocol import wire
 from tests.shell import FlakyLink, Tap, a_client, bits, generic, small_px4, swiftly, tasks_beside
 
@@ -93,8 +93,10 @@ class Recorded(Tap):
         return data
 
 
-def a_set(name: str, value: int) -> wire.ParamSet:
-    return wire.ParamSet(1, 1, name, encode(value, ParamType.INT32, Encoding.BYTEWISE), ParamType.INT32)
+def a_set(name: str, value: int) -> wire.ParamSetMessage:
+    return wire.ParamSetMessage(
+        1, 1, name, encode_value(value, ParamType.INT32, Encoding.BYTEWISE), ParamType.INT32
+    )
 
 
 @swiftly

@@ -38,8 +38,8 @@ from paramclient.protocol.params import table as table_room
 from paramclient.protocol.params import value_check
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.change_origin import Authors
-from paramclient.protocol.params.sync import Upkeep
-from paramclient.protocol.params.table import Room, Table
+from paramclient.protocol.params.sync import SyncSettings
+from paramclient.protocol.params.table import NameQuota, Table
 from paramclient.protocol.requests.retry import INITIAL_TIMEOUT
 from paramclient.protocol.station import Station
 from paramclient.protocol.stats import traffic as traffic_room
@@ -125,7 +125,7 @@ def test_a_cached_count_above_what_can_be_asked_for_is_none() -> None:
 
 
 def heard(table: Table, name: str) -> None:
-    table.hear(ParamValue(name, bytes(4), 9, 10, NO_INDEX), "vehicle")
+    table.store_value(ParamValue(name, bytes(4), 9, 10, NO_INDEX), "vehicle")
 
 
 def test_a_table_holds_so_many_names_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -134,10 +134,10 @@ def test_a_table_holds_so_many_names_and_no_more(monkeypatch: pytest.MonkeyPatch
     for name in "ABCD":
         heard(table, name)
     assert [*table.params] == ["A", "B", "C"]
-    assert table.take("E", 9, 0, 0, None, is_older=False) is None
+    assert table.store_file_entry("E", 9, 0, 0, None, is_older=False) is None
     assert table.fill({"F": known("F")}) == []
     assert [*table.params] == ["A", "B", "C"]
-    assert table.take("C", 9, 1, 0, None, is_older=False) is not None
+    assert table.store_file_entry("C", 9, 1, 0, None, is_older=False) is not None
     table.remove(lambda param: param.name == "A")
     heard(table, "D")
     assert [*table.params] == ["B", "C", "D"]
@@ -147,7 +147,7 @@ def test_the_tables_of_a_link_share_a_room(monkeypatch: pytest.MonkeyPatch) -> N
     """When it is full, each may still hold as many as an autopilot has."""
     monkeypatch.setattr(table_room, "LINK_NAMES_MAX", 6)
     monkeypatch.setattr(table_room, "NAMES_GUARANTEED", 2)
-    room = Room()
+    room = NameQuota()
     liar, honest = Table(room=room), Table(room=room)
     for name in "ABCDEFGH":
         heard(liar, name)
@@ -344,7 +344,7 @@ def test_no_lie_keeps_another_vehicle_from_being_fetched(
     """While the liar is fetched as well: its list is waited for once, and its values count for it alone."""
     monkeypatch.setattr(station_room, "COMPONENTS_MAX", 50)
     honest, liar = listing_ardupilot(), LiarVehicle(lie)
-    station = Station(link="sim:test", is_stream=False, upkeep=Upkeep(30.0))
+    station = Station(link="sim:test", is_stream=False, upkeep=SyncSettings(30.0))
     session = Simulation(honest, liar, station=station)
     session.meet()
     session.until(lambda: (66, 1) in session.station.components)
@@ -381,7 +381,7 @@ def test_all_lies_at_once_cost_no_more_than_so_much_memory() -> None:
         for number in range(TEXTS_MAX):
             text_of(b"%d" % number)  # what remembers names is full
         liars = [LiarVehicle(*list(LIES)[start::3], system=66 + start, rate=150) for start in range(3)]
-        station = Station(link="sim:test", is_stream=False, upkeep=Upkeep(30.0), counts_traffic=True)
+        station = Station(link="sim:test", is_stream=False, upkeep=SyncSettings(30.0), counts_traffic=True)
         held: list[int] = []
         for now in range(4):
             for liar in liars:

@@ -21,10 +21,10 @@ from paramclient import (
 )
 from paramclient.cli import run
 from paramclient.client.client import local_client
-from paramclient.model.values import Encoding, encode
+from paramclient.model.values import Encoding, encode_value
 from paramclient.protocol import wire
 from paramclient.protocol.params.passive import LIST_PAUSE_MAX, PASSIVE_TIMEOUT
-from paramclient.protocol.params.sync import Upkeep
+from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.station import Station
 from paramclient.sim import Endpoint
 from tests.shell import Radio, bits, generic, residue, small_px4, swiftly
@@ -113,9 +113,9 @@ async def test_what_others_set_is_told_with_its_author() -> None:
         channel.ask(LIST)
         await component.fetch_all()
         changes = component.changes()
-        raw = encode(7, ParamType.INT32, Encoding.BYTEWISE)
+        raw = encode_value(7, ParamType.INT32, Encoding.BYTEWISE)
         # also of a station with the ids that a client has
-        channel.ask(wire.ParamSet(1, 1, "PARAM_01", raw, ParamType.INT32), system=255)
+        channel.ask(wire.ParamSetMessage(1, 1, "PARAM_01", raw, ParamType.INT32), system=255)
         change = await anext(changes)
         assert (change.name, change.by) == ("PARAM_01", "station 255/190")
         assert component.params["PARAM_01"].value == 7
@@ -256,7 +256,9 @@ def test_the_command_listens_too(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def station_that_listens() -> Station:
-    station = Station(link="test", is_stream=False, upkeep=Upkeep.chosen(None, "auto", listen_only=True))
+    station = Station(
+        link="test", is_stream=False, upkeep=SyncSettings.chosen(None, "auto", listen_only=True)
+    )
     say(station, wire.Heartbeat(2, wire.MAV_AUTOPILOT_GENERIC, system_status=4), 0.0)
     return station
 

@@ -16,7 +16,7 @@ from paramclient import UnknownParameter
 from paramclient.cli import run
 from paramclient.protocol import wire
 from paramclient.protocol.station import Station
-from paramclient.protocol.stats.trace import Told
+from paramclient.protocol.stats.trace import LazyMessageText
 from paramclient.sim import Air
 from tests.shell import FlakyLink, Tap, a_client, generic, small_px4, swiftly
 
@@ -110,7 +110,7 @@ def test_words_are_made_up_only_when_they_are_wanted() -> None:
     station = Station(link="test", is_stream=False, trace=lambda *line: lines.append(line))
     beat = wire.Heartbeat(2, wire.MAV_AUTOPILOT_PX4, system_status=4)
     station.receive(wire.encode(beat, system=1, component=1, sequence=0), "peer", 0.0)
-    assert [type(line[-1]) for line in lines] == [Told]
+    assert [type(line[-1]) for line in lines] == [LazyMessageText]
     assert str(lines[0][-1]) == "COMMAND_LONG 512 (148)"
 
 
@@ -124,7 +124,7 @@ def test_words_are_made_up_only_when_they_are_wanted() -> None:
     ],
 )
 def test_messages_in_words(message: wire.Message, words: str) -> None:
-    assert str(Told(message)) == words
+    assert str(LazyMessageText(message)) == words
 
 
 def test_the_command_tells_its_steps(capsys: pytest.CaptureFixture[str]) -> None:

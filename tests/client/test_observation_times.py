@@ -38,7 +38,7 @@ NOW = 1_795_000_000.0
 
 
 def heard(table: Table, value: int, by: str, moment: float) -> None:
-    table.hear(param_value("A", value, index=0, kind=ParamType.INT32), by, moment)
+    table.store_value(param_value("A", value, index=0, kind=ParamType.INT32), by, moment)
 
 
 def test_a_value_that_is_heard_again_has_the_later_moment() -> None:
@@ -84,7 +84,7 @@ def test_what_did_not_reach_the_cache_is_given_back_with_its_moments() -> None:
     for again in (2.5, 3.0, 3.5):
         changed, params = table.changed, table.params.copy()
         news = (table.take_dirty(), table.take_overwritten(), table.take_gone(), changed, params)
-        table.give_back(*news)
+        table.restore_unwritten(*news)
         assert table.dirty == {"A": "vehicle"}
         heard(table, 2, "vehicle", again)
     assert [(each.param.value, each.moment) for each in table.take_overwritten()] == [(2, 2.0)]
@@ -99,7 +99,7 @@ def test_what_is_replaced_on_its_way_to_a_cache_that_does_not_take_it_is_kept(by
     changed, params = table.changed, table.params.copy()
     news = (table.take_dirty(), table.take_overwritten(), table.take_gone(), changed, params)
     heard(table, 3, by, 3.0)
-    table.give_back(*news)
+    table.restore_unwritten(*news)
     assert [(each.param.value, each.moment) for each in table.take_overwritten()] == [(2, 2.0)]
     assert table.take_dirty() == {"A": by}
 
@@ -107,7 +107,7 @@ def test_what_is_replaced_on_its_way_to_a_cache_that_does_not_take_it_is_kept(by
 def test_what_is_gone_was_found_missing_when_the_last_value_came() -> None:
     table = Table()
     heard(table, 1, "vehicle", 1.0)
-    table.hear(param_value("B", 1.0, index=0, count=1), "vehicle", 2.0)
+    table.store_value(param_value("B", 1.0, index=0, count=1), "vehicle", 2.0)
     table.settle({0: "B"})
     assert table.take_gone() == {"A": 2.0}
     assert table.params.moments == {"B": 2.0}
@@ -116,11 +116,11 @@ def test_what_is_gone_was_found_missing_when_the_last_value_came() -> None:
 def test_a_file_counts_from_when_it_was_asked_for() -> None:
     table = Table()
     heard(table, 1, "vehicle", 1.0)
-    table.take("A", ParamType.INT32, 2, 0, None, 1.5, is_older=False)
+    table.store_file_entry("A", ParamType.INT32, 2, 0, None, 1.5, is_older=False)
     assert table.params.moments == {"A": 1.5}
     heard(table, 3, "vehicle", 2.0)
     for value in (2, 3):  # also where the file has what was heard since
-        table.take("A", ParamType.INT32, value, 0, None, 1.7, is_older=True)
+        table.store_file_entry("A", ParamType.INT32, value, 0, None, 1.7, is_older=True)
         assert table.params.moments == {"A": 2.0}
 
 
@@ -137,7 +137,7 @@ def test_sleep_that_the_clock_leaves_out_makes_everything_older() -> None:
     table = Table()
     for number, moment in ((1, 1.0), (2, 2.0)):
         heard(table, number, "us", moment)
-    table.hear(param_value("B", 1.0, index=1), "vehicle", 3.0)
+    table.store_value(param_value("B", 1.0, index=1), "vehicle", 3.0)
     table.remove(lambda param: param.name == "B")
     table.age(1000.0)
     assert table.params.moments == {"A": -998.0}

@@ -148,12 +148,12 @@ async def test_after_an_absence_of_the_link_a_second_one_is_looked_for_again() -
     async with a_client(link) as client:
         await client.only_component()
         await link.drop()
-        await until(lambda: local_client(client).link_task.is_away)
+        await until(lambda: local_client(client).link_task.is_disconnected)
         began = swift_loop().now
         found = await client.only_component()
         assert swift_loop().now - began >= LOOK_TIME
         assert address(found) == (1, 1)
-        assert not tap.messages(wire.ParamSet)
+        assert not tap.messages(wire.ParamSetMessage)
 
 
 @swiftly

@@ -146,7 +146,7 @@ async def test_everything_on_the_link_is_written_both_ways(tmp_path: Path) -> No
     said = messages(path)
     listed = {each.param_id for each in said if isinstance(each, wire.ParamValue)}
     assert listed >= VALUES.keys()
-    assert [each.param_id for each in said if isinstance(each, wire.ParamSet)] == ["PARAM_01"]
+    assert [each.param_id for each in said if isinstance(each, wire.ParamSetMessage)] == ["PARAM_01"]
 
 
 def wire_frame(heard: tuple[float, wire.Frame, wire.Message]) -> bytes:

@@ -23,8 +23,8 @@ from paramclient import ParamCache, ParamClient
 from paramclient.cache import CachedComponent, TableUpdate
 from paramclient.client import cache_writer, link_task, loop_scheduler
 from paramclient.client.cache_writer import DOWNLOAD_INTERVAL, NEW_SHARE_MIN
-from paramclient.client.fetch_all import FetchTogether
-from paramclient.client.link_task import HELD_UP_MIN, TIMEOUT_DELAY_MAX, LinkTask
+from paramclient.client.fetch_all import FleetFetch
+from paramclient.client.link_task import LOOP_LATENCY_MIN, TIMEOUT_DELAY_MAX, LinkTask
 from paramclient.client.loop_scheduler import TURN_MAX
 from paramclient.errors import NoReply
 from paramclient.links import Peer
@@ -171,7 +171,7 @@ def test_a_fetch_that_is_given_back_is_freed_without_a_garbage_collection() -> N
 @swiftly
 async def test_the_errors_of_silent_components_hold_no_calls() -> None:
     station: Any = SimpleNamespace()
-    together = FetchTogether(station, {}, system=None, refresh=False)
+    together = FleetFetch(station, {}, system=None, refresh=False)
     for system in range(1, 4):
         fetch: Any = SimpleNamespace(error=None if system > 1 else NoReply("x", attempts=1, waited=1.0))
         fetch.result = SimpleNamespace(complete=True) if system == 3 else None
@@ -243,7 +243,11 @@ def session(air: Air, vehicles: list[Vehicle], *, everyone: bool) -> tuple[list[
             station.scheduler.reschedule_all()
         station.tick(now)
         machines = list(station.components.values())
-        if not fetches and len(machines) == len(vehicles) and all(each.who.settled for each in machines):
+        if (
+            not fetches
+            and len(machines) == len(vehicles)
+            and all(each.identification.settled for each in machines)
+        ):
             fetches = [machine.begin_fetch(now) for machine in machines]
         for data, _ in station.data_to_send():
             air.receive(data, now)
@@ -271,8 +275,8 @@ def test_whether_anything_is_awaited_is_asked_of_one(monkeypatch: pytest.MonkeyP
     for system in range(1, MANY + 1):
         hear(station, system, 0.0)
     for system in range(1, MANY):
-        station.components[system, 1].who.settled = True
-        station.components[system, 1].who._context.is_identifying = False
+        station.components[system, 1].identification.settled = True
+        station.components[system, 1].identification._context.is_identifying = False
     assert station.is_waiting
     asked.clear()
     assert station.is_waiting
@@ -390,7 +394,7 @@ class Starved(Watched):
         return super().next_deadline()
 
     def _starve(self) -> None:
-        swift_loop().now += HELD_UP_MIN + 0.002
+        swift_loop().now += LOOP_LATENCY_MIN + 0.002
 
 
 @swiftly
@@ -401,7 +405,7 @@ async def test_time_outs_wait_while_other_programs_have_the_processor() -> None:
     link.interval = TURN_MAX + 0.003  # the sender wakes before it
     began = anyio.current_time()
     await carry(link, station, 1.0, lambda: None)
-    assert not [at for at in station.ticks if at > began + link.interval + HELD_UP_MIN]
+    assert not [at for at in station.ticks if at > began + link.interval + LOOP_LATENCY_MIN]
 
 
 @swiftly
@@ -415,7 +419,7 @@ async def test_time_outs_wait_for_nothing_that_does_not_come() -> None:
         link.size = 0
         silent_at = anyio.current_time()
         await anyio.sleep(0.2)
-    assert next(at for at in station.ticks if at > silent_at) < silent_at + HELD_UP_MIN + 2 * TURN_MAX
+    assert next(at for at in station.ticks if at > silent_at) < silent_at + LOOP_LATENCY_MIN + 2 * TURN_MAX
 
 
 @swiftly
@@ -484,7 +488,7 @@ def test_a_link_has_no_more_lists_than_the_others_leave_it() -> None:
     assert readers.most_lists("c", 0, 2.0) == 2
     assert readers.most_lists("d", 9, 2.0) == 2
     assert readers.most_lists("a", 1, 2.0) == 1
-    readers.left("b")
+    readers.unregister("b")
     assert readers.most_lists("a", 1, 2.0) == most - 9
     assert readers.most_lists("c", 0, 2.0, awaited=4) == most - 10
     assert readers.most_lists("a", 1, 2.0, awaited=1) == most - 13
@@ -497,21 +501,21 @@ def test_a_list_that_is_only_awaited_takes_no_time_of_others() -> None:
     readers.most_lists("a", 1, 1.0)
     assert readers.is_busy_without("b")
     assert not readers.is_busy_without("a")
-    readers.left("a")
+    readers.unregister("a")
     assert not readers.is_busy_without("b")
 
 
 def test_no_link_has_lists_beside_each_other_while_more_has_come_on_one_than_was_read() -> None:
     readers = loop_scheduler.LoopScheduler()
-    readers.came("b", loop_scheduler.BACKLOG_DATAGRAMS_MIN - 1)
+    readers.record_read("b", loop_scheduler.BACKLOG_DATAGRAMS_MIN - 1)
     assert readers.most_lists("a", 0, 1.0) == math.inf
-    readers.came("b", loop_scheduler.BACKLOG_DATAGRAMS_MIN)
+    readers.record_read("b", loop_scheduler.BACKLOG_DATAGRAMS_MIN)
     assert readers.most_lists("a", 0, 1e6) == 1, "it is not done with them"
-    readers.taken("b", 2.0)
+    readers.record_processed("b", 2.0)
     assert readers.most_lists("a", 0, 2.0) == 1
     assert readers.most_lists("a", 0, 2.0 + loop_scheduler.BACKLOG_VALIDITY) == math.inf
-    readers.came("b", loop_scheduler.BACKLOG_DATAGRAMS_MIN - 1)
-    readers.taken("b", 2.0)
+    readers.record_read("b", loop_scheduler.BACKLOG_DATAGRAMS_MIN - 1)
+    readers.record_processed("b", 2.0)
     assert readers.most_lists("a", 0, 2.0) == math.inf
 
 
@@ -550,7 +554,7 @@ async def test_a_link_that_was_closed_leaves_nothing_behind_whichever_of_its_tas
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     station = Watched()
-    monkeypatch.setattr(scheduler.Turns, "bursts", loop_scheduler.BURST_LISTS_MAX)
+    monkeypatch.setattr(scheduler.ListAdmission, "bursts", loop_scheduler.BURST_LISTS_MAX)
     for first in ("read", "send"):
         tasks = {}
         link = LinkTask(Flood(), station, dispatch=lambda: None, end=lambda error: None)

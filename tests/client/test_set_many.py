@@ -128,7 +128,7 @@ async def test_values_of_one_name_are_set_in_order() -> None:
         assert [each.requested for each in result.outcomes] == [5, 1, 6, 4]
         assert result["PARAM_01"].requested == 4
         assert component.params["PARAM_01"].value == 4
-        sent = [each.raw[0] for each in tap.messages(wire.ParamSet) if each.param_id == "PARAM_01"]
+        sent = [each.raw[0] for each in tap.messages(wire.ParamSetMessage) if each.param_id == "PARAM_01"]
         assert sent == [5, 6, 4]
 
 
@@ -143,7 +143,7 @@ async def test_a_switch_of_a_group_is_a_barrier() -> None:
         result = await component.set_many(wanted)
         assert result.is_complete, result.outcomes
         assert values_of(vehicle.params, wanted) == wanted
-    sent = [(at, each.param_id) for at, _, each in tap.heard if isinstance(each, wire.ParamSet)]
+    sent = [(at, each.param_id) for at, _, each in tap.heard if isinstance(each, wire.ParamSetMessage)]
     assert [name for _, name in sent][:3] == ["PARAM_1", "PARAM_2", "GRP_ENABLE"]
     times = {name: at for at, name in sent}
     assert times["PARAM_2"] - times["PARAM_1"] < 0.01
@@ -163,7 +163,7 @@ async def test_so_many_writes_are_in_flight_as_the_vehicle_serves() -> None:
         assert result.elapsed < 4.5
     first: dict[str, float] = {}
     for at, _, each in tap.heard:
-        if isinstance(each, wire.ParamSet):
+        if isinstance(each, wire.ParamSetMessage):
             first.setdefault(each.param_id, at)  # a few are repeated early
     times = list(first.values())
     assert len(times) == 200
@@ -185,7 +185,7 @@ async def test_a_lost_vehicle_ends_the_call_and_nothing_is_lost() -> None:
         await component.fetch_all()
 
         async def fall_silent() -> None:
-            while len(tap.messages(wire.ParamSet)) < 50:  # noqa: ASYNC110 - nobody tells
+            while len(tap.messages(wire.ParamSetMessage)) < 50:  # noqa: ASYNC110 - nobody tells
                 await asyncio.sleep(0.01)
             tap.is_deaf = tap.is_mute = True
 
@@ -229,7 +229,7 @@ async def drop(link: FlakyLink) -> None:
 @swiftly
 async def test_a_vehicle_that_answers_no_write_ends_the_call() -> None:
     class Unwilling(GenericVehicle):
-        def _on_set(self, request: wire.ParamSet, sender: wire.Frame) -> None:
+        def _on_set(self, request: wire.ParamSetMessage, sender: wire.Frame) -> None:
             return
 
         def _on_read(self, request: wire.ParamRequestRead, sender: wire.Frame) -> None:
@@ -257,9 +257,9 @@ async def test_the_timeout_is_that_of_the_whole_call() -> None:
         assert result.counts[SetStatus.UNKNOWN] >= 10
         assert result.counts[SetStatus.NOT_TRIED] >= 100
         assert not left_of(component)
-        sent = len(tap.messages(wire.ParamSet))
+        sent = len(tap.messages(wire.ParamSetMessage))
         await asyncio.sleep(1.0)
-        assert len(tap.messages(wire.ParamSet)) == sent
+        assert len(tap.messages(wire.ParamSetMessage)) == sent
         assert (await component.set_many(NEW)).is_complete
 
 
@@ -281,7 +281,7 @@ async def test_nothing_is_sent_if_an_argument_is_wrong(values: dict[str, int], m
         with pytest.raises(UsageError, match="settle"):
             await component.set_many({"PARAM_01": 1}, settle=-1)
         await asyncio.sleep(1.0)
-        assert not tap.messages(wire.ParamSet)
+        assert not tap.messages(wire.ParamSetMessage)
 
 
 @swiftly
@@ -320,9 +320,9 @@ async def test_an_error_of_progress_cancels_the_call() -> None:
             await component.set_many(NEW, progress=fail)
         assert not left_of(component)
         await asyncio.sleep(0.1)  # what was to be sent already is sent
-        sent = len(tap.messages(wire.ParamSet))
+        sent = len(tap.messages(wire.ParamSetMessage))
         await asyncio.sleep(1.0)
-        assert len(tap.messages(wire.ParamSet)) == sent < 60
+        assert len(tap.messages(wire.ParamSetMessage)) == sent < 60
 
 
 @direct_only("the cache is that of the client")

@@ -18,7 +18,7 @@ from paramclient import ParamCache
 from paramclient.model.values import ParamType
 from paramclient.protocol import wire
 from paramclient.protocol.params.fetch import Fetch
-from paramclient.protocol.params.foreign_list import LIST_VALUES_MIN, Following
+from paramclient.protocol.params.foreign_list import LIST_VALUES_MIN, ForeignList
 from paramclient.protocol.params.reads import Reads
 from paramclient.protocol.params.table import Table
 from paramclient.protocol.requests.context import Context
@@ -61,7 +61,7 @@ class Shared:
     def meet(self) -> None:
         """Wait until both know who the vehicle is."""
         self.run(lambda: all((1, 1) in each.components for each in self.stations))
-        self.run(lambda: all(each.components[1, 1].who.settled for each in self.stations))
+        self.run(lambda: all(each.components[1, 1].identification.settled for each in self.stations))
 
     def fetch(self, number: int) -> Fetch:
         return self.stations[number].components[1, 1].begin_fetch(self.now)
@@ -138,14 +138,14 @@ def test_where_theirs_stops_in_the_middle_we_ask_for_the_rest() -> None:
 
 @pytest.mark.parametrize("ahead", [1, 2])
 def test_single_answers_to_others_are_no_list(ahead: int) -> None:
-    following = Following()
+    following = ForeignList()
     for index in range(0, ahead * (LIST_VALUES_MIN - 1), ahead):
         following.heard(param_value(f"P{index}", index=index, count=500), index * 0.01)
         assert not following.is_running(index * 0.01)
 
 
 def test_a_list_is_over_at_its_end_and_when_it_falls_quiet() -> None:
-    following = Following()
+    following = ForeignList()
     for index in range(20):
         following.heard(param_value(f"P{index}", index=index, count=21), index * 0.01)
     assert following.is_running(0.2)
@@ -160,7 +160,7 @@ def test_a_list_is_over_at_its_end_and_when_it_falls_quiet() -> None:
 
 
 def test_a_list_of_another_count_begins_anew() -> None:
-    following = Following()
+    following = ForeignList()
     for index in range(15):
         following.heard(param_value(f"P{index}", index=index, count=100), index * 0.01)
     following.heard(param_value("P15", index=15, count=101), 0.15)

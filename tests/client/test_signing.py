@@ -40,7 +40,7 @@ from paramclient.cli import session as cli_session
 from paramclient.cli import signing as signing_commands
 from paramclient.client import signing, signing_timestamps
 from paramclient.client.signing_timestamps import (
-    CHECK_INTERVAL,
+    TIMESTAMP_CHECK_INTERVAL,
     TIMESTAMP_RESERVE,
     TimestampFile,
     TimestampKeeper,
@@ -363,7 +363,7 @@ async def test_a_folder_that_cannot_be_used_is_told_and_costs_no_session(
     async with a_client(signed_vehicle(), signing=Signing(KEY, state=file)) as client:
         vehicle = await client.component()
         assert (await vehicle.fetch_all()).complete
-        await anyio.sleep(3 * CHECK_INTERVAL)
+        await anyio.sleep(3 * TIMESTAMP_CHECK_INTERVAL)
     assert len(caplog.records) == 1
     assert "cannot store signature timestamps (Not a directory)" in caplog.text
 

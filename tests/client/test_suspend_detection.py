@@ -13,7 +13,7 @@ from paramclient import Component, Event, Events, Lost, NoReply, Rebooted, Resyn
 from paramclient.client import suspend_detection
 from paramclient.client.suspend_detection import SUSPEND_MIN, SuspendDetector, time_asleep
 from paramclient.protocol.vehicle.presence import Presence
-from paramclient.protocol.wire import ParamSet, SystemTime
+from paramclient.protocol.wire import ParamSetMessage, SystemTime
 from paramclient.sim import Air, Endpoint
 from tests.shell import FlakyLink, Tap, a_client, bits, generic, small_px4, swift_loop, swiftly, until
 
@@ -136,7 +136,7 @@ async def test_a_write_does_not_reach_the_one_who_has_come_in_its_place(sleep: S
         berth.is_deaf = False
         sleep(HOURS)
         assert "another vehicle" in str(await writing)
-        assert berth.messages(ParamSet) == []
+        assert berth.messages(ParamSetMessage) == []
         assert stranger.params["PARAM_02"].value == 2
 
 
@@ -149,7 +149,7 @@ async def test_nor_does_one_that_is_asked_for_before_anybody_has_noticed(sleep: 
         sleep(HOURS)
         berth.moor(small_px4(uid=2))
         assert "another vehicle" in str(await _error_of(component, "PARAM_02", 22))
-        assert berth.messages(ParamSet) == []
+        assert berth.messages(ParamSetMessage) == []
 
 
 @swiftly

@@ -37,7 +37,7 @@ from paramclient.client.client import implementation_of
 from paramclient.client.events import EVENTS_MAX
 from paramclient.client.subscription import Changes
 from paramclient.protocol import wire
-from paramclient.protocol.wire import HASH_CHECK, ParamRequestList, ParamRequestRead, ParamSet
+from paramclient.protocol.wire import HASH_CHECK, ParamRequestList, ParamRequestRead, ParamSetMessage
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle
 from tests.shell import (
     VALUES,
@@ -58,7 +58,7 @@ from tests.ways import pytest_generate_tests, way
 __all__ = ["pytest_generate_tests", "way"]
 
 VOLATILE = {"CAL_ACC0_XOFF", "PARAM_03"}
-MISSES = (ParamRequestRead, ParamRequestList, ParamSet)
+MISSES = (ParamRequestRead, ParamRequestList, ParamSetMessage)
 
 
 @pytest.fixture
@@ -339,9 +339,9 @@ async def test_a_write_waits_until_it_is_known_who_it_is() -> None:
         tap.heard.clear()
         assert (await component.set("PARAM_02", 22)).actual == 22
         order = [type(message) for _, _, message in tap.heard]
-        assert order.index(wire.CommandLong) < order.index(ParamSet)
+        assert order.index(wire.CommandLong) < order.index(ParamSetMessage)
         times = {type(message): when for when, _, message in reversed(tap.heard)}
-        assert times[ParamSet] - times[wire.CommandLong] > 0.5, "a round trip"
+        assert times[ParamSetMessage] - times[wire.CommandLong] > 0.5, "a round trip"
 
 
 @swiftly

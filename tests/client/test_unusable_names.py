@@ -14,7 +14,7 @@ from paramclient.files import FileForm, dumps, loads
 from paramclient.model.paramset import ParamSet as Parameters
 from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import ParamType, is_portable_name
-from paramclient.protocol.wire import NO_INDEX, ParamError, ParamSet, ParamValue, encode
+from paramclient.protocol.wire import NO_INDEX, ParamError, ParamSetMessage, ParamValue, encode
 from paramclient.sim import ArduPilotVehicle, GenericVehicle
 from tests.caches import stored, update
 from tests.commands import Command, Put, behind, in_process, leaping
@@ -53,7 +53,7 @@ def put(monkeypatch: pytest.MonkeyPatch) -> Put:
     return behind(monkeypatch, "sim:px4")
 
 
-def say(session: Simulation, message: ParamValue | ParamSet | ParamError, system: int = 1) -> None:
+def say(session: Simulation, message: ParamValue | ParamSetMessage | ParamError, system: int = 1) -> None:
     """Let somebody say something under an address."""
     session.station.receive(encode(message, system=system, component=1, sequence=0), PEER, session.now)
 
@@ -88,7 +88,7 @@ def test_what_is_said_under_such_a_name_is_dropped_and_counted(name: str) -> Non
     say(session, param_value(name, 5.0, index=NO_INDEX, count=2))
     say(session, param_value(name, 5.0, index=0, count=7))
     say(session, ParamError(*session.station.own, name, -1, 1))
-    say(session, ParamSet(1, 1, name, bytes(4), 9), system=254)
+    say(session, ParamSetMessage(1, 1, name, bytes(4), 9), system=254)
     table = session.machine.table
     assert ([*table.params], table.count, table.left_out, table.left_out_name) == (["A", "B"], 2, 4, name)
     result = session.fetch(refresh=True)

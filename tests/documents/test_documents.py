@@ -27,8 +27,8 @@ from paramclient.documents.diff import DiffDoc
 from paramclient.documents.document import Document
 from paramclient.documents.fleet import FleetDiffDoc
 from paramclient.documents.history import HistoryDoc, HistoryEntryDoc, SnapshotDoc
-from paramclient.documents.param import GotDoc, InfoDoc, ParamDoc, WrittenParamDoc
-from paramclient.documents.paramset import FileDoc, FormDoc, SetDoc, UploadedDoc
+from paramclient.documents.param import InfoDoc, ParamDoc, ReadOutputDoc, WrittenParamDoc
+from paramclient.documents.paramset import FileDoc, FormatDoc, SetDoc, UploadedDoc
 from paramclient.documents.setup import ApplyResultDoc, InterruptedDoc, PlanDoc, VerifiedDoc
 from paramclient.errors import NoReply, UnknownParameter
 from paramclient.files import FileForm, loads
@@ -124,9 +124,9 @@ def test_a_parameter_has_its_members_in_order_and_no_empty_ones() -> None:
 
 def test_errors_are_a_member_only_if_a_parameter_was_not_received() -> None:
     error = UnknownParameter("no such", system=1, component=1, name="Q")
-    assert GotDoc.of([], None, {"Q": error}).as_json() == {"params": {}, "errors": {"Q": "no such"}}
+    assert ReadOutputDoc.of([], None, {"Q": error}).as_json() == {"params": {}, "errors": {"Q": "no such"}}
     metadata = Metadata.of([ParamInfo("P{n}", units="s")])
-    assert GotDoc.of([param("P7", 1.0)], metadata, {}).as_json()["params"]["P7"]["units"] == "s"
+    assert ReadOutputDoc.of([param("P7", 1.0)], metadata, {}).as_json()["params"]["P7"]["units"] == "s"
 
 
 def test_exact_history_has_times_and_bits() -> None:
@@ -170,7 +170,7 @@ def documents() -> Iterator[Document]:
     file = loads(b"A,1\nA,1\nB,2\n", source="a.param")
     yield FileDoc.of(file)
     yield UploadedDoc.of(file, file.choose())
-    yield from map(FormDoc.of, FileForm)
+    yield from map(FormatDoc.of, FileForm)
     yield SnapshotDoc.of(SnapshotSummary(1, PX4.key, 1, 1.5, "<b>", 3, 0xABC, True), exact=True)
     yield HistoryDoc.of(
         [HistoryEntry(1.5, 1, "A", param("A", 1.0), param("A", b"\0\0\0\1", 99), "us")], exact=True

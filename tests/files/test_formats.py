@@ -17,7 +17,7 @@ from pymavlink.mavparm import MAVParmDict
 from paramclient import FileError, FileForm, Identity, Param, ParamFile, ParamSet, ParamType, WrittenParam
 from paramclient.errors import UsageError
 from paramclient.files import dumps, line_formats, loads
-from paramclient.model.values import Encoding, Value, bits_of, decode, from_bits
+from paramclient.model.values import Encoding, Value, bits_of, decode_value, from_bits
 
 DATA = Path(__file__).parents[1] / "data"
 TABLES = Path(__file__).parents[2] / "paramclient/sim/tables"
@@ -125,7 +125,7 @@ def test_nan_words_of_other_programs_are_parsed(word: str) -> None:
 @pytest.mark.parametrize("form", TYPED[1:])
 def test_a_document_keeps_raw_bytes_and_nan_payloads(form: FileForm) -> None:
     quiet = from_bits(0x7FC12345, ParamType.REAL32)
-    cast, _ = decode(struct.pack("<f", 1e20), ParamType.INT8, Encoding.C_CAST)
+    cast, _ = decode_value(struct.pack("<f", 1e20), ParamType.INT8, Encoding.C_CAST)
     params = params_of(
         WrittenParam("NAN", quiet, ParamType.REAL32, math.nan),
         WrittenParam("CAST", cast, ParamType.INT8),

@@ -159,7 +159,7 @@ async def test_a_socket_for_every_address_is_not_reopened(net: Net, monkeypatch:
 async def test_an_address_that_is_lost_and_restored(net: Net, monkeypatch: pytest.MonkeyPatch) -> None:
     """A complete session: `udpin` on an address that this computer loses for a while."""
     monkeypatch.setattr(udp, "UNREACHABLE_TIMEOUT", 0.0)
-    monkeypatch.setattr(link_task, "BACKOFF_MIN", 0.01)
+    monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MIN", 0.01)
     is_gone = [False]
     bind = udp.UdpIn._open
 

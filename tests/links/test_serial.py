@@ -151,8 +151,8 @@ async def test_unplugged_in_the_middle_of_a_download(
 @pytest.mark.asyncio
 async def test_unplugged_permanently(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(link_task, "LINK_TIMEOUT", 0.2)
-    monkeypatch.setattr(link_task, "BACKOFF_MIN", 0.05)
-    monkeypatch.setattr(link_task, "BACKOFF_MAX", 0.1)
+    monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MIN", 0.05)
+    monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MAX", 0.1)
     vehicle = generic(stream=True)
     async with (
         asyncio.timeout(TIMEOUT),

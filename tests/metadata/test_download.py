@@ -26,7 +26,7 @@ from paramclient.protocol.events import EventMaker
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.retry import VersionAttempts
 from paramclient.protocol.vehicle.commands import MessageRequests
-from paramclient.protocol.vehicle.metadata_location import Descriptions
+from paramclient.protocol.vehicle.metadata_location import MetadataRequests
 from paramclient.protocol.wire import (
     AUTOPILOT_VERSION_ID,
     CommandAck,
@@ -404,7 +404,7 @@ async def test_nothing_is_stored_after_the_vehicle_was_replaced(
         await anyio.sleep(1.0)
 
         def read(content: bytes, source: str) -> Metadata:
-            who = local(component).machine.who
+            who = local(component).machine.identification
             who.identity = replace(who.identity, uid="another")
             return read_parameters(content, source)
 
@@ -423,7 +423,7 @@ class Asked:
         self.sent: list[Any] = []
         self.context = Context((1, 1), self.sent.append)
         self.messages = MessageRequests(self.context)
-        self.machine = Descriptions(self.context, self.messages)
+        self.machine = MetadataRequests(self.context, self.messages)
 
 
 def test_the_request_and_its_responses() -> None:

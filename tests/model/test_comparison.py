@@ -13,7 +13,7 @@ from paramclient.errors import UsageError
 from paramclient.model.comparison import Comparison, Moved, Standing, compare, defaults_of, same_value
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.renames import Rename, Renames
-from paramclient.model.values import Encoding, Param, ParamType, Value, bits_of, decode, from_bits
+from paramclient.model.values import Encoding, Param, ParamType, Value, bits_of, decode_value, from_bits
 
 INT32, REAL32, REAL64 = ParamType.INT32, ParamType.REAL32, ParamType.REAL64
 NAN, OTHER_NAN = from_bits(0x7FC00000, REAL32), from_bits(0x7FC00001, REAL32)
@@ -100,7 +100,7 @@ def test_same_value_is_symmetric(left: WrittenParam, right: WrittenParam) -> Non
 @given(VALUES, st.integers(0, 2**32 - 1), st.sampled_from([*ParamType, 77]), st.sampled_from(Encoding))
 def test_is_held_by_agrees_with_same_value(value: Value, raw: int, number: int, encoding: Encoding) -> None:
     """`WrittenParam.is_held_by` and `same_value` agree for values without a type or with the vehicle's."""
-    held, bits = decode(raw.to_bytes(4, "little"), number, encoding)
+    held, bits = decode_value(raw.to_bytes(4, "little"), number, encoding)
     assume(number != REAL32 or bits == bits_of(held, number))  # Python has no signalling NaN for these bits
     agree(value, Param("P", held, number, 0, bits))
     agree(held, Param("P", held, number, 0, bits))

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 
 from paramclient.model.params import (
     CACHED,
-    NOWHERE,
+    COMPACT_NO_INDEX,
     ParamMap,
     Params,
     as_params,
-    held_of,
+    compact_param,
     is_listed,
     pack_fields,
     param_of,
@@ -24,7 +24,7 @@ from paramclient.model.params import (
     with_index,
     with_trust_number,
 )
-from paramclient.model.values import Encoding, Param, ParamType, Trust, decode, known_type
+from paramclient.model.values import Encoding, Param, ParamType, Trust, decode_value, known_type
 from paramclient.protocol.params.change import Change
 
 
@@ -84,7 +84,7 @@ def test_the_compact_form_loses_nothing(
     wire: tuple[int, bytes, Encoding], index: int | None, trust: Trust, default: float | None
 ) -> None:
     number, raw, encoding = wire
-    value, bits = decode(raw, number, encoding)
+    value, bits = decode_value(raw, number, encoding)
     param = Param("NAME", value, known_type(number), index, bits, trust, default)
     params = Params()
     params["NAME"] = param
@@ -119,9 +119,9 @@ def test_params_can_be_changed_and_copied() -> None:
 
 def test_setting_index_or_trust_changes_nothing_else() -> None:
     param = Param("A", -5, ParamType.INT16, 300, 0xFFFB, Trust.VERIFIED)
-    held = held_of(param)
+    held = compact_param(param)
     assert param_of("A", with_index(held, 7)) == Param("A", -5, ParamType.INT16, 7, 0xFFFB, Trust.VERIFIED)
-    assert param_of("A", with_index(held, NOWHERE)).index is None
+    assert param_of("A", with_index(held, COMPACT_NO_INDEX)).index is None
     assert param_of("A", with_trust_number(held, CACHED)) == param.with_trust(Trust.CACHED)
     assert same_held(held, with_trust_number(with_index(held, 9), CACHED))
 

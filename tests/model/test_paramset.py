@@ -8,7 +8,7 @@ import pytest
 
 from paramclient.errors import UsageError
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import Encoding, Param, ParamType, Value, bits_of, decode
+from paramclient.model.values import Encoding, Param, ParamType, Value, bits_of, decode_value
 
 
 def held(value: Value, number: int, name: str = "P") -> Param:
@@ -45,7 +45,7 @@ def test_raw_bytes_equal_only_raw_bytes() -> None:
 
 def test_a_number_beyond_its_type_equals_only_itself() -> None:
     """A C-casting vehicle may report 300 for an INT8."""
-    odd, bits = decode(struct.pack("<f", 300), ParamType.INT8, Encoding.C_CAST)
+    odd, bits = decode_value(struct.pack("<f", 300), ParamType.INT8, Encoding.C_CAST)
     param = Param("P", odd, ParamType.INT8, 0, bits)
     assert WrittenParam.of(param).is_held_by(param)
     assert not WrittenParam("P", bits & 0x7F).is_held_by(param)

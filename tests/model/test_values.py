@@ -28,8 +28,8 @@ from paramclient.model.values import (
     check_name,
     check_value,
     crc32_px4,
-    decode,
-    encode,
+    decode_value,
+    encode_value,
     format_value,
     from_bits,
     hash_chunk,
@@ -119,19 +119,19 @@ def check_four_bytes(pattern: int) -> None:
     """Assert that decoding loses no bit of a 4-byte value, nor does encoding a value that is not raw."""
     raw = pattern.to_bytes(4, "little")
     for kind, layout in ((ParamType.UINT32, "<I"), (ParamType.INT32, "<i")):
-        value, bits = decode(raw, kind, BYTEWISE)
+        value, bits = decode_value(raw, kind, BYTEWISE)
         assert (value, bits) == (struct.unpack(layout, raw)[0], pattern)
-        assert encode(value, kind, BYTEWISE) == raw
+        assert encode_value(value, kind, BYTEWISE) == raw
         assert from_bits(bits, kind) == value
     for encoding in Encoding:
-        value, bits = decode(raw, ParamType.REAL32, encoding)
+        value, bits = decode_value(raw, ParamType.REAL32, encoding)
         assert isinstance(value, float)
         assert bits == pattern
         if math.isnan(value):
             assert math.isnan(from_bits(bits, ParamType.REAL32))  # type: ignore[arg-type]  # float, as the type is REAL32
-            assert encode(raw, ParamType.REAL32, encoding) == raw
+            assert encode_value(raw, ParamType.REAL32, encoding) == raw
         else:
-            assert encode(value, ParamType.REAL32, encoding) == raw
+            assert encode_value(value, ParamType.REAL32, encoding) == raw
             assert from_bits(bits, ParamType.REAL32) == value
 
 
@@ -150,8 +150,8 @@ def test_signalling_nan_bytes_are_not_decoded_through_a_float() -> None:
     raw = (-5000000).to_bytes(4, "little", signed=True)
     through_a_float = struct.pack("<f", struct.unpack("<f", raw)[0])
     assert int.from_bytes(through_a_float, "little", signed=True) == -805696
-    assert decode(raw, ParamType.INT32, BYTEWISE)[0] == -5000000
-    assert encode(-5000000, ParamType.INT32, BYTEWISE) == raw
+    assert decode_value(raw, ParamType.INT32, BYTEWISE)[0] == -5000000
+    assert encode_value(-5000000, ParamType.INT32, BYTEWISE) == raw
 
 
 @pytest.mark.parametrize(
@@ -169,8 +169,8 @@ def test_signalling_nan_bytes_are_not_decoded_through_a_float() -> None:
 def test_bytewise_encodes_the_value_in_the_first_bytes(
     kind: ParamType, raw: str, value: float, bits: int
 ) -> None:
-    assert decode(bytes.fromhex(raw), kind, BYTEWISE) == (value, bits)
-    assert encode(value, kind, BYTEWISE) == bytes.fromhex(raw)
+    assert decode_value(bytes.fromhex(raw), kind, BYTEWISE) == (value, bits)
+    assert encode_value(value, kind, BYTEWISE) == bytes.fromhex(raw)
 
 
 @thorough
@@ -178,10 +178,10 @@ def test_bytewise_encodes_the_value_in_the_first_bytes(
 def test_bytewise_ignores_bytes_after_a_small_type(kind: ParamType, pattern: int) -> None:
     raw = pattern.to_bytes(4, "little")
     own = raw[: kind.size]
-    value, bits = decode(raw, kind, BYTEWISE)
+    value, bits = decode_value(raw, kind, BYTEWISE)
     assert value == int.from_bytes(own, "little", signed=kind.bounds[0] < 0)
     assert bits == int.from_bytes(own, "little")
-    assert encode(value, kind, BYTEWISE) == own.ljust(4, b"\0")
+    assert encode_value(value, kind, BYTEWISE) == own.ljust(4, b"\0")
     assert from_bits(bits, kind) == value
 
 
@@ -189,7 +189,7 @@ def test_bytewise_ignores_bytes_after_a_small_type(kind: ParamType, pattern: int
 @given(st.sampled_from(SMALL), st.data())
 def test_bytewise_integers_are_packed_as_pymavlink_packs_them(kind: ParamType, data: st.DataObject) -> None:
     value = data.draw(st.integers(*kind.bounds))
-    raw = encode(value, kind, BYTEWISE)
+    raw = encode_value(value, kind, BYTEWISE)
     if any(low <= int.from_bytes(raw, "little") <= high for low, high in SIGNALLING):
         return  # pymavlink converts the bytes through a float, which changes these
     sent: list[bytes] = []
@@ -209,22 +209,22 @@ def test_bytewise_integers_are_packed_as_pymavlink_packs_them(kind: ParamType, d
 @pytest.mark.parametrize("pattern", [0, 1, 0x7F800001, 0xFFFFFFFF])
 def test_bytewise_keeps_wide_and_unknown_types_raw(kind: int, pattern: int) -> None:
     raw = pattern.to_bytes(4, "little")
-    assert decode(raw, kind, BYTEWISE) == (raw, pattern)
-    assert encode(raw, kind, BYTEWISE) == raw
+    assert decode_value(raw, kind, BYTEWISE) == (raw, pattern)
+    assert encode_value(raw, kind, BYTEWISE) == raw
     assert from_bits(pattern, kind, is_raw=True) == raw
     assert format_value(raw, kind) == f"0x{pattern:08x}"
     with pytest.raises(UsageError, match=r"8 bytes|not a type"):
-        encode(1, kind, BYTEWISE)
+        encode_value(1, kind, BYTEWISE)
 
 
 @pytest.mark.parametrize("number", UNDEFINED)
 def test_an_unknown_type_is_kept_raw_in_c_cast_too(number: int) -> None:
     raw = b"\x01\x02\x03\x04"
-    assert decode(raw, number, C_CAST) == (raw, 0x04030201)
-    assert encode(raw, number, C_CAST) == raw
+    assert decode_value(raw, number, C_CAST) == (raw, 0x04030201)
+    assert encode_value(raw, number, C_CAST) == raw
     assert from_bits(0x04030201, number) == raw
     with pytest.raises(UsageError, match=f"TYPE_{number}"):
-        encode(1.0, number, C_CAST)
+        encode_value(1.0, number, C_CAST)
 
 
 @pytest.mark.parametrize("kind", SMALL)
@@ -233,7 +233,7 @@ def test_encode_rejects_an_integer_outside_the_type(kind: ParamType, encoding: E
     low, high = kind.bounds
     for value in (low - 1, high + 1, float(low) - 1, float(high) + 1, 10**400):
         with pytest.raises(UsageError, match=kind.name):
-            encode(value, kind, encoding)
+            encode_value(value, kind, encoding)
 
 
 @pytest.mark.parametrize("kind", INTEGERS)
@@ -241,15 +241,15 @@ def test_encode_rejects_an_integer_outside_the_type(kind: ParamType, encoding: E
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_encode_rejects_non_finite_integers(kind: ParamType, encoding: Encoding, value: float) -> None:
     with pytest.raises(UsageError, match="not a whole number"):
-        encode(value, kind, encoding)
+        encode_value(value, kind, encoding)
 
 
 @pytest.mark.parametrize("kind", SMALL)
 def test_bytewise_accepts_whole_floats_and_rejects_fractions(kind: ParamType) -> None:
-    assert encode(6.0, kind, BYTEWISE) == b"\x06\0\0\0"
-    assert encode(-0.0, kind, BYTEWISE) == bytes(4)
+    assert encode_value(6.0, kind, BYTEWISE) == b"\x06\0\0\0"
+    assert encode_value(-0.0, kind, BYTEWISE) == bytes(4)
     with pytest.raises(UsageError, match=r"1\.5 is not a whole number"):
-        encode(1.5, kind, BYTEWISE)
+        encode_value(1.5, kind, BYTEWISE)
 
 
 # C-cast
@@ -288,7 +288,7 @@ def test_c_cast_decodes_to_the_integer_or_stays_raw(
     kind: ParamType, number: float, value: int | None
 ) -> None:
     raw = struct.pack("<f", number)
-    read, bits = decode(raw, kind, C_CAST)
+    read, bits = decode_value(raw, kind, C_CAST)
     if value is None:
         assert (read, bits) == (raw, int.from_bytes(raw, "little"))
         assert from_bits(bits, kind, is_raw=True) == raw
@@ -306,28 +306,28 @@ def test_c_cast_encodes_an_integer_exactly_or_rejects_it(kind: ParamType, data: 
     near = st.sampled_from([sign * 2**n + step for n in range(65) for sign in (-1, 1) for step in (-1, 0, 1)])
     value = data.draw(st.integers(low, high) | near.filter(lambda v: low <= v <= high))
     if as_float32(value) == value:
-        raw = encode(value, kind, C_CAST)
+        raw = encode_value(value, kind, C_CAST)
         assert raw == struct.pack("<f", value)
-        assert decode(raw, kind, C_CAST)[0] == value
-        assert encode(float(value), kind, C_CAST) == raw
+        assert decode_value(raw, kind, C_CAST)[0] == value
+        assert encode_value(float(value), kind, C_CAST) == raw
     else:
         assert abs(value) > 2**24
         with pytest.raises(UsageError, match=f"nearest is {int(as_float32(value))}"):
-            encode(value, kind, C_CAST)
+            encode_value(value, kind, C_CAST)
 
 
 def test_c_cast_is_exact_up_to_24_bits() -> None:
     for value in (2**24, -(2**24), 2**24 + 2):
-        assert decode(encode(value, ParamType.INT32, C_CAST), ParamType.INT32, C_CAST)[0] == value
+        assert decode_value(encode_value(value, ParamType.INT32, C_CAST), ParamType.INT32, C_CAST)[0] == value
     for wrong in (2**24 + 1, -(2**24) - 1, 16777217.0):
         with pytest.raises(UsageError, match="exactly"):
-            encode(wrong, ParamType.INT32, C_CAST)
+            encode_value(wrong, ParamType.INT32, C_CAST)
 
 
 @pytest.mark.parametrize("kind", INTEGERS)
 def test_c_cast_sends_a_fraction_unchanged(kind: ParamType) -> None:
-    assert encode(12.7, kind, C_CAST) == struct.pack("<f", 12.7)
-    assert decode(encode(12.7, kind, C_CAST), kind, C_CAST) == (12, 12)
+    assert encode_value(12.7, kind, C_CAST) == struct.pack("<f", 12.7)
+    assert decode_value(encode_value(12.7, kind, C_CAST), kind, C_CAST) == (12, 12)
 
 
 @pytest.mark.parametrize(
@@ -336,16 +336,16 @@ def test_c_cast_sends_a_fraction_unchanged(kind: ParamType) -> None:
 )
 def test_encode_rejects_a_fraction_that_rounds_out_of_the_type(value: float, kind: ParamType) -> None:
     with pytest.raises(UsageError, match="rounds to"):
-        encode(value, kind, C_CAST)
+        encode_value(value, kind, C_CAST)
 
 
 def test_c_cast_encodes_real64_as_float32() -> None:
     raw = struct.pack("<f", 0.1)
-    value, bits = decode(raw, ParamType.REAL64, C_CAST)
+    value, bits = decode_value(raw, ParamType.REAL64, C_CAST)
     assert value == as_float32(0.1)
     assert bits == int.from_bytes(struct.pack("<d", as_float32(0.1)), "little")
     assert from_bits(bits, ParamType.REAL64) == value
-    assert encode(0.1, ParamType.REAL64, C_CAST) == raw
+    assert encode_value(0.1, ParamType.REAL64, C_CAST) == raw
 
 
 @thorough
@@ -353,19 +353,19 @@ def test_c_cast_encodes_real64_as_float32() -> None:
 def test_real32_is_packed_as_pymavlink_packs_it(value: float, encoding: Encoding) -> None:
     message = dialect.MAVLink_param_value_message(b"P", value, ParamType.REAL32, 1, 0)
     raw = message.pack(dialect.MAVLink(None), force_mavlink1=True)[6:10]
-    assert encode(value, ParamType.REAL32, encoding) == raw
-    assert decode(raw, ParamType.REAL32, encoding)[0] == value
+    assert encode_value(value, ParamType.REAL32, encoding) == raw
+    assert decode_value(raw, ParamType.REAL32, encoding)[0] == value
 
 
 @pytest.mark.parametrize("encoding", Encoding)
 def test_real32_rounds_keeps_infinities_and_rejects_overflow(encoding: Encoding) -> None:
-    assert encode(0.1, ParamType.REAL32, encoding) == bytes.fromhex("cdcccc3d")
-    assert encode(1, ParamType.REAL32, encoding) == struct.pack("<f", 1.0)
-    assert encode(-math.inf, ParamType.REAL32, encoding) == bytes.fromhex("000080ff")
-    assert math.isnan(struct.unpack("<f", encode(math.nan, ParamType.REAL32, encoding))[0])
+    assert encode_value(0.1, ParamType.REAL32, encoding) == bytes.fromhex("cdcccc3d")
+    assert encode_value(1, ParamType.REAL32, encoding) == struct.pack("<f", 1.0)
+    assert encode_value(-math.inf, ParamType.REAL32, encoding) == bytes.fromhex("000080ff")
+    assert math.isnan(struct.unpack("<f", encode_value(math.nan, ParamType.REAL32, encoding))[0])
     for value in (3.5e38, -3.5e38, 10**400):
         with pytest.raises(UsageError, match="float32"):
-            encode(value, ParamType.REAL32, encoding)
+            encode_value(value, ParamType.REAL32, encoding)
 
 
 # Arguments of callers
@@ -459,8 +459,8 @@ def test_same_value() -> None:
     assert param(0, 0.0).same_value(param(0x80000000, -0.0, name="Q", index=None))
     assert not param(0, 0, ParamType.INT32).same_value(param(0x80000000, -(2**31), ParamType.INT32))
     assert not param(1, 1, ParamType.UINT8).same_value(param(1, 1, ParamType.INT8))
-    raw = decode(struct.pack("<f", 2.0**32), ParamType.UINT32, C_CAST)
-    number = decode(struct.pack("<f", float(raw[1])), ParamType.UINT32, C_CAST)
+    raw = decode_value(struct.pack("<f", 2.0**32), ParamType.UINT32, C_CAST)
+    number = decode_value(struct.pack("<f", float(raw[1])), ParamType.UINT32, C_CAST)
     assert raw[1] == number[1]
     assert not param(raw[1], raw[0], ParamType.UINT32).same_value(
         param(number[1], number[0], ParamType.UINT32)

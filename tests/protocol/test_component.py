@@ -30,8 +30,8 @@ from paramclient.protocol.events import (
 from paramclient.protocol.params import table as table_room
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.change_origin import DOUBT_TIME, FOREIGN_SET_MEMORY, FOREIGN_SETS_MAX
-from paramclient.protocol.params.sync import Upkeep
-from paramclient.protocol.params.value_check import DISTRUST_TIME
+from paramclient.protocol.params.sync import SyncSettings
+from paramclient.protocol.params.value_check import AMBIGUITY_WINDOW
 from paramclient.protocol.station import Station
 from paramclient.protocol.wire import (
     CAPABILITY_PARAM_ENCODE_BYTEWISE,
@@ -46,7 +46,7 @@ from paramclient.protocol.wire import (
     ParamError,
     ParamRequestList,
     ParamRequestRead,
-    ParamSet,
+    ParamSetMessage,
     ParamValue,
     StatusText,
 )
@@ -219,7 +219,7 @@ def test_what_the_user_says_about_the_encoding_holds() -> None:
     desk = Desk(ARDUPILOT, encoding=Encoding.BYTEWISE)
     desk.hear("A", 5, ParamType.INT32)
     assert desk.machine.table.params["A"].value == 5
-    assert desk.machine.who.encoding_reason == "chosen by the user"
+    assert desk.machine.identification.encoding_reason == "chosen by the user"
 
 
 def test_ardupilot_answers_in_the_spelling_that_was_asked_for() -> None:
@@ -230,7 +230,7 @@ def test_ardupilot_answers_in_the_spelling_that_was_asked_for() -> None:
     assert read.done
     assert list(desk.machine.table.params) == ["WPNAV_SPEED"]
     write = desk.machine.write("wpnav_speed", 400.0, desk.now)
-    assert [each.param_id for each in desk.take() if isinstance(each, ParamSet)] == ["WPNAV_SPEED"]
+    assert [each.param_id for each in desk.take() if isinstance(each, ParamSetMessage)] == ["WPNAV_SPEED"]
     desk.hear("wpnav_speed", 400.0)
     assert write.done
 
@@ -314,7 +314,7 @@ def test_what_changes_twice_in_a_short_while_is_asked_for_once_more() -> None:
     desk.hear("A", 1.0)
     desk.now += 2 * DOUBT_TIME
     desk.hear("A", 2.0)
-    desk.now += DISTRUST_TIME
+    desk.now += AMBIGUITY_WINDOW
     desk.hear("A", 1.0)  # an answer from before the change, it may be
     desk.hear("B", 1.0)
     assert desk.reads() == []
@@ -489,9 +489,9 @@ def test_before_it_is_certain_how_values_are_written_nothing_is_judged_or_sent()
     desk = Desk(None)
     desk.receive(param_value("A", 5.0, kind=ParamType.INT32, encoding=Encoding.C_CAST))
     write = desk.machine.write("A", 1234.7, desk.now)
-    assert not any(isinstance(each, ParamSet) for each in desk.take())
+    assert not any(isinstance(each, ParamSetMessage) for each in desk.take())
     desk.receive(ARDUPILOT)
-    [message] = [each for each in desk.take() if isinstance(each, ParamSet)]
+    [message] = [each for each in desk.take() if isinstance(each, ParamSetMessage)]
     assert message.raw == param_value("A", 1234.7).raw
     desk.hear("A", 1234, ParamType.INT32)
     assert write.result is not None
@@ -503,10 +503,10 @@ def test_an_unidentified_component_is_written_to_by_the_standard() -> None:
     desk.receive(SOMETHING)
     desk.hear("A", 5, ParamType.INT32)
     desk.machine.write("A", 6, desk.now)
-    assert not any(isinstance(each, ParamSet) for each in desk.take())
+    assert not any(isinstance(each, ParamSetMessage) for each in desk.take())
     desk.pass_time(6.0)
-    assert desk.machine.who.settled
-    assert any(isinstance(each, ParamSet) for each in desk.take())
+    assert desk.machine.identification.settled
+    assert any(isinstance(each, ParamSetMessage) for each in desk.take())
 
 
 # hashes
@@ -904,11 +904,11 @@ def test_hit_results_do_not_change_afterwards() -> None:
 
 def test_upkeep_goes_on_when_a_vehicle_is_found_whose_count_had_moved() -> None:
     vehicle = ArduPilotVehicle(table={"A": 1, "B_ENABLE": 0}, groups={"B_ENABLE": {"B_X": 5}}, live=())
-    station = Station(link="sim:test", is_stream=False, upkeep=Upkeep(30.0, without_hash=True))
+    station = Station(link="sim:test", is_stream=False, upkeep=SyncSettings(30.0, without_hash=True))
     world = Simulation(vehicle, station=station)
     world.fetch()
     world.run(10.0)  # so that its clock tells that it has started again
-    world.machine.table.move(1)
+    world.machine.table.change_count(1)
     vehicle._entry("B_ENABLE").store(1)
     vehicle.reboot(world.now, down=8.0)
     world.run(60.0)

@@ -27,9 +27,9 @@ from paramclient.protocol.scheduler import (
     STALE_DEADLINES_MAX,
     START_INTERVAL_BURSTY,
     TICKED_COMPONENTS_MAX,
+    ListAdmission,
+    ListStatistics,
     Scheduler,
-    Seen,
-    Turns,
 )
 from paramclient.protocol.wire import ParamRequestList, ParamRequestRead
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, Vehicle
@@ -65,8 +65,8 @@ class Lane:
     def is_running(self) -> bool:
         return self.began_at < math.inf
 
-    def seen(self) -> Seen:
-        return Seen(self.came, self.passed, STEP, self.is_bursty)
+    def seen(self) -> ListStatistics:
+        return ListStatistics(self.came, self.passed, STEP, self.is_bursty)
 
 
 class Road:
@@ -74,7 +74,7 @@ class Road:
 
     def __init__(self, lanes: int) -> None:
         self.now = 0.0
-        self.turns = Turns()
+        self.turns = ListAdmission()
         self.lanes = [Lane() for _ in range(lanes)]
         for lane in self.lanes:
             self.turns.ask(lane, self.now)
@@ -105,7 +105,7 @@ class Road:
     def end(self, lane: Lane, *, is_cut: bool = False) -> None:
         """One list is over."""
         lane.began_at = math.inf
-        self.turns.give_back(lane, is_cut=is_cut)
+        self.turns.release(lane, is_cut=is_cut)
 
 
 def test_a_list_that_is_alone_begins_at_once() -> None:
@@ -385,11 +385,11 @@ def test_one_that_falls_quiet_alone_tells_nothing() -> None:
 
 def test_a_turn_given_back_while_waiting_is_dropped() -> None:
     road = Road(3)
-    road.turns.give_back(road.lanes[1])
+    road.turns.release(road.lanes[1])
     road.end(road.lanes[0])
     road.run()
     assert [lane.is_running for lane in road.lanes] == [False, False, True]
-    road.turns.give_back(road.lanes[1])  # it is no longer there; that does no harm
+    road.turns.release(road.lanes[1])  # it is no longer there; that does no harm
 
 
 def test_what_was_found_out_is_forgotten_when_no_list_came_for_long() -> None:
@@ -443,7 +443,9 @@ def a_radio(vehicles: list[Vehicle], *, loss: float = 0.0, seed: int = 0) -> Sim
 def begin_all(world: Simulation, count: int) -> list[Fetch]:
     """Begin a fetch of every vehicle at once."""
     machines = world.station.components
-    world.until(lambda: len(machines) == count and all(each.who.settled for each in machines.values()))
+    world.until(
+        lambda: len(machines) == count and all(each.identification.settled for each in machines.values())
+    )
     return [machine.begin_fetch(world.now) for machine in machines.values()]
 
 
@@ -520,8 +522,8 @@ def test_a_list_that_waits_for_its_turn_is_not_silent_and_gives_it_back() -> Non
     first, second, third = begin_all(world, 3)
     world.run(0.3)
     assert not second.is_silent
-    assert second.held_up(world.now) == pytest.approx(0.3)
-    assert first.held_up(world.now) == 0.0
+    assert second.queue_wait(world.now) == pytest.approx(0.3)
+    assert first.queue_wait(world.now) == 0.0
     with pytest.raises(NoReply) as caught:
         second.partial(world.now, "")
     assert caught.value.attempts == 0

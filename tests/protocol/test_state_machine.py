@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from paramclient.errors import NoReply, ParamClientError
-from paramclient.model.values import Encoding, Param, ParamType, encode
+from paramclient.model.values import Encoding, Param, ParamType, encode_value
 from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_result import FetchResult, Policy
 from paramclient.protocol.params.list_download import REQUESTED_INDICES_MAX
 from paramclient.protocol.params.reads import Read
-from paramclient.protocol.params.sync import Upkeep
+from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.params.writes import Write
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.station import Station
@@ -170,7 +170,7 @@ MISFORTUNES = st.builds(
     list_every=st.sampled_from([math.inf, math.inf, math.inf, 0.5, 3.0]),
 )
 UPKEEPS = st.builds(
-    Upkeep,
+    SyncSettings,
     interval=st.sampled_from([math.inf, 5.0, 30.0]),
     without_hash=st.booleans(),
     policy=st.sampled_from([Policy.AUTO] * 6 + [Policy.HASH_ONLY, Policy.CACHE_ONLY]),
@@ -239,7 +239,7 @@ class Sessions(RuleBasedStateMachine):
         link: Link,
         seed: int,
         misfortunes: Misfortunes,
-        upkeep: Upkeep,
+        upkeep: SyncSettings,
         has_camera: bool,
         uptime: float,
         begins_with_fetch: bool,
@@ -345,8 +345,8 @@ class Sessions(RuleBasedStateMachine):
         self.moved()
         encoding = Encoding.C_CAST if isinstance(self.vehicle, ArduPilotVehicle) else Encoding.BYTEWISE
         kind = ParamType.REAL32 if name in FLOATS else ParamType.INT32
-        raw = encode(float(number) if name in FLOATS else number, kind, encoding)
-        self.another_sends(wire.ParamSet(1, 1, name, raw, kind), is_heard)
+        raw = encode_value(float(number) if name in FLOATS else number, kind, encoding)
+        self.another_sends(wire.ParamSetMessage(1, 1, name, raw, kind), is_heard)
 
     @rule(is_heard=st.booleans(), component=st.sampled_from([0, 1]))
     def another_station_lists(self, is_heard: bool, component: int) -> None:

@@ -13,7 +13,7 @@ from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ComponentHeard, ComponentIdentified
 from paramclient.protocol.params.fetch_result import FetchResult
-from paramclient.protocol.params.sync import Upkeep
+from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.requests.retry import HEARTBEAT_REQUESTS
 from paramclient.protocol.station import Station
 from paramclient.protocol.wire import (
@@ -27,7 +27,7 @@ from paramclient.protocol.wire import (
     Message,
     ParamRequestList,
     ParamRequestRead,
-    ParamSet,
+    ParamSetMessage,
     StatusText,
 )
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam
@@ -214,7 +214,7 @@ def test_only_an_autopilot_is_asked_for_its_heartbeat(system: int, component: in
 
 
 def test_a_listen_only_station_requests_no_heartbeat() -> None:
-    station = Station(link="x", is_stream=False, upkeep=Upkeep(listens_only=True))
+    station = Station(link="x", is_stream=False, upkeep=SyncSettings(listens_only=True))
     station.receive(telemetry(), "there", 0.0)
     assert sent(station) == []
 
@@ -414,7 +414,7 @@ def test_what_another_station_sets() -> None:
         hear(station, PX4, 1, component)
     hear(station, PX4, 2, 1)
     for system, component in ((1, 1), (1, 0), (0, 0), (2, 2)):
-        hear(station, ParamSet(system, component, f"P{system}{component}", bytes(4), 9), 254, 190)
+        hear(station, ParamSetMessage(system, component, f"P{system}{component}", bytes(4), 9), 254, 190)
     told = {}
     for address, machine in station.components.items():
         for name in ("P11", "P10", "P00", "P22"):
@@ -430,7 +430,7 @@ def test_what_another_station_sets() -> None:
 def test_our_own_sets_that_come_back_are_not_another_stations() -> None:
     station = a_station()
     hear(station, PX4)
-    hear(station, ParamSet(1, 1, "A", bytes(4), 9), 255, 190)
+    hear(station, ParamSetMessage(1, 1, "A", bytes(4), 9), 255, 190)
     assert station.components[1, 1]._authors.of("A", 0.0) == "vehicle"
 
 
@@ -508,13 +508,15 @@ def test_a_write_that_met_a_short_doubt_is_begun_all_the_same() -> None:
     hear(station, param_value("A", 1.0), 1, 100)
     autopilot, camera = station.components[1, 1], station.components[1, 100]
     station.tick(0.1)
-    autopilot.who.doubt(0.1)
-    assert autopilot.who.is_doubted
+    autopilot.identification.doubt(0.1)
+    assert autopilot.identification.is_doubted
     camera.write("A", 2.5, 0.2)
     hear(station, AutopilotVersion(0, uid=7), 1, 1, now=0.3)
     sent(station)
     station.tick(1.2)
-    assert [message.param_id for message, _, _ in sent(station) if isinstance(message, ParamSet)] == ["A"]
+    assert [message.param_id for message, _, _ in sent(station) if isinstance(message, ParamSetMessage)] == [
+        "A"
+    ]
 
 
 def test_a_component_alone_speaks_for_itself() -> None:
@@ -547,7 +549,7 @@ def settle(world: Simulation, count: int) -> None:
     world.until(
         lambda: (
             len(world.station.components) == count
-            and all(machine.who.settled for machine in world.station.components.values())
+            and all(machine.identification.settled for machine in world.station.components.values())
         )
     )
     world.sent.clear()

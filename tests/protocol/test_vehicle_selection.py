@@ -120,7 +120,7 @@ def test_the_look_begins_anew_when_the_link_was_away(listening: Listening) -> No
 
 def test_the_look_begins_anew_when_this_program_stood_still(listening: Listening) -> None:
     listening.hear(PX4, 5.0).hear(PX4, 6.0)
-    listening.station.stood_still(0.0, 9.0)
+    listening.station.handle_suspend(0.0, 9.0)
     assert listening.chosen(9.1) is None
     assert listening.chosen(9.0 + LOOK_TIME) == (1, 1)
 

@@ -166,7 +166,7 @@ def statuses(result: Any) -> dict[str, str]:
 
 def sets(tap: Tap) -> list[str]:
     """Return the names of the written parameters, once each, in order."""
-    return list(dict.fromkeys(message.param_id for message in tap.messages(wire.ParamSet)))
+    return list(dict.fromkeys(message.param_id for message in tap.messages(wire.ParamSetMessage)))
 
 
 @EVERY_KIND
@@ -203,7 +203,7 @@ async def test_prepare_lists_exactly_the_values_that_apply_sends(
     async with a_client(tap) as client:
         component = await client.component()
         plan = await prepare(component, wanted)
-        assert tap.messages(wire.ParamSet) == []
+        assert tap.messages(wire.ParamSetMessage) == []
         assert [[step.name for step in stage.steps] for stage in plan.stages] == [
             ["EK2_ENABLE"],
             ["TUNE_01", "TUNE_02", "EK2_ALT_M_NSE"],
@@ -221,7 +221,7 @@ async def test_the_verification_is_requested_after_the_last_write(make: Callable
     async with a_client(tap) as client:
         assert (await apply(await client.component(), written(another()))).complete
     messages = [message for _, _, message in tap.heard]
-    last = max(place for place, message in enumerate(messages) if isinstance(message, wire.ParamSet))
+    last = max(place for place, message in enumerate(messages) if isinstance(message, wire.ParamSetMessage))
     asked = messages[last + 1 :]
     if make is ardupilot:
         assert any(isinstance(message, wire.FileTransfer) for message in asked)
@@ -280,7 +280,7 @@ async def test_the_verification_reads_the_values_with_every_cache_policy(
         assert result.complete
         (kept,) = cache.snapshots(cache.vehicles()[0].key)
     messages = [message for _, _, message in tap.heard]
-    last = max(place for place, message in enumerate(messages) if isinstance(message, wire.ParamSet))
+    last = max(place for place, message in enumerate(messages) if isinstance(message, wire.ParamSetMessage))
     asked = {each.param_id for each in messages[last + 1 :] if isinstance(each, wire.ParamRequestRead)}
     by_hash = make is px4 and policy == "hash-only"
     assert asked == ({wire.HASH_CHECK} if by_hash else {"TUNE_01", "TUNE_04"})
@@ -300,7 +300,7 @@ async def test_a_plan_without_steps_writes_and_rereads_nothing(make: Callable[[]
         assert (await verify(component, wanted)).is_met
     assert result.complete
     assert set(statuses(result).values()) == {"unchanged", "skipped"}
-    assert tap.messages(wire.ParamSet) == []
+    assert tap.messages(wire.ParamSetMessage) == []
     assert listed <= 1
 
 
@@ -373,7 +373,7 @@ async def test_members_of_a_group_to_reveal_are_requested_during_the_file_downlo
     assert downloads(tap) == 2
     way = wire.FileTransfer if ftp else wire.ParamRequestList
     sent = [message for _, _, message in tap.heard]
-    sent = sent[: next(at for at, message in enumerate(sent) if isinstance(message, wire.ParamSet))]
+    sent = sent[: next(at for at, message in enumerate(sent) if isinstance(message, wire.ParamSetMessage))]
     reads = [each for each in sent if isinstance(each, wire.ParamRequestRead) and each.param_index < 0]
     last_of_table = max(at for at, message in enumerate(sent) if isinstance(message, way))
     assert (sent.index(reads[0]) < last_of_table) is is_beside
@@ -489,7 +489,7 @@ async def test_invalid_values_are_raised_before_anything_is_sent() -> None:
         with pytest.raises(InvalidParameters, match="SMALL: 300 does not fit INT8") as caught:
             await apply(component, wanted)
         assert set(caught.value.problems) == {"SMALL", "TUNE_03"}
-        assert tap.messages(wire.ParamSet) == []
+        assert tap.messages(wire.ParamSetMessage) == []
         result = await apply(component, wanted, skip_invalid=True)
     assert statuses(result) == {"TUNE_01": "set", "SMALL": "skipped", "TUNE_03": "skipped"}
     assert "cannot be sent exactly" in result.rows["TUNE_03"].reason
@@ -536,7 +536,7 @@ async def test_a_value_changed_by_a_later_write_is_written_again() -> None:
         for name, row in result.rows.items():
             assert row.actual == vehicle.param(name).value
             assert row.is_as_wanted is (row.actual == another(name)[name])
-        assert len(tap.messages(wire.ParamSet)) <= 5
+        assert len(tap.messages(wire.ParamSetMessage)) <= 5
 
 
 @swiftly
@@ -548,7 +548,7 @@ async def test_the_state_is_stored_before_anything_is_sent(tmp_path: Path) -> No
     store = ParamCache.store_snapshot
 
     def spy(*args: Any, **kwargs: Any) -> Any:
-        seen.append((kwargs["reason"], len(tap.messages(wire.ParamSet))))
+        seen.append((kwargs["reason"], len(tap.messages(wire.ParamSetMessage))))
         return store(*args, **kwargs)
 
     with mock.patch.object(ParamCache, "store_snapshot", spy):
@@ -574,7 +574,7 @@ async def test_nothing_is_sent_if_the_state_cannot_be_stored(tmp_path: Path) -> 
         async with ParamClient(tap, cache=tmp_path / "cache.sqlite3") as client:
             with pytest.raises(CacheError, match="disk full"):
                 await apply(await client.component(), written(another()))
-    assert tap.messages(wire.ParamSet) == []
+    assert tap.messages(wire.ParamSetMessage) == []
 
 
 @pytest.mark.parametrize("bring", [apply, restore])
@@ -594,7 +594,7 @@ async def test_before_writing_may_end_the_call(bring: Callable[..., Any], tmp_pa
             await bring(component, written(another()), before_writing=stop)
         assert len(seen) == 1
         assert seen[0] > len(SETTINGS), "it has been read"
-        assert not tap.messages(wire.ParamSet)
+        assert not tap.messages(wire.ParamSetMessage)
         key = component.identity.key
         await anyio.sleep(1.0)
     assert cache.snapshots(key) == []
@@ -829,7 +829,7 @@ async def test_an_armed_vehicle_is_refused_unless_allowed(make: Callable[..., An
         component = await client.component()
         with pytest.raises(VehicleArmed, match="1/1 is armed"):
             await apply(component, written(another()))
-        assert tap.messages(wire.ParamSet) == []
+        assert tap.messages(wire.ParamSetMessage) == []
         assert (await prepare(component, written(another()))).steps
         assert (await apply(component, written(another("TUNE_01")), allow_armed=True)).complete
         # an armed vehicle refuses to reboot, which ends the run
@@ -966,12 +966,12 @@ async def test_px4_reboots_before_parameters_that_the_frame_resets() -> None:
         component = await client.component()
         with pytest.raises(UsageError, match="SYS_AUTOCONFIG resets other parameters to their defaults"):
             await apply(component, wanted, include="SYS_AUTOCONFIG")
-        assert tap.messages(wire.ParamSet) == []
+        assert tap.messages(wire.ParamSetMessage) == []
         result = await apply(component, wanted, include="SYS_AUTOCONFIG", reboot=True)
     assert result.complete
     assert result.reboots == 1
     # values that were right before the reset were reset too, and written again
-    assert [message.param_id for message in tap.messages(wire.ParamSet)] == [
+    assert [message.param_id for message in tap.messages(wire.ParamSetMessage)] == [
         *("SYS_AUTOSTART", "SYS_AUTOCONFIG", "TUNE_01", "TUNE_05")
     ]
     assert result.rows["SYS_AUTOCONFIG"].reason == "done by the vehicle"
@@ -1105,7 +1105,7 @@ async def test_parameters_that_may_end_the_connection_are_written_one_by_one() -
     async with a_client(tap) as client:
         wanted = written({"SYSID_THISMAV": 7, "SYSID_ENFORCE": 1})
         assert (await apply(await client.component(), wanted, include="identity")).complete
-    heard = [(at, message) for at, _, message in tap.heard if isinstance(message, wire.ParamSet)]
+    heard = [(at, message) for at, _, message in tap.heard if isinstance(message, wire.ParamSetMessage)]
     times = {message.param_id: at for at, message in reversed(heard)}
     assert times["SYSID_ENFORCE"] + 0.001 < times["SYSID_THISMAV"]
 
@@ -1178,7 +1178,7 @@ async def test_another_vehicle_at_the_same_address_ends_the_run() -> None:
             result = await apply(component, written(another()))
     assert isinstance(result.error, AnotherVehicle)
     assert not result.complete
-    assert len(tap.messages(wire.ParamSet)) == len(SETTINGS)
+    assert len(tap.messages(wire.ParamSetMessage)) == len(SETTINGS)
 
 
 @swiftly
@@ -1193,7 +1193,7 @@ async def test_a_failure_before_anything_is_sent_is_raised() -> None:
     async with a_client(tap) as client:
         with mock.patch.object(ApplyRun, "_store_state", arm), pytest.raises(VehicleArmed):
             await apply(await client.component(), written(another()))
-    assert tap.messages(wire.ParamSet) == []
+    assert tap.messages(wire.ParamSetMessage) == []
 
 
 class EndpointWithEvent(Tap):
@@ -1322,7 +1322,7 @@ async def test_a_file_of_another_autopilot_is_refused_before_the_vehicle_is_read
         for call in (prepare, verify, apply):
             with pytest.raises(UsageError, match="are those of a vehicle with"):
                 await call(component, other)
-    assert not {wire.ParamSet, wire.ParamRequestRead, wire.ParamRequestList} & {
+    assert not {wire.ParamSetMessage, wire.ParamRequestRead, wire.ParamRequestList} & {
         type(message) for _, _, message in tap.heard
     }
 
@@ -1376,7 +1376,7 @@ async def test_the_verification_begins_after_the_verify_delay() -> None:
     tap = Tap(px4())
     async with a_client(tap) as client:
         assert (await apply(await client.component(), written(another()))).complete
-    sets = [at for at, _, message in tap.heard if isinstance(message, wire.ParamSet)]
+    sets = [at for at, _, message in tap.heard if isinstance(message, wire.ParamSetMessage)]
     hashes = [
         at
         for at, _, message in tap.heard
@@ -1438,7 +1438,7 @@ def tuned(vehicle: ArduPilotVehicle, count: int) -> ParamSet:
 def reads_after_the_last_set(tap: Tap) -> list[str]:
     """Return the names that were read by name after the last write."""
     messages = [message for _, _, message in tap.heard]
-    last = max(place for place, message in enumerate(messages) if isinstance(message, wire.ParamSet))
+    last = max(place for place, message in enumerate(messages) if isinstance(message, wire.ParamSetMessage))
     return [each.param_id for each in messages[last + 1 :] if isinstance(each, wire.ParamRequestRead)]
 
 

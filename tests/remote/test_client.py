@@ -44,7 +44,7 @@ from paramclient.remote.http import STREAM_TIMEOUT
 from paramclient.remote.service_client import ServiceClient
 from paramclient.service import Hub, Settings, create_app
 from paramclient.service.access import AccessSettings
-from paramclient.service.tokens import Holder, Tokens
+from paramclient.service.tokens import TokenHolder, Tokens
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from tests.asgi import ASGITransport
 from tests.shell import FlakyLink, Tap, a_client, generic, outcome, settled, small_px4, swiftly, until
@@ -252,7 +252,7 @@ async def test_two_that_set_one_name_are_put_in_order_and_each_learns_what_happe
         changes = second.changes()
         results = await asyncio.gather(first.set("PARAM_01", 10), second.set("PARAM_01", 11))
         assert [(result.status, result.actual) for result in results] == [("accepted", 10), ("accepted", 11)]
-        sent = [int.from_bytes(each.raw, "little") for each in tap.messages(wire.ParamSet)]
+        sent = [int.from_bytes(each.raw, "little") for each in tap.messages(wire.ParamSetMessage)]
         assert sent == [10, 11]
         assert first.params["PARAM_01"].value == second.params["PARAM_01"].value == 11
         told = await anext(changes)
@@ -284,7 +284,7 @@ SECRET = "0123456789abcdef0123456789abcdef0123456789"
 
 def tokens() -> Tokens:
     return Tokens(
-        (Holder(name, role), hashlib.sha256(f"{name}-{SECRET}".encode()).digest())  # type: ignore[arg-type]
+        (TokenHolder(name, role), hashlib.sha256(f"{name}-{SECRET}".encode()).digest())  # type: ignore[arg-type]
         for name, role in TOKENS.items()
     )
 
@@ -526,7 +526,7 @@ async def test_a_service_that_stays_away(caplog: pytest.LogCaptureFixture) -> No
             assert type(await outcome(call())) is LinkError
         assert anyio.current_time() - began < 0.01
         network.app = app
-        await asyncio.sleep(link_task.BACKOFF_MAX + 0.1)
+        await asyncio.sleep(link_task.RECONNECT_BACKOFF_MAX + 0.1)
         assert (await component.set("PARAM_01", 5)).actual == 5
     told = [each.getMessage() for each in caplog.records if each.name.startswith("paramclient.remote")]
     assert len([text for text in told if "reconnecting" in text]) == 1

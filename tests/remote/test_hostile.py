@@ -29,7 +29,7 @@ from paramclient.remote.bounded import (
     checked_document,
     decoder_of,
 )
-from paramclient.remote.http import Place
+from paramclient.remote.http import StreamPosition
 from paramclient.remote.mirror import Mirror
 
 RUN = "0123456789abcdef"
@@ -363,7 +363,7 @@ def test_encodings_that_are_asked_for_are_decoded(encoding: str) -> None:
 
 @pytest.mark.parametrize("text", ["", "5", f"{RUN}-", f"{RUN}-x", f"{RUN}-{'9' * 5_000}", "x" * 90 + "-1"])
 def test_what_is_no_place(text: str) -> None:
-    assert Place.read(text) is None
+    assert StreamPosition.read(text) is None
 
 
 def test_a_table_grows_no_further_than_that_of_a_service(monkeypatch: pytest.MonkeyPatch) -> None:

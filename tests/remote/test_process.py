@@ -57,8 +57,8 @@ def running(vehicle: Any, port: int = 0, **tls: Path) -> Iterator[str]:
 @pytest.mark.asyncio
 async def test_the_library_over_sockets_and_through_a_restart(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(link_task, "LINK_TIMEOUT", 0.5)
-    monkeypatch.setattr(link_task, "BACKOFF_MIN", 0.05)
-    monkeypatch.setattr(link_task, "BACKOFF_MAX", 0.1)
+    monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MIN", 0.05)
+    monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MAX", 0.1)
     vehicle = small_px4()
     with anyio.fail_after(PATIENCE):
         with running(vehicle) as url:

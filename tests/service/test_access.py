@@ -27,8 +27,8 @@ from paramclient.service.tokens import (
     WRONG_TOKEN_DELAY,
     WRONG_TOKEN_LIFETIME,
     WRONG_TOKENS_MAX,
-    Holder,
     Sessions,
+    TokenHolder,
     Tokens,
     WrongTokens,
     add_token,
@@ -199,8 +199,8 @@ def test_a_file_that_has_no_tokens_says_where_and_never_what(text: str, words: s
 
 
 def test_whose_a_token_is() -> None:
-    assert TOKENS.holder(ANNA.encode()) == Holder("anna", "write")
-    assert TOKENS.holder(BEN.encode()) == Holder("ben", "read")
+    assert TOKENS.holder(ANNA.encode()) == TokenHolder("anna", "write")
+    assert TOKENS.holder(BEN.encode()) == TokenHolder("ben", "read")
     for wrong in (b"", ANNA[:-1].encode(), ANNA.upper().encode(), f"{ANNA} ".encode(), b"\xff" * 40):
         assert TOKENS.holder(wrong) is None
     assert repr(TOKENS) == "<Tokens of anna, ben>"
@@ -232,10 +232,10 @@ def test_tokens_come_from_a_file_or_the_environment(tmp_path: Path) -> None:
         tokens_from(None, {"PARAMCLIENT_SERVICE_TOKEN_FILE": str(path)}),
     ):
         assert tokens is not None
-        assert tokens.holder(token.encode()) == Holder("anna", "write")
+        assert tokens.holder(token.encode()) == TokenHolder("anna", "write")
     alone = tokens_from(None, {"PARAMCLIENT_SERVICE_TOKEN": token})
     assert alone is not None
-    assert alone.holder(token.encode()) == Holder("token", "write")
+    assert alone.holder(token.encode()) == TokenHolder("token", "write")
     assert tokens_from(None, {}) is None
     with pytest.raises(UsageError, match="PARAMCLIENT_SERVICE_TOKEN: a token must have 16"):
         tokens_from(None, {"PARAMCLIENT_SERVICE_TOKEN": "short"})
@@ -256,7 +256,7 @@ def test_a_token_is_made_and_kept_as_its_digest(tmp_path: Path) -> None:
     eve = add_token(path, "eve", "write")
     tokens = Tokens.read(path)
     found = [tokens.holder(token.encode()) for token in (anna, ben, eve)]
-    assert found == [Holder("anna", "write"), Holder("ben", "read"), Holder("eve", "write")]
+    assert found == [TokenHolder("anna", "write"), TokenHolder("ben", "read"), TokenHolder("eve", "write")]
     kept = path.read_text()
     assert not any(token in kept for token in (anna, ben, eve))
     assert path.stat().st_mode & 0o777 == 0o600 or os.name != "posix"
@@ -565,7 +565,7 @@ async def test_where_no_token_is_needed_a_session_is_nothing() -> None:
 def test_sessions_are_few() -> None:
     now = 0.0
     sessions = Sessions(lambda: now)
-    anna, ben = Holder("anna", "write"), Holder("ben", "read")
+    anna, ben = TokenHolder("anna", "write"), TokenHolder("ben", "read")
     kept = sessions.begin(ben)
     texts = [sessions.begin(anna) for _ in range(3 * SESSIONS_OF_HOLDER_MAX)]
     assert len(sessions) == SESSIONS_OF_HOLDER_MAX + 1

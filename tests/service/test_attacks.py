@@ -567,7 +567,7 @@ async def test_what_one_connection_sends_is_parsed_in_slices(
 
         return data_received
 
-    for kind in (connections.Connection, connections.WebSocketConnection):
+    for kind in (connections.ServiceConnection, connections.WebSocketConnection):
         monkeypatch.setattr(kind, "data_received", watched(kind.data_received))
     options = {"ssl": trusting(), "server_hostname": "127.0.0.1"} if is_secure else {}
     async with served(listening=over_tls() if is_secure else None) as service:

@@ -14,7 +14,7 @@ import anyio
 import pytest
 
 from paramclient.cache import CutOff, SetupNotes
-from paramclient.cache.setups import INTERRUPTED_MAX, NOTE_BYTES_MAX, RunningSetup
+from paramclient.cache.interrupted_setups import INTERRUPTED_MAX, NOTE_BYTES_MAX, RunningSetup
 from paramclient.errors import CacheError
 from paramclient.links import create_link, serve_endpoint
 from paramclient.protocol import wire
@@ -33,7 +33,7 @@ def clock() -> Clock:
 
 @pytest.fixture
 def notes(tmp_path: Path, clock: Clock) -> SetupNotes:
-    return SetupNotes(tmp_path / "cache.setups", clock=clock)
+    return SetupNotes(tmp_path / "cache.interrupted_setups", clock=clock)
 
 
 def begun(notes: SetupNotes, name: str = "a1") -> RunningSetup:
@@ -117,9 +117,9 @@ def test_a_file_that_is_no_note_tells_nothing(notes: SetupNotes, content: bytes)
 
 
 def test_where_nothing_can_be_noted_nothing_begins(tmp_path: Path) -> None:
-    (tmp_path / "cache.setups").write_text("a file in its place")
+    (tmp_path / "cache.interrupted_setups").write_text("a file in its place")
     with pytest.raises(CacheError, match="the note of the set-up cannot be written to"):
-        begun(SetupNotes(tmp_path / "cache.setups"))
+        begun(SetupNotes(tmp_path / "cache.interrupted_setups"))
 
 
 # The service
@@ -188,7 +188,7 @@ class Mute(Tap):
 
     def receive(self, data: bytes, now: float) -> None:
         super().receive(data, now)
-        self.is_mute = len(self.messages(wire.ParamSet)) > 12
+        self.is_mute = len(self.messages(wire.ParamSetMessage)) > 12
 
 
 @pytest.mark.asyncio

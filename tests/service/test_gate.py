@@ -18,7 +18,7 @@ from paramclient.service.connection_slots import (
     LOOPBACK_RESERVED,
     ConnectionSlot,
     ConnectionSlots,
-    Stage,
+    ConnectionStage,
 )
 from paramclient.service.log_limit import LOG_INTERVAL, LOG_KINDS_MAX, LogLimit
 from tests.service.test_attacks import Answer, Served, over_tls, served, taken, trusting
@@ -36,7 +36,7 @@ def take(slots: ConnectionSlots, address: str) -> ConnectionSlot:
 def held(slots: ConnectionSlots, address: str) -> ConnectionSlot:
     """A slot of a connection that is being answered."""
     slot = take(slots, address)
-    slot.stage = Stage.ACTIVE
+    slot.stage = ConnectionStage.ACTIVE
     return slot
 
 
@@ -67,8 +67,8 @@ def test_loopback_has_slots_of_its_own_and_no_limit_for_one_address(address: str
     beyond = 0
     while seats.take(f"192.0.2.{beyond % 200}") is not None and beyond < 512 - LOOPBACK_RESERVED:
         beyond += 1
-    for slot in list(seats.at[Stage.SILENT]):
-        slot.stage = Stage.ACTIVE
+    for slot in list(seats.at[ConnectionStage.SILENT]):
+        slot.stage = ConnectionStage.ACTIVE
     assert len(seats) == 512 - LOOPBACK_RESERVED
     assert seats.take("192.0.2.250") is None
     for _ in range(LOOPBACK_RESERVED):
@@ -87,7 +87,11 @@ def test_a_proxy_that_is_trusted_is_many_clients() -> None:
 def test_whoever_says_least_loses_its_place_first() -> None:
     seats = ConnectionSlots(4, is_local=lambda _: True)
     ended: list[str] = []
-    for name, stage in (("idle", Stage.IDLE), ("begun", Stage.STARTED), ("old", Stage.SILENT)):
+    for name, stage in (
+        ("idle", ConnectionStage.IDLE),
+        ("begun", ConnectionStage.STARTED),
+        ("old", ConnectionStage.SILENT),
+    ):
         slot = take(seats, "127.0.0.1")
         slot.stage = stage
         slot.close = lambda name=name: ended.append(name)  # type: ignore[misc]
@@ -104,8 +108,8 @@ def test_a_client_that_has_too_many_takes_no_place_of_another_one() -> None:
     other = take(seats, "192.0.2.2")
     own = [take(seats, "192.0.2.1") for _ in range(ADDRESS_CONNECTIONS_MAX)]
     take(seats, "192.0.2.1")
-    assert own[0] not in seats.at[Stage.SILENT]
-    assert other in seats.at[Stage.SILENT]
+    assert own[0] not in seats.at[ConnectionStage.SILENT]
+    assert other in seats.at[ConnectionStage.SILENT]
 
 
 def test_those_beyond_this_computer_end_no_connection_of_it() -> None:
@@ -122,7 +126,7 @@ def test_a_place_is_given_back_once() -> None:
     slot = take(seats, "192.0.2.1")
     slot.release()
     slot.release()
-    slot.stage = Stage.ACTIVE
+    slot.stage = ConnectionStage.ACTIVE
     assert len(seats) == 0
     assert not any(seats.at.values())
 

@@ -98,7 +98,9 @@ async def test_it_waits_for_a_vehicle_and_ends_in_good_order(tmp_path: Path) -> 
             assert json.loads(await frames.recv())["type"] == "hello"
             vehicle.is_deaf = True
             pending = asyncio.create_task(browser.put(f"{C}/params/PARAM_02", json={"value": 5}))
-            await until(lambda: any(each.param_id == "PARAM_02" for each in vehicle.messages(wire.ParamSet)))
+            await until(
+                lambda: any(each.param_id == "PARAM_02" for each in vehicle.messages(wire.ParamSetMessage))
+            )
             process.send_signal(signal.SIGTERM)
             answer = await pending
             assert (answer.status_code, answer.json()["type"]) == (503, "urn:paramclient:closing")

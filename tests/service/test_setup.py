@@ -255,7 +255,7 @@ class Quiet(Tap):
 
     def receive(self, data: bytes, now: float) -> None:
         super().receive(data, now)
-        self.is_mute = len(self.messages(wire.ParamSet)) > 12
+        self.is_mute = len(self.messages(wire.ParamSetMessage)) > 12
 
 
 @swiftly

@@ -21,7 +21,7 @@ import pytest
 from fastapi import FastAPI
 from fastapi.dependencies import utils as dependency_utils
 
-from paramclient.client.fetch_all import ENDED_FETCHES_MAX, STARTED_FETCHES_MAX, FetchTogether
+from paramclient.client.fetch_all import ENDED_FETCHES_MAX, STARTED_FETCHES_MAX, FleetFetch
 from paramclient.documents.component import ComponentsDoc
 from paramclient.documents.diff import DiffDoc, DifferenceDoc
 from paramclient.documents.document import Document
@@ -60,8 +60,8 @@ from paramclient.service.problems import ServiceError
 from paramclient.service.quota import LARGE_GETS_OF_HOLDER_MAX, LONG_REQUESTS_OF_HOLDER_MAX, Quota
 from paramclient.service.responses import encode_document
 from paramclient.service.route_context import run_until_disconnect
+from paramclient.service.routes import apply as setup_room
 from paramclient.service.routes import params as params_room
-from paramclient.service.routes import setup as setup_room
 from paramclient.sim import GenericVehicle
 from tests.asgi import a_browser
 from tests.served import C, met, problem, service
@@ -637,7 +637,7 @@ async def test_fetches_of_many_are_begun_and_ended_few_at_a_time() -> None:
     components = {(system, 1): component(system) for system in range(1, 251)}
     station: Any = Station()
     station.components = {address: each.machine for address, each in components.items()}
-    together = FetchTogether(station, components, system=None, refresh=False)
+    together = FleetFetch(station, components, system=None, refresh=False)
     turns, ends = Turns(), Turns()
     ended: list[tuple[int, int]] = []
     checks = 0

@@ -459,17 +459,19 @@ class TestOtherStation:
         heard = [(time, frame, message) for time, frame, message in station.log if frame.system == 254]
         assert [(time, type(message)) for time, _, message in heard] == [
             (0.0, wire.Heartbeat),
-            (0.5, wire.ParamSet),
+            (0.5, wire.ParamSetMessage),
             (1.0, wire.Heartbeat),
             (1.0, wire.ParamRequestList),
             (2.0, wire.Heartbeat),
             (2.0, wire.ParamRequestList),
-            (2.5, wire.ParamSet),
+            (2.5, wire.ParamSetMessage),
             (3.0, wire.Heartbeat),
             (3.0, wire.ParamRequestList),
         ]
         assert [frame.sequence for _, frame, _ in heard] == list(range(9))
-        assert wire.ParamSet(2, 1, "B_INT", b"\x08\0\0\0", ParamType.INT32) in [each[2] for each in heard]
+        assert wire.ParamSetMessage(2, 1, "B_INT", b"\x08\0\0\0", ParamType.INT32) in [
+            each[2] for each in heard
+        ]
 
     def test_another_station_uses_the_vehicles_encoding(self) -> None:
         vehicle = ArduPilotVehicle()

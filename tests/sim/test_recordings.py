@@ -13,8 +13,8 @@ from paramclient.model.values import (
     Param,
     ParamType,
     Value,
-    decode,
-    encode,
+    decode_value,
+    encode_value,
     from_bits,
     known_type,
     px4_hash,
@@ -52,7 +52,7 @@ def params(values: Iterable[wire.ParamValue], encoding: Encoding) -> list[Param]
     found = []
     for value in values:
         if value.param_index != wire.NO_INDEX:
-            number, bits = decode(value.raw, value.param_type, encoding)
+            number, bits = decode_value(value.raw, value.param_type, encoding)
             found.append(Param(value.param_id, number, known_type(value.param_type), value.param_index, bits))
     return found
 
@@ -85,7 +85,7 @@ class TestDecoding:
     @pytest.mark.parametrize("name", NAMES)
     def test_decoded_messages_encode_to_the_same_bytes(self, name: str) -> None:
         """For the messages of the parameter protocol, which `wire` decodes completely."""
-        values = wire.ParamValue | wire.ParamSet | wire.ParamRequestRead | wire.ParamRequestList
+        values = wire.ParamValue | wire.ParamSetMessage | wire.ParamRequestRead | wire.ParamRequestList
         kinds = values | wire.FileTransfer
         for record in read(name):
             message = record.message
@@ -159,7 +159,7 @@ def px4_of(name: str) -> PX4Vehicle:
     volatile = {row.name for row in px4_table() if row.volatile}
     rows = []
     for value in last_list(name):
-        number, _ = decode(value.raw, value.param_type, Encoding.BYTEWISE)
+        number, _ = decode_value(value.raw, value.param_type, Encoding.BYTEWISE)
         rows.append(SimParam(value.param_id, value.param_type, number, value.param_id in volatile))
     return PX4Vehicle(table=rows)
 
@@ -175,7 +175,7 @@ def ardupilot_of(name: str) -> ArduPilotVehicle:
 def take(vehicle: ArduPilotVehicle, value: wire.ParamValue) -> None:
     """Store a received value, if it differs."""
     param = vehicle.param(value.param_id)
-    if encode(param.value, param.type, Encoding.C_CAST) != value.raw:
+    if encode_value(param.value, param.type, Encoding.C_CAST) != value.raw:
         (number,) = struct.unpack("<f", value.raw)
         vehicle.set_param(value.param_id, number if param.type == ParamType.REAL32 else int(number))
 
@@ -221,7 +221,7 @@ def with_groups(name: str) -> ArduPilotVehicle:
 def without_pushes(name: str, messages: Messages, start: float) -> Messages:
     """Leave out PARAM_VALUEs after a time, except the first one after a set of its name."""
     sets = [record.message for record in from_ground(name) if record.time >= start]
-    awaited = {message.param_id for message in sets if isinstance(message, wire.ParamSet)}
+    awaited = {message.param_id for message in sets if isinstance(message, wire.ParamSetMessage)}
     kept: Messages = []
     for time, message in messages:
         if isinstance(message, wire.ParamValue) and time >= start:

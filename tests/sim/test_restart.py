@@ -10,7 +10,7 @@ import pytest
 
 from paramclient import CommandResult, UsageError
 from paramclient.cli.simulate import VehicleFaults
-from paramclient.model.values import Encoding, ParamType, encode
+from paramclient.model.values import Encoding, ParamType, encode_value
 from paramclient.protocol import wire
 from paramclient.protocol.ftp.param_pck import PackedParam
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, Vehicle
@@ -61,7 +61,9 @@ class Desk:
         return [ack.result for ack in acks]
 
     def set(self, name: str, value: int, kind: ParamType, encoding: Encoding) -> None:
-        self.send(wire.ParamSet(self.vehicle.system, 1, name, encode(value, kind, encoding), kind))
+        self.send(
+            wire.ParamSetMessage(self.vehicle.system, 1, name, encode_value(value, kind, encoding), kind)
+        )
 
     def messages(self, kind: type[T]) -> list[T]:
         return [message for _, _, message in self.heard if isinstance(message, kind)]

@@ -251,7 +251,7 @@ _kind = st.integers(0, 255)
 _requests = st.one_of(
     st.builds(wire.ParamRequestList, _target, _target),
     st.builds(wire.ParamRequestRead, _target, _target, _text, st.integers(-32768, 32767)),
-    st.builds(wire.ParamSet, _target, _target, _text, st.binary(min_size=4, max_size=4), _kind),
+    st.builds(wire.ParamSetMessage, _target, _target, _text, st.binary(min_size=4, max_size=4), _kind),
     st.builds(wire.CommandLong, _target, _target, st.sampled_from([512, 520, 1])),
     st.builds(wire.Heartbeat, _kind, _kind),
 )
@@ -372,17 +372,17 @@ class TestGeneric:
         assert by_name["T9"].raw == struct.pack("<f", 1.0)
         assert by_name["T8"].raw == b"\x01\0\0\0"
         assert (by_name["T77"].raw, by_name["T77"].param_type) == (b"abcd", 77)
-        (value,) = station.ask(wire.ParamSet(1, 1, "T2", b"\xff\x01\x02\x03", 2))
+        (value,) = station.ask(wire.ParamSetMessage(1, 1, "T2", b"\xff\x01\x02\x03", 2))
         assert value.raw == b"\xff\0\0\0"
         assert vehicle.values["T2"] == -1
-        (value,) = station.ask(wire.ParamSet(1, 1, "T77", b"wxyz", 77))
+        (value,) = station.ask(wire.ParamSetMessage(1, 1, "T77", b"wxyz", 77))
         assert vehicle.values["T77"] == value.raw == b"wxyz"
 
     @pytest.mark.parametrize("bits", [0xFFB3B4C0, 0x7F800001, 0xFF800001, 0x7FBFFFFF])
     def test_signalling_nans_are_kept(self, bits: int) -> None:
         vehicle = GenericVehicle({"N": 0})
         raw = bits.to_bytes(4, "little")
-        (value,) = Station(vehicle).ask(wire.ParamSet(1, 1, "N", raw, ParamType.INT32))
+        (value,) = Station(vehicle).ask(wire.ParamSetMessage(1, 1, "N", raw, ParamType.INT32))
         assert value.raw == raw
         assert vehicle.param("N").bits == bits
 
@@ -424,8 +424,8 @@ class TestGeneric:
 HASH = read("_HASH_CHECK")
 
 
-def hash_set(value: int = 0) -> wire.ParamSet:
-    return wire.ParamSet(1, 1, "_HASH_CHECK", value.to_bytes(4, "little"), ParamType.UINT32)
+def hash_set(value: int = 0) -> wire.ParamSetMessage:
+    return wire.ParamSetMessage(1, 1, "_HASH_CHECK", value.to_bytes(4, "little"), ParamType.UINT32)
 
 
 class TestPX4:
@@ -572,7 +572,7 @@ class TestPX4:
     def test_no_range_check(self) -> None:
         vehicle = PX4Vehicle()
         raw = b"\x01\x00\x80\x7f"  # a signalling NaN
-        values = Station(vehicle).ask(wire.ParamSet(1, 1, "MPC_XY_VEL_MAX", raw, ParamType.REAL32))
+        values = Station(vehicle).ask(wire.ParamSetMessage(1, 1, "MPC_XY_VEL_MAX", raw, ParamType.REAL32))
         assert [value.raw for value in values] == [raw, raw]
         assert vehicle.param("MPC_XY_VEL_MAX").bits == 0x7F800001
 

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 from paramclient.errors import FileErrorCode, FileTransferError, UsageError
 from paramclient.protocol.ftp.blocks import Blocks
 from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, Opcode, Packet
-from paramclient.protocol.ftp.transfer_job import Job, Line
+from paramclient.protocol.ftp.transfer_job import FileTransferJob, FtpChannel
 from paramclient.protocol.requests.retry import (
     OVERTAKING_READS,
     READS_BEHIND_BURST_COPIES_MAX,
@@ -66,7 +66,7 @@ class _Flight(NamedTuple):
     """Whether it measures the round trip: no earlier request for this offset, and no burst running."""
 
 
-class FileRead(Job[bytes]):
+class FileRead(FileTransferJob[bytes]):
     """One read of a file. See `FileTransfers.read`.
 
     Attributes:
@@ -74,7 +74,7 @@ class FileRead(Job[bytes]):
             param.pck. None at first.
     """
 
-    def __init__(self, line: Line, path: str, now: float, *, read_size: int, limit: int) -> None:
+    def __init__(self, line: FtpChannel, path: str, now: float, *, read_size: int, limit: int) -> None:
         if not 1 <= read_size <= DATA_SIZE_MAX:
             raise UsageError(f"a file is read by 1 to {DATA_SIZE_MAX} bytes, not {read_size}")
         super().__init__(line, path, now)
@@ -192,7 +192,7 @@ class FileRead(Job[bytes]):
             for sequence, flight in list(self._flights.items()):
                 if self._flight_deadline(flight) <= now:
                     self._give_up(sequence)
-                    self._in_vain(flight, now)
+                    self._record_timeout(flight, now)
         self._go_on(now)
 
     def next_deadline(self) -> float:
@@ -230,7 +230,7 @@ class FileRead(Job[bytes]):
 
     def _burst(self, now: float) -> None:
         """Request everything from the present offset as a burst."""
-        if self._burst_attempts.is_hopeless(now):
+        if self._burst_attempts.should_give_up(now):
             self.fail(self._no_reply(self._burst_attempts.count, now), now)
             return
         sequence = self._line.next_sequence(answers=BURST_RESPONSES_MAX)
@@ -255,7 +255,7 @@ class FileRead(Job[bytes]):
         )
         if self.session is not None:
             for _ in range(min(self._most_copies, READS_BEHIND_BURST_COPIES_MAX)):
-                self._read_behind(now)
+                self._send_probe_read(now)
 
     def _is_of_a_burst(self, packet: Packet) -> bool:
         return any(0 < (packet.sequence - first) & 0xFFFF <= BURST_RESPONSES_MAX for first in self._bursts)
@@ -352,9 +352,9 @@ class FileRead(Job[bytes]):
             self._burst_attempts.timed_out()
             self._burst(now)
         else:
-            self._read_behind(now)
+            self._send_probe_read(now)
 
-    def _read_behind(self, now: float) -> None:
+    def _send_probe_read(self, now: float) -> None:
         """Send a read behind the burst: its response, without a block before it, shows that the burst was
         lost."""
         self._read_behind_at = now
@@ -386,7 +386,7 @@ class FileRead(Job[bytes]):
         if len(self._late) > LATE_READS_MAX:
             del self._late[next(iter(self._late))]
 
-    def _in_vain(self, flight: _Flight, now: float) -> None:
+    def _record_timeout(self, flight: _Flight, now: float) -> None:
         """Record an unanswered read; those of one offset that were sent meanwhile count as one."""
         attempts, counted_at = self._asked.get(flight.offset, (0, -math.inf))
         if not self._is_wanted(flight.offset) or flight.sent_at < counted_at:
@@ -397,7 +397,7 @@ class FileRead(Job[bytes]):
         if not (is_silence and self._is_silent):  # a silence that all reads share counts once
             self._retries.timed_out(attempts)
         self._is_silent = is_silence
-        if self._retries.is_hopeless(attempts, now, is_silence=is_silence):
+        if self._retries.should_give_up(attempts, now, is_silence=is_silence):
             self.fail(self._no_reply(attempts, now), now)
 
     def _flight_deadline(self, flight: _Flight) -> float:

@@ -14,7 +14,7 @@ from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.requests.retry import OPENS_MAX, SESSION_IDLE_TIME, FileAttempts, RetryPolicy
 from paramclient.protocol.wire import FileTransfer
 
-__all__ = ["BUSY", "SESSION_LOST", "Job", "Line", "path_bytes"]
+__all__ = ["BUSY", "SESSION_LOST", "FileTransferJob", "FtpChannel", "path_bytes"]
 
 Result = TypeVar("Result")
 
@@ -38,7 +38,7 @@ def path_bytes(path: str) -> bytes:
     return data
 
 
-class Line:
+class FtpChannel:
     """The way to the files of one component, shared by all transfers.
 
     Attributes:
@@ -91,7 +91,7 @@ class Line:
         return self._session
 
 
-class Job(Operation[Result]):
+class FileTransferJob(Operation[Result]):
     """One transfer with one file. Its owner passes responses and time to it.
 
     A job ends with its result or its error when its session is closed: the server has acknowledged that, or
@@ -108,7 +108,7 @@ class Job(Operation[Result]):
         asked_session: the requested session while it is unknown whether that is open, or None.
     """
 
-    def __init__(self, line: Line, path: str, now: float) -> None:
+    def __init__(self, line: FtpChannel, path: str, now: float) -> None:
         super().__init__(now)
         self._line = line
         self.path = path
@@ -247,7 +247,7 @@ class Job(Operation[Result]):
             if self.is_ended and self._attempts.is_close_hopeless:
                 self._send_blind_close()
                 self._closed(now)
-            elif self._attempts.is_hopeless(now):
+            elif self._attempts.should_give_up(now):
                 self._request = None
                 self.fail(self._no_reply(self.attempts, now), now)
             else:

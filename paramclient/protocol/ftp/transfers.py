@@ -14,14 +14,14 @@ from typing import Any, Final, NamedTuple, TypeVar
 from paramclient.errors import FileErrorCode, NoReply, UsageError
 from paramclient.protocol.ftp.file_read import FILE_SIZE_MAX, FileRead
 from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, Opcode, Packet
-from paramclient.protocol.ftp.transfer_job import Job, Line
+from paramclient.protocol.ftp.transfer_job import FileTransferJob, FtpChannel
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.wire import FileTransfer
 
 __all__ = ["DirectoryEntry", "FileChecksum", "FileList", "FileRead", "FileTransfers", "FileWrite"]
 
-AnyJob = TypeVar("AnyJob", bound=Job[Any])
+AnyJob = TypeVar("AnyJob", bound=FileTransferJob[Any])
 
 ENTRIES_MAX: Final = 65_536
 """Entries of a directory: more than a FAT card can hold in one."""
@@ -41,14 +41,14 @@ class DirectoryEntry(NamedTuple):
         return self.size is None
 
 
-class FileWrite(Job[None]):
+class FileWrite(FileTransferJob[None]):
     """One write of a file; ends when the server has closed it. See `FileTransfers.write`.
 
     Attributes:
         written: bytes that the server has acknowledged.
     """
 
-    def __init__(self, line: Line, path: str, data: bytes, now: float, *, write_size: int) -> None:
+    def __init__(self, line: FtpChannel, path: str, data: bytes, now: float, *, write_size: int) -> None:
         if not 1 <= write_size <= DATA_SIZE_MAX:
             raise UsageError(f"a file is written by 1 to {DATA_SIZE_MAX} bytes, not {write_size}")
         super().__init__(line, path, now)
@@ -93,10 +93,10 @@ class FileWrite(Job[None]):
             self.finish(None, now)
 
 
-class FileList(Job[tuple[DirectoryEntry, ...]]):
+class FileList(FileTransferJob[tuple[DirectoryEntry, ...]]):
     """One list of a directory. See `FileTransfers.list`."""
 
-    def __init__(self, line: Line, path: str, now: float) -> None:
+    def __init__(self, line: FtpChannel, path: str, now: float) -> None:
         super().__init__(line, path, now)
         self._entries: list[DirectoryEntry] = []
         self._passed = 0
@@ -127,7 +127,7 @@ class FileList(Job[tuple[DirectoryEntry, ...]]):
             self.finish(tuple(self._entries[:ENTRIES_MAX]), now)
 
 
-class FileChecksum(Job[int]):
+class FileChecksum(FileTransferJob[int]):
     """One checksum of a file. See `FileTransfers.checksum`."""
 
     def begin(self, now: float) -> None:
@@ -162,9 +162,9 @@ class FileTransfers(Machine):
         self._context = context
         self._target = context.target
         self._own = context.own
-        self._line: Line | None = None
-        self._job: Job[Any] | None = None
-        self._waiting: deque[Job[Any]] = deque()
+        self._line: FtpChannel | None = None
+        self._job: FileTransferJob[Any] | None = None
+        self._waiting: deque[FileTransferJob[Any]] = deque()
         self.on_closed: list[Callable[[float], None]] = []
         self.foreign_at = -math.inf
 
@@ -231,7 +231,7 @@ class FileTransfers(Machine):
         """
         return self._begin(FileChecksum(self._line_at(now), path, now), now)
 
-    def release(self, job: Job[Any], now: float, *, is_served: bool = True) -> None:
+    def release(self, job: FileTransferJob[Any], now: float, *, is_served: bool = True) -> None:
         """Cancel a transfer: its end is not reported, and its session is closed.
 
         Args:
@@ -297,9 +297,9 @@ class FileTransfers(Machine):
             job.stop(now, error)
         self._go_on(now)
 
-    def _line_at(self, now: float) -> Line:
+    def _line_at(self, now: float) -> FtpChannel:
         if self._line is None:
-            self._line = Line(self._context, now)
+            self._line = FtpChannel(self._context, now)
         return self._line
 
     def _begin(self, job: AnyJob, now: float) -> AnyJob:

@@ -26,6 +26,6 @@
 `value_check`: values that may be older than a change.
 `volatile_values`: reads of the values that a hash does not cover.
 `write_batch`: many PARAM_SETs in one call.
-`write_resolution`: changes too small for PX4 to save.
+`small_changes`: changes too small for PX4 to save.
 `writes`: PARAM_SET.
 """

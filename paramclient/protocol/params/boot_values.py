@@ -14,7 +14,7 @@ from paramclient.protocol.params.table import Table
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 
-__all__ = ["StartValues"]
+__all__ = ["BootValues"]
 
 MEASURING_TIME: Final = 3.0
 """Seconds after a boot is detected, and after the vehicle's main loop runs, until its measurements are done.
@@ -37,7 +37,7 @@ _MEASURED = re.compile(
 and later boots), and the corresponding ones of other sensors."""
 
 
-class StartValues(Machine):
+class BootValues(Machine):
     """Reads again what a vehicle without a hash measures at each boot; see `MEASURING_TIME`.
 
     If the file of the whole table is fast, it is fetched instead. A vehicle with a hash needs neither: its

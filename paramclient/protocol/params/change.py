@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from paramclient.model.params import Held, held_of, param_of
+from paramclient.model.params import CompactParam, compact_param, param_of
 from paramclient.model.values import Param, Value
 
 __all__ = ["Added", "Change", "Removed"]
@@ -10,7 +10,7 @@ __all__ = ["Added", "Change", "Removed"]
 _new = tuple.__new__  # the constructor of a tuple ends in this call and takes several times as long
 
 
-class Change(tuple[str, Held | None, Held | None, str, Value | None, Value | None]):
+class Change(tuple[str, CompactParam | None, CompactParam | None, str, Value | None, Value | None]):
     """One parameter that appeared, changed its value or was removed.
 
     Each first value makes a change; the parameters in it are therefore built only on access. `Added` and
@@ -27,7 +27,7 @@ class Change(tuple[str, Held | None, Held | None, str, Value | None, Value | Non
     __slots__ = ()
 
     def __new__(cls, name: str, old: Param | None, new: Param | None, by: str = "vehicle") -> Change:
-        before, now = (None if each is None else held_of(each) for each in (old, new))
+        before, now = (None if each is None else compact_param(each) for each in (old, new))
         defaults = (None if each is None else each.default for each in (new, old))
         return _new(cls, (name, before, now, by, *defaults))
 

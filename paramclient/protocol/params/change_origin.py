@@ -7,13 +7,13 @@ from typing import Final
 
 from paramclient.errors import UsageError
 
-__all__ = ["Authors", "by_us", "check_asker", "is_ours"]
+__all__ = ["Authors", "by_us", "check_author", "is_ours"]
 
 BY_US: Final = "us"
 """The author of a change by our own write."""
 BY_US_FOR: Final = "us for "
 """The beginning of the author of a change by our write on behalf of a name."""
-ASKER_LENGTH_MAX: Final = 128
+AUTHOR_LENGTH_MAX: Final = 128
 """Characters of an author's name: enough for a name with an address, and a program's own description."""
 
 FOREIGN_SET_MEMORY: Final = 2.0
@@ -29,7 +29,7 @@ batch of responses up to 100 ms before it sends them, and a PARAM_SET meanwhile 
 _NO_SET: Final = ("", -math.inf, b"")
 
 
-def check_asker(asker: str | None) -> str | None:
+def check_author(asker: str | None) -> str | None:
     """Return the author of a change, checked for the history.
 
     Raises:
@@ -37,9 +37,9 @@ def check_asker(asker: str | None) -> str | None:
     """
     if asker is None:
         return None
-    if not 1 <= len(asker) <= ASKER_LENGTH_MAX or not (asker.isascii() and asker.isprintable()):
+    if not 1 <= len(asker) <= AUTHOR_LENGTH_MAX or not (asker.isascii() and asker.isprintable()):
         raise UsageError(
-            f"asker must have 1 to {ASKER_LENGTH_MAX} printable ASCII characters, not {asker!r:.200}"
+            f"asker must have 1 to {AUTHOR_LENGTH_MAX} printable ASCII characters, not {asker!r:.200}"
         )
     return asker
 

@@ -13,7 +13,7 @@ from paramclient.protocol.params.table import Table
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.requests.retry import RetryPolicy
 
-__all__ = ["Repeated", "repeated_names"]
+__all__ = ["DuplicateNameReads", "repeated_names"]
 
 DUPLICATES_LISTED_MAX: Final = 5
 """Names that a note lists one by one."""
@@ -39,7 +39,7 @@ def repeated_names(names: Mapping[int, str]) -> dict[str, tuple[int, ...]]:
     return {name: tuple(places) for name, places in indices.items() if len(places) > 1}
 
 
-class Repeated(Operation[None]):
+class DuplicateNameReads(Operation[None]):
     """Reads each repeated name, so that the table holds the value that the component means by it.
 
     Values at the other indices are then ignored: each would replace that value on arrival. A component whose

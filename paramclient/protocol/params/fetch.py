@@ -9,10 +9,10 @@ from functools import partial
 from typing import Final, NamedTuple
 
 from paramclient.errors import CacheError, LinkError, NoReply, UnknownParameter
-from paramclient.protocol.params.duplicate_names import Repeated, repeated_names
+from paramclient.protocol.params.duplicate_names import DuplicateNameReads, repeated_names
 from paramclient.protocol.params.fetch_notes import (
+    CACHED_UNVERIFIED,
     FILE_IN_USE,
-    FROM_MEMORY,
     LEFT_OUT,
     NO_FILE,
     NOT_ASKED,
@@ -26,15 +26,15 @@ from paramclient.protocol.params.fetch_notes import (
 )
 from paramclient.protocol.params.fetch_result import (
     Announcement,
+    FetchContext,
     FetchResult,
-    Means,
     Policy,
     Progress,
     Sampled,
 )
-from paramclient.protocol.params.file_download import PackFetch
-from paramclient.protocol.params.hash_check import Proof
-from paramclient.protocol.params.list_download import Download, present_of
+from paramclient.protocol.params.file_download import FileDownload
+from paramclient.protocol.params.hash_check import HashCheck
+from paramclient.protocol.params.list_download import ListDownload, present_of
 from paramclient.protocol.params.list_estimate import ListPace
 from paramclient.protocol.params.reads import Read
 from paramclient.protocol.params.sampling import Sampling
@@ -76,7 +76,7 @@ class Fetch(Operation[FetchResult]):
     another station has a file open and the list is faster than waiting for the end of its session. As soon as
     the file is opened after all, the list's gaps are left to it. The first complete one ends the fetch.
 
-    For a vehicle with a hash, `Proof` decides whether the downloaded table is confirmed.
+    For a vehicle with a hash, `HashCheck` decides whether the downloaded table is confirmed.
 
     An unfinished download is resumed if the count is still the same. With a hash the result must be proven in
     the end, otherwise everything is downloaded again; without a hash the cached values stay *cached*.
@@ -96,7 +96,7 @@ class Fetch(Operation[FetchResult]):
 
     def __init__(
         self,
-        means: Means,
+        means: FetchContext,
         now: float,
         *,
         announced: Announcement | None,
@@ -124,8 +124,8 @@ class Fetch(Operation[FetchResult]):
         self._has_begun = self._had_no_file = self._file_was_silent = False
         self._sampling: Sampling | None = None
         self._hash_read: Read | None = None
-        self._proof = Proof(table)
-        self._repeated: Repeated | None = None
+        self._proof = HashCheck(table)
+        self._repeated: DuplicateNameReads | None = None
         self._was_asked_meanwhile = False
         self._is_hash_unknown = False  # the vehicle answers other reads, but not that of the hash
         self.first_value_at = math.inf
@@ -138,8 +138,8 @@ class Fetch(Operation[FetchResult]):
         self._download_begun_at = now
         self.begun_anew_at = -math.inf
         self.holders = 0
-        self.download: Download | None = None
-        self.file: PackFetch | None = None
+        self.download: ListDownload | None = None
+        self.file: FileDownload | None = None
         self.file_failed: bool | None = None
         self._notes: tuple[str, ...] = ()
         self._left_out_before = table.left_out
@@ -159,7 +159,7 @@ class Fetch(Operation[FetchResult]):
         if self.file is not None and self.file.is_awaited:
             self._proof.before = announcement
         if self.download is not None and not self.download.names:
-            self.download.heed(announcement.at)
+            self.download.note_list_head(announcement.at)
             if self._proof.before is None:
                 self._proof.before = announcement
 
@@ -246,7 +246,7 @@ class Fetch(Operation[FetchResult]):
 
     def restart(self, now: float) -> None:
         """Start again: the vehicle has restarted or is another one, so the received values are invalid."""
-        held_up = self.held_up(now)
+        queue_wait = self.queue_wait(now)
         self._drop(now)
         self.download = None
         self._notes = ()
@@ -259,7 +259,7 @@ class Fetch(Operation[FetchResult]):
             what = f"the parameters of {whose}, which has started again {self._restarts} times"
             self.fail(NoReply(what, attempts=self._restarts, waited=now - self.begun_at), now)
             return
-        self._held_before = held_up
+        self._held_before = queue_wait
         self._proof.forget()
         self._was_asked_meanwhile = False
         self._listed = False
@@ -328,10 +328,10 @@ class Fetch(Operation[FetchResult]):
         read = self._hash_read
         return read is not None and read.attempts > 1 and not read.request.controls
 
-    def held_up(self, now: float) -> float:
+    def queue_wait(self, now: float) -> float:
         """Return the seconds for which the list has waited for its turn: other lists of the link ran."""
         stream = self.download if self.file is None else self.file
-        return self._held_before + (0.0 if stream is None else stream.held_for(now))
+        return self._held_before + (0.0 if stream is None else stream.queue_wait(now))
 
     def progress(self, now: float) -> Progress:
         """Return the progress."""
@@ -445,7 +445,7 @@ class Fetch(Operation[FetchResult]):
         if self._context.expects_hash:
             # once and before the file, so that the response belongs to the time before it
             self._context.send(ParamRequestRead(*self._target, HASH_CHECK, -1))
-        file = self.file = PackFetch(
+        file = self.file = FileDownload(
             means.files,
             means.turns,
             means.table,
@@ -516,7 +516,7 @@ class Fetch(Operation[FetchResult]):
             # another station has requested it: another request would restart it for both
             followed, of = following.hand_over(means.reads)
             present, count = {**(present or {}), **followed} if of == count else followed, of
-        download = self.download = Download(
+        download = self.download = ListDownload(
             self._context,
             means.reads,
             means.turns,
@@ -535,7 +535,7 @@ class Fetch(Operation[FetchResult]):
             self._was_asked_meanwhile = True
             self._ask_hash(self._hash_came_meanwhile, now)
 
-    def _file_ended(self, file: PackFetch) -> None:
+    def _file_ended(self, file: FileDownload) -> None:
         if self.file is not file:
             return
         now = file.ended_at
@@ -558,7 +558,7 @@ class Fetch(Operation[FetchResult]):
             self.finish(self._result("ftp", file.count or 0, (), self._table.hash, now, ()), now)
             return
         self.file = None
-        self._held_before += file.held_up
+        self._held_before += file.queue_time
         is_over = self._is_file_check or (self.check is not None and file.is_in_use and not self.download)
         if file.error is not None and (is_over or isinstance(file.error, LinkError)):
             self.fail(file.error, now)
@@ -577,7 +577,7 @@ class Fetch(Operation[FetchResult]):
         else:
             self._begin_download(now)
 
-    def _hash_came_after_file(self, file: PackFetch, read: Read) -> None:
+    def _hash_came_after_file(self, file: FileDownload, read: Read) -> None:
         """Settle the hash: the file is the vehicle's table at one moment, the hash may belong to a later
         one."""
         after = Announcement.answering(read)
@@ -598,7 +598,7 @@ class Fetch(Operation[FetchResult]):
         note = NOT_ASKED if self._policy is Policy.CACHE_ONLY else NOT_CONFIRMED
         self.finish(self._result("cache", count, missing, None, now, (note,)), now)
 
-    def _download_ended(self, download: Download) -> None:
+    def _download_ended(self, download: ListDownload) -> None:
         if self.download is not download:
             return
         file = self.file
@@ -609,7 +609,7 @@ class Fetch(Operation[FetchResult]):
                 self.fail(download.error, download.ended_at)
             return
         if file is not None and not file.done:
-            self._file_was_silent = file.is_silent and self._open_retries.is_hopeless(file.attempts)
+            self._file_was_silent = file.is_silent and self._open_retries.should_give_up(file.attempts)
             if self._file_was_silent and not self._was_in_use:
                 self._notes += (NO_FILE.format(file.silence(download.ended_at)),)
             self._drop_file(download.ended_at)
@@ -625,27 +625,29 @@ class Fetch(Operation[FetchResult]):
         else:
             self._settle(download, None, now)
 
-    def _asks_for_repeated(self, download: Download) -> bool:
+    def _asks_for_repeated(self, download: ListDownload) -> bool:
         """Return whether reads of repeated names are still open."""
         if self._repeated is None:
             names = repeated_names(download.names)
             if not (names or self._table.passed_over):
                 return False
-            self._repeated = Repeated(names, self._context.retry, self._reads, self._table, download.ended_at)
+            self._repeated = DuplicateNameReads(
+                names, self._context.retry, self._reads, self._table, download.ended_at
+            )
             self._repeated.on_done.append(partial(self._download_ended, download))
         return not self._repeated.done
 
-    def _is_proven(self, download: Download) -> bool:
+    def _is_proven(self, download: ListDownload) -> bool:
         """Return whether a hash announced during the download proves the table."""
         if download.missing or not download.is_settled:
             return False
         self._remove_what_is_gone(download)
         return self._proof.is_given(download.count or 0)
 
-    def _remove_what_is_gone(self, download: Download) -> None:
+    def _remove_what_is_gone(self, download: ListDownload) -> None:
         self._means.changed(self._table.settle(download.names))
 
-    def _settle(self, download: Download, read: Read | None, now: float) -> None:
+    def _settle(self, download: ListDownload, read: Read | None, now: float) -> None:
         """End the fetch: the download is over and the hash, if there is one, is known."""
         after = None if read is None else Announcement.answering(read)
         notes: tuple[str, ...] = ()
@@ -666,7 +668,7 @@ class Fetch(Operation[FetchResult]):
             notes += judged
         self._finish_download(download, now, notes)
 
-    def _finish_download(self, download: Download, now: float, notes: tuple[str, ...]) -> None:
+    def _finish_download(self, download: ListDownload, now: float, notes: tuple[str, ...]) -> None:
         count = download.count or 0
         missing = download.missing
         table = self._table
@@ -684,7 +686,7 @@ class Fetch(Operation[FetchResult]):
             notes += (FILE_IN_USE,)
         if download.resumed and table.hash is None:
             earlier = table.only_cached
-            notes += (FROM_MEMORY.format(earlier),) if earlier else ()
+            notes += (CACHED_UNVERIFIED.format(earlier),) if earlier else ()
         self.finish(
             self._result("stream", count, missing, table.hash if not missing else None, now, notes), now
         )
@@ -746,7 +748,7 @@ class Fetch(Operation[FetchResult]):
         self._drop_list_pace()
         file, self.file = self.file, None
         if file is not None:
-            self._held_before += file.held_for(now)
+            self._held_before += file.queue_wait(now)
             file.cancel(now, is_served=is_served)
 
     def _drop_download(self) -> None:

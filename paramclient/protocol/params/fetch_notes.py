@@ -4,7 +4,7 @@ from __future__ import annotations
 
 __all__ = [
     "FILE_IN_USE",
-    "FROM_MEMORY",
+    "CACHED_UNVERIFIED",
     "LEFT_OUT",
     "MOVED",
     "NOT_ASKED",
@@ -14,7 +14,7 @@ __all__ = [
     "NOT_SAMPLED",
     "NO_FILE",
     "SAMPLED",
-    "UNBRACKETED",
+    "NO_HASH_BEFORE_DOWNLOAD",
     "UNPROVEN",
     "UNSETTLED",
 ]
@@ -25,7 +25,7 @@ UNPROVEN = (
 )
 LEFT_OUT = "Skipped {!r}{}: no parameter file can contain this name."
 MOVED = "The table changed during the download and has no hash: the next session downloads it again."
-UNBRACKETED = (
+NO_HASH_BEFORE_DOWNLOAD = (
     "No hash was received before the download, and the parameters that this firmware excludes from it are "
     "not verified: the table has no hash, and the next session downloads it again."
 )
@@ -47,7 +47,7 @@ NOT_RESUMED = (
     "The vehicle's hash does not match the values of an earlier download: "
     "the whole table was downloaded again."
 )
-FROM_MEMORY = (
+CACHED_UNVERIFIED = (
     "{} values are from an earlier session: this vehicle has no hash to verify them. "
     "A fetch with refresh=True reads them again."
 )

@@ -8,10 +8,10 @@ from functools import partial
 from typing import Final
 
 from paramclient.protocol.params.fetch import Check, Fetch
-from paramclient.protocol.params.fetch_result import FetchResult, Means, Policy, Sampled
-from paramclient.protocol.params.passive import Overheard, Overhearing
-from paramclient.protocol.params.sync import Sync, Upkeep
-from paramclient.protocol.params.sync_interval import CheckPace
+from paramclient.protocol.params.fetch_result import FetchContext, FetchResult, Policy, Sampled
+from paramclient.protocol.params.passive import PassiveFetch, PassiveTable
+from paramclient.protocol.params.sync import Sync, SyncSettings
+from paramclient.protocol.params.sync_interval import SyncInterval
 from paramclient.protocol.requests.machine import Machine
 
 __all__ = ["Fetches"]
@@ -40,10 +40,10 @@ class Fetches(Machine):
 
     def __init__(
         self,
-        means: Means,
+        means: FetchContext,
         sync: Sync,
-        upkeep: Upkeep,
-        check_pace: CheckPace,
+        upkeep: SyncSettings,
+        check_pace: SyncInterval,
         *,
         ended: Callable[[FetchResult], None],
     ) -> None:
@@ -54,9 +54,9 @@ class Fetches(Machine):
         self._means = means
         self._sync = sync
         self._policy = upkeep.policy
-        self.overheard: Overheard | None = None
+        self.overheard: PassiveTable | None = None
         if upkeep.listens_only:
-            self.overheard = Overheard(means, sync, whole=self._passive_ended, is_log=upkeep.is_log)
+            self.overheard = PassiveTable(means, sync, whole=self._passive_ended, is_log=upkeep.is_log)
         self._ended = ended
         self._check_pace = check_pace
         self._begun_anew_at = -math.inf  # of the last fetch
@@ -111,7 +111,7 @@ class Fetches(Machine):
             fetch.restart(now)
         may_sample = self.is_same_firmware and self._policy is Policy.AUTO and not self._sync.is_doubted
         if fetch is None and self.overheard is not None:
-            fetch = self.current = Overhearing(self._means, self.overheard, now)
+            fetch = self.current = PassiveFetch(self._means, self.overheard, now)
             if fetch.done:
                 self._overhearing_ended(fetch)
             else:
@@ -210,7 +210,7 @@ class Fetches(Machine):
         self.interrupt(now)
         if self.overheard is not None:
             self.overheard.is_over = True
-        if isinstance(self.current, Overhearing):
+        if isinstance(self.current, PassiveFetch):
             self.current.over(now)
 
     def _passive_ended(self, result: FetchResult, now: float) -> None:
@@ -218,7 +218,7 @@ class Fetches(Machine):
         self.last = result
         if self._sync.fetched(result, now):
             self._ended(result)
-        if isinstance(self.current, Overhearing):
+        if isinstance(self.current, PassiveFetch):
             self.current.came(result, now)
 
     def _overhearing_ended(self, fetch: Fetch) -> None:
@@ -236,6 +236,6 @@ class Fetches(Machine):
         if result is None:
             return
         self.last = result
-        self._check_pace.fetched(result, fetch.held_up(fetch.ended_at))
+        self._check_pace.fetched(result, fetch.queue_wait(fetch.ended_at))
         if self._sync.fetched(result, fetch.ended_at):
             self._ended(result)

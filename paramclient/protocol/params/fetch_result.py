@@ -11,15 +11,15 @@ from paramclient.model.values import Param, Trust
 from paramclient.protocol.ftp import FileTransfers
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.fetch_notes import MOVED
-from paramclient.protocol.params.foreign_list import Following
+from paramclient.protocol.params.foreign_list import ForeignList
 from paramclient.protocol.params.reads import Read, Reads
 from paramclient.protocol.params.sampling import Sample
 from paramclient.protocol.params.table import Table
 from paramclient.protocol.requests.context import Context
-from paramclient.protocol.scheduler import Turns
+from paramclient.protocol.scheduler import ListAdmission
 from paramclient.protocol.wire import ParamValue
 
-__all__ = ["Announcement", "FetchResult", "Means", "Policy", "Progress", "Sampled"]
+__all__ = ["Announcement", "FetchResult", "FetchContext", "Policy", "Progress", "Sampled"]
 
 FRESH_HASH: Final = 1.0
 """Seconds for which an announced hash is used without a new request. The hash is requested when a component
@@ -42,7 +42,7 @@ class Policy(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Means:
+class FetchContext:
     """The objects of the component that a fetch uses.
 
     Attributes:
@@ -55,11 +55,11 @@ class Means:
     context: Context
     reads: Reads
     table: Table
-    turns: Turns
+    turns: ListAdmission
     files: FileTransfers
     changed: Callable[[list[Change]], None]
     doubt: Callable[[float], None]
-    following: Following
+    following: ForeignList
 
 
 @dataclass(frozen=True, slots=True)

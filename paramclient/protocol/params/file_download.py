@@ -18,10 +18,10 @@ from paramclient.protocol.params.table import Table
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.requests.retry import FILE_READS_MAX
-from paramclient.protocol.scheduler import Seen, Turns
+from paramclient.protocol.scheduler import ListAdmission, ListStatistics
 from paramclient.protocol.wire import PARAMETERS_MAX, ParamValue
 
-__all__ = ["PARAMETER_FILE", "WITH_DEFAULTS", "PackFetch"]
+__all__ = ["PARAMETER_FILE", "WITH_DEFAULTS", "FileDownload"]
 
 PARAMETER_FILE: Final = "@PARAM/param.pck"
 """The parameter file of ArduPilot 4.1 and later, and of PX4 after 1.17."""
@@ -32,7 +32,7 @@ FILE_SILENCE_TIMEOUT: Final = 2.0
 """Seconds of silence after which the file no longer delays the lists of other components."""
 
 
-class PackFetch(Operation[None]):
+class FileDownload(Operation[None]):
     """One download of the packed file into the table. Ends with the table filled, or with an error.
 
     PARAM_VALUEs may arrive meanwhile: values received since the file was requested are newer than those in
@@ -49,7 +49,7 @@ class PackFetch(Operation[None]):
         yields: whether to end at once when another station has a file open.
 
     Attributes:
-        held_up: seconds for which it has waited for its turn.
+        queue_time: seconds for which it has waited for its turn.
         is_in_use: whether it ended because another station has a file open.
         is_useless: whether the component does not have the file, or an unreadable one, which does not change
             with this firmware.
@@ -60,7 +60,7 @@ class PackFetch(Operation[None]):
     def __init__(
         self,
         files: FileTransfers,
-        turns: Turns,
+        turns: ListAdmission,
         table: Table,
         changed: Callable[[list[Change]], None],
         now: float,
@@ -84,7 +84,7 @@ class PackFetch(Operation[None]):
         self._silent_at = math.inf
         self._doubts = table.doubts
         self._asked_at = now
-        self.held_up = 0.0
+        self.queue_time = 0.0
         self.is_useless = False
         self.is_in_use = False
         self.is_unheard = False
@@ -134,29 +134,29 @@ class PackFetch(Operation[None]):
 
     def give_way(self) -> None:
         """Let a list of the same component run in parallel, as long as nothing of the file is received."""
-        self._turns.give_back(self)
+        self._turns.release(self)
 
-    def seen(self) -> Seen:
+    def seen(self) -> ListStatistics:
         """Return the statistics in messages: a burst that is repaired separately skips nothing."""
         came = 0 if self._job is None else self._job.received // DATA_SIZE_MAX
-        return Seen(came, came, 0.0, False)
+        return ListStatistics(came, came, 0.0, False)
 
     def begin(self, now: float) -> None:
         """Begin: it is this file's turn."""
         if self._waits_since is not None:
-            self.held_up += now - self._waits_since
+            self.queue_time += now - self._waits_since
             self._waits_since = None
         self._read(now)
 
-    def held_for(self, now: float) -> float:
+    def queue_wait(self, now: float) -> float:
         """Return the seconds for which it has waited for its turn."""
-        return self.held_up + (0.0 if self._waits_since is None else now - self._waits_since)
+        return self.queue_time + (0.0 if self._waits_since is None else now - self._waits_since)
 
     def progress(self, now: float) -> Progress:
         """Return the progress by the share of the file, whose size the vehicle reports."""
         job, total = self._job, self.count or self._table.count
         share = min(job.received / job.size, 1.0) if job is not None and job.size else float(self.done)
-        received, running = int(share * (total or 0)), now - self.begun_at - self.held_for(now)
+        received, running = int(share * (total or 0)), now - self.begun_at - self.queue_wait(now)
         left = running * (1 - share) / share if share else None
         return Progress(received, total, received / running if running > 0 else 0.0, left)
 
@@ -182,7 +182,7 @@ class PackFetch(Operation[None]):
     def cancel(self, now: float, *, is_served: bool = True) -> None:
         """Cancel the download; the file is closed on board, where the component serves files."""
         job, self._job = self._job, None
-        self._turns.give_back(self)
+        self._turns.release(self)
         if job is not None:
             self._files.release(job, now, is_served=is_served)
 
@@ -232,7 +232,7 @@ class PackFetch(Operation[None]):
         except PackError as error:
             self._is_none(error, now, is_useless=True)
             return
-        self._turns.give_back(self)
+        self._turns.release(self)
         self._fill(pack)
         self.finish(None, now)
 
@@ -240,7 +240,7 @@ class PackFetch(Operation[None]):
         if isinstance(error, FileTransferError):
             self.is_useless = error.is_not_found or error.code == FileErrorCode.UNKNOWN_COMMAND
             self.is_in_use = error.code in BUSY
-        self._turns.give_back(self)
+        self._turns.release(self)
         self.fail(error, now)
 
     def _is_none(self, error: PackError, now: float, *, is_useless: bool = False) -> None:
@@ -249,7 +249,7 @@ class PackFetch(Operation[None]):
             self._read(now)
             return
         self.is_useless = is_useless
-        self._turns.give_back(self)
+        self._turns.release(self)
         self.fail(error, now)
 
     def _fill(self, pack: Pack) -> None:

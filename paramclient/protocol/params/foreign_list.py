@@ -11,7 +11,7 @@ from paramclient.protocol.params.reads import Reads
 from paramclient.protocol.requests.retry import QUIET_GAPS, STREAM_PAUSE_MAX
 from paramclient.protocol.wire import NO_INDEX, ParamValue
 
-__all__ = ["Following"]
+__all__ = ["ForeignList"]
 
 LIST_VALUES_MIN: Final = 10
 """Values by rising index that make a list: PX4 pushes up to a few changed parameters with their index, and
@@ -21,7 +21,7 @@ HEARD_SHARE_MIN: Final = 0.5
 once, PX4 pushes these by rising index too: 200 of 905."""
 
 
-class Following:
+class ForeignList:
     """Follows received values while no list of ours runs."""
 
     __slots__ = ("_began_at", "_count", "_front", "_heard_at", "_longest", "_names")

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from paramclient.protocol.params.fetch_notes import MOVED, UNBRACKETED, UNPROVEN
+from paramclient.protocol.params.fetch_notes import MOVED, NO_HASH_BEFORE_DOWNLOAD, UNPROVEN
 from paramclient.protocol.params.fetch_result import Announcement
 from paramclient.protocol.params.hash_exclusions import find_volatile
 from paramclient.protocol.params.table import Table
 
-__all__ = ["Proof"]
+__all__ = ["HashCheck"]
 
 
-class Proof:
+class HashCheck:
     """The hashes announced during one fetch, and what they prove.
 
     A table is the vehicle's when the hash recomputed from it equals an announced one; or when the vehicle
@@ -69,7 +69,7 @@ class Proof:
         if is_proven or (self.before is not None and self.before.hash == after.hash):
             self._confirm(after, volatile, proven=is_proven)
             return () if is_proven else (UNPROVEN,)
-        return (UNBRACKETED,) if self.before is None else (MOVED,)
+        return (NO_HASH_BEFORE_DOWNLOAD,) if self.before is None else (MOVED,)
 
     def _confirm(self, announced: Announcement, volatile: frozenset[str], *, proven: bool) -> None:
         self._table.confirm(announced.hash, volatile, proven=proven)

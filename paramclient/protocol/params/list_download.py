@@ -21,10 +21,10 @@ from paramclient.protocol.requests.retry import (
     ListAttempts,
     ReadRetries,
 )
-from paramclient.protocol.scheduler import Seen, Turns
+from paramclient.protocol.scheduler import ListAdmission, ListStatistics
 from paramclient.protocol.wire import NO_INDEX, PARAMETERS_MAX, ParamRequestList, ParamValue
 
-__all__ = ["Download", "present_of"]
+__all__ = ["ListDownload", "present_of"]
 
 RESUME_SHARE_MIN: Final = 0.5
 """The share of the table that must be present for single reads of the missing values to be worthwhile, where
@@ -53,7 +53,7 @@ PACED_GAIN: Final = 1.3
 fast as its list."""
 
 
-class Download(Operation[None]):
+class ListDownload(Operation[None]):
     """One list download. `missing` says at its end which indices were not received.
 
     The list is sent by rising index. Skipped indices are read while the list still runs; indices ahead of it
@@ -87,7 +87,7 @@ class Download(Operation[None]):
         resumed: values present at the beginning.
         lists: requests for the list.
         gives_way: whether the gaps of the list are left to the file.
-        held_up: seconds for which it has waited for its turn; see `held_since`.
+        queue_time: seconds for which it has waited for its turn; see `held_since`.
         held_since: when the present wait began, or None.
     """
 
@@ -95,7 +95,7 @@ class Download(Operation[None]):
         self,
         context: Context,
         reads: Reads,
-        turns: Turns,
+        turns: ListAdmission,
         now: float,
         *,
         listed: bool = False,
@@ -119,7 +119,7 @@ class Download(Operation[None]):
         self.lists = 0
         self.gives_way = False
         self._is_beside_file = beside_file
-        self.held_up = 0.0
+        self.queue_time = 0.0
         self.held_since: float | None = None
         self._passes = 1
         self._empty_passes = 0
@@ -188,14 +188,14 @@ class Download(Operation[None]):
         """When the list counts as silent, while nothing of it was received."""
         return self._silent_at if self._stream.is_awaited else math.inf
 
-    def seen(self) -> Seen:
+    def seen(self) -> ListStatistics:
         """Return the statistics of the list since its request."""
         return self._stream.seen()
 
     def begin(self, now: float) -> None:
         """Begin: it is this list's turn."""
         if self.held_since is not None:
-            self.held_up += now - self.held_since
+            self.queue_time += now - self.held_since
             self.held_since = None
         self._request.patient_since = now
         is_running = self._stream.is_at_pace and now < self._quiet_at
@@ -207,9 +207,9 @@ class Download(Operation[None]):
         self._ask_for_list(now)
         self._silent_at = now + self._request.wait
 
-    def held_for(self, now: float) -> float:
+    def queue_wait(self, now: float) -> float:
         """Return the seconds for which it has waited for its turn."""
-        return self.held_up + (0.0 if self.held_since is None else now - self.held_since)
+        return self.queue_time + (0.0 if self.held_since is None else now - self.held_since)
 
     def heard(self, message: ParamValue, now: float) -> None:
         """Process a PARAM_VALUE of the component, before the reads do."""
@@ -266,7 +266,7 @@ class Download(Operation[None]):
         is_troubled = self._asked or stream.holes or self.given_up or self._empty_passes or self.resumed
         return not (is_troubled or stream.is_awaited or self.done)
 
-    def heed(self, now: float) -> None:
+    def note_list_head(self, now: float) -> None:
         """Note that the head of the list was received, so that the request is not repeated yet.
 
         Counts once for each request: heads without a list behind them must not keep a turn.
@@ -290,7 +290,7 @@ class Download(Operation[None]):
             if self._request.due_at <= now and not self.gives_way:
                 if self._turns.is_beside_others(self):
                     self._request.patient_since = now  # the vehicle may have no bandwidth to answer
-                if self._request.is_hopeless(now):
+                if self._request.should_give_up(now):
                     self._end_unanswered(now)
                 else:
                     self._ask_for_list(now)
@@ -443,7 +443,7 @@ class Download(Operation[None]):
         self._reads.is_idle = True
         self.held_since = None
         self._reads.pace.stream_ended()
-        self._turns.give_back(self, is_cut=is_cut)
+        self._turns.release(self, is_cut=is_cut)
 
     def _start_over(self, count: int | None) -> None:
         """Start again: the count has changed, and earlier indices may mean other parameters now."""
@@ -576,7 +576,7 @@ class Download(Operation[None]):
         """Decide after an unanswered read whether to repeat it or to give it up."""
         now = read.ended_at
         if isinstance(read.error, NoReply) and read.begun_at <= self._turns.beside_others_at(self):
-            self._reads.forgive()  # the vehicle may have had no bandwidth to answer
+            self._reads.reset_timeouts()  # the vehicle may have had no bandwidth to answer
         elif not isinstance(read.error, NoReply) or self._seems_dead(index, read):
             self.given_up.add(index)
             return
@@ -624,7 +624,7 @@ class Download(Operation[None]):
         self._stream_ends()
         system, component = self._target
         what = f"the parameter list of {system}/{component}"
-        waited = now - self.begun_at - self.held_up
+        waited = now - self.begun_at - self.queue_time
         self.fail(NoReply(what, attempts=self.lists, waited=waited), now)
 
 

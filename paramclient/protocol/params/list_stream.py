@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Final
 
 from paramclient.protocol.requests.retry import LIST_REORDER_DEPTH, LIST_SILENCE_MIN, ListAttempts
-from paramclient.protocol.scheduler import Seen
+from paramclient.protocol.scheduler import ListStatistics
 
 __all__ = ["JUMP_MAX", "PACE_VALUES_MIN", "ListStream"]
 
@@ -15,7 +15,7 @@ PACE_VALUES_MIN: Final = 20
 JUMP_MAX: Final = 40
 """Indices that the list may skip at once. A longer jump counts when the next value continues from there: PX4
 pushes changed parameters, with their index, into a running list."""
-TOGETHER_TIME: Final = 0.00025
+BURST_GAP_MAX: Final = 0.00025
 """Seconds between two values, below which they count as received together."""
 BURSTY_SHARE: Final = 0.5
 """The share of values received together that makes a list one of bursts."""
@@ -89,7 +89,7 @@ class ListStream:
         gap = now - self.heard_at
         if gap > self._longest:
             self._longest = gap
-        elif gap < TOGETHER_TIME:
+        elif gap < BURST_GAP_MAX:
             self._together += 1
         self._advances += 1
         self.front = index
@@ -126,12 +126,12 @@ class ListStream:
         gap = (self._front_at - since) / (self.front - first) if self.front > first else 0.0
         return self._front_at + (last - self.front) * gap
 
-    def seen(self) -> Seen:
+    def seen(self) -> ListStatistics:
         """Return the statistics since the request."""
         if self.is_awaited:
-            return Seen(0, 0, 0.0, False)
+            return ListStatistics(0, 0, 0.0, False)
         came = self._advances - self._came_before
-        return Seen(came, self.front - self._began[0] + 1, self._longest, self.is_bursty)
+        return ListStatistics(came, self.front - self._began[0] + 1, self._longest, self.is_bursty)
 
     def measure(self) -> None:
         """Compute the pace; not done for each value."""

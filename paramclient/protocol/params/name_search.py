@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from typing import Final
 
 from paramclient.errors import NoReply
-from paramclient.protocol.params.foreign_list import Following
+from paramclient.protocol.params.foreign_list import ForeignList
 from paramclient.protocol.params.reads import KnownParams, Reads
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
@@ -71,7 +71,7 @@ class NameSearches(Machine):
         context: Context,
         reads: Reads,
         table: KnownParams,
-        following: Following,
+        following: ForeignList,
     ) -> None:
         self._target = context.target
         self._retries = NameRetries(context.retry)
@@ -151,7 +151,7 @@ class NameSearches(Machine):
             return
         search = self._searches[0]
         self._retries.control_timed_out()
-        if self._retries.is_hopeless:
+        if self._retries.should_give_up:
             self._leave(search, now)
         else:
             self._waiting.extendleft(sorted(self._window, reverse=True))

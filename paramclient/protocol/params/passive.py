@@ -9,13 +9,13 @@ from typing import Final
 from paramclient.errors import NoReply
 from paramclient.model.values import is_portable_name
 from paramclient.protocol.params.fetch import Fetch
-from paramclient.protocol.params.fetch_result import Announcement, FetchResult, Means, Policy, Progress
-from paramclient.protocol.params.hash_check import Proof
+from paramclient.protocol.params.fetch_result import Announcement, FetchContext, FetchResult, Policy, Progress
+from paramclient.protocol.params.hash_check import HashCheck
 from paramclient.protocol.params.passive_file import FileObserver, ObservedPack
 from paramclient.protocol.params.sync import Sync
 from paramclient.protocol.wire import PARAMETERS_MAX, ParamValue
 
-__all__ = ["PASSIVE_TIMEOUT", "Overheard", "Overhearing"]
+__all__ = ["PASSIVE_TIMEOUT", "PassiveTable", "PassiveFetch"]
 
 PASSIVE_TIMEOUT: Final = 20.0
 """Seconds, by default, in which another station may begin to request the list."""
@@ -24,7 +24,7 @@ LIST_PAUSE_MAX: Final = 5.0
 every 0.13 s, and a station that missed some requests them again within 1 to 2 s."""
 
 
-class Overheard:
+class PassiveTable:
     """Collects the lists of a component that other stations request, and the hashes that it announces to
     them.
 
@@ -48,7 +48,7 @@ class Overheard:
     """
 
     def __init__(
-        self, means: Means, sync: Sync, *, whole: Callable[[FetchResult, float], None], is_log: bool
+        self, means: FetchContext, sync: Sync, *, whole: Callable[[FetchResult, float], None], is_log: bool
     ) -> None:
         self.names: dict[int, str] = {}
         self.count: int | None = None
@@ -126,7 +126,7 @@ class Overheard:
         if table.count != total:
             if table.count is not None:
                 self._sync.count_moved(now)
-            table.move(total)
+            table.change_count(total)
         entries = {index: entry.name for index, entry in came.entries()}
         is_all = len(entries) == total
         names = {index: name for index, name in entries.items() if is_portable_name(name)}
@@ -160,7 +160,7 @@ class Overheard:
         self._whole(self._result(source, (), table.hash, now), now)
 
     def _is_proven(self, announcement: Announcement) -> bool:
-        proof = Proof(self._table)
+        proof = HashCheck(self._table)
         proof.before = announcement
         return proof.is_given(self._table.size)
 
@@ -186,7 +186,7 @@ class Overheard:
         )
 
 
-class Overhearing(Fetch):
+class PassiveFetch(Fetch):
     """A fetch without requests: it waits for a table from the traffic of other stations.
 
     It ends when the table is complete or confirmed, and with a partial result when the list has paused for
@@ -194,7 +194,7 @@ class Overhearing(Fetch):
     only then the last values are known.
     """
 
-    def __init__(self, means: Means, overheard: Overheard, now: float) -> None:
+    def __init__(self, means: FetchContext, overheard: PassiveTable, now: float) -> None:
         self._overheard = overheard
         super().__init__(
             means,

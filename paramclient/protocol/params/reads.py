@@ -18,7 +18,7 @@ from paramclient.errors import (
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
-from paramclient.protocol.requests.pacing import Pace, Share
+from paramclient.protocol.requests.pacing import LinkBandwidth, Pace
 from paramclient.protocol.requests.retry import ReadAttempts, ReadRetries, RetryPolicy
 from paramclient.protocol.wire import PARAMETERS_MAX, ParamError, ParamRequestRead, ParamValue
 
@@ -101,7 +101,7 @@ class Reads(Machine):
         self,
         context: Context,
         table: KnownParams,
-        share: Share | None = None,
+        share: LinkBandwidth | None = None,
     ) -> None:
         self._target = context.target
         self._policy = context.retry
@@ -113,10 +113,10 @@ class Reads(Machine):
         self.asked = self.retries = 0
         self.pace = Pace(context.round_trip, share)
         self._open: dict[Key, Read] = {}
-        self._flying: dict[Key, Read] = {}
+        self._in_flight: dict[Key, Read] = {}
         self._again: deque[Read] = deque()
-        self._urgent: deque[Read] = deque()
-        self._patient: deque[Read] = deque()
+        self._caller_queue: deque[Read] = deque()
+        self._fetch_queue: deque[Read] = deque()
         self.answered_at = self.sent_at = -math.inf
         self.list_runs_again = False
         self.is_idle = True
@@ -147,10 +147,10 @@ class Reads(Machine):
             read = Read(key, self._policy, now)
             self.asked += 1
             self._open[key] = read
-            (self._urgent if urgent else self._patient).append(read)
-        elif urgent and read in self._patient:
-            self._patient.remove(read)
-            self._urgent.append(read)
+            (self._caller_queue if urgent else self._fetch_queue).append(read)
+        elif urgent and read in self._fetch_queue:
+            self._fetch_queue.remove(read)
+            self._caller_queue.append(read)
         read.holders += 1
         self._reschedule()
         self._send_waiting(now, may_copy=False)  # other reads may begin at the same moment
@@ -192,7 +192,7 @@ class Reads(Machine):
         """Ignore a response whose value may be older than a PARAM_SET, and request it again at `until`."""
         is_answer = False
         for key in (message.param_id, message.param_index):
-            read = self._flying.get(key)
+            read = self._in_flight.get(key)
             if read is not None and read.request.sent_at < math.inf:
                 is_answer = True
                 self._count_answer(read, now)
@@ -212,12 +212,12 @@ class Reads(Machine):
             self._retries.control_answered(now, is_answer=is_answer)
             self.answered_at = now
             if not self.list_runs_again:  # otherwise the list may have brought the value
-                self._retries.count_control(read.request for read in self._flying.values())
+                self._retries.count_control(read.request for read in self._in_flight.values())
 
     def refused(self, message: ParamError, now: float) -> None:
         """Process a PARAM_ERROR that may belong to a read."""
         key: Key = message.param_id if message.param_index < 0 else message.param_index
-        read = self._flying.get(key)
+        read = self._in_flight.get(key)
         if read is not None:
             self._count_answer(read, now)
             self._drop(read)
@@ -252,8 +252,8 @@ class Reads(Machine):
     def tick(self, now: float) -> None:
         """Repeat timed-out requests and give up reads that are out of attempts."""
         timeout = self._policy.timeout
-        for read in [read for read in self._flying.values() if self._due_at(read) <= now]:
-            if self._flying.get(read.key) is not read:
+        for read in [read for read in self._in_flight.values() if self._due_at(read) <= now]:
+            if self._in_flight.get(read.key) is not read:
                 continue  # ended by the end of another read
             if read.ask_again_at < math.inf:
                 read.ask_again_at = math.inf
@@ -261,7 +261,7 @@ class Reads(Machine):
                 continue
             may_be_in_list = self.list_runs_again and isinstance(read.key, int)
             self._retries.timed_out(read.request, tells_loss=not may_be_in_list)
-            if self._retries.is_hopeless(read.request, now, is_known=self._is_known(read.key)):
+            if self._retries.should_give_up(read.request, now, is_known=self._is_known(read.key)):
                 self._drop(read)
                 self._trace("%s/%s %s: given up after try %s", *self._target, read.key, read.attempts)
                 read.fail(self._timeout_error(read, now), now)
@@ -278,16 +278,16 @@ class Reads(Machine):
         pointless."""
         return self._retries.is_silent(now)
 
-    def forgive(self) -> None:
+    def reset_timeouts(self) -> None:
         """Reset the count of timeouts: the silence has another cause."""
-        self._retries.forgive()
+        self._retries.reset_timeouts()
 
     def next_deadline(self) -> float:
         """Return when `tick` is due, or infinity."""
         earliest = math.inf
-        if self._flying:
-            earliest = min(map(self._due_at, self._flying.values()))
-        if self._again or self._urgent or self._patient:
+        if self._in_flight:
+            earliest = min(map(self._due_at, self._in_flight.values()))
+        if self._again or self._caller_queue or self._fetch_queue:
             return min(earliest, self.pace.next_at())
         if self._copy_wanted() is not None:
             return min(earliest, self.pace.next_at(COPY_RESERVE))
@@ -297,7 +297,7 @@ class Reads(Machine):
         """Queue everything that was in flight again: the link is back."""
         self._retries.resume()
         self._again.clear()
-        for read in self._flying.values():
+        for read in self._in_flight.values():
             read.request.uncount()
             read.request.sent_at = read.ask_again_at = math.inf
             self._again.append(read)
@@ -324,7 +324,7 @@ class Reads(Machine):
 
     def _time_to_serve(self) -> float:
         """Return the seconds until a request sent now is answered, given the requests in flight."""
-        requests = [read.request for read in self._flying.values()]
+        requests = [read.request for read in self._in_flight.values()]
         in_flight = sum(1 + each.copies for each in requests if each.sent_at < math.inf)
         return self._retries.serving_time(in_flight, self.pace.quickest)
 
@@ -341,7 +341,7 @@ class Reads(Machine):
 
     def _note_response(self, now: float) -> None:
         self.answered_at = now
-        self.forgive()
+        self.reset_timeouts()
 
     def _timeout_error(self, read: Read, now: float) -> Exception:
         if self._seems_unknown(read):
@@ -361,7 +361,7 @@ class Reads(Machine):
     @property
     def _is_answered(self) -> bool:
         """Whether no request is unanswered: one more cannot make a queue."""
-        return not self._flying and self.answered_at >= self.sent_at
+        return not self._in_flight and self.answered_at >= self.sent_at
 
     def _transmit(self, read: Read, now: float, *, is_charged: bool = True) -> None:
         read.request.sent(now)
@@ -397,16 +397,16 @@ class Reads(Machine):
         A caller's read is sent regardless of the rate limit if nothing is in flight and the last request was
         answered: a caller that reads one value after the other is as fast as the vehicle.
         """
-        while self._again or self._urgent or self._patient:
-            queue = self._urgent or self._again or self._patient
+        while self._again or self._caller_queue or self._fetch_queue:
+            queue = self._caller_queue or self._again or self._fetch_queue
             if self._open.get(queue[0].key) is not queue[0]:
                 queue.popleft()
                 continue
             has_token = self.pace.may_send(now)
-            if not has_token and not (queue is self._urgent and self._is_answered):
+            if not has_token and not (queue is self._caller_queue and self._is_answered):
                 return
             read = queue.popleft()
-            self._flying[read.key] = read
+            self._in_flight[read.key] = read
             self._transmit(read, now, is_charged=has_token)
         while (
             may_copy
@@ -419,17 +419,17 @@ class Reads(Machine):
 
     def _copy_wanted(self) -> Read | None:
         """Return a read for which a copy is worthwhile while its response may be on the way."""
-        if not self.is_idle or not self._flying:
+        if not self.is_idle or not self._in_flight:
             return None
         most = self._retries.copies
         if not most:
             return None
-        fewest = min(self._flying.values(), key=lambda read: read.request.copies)
+        fewest = min(self._in_flight.values(), key=lambda read: read.request.copies)
         is_in_flight = fewest.request.sent_at < math.inf
         return fewest if fewest.request.copies < most and is_in_flight else None
 
     def _drop(self, read: Read) -> None:
         del self._open[read.key]
-        self._flying.pop(read.key, None)
+        self._in_flight.pop(read.key, None)
         if not self._open:
             self.pace.idle()

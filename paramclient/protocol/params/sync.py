@@ -15,16 +15,16 @@ from paramclient.protocol.params.change_origin import is_ours
 from paramclient.protocol.params.fetch import Check, Fetch
 from paramclient.protocol.params.fetch_result import Announcement, FetchResult, Policy
 from paramclient.protocol.params.reads import Read, Reads
-from paramclient.protocol.params.sync_interval import CheckPace
+from paramclient.protocol.params.sync_interval import SyncInterval
 from paramclient.protocol.params.table import NAMES_MAX, Table
-from paramclient.protocol.params.volatile_values import Refresh
+from paramclient.protocol.params.volatile_values import VolatileReads
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.retry import FILE_IN_USE_RETRY
 from paramclient.protocol.vehicle.presence import Presence
 from paramclient.protocol.wire import HASH_CHECK, ParamValue
 
-__all__ = ["Sync", "SyncState", "Upkeep"]
+__all__ = ["Sync", "SyncState", "SyncSettings"]
 
 WATCH_INTERVAL: Final = 30.0
 """Seconds between two checks of the hash, by default."""
@@ -71,7 +71,7 @@ class SyncState(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Upkeep:
+class SyncSettings:
     """What is done for a table without a request of the user.
 
     Attributes:
@@ -97,7 +97,7 @@ class Upkeep:
         *,
         listen_only: bool = False,
         is_log: bool = False,
-    ) -> Upkeep:
+    ) -> SyncSettings:
         """Return the upkeep for a user's choice; see `ParamClient`.
 
         Raises:
@@ -170,8 +170,8 @@ class Sync(Machine):
         context: Context,
         reads: Reads,
         table: Table,
-        upkeep: Upkeep,
-        check_pace: CheckPace,
+        upkeep: SyncSettings,
+        check_pace: SyncInterval,
         presence: Presence,
         files: FileTransfers,
         host: SyncHost,
@@ -186,7 +186,7 @@ class Sync(Machine):
         self._host = host
         self.announced: Announcement | None = None
         self.synced = False
-        self.refresh: Refresh | None = None
+        self.refresh: VolatileReads | None = None
         self.holds = 0
         self._was_synced = False  # at any time on this link: checks are for such tables only
         self._moved_by_us_alone = False
@@ -420,15 +420,15 @@ class Sync(Machine):
         self._table.doubt(Trust.VERIFIED)
 
     def _read_unhashed(self, confirmed: int, now: float, *, again: bool = False) -> None:
-        """Read the values that the hash does not cover; `again` is as in `Refresh`."""
+        """Read the values that the hash does not cover; `again` is as in `VolatileReads`."""
         if self._upkeep.policy is not Policy.AUTO:
             return
-        refresh = Refresh(self._reads, self._table, confirmed, self._context, now, again=again)
+        refresh = VolatileReads(self._reads, self._table, confirmed, self._context, now, again=again)
         if not refresh.done:
             self.refresh = refresh
             refresh.on_done.append(partial(self._refresh_ended, refresh))
 
-    def _refresh_ended(self, refresh: Refresh) -> None:
+    def _refresh_ended(self, refresh: VolatileReads) -> None:
         took = refresh.ended_at - refresh.begun_at
         self._volatile_at = refresh.ended_at + took * (1.0 / VOLATILE_SHARE - 1.0)
         if self.refresh is refresh:

@@ -10,7 +10,7 @@ from typing import Final
 
 from paramclient.protocol.params.fetch_result import FetchResult
 
-__all__ = ["CheckPace"]
+__all__ = ["SyncInterval"]
 
 FILE_SHARE: Final = 0.05
 """The share of time that reads of the parameter file may take when no interval was chosen: 1.5 s of 30 s."""
@@ -28,7 +28,7 @@ UNCONFIRMED_INTERVALS: Final = 4
 """Intervals until the next check, at most, while only one fetch was measured: it may have been a slow one."""
 
 
-class CheckPace:
+class SyncInterval:
     """Computes the interval of checks from the duration of the last fetches.
 
     Without a chosen interval only the parameter file is read, of vehicles that have served it or say that
@@ -80,7 +80,7 @@ class CheckPace:
         """Seconds from one response with the hash to the next request, early enough for a fetch after it to
         end within the interval, where that takes only a small share of it."""
         times = self._times.get("ftp") or self._times.get("stream") or (0.0,)
-        return self._aim - min(median_low(times), FILE_SHARE * self._interval)
+        return self._target_interval - min(median_low(times), FILE_SHARE * self._interval)
 
     def interval(self, *, may_use_file: bool) -> float:
         """Return the seconds from the start of one check to the next, so that it ends within the interval.
@@ -98,10 +98,10 @@ class CheckPace:
         """Return the interval less the duration of a check, or longer, to stay within that share of time."""
         times, took = self._last_times, self._time
         longest = UNCONFIRMED_INTERVALS * self._interval if len(times) == 1 else math.inf
-        return max(self._aim - took, min(took / share, longest))
+        return max(self._target_interval - took, min(took / share, longest))
 
     @property
-    def _aim(self) -> float:
+    def _target_interval(self) -> float:
         """Seconds from one check to the next within which the next one should end."""
         return self._interval * (1.0 - RESERVE_SHARE)
 

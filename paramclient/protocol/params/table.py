@@ -10,10 +10,10 @@ from typing import Final, NamedTuple
 
 from paramclient.model.params import (
     CACHED,
+    COMPACT_NO_INDEX,
     LIVE,
-    NOWHERE,
     VERIFIED,
-    Held,
+    CompactParam,
     Params,
     as_params,
     is_listed,
@@ -44,7 +44,7 @@ from paramclient.protocol.params.change_origin import is_ours
 from paramclient.protocol.params.hash_exclusions import hash_of
 from paramclient.protocol.wire import NO_INDEX, PARAMETERS_MAX, ParamValue
 
-__all__ = ["NAMES_MAX", "Observation", "Room", "Table"]
+__all__ = ["NAMES_MAX", "Observation", "NameQuota", "Table"]
 
 NAMES_MAX: Final = 65_535
 """Names in one table: as many as there are indices, and as many again without an index (parameters not in
@@ -66,7 +66,7 @@ _EXACT = 1 << 24  # every integer up to here is a float32
 _new = tuple.__new__  # the constructor of a tuple ends in this call and takes several times as long
 
 
-class Room:
+class NameQuota:
     """The number of names in the tables of one link.
 
     Attributes:
@@ -78,7 +78,7 @@ class Room:
     def __init__(self) -> None:
         self.taken = 0
 
-    def has_some(self, held: int) -> bool:
+    def has_capacity(self, held: int) -> bool:
         """Return whether a table with this many names may add one."""
         return held < NAMES_MAX and (held < NAMES_GUARANTEED or self.taken < LINK_NAMES_MAX)
 
@@ -130,8 +130,8 @@ class Table:
             or replaced, and the first observation of a changed value that was received again.
     """
 
-    def __init__(self, encoding: Encoding = Encoding.BYTEWISE, room: Room | None = None) -> None:
-        self._room = Room() if room is None else room
+    def __init__(self, encoding: Encoding = Encoding.BYTEWISE, room: NameQuota | None = None) -> None:
+        self._room = NameQuota() if room is None else room
         self.params = Params()
         self._held = self.params.held
         self._defaults = self.params.defaults
@@ -199,7 +199,7 @@ class Table:
         """Mark the hash as stale, so that the next access recomputes it."""
         self._hash_is_stale = self._hash is not None
 
-    def hear(
+    def store_value(
         self, message: ParamValue, by: str, moment: float = 0.0, *, is_exact: bool = False
     ) -> Change | None:
         """Store one PARAM_VALUE and return the change, if there is one (a first value is one).
@@ -222,10 +222,10 @@ class Table:
         self._latest = moment
         if old is None:  # fast path for a first value
             room = self._room
-            if not room.has_some(len(everything)):
+            if not room.has_capacity(len(everything)):
                 return None
             room.taken += 1
-            place = NOWHERE if given >= count or count > PARAMETERS_MAX else given
+            place = COMPACT_NO_INDEX if given >= count or count > PARAMETERS_MAX else given
             bits, is_raw = bits_of_wire(raw, number, self._encoding)
             new = everything[name] = pack_fields(bits, number, is_raw, LIVE, place)
             self._wire[name] = raw
@@ -267,13 +267,13 @@ class Table:
             self.dirty.setdefault(name, "vehicle")
 
     def _update(
-        self, name: str, old: Held, message: ParamValue, by: str, moment: float, *, is_exact: bool
+        self, name: str, old: CompactParam, message: ParamValue, by: str, moment: float, *, is_exact: bool
     ) -> Change | None:
         """Store a PARAM_VALUE of a known parameter."""
         _, raw, number, count, given = message
         old_bits, old_number, old_is_raw, _, place = unpack_fields(old)
         if given != NO_INDEX:
-            place = NOWHERE if given >= count or count > PARAMETERS_MAX else given
+            place = COMPACT_NO_INDEX if given >= count or count > PARAMETERS_MAX else given
         seen_at = self._moments.get(name, moment)
         self._moments[name] = moment
         is_same_type = old_number == number
@@ -299,7 +299,7 @@ class Table:
             self._invalidate_hash(name)
         return _new(Change, (name, old, new, by, self._defaults.get(name), before))
 
-    def take(
+    def store_file_entry(
         self,
         name: str,
         number: int,
@@ -325,7 +325,7 @@ class Table:
         initial = None if default is None else from_bits(default, number)
         old = self._held.get(name)
         if old is None:
-            if not self._room.has_some(len(self._held)):
+            if not self._room.has_capacity(len(self._held)):
                 return None
             self._room.taken += 1
         raw = as_sent(bits, number, self._encoding)
@@ -362,7 +362,7 @@ class Table:
         Args:
             pack: the file, or a part of it.
             moment: when it was requested.
-            newer: names with a PARAM_VALUE received since the file was requested, as in `take`.
+            newer: names with a PARAM_VALUE received since the file was requested, as in `store_file_entry`.
             start: the index of the first entry.
         """
         changes = []
@@ -372,7 +372,7 @@ class Table:
                 continue
             if default is None and pack.with_defaults:
                 default = bits  # the file has only defaults that differ from the value
-            change = self.take(name, number, bits, index, default, moment, is_older=name in newer)
+            change = self.store_file_entry(name, number, bits, index, default, moment, is_older=name in newer)
             if change is not None:
                 changes.append(change)
         return changes
@@ -467,7 +467,7 @@ class Table:
             if old is not None:
                 if unpack_fields(old)[1] == unpack_fields(cached)[1] and name not in self._filed:
                     changes += self._merge_cached(name, old, cached, default)
-            elif is_portable_name(name) and self._room.has_some(len(self._held)):
+            elif is_portable_name(name) and self._room.has_capacity(len(self._held)):
                 self._room.taken += 1
                 new = with_trust_number(cached, CACHED)
                 if not are_placed and is_listed(new):
@@ -505,7 +505,7 @@ class Table:
             changes.append(_new(Change, (name, old, new, "vehicle", self._defaults.get(name), before)))
         return changes
 
-    def move(self, count: int) -> None:
+    def change_count(self, count: int) -> None:
         """Take a changed count: all indices become invalid."""
         if self.count is not None:
             self._was_complete |= self.complete
@@ -553,7 +553,7 @@ class Table:
         twice = set()
         for name, held in self._held.items():
             index = unpack_fields(held)[4]
-            if index != NOWHERE and names.setdefault(index, name) != name:
+            if index != COMPACT_NO_INDEX and names.setdefault(index, name) != name:
                 twice.add(index)
         count = self.count or 0
         return {index: name for index, name in names.items() if index < count and index not in twice}
@@ -633,7 +633,7 @@ class Table:
     def gaps(self) -> tuple[int, tuple[int, ...]]:
         """Return the number of parameters that the table should have, and the missing indices."""
         present = {unpack_fields(held)[4] for held in self._held.values()}
-        present.discard(NOWHERE)
+        present.discard(COMPACT_NO_INDEX)
         count = len(present) if self.count is None else self.count
         return count, tuple(index for index in range(count) if index not in present)
 
@@ -664,7 +664,7 @@ class Table:
         """When each value changed since the last `take_overwritten`, and the author of the change."""
         return self._changed.copy()
 
-    def give_back(
+    def restore_unwritten(
         self,
         dirty: Mapping[str, str],
         overwritten: Sequence[Observation],
@@ -702,7 +702,7 @@ class Table:
         """Move every moment back by time that the core's clock has left out.
 
         Args:
-            seconds: of system suspend, see `Station.stood_still`.
+            seconds: of system suspend, see `Station.handle_suspend`.
         """
         if not seconds:
             return
@@ -739,12 +739,12 @@ class Table:
         else:
             self._defaults[name] = default
 
-    def _change(self, name: str, old: Held | None, new: Held) -> Change:
+    def _change(self, name: str, old: CompactParam | None, new: CompactParam) -> Change:
         default = self._defaults.get(name)
         return _new(Change, (name, old, new, "vehicle", default, default))
 
     def _record_change(
-        self, name: str, old: Held | None, by: str, default: Value | None, seen_at: float
+        self, name: str, old: CompactParam | None, by: str, default: Value | None, seen_at: float
     ) -> None:
         """Record that a value has changed, at the moment that the table already has for it.
 
@@ -768,7 +768,9 @@ class Table:
             self._changed[name] = (self._moments[name], by)
         self.dirty[name] = by
 
-    def _merge_cached(self, name: str, heard: Held, cached: Held, default: Value | None) -> list[Change]:
+    def _merge_cached(
+        self, name: str, heard: CompactParam, cached: CompactParam, default: Value | None
+    ) -> list[Change]:
         """Complete a received value with what its message lacks: the default and the exact integer."""
         bits, number, is_raw, trust, place = unpack_fields(heard)
         if self._is_rounded(cached, self._wire.get(name, b"")):
@@ -782,7 +784,7 @@ class Table:
         self.dirty.setdefault(name, "vehicle")
         return [self._change(name, heard, new)]
 
-    def _is_rounded(self, known: Held, raw: bytes) -> bool:
+    def _is_rounded(self, known: CompactParam, raw: bytes) -> bool:
         """Return whether a message is a rounded form of a known integer beyond the 24 bits of a float32."""
         if self._encoding is not Encoding.C_CAST:
             return False
@@ -790,9 +792,9 @@ class Table:
         value = from_bits(bits, number, is_raw=is_raw)
         return isinstance(value, int) and abs(value) > _EXACT and as_sent(bits, number, self._encoding) == raw
 
-    def _displaced(self, name: str, held: Held) -> Held:
+    def _displaced(self, name: str, held: CompactParam) -> CompactParam:
         self.displaced.add(name)
-        return with_index(held, NOWHERE)
+        return with_index(held, COMPACT_NO_INDEX)
 
     def _invalidate_hash(self, name: str) -> None:
         if name in self.volatile:

@@ -17,7 +17,7 @@ from paramclient.protocol.wire import ParamValue
 
 __all__ = ["LATER_CHANGE_TIME", "Rereads", "ValueChecks"]
 
-DISTRUST_TIME: Final = 0.3
+AMBIGUITY_WINDOW: Final = 0.3
 """Seconds after a change in which a PARAM_VALUE with the previous value is ambiguous: ArduPilot takes the
 value of a read when it queues the response, and sends it up to 100 ms later. Jitter comes on top."""
 LATER_CHANGE_TIME: Final = 1.2
@@ -114,7 +114,7 @@ class ValueChecks:
     """The previous values of one component's parameters, and which parameters to read again, and when.
 
     The rule: a value that may be older than a change is not an observation of the present. Within
-    `DISTRUST_TIME` of a change only the previous value is ambiguous: it may have been taken before the
+    `AMBIGUITY_WINDOW` of a change only the previous value is ambiguous: it may have been taken before the
     change, or be a change back. It is ignored, and the parameter is read again at the end of that time. Every
     other value is news.
 
@@ -146,7 +146,7 @@ class ValueChecks:
         """
         values = self._replaced.pop(name, {})
         values.pop((new.param_type, new.raw), None)
-        values[number, old] = (now + DISTRUST_TIME, now - sent_at < LATE_ANSWER_TIME)
+        values[number, old] = (now + AMBIGUITY_WINDOW, now - sent_at < LATE_ANSWER_TIME)
         self._replaced[name] = values
         if len(self._replaced) > REPLACED_MAX:
             del self._replaced[next(iter(self._replaced))]

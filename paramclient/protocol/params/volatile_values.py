@@ -15,14 +15,14 @@ from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.wire import HASH_CHECK
 
-__all__ = ["Refresh"]
+__all__ = ["VolatileReads"]
 
 REFRESH_READS_MAX: Final = 16
 """Values requested at a time: more than are in flight on any link except a fast one with a long round trip.
 Each waiting read is an object, and 250 vehicles have 14,000 such values together."""
 
 
-class Refresh(Operation[None]):
+class VolatileReads(Operation[None]):
     """The reads of all values that a confirmed hash does not cover. Ends when each was answered or given up.
 
     While the volatile parameters are unknown, these are all values that were not received on this link. Then

@@ -20,20 +20,20 @@ from paramclient.model.values import (
     ParamType,
     Trust,
     Value,
-    decode,
-    encode,
+    decode_value,
+    encode_value,
     format_value,
     type_name,
 )
 from paramclient.protocol.params.change_origin import by_us
 from paramclient.protocol.params.reads import Read, Reads
+from paramclient.protocol.params.small_changes import note_on_small_change
 from paramclient.protocol.params.table import Table
-from paramclient.protocol.params.write_resolution import note_on_small_change
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.requests.retry import RetryPolicy, WriteAttempts
-from paramclient.protocol.wire import ParamError, ParamSet, ParamValue
+from paramclient.protocol.wire import ParamError, ParamSetMessage, ParamValue
 
 __all__ = ["SetResult", "Write", "Writes"]
 
@@ -246,14 +246,14 @@ class Writes(Machine):
         wanted = None if write is None else write.wanted
         if wanted is None or wanted.type != message.param_type:
             return False
-        return wanted.bits == decode(message.raw, message.param_type, self._table.encoding)[1]
+        return wanted.bits == decode_value(message.raw, message.param_type, self._table.encoding)[1]
 
     def heard(self, message: ParamValue, now: float) -> None:
         """Process a PARAM_VALUE of the component, after the table has stored it."""
         write = self._active(message.param_id)
         if write is None:
             return
-        value, bits = decode(message.raw, message.param_type, self._table.encoding)
+        value, bits = decode_value(message.raw, message.param_type, self._table.encoding)
         heard = Param(write.name, value, message.param_type, None, bits)
         if message.param_type != write.number:
             if write.was_retyped:
@@ -311,7 +311,7 @@ class Writes(Machine):
                 self._read(write, now)
             elif write in overdue and self._awaits_answer(write) and not write.is_answered:
                 write.request.timed_out()
-                if write.request.is_hopeless(now):
+                if write.request.should_give_up(now):
                     # reads in between have shown that nothing was applied
                     self._fail(write, self._not_applied(write, self._params[write.name]), now)
                     continue
@@ -392,12 +392,12 @@ class Writes(Machine):
             return
         encoding = self._table.encoding
         try:
-            raw = encode(write.value, write.number, encoding)
+            raw = encode_value(write.value, write.number, encoding)
         except UsageError as error:
             # something was sent before, and the vehicle has turned out to be a different one
             self._fail(write, self._type_mismatch(write, str(error)) if write.was_retyped else error, now)
             return
-        value, bits = decode(raw, write.number, encoding)
+        value, bits = decode_value(raw, write.number, encoding)
         try:
             self.check_finite(write.name, value, force=write.is_forced)
         except UsageError as error:
@@ -408,7 +408,7 @@ class Writes(Machine):
         self.retries += write.attempts > 1
         write.is_answered = False
         write.verify_at = math.inf
-        self._send(ParamSet(*self._target, write.name, raw, write.number))
+        self._send(ParamSetMessage(*self._target, write.name, raw, write.number))
 
     def _read(self, write: Write, now: float) -> None:
         """Read the vehicle's value: before the first PARAM_SET for the type, later to decide."""
@@ -436,7 +436,7 @@ class Writes(Machine):
         is_made_again = write.made is not None and write.made.same_value(actual)
         if write.is_answered and is_made_again:
             self._succeed(write, now)
-        elif write.request.is_hopeless(now):
+        elif write.request.should_give_up(now):
             self._fail(write, self._not_applied(write, actual), now)
         else:
             is_old = write.before is not None and write.before.same_value(actual)

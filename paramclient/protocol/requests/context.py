@@ -8,7 +8,7 @@ from typing import Final
 
 from paramclient.protocol.requests.retry import RetryPolicy
 from paramclient.protocol.requests.round_trip import RoundTrip
-from paramclient.protocol.stats.trace import Trace, silent
+from paramclient.protocol.stats.trace import Trace, discard
 from paramclient.protocol.wire import MAV_AUTOPILOT_ARDUPILOTMEGA, MAV_AUTOPILOT_PX4, Message
 
 __all__ = ["Context"]
@@ -49,7 +49,7 @@ class Context:
     send: Callable[[Message], None]
     own: tuple[int, int] = OWN_ADDRESS
     retry: RetryPolicy = field(default_factory=RetryPolicy)
-    trace: Trace = silent
+    trace: Trace = discard
     may_send: bool = True
     reschedule: Callable[[], None] = lambda: None
     autopilot: int | None = None

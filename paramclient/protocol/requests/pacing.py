@@ -7,7 +7,7 @@ from typing import Final
 
 from paramclient.protocol.requests.round_trip import RoundTrip
 
-__all__ = ["WRITES_MAX", "Pace", "Share", "WriteWindow"]
+__all__ = ["WRITES_MAX", "Pace", "LinkBandwidth", "WriteWindow"]
 
 FIRST_RATE: Final = 50.0
 """Requests per second before any measurement: the rate of ArduPilot, the slowest autopilot."""
@@ -58,7 +58,7 @@ WRITES_MAX: Final = 30
 within 1 ms (measured), and the buffer of a telemetry radio holds about as many."""
 
 
-class Share:
+class LinkBandwidth:
     """The rate that the reads of all components of one link may use together: a third of the link's rate.
 
     The link's rate is that of the measured lists, and the sum of those that ran in parallel. It is divided
@@ -158,9 +158,9 @@ class Pace:
         "is_batched",
     )
 
-    def __init__(self, round_trip: RoundTrip, share: Share | None = None) -> None:
+    def __init__(self, round_trip: RoundTrip, share: LinkBandwidth | None = None) -> None:
         self._round_trip = round_trip
-        self._share = Share() if share is None else share
+        self._share = LinkBandwidth() if share is None else share
         self.gap = 0.0
         self.is_batched = False
         self._likely_loss = 1.0  # of exchanges, by the losses of the list

@@ -205,7 +205,7 @@ class RetryPolicy:
         """Return whether nothing at all of the component was received for `SILENCE_MAX`."""
         return now - self.round_trip.heard_at >= SILENCE_MAX
 
-    def is_hopeless(self, attempts: int, now: float) -> bool:
+    def should_give_up(self, attempts: int, now: float) -> bool:
         """Return whether a request was repeated often enough: `tries` times, or the component is gone."""
         return attempts >= self.tries or (self.is_gone(now) and attempts >= ATTEMPTS_MIN)
 
@@ -295,9 +295,9 @@ class Attempts:
         """Record that the present attempt counts as lost."""
         self._policy.timed_out(self.count)
 
-    def is_hopeless(self, now: float) -> bool:
+    def should_give_up(self, now: float) -> bool:
         """Return whether the request is to be given up instead of repeated."""
-        return self._policy.is_hopeless(self.count, now)
+        return self._policy.should_give_up(self.count, now)
 
 
 # PARAM_SET
@@ -370,8 +370,8 @@ class CommandAttempts(Attempts):
         if self.progress_at is None:
             super().timed_out()
 
-    def is_hopeless(self, now: float) -> bool:
-        return self.progress_at is not None or super().is_hopeless(now)
+    def should_give_up(self, now: float) -> bool:
+        return self.progress_at is not None or super().should_give_up(now)
 
     def reboot_due_at(self, beat_at: float) -> float:
         """Return when a reboot command counts as lost; infinity while it may be executed.
@@ -438,7 +438,7 @@ class VersionAttempts(MessageAttempts):
         """Begin again: the identity is open."""
         self.count = 0
 
-    def insist(self, now: float) -> None:
+    def extend_requests(self, now: float) -> None:
         """Repeat the request for `DOUBT_TIME_MIN` at least."""
         self._until = now + DOUBT_TIME_MIN
 
@@ -478,7 +478,7 @@ class VersionAttempts(MessageAttempts):
         """When to request it once more after the usual number of requests."""
         return self.sent_at + LATER_REQUEST_INTERVAL
 
-    def is_hopeless(self, now: float) -> bool:
+    def should_give_up(self, now: float) -> bool:
         return self.count >= self._tries and now >= self._until
 
     @property
@@ -570,7 +570,7 @@ class ReadRetries:
         """Record a request."""
         self._silent_since = min(self._silent_since, now)
 
-    def forgive(self) -> None:
+    def reset_timeouts(self) -> None:
         """Reset the count of timeouts: there was a response, or the silence has another cause."""
         self._silences = 0
         self._silent_since = math.inf
@@ -640,7 +640,7 @@ class ReadRetries:
         is_late = now - control.sent_at > LATE_CONTROL_TIMEOUTS * control.timeout
         self._policy.answered(control.sent_at, now, control.count + is_late + is_answer)
         control.sent_at = math.inf
-        self.forgive()
+        self.reset_timeouts()
 
     def count_control(self, requests: Iterable[ReadAttempts]) -> None:
         """Count an answered control read for the requests that stayed silent meanwhile."""
@@ -652,7 +652,7 @@ class ReadRetries:
         """Return whether silence shows that there is no such parameter."""
         return request.controls >= CONTROLS_CERTAIN and not is_known
 
-    def is_hopeless(self, request: ReadAttempts, now: float, *, is_known: bool) -> bool:
+    def should_give_up(self, request: ReadAttempts, now: float, *, is_known: bool) -> bool:
         """Return whether a read is to be given up instead of repeated."""
         silent_for = now - self._silent_since
         is_mute = request.count >= ATTEMPTS_MIN and silent_for >= 2 * SILENCE_MAX
@@ -665,7 +665,7 @@ class ReadRetries:
             return True
         # half as many are enough if nothing has announced the parameter and the link serves others
         weight = 2 if self.seems_unknown(request, is_known=is_known) else 1
-        return self._policy.is_hopeless(weight * request.count, now)
+        return self._policy.should_give_up(weight * request.count, now)
 
     def is_silent(self, now: float) -> bool:
         """Return whether all requests have been unanswered for so long, and so often, that more are
@@ -751,7 +751,7 @@ class NameRetries:
         self._controls_lost += 1
 
     @property
-    def is_hopeless(self) -> bool:
+    def should_give_up(self) -> bool:
         """Whether the search is to be given up."""
         return self._controls_lost >= CONTROLS_LOST_MAX
 
@@ -879,7 +879,7 @@ class ListAttempts(Attempts):
         self.sent_at = now - self.wait
         self.patient_since = now
 
-    def is_hopeless(self, now: float) -> bool:
+    def should_give_up(self, now: float) -> bool:
         is_enough = self._policy.is_gone(now) or self.count >= LIST_ATTEMPTS_MIN
         return is_enough and now - self.patient_since >= LIST_TIMEOUT
 
@@ -1000,11 +1000,11 @@ class FileAttempts(Attempts):
         """Count anew for a request to open a file whose response is only needed to close it."""
         self.count = min(self.count, 1)
 
-    def is_hopeless(self, now: float) -> bool:
+    def should_give_up(self, now: float) -> bool:
         is_unheard = self._server.heard_at == -math.inf  # the loss of requests is unknown
         if is_unheard and self.count < UNHEARD_ATTEMPTS_MAX and not self._policy.is_gone(now):
             return False
-        return super().is_hopeless(now)
+        return super().should_give_up(now)
 
     @property
     def is_close_hopeless(self) -> bool:
@@ -1160,7 +1160,7 @@ class BlockRetries:
         """Record that a read counts as lost, after so many of its block."""
         self._policy.timed_out(attempts)
 
-    def is_hopeless(self, attempts: int, now: float, *, is_silence: bool) -> bool:
+    def should_give_up(self, attempts: int, now: float, *, is_silence: bool) -> bool:
         """Return whether to give the file up.
 
         Args:
@@ -1169,7 +1169,7 @@ class BlockRetries:
             is_silence: whether the server has answered nothing since the read. Otherwise it is there, and the
                 loss is higher than measured.
         """
-        return attempts >= ATTEMPTS_MAX or (is_silence and self._policy.is_hopeless(attempts, now))
+        return attempts >= ATTEMPTS_MAX or (is_silence and self._policy.should_give_up(attempts, now))
 
     def copies(self, came: int, lost: int) -> int:
         """Return how many early copies of one read are worthwhile.
@@ -1227,7 +1227,7 @@ class OpenRetries:
         return asked_at + max(FILE_OPEN_TIMEOUT, FILE_OPEN_TIMEOUT_FACTOR * self._policy.prompt_timeout)
 
     @staticmethod
-    def is_hopeless(attempts: int) -> bool:
+    def should_give_up(attempts: int) -> bool:
         """Return whether the component counts as one that serves no files."""
         return attempts >= UNANSWERED_OPENS_MAX
 

@@ -15,7 +15,7 @@ CERTAIN_GAP: Final = 8
 NUMBERING_TIMEOUT: Final = 5.0
 """Seconds of silence after which only a gap of `CERTAIN_GAP` counts: the sender may have started a new
 numbering, as after a reboot, or its numbers may have wrapped several times."""
-PROBATION: Final = 32
+NUMBERING_CONFIRMATION_FRAMES: Final = 32
 """Numbers without a continuation after which the numbering before a jump counts as ended."""
 NUMBERINGS_MAX: Final = 4
 """Parallel numberings: a vehicle numbers each of its links separately, and a router may merge them."""
@@ -90,7 +90,7 @@ class SequenceCheck:
                 self.lost -= other.gap
                 other.gap = 0
         over = set()
-        if numbering.span >= PROBATION:
+        if numbering.span >= NUMBERING_CONFIRMATION_FRAMES:
             before, numbering.before = numbering.before, None
             while before is not None:
                 over.add(before)

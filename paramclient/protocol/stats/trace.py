@@ -11,20 +11,20 @@ from paramclient.protocol.wire import (
     Message,
     ParamRequestList,
     ParamRequestRead,
-    ParamSet,
+    ParamSetMessage,
 )
 
-__all__ = ["Told", "Trace", "silent"]
+__all__ = ["LazyMessageText", "Trace", "discard"]
 
 Trace: TypeAlias = Callable[..., None]
 """Takes a %-format and its arguments, as `logging.Logger.debug` does."""
 
 
-def silent(text: str, *details: object) -> None:
+def discard(text: str, *details: object) -> None:
     """Discard the line."""
 
 
-class Told:
+class LazyMessageText:
     """A message as text, formatted on demand; of types not listed here, such as a key, only the type."""
 
     __slots__ = ("_message",)
@@ -38,7 +38,7 @@ class Told:
                 return f"PARAM_REQUEST_READ {name if index < 0 else index}"
             case ParamRequestList():
                 return "PARAM_REQUEST_LIST"
-            case ParamSet(param_id=name, raw=raw, param_type=number):
+            case ParamSetMessage(param_id=name, raw=raw, param_type=number):
                 return f"PARAM_SET {name} to {raw.hex()} of type {number}"
             case CommandLong(command=command, params=params):
                 return f"COMMAND_LONG {command} ({params[0]:g})"

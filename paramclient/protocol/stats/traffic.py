@@ -17,7 +17,7 @@ __all__ = ["ComponentTraffic", "MessageTraffic", "RadioStatus", "Traffic", "Traf
 RATE_WINDOW: Final = 5.0
 """Seconds over which rates and losses are measured: several heartbeats, and short enough to adjust an
 antenna."""
-SLICE: Final = 0.5
+RATE_SLICE: Final = 0.5
 """Seconds of one slice of that time."""
 RATE_TIME_MIN: Final = 1.0
 """Seconds, at least, over which a rate is computed."""
@@ -282,8 +282,8 @@ class _Source:
 
     def report(self, began: float, now: float) -> ComponentTraffic:
         system, component = self._address
-        came = self._frames.of_late(now) - self._repeated.of_late(now)
-        lost = max(self._lost.of_late(now), 0)
+        came = self._frames.recent_total(now) - self._repeated.recent_total(now)
+        lost = max(self._lost.recent_total(now), 0)
         messages = [
             MessageTraffic(message_name(number), number, each.total, each.rate(began, now))
             for number, each in self._messages.items()
@@ -325,27 +325,27 @@ class _Recently:
     def __init__(self) -> None:
         self.total = 0
         # number of the slice, sum; the garbage collector visits no tuples of numbers
-        self._slices: deque[tuple[int, int]] = deque(maxlen=round(RATE_WINDOW / SLICE))
+        self._slices: deque[tuple[int, int]] = deque(maxlen=round(RATE_WINDOW / RATE_SLICE))
 
     def add(self, now: float, amount: int) -> None:
         self.total += amount
-        number = int(now / SLICE)
+        number = int(now / RATE_SLICE)
         if self._slices and self._slices[-1][0] == number:
             amount += self._slices.pop()[1]
         self._slices.append((number, amount))
 
-    def of_late(self, now: float) -> int:
+    def recent_total(self, now: float) -> int:
         first = _first_slice(now)
         return sum(amount for number, amount in self._slices if number >= first)
 
     def rate(self, began: float, now: float) -> float:
         """Return the recent increase per second."""
-        return self.of_late(now) / max(now - max(_first_slice(now) * SLICE, began), RATE_TIME_MIN)
+        return self.recent_total(now) / max(now - max(_first_slice(now) * RATE_SLICE, began), RATE_TIME_MIN)
 
 
 def _first_slice(now: float) -> int:
     """Return the oldest slice within that time."""
-    return int(now / SLICE) - round(RATE_WINDOW / SLICE) + 1
+    return int(now / RATE_SLICE) - round(RATE_WINDOW / RATE_SLICE) + 1
 
 
 _RADIO_STATUS = struct.Struct("<HHBBBBB")

@@ -11,10 +11,10 @@ from paramclient.protocol.vehicle.commands import MessageRequests
 from paramclient.protocol.vehicle.presence import Presence
 from paramclient.protocol.wire import SYSTEM_TIME_ID
 
-__all__ = ["ClockRequests"]
+__all__ = ["BootTimeRequests"]
 
 
-class ClockRequests(Machine):
+class BootTimeRequests(Machine):
     """Requests the time since boot after the identification, and when the component may have rebooted.
 
     ArduCopter sends neither SYSTEM_TIME nor another message with a clock unless a ground station has

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
-__all__ = ["ClockSampling"]
+__all__ = ["BootTimeSampling"]
 
 SAMPLE_TIME: Final = 0.1
 """Seconds after a heartbeat in which a component's clocks are read. Messages at 10 Hz and more arrive in that
 time; without any clock the window stays open until one arrives."""
 
 
-class ClockSampling:
+class BootTimeSampling:
     """Opens a window after each heartbeat in which frames with `time_boot_ms` are decoded.
 
     An object for each telemetry frame would take a third of the time of framing. A reboot shows in any later

@@ -20,7 +20,7 @@ from paramclient.protocol.wire import (
     SystemTime,
 )
 
-__all__ = ["Claim", "Verdict", "Variants", "compare", "compare_in_turn"]
+__all__ = ["Claim", "PeerRelation", "AlternatingValues", "compare", "compare_in_turn"]
 
 BOOT_DIFFERENCE_MIN: Final = 10.0
 """Seconds between two boots that make them those of two vehicles, if one peer sends both alternately: more
@@ -46,7 +46,7 @@ VARIANTS_MAX: Final = 8
 Value = TypeVar("Value", bound=Hashable)
 
 
-class Verdict(Enum):
+class PeerRelation(Enum):
     """The relation of two claims to one address."""
 
     OPEN = "open"
@@ -54,7 +54,7 @@ class Verdict(Enum):
     OTHER = "another vehicle"
 
 
-class Variants(Generic[Value]):
+class AlternatingValues(Generic[Value]):
     """The values that a peer sends for one property, and whether they alternate.
 
     A change is no alternation: another firmware was started, or another vehicle plugged in. It is one when an
@@ -83,7 +83,7 @@ class Variants(Generic[Value]):
         """The values received within the timeout, the earliest first."""
         return [*self._earlier, *(() if self.current is None else (self.current,))]
 
-    def say(self, value: Value, now: float, timeout: float) -> bool:
+    def add(self, value: Value, now: float, timeout: float) -> bool:
         """Take a value and return whether it differs from the one before."""
         if value == self.current:
             self._at = now
@@ -115,7 +115,7 @@ class _Clock(NamedTuple):
     boot_ms: int
 
 
-class _Starts:
+class _BootTimes:
     """The boots that messages of one id imply, as far as they differ.
 
     Attributes:
@@ -128,7 +128,7 @@ class _Starts:
         self._current: float | None = None
         self.turns: list[float] = []
 
-    def tell(self, started_at: float, now: float) -> None:
+    def add(self, started_at: float, now: float) -> None:
         if self._current is not None and abs(started_at - self._current) > BOOT_DIFFERENCE_MIN:
             self.turns.append(now)
         self._current = started_at
@@ -176,13 +176,13 @@ class Claim:
     def __init__(self, peer: Peer, now: float) -> None:
         self.peer = peer
         self.first_at = self.heard_at = now
-        self.kind: Variants[tuple[int, int]] = Variants()
-        self.uid: Variants[str] = Variants()
+        self.kind: AlternatingValues[tuple[int, int]] = AlternatingValues()
+        self.uid: AlternatingValues[str] = AlternatingValues()
         self._clocks: dict[int, _Clock] = {}
-        self._starts: dict[int, _Starts] = {}
+        self._starts: dict[int, _BootTimes] = {}
         self.asks = 0
         self.asked_at = -math.inf
-        self.verdict = Verdict.OPEN
+        self.verdict = PeerRelation.OPEN
         self.heartbeat: Heartbeat | None = None
         self.version: AutopilotVersion | None = None
         self.version_at = math.inf
@@ -212,11 +212,11 @@ class Claim:
     def take(self, message: Message, now: float, timeout: float) -> None:
         """Record what a message of this peer says about the vehicle."""
         if isinstance(message, Heartbeat | HighLatency2):
-            self.kind.say((message.autopilot, message.type), now, timeout)
+            self.kind.add((message.autopilot, message.type), now, timeout)
             if isinstance(message, Heartbeat):
                 self.heartbeat = message
         elif isinstance(message, AutopilotVersion):
-            self.uid.say(hardware_id(message.uid, message.uid2) or "", now, timeout)
+            self.uid.add(hardware_id(message.uid, message.uid2) or "", now, timeout)
             self.version, self.version_at = message, now
         elif isinstance(message, SystemTime):
             self.take_clock(SYSTEM_TIME_ID, message.time_boot_ms, now)
@@ -227,7 +227,7 @@ class Claim:
         if not boot_ms or (clock is None and len(self._clocks) >= CLAIMED_CLOCKS_MAX):
             return
         started_at = now - boot_ms / 1000
-        self._starts.setdefault(message_id, _Starts()).tell(started_at, now)
+        self._starts.setdefault(message_id, _BootTimes()).add(started_at, now)
         is_same_run = (
             clock is not None
             and boot_ms + 1000 * REORDERING_TIME >= clock.boot_ms
@@ -293,7 +293,7 @@ class Claim:
         return f"{words} from {peer_in_words(self.peer)}"
 
 
-def compare(mine: Claim, other: Claim, *, is_over: bool, may_ask: bool) -> tuple[Verdict, str]:
+def compare(mine: Claim, other: Claim, *, is_over: bool, may_ask: bool) -> tuple[PeerRelation, str]:
     """Return whether two claims are of one vehicle, and their difference as text.
 
     Args:
@@ -304,27 +304,27 @@ def compare(mine: Claim, other: Claim, *, is_over: bool, may_ask: bool) -> tuple
     kinds = mine.kind.current, other.kind.current
     uids = mine.uid.current, other.uid.current
     if None not in kinds and kinds[0] != kinds[1]:
-        return Verdict.OTHER, "the autopilot or vehicle type"
+        return PeerRelation.OTHER, "the autopilot or vehicle type"
     if None not in uids and uids[0] != uids[1]:
-        return Verdict.OTHER, "the hardware id"
+        return PeerRelation.OTHER, "the hardware id"
     have_one_start = mine.has_one_start(other)
     if have_one_start is False:
-        return Verdict.OTHER, "the time since boot"
+        return PeerRelation.OTHER, "the time since boot"
     uid = uids[0] if uids[0] == uids[1] else None
     if kinds[0] == kinds[1] and uid and (have_one_start or (is_over and uid not in SHARED_UIDS)):
-        return Verdict.SAME, ""
+        return PeerRelation.SAME, ""
     if not is_over:
-        return Verdict.OPEN, ""
+        return PeerRelation.OPEN, ""
     if kinds[0] == kinds[1] and uids[0] == uids[1]:
         no_clock = not (mine.tells_clock or other.tells_clock)
         if have_one_start or (no_clock and not uid):
-            return Verdict.SAME, ""
+            return PeerRelation.SAME, ""
     if kinds[0] == kinds[1] and have_one_start and not may_ask:
-        return Verdict.SAME, ""
-    return Verdict.OTHER, "nothing that shows them to be one vehicle"
+        return PeerRelation.SAME, ""
+    return PeerRelation.OTHER, "nothing that shows them to be one vehicle"
 
 
-def compare_in_turn(mine: Claim, other: Claim, *, may_ask: bool) -> Verdict:
+def compare_in_turn(mine: Claim, other: Claim, *, may_ask: bool) -> PeerRelation:
     """Return whether a claim is of the vehicle that has sent under another one until it went silent.
 
     The vehicle may have rebooted since, so only the hardware id proves that. `OPEN` where there is none to
@@ -337,13 +337,13 @@ def compare_in_turn(mine: Claim, other: Claim, *, may_ask: bool) -> Verdict:
     """
     kinds = mine.kind.current, other.kind.current
     if None not in kinds and kinds[0] != kinds[1]:
-        return Verdict.OTHER
+        return PeerRelation.OTHER
     if mine.uid.current == other.uid.current:
-        return Verdict.SAME if mine.has_own_uid else Verdict.OPEN
+        return PeerRelation.SAME if mine.has_own_uid else PeerRelation.OPEN
     if other.uid.current is None:
         is_heard = not may_ask and kinds[0] == kinds[1] and mine.has_one_start(other)
-        return Verdict.SAME if is_heard else Verdict.OPEN
-    return Verdict.OTHER if mine.uid.current or other.uid.current else Verdict.OPEN
+        return PeerRelation.SAME if is_heard else PeerRelation.OPEN
+    return PeerRelation.OTHER if mine.uid.current or other.uid.current else PeerRelation.OPEN
 
 
 def _is_one_start(one: _Clock, another: _Clock) -> bool | None:

@@ -153,7 +153,7 @@ class Commands(Machine):
             if command.request.due_at > now:
                 continue
             command.request.timed_out()
-            if command.request.is_hopeless(now):
+            if command.request.should_give_up(now):
                 self._leave(command, now)
                 command.fail(self._no_reply(command, now), now)
             else:
@@ -311,7 +311,7 @@ class MessageRequests(Machine):
             if wanted.request.due_at > now:
                 continue
             wanted.request.timed_out()
-            if wanted.request.is_hopeless(now):
+            if wanted.request.should_give_up(now):
                 self.end(wanted)
                 system, component = self._target
                 what = f"{message_name(wanted.message_id)} of {system}/{component}"

@@ -123,7 +123,7 @@ class Identification(Machine):
         return self.vehicle_type != MAV_TYPE_GCS
 
     @property
-    def says_file(self) -> bool:
+    def claims_parameter_file(self) -> bool:
         """Whether it claims to serve files, including the packed parameter file.
 
         PX4 has claimed so since long before it had that file: 1.17 responds "file not found" (measured). An
@@ -169,7 +169,7 @@ class Identification(Machine):
         return self.encoding_is_certain and not self._context.may_be_another
 
     @property
-    def has_spoken(self) -> bool:
+    def has_response(self) -> bool:
         """Whether it has sent a heartbeat or its version, or was asked without success."""
         return self.vehicle_type is not None or self.settled
 
@@ -210,7 +210,7 @@ class Identification(Machine):
             self._was_doubted = self._was_doubted or self.settled
             self.doubted_at = now
             if self.identity.uid is not None:
-                self._attempts.insist(now)
+                self._attempts.extend_requests(now)
             self._ask(now)
 
     def forget(self, now: float) -> None:
@@ -225,7 +225,7 @@ class Identification(Machine):
         self._context.may_be_another = True
         self._was_doubted = False
         self.doubted_at = now
-        self._attempts.insist(now)
+        self._attempts.extend_requests(now)
         self._ask(now)
 
     def version(self, message: AutopilotVersion, now: float) -> bool:
@@ -312,6 +312,6 @@ class Identification(Machine):
         """Derive encoding and identity from what the component has sent."""
         context = self._context
         context.autopilot = self.autopilot
-        context.serves_file = self.says_file
+        context.serves_file = self.claims_parameter_file
         context.adds_defaults = self.adds_defaults
         self.encoding, self.encoding_reason = judge_encoding(self._chosen, self.capabilities, self.autopilot)

@@ -16,13 +16,13 @@ from paramclient.protocol.requests.retry import MessageAttempts
 from paramclient.protocol.vehicle.commands import MessageRequest, MessageRequests
 from paramclient.protocol.wire import COMPONENT_METADATA_ID, ComponentMetadata
 
-__all__ = ["DescriptionAsk", "Descriptions"]
+__all__ = ["MetadataRequest", "MetadataRequests"]
 
 NOT_SUPPORTED: Final = (CommandResult.UNSUPPORTED, CommandResult.DENIED, CommandResult.FAILED)
 """Results that mean that the protocol is not supported; other results are ignored."""
 
 
-class DescriptionAsk(Operation[ComponentMetadata | None]):
+class MetadataRequest(Operation[ComponentMetadata | None]):
     """One request for the general file; its result is None where the component has none.
 
     Attributes:
@@ -39,7 +39,7 @@ class DescriptionAsk(Operation[ComponentMetadata | None]):
         return self.request.count
 
 
-class Descriptions(Machine):
+class MetadataRequests(Machine):
     """Requests COMPONENT_METADATA of a component until it is received, refused or given up.
 
     Args:
@@ -50,7 +50,7 @@ class Descriptions(Machine):
         self._target = context.target
         self._policy = context.retry
         self._messages = messages
-        self._asks: list[DescriptionAsk] = []
+        self._asks: list[MetadataRequest] = []
         self._request: MessageRequest | None = None
 
     @property
@@ -58,7 +58,7 @@ class Descriptions(Machine):
         """Whether a response is awaited."""
         return bool(self._asks)
 
-    def ask(self, now: float) -> DescriptionAsk:
+    def ask(self, now: float) -> MetadataRequest:
         """Request the message; give the request back with `release`. Parallel requests share the response."""
         request = self._request
         if request is None:
@@ -66,11 +66,11 @@ class Descriptions(Machine):
                 COMPONENT_METADATA_ID, MessageAttempts(self._policy), now, refusals=NOT_SUPPORTED
             )
             request.on_done.append(self._ended)
-        ask = DescriptionAsk(request.request, now)
+        ask = MetadataRequest(request.request, now)
         self._asks.append(ask)
         return ask
 
-    def release(self, ask: DescriptionAsk) -> None:
+    def release(self, ask: MetadataRequest) -> None:
         """Give a request back."""
         if ask in self._asks:
             self._asks.remove(ask)
@@ -113,7 +113,7 @@ class Descriptions(Machine):
         for ask in self._end():
             ask.fail(NoReply(what, attempts=ask.attempts, waited=now - ask.begun_at), now)
 
-    def _end(self) -> list[DescriptionAsk]:
+    def _end(self) -> list[MetadataRequest]:
         """End the request and return the open asks."""
         asks, self._asks = self._asks, []
         request, self._request = self._request, None

@@ -10,7 +10,7 @@ from typing import Final, Protocol
 from paramclient.errors import ContestedAddress
 from paramclient.protocol.addresses import Peer
 from paramclient.protocol.requests.retry import PEER_RECHECKS, PEER_REQUESTS
-from paramclient.protocol.vehicle.claims import Claim, Verdict, compare, compare_in_turn
+from paramclient.protocol.vehicle.claims import Claim, PeerRelation, compare, compare_in_turn
 from paramclient.protocol.vehicle.commands import message_requests
 from paramclient.protocol.vehicle.presence import LOST_AFTER, Presence
 from paramclient.protocol.wire import (
@@ -91,7 +91,7 @@ class Host(Protocol):
         """Have clocks in telemetry read for a while."""
 
     @abstractmethod
-    def peer_moved(self, claim: Claim, now: float, verdict: Verdict) -> None:
+    def peer_moved(self, claim: Claim, now: float, verdict: PeerRelation) -> None:
         """Take another peer as the one with the address; the verdict is that of `compare_in_turn`."""
 
     @abstractmethod
@@ -152,7 +152,7 @@ class ComponentPeers:
     def is_rival(self, peer: Peer) -> bool:
         """Return whether a peer also sends for the component without being proven the same vehicle."""
         claim = self._others.get(peer)
-        return claim is not None and claim.verdict is not Verdict.SAME
+        return claim is not None and claim.verdict is not PeerRelation.SAME
 
     def takes(self, peer: Peer, now: float) -> bool:
         """Return whether to accept a message that cannot tell vehicles apart, such as PARAM_VALUE."""
@@ -192,7 +192,7 @@ class ComponentPeers:
     @property
     def wants_clocks(self) -> bool:
         """Whether clocks in telemetry may show that two peers are one vehicle."""
-        return any(claim.verdict is Verdict.OPEN for claim in self._others.values())
+        return any(claim.verdict is PeerRelation.OPEN for claim in self._others.values())
 
     def follow(self, peer: Peer) -> None:
         """Accept the messages of this peer in any case: those of ground stations do not matter."""
@@ -235,7 +235,7 @@ class ComponentPeers:
 
     @property
     def _timeout(self) -> float:
-        patience = self._host.presence.patience
+        patience = self._host.presence.heartbeat_timeout
         return patience if patience < math.inf else LOST_AFTER
 
     def _mine_or(self, peer: Peer, now: float) -> Claim:
@@ -259,7 +259,7 @@ class ComponentPeers:
 
     def _is_path(self, claim: Claim | None) -> bool:
         """Return whether to accept a message of a further peer; count it otherwise."""
-        is_known = claim is not None and (claim.verdict is Verdict.SAME or claim is self._mine)
+        is_known = claim is not None and (claim.verdict is PeerRelation.SAME or claim is self._mine)
         is_taken = is_known and self.contest is None
         self.foreign += not is_taken
         return is_taken
@@ -288,13 +288,15 @@ class ComponentPeers:
         mine = self._mine
         if mine is None:
             return ""
-        is_over = claim.verdict is Verdict.OTHER or self._is_over(claim, now)
+        is_over = claim.verdict is PeerRelation.OTHER or self._is_over(claim, now)
         claim.verdict, difference = compare(mine, claim, is_over=is_over, may_ask=self._may_ask)
         tells_nothing_else = claim.kind.current == mine.kind.current and claim.uid.current in (
             None,
             mine.uid.current,
         )
-        is_unproven = claim.verdict is Verdict.OPEN or (claim.verdict is Verdict.OTHER and tells_nothing_else)
+        is_unproven = claim.verdict is PeerRelation.OPEN or (
+            claim.verdict is PeerRelation.OTHER and tells_nothing_else
+        )
         if is_unproven and self._may_ask and now >= claim.asked_at + PEER_REQUESTS.pause_after(claim.asks):
             claim.asks += 1
             self._ask(claim, now)
@@ -302,7 +304,7 @@ class ComponentPeers:
             is_here = self.home is not NO_PEER
             if is_here and self._host.is_identified:  # otherwise ambiguous acknowledgements
                 self._request(mine, SYSTEM_TIME_ID)
-        return difference if claim.verdict is Verdict.OTHER else ""
+        return difference if claim.verdict is PeerRelation.OTHER else ""
 
     def _is_over(self, claim: Claim, now: float) -> bool:
         """Return whether everything was done to identify a further peer."""
@@ -318,7 +320,7 @@ class ComponentPeers:
         rivals = [
             each
             for each in self._others.values()
-            if each.verdict is Verdict.OTHER
+            if each.verdict is PeerRelation.OTHER
             and is_here
             and self.heard_at > each.first_at
             and not (each.is_by_satellite and mine is not None and each.kind.current == mine.kind.current)
@@ -341,7 +343,7 @@ class ComponentPeers:
                 self.speaker = self.home
                 is_same = self._began_as is not None and (
                     (mine, mine.kind.current) == self._began_as
-                    or self._in_turn(self._began_as[0], mine) is Verdict.SAME
+                    or self._in_turn(self._began_as[0], mine) is PeerRelation.SAME
                 )
                 self._host.contest_ended(mine, now, is_same=is_same)
 
@@ -364,7 +366,7 @@ class ComponentPeers:
         for claim in sorted(self._others.values(), key=_preference):
             if claim.heard_at < self.heard_at:
                 continue
-            if claim.verdict is Verdict.SAME and self.contest is None:
+            if claim.verdict is PeerRelation.SAME and self.contest is None:
                 if silence >= PATH_SILENCE:
                     self._swap(claim, now, is_proven=True)
                     return
@@ -379,7 +381,7 @@ class ComponentPeers:
         is_over = self._is_over(claim, now) and not self._host.is_restarting
         if mine is None or self.contest is not None or is_over:
             return False
-        return self._hides_id(mine, claim) and self._in_turn(mine, claim) is Verdict.OPEN
+        return self._hides_id(mine, claim) and self._in_turn(mine, claim) is PeerRelation.OPEN
 
     @staticmethod
     def _hides_id(before: Claim, claim: Claim) -> bool:
@@ -405,16 +407,16 @@ class ComponentPeers:
         assert before is not None, "it has the address"
         del self._others[claim.peer]
         if is_proven and not self.has_left:
-            before.heard_at, before.verdict = self.heard_at, Verdict.SAME
+            before.heard_at, before.verdict = self.heard_at, PeerRelation.SAME
             self._others[before.peer] = before
         for each in self._others.values():
-            each.verdict = each.verdict if is_proven else Verdict.OPEN
+            each.verdict = each.verdict if is_proven else PeerRelation.OPEN
         self._settle_at(claim)
         if is_proven or self.contest is not None:
             return
         verdict = self._in_turn(before, claim)
-        if verdict is Verdict.OPEN and self._hides_id(before, claim):
-            verdict = Verdict.OTHER  # requested without success
+        if verdict is PeerRelation.OPEN and self._hides_id(before, claim):
+            verdict = PeerRelation.OTHER  # requested without success
         self._host.peer_moved(claim, now, verdict)
 
     def _settle_at(self, claim: Claim) -> None:
@@ -423,7 +425,7 @@ class ComponentPeers:
         self.heard_at = claim.heard_at
         self.speaker = self.home if self.contest is None else NO_PEER
 
-    def _in_turn(self, before: Claim, claim: Claim) -> Verdict:
+    def _in_turn(self, before: Claim, claim: Claim) -> PeerRelation:
         return compare_in_turn(before, claim, may_ask=self._may_ask)
 
     def _ask(self, claim: Claim, now: float) -> None:
@@ -448,4 +450,4 @@ class ComponentPeers:
 
 def _preference(claim: Claim) -> tuple[bool, float]:
     """Return the sort key: proven paths first, then the latest message."""
-    return claim.verdict is not Verdict.SAME, -claim.heard_at
+    return claim.verdict is not PeerRelation.SAME, -claim.heard_at

@@ -98,7 +98,7 @@ class Presence:
         self._sequence: int | None = None
 
     @property
-    def patience(self) -> float:
+    def heartbeat_timeout(self) -> float:
         """The heartbeat timeout in seconds; infinity before the first heartbeat."""
         if self.is_high_latency:
             return LOST_AFTER_HIGH_LATENCY
@@ -239,9 +239,9 @@ class Presence:
 
     def lost_at(self) -> float:
         """Return when it will be lost without a message; infinity while it is lost."""
-        return math.inf if self.is_lost else self.heard_at + self.patience
+        return math.inf if self.is_lost else self.heard_at + self.heartbeat_timeout
 
     def was_away(self, silence: float) -> bool:
         """Return whether another vehicle may have taken its place in this many seconds."""
-        patience = self.patience
+        patience = self.heartbeat_timeout
         return silence >= (patience if patience < math.inf else LOST_AFTER)

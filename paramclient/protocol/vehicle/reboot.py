@@ -12,13 +12,13 @@ from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.requests.retry import REBOOT_IDENTITY_REQUESTS
-from paramclient.protocol.vehicle.boot_time_requests import ClockRequests
+from paramclient.protocol.vehicle.boot_time_requests import BootTimeRequests
 from paramclient.protocol.vehicle.commands import Command, Commands
 from paramclient.protocol.vehicle.identification import Identification
 from paramclient.protocol.vehicle.presence import Presence
 from paramclient.protocol.wire import MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
 
-__all__ = ["Restart", "Restarts"]
+__all__ = ["Reboot", "Reboots"]
 
 SAVING_TIME: Final = 2.5
 """Seconds from a write until the value survives a reboot: PX4 saves changed parameters up to 2 s later (its
@@ -40,7 +40,7 @@ UNOBSERVED_TIMEOUT: Final = 10.0
 without a gap, sends no clock, and no MAV_STATE_BOOT."""
 
 
-class Restarts(Machine):
+class Reboots(Machine):
     """The reboot on command of one component: at most one at a time, shared by all callers.
 
     Args:
@@ -58,14 +58,14 @@ class Restarts(Machine):
         commands: Commands,
         who: Identification,
         presence: Presence,
-        clock_requests: ClockRequests,
+        clock_requests: BootTimeRequests,
         restarted: Callable[[float], None],
     ) -> None:
-        self.current: Restart | None = None
+        self.current: Reboot | None = None
         self.saved_at = -math.inf
         self._context = context
         self._commands = commands
-        self._who = who
+        self._identification = who
         self._presence = presence
         self._clock_requests = clock_requests
         self._restarted = restarted
@@ -75,18 +75,18 @@ class Restarts(Machine):
         """Whether a reboot was commanded and is awaited."""
         return self.current is not None and not self.current.done
 
-    def begin(self, now: float, *, returns: bool) -> Restart:
+    def begin(self, now: float, *, returns: bool) -> Reboot:
         """Begin a reboot, or join the one in progress; give it back with `end`.
 
         Args:
             now: the time.
-            returns: as in `Restart`.
+            returns: as in `Reboot`.
         """
         if self.current is None or self.current.done:
-            self.current = Restart(
+            self.current = Reboot(
                 self._context,
                 self._commands,
-                self._who,
+                self._identification,
                 self._presence,
                 self.saved_at,
                 self._restarted,
@@ -97,7 +97,7 @@ class Restarts(Machine):
         self.current.waiters += 1
         return self.current
 
-    def end(self, restart: Restart, now: float) -> None:
+    def end(self, restart: Reboot, now: float) -> None:
         """Give a reboot back. The last holder ends it; whether the command takes effect is then unknown."""
         restart.waiters -= 1
         if not restart.waiters:
@@ -124,26 +124,26 @@ class Restarts(Machine):
             self.current.fail(error, now)
 
     def rebooted(self, now: float) -> None:
-        """See `Restart.rebooted`."""
+        """See `Reboot.rebooted`."""
         if self.current is not None:
             self.current.rebooted(now)
 
     def numbering_began(self, now: float) -> bool:
-        """See `Restart.numbering_began`."""
+        """See `Reboot.numbering_began`."""
         return self.current is not None and self.current.numbering_began(now)
 
-    def silent(self, silence: float, now: float) -> None:
-        """See `Restart.silent`."""
+    def silence_ended(self, silence: float, now: float) -> None:
+        """See `Reboot.silence_ended`."""
         if self.current is not None:
-            self.current.silent(silence, now)
+            self.current.silence_ended(silence, now)
 
-    def another(self, now: float) -> None:
-        """See `Restart.another`."""
+    def vehicle_replaced(self, now: float) -> None:
+        """See `Reboot.vehicle_replaced`."""
         if self.current is not None:
-            self.current.another(now)
+            self.current.vehicle_replaced(now)
 
 
-class Restart(Operation[None]):
+class Reboot(Operation[None]):
     """MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN until the same vehicle is back, or until another one is.
 
     Before it, the identity must be known, or requested without success, and all written values must be saved.
@@ -175,7 +175,7 @@ class Restart(Operation[None]):
         presence: Presence,
         saved_at: float,
         restarted: Callable[[float], None],
-        clock_requests: ClockRequests,
+        clock_requests: BootTimeRequests,
         *,
         returns: bool,
         now: float,
@@ -183,7 +183,7 @@ class Restart(Operation[None]):
         super().__init__(now)
         self._target = context.target
         self._commands = commands
-        self._who = who
+        self._identification = who
         self._presence = presence
         self._saved_at = saved_at
         self._restarted = restarted
@@ -240,7 +240,7 @@ class Restart(Operation[None]):
         self._restarted(now)
         return True
 
-    def silent(self, silence: float, now: float) -> None:
+    def silence_ended(self, silence: float, now: float) -> None:
         """Process the end of a long silence."""
         command = self._command
         if command is None or self._back_at is not None:
@@ -248,7 +248,7 @@ class Restart(Operation[None]):
         if min(silence, now - command.request.sent_at) >= self._presence.gap:
             self._heard_again_at = now
 
-    def another(self, now: float) -> None:
+    def vehicle_replaced(self, now: float) -> None:
         """End with an error: another vehicle uses the address."""
         if self._before is not None:
             self._fail_for_another(now)
@@ -271,13 +271,13 @@ class Restart(Operation[None]):
         return math.inf if self.done else self._next_step()[0]
 
     def _next_step(self) -> tuple[float, Callable[[float], None]]:
-        command, presence, who = self._command, self._presence, self._who
+        command, presence, who = self._command, self._presence, self._identification
         if command is None:
             return (self._saved_at if who.settled else math.inf), self._begin
         if self._back_at is not None:
             if presence.is_booting:
                 return math.inf, self._ask
-            if self._has_said_who(self._back_at):
+            if self._is_identified_since(self._back_at):
                 return -math.inf, self._compare
             return (math.inf if who.is_asking else self._ask_at), self._ask
         if self._clock_shows_it(command.request.sent_at):
@@ -293,7 +293,7 @@ class Restart(Operation[None]):
         return due, self._repeat
 
     def _begin(self, now: float) -> None:
-        self._before = self._who.identity
+        self._before = self._identification.identity
         self._started_before = self._presence.started_at
         self._command = command = self._commands.begin(
             MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, (1.0,), now, repeats=False
@@ -337,21 +337,21 @@ class Restart(Operation[None]):
 
     def _ask(self, now: float) -> None:
         self._ask_at = now + REBOOT_IDENTITY_REQUESTS.later
-        self._who.doubt(now)
+        self._identification.doubt(now)
 
-    def _has_said_who(self, since: float) -> bool:
+    def _is_identified_since(self, since: float) -> bool:
         assert self._before is not None
         if self._before.uid is None:
             return self._presence.beat_at >= since
-        return self._who.known_at >= since
+        return self._identification.known_at >= since
 
     def _compare(self, now: float) -> None:
         assert self._before is not None
-        if self._before.is_same_vehicle(self._who.identity):
+        if self._before.is_same_vehicle(self._identification.identity):
             self.finish(None, now)
         else:
             self._fail_for_another(now)
 
     def _fail_for_another(self, now: float) -> None:
         assert self._before is not None
-        self.fail(AnotherVehicle(*self._target, str(self._before), str(self._who.identity)), now)
+        self.fail(AnotherVehicle(*self._target, str(self._before), str(self._identification.identity)), now)

@@ -25,7 +25,7 @@ from paramclient.protocol.wire.messages import (
     ParamError,
     ParamRequestList,
     ParamRequestRead,
-    ParamSet,
+    ParamSetMessage,
     ParamValue,
     SetupSigning,
     StatusText,
@@ -140,9 +140,9 @@ def _decode_param_request_list(payload: bytes) -> ParamRequestList:
     return ParamRequestList(*_fields(_PARAM_REQUEST_LIST, payload))
 
 
-def _decode_param_set(payload: bytes) -> ParamSet:
+def _decode_param_set(payload: bytes) -> ParamSetMessage:
     raw, system, component, name, number = _fields(_PARAM_SET, payload)
-    return ParamSet(system, component, text_of(name), raw, number)
+    return ParamSetMessage(system, component, text_of(name), raw, number)
 
 
 def _decode_statustext(payload: bytes) -> StatusText:
@@ -218,7 +218,7 @@ _ENCODERS: dict[type, Callable[..., tuple[int, bytes]]] = {
         22,
         _PARAM_VALUE.pack(m.raw, m.param_count, m.param_index, _name(m.param_id), m.param_type),
     ),
-    ParamSet: lambda m: (
+    ParamSetMessage: lambda m: (
         23,
         _PARAM_SET.pack(m.raw, m.target_system, m.target_component, _name(m.param_id), m.param_type),
     ),

@@ -49,7 +49,7 @@ __all__ = [
     "ParamError",
     "ParamRequestList",
     "ParamRequestRead",
-    "ParamSet",
+    "ParamSetMessage",
     "ParamValue",
     "SetupSigning",
     "SYSTEM_TIME_ID",
@@ -167,7 +167,7 @@ class ParamValue(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class ParamSet:
+class ParamSetMessage:
     """PARAM_SET; `raw` has the 4 value bytes."""
 
     target_system: int
@@ -249,7 +249,7 @@ Message: TypeAlias = (
     | ParamRequestRead
     | ParamRequestList
     | ParamValue
-    | ParamSet
+    | ParamSetMessage
     | ParamError
     | StatusText
     | FileTransfer

@@ -2,7 +2,7 @@
 
 - `components`, `params`, `fetches`, `param_files`, `metadata`: components, parameters, fetches and jobs,
   parameter files, metadata.
-- `history`, `setup`, `events`, `system`: earlier states, set-ups, the event stream, the service itself.
+- `history`, `apply`, `events`, `system`: earlier states, set-ups, the event stream, the service itself.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Final
 from fastapi import APIRouter
 
 from paramclient.service.routes import (
+    apply,
     components,
     events,
     fetches,
@@ -19,7 +20,6 @@ from paramclient.service.routes import (
     metadata,
     param_files,
     params,
-    setup,
     system,
 )
 
@@ -31,7 +31,7 @@ ROUTERS: Final[tuple[APIRouter, ...]] = (
     params.router,
     metadata.router,
     fetches.router,
-    setup.router,
+    apply.router,
     param_files.router,
     history.router,
     events.router,

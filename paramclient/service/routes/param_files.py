@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Query, Request, Response
 
-from paramclient.documents.paramset import FormDoc, FormsDoc, UploadedDoc
+from paramclient.documents.paramset import FormatDoc, FormatsDoc, UploadedDoc
 from paramclient.errors import UsageError
 from paramclient.files import FileForm, dumps
 from paramclient.files.param_file import ENDINGS
@@ -54,9 +54,9 @@ _FILE: Final[dict[int | str, dict[str, Any]]] = {
 
 
 @router.get("/forms")
-async def forms() -> FormsDoc:
+async def forms() -> FormatsDoc:
     """Return the formats of parameter files. All can be read."""
-    return FormsDoc(forms=[FormDoc.of(form) for form in FileForm])
+    return FormatsDoc(forms=[FormatDoc.of(form) for form in FileForm])
 
 
 @router.get("/components/{system}/{component}/file", responses=_FILE, response_class=Response)

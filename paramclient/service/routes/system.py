@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fastapi import APIRouter, Request, Response
 
-from paramclient.documents.link import HealthDoc, HealthLinkDoc, LinksDoc, MeDoc
+from paramclient.documents.link import HealthDoc, HealthLinkDoc, LinksDoc, TokenHolderDoc
 from paramclient.service.metrics import METRICS_MEDIA_TYPE, metrics_text
 from paramclient.service.route_context import HubArgument, author_of
 from paramclient.version import __version__
@@ -31,10 +31,10 @@ async def metrics(hub: HubArgument) -> Response:
 
 
 @router.get("/api/v1/me")
-async def me(request: Request) -> MeDoc:
+async def me(request: Request) -> TokenHolderDoc:
     """Return name and permissions of the client."""
     state = request.scope["state"]
-    return MeDoc(
+    return TokenHolderDoc(
         name=state["name"], asker=author_of(request), role=state["role"], read_only=state["read_only"]
     )
 

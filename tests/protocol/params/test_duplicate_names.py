@@ -14,7 +14,7 @@ from paramclient.protocol.params.duplicate_names import (
     EQUAL_RESPONSES_MIN,
     RESPONSE_PAUSE,
     RESPONSES_MAX,
-    Repeated,
+    DuplicateNameReads,
     repeated_names,
 )
 from paramclient.protocol.params.sync import SyncState
@@ -126,16 +126,16 @@ def test_the_last_one_who_waits_ends_it() -> None:
     assert machine.table.passed_over == {}
 
 
-def repeated(desk: Desk, **names: tuple[int, ...]) -> tuple[Repeated, Table]:
+def repeated(desk: Desk, **names: tuple[int, ...]) -> tuple[DuplicateNameReads, Table]:
     table = Table()
-    asking = Repeated(names, RetryPolicy(), desk.reads, table, desk.now)
+    asking = DuplicateNameReads(names, RetryPolicy(), desk.reads, table, desk.now)
     assert desk.take() == []
     desk.now = asking.next_deadline()
     asking.tick(desk.now)
     return asking, table
 
 
-def answer(desk: Desk, asking: Repeated, name: str, index: int) -> None:
+def answer(desk: Desk, asking: DuplicateNameReads, name: str, index: int) -> None:
     """Answer the read, and pass the time until the next one."""
     desk.hear(name, index=index)
     if (next_at := asking.next_deadline()) < math.inf:
@@ -176,14 +176,14 @@ def test_a_name_that_is_not_answered_leaves_it_open() -> None:
     desk.pass_time()
     assert asking.done
     assert table.passed_over == {"B": {0}}
-    table.hear(param_value("B", 1.0, index=1), "vehicle")
-    assert table.hear(param_value("B", 2.0, index=0), "vehicle") is None
+    table.store_value(param_value("B", 1.0, index=1), "vehicle")
+    assert table.store_value(param_value("B", 2.0, index=0), "vehicle") is None
     assert table.params["B"].value == 1.0
 
 
 def test_the_note_names_a_few() -> None:
     names = {f"N{number}": (number, number + 100) for number in range(DUPLICATES_LISTED_MAX + 2)}
-    note = Repeated(names, RetryPolicy(), Desk().reads, Table(), 0.0).note
+    note = DuplicateNameReads(names, RetryPolicy(), Desk().reads, Table(), 0.0).note
     assert "N0 (indices 0, 100)" in note
     assert "N4 (indices 4, 104) and 2 more" in note
     assert "N5" not in note

@@ -14,7 +14,7 @@ from paramclient.model.values import Encoding, ParamType
 from paramclient.protocol.events import ComponentRebooted
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_result import FetchResult
-from paramclient.protocol.params.sync import Upkeep
+from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.station import Station
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, OtherStation, PX4Vehicle, SimParam, Vehicle
 from tests.simulation import Simulation
@@ -54,7 +54,7 @@ def world_of(
 ) -> Simulation:
     """A session with these vehicles, which have been running for a while; 50 ms there and 50 ms back."""
     air = Air.symmetric(vehicles, loss=loss, delay=0.05, others=others, seed=seed)
-    station = Station(link="sim:test", is_stream=False, upkeep=Upkeep(30.0))
+    station = Station(link="sim:test", is_stream=False, upkeep=SyncSettings(30.0))
     world = Simulation(air=air, station=station)
     world.meet()
     world.run(UPTIME - world.now)

@@ -14,7 +14,7 @@ from paramclient.protocol.events import Fetched, ParamChanged
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.fetch_result import FRESH_HASH, FetchResult
 from paramclient.protocol.params.reads import Read
-from paramclient.protocol.wire import HASH_CHECK, ParamRequestList, ParamRequestRead, ParamSet
+from paramclient.protocol.wire import HASH_CHECK, ParamRequestList, ParamRequestRead, ParamSetMessage
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam
 from paramclient.sim.param_table import Table
 from tests.simulation import Memory, Simulation, is_so, known, listing_ardupilot
@@ -177,7 +177,7 @@ def test_a_hit_costs_one_request_and_the_volatile_values() -> None:
     world.until(lambda: refresh.done)
     assert sorted(names_read(world)) == sorted([HASH_CHECK, *volatile])
     assert world.sent_of(ParamRequestList) == []
-    assert world.sent_of(ParamSet) == []
+    assert world.sent_of(ParamSetMessage) == []
     assert {world.machine.table.params[name].trust for name in volatile} == {Trust.LIVE}
     assert world.machine.refresh is None
 
@@ -844,7 +844,7 @@ def test_small_tables_on_bad_links(table: Table, loss: float, seed: int) -> None
 def test_an_ardupilot_may_first_say_whether_it_serves_the_file() -> None:
     world = Simulation(air=Air.symmetric([ArduPilotVehicle(live=())], delay=0.05))
     world.until(lambda: (1, 1) in world.station.components)
-    assert not world.machine.who.settled
+    assert not world.machine.identification.settled
     result = world.outcome(world.machine.begin_fetch(world.now))
     assert result.source == "ftp"
     assert not world.sent_of(ParamRequestList)
@@ -853,7 +853,7 @@ def test_an_ardupilot_may_first_say_whether_it_serves_the_file() -> None:
 def test_the_file_of_an_unidentified_component_is_requested() -> None:
     world = Simulation(air=Air.symmetric([ArduPilotVehicle(live=())], delay=0.05))
     world.until(lambda: (1, 1) in world.station.components)
-    world.machine.who.version = lambda message, now: False  # type: ignore[method-assign]  # as if it was lost
+    world.machine.identification.version = lambda message, now: False  # type: ignore[method-assign]  # as if it was lost
     result = world.outcome(world.machine.begin_fetch(world.now))
     assert result.source == "ftp"
     assert result.elapsed < 0.65

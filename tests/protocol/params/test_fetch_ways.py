@@ -207,7 +207,7 @@ def test_a_late_version_that_says_that_no_file_will_come_lets_the_list_begin() -
     result = session.outcome(fetch)
     assert (result.source, bits(result.params)) == ("stream", bits(vehicle.params))
     assert "file not found" in result.notes[0].lower()
-    version_at = session.machine.who.known_at
+    version_at = session.machine.identification.known_at
     assert version_at <= times_of(session, ParamRequestList)[0] < version_at + 0.01
 
 

@@ -17,7 +17,7 @@ from paramclient.protocol.events import ParamChanged, TableResynced
 from paramclient.protocol.ftp.packets import Opcode, Packet
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.file_download import PARAMETER_FILE, WITH_DEFAULTS
-from paramclient.protocol.params.sync import Upkeep
+from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.station import Station
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, GenericVehicle, PX4Vehicle
 from tests.shell import Tap, bits
@@ -564,7 +564,7 @@ def test_files_of_several_vehicles_on_a_radio_take_no_longer_than_one_after_the_
         session.until(
             lambda: (
                 len(session.station.components) == number
-                and all(machine.who.settled for machine in session.station.components.values())
+                and all(machine.identification.settled for machine in session.station.components.values())
             )
         )
         return session, vehicles
@@ -593,7 +593,7 @@ def upkept(server: Server) -> Simulation:
     session = Simulation(server)
     session.run(10.0)
     server.opened.clear()
-    session.next_session(Station(link="sim:test", is_stream=False, upkeep=Upkeep.chosen(None, "auto")))
+    session.next_session(Station(link="sim:test", is_stream=False, upkeep=SyncSettings.chosen(None, "auto")))
     return session
 
 

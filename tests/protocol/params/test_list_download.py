@@ -12,7 +12,7 @@ from paramclient.protocol.params import list_download as room
 from paramclient.protocol.params.list_download import (
     MISSING_WITHOUT_LIST_MAX,
     REQUESTED_INDICES_MAX,
-    Download,
+    ListDownload,
 )
 from paramclient.protocol.params.list_stream import JUMP_MAX
 from paramclient.protocol.params.reads import CONTROL_INDEX, Reads
@@ -30,7 +30,7 @@ from paramclient.protocol.requests.retry import (
     LIST_TIMEOUT,
     RetryPolicy,
 )
-from paramclient.protocol.scheduler import Turns
+from paramclient.protocol.scheduler import ListAdmission
 from paramclient.protocol.wire import (
     NO_INDEX,
     Message,
@@ -57,8 +57,8 @@ class Desk:
             self.retry.answered(0.0, round_trip or 0.0, 1)
         context = Context((1, 1), self.sent.append, retry=self.retry)
         self.reads = Reads(context, Table())
-        self.turns = Turns()
-        self.download = Download(context, self.reads, self.turns, 0.0, listed=listed)
+        self.turns = ListAdmission()
+        self.download = ListDownload(context, self.reads, self.turns, 0.0, listed=listed)
 
     def hear(self, index: int, *, count: int = 100, name: str | None = None) -> None:
         message = param_value(f"P{index}" if name is None else name, index=index, count=count)
@@ -145,13 +145,13 @@ def test_the_list_is_asked_for_again_as_long_as_nothing_comes() -> None:
 def test_the_head_of_the_list_shows_that_it_was_heard() -> None:
     desk = Desk(round_trip=None)
     desk.now = 0.2
-    desk.download.heed(desk.now)
+    desk.download.note_list_head(desk.now)
     desk.pass_time(FIRST_TIMEOUT - 0.01)
     assert desk.take() == ["list"]
     desk.pass_time(0.02)
     assert desk.take() == ["list"]
     desk.stream(range(100))
-    desk.download.heed(desk.now)
+    desk.download.note_list_head(desk.now)
     assert desk.download.done
     assert desk.trip.smoothed == pytest.approx(0.2)  # when the head came, not what followed it
 
@@ -159,7 +159,7 @@ def test_the_head_of_the_list_shows_that_it_was_heard() -> None:
 def test_a_slow_stream_gets_time_for_its_first_value() -> None:
     desk = Desk(round_trip=0.001)
     desk.now = 0.05
-    desk.download.heed(desk.now)
+    desk.download.note_list_head(desk.now)
     desk.pass_time(0.2)
     assert desk.take() == ["list"]
 

@@ -9,7 +9,7 @@ from functools import partial
 import pytest
 
 from paramclient.errors import LinkError, NoReply
-from paramclient.protocol.params.foreign_list import Following
+from paramclient.protocol.params.foreign_list import ForeignList
 from paramclient.protocol.params.name_search import WINDOW_SIZE, NameSearches
 from paramclient.protocol.params.reads import Reads
 from paramclient.protocol.requests.context import Context
@@ -43,7 +43,7 @@ class Desk:
         self.params: set[str] = set()
         context = Context((1, 1), self._send, retry=self.retry)
         self.reads = Reads(context, self)
-        self.searches = NameSearches(context, self.reads, self, Following())
+        self.searches = NameSearches(context, self.reads, self, ForeignList())
 
     def _send(self, message: Message) -> None:
         assert isinstance(message, ParamRequestRead)

@@ -21,7 +21,7 @@ from paramclient.protocol.ftp.packets import Opcode, Packet
 from paramclient.protocol.ftp.param_pck import PackedParam, decode, decode_prefix, encode
 from paramclient.protocol.ftp.passive import IDLE_TIMEOUT, OFFSETS_MAX, OPENINGS_MAX, PIECES_MAX, READS_MAX
 from paramclient.protocol.params.fetch_result import FetchResult
-from paramclient.protocol.params.sync import Upkeep
+from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.station import Station
 from paramclient.sim import ArduPilotVehicle, Endpoint
 from tests.recordings import DATA
@@ -552,7 +552,7 @@ def frames(log: FileLog) -> list[bytes]:
 
 
 def listening() -> Station:
-    upkeep = Upkeep.chosen(None, "auto", listen_only=True)
+    upkeep = SyncSettings.chosen(None, "auto", listen_only=True)
     return Station(link="test", is_stream=False, upkeep=upkeep)
 
 

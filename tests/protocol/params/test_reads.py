@@ -476,7 +476,7 @@ def test_earlier_timeouts_do_not_count_against_later_reads() -> None:
     desk.pass_time()
     assert all(read.done for read in gone)
     desk.now += 60.0
-    desk.reads.forgive()
+    desk.reads.reset_timeouts()
     desk.reads.is_idle = False
     read = desk.ask("A")
     desk.now = desk.reads.next_deadline()

@@ -16,7 +16,7 @@ from paramclient import Component, FetchResult, ParamCache, ParamClient, Policy,
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_result import Sampled
 from paramclient.protocol.params.sampling import SAMPLE_SIZE, Sample
-from paramclient.protocol.params.sync import Upkeep
+from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.station import Station
 from paramclient.protocol.wire import ParamRequestList, ParamRequestRead
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle
@@ -172,9 +172,9 @@ def test_another_firmware_after_a_reboot_is_not_sampled() -> None:
         vehicle._version = replace(version, git_hash=version.git_hash[::-1])
         if sampled_at == "once it is heard":
             vehicle.reboot(session.now, down=1.0)
-            session.until(lambda: machine.who.is_doubted)  # noqa: B023 - called at once
+            session.until(lambda: machine.identification.is_doubted)  # noqa: B023 - called at once
         else:
-            machine.who.ask_again(session.now)
+            machine.identification.ask_again(session.now)
         fetch = machine.begin_fetch(session.now, sampled=Sampled(SAMPLE_SIZE, 1))
         result = session.outcome(fetch)
         assert (result.source, result.sample) == ("ftp", None), sampled_at
@@ -182,7 +182,7 @@ def test_another_firmware_after_a_reboot_is_not_sampled() -> None:
 
 @pytest.mark.parametrize("policy", [Policy.HASH_ONLY, Policy.CACHE_ONLY])
 def test_a_policy_that_allows_no_reads_allows_no_sample(policy: Policy) -> None:
-    station = Station(link="sim:test", is_stream=False, upkeep=Upkeep.chosen(None, policy))
+    station = Station(link="sim:test", is_stream=False, upkeep=SyncSettings.chosen(None, policy))
     session = Simulation(generic(), station=station)
     result = session.outcome(sampled(session))
     assert (result.source, result.sample) == ("cache", None)

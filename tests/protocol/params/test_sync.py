@@ -23,7 +23,7 @@ from paramclient.protocol.events import (
 )
 from paramclient.protocol.params.fetch_result import Policy
 from paramclient.protocol.params.reads import Read
-from paramclient.protocol.params.sync import GAP_CHECK_INTERVAL, WATCH_INTERVAL, SyncState, Upkeep
+from paramclient.protocol.params.sync import GAP_CHECK_INTERVAL, WATCH_INTERVAL, SyncSettings, SyncState
 from paramclient.protocol.params.sync_interval import RESERVE_SHARE
 from paramclient.protocol.params.writes import Write
 from paramclient.protocol.requests.retry import FETCH_RESTARTS_MAX
@@ -35,7 +35,7 @@ from paramclient.protocol.wire import (
     FileTransfer,
     ParamRequestList,
     ParamRequestRead,
-    ParamSet,
+    ParamSetMessage,
 )
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam
 from tests.shell import Tap
@@ -57,9 +57,11 @@ PLAIN = {name: number for number, name in enumerate(NAMES)}
 class World(Simulation):
     """A simulation whose station keeps its tables up, with one tapped vehicle after the other."""
 
-    def __init__(self, *vehicles: Endpoint, air: Air | None = None, upkeep: Upkeep | None = None) -> None:
+    def __init__(
+        self, *vehicles: Endpoint, air: Air | None = None, upkeep: SyncSettings | None = None
+    ) -> None:
         self.taps = [Tap(vehicle) for vehicle in vehicles]
-        self.upkeep = Upkeep(INTERVAL) if upkeep is None else upkeep
+        self.upkeep = SyncSettings(INTERVAL) if upkeep is None else upkeep
         super().__init__(*self.taps, air=air, station=self.a_station())
 
     def a_station(self) -> Station:
@@ -96,11 +98,11 @@ class World(Simulation):
 
     def requests(self) -> int:
         """Everything sent that has to do with parameters."""
-        return sum(len(self.sent_of(kind)) for kind in (ParamRequestRead, ParamRequestList, ParamSet))
+        return sum(len(self.sent_of(kind)) for kind in (ParamRequestRead, ParamRequestList, ParamSetMessage))
 
 
 def fetched(
-    make: Callable[..., PX4Vehicle] = PX4Vehicle, *, upkeep: Upkeep | None = None, **options: object
+    make: Callable[..., PX4Vehicle] = PX4Vehicle, *, upkeep: SyncSettings | None = None, **options: object
 ) -> tuple[World, PX4Vehicle]:
     """A vehicle whose table was just fetched."""
     vehicle = make(table=TABLE, **options)
@@ -168,7 +170,7 @@ def test_as_long_as_nothing_moves_an_interval_costs_one_question_and_the_volatil
 
 
 def test_without_a_watch_nothing_is_asked() -> None:
-    world, vehicle = fetched(upkeep=Upkeep())
+    world, vehicle = fetched(upkeep=SyncSettings())
     world.unheard(vehicle, P07=700)
     world.away(4.0)
     world.run(500.0)
@@ -227,8 +229,8 @@ def test_a_radio_of_57600_baud_is_no_low_bandwidth_mode() -> None:
     assert world.requests() == 1 + VOLATILE
 
 
-@pytest.mark.parametrize("upkeep", [Upkeep(INTERVAL), Upkeep(INTERVAL, without_hash=True)])
-def test_a_vehicle_without_a_hash(upkeep: Upkeep) -> None:
+@pytest.mark.parametrize("upkeep", [SyncSettings(INTERVAL), SyncSettings(INTERVAL, without_hash=True)])
+def test_a_vehicle_without_a_hash(upkeep: SyncSettings) -> None:
     vehicle = ArduPilotVehicle(ftp=False, table=PLAIN)
     world = World(vehicle, upkeep=upkeep)
     world.fetch()
@@ -251,7 +253,7 @@ def test_a_vehicle_without_a_hash(upkeep: Upkeep) -> None:
 
 
 def test_gaps_bring_about_no_lists() -> None:
-    world = World(ArduPilotVehicle(ftp=False, table=PLAIN), upkeep=Upkeep(INTERVAL, without_hash=True))
+    world = World(ArduPilotVehicle(ftp=False, table=PLAIN), upkeep=SyncSettings(INTERVAL, without_hash=True))
     world.fetch()
     world.sent.clear()
     for _ in range(5):
@@ -290,7 +292,7 @@ def test_a_resync_that_fails_is_tried_again() -> None:
 
 
 def test_of_one_that_was_lost_during_its_fetch_nothing_is_asked() -> None:
-    world = World(ArduPilotVehicle(ftp=False, table=PLAIN), upkeep=Upkeep(INTERVAL, without_hash=True))
+    world = World(ArduPilotVehicle(ftp=False, table=PLAIN), upkeep=SyncSettings(INTERVAL, without_hash=True))
     world.fetch()
     fetch = world.machine.begin_fetch(world.now, refresh=True)
     world.until(lambda: fetch.progress(world.now).received > 0)
@@ -305,7 +307,7 @@ def test_of_one_that_was_lost_during_its_fetch_nothing_is_asked() -> None:
 def test_a_table_that_came_as_a_file_is_kept_up_by_its_hash_alone() -> None:
     unknown = [SimParam(row.name, row.type, row.value, volatile=row.name in NAMES[::9]) for row in TABLE]
     vehicle = PX4Vehicle(ftp=True, table=unknown)
-    world = World(air=Air.symmetric([vehicle], delay=0.05), upkeep=Upkeep(INTERVAL))
+    world = World(air=Air.symmetric([vehicle], delay=0.05), upkeep=SyncSettings(INTERVAL))
     result = world.fetch()
     assert result.source == "ftp"
     assert result.hash == vehicle.announced_hash(), "it was the same before and after"
@@ -658,7 +660,7 @@ def test_back_without_a_hash_its_values_are_cached_until_they_are_fetched() -> N
 
 
 def test_without_a_watch_it_is_checked_on_return_all_the_same() -> None:
-    world, _ = fetched(upkeep=Upkeep())
+    world, _ = fetched(upkeep=SyncSettings())
     world.away(9.0)
     world.run(2.0)
     assert state(world) is SyncState.SYNCED
@@ -778,7 +780,7 @@ def test_a_link_that_was_away_for_long_is_checked_like_a_loss() -> None:
     world.station.pause()
     world.away(9.0)
     world.station.resume(world.now)
-    assert world.machine.who.is_doubted, "it may be another vehicle by now"
+    assert world.machine.identification.is_doubted, "it may be another vehicle by now"
     assert state(world) is SyncState.CHECKING
     assert trusts(world.machine) == {Trust.CACHED}
     world.run(3.0)
@@ -876,7 +878,7 @@ def test_writes_to_a_camera_wait_for_its_vehicle() -> None:
     world = World(air=Air.symmetric([berth, camera], delay=0.2))
     world.fetch()
     eye = world.station.components[1, 100]
-    world.until(lambda: eye.who.settled)
+    world.until(lambda: eye.identification.settled)
     world.outcome(eye.read("P07", world.now))
     berth.is_mute = berth.is_deaf = True
     world.run(9.0)
@@ -951,7 +953,7 @@ def test_a_vehicle_that_never_stops_starting_again_ends_a_fetch() -> None:
 
 
 def offline(memory: Memory, vehicle: Endpoint, policy: Policy) -> World:
-    world = World(vehicle, upkeep=Upkeep(INTERVAL, policy=policy))
+    world = World(vehicle, upkeep=SyncSettings(INTERVAL, policy=policy))
     world.meet().use_cached(now=world.now, **memory)
     return world
 
@@ -989,7 +991,7 @@ def test_cache_only_sends_nothing() -> None:
 
 
 def test_cache_only_without_a_cache() -> None:
-    world = World(PX4Vehicle(table=TABLE), upkeep=Upkeep(policy=Policy.CACHE_ONLY))
+    world = World(PX4Vehicle(table=TABLE), upkeep=SyncSettings(policy=Policy.CACHE_ONLY))
     assert isinstance(world.error_of(world.fetch), CacheError)
     assert world.machine.fetch is None
     assert world.requests() == 0
@@ -1054,7 +1056,7 @@ def test_hash_only_on_return() -> None:
 @pytest.mark.parametrize("policy", [Policy.CACHE_ONLY, Policy.HASH_ONLY])
 def test_no_list_goes_to_all_components_at_once(policy: Policy) -> None:
     vehicles = [GenericVehicle(table=PLAIN, component=number) for number in (1, 2)]
-    world = World(*vehicles, upkeep=Upkeep(INTERVAL, policy=policy))
+    world = World(*vehicles, upkeep=SyncSettings(INTERVAL, policy=policy))
     world.run(10.0)
     world.station.begin_fetches(list(world.station.components.values()), world.now)
     assert world.sent_of(ParamRequestList) == []
@@ -1064,13 +1066,15 @@ def test_no_list_goes_to_all_components_at_once(policy: Policy) -> None:
 
 
 def test_what_a_users_choice_means() -> None:
-    assert Upkeep.chosen(None, "auto") == Upkeep(WATCH_INTERVAL)
-    assert Upkeep.chosen(5, Policy.AUTO) == Upkeep(5, without_hash=True)
-    assert Upkeep.chosen(0, "hash-only") == Upkeep(math.inf, without_hash=True, policy=Policy.HASH_ONLY)
+    assert SyncSettings.chosen(None, "auto") == SyncSettings(WATCH_INTERVAL)
+    assert SyncSettings.chosen(5, Policy.AUTO) == SyncSettings(5, without_hash=True)
+    assert SyncSettings.chosen(0, "hash-only") == SyncSettings(
+        math.inf, without_hash=True, policy=Policy.HASH_ONLY
+    )
     wrong: Sequence[tuple[float | None, str]] = [(0.5, "auto"), (-1, "auto"), (math.nan, "auto"), (None, "x")]
     for interval, policy in wrong:
         with pytest.raises(UsageError):
-            Upkeep.chosen(interval, policy)
+            SyncSettings.chosen(interval, policy)
 
 
 def test_a_table_that_moved_while_it_came_is_fetched_again() -> None:
@@ -1078,7 +1082,7 @@ def test_a_table_that_moved_while_it_came_is_fetched_again() -> None:
     names = ["A_LATE", "SWITCH", *list(PLAIN)[:12]]
     rows = [SimParam(name, ParamType.INT32, number) for number, name in enumerate(names)]
     vehicle = PX4Vehicle(table=rows, late_use={"SWITCH": ["A_LATE"]})
-    world = World(air=Air.symmetric([vehicle], delay=0.3), upkeep=Upkeep(INTERVAL))
+    world = World(air=Air.symmetric([vehicle], delay=0.3), upkeep=SyncSettings(INTERVAL))
     vehicle.when_listed(3, lambda: vehicle.set_param("SWITCH", 9))
     world.until(lambda: (1, 1) in world.station.components)
     fetch = world.machine.begin_fetch(world.now, refresh=True)
@@ -1092,7 +1096,7 @@ def test_a_table_that_moved_while_it_came_is_fetched_again() -> None:
 
 def test_nothing_is_begun_for_a_component_that_is_lost() -> None:
     vehicle = ArduPilotVehicle(ftp=False, table=PLAIN)
-    world = World(vehicle, upkeep=Upkeep(5.0, without_hash=True))
+    world = World(vehicle, upkeep=SyncSettings(5.0, without_hash=True))
     world.fetch()
     fetch = world.machine.begin_fetch(world.now, refresh=True)
     vehicle.reboot(world.now, down=math.inf)

@@ -14,8 +14,13 @@ from paramclient.protocol import wire
 from paramclient.protocol.ftp.packets import Opcode, Packet
 from paramclient.protocol.params.fetch import Check
 from paramclient.protocol.params.fetch_result import FetchResult
-from paramclient.protocol.params.sync import FOREIGN_CHECK_INTERVAL, FOREIGN_SETTLING_TIME, SyncState, Upkeep
-from paramclient.protocol.params.sync_interval import FETCHES_KEPT, PAUSE_MIN, CheckPace
+from paramclient.protocol.params.sync import (
+    FOREIGN_CHECK_INTERVAL,
+    FOREIGN_SETTLING_TIME,
+    SyncSettings,
+    SyncState,
+)
+from paramclient.protocol.params.sync_interval import FETCHES_KEPT, PAUSE_MIN, SyncInterval
 from paramclient.protocol.requests.retry import FILE_IN_USE_RETRY
 from paramclient.protocol.wire import CommandLong, FileTransfer, ParamRequestList, ParamRequestRead
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, SimParam, px4_table
@@ -28,7 +33,7 @@ PATH = b"@PARAM/param.pck"
 
 
 def watched(
-    vehicle: ArduPilotVehicle, *, upkeep: Upkeep | None = None, air: Air | None = None
+    vehicle: ArduPilotVehicle, *, upkeep: SyncSettings | None = None, air: Air | None = None
 ) -> tuple[World, ArduPilotVehicle]:
     """An ArduPilot whose table was just fetched, as a file where it serves one."""
     world = World(*() if air else (vehicle,), air=air, upkeep=upkeep)
@@ -140,7 +145,7 @@ def test_a_check_whose_file_does_not_come_downloads_no_list() -> None:
 
 def test_a_chosen_interval_lists_where_there_is_no_file_half_of_the_time_at_most() -> None:
     vehicle = listing_ardupilot(table=PLAIN, burst=1, period=0.08)
-    world, _ = watched(vehicle, upkeep=Upkeep(5.0, without_hash=True))
+    world, _ = watched(vehicle, upkeep=SyncSettings(5.0, without_hash=True))
     world.run(100.0)
     assert 13 <= len(world.sent_of(ParamRequestList)) <= 16, "the list takes 3.2 s"
 
@@ -161,8 +166,10 @@ def test_a_count_that_moves_all_the_time_is_followed_once_a_second() -> None:
 
 
 @pytest.mark.parametrize("is_heard", [True, False], ids=["heard", "on another link"])
-@pytest.mark.parametrize("upkeep", [Upkeep(INTERVAL), Upkeep(INTERVAL, without_hash=True)])
-def test_while_another_station_has_a_file_open_a_check_skips_its_turn(is_heard: bool, upkeep: Upkeep) -> None:
+@pytest.mark.parametrize("upkeep", [SyncSettings(INTERVAL), SyncSettings(INTERVAL, without_hash=True)])
+def test_while_another_station_has_a_file_open_a_check_skips_its_turn(
+    is_heard: bool, upkeep: SyncSettings
+) -> None:
     world, vehicle = watched(ArduPilotVehicle(table=PLAIN), upkeep=upkeep)
     other = Other(world, is_heard=is_heard)
     world.run(INTERVAL - 20.0)
@@ -227,7 +234,7 @@ def took(seconds: float, source: str = "ftp", missing: tuple[int, ...] = ()) -> 
 
 
 def test_the_median_of_the_last_times_counts() -> None:
-    pace = CheckPace(30.0, is_chosen=False)
+    pace = SyncInterval(30.0, is_chosen=False)
     assert pace.interval(may_use_file=False) == math.inf
     assert pace.interval(may_use_file=True) == 28.5
     assert is_so(not pace.file_is_quick)
@@ -248,7 +255,7 @@ def test_the_median_of_the_last_times_counts() -> None:
 
 
 def test_a_chosen_interval_is_stretched_less() -> None:
-    pace = CheckPace(10.0, is_chosen=True)
+    pace = SyncInterval(10.0, is_chosen=True)
     assert pace.interval(may_use_file=False) == 9.5
     for _ in range(3):
         pace.fetched(took(35.0, "stream"), 0.0)
@@ -259,7 +266,7 @@ def test_a_chosen_interval_is_stretched_less() -> None:
 
 
 def test_the_hash_is_asked_for_so_early_that_a_fetch_ends_within_the_interval() -> None:
-    pace = CheckPace(30.0, is_chosen=False)
+    pace = SyncInterval(30.0, is_chosen=False)
     assert pace.hash_interval == 28.5
     for _ in range(3):
         pace.fetched(took(0.9, "stream"), 0.0)
@@ -301,7 +308,7 @@ def test_what_px4_changes_after_its_hash_was_asked_for_is_right_one_interval_lat
 # what others change on PX4
 
 
-def quad(seed: int = 0, upkeep: Upkeep | None = None) -> tuple[World, PX4Vehicle]:
+def quad(seed: int = 0, upkeep: SyncSettings | None = None) -> tuple[World, PX4Vehicle]:
     vehicle = PX4Vehicle(clamp_delay=None)
     world = World(vehicle, upkeep=upkeep)
     assert world.fetch().complete
@@ -413,7 +420,7 @@ def test_on_a_slow_link_they_are_read_in_a_twentieth_of_the_time_at_most() -> No
         for axis in "XYZ"
     ]
     vehicle = PX4Vehicle(table=[*TABLE, *(row for row in rows if row.name != "CAL_MAG0_XOFF")])
-    world = World(air=Air.symmetric([vehicle], delay=0.4), upkeep=Upkeep(10.0))
+    world = World(air=Air.symmetric([vehicle], delay=0.4), upkeep=SyncSettings(10.0))
     world.fetch()
     world.run(20.0)
     world.sent.clear()
@@ -427,7 +434,7 @@ def test_on_a_slow_link_they_are_read_in_a_twentieth_of_the_time_at_most() -> No
 def test_the_volatile_values_of_one_vehicle_keep_no_other_from_its_check() -> None:
     vehicles = [PX4Vehicle(system=system, table=TABLE) for system in range(1, 41)]
     taps = [Tap(vehicle) for vehicle in vehicles]
-    world = World(air=Air.symmetric(taps, delay=0.3), upkeep=Upkeep(INTERVAL))
+    world = World(air=Air.symmetric(taps, delay=0.3), upkeep=SyncSettings(INTERVAL))
     world.run(2.0)
     machines = list(world.station.components.values())
     fetches = [machine.begin_fetch(world.now) for machine in machines]
@@ -444,8 +451,8 @@ def test_the_volatile_values_of_one_vehicle_keep_no_other_from_its_check() -> No
     assert len(world.sent) < 40 * 4 * 3 * 1.3 + 200, "three questions in each interval, and our heartbeats"
 
 
-@pytest.mark.parametrize("upkeep", [Upkeep(), replace(Upkeep(INTERVAL), interval=math.inf)])
-def test_without_a_watch_nothing_is_asked_after_foreign_values(upkeep: Upkeep) -> None:
+@pytest.mark.parametrize("upkeep", [SyncSettings(), replace(SyncSettings(INTERVAL), interval=math.inf)])
+def test_without_a_watch_nothing_is_asked_after_foreign_values(upkeep: SyncSettings) -> None:
     world, vehicle = fetched(upkeep=upkeep)
     world.run(2.0)
     vehicle.set_param("P07", 700)
@@ -466,7 +473,7 @@ def test_nothing_is_asked_after_foreign_values_in_high_latency_mode() -> None:
 
 def test_a_listen_only_station_sends_nothing_after_changes() -> None:
     vehicle = PX4Vehicle(table=TABLE)
-    upkeep = Upkeep.chosen(None, "auto", listen_only=True)
+    upkeep = SyncSettings.chosen(None, "auto", listen_only=True)
     world = World(vehicle, upkeep=upkeep)
     world.other_station(ParamRequestList(1, 1))
     world.run(5.0)

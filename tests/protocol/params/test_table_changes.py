@@ -7,7 +7,7 @@ import pytest
 from paramclient.model.values import ParamType
 from paramclient.protocol.events import ParamChanged
 from paramclient.protocol.params.change import Added, Change, Removed
-from paramclient.protocol.params.sync import SyncState, Upkeep
+from paramclient.protocol.params.sync import SyncSettings, SyncState
 from paramclient.protocol.params.sync_interval import PAUSE_MIN
 from paramclient.protocol.wire import FileTransfer, ParamRequestList
 from paramclient.sim import Air, ArduPilotVehicle
@@ -25,7 +25,7 @@ def vehicle(*, ftp: bool = True) -> ArduPilotVehicle:
     return ArduPilotVehicle(table=TABLE, groups={"GRIP_ENABLE": GROUP}, live=(), ftp=ftp)
 
 
-def in_sync(*vehicles: ArduPilotVehicle, air: Air | None = None, upkeep: Upkeep | None = None) -> World:
+def in_sync(*vehicles: ArduPilotVehicle, air: Air | None = None, upkeep: SyncSettings | None = None) -> World:
     """A session whose table was fetched a while ago."""
     world = World(*vehicles, air=air, upkeep=upkeep)
     assert world.fetch().complete
@@ -101,7 +101,7 @@ def test_a_list_after_a_changed_count_that_does_not_come_is_requested_again() ->
 
 
 def test_without_a_watch_a_changed_count_requests_nothing() -> None:
-    world = in_sync(board := vehicle(ftp=False), upkeep=Upkeep())
+    world = in_sync(board := vehicle(ftp=False), upkeep=SyncSettings())
     board.set_param("GRIP_ENABLE", 1)
     world.run(INTERVAL)
     assert state(world) is SyncState.UNSYNCED

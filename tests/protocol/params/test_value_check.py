@@ -12,8 +12,8 @@ from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import Event, EventMaker, ParamChanged
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.reads import Read
-from paramclient.protocol.params.sync import Upkeep
-from paramclient.protocol.params.value_check import DISTRUST_TIME, REPLACED_MAX, ValueChecks
+from paramclient.protocol.params.sync import SyncSettings
+from paramclient.protocol.params.value_check import AMBIGUITY_WINDOW, REPLACED_MAX, ValueChecks
 from paramclient.protocol.params.writes import Write
 from paramclient.protocol.requests.retry import BATCH_INTERVAL
 from paramclient.protocol.station import Station
@@ -24,7 +24,7 @@ from paramclient.protocol.wire import (
     Heartbeat,
     Message,
     ParamRequestRead,
-    ParamSet,
+    ParamSetMessage,
 )
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from tests.simulation import Simulation, is_so, param_value
@@ -45,7 +45,9 @@ def are_done(operations: Sequence[Read] | Sequence[Write]) -> bool:
 class Desk:
     """An ArduPilot 1/1 with A = 1 and B = 1, heard long ago, and all that is sent to it."""
 
-    def __init__(self, autopilot: int = MAV_AUTOPILOT_ARDUPILOTMEGA, upkeep: Upkeep | None = None) -> None:
+    def __init__(
+        self, autopilot: int = MAV_AUTOPILOT_ARDUPILOTMEGA, upkeep: SyncSettings | None = None
+    ) -> None:
         self.now = 0.0
         self.sent: list[Message] = []
         self.events: list[Event] = []
@@ -75,10 +77,10 @@ class Desk:
         end = self.now + seconds
         while (deadline := self.machine.next_deadline()) <= end:
             self.now = max(deadline, self.now)
-            self.machine.receive(Heartbeat(2, self.machine.who.autopilot or 0), self.now)
+            self.machine.receive(Heartbeat(2, self.machine.identification.autopilot or 0), self.now)
             self.machine.tick(self.now)
         self.now = end
-        self.machine.receive(Heartbeat(2, self.machine.who.autopilot or 0), self.now)
+        self.machine.receive(Heartbeat(2, self.machine.identification.autopilot or 0), self.now)
 
     def take(self) -> list[Message]:
         sent, self.sent[:] = list(self.sent), []
@@ -117,7 +119,7 @@ def test_a_late_answer_with_the_old_value_ends_no_read_and_makes_no_change() -> 
     desk.hear("A", 1.0)
     assert not is_so(read.done)
     assert desk.value == 2.0
-    desk.pass_time(DISTRUST_TIME - 0.09)
+    desk.pass_time(AMBIGUITY_WINDOW - 0.09)
     assert desk.reads() == []
     desk.pass_time(0.02)
     assert desk.reads() == ["A"]
@@ -152,7 +154,7 @@ def test_of_two_changes_in_a_row_both_old_values_are_distrusted_and_the_present_
     for late in (1.0, 2.0, 3.0):
         desk.hear("A", late)
     assert desk.values == [2.0, 3.0]
-    desk.now += DISTRUST_TIME - 0.05
+    desk.now += AMBIGUITY_WINDOW - 0.05
     desk.hear("A", 1.0)  # so long after the first change it is no late answer
     assert desk.values == [2.0, 3.0, 1.0]
 
@@ -163,7 +165,7 @@ def test_a_change_back_by_another_station_is_learnt_when_the_doubt_is_over() -> 
     desk.now += 0.1
     desk.hear("A", 1.0)
     assert desk.value == 2.0
-    desk.pass_time(DISTRUST_TIME)
+    desk.pass_time(AMBIGUITY_WINDOW)
     assert desk.reads() == ["A"]
     desk.hear("A", 1.0)
     assert desk.values == [2.0, 1.0]
@@ -173,7 +175,7 @@ def test_a_list_brings_the_index_and_not_the_old_value() -> None:
     desk = Desk()
     desk.hear("A", 1.0, index=0)
     desk.set(2.0)
-    desk.machine.table.move(3)
+    desk.machine.table.change_count(3)
     desk.machine.table.count = 2
     desk.hear("A", 1.0, index=0)
     param = desk.machine.table.params["A"]
@@ -201,10 +203,14 @@ def test_px4_has_no_old_values_on_the_way() -> None:
 
 
 def test_where_nothing_may_be_asked_the_value_is_no_longer_live() -> None:
-    desk = Desk(upkeep=Upkeep(listens_only=True, policy=Upkeep.chosen(None, "auto", listen_only=True).policy))
+    desk = Desk(
+        upkeep=SyncSettings(
+            listens_only=True, policy=SyncSettings.chosen(None, "auto", listen_only=True).policy
+        )
+    )
     desk.hear("A", 2.0)
     desk.hear("A", 1.0)
-    desk.pass_time(DISTRUST_TIME + 0.01)
+    desk.pass_time(AMBIGUITY_WINDOW + 0.01)
     assert (desk.value, desk.machine.table.params["A"].trust) == (2.0, Trust.CACHED)
     desk.hear("A", 2.0)
     assert desk.machine.table.params["A"].trust is Trust.LIVE
@@ -231,10 +237,10 @@ def test_a_set_back_is_not_proven_by_a_late_answer() -> None:
     desk.hear("A", 1.0)  # the answer to a repeat of the read
     assert not is_so(write.done)
     assert desk.value == 2.0
-    desk.pass_time(DISTRUST_TIME)
+    desk.pass_time(AMBIGUITY_WINDOW)
     assert desk.reads() == ["A"]
     desk.hear("A", 2.0)
-    assert [each.param_id for each in desk.take() if isinstance(each, ParamSet)] == ["A"]
+    assert [each.param_id for each in desk.take() if isinstance(each, ParamSetMessage)] == ["A"]
     desk.hear("A", 1.0)
     assert write.done
     assert desk.values == [2.0, 1.0]
@@ -257,8 +263,8 @@ def test_what_is_remembered_is_bounded() -> None:
     message = param_value("P0", 0.0)
     assert checks.ambiguous_until(message, 0.1, is_wanted=False) < 0.0
     message = param_value(name, 0.0)
-    assert checks.ambiguous_until(message, 0.1, is_wanted=False) == pytest.approx(DISTRUST_TIME)
-    checks.forget(DISTRUST_TIME)
+    assert checks.ambiguous_until(message, 0.1, is_wanted=False) == pytest.approx(AMBIGUITY_WINDOW)
+    checks.forget(AMBIGUITY_WINDOW)
     assert not checks
 
 
@@ -317,7 +323,7 @@ def test_a_simulated_ardupilot_takes_the_value_of_a_read_when_it_is_queued() -> 
 @pytest.mark.parametrize("fetched", [True, False], ids=["whole", "unfetched"])
 def test_a_change_after_the_acknowledgement_is_found_although_nothing_tells_of_it(fetched: bool) -> None:
     vehicle = PX4Vehicle()
-    upkeep = Upkeep.chosen(None, "auto")
+    upkeep = SyncSettings.chosen(None, "auto")
     station = Station(link="sim:test", is_stream=False, upkeep=upkeep)
     session = Simulation(vehicle, station=station)
     session.meet()
@@ -343,7 +349,7 @@ def test_a_change_after_the_acknowledgement_is_found_although_nothing_tells_of_i
 
 def test_after_many_writes_the_hash_alone_proves_that_they_have_lasted() -> None:
     vehicle = PX4Vehicle()
-    station = Station(link="sim:test", is_stream=False, upkeep=Upkeep.chosen(None, "auto"))
+    station = Station(link="sim:test", is_stream=False, upkeep=SyncSettings.chosen(None, "auto"))
     session = Simulation(vehicle, station=station)
     machine = session.meet()
     session.fetch()

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from paramclient.model.values import Param, ParamType, Value, bits_of
-from paramclient.protocol.params.write_resolution import CHANGE_MIN, note_on_small_change
+from paramclient.protocol.params.small_changes import CHANGE_MIN, note_on_small_change
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle
 from tests.simulation import Simulation
 

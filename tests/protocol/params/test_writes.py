@@ -18,13 +18,13 @@ from paramclient.errors import (
     UsageError,
     ValueNotApplied,
 )
-from paramclient.model.values import Encoding, ParamType, Trust, Value, decode
+from paramclient.model.values import Encoding, ParamType, Trust, Value, decode_value
 from paramclient.protocol.params.reads import Reads
 from paramclient.protocol.params.table import Table
 from paramclient.protocol.params.writes import Write, Writes
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.retry import ATTEMPTS_MIN, INITIAL_TIMEOUT, RetryPolicy
-from paramclient.protocol.wire import Message, ParamError, ParamRequestRead, ParamSet, ParamValue
+from paramclient.protocol.wire import Message, ParamError, ParamRequestRead, ParamSetMessage, ParamValue
 from tests.simulation import is_so, known, param_value
 
 INT32 = ParamType.INT32
@@ -55,7 +55,7 @@ class Desk:
         self.take_in(param_value(name, value, kind=kind, encoding=self.table.encoding))
 
     def take_in(self, message: ParamValue) -> None:
-        self.table.hear(message, "vehicle")
+        self.table.store_value(message, "vehicle")
         self.writes.heard(message, self.now)
         self.reads.heard(message, self.now)
 
@@ -82,9 +82,9 @@ class Desk:
         return [self._short(message) for message in sent]
 
     def _short(self, message: Message) -> str:
-        if isinstance(message, ParamSet):
+        if isinstance(message, ParamSetMessage):
             assert (message.target_system, message.target_component) == (1, 1)
-            value, _ = decode(message.raw, message.param_type, self.table.encoding)
+            value, _ = decode_value(message.raw, message.param_type, self.table.encoding)
             return f"set {message.param_id} {value!r} {ParamType(message.param_type).name}"
         assert isinstance(message, ParamRequestRead)
         return f"read {message.param_id or message.param_index}"
@@ -215,7 +215,7 @@ def test_values_that_are_taken_as_they_are(kind: ParamType, value: Value) -> Non
     desk.take_in(ParamValue("A", bytes(4), kind, 10, 65535))
     write = desk.set("A", value)
     [message] = desk.sent
-    assert isinstance(message, ParamSet)
+    assert isinstance(message, ParamSetMessage)
     assert message.param_type == kind
     if isinstance(value, bytes):
         assert message.raw == value
@@ -252,7 +252,7 @@ def test_ardupilot_cuts_off_the_fraction() -> None:
     desk.knows("A", 0, INT32)
     write = desk.set("A", 1234.7)
     [message] = desk.sent
-    assert isinstance(message, ParamSet)
+    assert isinstance(message, ParamSetMessage)
     assert struct.unpack("<f", message.raw)[0] == pytest.approx(1234.7)
     desk.hear("A", 1234, INT32)
     assert write.result is not None
@@ -417,7 +417,7 @@ def test_without_any_answer_to_the_first_read_there_is_no_reply() -> None:
     write = desk.set("A", 2.0)
     desk.pass_time()
     assert isinstance(write.error, NoReply)
-    assert not any(isinstance(message, ParamSet) for message in desk.sent)
+    assert not any(isinstance(message, ParamSetMessage) for message in desk.sent)
 
 
 def test_silence_on_the_write_alone_says_that_it_is_not_applied() -> None:

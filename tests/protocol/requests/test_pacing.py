@@ -13,8 +13,8 @@ from paramclient.protocol.requests.pacing import (
     RATE_MIN,
     READS_PER_LIST_VALUE,
     UPSTREAM_SHARE,
+    LinkBandwidth,
     Pace,
-    Share,
 )
 from paramclient.protocol.requests.retry import RetryPolicy
 from paramclient.protocol.requests.round_trip import RoundTrip
@@ -204,7 +204,7 @@ def test_answers_that_were_not_counted_slow_nothing_down() -> None:
 
 
 def test_components_share_what_reads_may_take_of_the_link() -> None:
-    share = Share()
+    share = LinkBandwidth()
     one, two = Pace(RoundTrip(), share), Pace(RoundTrip(), share)
     one.stream_seen(0.1)
     total = 37 * 10 * UPSTREAM_SHARE / 16
@@ -217,7 +217,7 @@ def test_components_share_what_reads_may_take_of_the_link() -> None:
 
 
 def test_lists_that_run_beside_each_other_show_the_link_by_what_came_of_them() -> None:
-    share = Share()
+    share = LinkBandwidth()
     one, two = Pace(RoundTrip(), share), Pace(RoundTrip(), share)
     one.stream_seen(0.1, 0.5)
     assert one.rate == pytest.approx(37 * 10 * UPSTREAM_SHARE / 16), (

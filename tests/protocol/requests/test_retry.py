@@ -163,12 +163,12 @@ def test_the_number_of_tries_follows_the_loss() -> None:
 
 def test_enough_is_enough() -> None:
     policy = measured(0.1, 200)
-    assert not policy.is_hopeless(ATTEMPTS_MIN - 1, 1e9)
-    assert policy.is_hopeless(ATTEMPTS_MIN, 0.0)
+    assert not policy.should_give_up(ATTEMPTS_MIN - 1, 1e9)
+    assert policy.should_give_up(ATTEMPTS_MIN, 0.0)
     for _ in range(50):
         policy.timed_out(1)
     assert policy.tries > ATTEMPTS_MIN
-    assert not policy.is_hopeless(ATTEMPTS_MIN, 1e9)  # nobody keeps its `heard_at`
+    assert not policy.should_give_up(ATTEMPTS_MIN, 1e9)  # nobody keeps its `heard_at`
 
 
 def test_a_component_that_is_gone_is_not_asked_for_ever() -> None:
@@ -176,9 +176,9 @@ def test_a_component_that_is_gone_is_not_asked_for_ever() -> None:
     for _ in range(50):
         policy.timed_out(1)
     policy.round_trip.heard_at = 100.0
-    assert not policy.is_hopeless(ATTEMPTS_MIN, 99.0 + SILENCE_MAX)
-    assert policy.is_hopeless(ATTEMPTS_MIN, 100.0 + SILENCE_MAX)
-    assert not policy.is_hopeless(ATTEMPTS_MIN - 1, 100.0 + SILENCE_MAX)
+    assert not policy.should_give_up(ATTEMPTS_MIN, 99.0 + SILENCE_MAX)
+    assert policy.should_give_up(ATTEMPTS_MIN, 100.0 + SILENCE_MAX)
+    assert not policy.should_give_up(ATTEMPTS_MIN - 1, 100.0 + SILENCE_MAX)
 
 
 def test_an_answer_to_what_was_sent_at_no_known_time_tells_nothing_of_the_round_trip() -> None:

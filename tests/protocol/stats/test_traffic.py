@@ -17,8 +17,8 @@ from paramclient.protocol.stats import traffic as room
 from paramclient.protocol.stats.packet_loss import (
     CERTAIN_GAP,
     GAP_MAX,
+    NUMBERING_CONFIRMATION_FRAMES,
     NUMBERING_TIMEOUT,
-    PROBATION,
     REORDER_DEPTH,
     SequenceCheck,
 )
@@ -184,7 +184,7 @@ def test_a_long_gap_is_counted_exactly(start: int, gaps: list[tuple[int, int]]) 
     number = start
     heard = [number]
     for gap, run in gaps:
-        heard += range(number + gap + 1, number + gap + 1 + PROBATION + 1 + run)
+        heard += range(number + gap + 1, number + gap + 1 + NUMBERING_CONFIRMATION_FRAMES + 1 + run)
         number = heard[-1]
     check = check_of(heard)
     assert (check.lost, check.repeated, check.late) == (sum(gap for gap, _ in gaps), 0, 0)
@@ -259,7 +259,11 @@ def test_a_jump_back_by_a_little_is_none() -> None:
 @given(st.integers(0, 255), st.integers(0, 255), st.lists(st.booleans(), max_size=600))
 def test_two_numberings_side_by_side_have_lost_nothing(first: int, second: int, turns: list[bool]) -> None:
     apart = (second - first) % 256
-    if REORDER_DEPTH + PROBATION < apart < 256 - REORDER_DEPTH - PROBATION:
+    if (
+        REORDER_DEPTH + NUMBERING_CONFIRMATION_FRAMES
+        < apart
+        < 256 - REORDER_DEPTH - NUMBERING_CONFIRMATION_FRAMES
+    ):
         at = [first, second]
         heard = [first, second]
         for turn in [False, True, *turns]:

@@ -12,7 +12,7 @@ from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ComponentRebooted, Event, EventMaker
 from paramclient.protocol.params.boot_values import MEASURING_TIME, MEASURING_UPTIME_MAX
-from paramclient.protocol.params.sync import Upkeep
+from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.retry import (
     BASELINE_DELAY,
@@ -21,8 +21,8 @@ from paramclient.protocol.requests.retry import (
     SLOW_REQUEST_INTERVAL,
 )
 from paramclient.protocol.station import Station
-from paramclient.protocol.vehicle.boot_time_requests import ClockRequests
-from paramclient.protocol.vehicle.boot_time_sampling import SAMPLE_TIME, ClockSampling
+from paramclient.protocol.vehicle.boot_time_requests import BootTimeRequests
+from paramclient.protocol.vehicle.boot_time_sampling import SAMPLE_TIME, BootTimeSampling
 from paramclient.protocol.vehicle.commands import MessageRequests
 from paramclient.protocol.vehicle.presence import Presence
 from paramclient.protocol.wire import (
@@ -52,7 +52,7 @@ CLOCK_REQUEST = CommandLong(1, 1, MAV_CMD_REQUEST_MESSAGE, (float(SYSTEM_TIME_ID
 
 
 class Requests:
-    """A `ClockRequests` in a time of its own.
+    """A `BootTimeRequests` in a time of its own.
 
     Attributes:
         sent: when each request went out.
@@ -69,7 +69,7 @@ class Requests:
             self.sent.append(self.now)
 
         self.context = Context((1, 1), send, may_send=may_send)
-        self.requests = ClockRequests(self.context, MessageRequests(self.context), self.presence)
+        self.requests = BootTimeRequests(self.context, MessageRequests(self.context), self.presence)
 
     def run(self, until: float) -> list[float]:
         """Give the requests that are sent until then."""
@@ -181,7 +181,7 @@ class Desk:
             link="x",
             send=lambda message: self.sent.append((self.now, message)),
             observer=EventMaker(self.events.append),
-            upkeep=Upkeep(interval),
+            upkeep=SyncSettings(interval),
         )
         self.machine.reads.is_idle = False
         self.hear(heartbeat, sequence=100)
@@ -385,7 +385,7 @@ def test_boot_values_are_not_read_where_that_is_not_wanted_or_needed(desk: Desk)
 
 def test_windows_open_and_close() -> None:
     chosen: list[bool] = []
-    sampling = ClockSampling(chosen.append)
+    sampling = BootTimeSampling(chosen.append)
     first, second = (1, 1), (2, 1)
     sampling.open(first, 10.0)
     sampling.open(second, 10.0)

@@ -11,7 +11,7 @@ from paramclient.protocol import station as station_room
 from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ComponentContested, ComponentReplaced, ComponentUncontested, Event
-from paramclient.protocol.params.sync import Upkeep
+from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.requests.retry import PEER_REQUESTS, PEER_REQUESTS_MAX
 from paramclient.protocol.station import Station
 from paramclient.protocol.vehicle import peers as room
@@ -29,7 +29,7 @@ from paramclient.protocol.wire import (
     Heartbeat,
     Message,
     ParamRequestRead,
-    ParamSet,
+    ParamSetMessage,
     ParamValue,
     SystemTime,
 )
@@ -98,7 +98,7 @@ class Speaker:
                     self.say(AutopilotVersion(0, uid=self.uid))
                 if message.params[0] == wire.SYSTEM_TIME_ID and self.booted_at is not None:
                     self.say(SystemTime(0, int(1000 * (now - self.booted_at))))
-            elif isinstance(message, ParamSet) and self._obeys:
+            elif isinstance(message, ParamSetMessage) and self._obeys:
                 self.say(ParamValue(message.param_id, message.raw, message.param_type, 1, 0))
             elif isinstance(message, ParamRequestRead):
                 self.say(param_value("P", self.value, index=0, count=1))
@@ -228,8 +228,8 @@ def test_heartbeats_at_20_hz_divert_no_request() -> None:
     net.run(0.6)
     write = net.machine.write("P", 5.0, net.now)
     net.run(2.0)
-    assert not any(isinstance(each, ParamSet) for each in forger.heard)
-    assert any(isinstance(each, ParamSet) for each in vehicle.heard)
+    assert not any(isinstance(each, ParamSetMessage) for each in forger.heard)
+    assert any(isinstance(each, ParamSetMessage) for each in vehicle.heard)
     forger.say(param_value("P", 5.0, index=0, count=1))
     forger.say(CommandAck(400, 0, 255, 190))
     net.run(0.2)
@@ -247,7 +247,7 @@ def test_requests_go_to_the_peer_that_gives_the_hardware_id() -> None:
     net = Net(forger=Speaker(PX4, uid=None, booted_at=None, every=0.05), vehicle=vehicle)
     net.run(1.0)
     assert net.machine.peers.home == "vehicle"
-    assert net.machine.who.identity.uid == f"{1:016x}"
+    assert net.machine.identification.identity.uid == f"{1:016x}"
     net.run(PEER_REQUESTS.duration + 2.0)
     assert net.kinds() == ["Contested"]
 
@@ -281,8 +281,8 @@ def test_the_other_one_may_be_left() -> None:
     net.run(3.0)
     assert net.kinds() == ["Contested", "Uncontested"]
     assert net.machine.peers.home == "b"
-    assert net.machine.who.identity.uid == f"{2:016x}"
-    assert net.machine.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA
+    assert net.machine.identification.identity.uid == f"{2:016x}"
+    assert net.machine.identification.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA
     assert dict(net.machine.table.params) == {}, "nothing of the other one's"
     read = net.machine.read("P", net.now)
     net.run(0.2)
@@ -335,7 +335,7 @@ def test_a_change_without_return_is_another_vehicle_as_before() -> None:
     assert net.station.is_doubted(net.machine)
     net.run(LOST_AFTER + 1.0)
     assert net.kinds() == []
-    assert net.machine.who.identity.uid == f"{2:016x}"
+    assert net.machine.identification.identity.uid == f"{2:016x}"
     assert not net.station.is_doubted(net.machine)
 
 
@@ -426,7 +426,7 @@ def test_a_vehicle_in_place_of_a_ground_station_is_heard() -> None:
     net.peers["b"] = Speaker()
     net.peers["a"].end = net.now
     net.run(4.0)
-    assert net.machine.who.identity.uid == f"{1:016x}"
+    assert net.machine.identification.identity.uid == f"{1:016x}"
     assert net.kinds() == []
 
 
@@ -443,7 +443,7 @@ def test_components_of_one_system_may_come_from_several_peers() -> None:
 
 
 def test_a_heartbeat_from_a_forged_address_brings_that_seven_requests_and_no_more() -> None:
-    station = Station(link="udpin:test", is_stream=False, upkeep=Upkeep.chosen(None, "auto"))
+    station = Station(link="udpin:test", is_stream=False, upkeep=SyncSettings.chosen(None, "auto"))
     station.receive(wire.encode(PX4, system=9, component=1, sequence=0), "victim", 0.0)
     framer, sent = Framer(wire.DECODED_IDS, stream=False), []
     for step in range(1200):
@@ -486,7 +486,7 @@ def test_another_vehicle_in_place_of_one_that_is_gone_is_identified_anew() -> No
     net.run(4.0)
     assert net.kinds() == []
     assert net.machine.peers.home == "b"
-    assert net.machine.who.identity.uid == f"{2:016x}"
+    assert net.machine.identification.identity.uid == f"{2:016x}"
     assert dict(net.machine.table.params) == {}
 
 
@@ -503,7 +503,7 @@ def test_further_peers_are_so_many_and_no_more() -> None:
 
 def test_where_nothing_is_sent_the_clock_shows_a_second_path() -> None:
     def listening(**other: object) -> Net:
-        station = Station(link="udpin:test", is_stream=False, upkeep=Upkeep(listens_only=True))
+        station = Station(link="udpin:test", is_stream=False, upkeep=SyncSettings(listens_only=True))
         net = Net(a=Speaker(), b=Speaker(start=0.4, **other), station=station)  # type: ignore[arg-type]
         for _ in range(20):
             for speaker in net.peers.values():
@@ -584,7 +584,7 @@ def test_one_that_gives_its_id_first_takes_nothing_over() -> None:
     assert [*net.machine.table.params] == ["P"]
     net.run(1.0)
     assert net.machine.peers.home == "b"
-    assert net.machine.who.identity.uid == f"{9:016x}"
+    assert net.machine.identification.identity.uid == f"{9:016x}"
     assert dict(net.machine.table.params) == {}
     assert any(isinstance(each, ComponentReplaced) for each in net.events)
     net.peers["b"].say(param_value("Q", 9.0, index=1, count=2))
@@ -630,9 +630,9 @@ def test_one_that_stays_and_gives_no_id_is_another_vehicle() -> None:
     write = net.machine.write("P", 5.0, net.now)
     net.run(3.5 + PEER_REQUESTS.duration + 1.0 - net.now)
     assert isinstance(write.error, NoReply)
-    assert not any(isinstance(each, ParamSet) for each in net.peers["b"].heard)
+    assert not any(isinstance(each, ParamSetMessage) for each in net.peers["b"].heard)
     assert net.machine.peers.home == "b"
-    assert not net.machine.who.identity.uid
+    assert not net.machine.identification.identity.uid
     assert dict(net.machine.table.params) == {}
     write = net.machine.write("P", 6.0, net.now)
     net.run(8.0)
@@ -641,7 +641,7 @@ def test_one_that_stays_and_gives_no_id_is_another_vehicle() -> None:
     net.peers["a"].end = 1e9
     net.peers["b"].end = net.now
     net.run(10.0)
-    assert net.machine.who.identity.uid == f"{1:016x}"
+    assert net.machine.identification.identity.uid == f"{1:016x}"
     assert {param.value for param in net.machine.table.params.values()} <= {1.0}, "nothing of the other one"
 
 
@@ -662,8 +662,8 @@ def test_a_write_does_not_go_to_the_peers_that_are_left_where_a_connection_ends(
     assert net.machine.peers.home == "b", "what has ended needs no further silence"
     net.run(8.0)
     assert isinstance(write.error, NoReply)
-    assert not any(isinstance(each, ParamSet) for each in net.peers["b"].heard)
-    assert net.machine.who.identity.uid == f"{2:016x}"
+    assert not any(isinstance(each, ParamSetMessage) for each in net.peers["b"].heard)
+    assert net.machine.identification.identity.uid == f"{2:016x}"
 
 
 def test_a_vehicle_that_connects_anew_goes_on() -> None:
@@ -704,7 +704,7 @@ def test_a_component_that_no_longer_identifies_itself_is_not_written_to() -> Non
     speaker.uid = 1
     net.run(2.0)
     assert again.result is not None
-    assert len([each for each in speaker.heard if isinstance(each, ParamSet)]) == 1
+    assert len([each for each in speaker.heard if isinstance(each, ParamSetMessage)]) == 1
 
 
 def test_another_kind_through_one_peer_is_identified() -> None:
@@ -716,7 +716,7 @@ def test_another_kind_through_one_peer_is_identified() -> None:
     net.run(2.0)
     port._heartbeats, port.uid, port.end = (ARDUPILOT,), 2, 1e9
     net.run(2.0)
-    assert net.machine.who.identity.uid == f"{2:016x}"
+    assert net.machine.identification.identity.uid == f"{2:016x}"
     assert dict(net.machine.table.params) == {}
 
 
@@ -749,7 +749,7 @@ def test_one_that_gives_an_id_after_one_without_is_another(first: int | None) ->
     assert write.done
     port.end, port.uid, port._obeys = 1e9, 2, True
     net.run(3.0)
-    assert net.machine.who.identity.uid == f"{2:016x}"
+    assert net.machine.identification.identity.uid == f"{2:016x}"
     assert {param.value for param in net.machine.table.params.values()} <= {port.value}
     assert any(isinstance(each, ComponentReplaced) for each in net.events)
 
@@ -843,7 +843,7 @@ def test_the_other_components_go_with_the_autopilot_that_loses_a_contest() -> No
     assert [*other.table.params] == ["CAM"]
     net.run(15.0)
     assert net.kinds() == ["Contested", "Uncontested"]
-    assert net.machine.who.identity.uid == f"{2:016x}"
+    assert net.machine.identification.identity.uid == f"{2:016x}"
     assert dict(other.table.params) == {}
 
 
@@ -860,7 +860,7 @@ def test_a_component_at_the_peer_of_a_rival_is_neither_kept_nor_written_to() -> 
     camera(net, "b", 9.0)
     assert net.station.is_doubted(other)
     net.run(15.0)
-    assert net.machine.who.identity.uid == f"{1:016x}"
+    assert net.machine.identification.identity.uid == f"{1:016x}"
     assert dict(other.table.params) == {}, "it was heard from the rival's peer"
 
 
@@ -876,4 +876,4 @@ def test_the_components_of_an_unidentified_autopilot_are_not_written_to() -> Non
     write = other.write("CAM", 5.0, net.now)
     net.run(15.0)
     assert isinstance(write.error, NoReply)
-    assert not any(isinstance(each, ParamSet) for each in port.heard)
+    assert not any(isinstance(each, ParamSetMessage) for each in port.heard)

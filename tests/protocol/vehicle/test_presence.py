@@ -52,7 +52,7 @@ def test_what_never_sent_a_heartbeat_is_never_lost() -> None:
     presence = Presence()
     presence.heard(1.0)
     assert not presence.has_beaten
-    assert presence.patience == math.inf
+    assert presence.heartbeat_timeout == math.inf
     assert presence.lost_at() == math.inf
     assert not presence.was_away(LOST_AFTER - 0.1)
     assert presence.was_away(LOST_AFTER), "another vehicle may speak now all the same"
@@ -70,29 +70,29 @@ def test_five_seconds_after_the_last_word_it_is_lost() -> None:
 @pytest.mark.parametrize("interval", [0.1, 0.6, 1.0, 1.6])
 def test_usual_heartbeats_change_nothing(interval: float) -> None:
     presence = beating(0.0, interval, 2 * interval, 3 * interval)
-    assert presence.patience == LOST_AFTER
+    assert presence.heartbeat_timeout == LOST_AFTER
     assert 2.5 <= presence.gap <= 4.0
 
 
 def test_one_that_beats_rarely_is_given_three_of_its_own_intervals() -> None:
     presence = beating(0.0, 10.0)
-    assert presence.patience == 30.0
+    assert presence.heartbeat_timeout == 30.0
     assert presence.gap == 25.0, "no gap after each of its heartbeats"
 
 
 def test_heartbeats_that_came_twice_tell_of_no_quicker_rhythm() -> None:
     presence = beating(0.0, 0.01, 10.0, 10.01, 20.0, 20.01)
-    assert presence.patience == pytest.approx(29.97)
+    assert presence.heartbeat_timeout == pytest.approx(29.97)
 
 
 def test_lost_heartbeats_do_not_make_it_one_that_beats_rarely() -> None:
     presence = beating(0.0, 9.0, 10.0, 14.0)
-    assert presence.patience == LOST_AFTER
+    assert presence.heartbeat_timeout == LOST_AFTER
     assert presence.gap == 2.5
 
 
 def test_patience_has_an_end() -> None:
-    assert beating(0.0, 1e6).patience == LOST_AFTER_MAX
+    assert beating(0.0, 1e6).heartbeat_timeout == LOST_AFTER_MAX
 
 
 def test_high_latency_needs_more_patience_until_the_next_heartbeat() -> None:

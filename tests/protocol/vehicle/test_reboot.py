@@ -138,7 +138,7 @@ async def test_it_comes_back(make: Make, uptime: float, down: float, ack: bool) 
         assert await component.reboot() is component
         assert len(starts) == 1
         assert starts[0] <= anyio.current_time() < starts[0] + 3.5
-        assert local(component).machine.who.known_at >= starts[0]  # it has said who it is since
+        assert local(component).machine.identification.known_at >= starts[0]  # it has said who it is since
         assert (await component.get(next(iter(vehicle.params)))).value is not None
         assert residue(component) == []
         await asyncio.sleep(10.0)

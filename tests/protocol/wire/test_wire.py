@@ -35,7 +35,7 @@ from paramclient.protocol.wire import (
     ParamError,
     ParamRequestList,
     ParamRequestRead,
-    ParamSet,
+    ParamSetMessage,
     ParamValue,
     SetupSigning,
     SigningKey,
@@ -165,7 +165,7 @@ MESSAGES: list[tuple[Message, Any]] = [
     ),
     (ParamValue("", bytes(4), 0, 0, 0), dialect.MAVLink_param_value_message(b"", 0.0, 0, 0, 0)),
     (
-        ParamSet(1, 2, NAME.decode(), PACKED_FLOAT, 6),
+        ParamSetMessage(1, 2, NAME.decode(), PACKED_FLOAT, 6),
         dialect.MAVLink_param_set_message(1, 2, NAME, 6.5, 6),
     ),
     (StatusText(4, "write denied (A)"), dialect.MAVLink_statustext_message(4, b"write denied (A)")),
@@ -290,7 +290,7 @@ def test_values_and_sets_of_every_kind_are_pymavlinks(
             dialect.MAVLink_param_value_message(name.encode(), value, number, count, index),
         ),
         (
-            ParamSet(count % 256, index % 256, name, raw, number),
+            ParamSetMessage(count % 256, index % 256, name, raw, number),
             dialect.MAVLink_param_set_message(count % 256, index % 256, name.encode(), value, number),
         ),
     ]
@@ -303,7 +303,7 @@ def test_values_and_sets_of_every_kind_are_pymavlinks(
 @thorough
 @given(st.binary(min_size=4, max_size=4) | st.sampled_from([b"\x01\0\x80\x7f", b"\xc0\xb4\xb3\xff"]))
 def test_the_four_value_bytes_are_not_touched(raw: bytes) -> None:
-    for message in (ParamValue("A", raw, 6, 1, 0), ParamSet(1, 1, "A", raw, 6)):
+    for message in (ParamValue("A", raw, 6, 1, 0), ParamSetMessage(1, 1, "A", raw, 6)):
         for version in (1, 2):
             frame = encode(message, system=1, component=1, sequence=0, version=version)
             assert decode(one_frame(frame)) == message

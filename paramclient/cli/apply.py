@@ -18,7 +18,6 @@ from cyclopts.validators import Number
 from paramclient.cache import ParamCache
 from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_session
-from paramclient.cli.moments import parse_when
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import print_document, printable, progress_bar, report, say
 from paramclient.cli.param_rows import described
@@ -47,6 +46,7 @@ from paramclient.cli.targets import (
     fill_pattern,
     targets,
 )
+from paramclient.cli.time_arguments import parse_when
 from paramclient.client.component import Component
 from paramclient.client.local import local
 from paramclient.errors import NoReply, NotInCache, ParamClientError, UnknownVehicle, UsageError
@@ -56,8 +56,8 @@ from paramclient.protocol.params.fetch_result import Progress
 from paramclient.provision import ApplyProgress, ApplyResult, ApplyRow, Plan, verify_all
 from paramclient.provision import apply_all as apply_to_all
 from paramclient.provision import restore as restore_to
+from paramclient.provision.apply_restore import restore_categories
 from paramclient.provision.inspection import wait_for_identity
-from paramclient.provision.set_up import restore_categories
 from paramclient.provision.vehicle_params import load_state_before_apply
 
 if TYPE_CHECKING:

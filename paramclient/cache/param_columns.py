@@ -16,7 +16,7 @@ from operator import itemgetter
 from typing import Any, Final, NamedTuple
 
 from paramclient.cache.cells import MASK_64, Damaged, cells, signed
-from paramclient.model.params import CACHED, NOWHERE, Params, iter_unpack_fields, pack_fields
+from paramclient.model.params import CACHED, COMPACT_NO_INDEX, Params, iter_unpack_fields, pack_fields
 from paramclient.model.values import Param, ParamType, Trust, Value, bits_of, from_bits, known_type, same_bits
 
 __all__ = [
@@ -234,7 +234,9 @@ class StoredTable(Mapping[str, StoredParam]):
                 types,
                 [signed(each) for each in bits] if max(bits) >> 63 else bits,
                 is_raw,
-                [None if place == NOWHERE else place for place in places] if NOWHERE in places else places,
+                [None if place == COMPACT_NO_INDEX else place for place in places]
+                if COMPACT_NO_INDEX in places
+                else places,
                 bytes(map(volatile.__contains__, held)),
                 heard_at,
                 initial,
@@ -288,7 +290,7 @@ class StoredTable(Mapping[str, StoredParam]):
             unsigned = bits & MASK_64
             if unsigned >= (_ENDS[0] if is_raw else _ENDS[number]):
                 raise Damaged(f"{unsigned} is not a value of type {number}")
-            place = NOWHERE if index is None else index
+            place = COMPACT_NO_INDEX if index is None else index
             try:
                 held[name] = pack_fields(unsigned, number, bool(is_raw), CACHED, place)
             except struct.error as error:

@@ -19,7 +19,7 @@ from paramclient.metadata import Metadata, MetadataStore
 from paramclient.model.comparison import compare, defaults_of
 from paramclient.model.paramset import ParamSet
 from paramclient.provision import ApplyProgress, ApplyResult, ApplyRow, Plan, apply, overlay, prepare, restore
-from paramclient.provision.set_up import restore_categories
+from paramclient.provision.apply_restore import restore_categories
 from paramclient.provision.vehicle_params import NO_DEFAULTS, FetchedSet, fetch_set
 from paramclient.service.followed_component import FollowedComponent
 from paramclient.service.hub import Hub
@@ -27,8 +27,8 @@ from paramclient.service.jobs import Job, Kind
 from paramclient.service.param_sources import (
     Number,
     Patterns,
-    Source,
     Timestamp,
+    WantedParams,
     current_set,
     load_state,
     resolve_source,
@@ -60,8 +60,8 @@ Result = TypeVar("Result")
 class DiffRequest(Body):
     """Parameters to compare with those of a component; `known` compares without requests to the vehicle."""
 
-    wanted: Source
-    base: Source | None = None
+    wanted: WantedParams
+    base: WantedParams | None = None
     only: Patterns = ()
     partial: bool = False
     full: bool = False
@@ -72,8 +72,8 @@ class DiffRequest(Body):
 class PlanRequest(Body):
     """Wanted parameters: those of `wanted`, overlaid by `over`, limited to `only`."""
 
-    wanted: Source
-    over: Source | None = None
+    wanted: WantedParams
+    over: WantedParams | None = None
     only: Patterns = ()
     include: Patterns = ()
     force: bool = False
