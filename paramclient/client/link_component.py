@@ -277,7 +277,9 @@ class LinkComponent(LocalComponent):
                 await news.wait()
         now = anyio.current_time()
         if not batch.done:
-            what = f"PARAM_SET to {self.system}/{self.component} before the timeout"
+            open_names = batch.open_names
+            what = f"PARAM_SET {open_names[0]}" if len(open_names) == 1 else f"{len(open_names)} PARAM_SETs"
+            what += f" to {self.system}/{self.component}"
             batch.give_up(NoReply(what, attempts=batch.attempts, waited=now - batch.begun_at), now)
         report()
         return _outcome(batch)

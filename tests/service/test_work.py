@@ -623,7 +623,7 @@ async def test_fetches_of_many_are_begun_and_ended_few_at_a_time() -> None:
 
     def component(system: int) -> Any:
         machine = SimpleNamespace(
-            who=SimpleNamespace(has_parameters=True),
+            identification=SimpleNamespace(has_parameters=True),
             presence=SimpleNamespace(is_lost=False),
             peers=SimpleNamespace(contest=None),
             fetch=None,

@@ -185,6 +185,11 @@ class WriteBatch(Operation[tuple[SetOutcome, ...]]):
         """Begin no further write; the open ones end by themselves."""
         self.failure = self.failure or error
 
+    @property
+    def open_names(self) -> list[str]:
+        """The names of the writes that have begun and not ended."""
+        return [write.name for write in self._open.values()]
+
     def give_up(self, error: ParamClientError, now: float) -> None:
         """End at once: open writes are cancelled, and their outcome is unknown if anything was sent."""
         if self.done:
