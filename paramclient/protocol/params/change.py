@@ -85,7 +85,7 @@ class Change(tuple[str, CompactParam | None, CompactParam | None, str, Value | N
 class Added(Change):
     """A parameter that the vehicle has and the table lacked when it was complete last.
 
-    A value that a `set` of *_ENABLE reveals is one, and so is a parameter outside the vehicle's list that is
+    Examples are a parameter that a `set` of `*_ENABLE` reveals, and one outside the vehicle's list that is
     read by name. The first values of a table that was never complete are plain changes.
     """
 
