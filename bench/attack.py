@@ -485,7 +485,7 @@ async def many_components(rows: list[Row], quick: bool) -> None:
                 _, answer = await service.ask("GET", "/api/v1/components", b"", token(READER))
                 known = len(json.loads(answer)["components"])
             assert known == count, known
-            for path in ("/api/v1/components", "/api/v1/vehicles", "/api/v1/state"):
+            for path in ("/api/v1/components", "/api/v1/links", "/metrics"):
                 service.attack = f"{count:,} components: GET {path}"
                 with service.watched(late=LATE):
                     status, answer = await service.ask("GET", path, b"", token(READER))
