@@ -252,7 +252,7 @@ _add(
     "udpin:0.0.0.0:14550 quad.yaml",
     "sim:ardupilot tuned.param --changed",
     "1 before.params --all",
-    arguments="URL|VEHICLE FILE",
+    arguments="URL|LOG|VEHICLE FILE",
 )
 _add(
     _app,
