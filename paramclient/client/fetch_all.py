@@ -114,7 +114,8 @@ class FleetFetch:
             while True:
                 check()
                 now = anyio.current_time()
-                while self.join(now, wake):
+                while self.join(now):
+                    wake()
                     await anyio.lowlevel.checkpoint()
                     check()
                     now = anyio.current_time()
@@ -132,7 +133,7 @@ class FleetFetch:
                 if machine is not None:  # the station may have forgotten it since
                     await closed(machine)
 
-    def join(self, now: float, wake: Callable[[], None]) -> bool:
+    def join(self, now: float) -> bool:
         """Start the fetches of components whose cached table is loaded. Return whether any was due.
 
         It starts at most `STARTED_FETCHES_MAX` fetches, but all components of one vehicle together.
@@ -160,7 +161,6 @@ class FleetFetch:
             for machine, fetch in zip(machines, begun, strict=True):
                 address = machine.address
                 self._fetches[address] = self._unanswered[address] = fetch
-                wake()
         return bool(ready)
 
     def is_worth_waiting(self, now: float, *, listen_until: float, hear_until: float) -> bool:
@@ -248,11 +248,13 @@ class FleetFetch:
     async def _end(self, wake: Callable[[], None]) -> None:
         """Release all fetches, the last ones first: those without a turn must not get one that ends."""
         for number, (address, fetch) in enumerate(reversed(self._fetches.items()), 1):
-            machine = self._station.components[address]
-            machine.end_fetch(fetch, anyio.current_time())
-            wake()
+            machine = self._station.components.get(address)
+            if machine is not None:  # the station may have forgotten it since
+                machine.end_fetch(fetch, anyio.current_time())
             if not number % ENDED_FETCHES_MAX:
+                wake()
                 await anyio.lowlevel.checkpoint()
+        wake()  # requests of other operations may have waited for these fetches
 
     def _look(self, address: Address, fetch: Fetch, now: float) -> None:
         """Record the response time of a component, or the time at which its heartbeats were overdue."""

@@ -661,6 +661,20 @@ async def test_fetches_of_many_are_begun_and_ended_few_at_a_time() -> None:
 
 
 @swiftly
+async def test_a_component_that_the_link_has_forgotten_does_not_break_the_end_of_a_fetch() -> None:
+    ended: list[int] = []
+    machines = {
+        (system, 1): SimpleNamespace(end_fetch=lambda fetch, now, system=system: ended.append(system))
+        for system in (1, 3)
+    }
+    station: Any = SimpleNamespace(components=machines)
+    together = FleetFetch(station, {}, system=None, refresh=False)
+    together._fetches.update({(system, 1): SimpleNamespace() for system in (1, 2, 3)})  # type: ignore[misc]
+    await together._end(lambda: None)
+    assert ended == [3, 1]
+
+
+@swiftly
 async def test_many_components_are_looked_at_few_at_a_time() -> None:
     turns = Turns()
     looked: Any = SimpleNamespace(publish_changes=turns.note)
