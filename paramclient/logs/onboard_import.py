@@ -87,8 +87,10 @@ def _types(log: OnboardLog, cache: ParamCache) -> Mapping[str, ParamType | int]:
     own: dict[str, ParamType | int] = {}
     others: dict[str, Counter[ParamType | int]] = {}
     for summary in cache.components():
+        if summary.autopilot != log.identity.autopilot:
+            continue
         table = cache.load(summary.key, summary.component)
-        if table is None or table.autopilot != log.identity.autopilot:
+        if table is None:  # another process may have removed it
             continue
         if summary.key == log.identity.key and summary.component == AUTOPILOT:
             own = {name: param.type for name, param in table.params.items()}
