@@ -154,7 +154,6 @@ class Station:
         self._signer: Signer | None = None
         self._is_watched = counts_traffic  # one check in the hot path for both
         self.verifier: Verifier | None = None
-        self._ticked_at = -math.inf
         self._heartbeat_at = math.inf if self.listens_only else -math.inf
         self._is_paused = False
         self.scheduler = Scheduler()
@@ -259,7 +258,6 @@ class Station:
             return
         if self._is_paused:
             return
-        self._ticked_at = now
         if self._signer is not None:
             self._signer.advance(now)
         if self._heartbeat_at <= now:
