@@ -129,33 +129,13 @@ async def diff(request: Request, hub: HubArgument, target: Target, body: DiffReq
 async def plan(request: Request, hub: HubArgument, target: Target, body: PlanRequest) -> Response:
     """Return which values a set-up would write, in which order, and which it would skip. Nothing is
     written."""
-    system, component = target.address
-
-    async def work() -> Response:
-        found = await _plan(hub, target, body)
-        return await document_response(
-            hub.run_in_file_thread,
-            lambda: PlanDoc.of(found, system=system, component=component, full=body.full),
-        )
-
-    with long_request(request):
-        return await run_until_disconnect(request, work, target)
+    return await _planned(request, hub, target, body, PlanDoc)
 
 
 @router.post("/verify", response_model=VerifiedDoc)
 async def verify(request: Request, hub: HubArgument, target: Target, body: PlanRequest) -> Response:
     """Compare a component with its wanted parameters. Nothing is written."""
-    system, component = target.address
-
-    async def work() -> Response:
-        found = await _plan(hub, target, body)
-        return await document_response(
-            hub.run_in_file_thread,
-            lambda: VerifiedDoc.of(found, system=system, component=component, full=body.full),
-        )
-
-    with long_request(request):
-        return await run_until_disconnect(request, work, target)
+    return await _planned(request, hub, target, body, VerifiedDoc)
 
 
 @router.post(
@@ -285,6 +265,27 @@ async def _wanted(hub: Hub, target: FollowedComponent, body: PlanRequest) -> Par
         found = overlay(found, await resolve_source(hub, target, body.over))
     whole = found
     return await hub.run_in_file_thread(lambda: whole.only(body.only)) if body.only else whole
+
+
+async def _planned(
+    request: Request,
+    hub: Hub,
+    target: FollowedComponent,
+    body: PlanRequest,
+    kind: type[PlanDoc] | type[VerifiedDoc],
+) -> Response:
+    """Return the response with the plan, as a document of this kind."""
+    system, component = target.address
+
+    async def work() -> Response:
+        found = await _plan(hub, target, body)
+        return await document_response(
+            hub.run_in_file_thread,
+            lambda: kind.of(found, system=system, component=component, full=body.full),
+        )
+
+    with long_request(request):
+        return await run_until_disconnect(request, work, target)
 
 
 async def _plan(hub: Hub, target: FollowedComponent, body: PlanRequest) -> Plan:
