@@ -39,6 +39,7 @@ from paramclient.client.events import (
 )
 from paramclient.client.fetch_all import FetchedAll
 from paramclient.client.files import Ftp
+from paramclient.client.reset import ResetResult
 from paramclient.client.signing import Signing, key_from_environment, read_key
 from paramclient.client.stats import ClientStats
 from paramclient.client.subscription import Changes
@@ -166,6 +167,7 @@ __all__ = [
     "Removed",
     "Rename",
     "Renames",
+    "ResetResult",
     "Resynced",
     "Sample",
     "SetManyResult",

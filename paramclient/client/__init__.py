@@ -13,6 +13,7 @@
 - `link_task`: link reader, sender and reconnection.
 - `local`: internal interface of a client and a component on a link of this process.
 - `recording`: telemetry log of a link.
+- `reset`: resets of parameters to the firmware's defaults.
 - `signing`: signing keys and options.
 - `signing_timestamps`: persistent signature timestamps.
 - `stats`: counters of a client.

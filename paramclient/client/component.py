@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 
+import anyio
+
+from paramclient.client.reset import ResetChoice, ResetResult
 from paramclient.client.subscription import Changes
+from paramclient.errors import UsageError
 from paramclient.model.identity import Identity
 from paramclient.model.params import ParamMap
-from paramclient.model.values import Encoding, Param, Settable
+from paramclient.model.values import Encoding, Param, Settable, Trust, Value
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.params.fetch_result import FetchResult, Progress
 from paramclient.protocol.params.sampling import SAMPLE_SIZE
@@ -239,6 +244,59 @@ class Component(ABC):
             CacheError: with `durable`, the disk cannot be written; nothing was sent.
             LinkError: the link had failed already, or the client was closed.
         """
+
+    async def reset(
+        self,
+        *names: str,
+        defaults: Mapping[str, Value] | None = None,
+        progress: Callable[[SetOutcome], None] | None = None,
+        timeout: float | None = None,
+        settle: float = 0.0,
+        durable: bool = False,
+        asker: str | None = None,
+    ) -> ResetResult:
+        """Set parameters to the firmware's defaults, and verify each as `set` does.
+
+        The parameters are fetched first: ArduPilot, and PX4 from 1.18 on, give the defaults in the file
+        `param.pck`. Parameters without a known default, and those that have it already, are not written. The
+        values are written as by `set_many`, in the order of the names.
+
+        Args:
+            names: param_ids, at least one.
+            defaults: defaults of parameters whose default the vehicle does not give, by name, such as
+                `Metadata.defaults_of`.
+            progress, settle, durable, asker: as in `set_many`.
+            timeout: seconds for the whole call; None: no limit besides the number of attempts.
+
+        Returns:
+            The outcomes of the written values, and the names that were not written.
+
+        Raises:
+            UsageError: no name, or another argument is not valid, or the client only listens.
+            UnknownParameter: the vehicle has no parameter with one of the names. Nothing was written.
+            NoReply: the vehicle did not respond. Nothing was written.
+            ParamClientError: as from `fetch_all` and `set_many`.
+        """
+        if not names:
+            raise UsageError("reset needs the name of at least one parameter")
+        deadline = math.inf if timeout is None else anyio.current_time() + timeout
+
+        def left() -> float | None:
+            return None if timeout is None else max(deadline - anyio.current_time(), 0.0)
+
+        await self.fetch_all(timeout=timeout)
+        present = []
+        for name in dict.fromkeys(names):
+            param = self.params.get(name)
+            if param is None or param.trust is Trust.CACHED:
+                await self.get(name, timeout=left())
+                param = self.params[name]
+            present.append(param)
+        choice = ResetChoice.of(present, {} if defaults is None else defaults)
+        written = await self.set_many(
+            choice.values, progress=progress, timeout=left(), settle=settle, durable=durable, asker=asker
+        )
+        return ResetResult(written, choice.unchanged, choice.without_default)
 
     @abstractmethod
     async def fetch_all(

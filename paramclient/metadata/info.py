@@ -237,6 +237,15 @@ class Metadata(Mapping[str, ParamInfo]):
         """Return the description of a parameter, also by its name in lower case, as ArduPilot accepts it."""
         return self.get(name) or self.get(name.upper())
 
+    def defaults_of(self, names: Iterable[str]) -> dict[str, int | float]:
+        """Return the firmware's defaults of those of the named parameters for which it is given."""
+        infos = {name: self.get(name) for name in names}
+        return {
+            name: info.default
+            for name, info in infos.items()
+            if info is not None and info.default is not None
+        }
+
     def __iter__(self) -> Iterator[str]:
         return iter(self.params)
 
