@@ -260,7 +260,25 @@ class VehicleError(ParamClientError):
 
 
 class UnknownParameter(VehicleError):
-    """The vehicle has no such parameter: it said so, or left this read unanswered and answered others."""
+    """The vehicle has no such parameter: it said so, or left this read unanswered and answered others.
+
+    Attributes:
+        nearest: the most similar names that are known of the vehicle, most similar first. The text suggests
+            them.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        system: int,
+        component: int,
+        name: str | None = None,
+        index: int | None = None,
+        nearest: Sequence[str] = (),
+    ) -> None:
+        super().__init__(message, system=system, component=component, name=name, index=index)
+        self.nearest = tuple(nearest)
 
 
 class Refused(VehicleError):

@@ -1,21 +1,22 @@
-"""Documents of the cache: tables and vehicles, and results of copying and removing."""
+"""Documents of the cache: tables and vehicles, and results of adding, copying and removing."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from paramclient.documents.document import Document
+from paramclient.documents.document import Document, Maybe
 from paramclient.documents.param import ParamDoc
 from paramclient.model.identity import autopilot_name
-from paramclient.model.notation import hash_text, time_or_none
+from paramclient.model.notation import hash_text, time_or_none, time_text
 
 if TYPE_CHECKING:
-    from paramclient.cache import CachedComponent, CachedSummary, CachedVehicle
+    from paramclient.cache import AddedTable, CachedComponent, CachedSummary, CachedVehicle
     from paramclient.metadata import Metadata
     from paramclient.model.values import Param
 
 __all__ = [
+    "AddedDoc",
     "CachedListDoc",
     "CachedSummaryDoc",
     "CachedTableDoc",
@@ -42,6 +43,7 @@ class CachedSummaryDoc(Document):
     hash: str | None
     synced_at: str | None
     updated_at: str | None
+    source: Maybe[str] = None
 
     @classmethod
     def of(cls, summary: CachedSummary) -> CachedSummaryDoc:
@@ -58,6 +60,7 @@ class CachedSummaryDoc(Document):
             hash=hash_text(summary.hash),
             synced_at=time_or_none(summary.synced_at),
             updated_at=time_or_none(summary.updated_at),
+            source=summary.source,
         )
 
 
@@ -77,6 +80,7 @@ class CachedTableDoc(Document):
     uid: str | None
     hash: str | None
     synced_at: str | None
+    source: Maybe[str] = None
     params: dict[str, ParamDoc]
 
     @classmethod
@@ -115,6 +119,7 @@ class CachedTableDoc(Document):
             uid=table.identity.uid,
             hash=hash_text(table.hash),
             synced_at=time_or_none(table.synced_at),
+            source=table.source,
             params=members,
         )
 
@@ -171,6 +176,35 @@ class CopiedDoc(Document):
     params: int
     lines: int
     snapshots: int
+
+
+class AddedDoc(Document):
+    """The result of adding a file to the cache; see `AddedTable`."""
+
+    file: str
+    key: str
+    system: int
+    component: int
+    size: int
+    complete: bool
+    hash: str | None
+    at: str
+    notes: list[str]
+
+    @classmethod
+    def of(cls, added: AddedTable, file: str) -> AddedDoc:
+        """Return the document of an `AddedTable`."""
+        return cls(
+            file=file,
+            key=added.key,
+            system=added.system,
+            component=added.component,
+            size=added.size,
+            complete=added.complete,
+            hash=hash_text(added.hash),
+            at=time_text(added.at),
+            notes=list(added.notes),
+        )
 
 
 class RemovedDoc(Document):
