@@ -28,7 +28,8 @@ def run(arguments: Sequence[str]) -> int:
         KeyboardInterrupt: Ctrl-C while nothing is awaited, or a second Ctrl-C.
         BrokenPipeError: the reader of stdout has closed it.
     """
-    if _shows_help(arguments):
+    shows_help = _shows_help(arguments)
+    if shows_help:
         _load(_app)
     with _warnings_shown() as printer:
         try:
@@ -47,6 +48,10 @@ def run(arguments: Sequence[str]) -> int:
             return code_of(error)
         except BrokenPipeError:
             raise
+        except SystemExit:  # from rich: the reader of the help, such as head, has closed it
+            if not shows_help:
+                raise
+            code = ExitCode.DONE
         except OSError as error:  # of stdout: the library translates all others into its own errors
             report(f"cannot write the output: {error.strerror}")
             return ExitCode.INCOMPLETE

@@ -12,12 +12,12 @@ from cyclopts.validators import Number
 from paramclient.cache import CutOff, HistoryEntry, ParamCache, SetupNotes, SnapshotSummary
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import CacheOptions, Id
-from paramclient.cli.output import print_document, print_table
+from paramclient.cli.output import local_time, print_document, print_table, say
 from paramclient.cli.param_names import cached_names, check_given, unmatched_text
 from paramclient.cli.sources import tables_in
 from paramclient.cli.time_arguments import parse_time
 from paramclient.errors import NotInCache, UsageError
-from paramclient.model.notation import hash_text, time_text
+from paramclient.model.notation import hash_text
 from paramclient.model.patterns import NameChoice
 from paramclient.model.values import Param, format_value
 
@@ -45,11 +45,14 @@ def history(
         vehicle: Its system id, its hardware id in full, uid: and at least 6 digits of it, or its key.
         names: Print only these parameters: names in upper or lower case, or patterns such as "MC_*".
         component: Print only this component.
-        since: Print only changes from this time on: 2h ago, yesterday, '2026-11-20 14:00'.
+        since: Print only changes from this time on: 2h ago, yesterday, '2026-11-20 14:00'. A time
+            without a zone is of this computer's time zone, as the printed ones are.
         limit: Print at most this number of changes, the newest ones.
         snapshots: Print the snapshots instead of the changes.
     """
     begin = None if since is None else parse_time(since, time.time())
+    if begin is not None and not options.json:
+        say(f"since {local_time(begin)}")
     wanted = check_given(names)
     if snapshots and wanted:
         raise UsageError("--snapshots lists whole tables and takes no parameter name")
@@ -115,7 +118,7 @@ def _print_snapshots(kept: Sequence[SnapshotSummary], options: CacheOptions) -> 
         print_document(SnapshotsDoc.of(kept))
         return
     rows = (
-        (each.id, time_text(each.at), each.component, each.size, hash_text(each.hash), _reason(each))
+        (each.id, local_time(each.at), each.component, each.size, hash_text(each.hash), _reason(each))
         for each in kept
     )
     print_table(["id", "time", "component", "params", "hash", "reason"], rows, right="id params")
@@ -123,12 +126,12 @@ def _print_snapshots(kept: Sequence[SnapshotSummary], options: CacheOptions) -> 
 
 def _entry_cells(entry: HistoryEntry) -> tuple[object, ...]:
     new = None if entry.new is None else _value(entry.new)
-    return time_text(entry.at), entry.component, entry.name, _value(entry.old), new, entry.by
+    return local_time(entry.at), entry.component, entry.name, _value(entry.old), new, entry.by
 
 
 def _cut_off_cells(note: CutOff) -> tuple[object, ...]:
     progress = f"{note.done} of {note.total} values" if note.total else "nothing written"
-    return time_text(note.at), note.component, f"({note.kind} cut off)", None, progress, note.asked_by
+    return local_time(note.at), note.component, f"({note.kind} cut off)", None, progress, note.asked_by
 
 
 def _reason(each: SnapshotSummary) -> str:

@@ -24,6 +24,7 @@ from paramclient.cli.options import CacheOptions, Id
 from paramclient.cli.output import (
     by_index,
     default_text,
+    local_time,
     print_document,
     print_line,
     print_table,
@@ -37,7 +38,7 @@ from paramclient.cli.sources import choose, is_file, open_file, tables_in
 from paramclient.errors import NotInCache, UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.identity import autopilot_name
-from paramclient.model.notation import hash_text, time_or_none, time_text
+from paramclient.model.notation import hash_text
 from paramclient.model.patterns import NameChoice
 from paramclient.model.values import Param, format_value, type_name
 from paramclient.model.wording import counted
@@ -156,7 +157,7 @@ def cache_add(
         crc = "" if added.hash is None else f"; hash {hash_text(added.hash)}"
         print_line(
             f"{counted(added.size, 'parameter')} of {file} are the cached table of "
-            f"{added.system}/{added.component} ({added.key}), values of {time_text(added.at)}{crc}"
+            f"{added.system}/{added.component} ({added.key}), values of {local_time(added.at)}{crc}"
         )
     return ExitCode.DONE
 
@@ -318,12 +319,19 @@ def _print_summaries(summaries: Sequence[CachedSummary]) -> None:
             autopilot_name(each.autopilot),
             each.size,
             hash_text(each.hash),
-            time_or_none(each.synced_at) if each.source is None else f"file {each.source}",
+            _synced(each),
             each.key,
         )
         for each in summaries
     )
     print_table(["component", "autopilot", "params", "hash", "synced", "key"], rows, right="params")
+
+
+def _synced(table: CachedSummary) -> str | None:
+    """Return when a table was verified last, or the file that it was added from."""
+    if table.source is not None:
+        return f"file {table.source}"
+    return None if table.synced_at is None else local_time(table.synced_at)
 
 
 def _print_table(view: _View) -> None:
@@ -334,7 +342,7 @@ def _print_table(view: _View) -> None:
     rows = (
         (
             *(param.name, _value(param), *([default_text(param)] if changed else [])),
-            *(type_name(param.type), param.index, time_text(table.heard_at[param.name])),
+            *(type_name(param.type), param.index, local_time(table.heard_at[param.name])),
             *(() if metadata is None else described_cells(metadata, param)),
         )
         for param in params
@@ -347,7 +355,7 @@ def _print_table(view: _View) -> None:
         print_descriptions(view.names, metadata)
     if view.names:
         return
-    synced = "never complete" if table.synced_at is None else f"synced {time_text(table.synced_at)}"
+    synced = "never complete" if table.synced_at is None else f"synced {local_time(table.synced_at)}"
     if table.source is not None:
         synced = f"added from the file {table.source}, not confirmed by the vehicle"
     crc = "" if table.hash is None else f"; hash {hash_text(table.hash)}"

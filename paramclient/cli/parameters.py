@@ -25,6 +25,7 @@ from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import (
     by_index,
     default_text,
+    local_time,
     milliseconds,
     print_document,
     print_line,
@@ -49,7 +50,7 @@ from paramclient.client.events import (
 )
 from paramclient.client.subscription import Changes
 from paramclient.errors import CacheError, NoReply, ParamClientError, UsageError
-from paramclient.model.notation import hash_text, time_text
+from paramclient.model.notation import hash_text
 from paramclient.model.patterns import NameChoice, is_pattern
 from paramclient.model.values import Param, Trust, format_value, type_name
 from paramclient.model.wording import first_of
@@ -466,7 +467,7 @@ async def _print_changes_and_events(
             if as_lines_of_json:
                 print_document(_line(each, at))
             else:
-                print_line(f"{time_text(at)}  {text}")
+                print_line(f"{local_time(at)}  {text}")
 
 
 async def _merged(changes: Changes, events: Events) -> AsyncGenerator[Change | Event]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal, TypeAlias
 
 import anyio
 import anyio.to_thread
@@ -29,6 +29,9 @@ from paramclient.provision.vehicle_params import cached_param_set, select_non_de
 
 __all__ = ["save"]
 
+SaveForm: TypeAlias = Literal["qgc", "parm", "mission-planner", "pck", "json", "yaml"]
+"""The file formats that can be written: all but PX4's start scripts."""
+
 _DEFAULTS: Final = LinkOptions()
 
 
@@ -37,7 +40,7 @@ async def save(
     file: Path,
     /,
     *,
-    form: FileForm | None = None,
+    form: SaveForm | None = None,
     changed: bool = False,
     only: Annotated[tuple[str, ...], Parameter(show_default=False)] = (),
     all_: Annotated[bool, Parameter(name="--all")] = False,
@@ -61,9 +64,7 @@ async def save(
         all_: Write all components of the vehicle, if the file format can hold several.
         refresh: Download all parameters even if the cache is up to date.
     """
-    form = format_of_name(str(file)) if form is None else form
-    if form is FileForm.PX4_SCRIPT:
-        raise UsageError("start scripts of PX4 cannot be written, only read; choose another file format")
+    written = format_of_name(str(file)) if form is None else FileForm(form)
     if all_ and options.component is not None:
         raise UsageError("--all and --component exclude each other")
     if is_file(where):
@@ -81,8 +82,8 @@ async def save(
         report(fault)
     sets = _chosen(sets, only) if only else sets
     if sets:
-        await anyio.to_thread.run_sync(lambda: write_file(file, sets, form=form))
-        _show(file, form, sets, as_json=options.json)
+        await anyio.to_thread.run_sync(lambda: write_file(file, sets, form=written))
+        _show(file, written, sets, as_json=options.json)
     else:
         report(f"nothing was written to {file}")
     return ExitCode.INCOMPLETE if faults or not sets else ExitCode.DONE
