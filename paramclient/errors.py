@@ -423,9 +423,7 @@ class NoReply(ParamClientError, TimeoutError):
         awaited: the expected response, in words.
         attempts: the number of requests sent (0 if there is no request for it).
         waited: seconds from the first request to giving up.
-
-    Args:
-        hint: what was received instead and the likely cause, in sentences, for the message.
+        hint: what was received instead and the likely cause, in sentences, which end the message; or "".
     """
 
     def __init__(self, awaited: str, *, attempts: int, waited: float, hint: str = "") -> None:
@@ -434,6 +432,7 @@ class NoReply(ParamClientError, TimeoutError):
         self.awaited = awaited
         self.attempts = attempts
         self.waited = waited
+        self.hint = hint
 
 
 class LinkError(ParamClientError, OSError):

@@ -53,6 +53,8 @@ COMMANDS = [
     "diff",
     "save",
     "history",
+    "search",
+    "info",
     "sim",
 ]
 COMMANDS += ["apply", "verify", "restore", "import", "serve", "token"]

@@ -2,8 +2,8 @@
 
 - `app`: all subcommands, the main function, signals and errors.
 - Subcommands: `parameters` (fetch, get, watch), `set_command` (set), `offline` (show, cache), `logs`
-  (import), `apply` (apply, verify, restore), `save`, `diff`, `history`, `fleet`, `link`, `check`, `ports`,
-  `signing`, `serve`, `token` and `simulate` (sim).
+  (import), `apply` (apply, verify, restore), `save`, `diff`, `history`, `search` (search, info), `fleet`,
+  `link`, `check`, `ports`, `signing`, `serve`, `token` and `simulate` (sim).
 - `param_names`: names and patterns of parameters, and suggestions.
 - `sources`, `targets`: the parameters and the vehicles that an argument names. `time_arguments`: times.
 - `session`, `options`: an open link with its vehicle; options that several subcommands share.

@@ -245,7 +245,7 @@ _add(
     "before.params after.params",
     "quad.param udpin:0.0.0.0:14550 --only 'MC_*'",
     "1 2 --base defaults",
-    arguments="A B",
+    arguments="LEFT RIGHT",
 )
 _add(
     _app,
@@ -253,6 +253,13 @@ _add(
     *("1 MC_ROLL_P", "1 'MC_*' --since '2h ago'", "1 --snapshots"),
     arguments="VEHICLE [NAME...]",
 )
+_add(
+    _app,
+    "search:search",
+    *("roll rate", "battery voltage --vehicle 1", "geofence --metadata apm.pdef.xml"),
+    arguments="WORD [WORD...]",
+)
+_add(_app, "search:info", "MC_ROLL_P", "rtl_alt --vehicle 1 --json")
 _app.command(_fleet)
 _add(
     _app,

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 from paramclient.documents.document import Document, Maybe
-from paramclient.documents.param import ParamDoc
+from paramclient.documents.history import HistoryEntryDoc
+from paramclient.documents.param import InfoDoc, ParamDoc
 from paramclient.model.identity import autopilot_name
 from paramclient.model.notation import hash_text, time_or_none, time_text
 
 if TYPE_CHECKING:
-    from paramclient.cache import AddedTable, CachedComponent, CachedSummary, CachedVehicle
-    from paramclient.metadata import Metadata
+    from paramclient.cache import AddedTable, CachedComponent, CachedSummary, CachedVehicle, HistoryEntry
+    from paramclient.metadata import Metadata, ParamInfo
     from paramclient.model.values import Param
 
 __all__ = [
@@ -22,6 +23,10 @@ __all__ = [
     "CachedTableDoc",
     "CachedTablesDoc",
     "CopiedDoc",
+    "FoundDoc",
+    "FoundParamDoc",
+    "KnownValueDoc",
+    "ParamInfoDoc",
     "PlaceDoc",
     "RemovedDoc",
     "VehicleDoc",
@@ -204,6 +209,77 @@ class AddedDoc(Document):
             hash=hash_text(added.hash),
             at=time_text(added.at),
             notes=list(added.notes),
+        )
+
+
+class FoundParamDoc(Document):
+    """A parameter that a search has found; `vehicles` are the keys of the vehicles that have it."""
+
+    name: str
+    description: str | None
+    vehicles: list[str]
+
+    @classmethod
+    def of(cls, name: str, info: ParamInfo | None, tables: Iterable[CachedComponent]) -> FoundParamDoc:
+        """Return the document of a parameter with the tables that have it."""
+        description = None if info is None else info.short_description or None
+        return cls(name=name, description=description, vehicles=[each.key for each in tables])
+
+
+class FoundDoc(Document):
+    """The parameters that a search has found, best match first."""
+
+    results: list[FoundParamDoc]
+
+
+class KnownValueDoc(Document):
+    """The cached value of a parameter on one vehicle, and its last changes."""
+
+    key: str
+    system: int
+    component: int
+    autopilot: str
+    param: ParamDoc
+    changes: list[HistoryEntryDoc]
+
+
+class ParamInfoDoc(Document):
+    """What is known of a parameter: its metadata, and its value on each vehicle."""
+
+    name: str
+    metadata: InfoDoc | None
+    vehicles: list[KnownValueDoc]
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        info: ParamInfo | None,
+        tables: Iterable[CachedComponent],
+        changes: Mapping[tuple[str, int], Iterable[HistoryEntry]],
+    ) -> ParamInfoDoc:
+        """Return the document of a parameter.
+
+        Args:
+            name: param_id.
+            info: its metadata, or None.
+            tables: the tables that have it.
+            changes: its last changes by key and component.
+        """
+        return cls(
+            name=name,
+            metadata=None if info is None else InfoDoc.of(info),
+            vehicles=[
+                KnownValueDoc(
+                    key=each.key,
+                    system=each.system,
+                    component=each.component,
+                    autopilot=autopilot_name(each.autopilot),
+                    param=ParamDoc.kept(each.params[name], heard_at=each.heard_at[name]),
+                    changes=[HistoryEntryDoc.of(line) for line in changes[each.key, each.component]],
+                )
+                for each in tables
+            ],
         )
 
 

@@ -85,7 +85,10 @@ def _vehicles(problem: Problem) -> tuple[str, ...]:
 
 def _no_reply(detail: str, problem: Problem) -> NoReply:
     return NoReply(
-        str(problem["awaited"]), attempts=int(problem["attempts"]), waited=float(problem["waited"])
+        str(problem["awaited"]),
+        attempts=int(problem["attempts"]),
+        waited=float(problem["waited"]),
+        hint=str(problem.get("hint", ""))[:DETAIL_LENGTH_MAX],
     )
 
 
