@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 from paramclient.cache import (
+    AddedTable,
     CachedComponent,
     CachedVehicle,
     FleetDiff,
@@ -100,6 +101,7 @@ from paramclient.protocol.wire import Refusal, SigningKey, SigningPolicy, Signin
 from paramclient.version import __version__
 
 __all__ = [
+    "AddedTable",
     "Added",
     "AmbiguousVehicle",
     "AnotherVehicle",

@@ -260,7 +260,25 @@ class VehicleError(ParamClientError):
 
 
 class UnknownParameter(VehicleError):
-    """The vehicle has no such parameter: it said so, or left this read unanswered and answered others."""
+    """The vehicle has no such parameter: it said so, or left this read unanswered and answered others.
+
+    Attributes:
+        nearest: the most similar names that are known of the vehicle, most similar first. The text suggests
+            them.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        system: int,
+        component: int,
+        name: str | None = None,
+        index: int | None = None,
+        nearest: Sequence[str] = (),
+    ) -> None:
+        super().__init__(message, system=system, component=component, name=name, index=index)
+        self.nearest = tuple(nearest)
 
 
 class Refused(VehicleError):
@@ -405,9 +423,7 @@ class NoReply(ParamClientError, TimeoutError):
         awaited: the expected response, in words.
         attempts: the number of requests sent (0 if there is no request for it).
         waited: seconds from the first request to giving up.
-
-    Args:
-        hint: what was received instead and the likely cause, in sentences, for the message.
+        hint: what was received instead and the likely cause, in sentences, which end the message; or "".
     """
 
     def __init__(self, awaited: str, *, attempts: int, waited: float, hint: str = "") -> None:
@@ -416,6 +432,7 @@ class NoReply(ParamClientError, TimeoutError):
         self.awaited = awaited
         self.attempts = attempts
         self.waited = waited
+        self.hint = hint
 
 
 class LinkError(ParamClientError, OSError):

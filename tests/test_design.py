@@ -57,9 +57,8 @@ MAY_IMPORT = {
     "remote": SHELL | {"documents"},
     "metadata": SHELL,
     "provision.apply_rules": {"errors", "model"},
-    "provision.similar_names": set[str](),
-    "provision.planning": {"errors", "model", "provision.apply_rules", "provision.similar_names"},
-    "provision": SHELL | {"files", "provision.planning", "provision.apply_rules", "provision.similar_names"},
+    "provision.planning": {"errors", "model", "provision.apply_rules"},
+    "provision": SHELL | {"files", "provision.planning", "provision.apply_rules"},
     "logs": SHELL | {"files"},
     "diagnosis": SHELL | {"metadata"},
     "testing": {"errors", "sim"},
@@ -69,7 +68,7 @@ MAY_IMPORT = {
 """Which other rooms a room may import; the longest name that fits a module counts. The empty name is the
 public face. What is not named, command and service, may import all of these, and none of these imports it."""
 
-PURE = ("errors", "model", "protocol", "sim", "provision.planning", "provision.similar_names")
+PURE = ("errors", "model", "protocol", "sim", "provision.planning")
 """Rooms without input and output: time comes in as an argument, bytes as bytes."""
 
 IMPURE_MODULES = {

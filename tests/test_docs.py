@@ -53,6 +53,8 @@ COMMANDS = [
     "diff",
     "save",
     "history",
+    "search",
+    "info",
     "sim",
 ]
 COMMANDS += ["apply", "verify", "restore", "import", "serve", "token"]
@@ -251,7 +253,7 @@ def subcommand(words: list[str]) -> list[str]:
 
 def test_every_command_is_shown_and_exists() -> None:
     used = {tuple(subcommand(words)) for words in commands()}
-    cache = {("cache", verb) for verb in ("list", "history", "path", "remove", "copy")}
+    cache = {("cache", verb) for verb in ("list", "history", "path", "add", "remove", "copy")}
     fleet = {("fleet", "diff")}
     signing = {("signing", verb) for verb in ("setup", "disable")}
     assert used == {(verb,) for verb in COMMANDS} | cache | fleet | signing
@@ -273,7 +275,7 @@ def test_the_page_of_the_command_names_every_option() -> None:
         offered |= set(re.findall(r"--[a-z][a-z-]+", help_of(command)))
     for verb in ("setup", "disable"):
         offered |= set(re.findall(r"--[a-z][a-z-]+", help_of("signing", verb)))
-    for verb in ("list", "history", "path", "remove", "copy"):
+    for verb in ("list", "history", "path", "add", "remove", "copy"):
         offered |= set(re.findall(r"--[a-z][a-z-]+", help_of("cache", verb)))
     offered |= set(re.findall(r"--[a-z][a-z-]+", help_of("fleet", "diff")))
     named = set(re.findall(r"`(--[a-z][a-z-]+)", page))

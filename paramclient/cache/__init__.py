@@ -3,6 +3,7 @@
 - `cells`: database cells: checks of their types, times and identities.
 - `database_url`: URL of a PostgreSQL database.
 - `file_ownership`: owner and access rights of files.
+- `file_table`: a parameter file as the table of a vehicle.
 - `fleet`: comparison of parameters across vehicles.
 - `interface`: `Store`, the interface of a file and of a shared database.
 - `lock`: lock on a folder or file.
@@ -31,6 +32,7 @@
 
 from __future__ import annotations
 
+from paramclient.cache.file_table import AddedTable
 from paramclient.cache.fleet import FleetDiff, FleetValue, FleetVehicle, Holder, NameSpread
 from paramclient.cache.interrupted_setups import CutOff, RunningSetup, SetupNotes
 from paramclient.cache.observed_table import HeardParams, UnixTimes
@@ -54,6 +56,7 @@ from paramclient.cache.tables import HISTORY_LINES
 from paramclient.cache.transfer import CopyResult
 
 __all__ = [
+    "AddedTable",
     "BY_US",
     "BY_VEHICLE",
     "CLOCK_SLACK",

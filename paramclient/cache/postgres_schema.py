@@ -105,5 +105,6 @@ MIGRATIONS: Final[tuple[tuple[str, ...], ...]] = (
         # Number of the last operation of each program, so that no operation is executed twice.
         "CREATE TABLE writer (id text PRIMARY KEY, done bigint NOT NULL)",
     ),
+    ("ALTER TABLE component ADD COLUMN source text",),
 )
 """Statements from each version to the next. The version is the number of steps executed."""

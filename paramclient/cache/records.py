@@ -49,6 +49,8 @@ class TableState:
         volatile_known: whether the set of volatile parameters was verified by computing the hash.
         synced_at: time of the last verification of the table against the vehicle.
         file_works: whether the vehicle, with this firmware, serves the table as a file; None if unknown.
+        source: the file from which the table was added, see `ParamCache.add`. None does not change the stored
+            one, except in a state with `synced_at`: then the vehicle has replaced or confirmed the values.
     """
 
     hash: int | None = None
@@ -57,6 +59,7 @@ class TableState:
     volatile_known: bool = False
     synced_at: float | None = None
     file_works: bool | None = None
+    source: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -205,6 +208,8 @@ class CachedSummary:
         autopilot: MAV_AUTOPILOT of this component's heartbeat.
         size: number of cached parameters.
         hash, count, complete, volatile_known, synced_at, file_works: as in `TableState`.
+        source: the file from which the table was added; None if it came from the vehicle, or the vehicle has
+            confirmed it since.
         updated_at: time of the last write to the table.
     """
 
@@ -220,6 +225,7 @@ class CachedSummary:
     synced_at: float | None
     updated_at: float
     file_works: bool | None
+    source: str | None
 
     @property
     def system(self) -> int:

@@ -153,6 +153,7 @@ MIGRATIONS: Final[tuple[Step, ...]] = (
         _pack_tables,
         "DROP TABLE param",
     ),
+    ("ALTER TABLE component ADD COLUMN source TEXT",),
 )
 """Changes from each schema version to the next. The version is the number of steps executed. Released steps
 never change."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
@@ -12,6 +13,7 @@ import platformdirs
 
 from paramclient.cache import fleet, snapshots, tables
 from paramclient.cache.database_url import DatabaseAddress, is_address
+from paramclient.cache.file_table import AddedTable, FileTable
 from paramclient.cache.fleet import FleetDiff
 from paramclient.cache.interface import Store
 from paramclient.cache.lookup import find_vehicle
@@ -29,8 +31,9 @@ from paramclient.cache.records import (
 from paramclient.cache.sqlite import SqliteStore
 from paramclient.cache.transaction import Session
 from paramclient.cache.transfer import CopyResult, copy_store
-from paramclient.errors import CacheError, NotInCache
+from paramclient.errors import CacheError, NotInCache, UnknownVehicle, UsageError
 from paramclient.model.identity import Identity
+from paramclient.model.notation import time_text
 from paramclient.model.paramset import ParamSet
 
 __all__ = ["ParamCache", "default_path"]
@@ -172,6 +175,67 @@ class ParamCache:
         """
         if updates:
             self._store.do(Merge(updates, based_on or {}))
+
+    def add(
+        self,
+        params: ParamSet,
+        vehicle: str | Identity | None = None,
+        *,
+        component: int | None = None,
+        at: float | None = None,
+        force: bool = False,
+    ) -> AddedTable:
+        """Make the parameters of a file the cached table of a vehicle, such as before a slow link is used.
+
+        The table is marked with `params.source` until the vehicle has confirmed or replaced it. If the
+        vehicle is a PX4 and the file is complete, the table has the hash of its values: at the first contact,
+        an equal hash of the vehicle confirms them without a download. Otherwise the next fetch downloads the
+        table.
+
+        Types that the file does not have, and the indices, are those of the vehicle's previous table, or of
+        another complete table of the same firmware; without one, a PX4's indices follow from the names.
+
+        Args:
+            params: the parameters.
+            vehicle: a vehicle in the cache, as for `components`, or that of the file's identity; or another
+                identity, which may be new; None for the identity of the file.
+            component: component id; None for that of the file, else the autopilot's.
+            at: time of the values in unix seconds; None for that of the file, else now.
+            force: replace a table that was received later than `at`: the values then have the present time.
+
+        Raises:
+            UsageError: the file is empty, does not tell its vehicle, lacks types that no cached table has, or
+                has an invalid value; or the table was received later, and `force` is not given.
+            UnknownVehicle: no vehicle in the cache has this name.
+            AmbiguousVehicle: several vehicles have this name.
+        """
+        number = component or params.component or 1
+        moment = at or params.at or time.time()
+        if not params:
+            raise UsageError(f"{params.source or 'the file'} has no parameters")
+
+        def work(session: Session) -> tuple[TableUpdate, AddedTable]:
+            identity = params.identity if vehicle is None else vehicle
+            if isinstance(identity, str):
+                identity = self._named(session, identity, params.identity)
+            elif identity is None:
+                what = params.source or "the file"
+                raise UsageError(f"{what} does not tell its vehicle; name one of the cache")
+            kept = next((each for _, each in session.summaries(identity.key, number)), None)
+            since = moment
+            if kept is not None and kept.size:
+                owner = session.owner_of(kept.key, number)
+                assert owner is not None, "it was found in the same transaction"
+                last = max(session.heard_last(owner), kept.synced_at or 0.0)
+                if last > moment:
+                    if kept.source is None and not force:
+                        raise UsageError(_newer(kept, last, moment))
+                    since = max(time.time(), last)
+            return FileTable(identity, number, params, since).update(session, kept)
+
+        update, added = self._store.read(work)
+        self.save(update)
+        return added
 
     def load(self, key: str, component: int) -> CachedComponent | None:
         """Return the table of a vehicle's component; None if there is none.
@@ -451,6 +515,24 @@ class ParamCache:
         key, known = self._store.read(work)
         return self._store.do(Remove(key, component, known))
 
+    def _named(self, session: Session, name: str, new: Identity | None) -> Identity:
+        """Return the identity of the vehicle with this name, which may be one that the cache does not have.
+
+        Raises:
+            UnknownVehicle, AmbiguousVehicle: as `components`.
+        """
+        try:
+            key = self._choose(session, name)
+        except UnknownVehicle:
+            if new is None:
+                raise
+            one = CachedVehicle(new.key, new, 0.0, 0.0, ())
+            with suppress(UnknownVehicle):
+                return find_vehicle([one], name, place="").identity
+            raise
+        [found] = session.vehicles(key)
+        return found.identity
+
     def _table(self, session: Session, vehicle: str, component: int) -> tuple[str, int]:
         """Return the key of the only vehicle with this name, and the id of its table."""
         key = self._choose(session, vehicle, component=component)
@@ -476,3 +558,10 @@ class ParamCache:
         return find_vehicle(
             session.vehicles(), vehicle, place=self.place, system=system, component=component
         ).key
+
+
+def _newer(kept: CachedSummary, last: float, at: float) -> str:
+    return (
+        f"the cached table of {kept.system}/{kept.component} ({kept.key}) was received at {time_text(last)}, "
+        f"later than the values of the file ({time_text(at)}); it is replaced only with --force (force=True)"
+    )

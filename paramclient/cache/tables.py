@@ -154,6 +154,8 @@ def write_lines(session: Session, owner: int, lines: Sequence[Line]) -> None:
 
 def write_state(session: Session, owner: int, state: TableState) -> None:
     """Write the state of a table as a whole."""
+    if state.source is not None or state.synced_at is not None:
+        session.describe(owner, source=state.source)
     session.describe(
         owner,
         hash=state.hash,

@@ -106,7 +106,7 @@ class Session(ABC):
         """Return tables with their ids, without parameters, optionally of one vehicle or component."""
         rows = self._all(
             f"SELECT id, component, own_autopilot, {self.SIZE}, hash,"
-            f" count, complete, volatile_known, synced_at, updated_at, file_works, key, {_IDENTITY}"
+            f" count, complete, volatile_known, synced_at, updated_at, file_works, source, key, {_IDENTITY}"
             " FROM component c JOIN vehicle ON key = vehicle"
             " WHERE key = coalesce(?, key) AND component = coalesce(?, component)"
             " ORDER BY last_seen DESC, key, component",
@@ -532,11 +532,11 @@ class Session(ABC):
 
 
 def _summary(row: Sequence[object]) -> tuple[int, CachedSummary]:
-    owner, component, autopilot, size, *state, key = cells(row[:12], "iiiiIIiiFfIs")
-    crc, count, complete, volatile_known, synced_at, updated_at, file_works = state
+    owner, component, autopilot, size, *state, key = cells(row[:13], "iiiiIIiiFfISs")
+    crc, count, complete, volatile_known, synced_at, updated_at, file_works, source = state
     return owner, CachedSummary(
         key=key,
-        identity=read_identity(row[12:]),
+        identity=read_identity(row[13:]),
         component=component,
         autopilot=autopilot,
         size=size,
@@ -547,6 +547,7 @@ def _summary(row: Sequence[object]) -> tuple[int, CachedSummary]:
         synced_at=synced_at,
         updated_at=updated_at,
         file_works=None if file_works is None else bool(file_works),
+        source=source,
     )
 
 

@@ -300,4 +300,5 @@ def _state(table: CachedSummary) -> TableState:
         volatile_known=table.volatile_known,
         synced_at=table.synced_at,
         file_works=table.file_works,
+        source=table.source,
     )

@@ -28,7 +28,8 @@ def run(arguments: Sequence[str]) -> int:
         KeyboardInterrupt: Ctrl-C while nothing is awaited, or a second Ctrl-C.
         BrokenPipeError: the reader of stdout has closed it.
     """
-    if _shows_help(arguments):
+    shows_help = _shows_help(arguments)
+    if shows_help:
         _load(_app)
     with _warnings_shown() as printer:
         try:
@@ -47,6 +48,10 @@ def run(arguments: Sequence[str]) -> int:
             return code_of(error)
         except BrokenPipeError:
             raise
+        except SystemExit:  # from rich: the reader of the help, such as head, has closed it
+            if not shows_help:
+                raise
+            code = ExitCode.DONE
         except OSError as error:  # of stdout: the library translates all others into its own errors
             report(f"cannot write the output: {error.strerror}")
             return ExitCode.INCOMPLETE
@@ -142,10 +147,11 @@ _app: Final = App(
 )
 _cache: Final = App(
     name="cache",
-    help="Show, remove or copy tables in the cache. Needs no link.",
+    help="Show, add, remove or copy tables in the cache. Needs no link.",
     help_epilogue=_examples(
         "cache list",
         "cache history 1 MC_ROLL_P",
+        "cache add 1 quad.params",
         "cache path",
         "cache remove 1",
         "cache copy field.sqlite3 postgresql://me@office/fleet",
@@ -195,17 +201,19 @@ _add(
     "udpin:0.0.0.0:14550",
     "sim:px4 --json",
     "tcp:127.0.0.1:5760 --system 3",
+    "udpin:0.0.0.0:14550 --only 'MC_*'",
+    arguments="URL",
 )
 _add(
     _app,
     "parameters:get",
     "udpin:0.0.0.0:14550 MC_ROLL_P MC_PITCH_P",
-    "sim:ardupilot RTL_ALT",
+    "sim:ardupilot 'rtl_*'",
     arguments="URL NAME [NAME...]",
 )
 _add(
     _app,
-    "parameters:set_",
+    "set_command:set_",
     "udpin:0.0.0.0:14550 MC_ROLL_P 6.5 MC_PITCH_P 6.5",
     "udpin:0.0.0.0:14550 FLTMODE1=Loiter --metadata apm.pdef.xml",
     arguments="URL NAME VALUE|NAME=VALUE [NAME VALUE|NAME=VALUE...]",
@@ -237,14 +245,21 @@ _add(
     "before.params after.params",
     "quad.param udpin:0.0.0.0:14550 --only 'MC_*'",
     "1 2 --base defaults",
-    arguments="A B",
+    arguments="LEFT RIGHT",
 )
 _add(
     _app,
     "history:history",
-    *("1 MC_ROLL_P", "1 --since '2h ago'", "1 --snapshots"),
-    arguments="VEHICLE [NAME]",
+    *("1 MC_ROLL_P", "1 'MC_*' --since '2h ago'", "1 --snapshots"),
+    arguments="VEHICLE [NAME...]",
 )
+_add(
+    _app,
+    "search:search",
+    *("roll rate", "battery voltage --vehicle 1", "geofence --metadata apm.pdef.xml"),
+    arguments="WORD [WORD...]",
+)
+_add(_app, "search:info", "MC_ROLL_P", "rtl_alt --vehicle 1 --json")
 _app.command(_fleet)
 _add(
     _app,
@@ -299,7 +314,13 @@ _app.command(_signing)
 _add(_signing, "signing:setup")
 _add(_signing, "signing:disable")
 _add(_cache, "offline:cache_list")
-_add(_cache, "history:history", arguments="VEHICLE [NAME]")
+_add(_cache, "history:history", arguments="VEHICLE [NAME...]")
+_add(
+    _cache,
+    "offline:cache_add",
+    *("1 quad.params", "uid:0002000000003331 before.yaml"),
+    arguments="VEHICLE FILE",
+)
 _add(_cache, "offline:cache_path")
 _add(_cache, "offline:cache_remove")
 _add(_cache, "offline:cache_copy")

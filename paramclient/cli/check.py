@@ -25,6 +25,7 @@ from paramclient.cli.output import (
 from paramclient.cli.session import VEHICLE_TIMEOUT, Deadline, listen
 from paramclient.diagnosis import Finding, Severity, VehicleReport, check_vehicle, findings_of
 from paramclient.errors import UsageError
+from paramclient.model.identity import version_text
 from paramclient.model.wording import first_of
 from paramclient.version import __version__
 
@@ -141,9 +142,8 @@ def _identity_rows(report: VehicleReport) -> Iterator[tuple[str, str]]:
     if not report.has_version:
         yield "firmware", "unknown: no AUTOPILOT_VERSION received"
         return
-    number = identity.firmware
     git_hash = f", commit {identity.git_hash}" if identity.git_hash.strip("0") else ""
-    yield "firmware", f"{number >> 24}.{number >> 16 & 255}.{number >> 8 & 255}{git_hash}"
+    yield "firmware", f"{version_text(identity.firmware)}{git_hash}"
     yield "hardware id", identity.uid or "none"
     yield "capabilities", f"0x{identity.capabilities:x}"
 

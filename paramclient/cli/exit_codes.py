@@ -1,4 +1,4 @@
-"""Exit codes of the command line, and the status words of writes, by error."""
+"""Exit codes and messages of the command line, by error."""
 
 from __future__ import annotations
 
@@ -7,25 +7,16 @@ from typing import Final
 
 from paramclient.errors import (
     AmbiguousVehicle,
-    AnotherVehicle,
     CacheError,
-    ContestedAddress,
-    FileTransferError,
     LinkError,
     NoReply,
-    NotDurable,
     PackError,
     ParamClientError,
-    Refused,
-    TypeMismatch,
-    UnknownParameter,
     UsageError,
-    ValueNotApplied,
-    VehicleArmed,
     VehicleError,
 )
 
-__all__ = ["ExitCode", "code_of", "status_of", "text_of"]
+__all__ = ["ExitCode", "code_of", "text_of"]
 
 
 class ExitCode(IntEnum):
@@ -59,11 +50,6 @@ def text_of(error: ParamClientError) -> str:
     return str(error)
 
 
-def status_of(error: ParamClientError) -> str:
-    """Return the status of a write that failed with this error, in a word."""
-    return next(status for kind, status in _STATUSES.items() if isinstance(error, kind))
-
-
 _CODES: Final = {
     VehicleError: ExitCode.INCOMPLETE,
     PackError: ExitCode.INCOMPLETE,
@@ -73,19 +59,3 @@ _CODES: Final = {
     CacheError: ExitCode.CACHE,
 }
 """Exit codes by class of error; the first class that matches applies."""
-_STATUSES: Final = {
-    Refused: "refused",
-    FileTransferError: "refused",
-    UnknownParameter: "unknown",
-    TypeMismatch: "mismatch",
-    ValueNotApplied: "not-applied",
-    AnotherVehicle: "another",
-    VehicleArmed: "armed",
-    ContestedAddress: "contested",
-    NoReply: "no-reply",
-    UsageError: "invalid",
-    NotDurable: "not-durable",
-    CacheError: "cache",
-    LinkError: "link",
-}
-"""Status words of a failed write by class of error; the first class that matches applies."""

@@ -9,9 +9,8 @@ from typing import Final
 from paramclient.cache import FleetDiff, FleetVehicle, Holder, NameSpread, ParamCache
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import CacheOptions, Id
-from paramclient.cli.output import print_document, print_table, report, say
+from paramclient.cli.output import local_time, print_document, print_table, report, say
 from paramclient.errors import UsageError
-from paramclient.model.notation import time_text
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import Param, ParamType, check_name, format_value
 from paramclient.model.wording import counted
@@ -101,7 +100,7 @@ def _rows(each: NameSpread, vehicles: int) -> Iterator[tuple[object, ...]]:
 def _since(holder: Holder) -> str | None:
     if holder.since is None:
         return None
-    return f"{'' if holder.changed else 'before '}{time_text(holder.since)}"
+    return f"{'' if holder.changed else 'before '}{local_time(holder.since)}"
 
 
 def _vehicle_text(vehicle: FleetVehicle) -> str:

@@ -12,12 +12,14 @@ from cyclopts.validators import Number
 from paramclient.cache import CutOff, HistoryEntry, ParamCache, SetupNotes, SnapshotSummary
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import CacheOptions, Id
-from paramclient.cli.output import print_document, print_table
+from paramclient.cli.output import local_time, print_document, print_table, say
+from paramclient.cli.param_names import cached_names, check_given, unmatched_text
 from paramclient.cli.sources import tables_in
 from paramclient.cli.time_arguments import parse_time
-from paramclient.errors import UsageError
-from paramclient.model.notation import hash_text, time_text
-from paramclient.model.values import Param, check_name, format_value
+from paramclient.errors import NotInCache, UsageError
+from paramclient.model.notation import hash_text
+from paramclient.model.patterns import NameChoice
+from paramclient.model.values import Param, format_value
 
 __all__ = ["history"]
 
@@ -26,9 +28,8 @@ _DEFAULTS: Final = CacheOptions()
 
 def history(
     vehicle: str,
-    name: str | None = None,
     /,
-    *,
+    *names: str,
     component: Id = None,
     since: str | None = None,
     limit: Annotated[int | None, Parameter(validator=Number(gte=1))] = None,
@@ -42,26 +43,29 @@ def history(
 
     Args:
         vehicle: Its system id, its hardware id in full, uid: and at least 6 digits of it, or its key.
-        name: Print only this parameter.
+        names: Print only these parameters: names in upper or lower case, or patterns such as "MC_*".
         component: Print only this component.
-        since: Print only changes from this time on: 2h ago, yesterday, '2026-11-20 14:00'.
+        since: Print only changes from this time on: 2h ago, yesterday, '2026-11-20 14:00'. A time
+            without a zone is of this computer's time zone, as the printed ones are.
         limit: Print at most this number of changes, the newest ones.
         snapshots: Print the snapshots instead of the changes.
     """
     begin = None if since is None else parse_time(since, time.time())
-    if snapshots and name is not None:
+    if begin is not None and not options.json:
+        say(f"since {local_time(begin)}")
+    wanted = check_given(names)
+    if snapshots and wanted:
         raise UsageError("--snapshots lists whole tables and takes no parameter name")
-    if name is not None:
-        check_name(name)
     with ParamCache(options.cache) as cache:
         key = tables_in(cache, vehicle, None)[0].key
         if snapshots:
             kept = [each for each in cache.snapshots(key, component) if begin is None or each.at >= begin]
             _print_snapshots(kept[-limit:] if limit else kept, options)
         else:
-            entries = cache.history(key, component, name, limit, begin)
+            entries = _entries(cache, key, component, wanted, begin)
+            entries = entries[-limit:] if limit else entries
             oldest = entries[0].at if limit and len(entries) == limit else begin
-            notes = SetupNotes.beside(cache.path).cut_off() if name is None else []
+            notes = [] if wanted else SetupNotes.beside(cache.path).cut_off()
             cut_off = [
                 note
                 for note in notes
@@ -71,6 +75,28 @@ def history(
             ]
             _print_entries(entries, cut_off, options)
     return ExitCode.DONE
+
+
+def _entries(
+    cache: ParamCache, key: str, component: int | None, wanted: Sequence[str], begin: float | None
+) -> list[HistoryEntry]:
+    """Return the changes of the parameters that names and patterns choose; of all parameters without any.
+
+    Raises:
+        NotInCache: the vehicle has and had no such parameter.
+    """
+    if not wanted:
+        return cache.history(key, component, None, None, begin)
+    entries = cache.history(key, component)
+    known = {entry.name for entry in entries}
+    for each in cache.components(key):
+        table = cache.load(key, each.component) if component in (None, each.component) else None
+        known.update(() if table is None else table.params)
+    chosen, unmatched = NameChoice(wanted).divide(known)
+    if unmatched:
+        text = unmatched_text(unmatched, known, lambda: cached_names(cache))
+        raise NotInCache(f"no parameter of {key} in the cache is called {text}")
+    return [entry for entry in entries if entry.name in chosen and (begin is None or entry.at >= begin)]
 
 
 def _print_entries(entries: Sequence[HistoryEntry], cut_off: Sequence[CutOff], options: CacheOptions) -> None:
@@ -92,7 +118,7 @@ def _print_snapshots(kept: Sequence[SnapshotSummary], options: CacheOptions) -> 
         print_document(SnapshotsDoc.of(kept))
         return
     rows = (
-        (each.id, time_text(each.at), each.component, each.size, hash_text(each.hash), _reason(each))
+        (each.id, local_time(each.at), each.component, each.size, hash_text(each.hash), _reason(each))
         for each in kept
     )
     print_table(["id", "time", "component", "params", "hash", "reason"], rows, right="id params")
@@ -100,12 +126,12 @@ def _print_snapshots(kept: Sequence[SnapshotSummary], options: CacheOptions) -> 
 
 def _entry_cells(entry: HistoryEntry) -> tuple[object, ...]:
     new = None if entry.new is None else _value(entry.new)
-    return time_text(entry.at), entry.component, entry.name, _value(entry.old), new, entry.by
+    return local_time(entry.at), entry.component, entry.name, _value(entry.old), new, entry.by
 
 
 def _cut_off_cells(note: CutOff) -> tuple[object, ...]:
     progress = f"{note.done} of {note.total} values" if note.total else "nothing written"
-    return time_text(note.at), note.component, f"({note.kind} cut off)", None, progress, note.asked_by
+    return local_time(note.at), note.component, f"({note.kind} cut off)", None, progress, note.asked_by
 
 
 def _reason(each: SnapshotSummary) -> str:

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
 import anyio
+import anyio.to_thread
 
 from paramclient.cache import ParamCache
 from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.options import CacheOptions
 from paramclient.cli.output import print_document, print_table, report
-from paramclient.errors import ParamClientError
+from paramclient.errors import FileError, LinkError, ParamClientError
+from paramclient.files import read_file
 from paramclient.links import LinkKind, parse_link
 from paramclient.logs.imported_table import ImportedTable
 from paramclient.logs.onboard import is_onboard_log
@@ -24,6 +26,11 @@ from paramclient.model.identity import autopilot_name
 from paramclient.model.notation import hash_text
 
 __all__ = ["cache_of_log", "import_"]
+
+KIND_BYTES: Final = 4096
+"""Bytes at the beginning of a file that tell what it is."""
+SQLITE_MAGIC: Final = b"SQLite format 3\0"
+"""The first bytes of an SQLite database (its file format, section 1.3)."""
 
 _DEFAULTS: Final = CacheOptions()
 
@@ -65,9 +72,43 @@ async def import_(file: Path, /, *files: Path, options: CacheOptions = _DEFAULTS
 
 
 async def _import(path: Path, cache: ParamCache) -> tuple[ImportedTable, ...]:
+    """Import one log.
+
+    Raises:
+        FileError: it is no log, or cannot be read.
+        CacheError: the cache cannot be written.
+    """
     if is_onboard_log(path):
         return (await import_onboard_log(path, cache),)
-    return await import_log(path, cache)
+    try:
+        return await import_log(path, cache)
+    except LinkError as error:
+        kind = await anyio.to_thread.run_sync(_kind_of, path)
+        if kind is None:
+            raise FileError(str(error).partition(": ")[2]) from error
+        raise FileError(f"not imported: {kind}", source=str(path)) from error
+
+
+def _kind_of(path: Path) -> str | None:
+    """Return in words what a file that is no log is; None if it cannot be read."""
+    try:
+        if not path.is_file():
+            return None
+        with path.open("rb") as file:
+            begin = file.read(KIND_BYTES)
+    except OSError:
+        return None
+    if not begin:
+        return "the file is empty"
+    if begin.startswith(SQLITE_MAGIC):
+        return "an SQLite database, and no log. `paramclient cache copy` copies a cache"
+    with suppress(ParamClientError):
+        form = read_file(path).form
+        return f"a parameter file ({form}), and no log. `paramclient cache add VEHICLE {path}` adds it"
+    with suppress(UnicodeDecodeError):
+        begin.decode()
+        return "a text file, and no log"
+    return "neither a telemetry log (.tlog) nor an on-board log (.bin, .ulg): it has no MAVLink frame"
 
 
 @contextmanager

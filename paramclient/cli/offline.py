@@ -1,4 +1,4 @@
-"""The subcommands show, cache list, cache path, cache remove and cache copy, which need no link."""
+"""The subcommands show and cache (list, add, path, remove, copy), which need no link."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from paramclient.cli.options import CacheOptions, Id
 from paramclient.cli.output import (
     by_index,
     default_text,
+    local_time,
     print_document,
     print_line,
     print_table,
@@ -31,20 +32,22 @@ from paramclient.cli.output import (
     report,
     say,
 )
+from paramclient.cli.param_names import cached_names, check_given, unmatched_text
 from paramclient.cli.param_rows import show_file
-from paramclient.cli.sources import is_file, open_file, tables_in
+from paramclient.cli.sources import choose, is_file, open_file, tables_in
 from paramclient.errors import NotInCache, UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.identity import autopilot_name
-from paramclient.model.notation import hash_text, time_or_none, time_text
-from paramclient.model.values import Param, check_name, format_value, type_name
+from paramclient.model.notation import hash_text
+from paramclient.model.patterns import NameChoice
+from paramclient.model.values import Param, format_value, type_name
 from paramclient.model.wording import counted
 from paramclient.provision.vehicle_params import NO_DEFAULTS, left_out_note
 
 if TYPE_CHECKING:
     from paramclient.documents.cached import CachedTableDoc
 
-__all__ = ["cache_copy", "cache_list", "cache_path", "cache_remove", "show", "tables_of"]
+__all__ = ["cache_add", "cache_copy", "cache_list", "cache_path", "cache_remove", "show", "tables_of"]
 
 _DEFAULTS: Final = CacheOptions()
 
@@ -67,23 +70,23 @@ def show(
             least 6 digits of it, or its key, also with the prefix cache:; or replay:FILE, a telemetry log.
         component: Print only this component.
         changed: Print only parameters that differ from the firmware's defaults.
-        names: Print only these parameters of a vehicle, with their metadata.
+        names: Print only these parameters of a vehicle, with their metadata: names in upper or lower case, or
+            patterns such as "MC_*".
         metadata: A file that describes parameters. Default: the stored metadata of the vehicle's firmware.
     """
     if vehicle is not None and is_file(vehicle):
         if names or metadata is not None:
             raise UsageError("names and --metadata go with a vehicle in the cache, not with a parameter file")
         return show_file(open_file(vehicle), component, changed=changed, json=options.json)
-    wanted = tuple(check_name(name) for name in dict.fromkeys(names))
+    wanted = tuple(check_given(names))
     described = from_file(metadata, offline=True)
     is_log = vehicle is not None and vehicle.lower().startswith("replay:")
     with _open(options) if not is_log or vehicle is None else cache_of_log(vehicle) as cache:
         summaries = tables_in(cache, None if is_log else vehicle, component)
         is_list = vehicle is None and len(summaries) > 1 and not options.json
         tables = [] if is_list else _load(cache, summaries)
+        _check_known(cache, wanted, [name for table in tables for name in table.params])
     views = [_View.of(table, wanted, described, cache, changed=changed) for table in tables]
-    if unknown := [name for name in wanted if not any(name in table.params for table in tables)]:
-        raise NotInCache(f"not among the cached parameters: {', '.join(unknown)}")
     if options.json:
         from paramclient.documents.cached import CachedTablesDoc  # only here: loads pydantic
 
@@ -114,6 +117,48 @@ def cache_list(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
         _print_summaries(summaries)
     else:
         say(f"the cache {printable(cache.place)} is empty")
+    return ExitCode.DONE
+
+
+def cache_add(
+    vehicle: str,
+    file: Path,
+    /,
+    *,
+    component: Id = None,
+    force: bool = False,
+    options: CacheOptions = _DEFAULTS,
+) -> ExitCode:
+    """Make a parameter file the cached table of a vehicle, such as before a slow link is used.
+
+    The table is marked with the file until the vehicle confirms or replaces it. If the hash of a PX4 agrees
+    at the first contact, nothing is downloaded; otherwise, and from a vehicle without a hash, the next fetch
+    downloads the table. A table that was received later than the file was written is not replaced.
+
+    Args:
+        vehicle: A vehicle in the cache, or the one that the file names: its system id, its hardware id in
+            full, uid: and at least 6 digits of it, or its key.
+        file: The parameter file. Without types, those of the vehicle's previous table or of another one of
+            the same firmware are used.
+        component: The component. Default: the autopilot, or the only one of the file.
+        force: Replace a table that was received later.
+    """
+    params = choose(open_file(str(file)), component, None)
+    at = file.stat().st_mtime if params.at is None else params.at
+    with _open(options) as cache:
+        added = cache.add(params, vehicle, component=component, at=at, force=force)
+    for note in added.notes:
+        report(f"{file.name}: {note}")
+    if options.json:
+        from paramclient.documents.cached import AddedDoc  # only here: loads pydantic
+
+        print_document(AddedDoc.of(added, str(file)))
+    else:
+        crc = "" if added.hash is None else f"; hash {hash_text(added.hash)}"
+        print_line(
+            f"{counted(added.size, 'parameter')} of {file} are the cached table of "
+            f"{added.system}/{added.component} ({added.key}), values of {local_time(added.at)}{crc}"
+        )
     return ExitCode.DONE
 
 
@@ -194,6 +239,18 @@ def tables_of(options: CacheOptions, vehicle: str, component: int | None) -> lis
         return _load(cache, tables_in(cache, vehicle, component))
 
 
+def _check_known(cache: ParamCache, wanted: Sequence[str], known: Sequence[str]) -> None:
+    """Check that each name and pattern fits a cached parameter.
+
+    Raises:
+        NotInCache: one fits none. The message suggests similar names.
+    """
+    _, unmatched = NameChoice(wanted).divide(known)
+    if unmatched:
+        text = unmatched_text(unmatched, known, lambda: cached_names(cache))
+        raise NotInCache(f"not among the cached parameters: {text}")
+
+
 def _open(options: CacheOptions) -> ParamCache:
     return ParamCache(options.cache)
 
@@ -239,7 +296,8 @@ class _View:
     ) -> _View:
         """Return the view of a table; without `metadata`, with the stored metadata of its firmware."""
         known = known_of_table(cache.path, table) if metadata is None else metadata
-        return cls(table, tuple(name for name in names if name in table.params), known, changed)
+        chosen, _ = NameChoice(names).divide(table.params)
+        return cls(table, tuple(name for name in table.params if name in chosen), known, changed)
 
     @property
     def params(self) -> Iterable[Param]:
@@ -261,12 +319,19 @@ def _print_summaries(summaries: Sequence[CachedSummary]) -> None:
             autopilot_name(each.autopilot),
             each.size,
             hash_text(each.hash),
-            time_or_none(each.synced_at),
+            _synced(each),
             each.key,
         )
         for each in summaries
     )
     print_table(["component", "autopilot", "params", "hash", "synced", "key"], rows, right="params")
+
+
+def _synced(table: CachedSummary) -> str | None:
+    """Return when a table was verified last, or the file that it was added from."""
+    if table.source is not None:
+        return f"file {table.source}"
+    return None if table.synced_at is None else local_time(table.synced_at)
 
 
 def _print_table(view: _View) -> None:
@@ -277,7 +342,7 @@ def _print_table(view: _View) -> None:
     rows = (
         (
             *(param.name, _value(param), *([default_text(param)] if changed else [])),
-            *(type_name(param.type), param.index, time_text(table.heard_at[param.name])),
+            *(type_name(param.type), param.index, local_time(table.heard_at[param.name])),
             *(() if metadata is None else described_cells(metadata, param)),
         )
         for param in params
@@ -290,7 +355,9 @@ def _print_table(view: _View) -> None:
         print_descriptions(view.names, metadata)
     if view.names:
         return
-    synced = "never complete" if table.synced_at is None else f"synced {time_text(table.synced_at)}"
+    synced = "never complete" if table.synced_at is None else f"synced {local_time(table.synced_at)}"
+    if table.source is not None:
+        synced = f"added from the file {table.source}, not confirmed by the vehicle"
     crc = "" if table.hash is None else f"; hash {hash_text(table.hash)}"
     vehicle = f"{table.system}/{table.component} {autopilot_name(table.autopilot)} ({table.key})"
     if changed:

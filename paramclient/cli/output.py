@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from datetime import datetime
 from typing import TYPE_CHECKING, Final
 
 from paramclient.model.values import Param, format_value
@@ -18,6 +19,7 @@ from paramclient.protocol.params.fetch_result import Progress
 
 if TYPE_CHECKING:
     from rich.table import Table
+    from rich.text import Text
 
     from paramclient.documents.document import Document
 
@@ -26,6 +28,7 @@ __all__ = [
     "by_index",
     "default_text",
     "live_view",
+    "local_time",
     "milliseconds",
     "print_document",
     "print_line",
@@ -38,6 +41,11 @@ __all__ = [
 
 WIDTH_UNLIMITED: Final = 10_000
 """Width in columns of an output that is not a terminal, so that nothing is wrapped or cut."""
+
+GAP: Final = 2
+"""Blanks between two columns of a table, and before the second and later lines of a row."""
+SENTENCE_WIDTH_MIN: Final = 20
+"""Columns that sentences in the last column of a table take at least; in less they are hard to read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +80,12 @@ def default_text(param: Param) -> str | None:
     return None if param.default is None else format_value(param.default, param.type)
 
 
+def local_time(at: float) -> str:
+    """Return a unix time as ISO 8601 in the time zone of this computer, with milliseconds and the zone."""
+    text = datetime.fromtimestamp(at).astimezone().isoformat(timespec="milliseconds")
+    return text.replace("+00:00", "Z")
+
+
 def by_index(params: Iterable[Param]) -> list[Param]:
     """Return parameters in the vehicle's order; those without an index last, by name."""
     return sorted(params, key=lambda param: (param.index is None, param.index or 0, param.name))
@@ -96,6 +110,9 @@ def print_line(text: str) -> None:
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, right: str = "") -> None:
     """Print a table, at most as wide as the terminal; without a terminal, as wide as needed.
 
+    No value is broken in two: if the columns do not fit beside each other, each row takes several lines, of
+    which the second and later ones are indented. Only sentences in the last column are wrapped, at spaces.
+
     Args:
         columns: the headings.
         rows: the cells of each row; None is an empty cell.
@@ -103,11 +120,14 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, rig
     """
     from rich.console import Console  # only here: not needed to get started
 
-    table = _table(columns, rows, right.split())
     console = Console(width=None if sys.stdout.isatty() else WIDTH_UNLIMITED)
+    held = [list(row) for row in rows]
     # rich would end the process when the output is closed
     with console.capture() as captured:
-        console.print(table)
+        if (groups := _groups(columns, held, console.width)) is None:
+            console.print(_table(columns, held, right.split(), keeps_values=True))
+        else:
+            console.print(_stacked(columns, held, right.split(), groups), soft_wrap=True)
     lines = [line.rstrip() for line in captured.get().splitlines()]
     print(*lines, sep="\n", flush=True)
 
@@ -198,24 +218,98 @@ def _start_bar(title: str, stack: ExitStack) -> Callable[[Progress], None]:
     return update
 
 
-def _table(columns: Sequence[str], rows: Iterable[Sequence[object]], right: Container[str]) -> Table:
+def _table(
+    columns: Sequence[str],
+    rows: Iterable[Sequence[object]],
+    right: Container[str],
+    *,
+    keeps_values: bool = False,
+) -> Table:
+    """Return a table of rich. With `keeps_values`, only the last column may be wrapped."""
     from rich.table import Table  # only here: not needed to get started
     from rich.text import Text
 
     table = Table(box=None, pad_edge=False, header_style="bold")
-    for column in columns:
-        table.add_column(column, justify="right" if column in right else "left", overflow="fold")
+    for number, column in enumerate(columns, start=1):
+        table.add_column(
+            column,
+            justify="right" if column in right else "left",
+            overflow="fold",
+            no_wrap=keeps_values and number < len(columns),
+        )
     for row in rows:
         table.add_row(
             *(
                 Text(
-                    "" if cell is None else printable(str(cell)),
+                    _cell_text(cell),
                     style=cell.style if isinstance(cell, Coloured) else "",
                 )
                 for cell in row
             )
         )
     return table
+
+
+def _groups(columns: Sequence[str], rows: Sequence[Sequence[object]], width: int) -> list[list[int]] | None:
+    """Return the columns that stand on each line of a row; None if all fit beside each other.
+
+    They fit as well if the last column is left with `SENTENCE_WIDTH_MIN`, or with its longest word.
+    """
+    natural = _widths(columns, rows)
+    if sum(natural) + GAP * (len(natural) - 1) <= width:
+        return None
+    words = [len(word) for row in rows for word in _cell_text(row[-1]).split()]
+    left = width - sum(natural[:-1]) - GAP * (len(natural) - 1)
+    if left >= max([SENTENCE_WIDTH_MIN, len(columns[-1]), *words]):
+        return None
+    groups: list[list[int]] = [[]]
+    used = 0
+    for at, wide in enumerate(natural):
+        needed = wide if not groups[-1] else used + GAP + wide
+        if groups[-1] and needed > width:
+            groups.append([])
+            needed = GAP + wide
+        groups[-1].append(at)
+        used = needed
+    return groups
+
+
+def _stacked(
+    columns: Sequence[str],
+    rows: Sequence[Sequence[object]],
+    right: Container[str],
+    groups: Sequence[Sequence[int]],
+) -> Text:
+    """Return a table in which each row takes a line for each group of columns."""
+    from rich.text import Text  # only here: not needed to get started
+
+    natural = _widths(columns, rows)
+    text = Text()
+    for row in (None, *rows):
+        for number, group in enumerate(groups):
+            text.append("" if not number else " " * GAP)
+            for place, at in enumerate(group):
+                cell = columns[at] if row is None else row[at]
+                shown = _cell_text(cell)
+                style = "bold" if row is None else cell.style if isinstance(cell, Coloured) else ""
+                text.append(" " * GAP if place else "")
+                padding = " " * (natural[at] - len(shown))
+                is_right = columns[at] in right
+                text.append(padding if is_right else "")
+                text.append(shown, style=style)
+                text.append("" if is_right or place == len(group) - 1 else padding)
+            text.append("\n")
+    text.rstrip()
+    return text
+
+
+def _widths(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> list[int]:
+    """Return the width of the widest cell of each column, heading included."""
+    return [max([len(name), *(len(_cell_text(row[at])) for row in rows)]) for at, name in enumerate(columns)]
+
+
+def _cell_text(cell: object) -> str:
+    return "" if cell is None else printable(str(cell))
 
 
 def _escaped(character: str) -> str:

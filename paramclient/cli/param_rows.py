@@ -5,12 +5,11 @@ from __future__ import annotations
 from typing import Final
 
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.output import print_document, print_table, printable, report, say
+from paramclient.cli.output import local_time, print_document, print_table, printable, report, say
 from paramclient.files import ParamFile
 from paramclient.files.param_file import address
 from paramclient.model.comparison import non_defaults
 from paramclient.model.identity import autopilot_name
-from paramclient.model.notation import time_text
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, Value, format_value, type_name
 from paramclient.model.wording import counted
@@ -48,7 +47,7 @@ def described(params: ParamSet) -> str:
         "" if params.identity is None else autopilot_name(params.identity.autopilot),
         f"from {params.source}" if params.source else "",
     ]
-    at = "" if params.at is None else f", {time_text(params.at)}"
+    at = "" if params.at is None else f", {local_time(params.at)}"
     return " ".join(filter(None, [counted(len(params), "parameter"), *origin])) + at
 
 

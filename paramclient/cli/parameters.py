@@ -1,8 +1,9 @@
-"""The subcommands fetch, get, set and watch."""
+"""The subcommands fetch, get and watch."""
 
 from __future__ import annotations
 
 import asyncio
+import shlex
 from collections.abc import AsyncGenerator, Iterable, Sequence
 from contextlib import aclosing, suppress
 from dataclasses import dataclass, replace
@@ -12,23 +13,19 @@ import anyio
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from paramclient.cli.exit_codes import ExitCode, code_of, status_of
+from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.metadata import (
     DESCRIBED_COLUMNS,
     MetadataChoice,
     described_cells,
     from_file,
-    info_of,
     known_of_session,
-    needs_reboot,
-    parse_pairs,
-    problems,
-    resolved,
 )
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import (
     by_index,
     default_text,
+    local_time,
     milliseconds,
     print_document,
     print_line,
@@ -38,8 +35,8 @@ from paramclient.cli.output import (
     report,
     say,
 )
+from paramclient.cli.param_names import ChosenNames, check_given, may_appear, suggest
 from paramclient.cli.session import CommandSession, connect
-from paramclient.client.arguments import SETTLE_MAX
 from paramclient.client.events import (
     Contested,
     Event,
@@ -52,20 +49,20 @@ from paramclient.client.events import (
     Uncontested,
 )
 from paramclient.client.subscription import Changes
-from paramclient.errors import CacheError, NoReply, ParamClientError, UsageError, ValueNotApplied
-from paramclient.metadata import Metadata
-from paramclient.model.notation import hash_text, time_text
-from paramclient.model.values import Param, ParamType, Trust, Value, check_name, format_value, type_name
+from paramclient.errors import CacheError, NoReply, ParamClientError, UsageError
+from paramclient.model.notation import hash_text
+from paramclient.model.patterns import NameChoice, is_pattern
+from paramclient.model.values import Param, Trust, format_value, type_name
 from paramclient.model.wording import first_of
 from paramclient.protocol.params.change import Added, Change, Removed
 from paramclient.protocol.params.fetch_result import FetchResult, Policy
 from paramclient.protocol.params.sampling import SAMPLE_SIZE, Sample
 
 if TYPE_CHECKING:
-    from paramclient.documents.command_output import FetchOutputDoc, WriteOutputDoc
+    from paramclient.documents.command_output import FetchOutputDoc
     from paramclient.documents.document import Document
 
-__all__ = ["fetch", "get", "set_", "watch"]
+__all__ = ["fetch", "get", "watch"]
 
 REFRESH_TIMEOUT: Final = 10.0
 """Seconds to wait for the values that the vehicle's hash does not cover, without --timeout."""
@@ -80,7 +77,8 @@ _ComponentEvent: TypeAlias = Lost | Found | Rebooted | Resynced | Contested | Un
 async def fetch(
     url: str,
     /,
-    *,
+    *names: Annotated[str, Parameter(show=False)],
+    only: Annotated[tuple[str, ...], Parameter(show_default=False)] = (),
     refresh: bool = False,
     changed: bool = False,
     accept: Literal["verified", "sampled"] = "verified",
@@ -94,6 +92,8 @@ async def fetch(
 
     Args:
         url: The link, such as udpin:0.0.0.0:14550, tcp:HOST:PORT or sim:px4.
+        names: Not accepted; the error names the commands that take names.
+        only: Print only this name or pattern, such as "MC_*". May be given several times.
         refresh: Download all parameters even if the cache is up to date.
         changed: Print only parameters that differ from the firmware's defaults.
         accept: With "sampled", a cached table of a vehicle without a hash is accepted if a sample of it
@@ -101,6 +101,12 @@ async def fetch(
         sample: Number of parameters in the sample. Default: 30.
         policy: Requests that may be sent to the vehicle: all that are needed, only for its hash, or none.
     """
+    if names:
+        given = shlex.quote(names[0])
+        raise UsageError(
+            f"fetch takes no names, as it fetches all: `paramclient get {url} {given}` reads only some, "
+            f"`paramclient fetch {url} --only {given}` fetches all and prints some"
+        )
     if sample is not None and accept != "sampled":
         raise UsageError("--sample needs --accept sampled")
     async with connect(url, options, policy=policy) as session:
@@ -109,6 +115,11 @@ async def fetch(
             await session.component.refreshed(timeout=session.deadline.left(REFRESH_TIMEOUT))
         fetched = _Fetched.of(session, result, policy)
     has_defaults = any(param.default is not None for param in fetched.params)
+    if only:
+        chosen, unmatched = NameChoice(only).choose({param.name for param in fetched.params})
+        if unmatched:
+            raise UsageError(f"no parameter of {session.label} is called {unmatched}")
+        fetched = replace(fetched, params=[param for param in fetched.params if param.name in chosen])
     if changed:
         fetched = replace(fetched, params=[param for param in fetched.params if param.is_changed])
     for note in result.notes:
@@ -148,18 +159,19 @@ async def get(
     metadata: MetadataChoice = None,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
-    """Read single parameters from the vehicle.
+    """Read parameters from the vehicle.
 
     Args:
         url: The link.
-        name: The parameter.
-        names: Further parameters.
+        name: The parameter, in upper or lower case, or a pattern such as "MC_*": then the whole table is
+            fetched, from the cache if the vehicle's hash matches.
+        names: Further parameters and patterns.
         metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
     """
     described = from_file(metadata)
-    wanted = [check_name(each) for each in dict.fromkeys((name, *names))]
+    wanted = check_given((name, *names))
     async with connect(url, options) as session:
-        params, errors = await _get_all(session, wanted)
+        params, errors = await _get_chosen(session, wanted)
         if described is None:
             described = await known_of_session(session, metadata)
     if options.json:
@@ -174,111 +186,53 @@ async def get(
     return _report_all(errors.values())
 
 
-async def set_(
-    url: str,
-    /,
-    *pairs: Annotated[str, Parameter(name="NAME VALUE", allow_leading_hyphen=True)],
-    settle: Annotated[float, Parameter(validator=Number(gte=0, lte=SETTLE_MAX))] = 0.0,
-    force: bool = False,
-    durable: bool = False,
-    metadata: MetadataChoice = None,
-    options: LinkOptions = _DEFAULTS,
-) -> int:
-    """Write parameters in the order given, and verify each by the value that the vehicle reports.
-
-    A value is a decimal or hexadecimal number (0x1F), nan or inf. As NAME=VALUE, it may also be the name of a
-    value, or names of bits separated by |, if metadata describes the parameter: it is downloaded from the
-    vehicle unless --metadata names a file. All parameters are tried even if one is refused. If several
-    vehicles are heard, --system must choose one.
-
-    Args:
-        url: The link.
-        pairs: A parameter and its value, or NAME=VALUE. May be given several times.
-        settle: Seconds after the last write until all values are read again. 1.2 shows values that PX4's
-            modules clamp.
-        force: Send NaN and infinity also to PX4, which cannot save them and may stop, and to ArduPilot.
-        durable: Continue only when the value and its history are on the disk and survive a power loss.
-        metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
-    """
-    wanted = parse_pairs(pairs)
-    described = from_file(metadata)
-    if described is not None:
-        wanted = [*resolved(wanted, described)]
-    async with connect(url, options, only=True) as session:
-        if described is None:
-            has_names = any(isinstance(value, str) for _, value in wanted)
-            described = await known_of_session(session, metadata, must=has_names)
-        writes = resolved(wanted, described)
-        for problem in problems(writes, described):
-            report(problem)
-        await session.check_only()
-        began = anyio.current_time()
-        outcomes = [
-            await _write(session, name, value, force=force, durable=durable) for name, value in writes
-        ]
-        if settle:
-            await anyio.sleep(settle)
-            outcomes = [await _read_again(session, outcome) for outcome in outcomes]
-        client = session.client
-        summary = (
-            f"{sum(not outcome.reason for outcome in outcomes)} of {len(outcomes)} set on {session.label} in "
-            f"{anyio.current_time() - began:.2f} s, "
-            f"{client.bytes_received:,} bytes received, {client.bytes_sent:,} sent"
-        )
-    if options.json:
-        from paramclient.documents.command_output import WritesOutputDoc  # only here: loads pydantic
-
-        print_document(WritesOutputDoc(results=[outcome.document(described) for outcome in outcomes]))
-    else:
-        print_table(
-            ["name", "requested", "actual", "status"],
-            (outcome.cells() for outcome in outcomes),
-            right="requested actual",
-        )
-        say(summary)
-    late = {each.name: None for each in outcomes if not each.reason and needs_reboot(each.name, described)}
-    if late:
-        say(printable(f"takes effect after a reboot: {', '.join(late)}"))
-    for outcome in outcomes:
-        if outcome.note:
-            say(printable(f"{outcome.name}: {outcome.note}"))
-        if outcome.reason:
-            report(f"{outcome.name}: {outcome.reason}")
-    return max(outcome.code for outcome in outcomes)
-
-
 async def watch(
     url: str, /, *names: str, policy: Policy = Policy.AUTO, options: LinkOptions = _DEFAULTS
 ) -> int:
     """Print changes of values by any source, as they happen, until Ctrl-C or --timeout.
 
     Updates the table first, and also prints values that have changed since the cache was written. Also prints
-    when the vehicle is lost, found or rebooted, and when its table matches again.
+    when the vehicle is lost, found or rebooted, and when its table matches again. Parameters that appear, as
+    after a change of an *_ENABLE, are watched as well if NAMES or a pattern fits.
 
     Args:
         url: The link.
-        names: The parameters to watch. Default: all.
+        names: The parameters to watch, or patterns such as "MC_*". Default: all.
         policy: Requests that may be sent besides those for NAMES: all that are needed, only for the hash, or
             none.
     """
-    wanted = [check_name(each) for each in dict.fromkeys(names)]
+    wanted = check_given(names)
     async with connect(url, options, policy=policy, is_live=True) as session:
         changes, events = session.component.changes(), session.client.events()
         listens = session.client.listens_only
-        if wanted and not listens:
-            _, errors = await _get_all(session, wanted)
-            if errors:
-                return _report_all(errors.values())
-        elif not listens:
+        has_pattern = any(map(is_pattern, wanted))
+        if not listens and (has_pattern or not wanted):
             with suppress(CacheError):  # with an empty cache, all received parameters are new
                 await _fetch_all(session)
+        if wanted and not listens and (code := await _check_watched(session, wanted)):
+            return code
         known = None if listens else set(session.component.params)
         watched = ", ".join(wanted) if wanted else f"{len(session.component.params)} parameters"
         say(printable(f"watching {watched} of {session.label}"))
-        with anyio.move_on_after(session.deadline.left()):
-            await _print_changes_and_events(
-                session, changes, events, known, frozenset(wanted), as_lines_of_json=options.json
-            )
+        failure: Exception | None = None
+        async with anyio.create_task_group() as tasks:
+            if wanted and not has_pattern and not listens:
+                tasks.start_soon(_follow_groups, session)
+            with anyio.move_on_after(session.deadline.left()):
+                try:
+                    await _print_changes_and_events(
+                        session,
+                        changes,
+                        events,
+                        known,
+                        NameChoice(wanted) if wanted else None,
+                        as_lines_of_json=options.json,
+                    )
+                except Exception as error:  # raised here, the task group would wrap it in a group
+                    failure = error
+            tasks.cancel_scope.cancel()
+        if failure is not None:
+            raise failure
     return ExitCode.DONE
 
 
@@ -395,6 +349,32 @@ def _cells(param: Param) -> tuple[object, ...]:
     return param.name, format_value(param.value, param.type), type_name(param.type), param.index
 
 
+async def _get_chosen(
+    session: CommandSession, wanted: Sequence[str]
+) -> tuple[list[Param], dict[str, ParamClientError]]:
+    """Read the parameters that names and patterns choose; return them, and the errors by name.
+
+    With a pattern, the table is fetched. Values that were received or confirmed by that are not read again.
+    """
+    component = session.component
+    has_pattern = any(map(is_pattern, wanted))
+    if has_pattern:
+        await _fetch_all(session)
+        with suppress(NoReply):
+            await component.refreshed(timeout=session.deadline.left(REFRESH_TIMEOUT))
+    chosen = ChosenNames.of(component, wanted)
+    held = {name: component.params[name] for name in chosen.names if has_pattern and name in component.params}
+    fresh = {name: param for name, param in held.items() if param.trust is not Trust.CACHED}
+    asked = [name for name in chosen.names if name not in fresh]
+    read, errors = await _get_all(session, asked)
+    answered = [name for name in asked if name not in errors]
+    found = fresh | dict(zip(answered, read, strict=True))
+    return (
+        [found[name] for name in chosen.names if name in found],
+        await suggest(session, {**errors, **chosen.errors}),
+    )
+
+
 async def _get_all(
     session: CommandSession, names: Sequence[str]
 ) -> tuple[list[Param], dict[str, ParamClientError]]:
@@ -426,99 +406,27 @@ def _report_all(errors: Iterable[ParamClientError]) -> int:
     return worst
 
 
-# set
-
-
-@dataclass(frozen=True, slots=True)
-class _Written:
-    """The outcome of one write.
-
-    Attributes:
-        name: param_id.
-        type: the vehicle's type of the parameter.
-        requested: the value that was requested.
-        actual: the value that the vehicle has, or None if unknown.
-        status: the outcome in a word.
-        reason: the cause of a failure; "" for a success.
-        code: the exit code.
-        param: the acknowledged parameter, or None.
-        note: a remark on the outcome, or "".
-    """
-
-    name: str
-    type: ParamType | int
-    requested: Value
-    actual: Value | None
-    status: str
-    reason: str = ""
-    code: ExitCode = ExitCode.DONE
-    param: Param | None = None
-    note: str = ""
-
-    def document(self, metadata: Metadata | None) -> WriteOutputDoc:
-        """Return the JSON document."""
-        from paramclient.documents.command_output import WriteOutputDoc  # only here: loads pydantic
-
-        return WriteOutputDoc.of(
-            self.name,
-            self.type,
-            self.requested,
-            self.actual,
-            status=self.status,
-            reason=self.reason,
-            note=self.note,
-            info=info_of(metadata, self.name),
-        )
-
-    def cells(self) -> tuple[object, ...]:
-        """Return the row of the table."""
-        actual = None if self.actual is None else format_value(self.actual, self.type)
-        return self.name, format_value(self.requested, ParamType.REAL64), actual, self.status
-
-
-async def _write(
-    session: CommandSession, name: str, value: int | float, *, force: bool, durable: bool
-) -> _Written:
-    left = session.deadline.left()
-    try:
-        done = await session.component.set(name, value, timeout=left, force=force, durable=durable)
-    except ParamClientError as error:
-        known = session.component.params.get(name)
-        return _Written(
-            name,
-            ParamType.REAL32 if known is None else known.type,
-            requested=value,
-            actual=error.actual if isinstance(error, ValueNotApplied) else None,
-            status=status_of(error),
-            reason=str(error),
-            code=code_of(error),
-        )
-    return _Written(
-        name,
-        done.param.type,
-        requested=value,
-        actual=done.actual,
-        status=done.status,
-        param=done.param,
-        note=done.note,
-    )
-
-
-async def _read_again(session: CommandSession, written: _Written) -> _Written:
-    """Read a written value again; return the outcome with the present value."""
-    if written.param is None:
-        return written
-    try:
-        param = await session.component.get(written.name, timeout=session.deadline.left())
-    except ParamClientError as error:
-        reason = f"acknowledged, but the second read failed: {error}"
-        return replace(written, actual=None, status=status_of(error), reason=reason, code=code_of(error))
-    if param.same_value(written.param):
-        return written
-    return replace(written, actual=param.value, status="adjusted")
-
-
 # watch
+
+
+async def _check_watched(session: CommandSession, wanted: Sequence[str]) -> int:
+    """Read the watched parameters, and report those that the vehicle does not have; return the exit code.
+
+    A name or pattern of a group that the vehicle hides at present may appear later, and is no error.
+    """
+    _, errors = await _get_chosen(session, [text for text in wanted if not is_pattern(text)])
+    patterns = [text for text in wanted if is_pattern(text)]
+    errors |= ChosenNames.of(session.component, patterns).errors
+    hidden = [name for name in errors if may_appear(name, session.component)]
+    if hidden:
+        say(printable(f"not there at present: {', '.join(hidden)}"))
+    return _report_all(error for name, error in errors.items() if name not in hidden)
+
+
+async def _follow_groups(session: CommandSession) -> None:
+    """Fetch the table, so that parameters which come and go are noticed. Values were read already."""
+    with suppress(ParamClientError):  # the events and the end of the changes tell
+        await session.component.fetch_all()
 
 
 async def _print_changes_and_events(
@@ -526,7 +434,7 @@ async def _print_changes_and_events(
     changes: Changes,
     events: Events,
     known: set[str] | None,
-    wanted: frozenset[str],
+    wanted: NameChoice | None,
     *,
     as_lines_of_json: bool,
 ) -> None:
@@ -538,7 +446,7 @@ async def _print_changes_and_events(
         events: the events of the client.
         known: names of the table at the start. The first value of any other parameter is not a change. None:
             the first value of every parameter is not a change.
-        wanted: the names to watch; empty for all.
+        wanted: the names to watch; None for all.
         as_lines_of_json: print JSON instead of text.
     """
     async with aclosing(_merged(changes, events)) as news:
@@ -548,7 +456,7 @@ async def _print_changes_and_events(
                 if is_first and (known is None or each.name in known):
                     known = known and known - {each.name}
                     continue
-                if wanted and each.name not in wanted:
+                if wanted is not None and not wanted.has(each.name):
                     continue
                 text = _change_text(each)
             elif isinstance(each, Heard) or each.component is not session.component:
@@ -559,7 +467,7 @@ async def _print_changes_and_events(
             if as_lines_of_json:
                 print_document(_line(each, at))
             else:
-                print_line(f"{time_text(at)}  {text}")
+                print_line(f"{local_time(at)}  {text}")
 
 
 async def _merged(changes: Changes, events: Events) -> AsyncGenerator[Change | Event]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal, TypeAlias
 
 import anyio
 import anyio.to_thread
@@ -21,11 +22,15 @@ from paramclient.errors import UsageError
 from paramclient.files import FileForm, write_file
 from paramclient.files.param_file import AUTOPILOT, address, format_of_name
 from paramclient.model.paramset import ParamSet
+from paramclient.model.patterns import NameChoice
 from paramclient.model.wording import counted
 from paramclient.protocol.params.fetch_result import FetchResult
 from paramclient.provision.vehicle_params import cached_param_set, select_non_defaults
 
 __all__ = ["save"]
+
+SaveForm: TypeAlias = Literal["qgc", "parm", "mission-planner", "pck", "json", "yaml"]
+"""The file formats that can be written: all but PX4's start scripts."""
 
 _DEFAULTS: Final = LinkOptions()
 
@@ -35,8 +40,9 @@ async def save(
     file: Path,
     /,
     *,
-    form: FileForm | None = None,
+    form: SaveForm | None = None,
     changed: bool = False,
+    only: Annotated[tuple[str, ...], Parameter(show_default=False)] = (),
     all_: Annotated[bool, Parameter(name="--all")] = False,
     refresh: bool = False,
     options: LinkOptions = _DEFAULTS,
@@ -54,12 +60,11 @@ async def save(
         file: The file. Its ending determines the file format: .params, .parm, .param, .pck, .json, .yaml.
         form: The file format, if the ending does not determine it.
         changed: Write only parameters that differ from the firmware's defaults.
+        only: Write only this name or pattern, such as "MC_*". May be given several times.
         all_: Write all components of the vehicle, if the file format can hold several.
         refresh: Download all parameters even if the cache is up to date.
     """
-    form = format_of_name(str(file)) if form is None else form
-    if form is FileForm.PX4_SCRIPT:
-        raise UsageError("start scripts of PX4 cannot be written, only read; choose another file format")
+    written = format_of_name(str(file)) if form is None else FileForm(form)
     if all_ and options.component is not None:
         raise UsageError("--all and --component exclude each other")
     if is_file(where):
@@ -75,9 +80,10 @@ async def save(
         sets, faults = await _from_link(where, options, all_=all_, refresh=refresh, changed=changed)
     for fault in faults:
         report(fault)
+    sets = _chosen(sets, only) if only else sets
     if sets:
-        await anyio.to_thread.run_sync(lambda: write_file(file, sets, form=form))
-        _show(file, form, sets, as_json=options.json)
+        await anyio.to_thread.run_sync(lambda: write_file(file, sets, form=written))
+        _show(file, written, sets, as_json=options.json)
     else:
         report(f"nothing was written to {file}")
     return ExitCode.INCOMPLETE if faults or not sets else ExitCode.DONE
@@ -165,6 +171,19 @@ def _from_cache(
             continue
         faults += _add(sets, cached_param_set(table), changed=changed)
     return sets, faults
+
+
+def _chosen(sets: Sequence[ParamSet], only: Sequence[str]) -> list[ParamSet]:
+    """Return the sets with only the parameters that names and patterns choose, without empty sets.
+
+    Raises:
+        UsageError: a name or pattern fits no parameter of any set.
+    """
+    names, unmatched = NameChoice(only).choose({name for each in sets for name in each})
+    if unmatched and sets:
+        raise UsageError(f"no parameter is called {unmatched}")
+    parts = [replace(each, params={n: param for n, param in each.items() if n in names}) for each in sets]
+    return [each for each in parts if each]
 
 
 def _add(sets: list[ParamSet], whole: ParamSet, *, changed: bool) -> Sequence[str]:

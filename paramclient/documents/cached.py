@@ -1,26 +1,32 @@
-"""Documents of the cache: tables and vehicles, and results of copying and removing."""
+"""Documents of the cache: tables and vehicles, and results of adding, copying and removing."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
-from paramclient.documents.document import Document
-from paramclient.documents.param import ParamDoc
+from paramclient.documents.document import Document, Maybe
+from paramclient.documents.history import HistoryEntryDoc
+from paramclient.documents.param import InfoDoc, ParamDoc
 from paramclient.model.identity import autopilot_name
-from paramclient.model.notation import hash_text, time_or_none
+from paramclient.model.notation import hash_text, time_or_none, time_text
 
 if TYPE_CHECKING:
-    from paramclient.cache import CachedComponent, CachedSummary, CachedVehicle
-    from paramclient.metadata import Metadata
+    from paramclient.cache import AddedTable, CachedComponent, CachedSummary, CachedVehicle, HistoryEntry
+    from paramclient.metadata import Metadata, ParamInfo
     from paramclient.model.values import Param
 
 __all__ = [
+    "AddedDoc",
     "CachedListDoc",
     "CachedSummaryDoc",
     "CachedTableDoc",
     "CachedTablesDoc",
     "CopiedDoc",
+    "FoundDoc",
+    "FoundParamDoc",
+    "KnownValueDoc",
+    "ParamInfoDoc",
     "PlaceDoc",
     "RemovedDoc",
     "VehicleDoc",
@@ -42,6 +48,7 @@ class CachedSummaryDoc(Document):
     hash: str | None
     synced_at: str | None
     updated_at: str | None
+    source: Maybe[str] = None
 
     @classmethod
     def of(cls, summary: CachedSummary) -> CachedSummaryDoc:
@@ -58,6 +65,7 @@ class CachedSummaryDoc(Document):
             hash=hash_text(summary.hash),
             synced_at=time_or_none(summary.synced_at),
             updated_at=time_or_none(summary.updated_at),
+            source=summary.source,
         )
 
 
@@ -77,6 +85,7 @@ class CachedTableDoc(Document):
     uid: str | None
     hash: str | None
     synced_at: str | None
+    source: Maybe[str] = None
     params: dict[str, ParamDoc]
 
     @classmethod
@@ -115,6 +124,7 @@ class CachedTableDoc(Document):
             uid=table.identity.uid,
             hash=hash_text(table.hash),
             synced_at=time_or_none(table.synced_at),
+            source=table.source,
             params=members,
         )
 
@@ -171,6 +181,106 @@ class CopiedDoc(Document):
     params: int
     lines: int
     snapshots: int
+
+
+class AddedDoc(Document):
+    """The result of adding a file to the cache; see `AddedTable`."""
+
+    file: str
+    key: str
+    system: int
+    component: int
+    size: int
+    complete: bool
+    hash: str | None
+    at: str
+    notes: list[str]
+
+    @classmethod
+    def of(cls, added: AddedTable, file: str) -> AddedDoc:
+        """Return the document of an `AddedTable`."""
+        return cls(
+            file=file,
+            key=added.key,
+            system=added.system,
+            component=added.component,
+            size=added.size,
+            complete=added.complete,
+            hash=hash_text(added.hash),
+            at=time_text(added.at),
+            notes=list(added.notes),
+        )
+
+
+class FoundParamDoc(Document):
+    """A parameter that a search has found; `vehicles` are the keys of the vehicles that have it."""
+
+    name: str
+    description: str | None
+    vehicles: list[str]
+
+    @classmethod
+    def of(cls, name: str, info: ParamInfo | None, tables: Iterable[CachedComponent]) -> FoundParamDoc:
+        """Return the document of a parameter with the tables that have it."""
+        description = None if info is None else info.short_description or None
+        return cls(name=name, description=description, vehicles=[each.key for each in tables])
+
+
+class FoundDoc(Document):
+    """The parameters that a search has found, best match first."""
+
+    results: list[FoundParamDoc]
+
+
+class KnownValueDoc(Document):
+    """The cached value of a parameter on one vehicle, and its last changes."""
+
+    key: str
+    system: int
+    component: int
+    autopilot: str
+    param: ParamDoc
+    changes: list[HistoryEntryDoc]
+
+
+class ParamInfoDoc(Document):
+    """What is known of a parameter: its metadata, and its value on each vehicle."""
+
+    name: str
+    metadata: InfoDoc | None
+    vehicles: list[KnownValueDoc]
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        info: ParamInfo | None,
+        tables: Iterable[CachedComponent],
+        changes: Mapping[tuple[str, int], Iterable[HistoryEntry]],
+    ) -> ParamInfoDoc:
+        """Return the document of a parameter.
+
+        Args:
+            name: param_id.
+            info: its metadata, or None.
+            tables: the tables that have it.
+            changes: its last changes by key and component.
+        """
+        return cls(
+            name=name,
+            metadata=None if info is None else InfoDoc.of(info),
+            vehicles=[
+                KnownValueDoc(
+                    key=each.key,
+                    system=each.system,
+                    component=each.component,
+                    autopilot=autopilot_name(each.autopilot),
+                    param=ParamDoc.kept(each.params[name], heard_at=each.heard_at[name]),
+                    changes=[HistoryEntryDoc.of(line) for line in changes[each.key, each.component]],
+                )
+                for each in tables
+            ],
+        )
 
 
 class RemovedDoc(Document):

@@ -21,9 +21,10 @@ if TYPE_CHECKING:
     from paramclient.logs.imported_table import ImportedTable
     from paramclient.metadata import ParamInfo
     from paramclient.model.paramset import ParamSet
-    from paramclient.model.values import Param, Value
+    from paramclient.model.values import Param
     from paramclient.protocol.params.fetch_result import FetchResult
     from paramclient.protocol.params.sampling import Sample
+    from paramclient.protocol.params.write_batch import SetOutcome
 
 __all__ = [
     "ChangeLineDoc",
@@ -136,49 +137,40 @@ class FetchOutputDoc(Document):
 
 
 class WriteOutputDoc(Document):
-    """The outcome of one write; `reason` is the cause of a failure, `note` a remark on it."""
+    """The outcome of one write; see `SetOutcome`.
+
+    `reason` is the cause if the value was not set or is not on the disk, `error` the class of that error,
+    `note` a remark on the outcome.
+    """
 
     name: str
     requested: Scalar
     actual: Scalar | None
     status: str
     reason: Maybe[str] = None
+    error: Maybe[str] = None
     note: Maybe[str] = None
     text: Maybe[str] = None
     reboot_required: Maybe[bool] = None
 
     @classmethod
-    def of(
-        cls,
-        name: str,
-        kind: ParamType | int,
-        requested: Value,
-        actual: Value | None,
-        *,
-        status: str,
-        reason: str = "",
-        note: str = "",
-        info: ParamInfo | None = None,
-    ) -> WriteOutputDoc:
+    def of(cls, outcome: SetOutcome, kind: ParamType | int, info: ParamInfo | None) -> WriteOutputDoc:
         """Return the document of a write.
 
         Args:
-            name: param_id.
+            outcome: the outcome.
             kind: the vehicle's type of the parameter.
-            requested: the value that was requested.
-            actual: the value that the vehicle has now, or None if unknown.
-            status: the outcome in a word.
-            reason: the cause of a failure, or "".
-            note: a remark on the outcome, or "".
             info: the metadata of the parameter, or None.
         """
+        actual, error, result = outcome.actual, outcome.error, outcome.result
         return cls(
-            name=name,
-            requested=value_json(requested, ParamType.REAL64),
+            name=outcome.name,
+            requested=value_json(outcome.requested, ParamType.REAL64),
             actual=None if actual is None else value_json(actual, kind),
-            status=status,
-            reason=reason or None,
-            note=note or None,
+            status=outcome.status,
+            reason=None if error is None else str(error),
+            error=None if error is None else type(error).__name__,
+            note=None if result is None else result.note or None,
             text=None if info is None or actual is None else info.text(actual) or None,
             reboot_required=(info is not None and info.reboot_required) or None,
         )

@@ -11,7 +11,7 @@ from paramclient.files import document_format, line_formats, param_pck, script
 from paramclient.files.includes import Includes
 from paramclient.files.param_file import AUTOPILOT, ENDINGS, FileForm, ParamFile, address, parse_format
 from paramclient.files.text import decode_text, lines_of, time_of
-from paramclient.model.identity import autopilot_name
+from paramclient.model.identity import autopilot_name, version_text
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import check_name
 from paramclient.model.wording import counted
@@ -167,8 +167,7 @@ def _header_lines(params: ParamSet) -> Iterator[str]:
     yield f"{counted(len(params), 'parameter')} of system/component {address(params)}{kind}"
     if who is not None:
         commit = f", commit {who.git_hash}" if who.git_hash else ""
-        version = ".".join(str(who.firmware >> shift & 0xFF) for shift in (24, 16, 8))
-        firmware = f", firmware {version}{commit}" if who.firmware else ""
+        firmware = f", firmware {version_text(who.firmware)}{commit}" if who.firmware else ""
         yield f"of the vehicle {who.key}{firmware}"
     if params.at is not None:
         yield f"as of {time_of(params.at, 'seconds')}"

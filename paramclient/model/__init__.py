@@ -5,6 +5,8 @@ words.
   identity.
 - `comparison`, `patterns`, `notation`: comparison of sets, selection of names, JSON notation.
 - `group_switches`: parameters that others depend on.
+- `hash_exclusions`: the parameters that PX4 excludes from its hash.
 - `renames`: names that firmware versions have changed, and the conversion of their values.
+- `similar_names`: names that are similar to a mistyped one.
 - `wording`: counts and lists of names in messages.
 """

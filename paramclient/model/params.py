@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import struct
 from collections.abc import ItemsView, Iterable, Iterator, Mapping, MutableMapping, ValuesView
-from typing import Final, TypeAlias
+from typing import Final, TypeAlias, TypeVar, overload
 
+from paramclient.model.similar_names import unknown_name
 from paramclient.model.values import Param, Trust, Value, from_bits, known_type, same_bits
 from paramclient.model.wording import counted
 
@@ -222,6 +223,9 @@ def same_held(one: CompactParam, other: CompactParam) -> bool:
     return (number, is_raw) == (number2, is_raw2) and same_bits(number, bits, bits2)
 
 
+T = TypeVar("T")
+
+
 class ParamMap(Mapping[str, Param]):
     """Parameters by name: a read-only view of a table that may still change.
 
@@ -238,7 +242,20 @@ class ParamMap(Mapping[str, Param]):
         self._params = params
 
     def __getitem__(self, name: str) -> Param:
-        return self._params[name]
+        try:
+            return self._params[name]
+        except KeyError:
+            raise unknown_name(name, self._params) from None
+
+    @overload
+    def get(self, name: str, /) -> Param | None: ...
+    @overload
+    def get(self, name: str, default: Param, /) -> Param: ...
+    @overload
+    def get(self, name: str, default: T, /) -> Param | T: ...
+    def get(self, name: str, default: Param | T | None = None, /) -> Param | T | None:
+        """Return the parameter with this name, or `default`."""
+        return self._params.get(name, default)
 
     def __contains__(self, name: object) -> bool:
         return name in self._params

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import TypeVar, overload
 
 from paramclient.errors import UsageError
 from paramclient.model.identity import Identity
 from paramclient.model.patterns import NameChoice
+from paramclient.model.similar_names import unknown_name
 from paramclient.model.values import Param, ParamType, Value, bits_of, format_value, same_bits
 from paramclient.model.wording import counted
 
@@ -70,6 +72,9 @@ class WrittenParam:
         return f"{self.name} = {format_value(self.value, kind)}"
 
 
+T = TypeVar("T")
+
+
 @dataclass(frozen=True, slots=True)
 class ParamSet(Mapping[str, WrittenParam]):
     """The parameters of one component by name, in the order of the source. Immutable.
@@ -109,7 +114,7 @@ class ParamSet(Mapping[str, WrittenParam]):
         """Return the set with only the selected parameters.
 
         Args:
-            patterns: names or shell patterns (`MC_*`, `SERVO?_TRIM`), case-sensitive.
+            patterns: names or shell patterns (`MC_*`, `SERVO?_TRIM`). Upper and lower case do not matter.
 
         Raises:
             UsageError: a pattern matches no name. Without this error, a misspelt name would go unnoticed.
@@ -121,7 +126,20 @@ class ParamSet(Mapping[str, WrittenParam]):
         return replace(self, params={name: param for name, param in self.items() if name in chosen})
 
     def __getitem__(self, name: str) -> WrittenParam:
-        return self.params[name]
+        try:
+            return self.params[name]
+        except KeyError:
+            raise unknown_name(name, self.params) from None
+
+    @overload
+    def get(self, name: str, /) -> WrittenParam | None: ...
+    @overload
+    def get(self, name: str, default: WrittenParam, /) -> WrittenParam: ...
+    @overload
+    def get(self, name: str, default: T, /) -> WrittenParam | T: ...
+    def get(self, name: str, default: WrittenParam | T | None = None, /) -> WrittenParam | T | None:
+        """Return the parameter with this name, or `default`."""
+        return self.params.get(name, default)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.params)

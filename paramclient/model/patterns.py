@@ -7,6 +7,8 @@ from collections.abc import Collection, Iterable
 from fnmatch import translate
 from typing import Final
 
+from paramclient.model.similar_names import nearest_names
+
 __all__ = ["NameChoice", "is_pattern"]
 
 UNMATCHED_LISTED_MAX: Final = 20
@@ -22,35 +24,50 @@ class NameChoice:
     """A selection of names. An exact name costs one look-up, a pattern one comparison with each name.
 
     Args:
-        given: exact names or shell patterns (`MC_*`, `SERVO?_TRIM`), case-sensitive.
+        given: exact names or shell patterns (`MC_*`, `SERVO?_TRIM`). Upper and lower case do not matter.
     """
 
     def __init__(self, given: Iterable[str]) -> None:
         each = dict.fromkeys(given)
-        self._names = {name: None for name in each if not is_pattern(name)}
-        self._patterns = {text: re.compile(translate(text)) for text in each if is_pattern(text)}
+        self._names = {name.upper(): name for name in each if not is_pattern(name)}
+        self._patterns = {
+            text: re.compile(translate(text), re.IGNORECASE) for text in each if is_pattern(text)
+        }
 
     def has(self, name: str) -> bool:
         """Return whether a name is selected."""
-        return name in self._names or any(pattern.match(name) for pattern in self._patterns.values())
+        return name.upper() in self._names or any(pattern.match(name) for pattern in self._patterns.values())
 
     def choose(self, known: Collection[str]) -> tuple[set[str], str]:
         """Select among these names.
 
         Returns:
-            The selected names; and a text that lists the names and patterns without a match, or "".
+            The selected names; and a text that lists the names and patterns without a match, with the most
+            similar known names, or "".
         """
+        chosen, unmatched = self.divide(known)
+        listed = [_with_nearest(text, known) for text in unmatched[:UNMATCHED_LISTED_MAX]]
+        more = len(unmatched) - len(listed)
+        words = " or ".join(listed)
+        return chosen, f"{words} (and {more} more)" if more > 0 else words
+
+    def divide(self, known: Collection[str]) -> tuple[set[str], list[str]]:
+        """Return the selected ones of these names, and the given names and patterns without a match."""
         names = frozenset(known)
-        chosen = {name for name in self._names if name in names}
-        useless = [name for name in self._names if name not in names]
+        chosen = {name for name in names if name.upper() in self._names}
+        found = {name.upper() for name in chosen}
+        unmatched = [name for upper, name in self._names.items() if upper not in found]
         for text, pattern in self._patterns.items():
             fitting = [name for name in names if pattern.match(name)]
             chosen.update(fitting)
             if not fitting:
-                useless.append(text)
-        more = len(useless) - UNMATCHED_LISTED_MAX
-        words = " or ".join(useless[:UNMATCHED_LISTED_MAX])
-        return chosen, f"{words} (and {more} more)" if more > 0 else words
+                unmatched.append(text)
+        return chosen, unmatched
+
+
+def _with_nearest(text: str, known: Collection[str]) -> str:
+    nearest = () if is_pattern(text) else nearest_names(text, known)
+    return f"{text} (did you mean {', '.join(nearest)}?)" if nearest else text
 
 
 _WILDCARDS: Final = frozenset("*?[")

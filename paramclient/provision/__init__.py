@@ -5,7 +5,7 @@
 - `apply_restore`: `apply` and `restore`; `execution` runs them, `results` holds their results.
 - `fleet`: `apply_all` and `verify_all` for several vehicles.
 - `vehicle_params`: parameters of a vehicle or of the cache as a set.
-- `apply_rules`, `similar_names`, `runner`: special parameters, mistyped names, long computations.
+- `apply_rules`, `runner`: special parameters, long computations.
 """
 
 from __future__ import annotations

@@ -14,6 +14,7 @@ from paramclient.errors import UsageError
 from paramclient.model.identity import Identity, autopilot_name, reason_against_non_finite, version_difference
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.renames import Renames
+from paramclient.model.similar_names import nearest_names
 from paramclient.model.values import (
     Encoding,
     Param,
@@ -26,7 +27,6 @@ from paramclient.model.values import (
     type_name,
 )
 from paramclient.provision.apply_rules import OUT_OF_RANGE, READ_ONLY, ApplyRules, Choice, rules_for
-from paramclient.provision.similar_names import nearest_names
 
 __all__ = [
     "MISSING",
@@ -527,7 +527,10 @@ class _Planner:
             nearest: Mapping[str, tuple[str, ...]] = {}
         else:
             unnamed = self._current.keys() - self._targets.keys()
-            nearest = {name: nearest_names(name, unnamed) for name in names}
+            spelled = {name.upper(): name for name in self._current}
+            nearest = {
+                name: nearest_names(name, unnamed | {spelled.get(name.upper(), name)}) for name in names
+            }
         settled = dict(rows)
         for name in names:
             settled[name] = replace(

@@ -85,7 +85,10 @@ def _vehicles(problem: Problem) -> tuple[str, ...]:
 
 def _no_reply(detail: str, problem: Problem) -> NoReply:
     return NoReply(
-        str(problem["awaited"]), attempts=int(problem["attempts"]), waited=float(problem["waited"])
+        str(problem["awaited"]),
+        attempts=int(problem["attempts"]),
+        waited=float(problem["waited"]),
+        hint=str(problem.get("hint", ""))[:DETAIL_LENGTH_MAX],
     )
 
 
@@ -120,7 +123,9 @@ _MAKERS: Final[dict[str, Callable[[str, Problem], ParamClientError]]] = {
     "AmbiguousVehicle": lambda detail, problem: AmbiguousVehicle(
         str(problem["summary"]), vehicles=_vehicles(problem), choose_by=str(problem["choose_by"])
     ),
-    "UnknownParameter": lambda detail, problem: UnknownParameter(detail, **_whom(problem)),
+    "UnknownParameter": lambda detail, problem: UnknownParameter(
+        detail, **_whom(problem), nearest=tuple(map(str, problem.get("nearest", ())))
+    ),
     "TypeMismatch": lambda detail, problem: TypeMismatch(detail, **_whom(problem)),
     "ContestedAddress": lambda detail, problem: ContestedAddress(
         int(problem["system"]),

@@ -17,7 +17,7 @@ import anyio.abc
 import anyio.lowlevel
 
 from paramclient.cache import SetupNotes
-from paramclient.client.arguments import address_in_words
+from paramclient.client.arguments import address_in_words, silence_in_words
 from paramclient.client.cache_writer import choose_cache
 from paramclient.client.client import ParamClient, local_client
 from paramclient.client.worker_thread import Worker
@@ -278,7 +278,8 @@ class Hub:
         if not found:
             reasons = [f"; {each.error}" for each in chosen if each.state == "failed" and each.error]
             awaited = address_in_words(system, component) + "".join(reasons)
-            raise NoReply(awaited, attempts=0, waited=anyio.current_time() - began)
+            hint = "" if reasons else _silence_of(chosen)
+            raise NoReply(awaited, attempts=0, waited=anyio.current_time() - began, hint=hint)
         return found[0]
 
     async def wait_for_only_component(
@@ -323,10 +324,10 @@ class Hub:
                         await _wait_for_any([*news, self._closing])
                 for _, client in clients:
                     await client.link_task.wait_for_reader(choice.due)
-        awaited = address_in_words(system, component)
+        awaited, hint = address_in_words(system, component), _silence_of(chosen)
         if choice.due < math.inf:
-            awaited += f", then {LOOK_TIME} s without another vehicle"
-        raise NoReply(awaited, attempts=0, waited=anyio.current_time() - began)
+            awaited, hint = f"{awaited}, then {LOOK_TIME} s without another vehicle", ""
+        raise NoReply(awaited, attempts=0, waited=anyio.current_time() - began, hint=hint)
 
     def _check_open(self) -> None:
         if self._closing.is_set():
@@ -427,6 +428,17 @@ async def _fetch(options: dict[str, Any], job: Job) -> FetchResultDoc:
 
 def _is_log(link: object) -> bool:
     return isinstance(link, str) and link.lower().startswith("replay:")
+
+
+def _silence_of(links: Iterable[ServiceLink]) -> str:
+    """Return in sentences what was received on links instead of an awaited component."""
+    sentences = []
+    for each in links:
+        if each.client is not None:
+            station = local_client(each.client).station
+            heard = [(machine.system, machine.component) for machine in station.components.values()]
+            sentences.append(silence_in_words(each.name, heard, station.bytes_received))
+    return " ".join(sentences)
 
 
 def _closing() -> ServiceError:

@@ -118,6 +118,10 @@ def sound_file() -> bytes:
 def make_older(path: Path, version: int) -> None:
     """Make of the present file what an earlier version would have made."""
     with connect(path) as connection:
+        connection.execute("ALTER TABLE component DROP COLUMN source")
+        connection.execute(f"PRAGMA user_version = {version}")
+        if version == 4:
+            return
         for statement in (MIGRATIONS[0][2], MIGRATIONS[1][0]):
             assert isinstance(statement, str)
             connection.execute(statement)
@@ -138,7 +142,6 @@ def make_older(path: Path, version: int) -> None:
         if version < 2:
             connection.execute("ALTER TABLE param DROP COLUMN default_bits")
             connection.execute("ALTER TABLE component DROP COLUMN file_works")
-        connection.execute(f"PRAGMA user_version = {version}")
 
 
 # Killed at any moment
@@ -459,7 +462,7 @@ def sound_with(at: int, byte: int) -> Callable[[Path], None]:
         (lambda path: other_program(path, APPLICATION_ID), "tables are not those of version 0"),
         (lambda path: other_program(path, APPLICATION_ID, 1), "tables are not those of version 1"),
         (sound_but("PRAGMA user_version = -1"), "tables are not those of version -1"),
-        (sound_but("DROP TABLE history"), "tables are not those of version 4"),
+        (sound_but("DROP TABLE history"), f"tables are not those of version {len(MIGRATIONS)}"),
         (sound_but("ALTER TABLE packed RENAME COLUMN params TO rows"), "tables are not those"),
         (sound_but("UPDATE component SET count = 'much'"), "a cell holds 'much'"),
         (sound_but("UPDATE history SET name = CAST(x'ff' || owner AS TEXT)"), "UTF-8"),
@@ -846,6 +849,16 @@ def test_a_file_from_before_tables_were_packed_keeps_every_cell(path: Path, vers
         works(cache)
     with connect(path) as connection:
         assert not connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'param'").fetchall()
+
+
+def test_a_file_from_before_tables_could_come_from_files_keeps_them(path: Path) -> None:
+    path.write_bytes(sound_file())
+    make_older(path, 4)
+    with ParamCache(path) as cache:
+        assert [values(cache, *table) for table in SOUND_TABLES] == list(SOUND_TABLES.values())
+        assert {each.source for each in cache.components()} == {None}
+        assert cache.history(PX4.key)
+        assert not cache.notes
 
 
 def test_a_file_that_cannot_be_brought_up_to_date_stays_what_it_was(

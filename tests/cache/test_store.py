@@ -38,7 +38,7 @@ from paramclient.cache.transaction import Line, Session
 from paramclient.cache.transfer import take_whole
 from paramclient.errors import CacheError, UsageError
 from paramclient.model.values import Param, ParamType
-from tests.cache import test_cache, test_fleet, test_snapshots
+from tests.cache import test_cache, test_file_table, test_fleet, test_snapshots
 from tests.caches import NOW, PX4, stored, update, values, whole_table
 from tests.client.test_observation_times import interleaved
 from tests.commands import in_process
@@ -83,7 +83,9 @@ def asked_of(module: ModuleType) -> dict[str, object]:
     }
 
 
-globals().update(asked_of(test_cache) | asked_of(test_fleet) | asked_of(test_snapshots))
+globals().update(
+    asked_of(test_cache) | asked_of(test_file_table) | asked_of(test_fleet) | asked_of(test_snapshots)
+)
 three = test_cache.three
 
 

@@ -241,7 +241,9 @@ def test_only_compares_the_named_parameters(command: Command) -> None:
     assert (narrowed.code, list(narrowed.json["params"])) == (1, ["B_FLOAT"])
     misspelt = command("diff", 1, 2, "--only", "A_*", "--only", "B_FLAOT")
     assert (misspelt.code, misspelt.out) == (2, "")
-    assert misspelt.err == "paramclient: no parameter of either side is called B_FLAOT\n"
+    assert (
+        misspelt.err == "paramclient: no parameter of either side is called B_FLAOT (did you mean B_FLOAT?)\n"
+    )
 
 
 # Sources

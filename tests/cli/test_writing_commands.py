@@ -236,7 +236,7 @@ def test_a_vehicle_that_appears_during_the_metadata_download_stops_the_write(
     async def slowly(*_: object, **__: object) -> None:
         await anyio.sleep(4.0)
 
-    monkeypatch.setattr("paramclient.cli.parameters.known_of_session", slowly)
+    monkeypatch.setattr("paramclient.cli.set_command.known_of_session", slowly)
     done = command("set", URL, "MC_ROLL_P", "7.5")
     assert (done.code, done.out, done.err) == (2, "", LISTED)
     assert untouched(one, two)
@@ -251,7 +251,7 @@ def test_a_vehicle_that_replaces_a_lost_one_is_not_written_to(
     async def slowly(*_: object, **__: object) -> None:
         await anyio.sleep(15.0)
 
-    monkeypatch.setattr("paramclient.cli.parameters.known_of_session", slowly)
+    monkeypatch.setattr("paramclient.cli.set_command.known_of_session", slowly)
     done = command("set", URL, "MC_ROLL_P", "7.5")
     assert (done.code, done.out) == (2, "")
     assert done.err == (

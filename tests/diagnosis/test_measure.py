@@ -215,7 +215,7 @@ def test_the_output_is_a_table(live_command: Command, put: Put) -> None:
     rows = {row[0]: row[1:] for row in done.rows if row}
     assert done.code == ExitCode.DONE
     assert rows["vehicle"] == ["1/1 px4 quadrotor, disarmed"]
-    assert rows["firmware"][0].startswith("1.17.0, commit ")
+    assert rows["firmware"][0].startswith("1.17.0-alpha, commit ")
     assert rows["hardware id"] == ["0000001234567890"]
     assert rows["list"][0].startswith("903 of 903 in ")
     assert rows["hash"][0].startswith("cf579589, the same after ")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, TypedDict, Unpack
 
@@ -20,8 +20,10 @@ from paramclient.protocol.params.fetch_result import FetchResult, Policy
 from paramclient.protocol.params.list_download import REQUESTED_INDICES_MAX
 from paramclient.protocol.params.reads import Read
 from paramclient.protocol.params.sync import SyncSettings
+from paramclient.protocol.params.write_batch import SetOutcome, SetStatus, WriteBatch
 from paramclient.protocol.params.writes import Write
 from paramclient.protocol.requests.operation import Operation
+from paramclient.protocol.requests.pacing import WRITES_MAX
 from paramclient.protocol.station import Station
 from paramclient.protocol.wire import HASH_CHECK
 from paramclient.sim import (
@@ -47,6 +49,8 @@ FLOATS = [f"REAL_{number:02d}" for number in range(20)]
 SWITCH = "ZZ_ENABLE"
 LATE = "ZZ_LATE"
 VOLATILE = ("CAL_MAG0_XOFF", "COM_FLIGHT_UUID", "LND_FLIGHT_T_LO")
+GROUP = [f"ZY_{number}" for number in range(5)]
+"""What an ArduPilot shows when the switch is on."""
 CAMERA = 100
 
 Vehicle = PX4Vehicle | ArduPilotVehicle | GenericVehicle
@@ -89,7 +93,7 @@ def px4_with_unknown_volatile(size: int, **options: Unpack[Options]) -> Vehicle:
 
 
 def ardupilot(size: int, **options: Unpack[Options]) -> Vehicle:
-    group = {f"ZY_{number}": float(number) for number in range(5)}
+    group = {name: float(number) for number, name in enumerate(GROUP)}
     return ArduPilotVehicle(ftp=False, table=table_of(size), groups={SWITCH: group}, live=(), **options)
 
 
@@ -185,6 +189,7 @@ class Subject:
         self.address = (vehicle.system, vehicle.component)
         self.changes = 0  # how often anything was changed, by anyone
         self.changed_at = -math.inf
+        self.acts = 0  # how often anything else than one batch of writes may have changed a value
         self.is_written = False
         self.seen: FetchResult | None = None  # the last one that was looked at
         self.proved: int | None = None  # how much had been changed when the table was last seen to be right
@@ -202,6 +207,10 @@ class Begun:
     subject: Subject
     changes: int | None
     """How much had been changed; None when something was still on the move."""
+    acts: int | None = None
+    """Of a batch: `Subject.acts` when it began; None if other writes were open."""
+    pairs: Sequence[tuple[str, int]] = ()
+    """Of a batch: what was to be written."""
 
 
 class Sessions(RuleBasedStateMachine):
@@ -265,6 +274,7 @@ class Sessions(RuleBasedStateMachine):
         self.misfortunes = misfortunes
         self.upkeep = upkeep
         self.is_bad = self.is_never_good(link)  # whether the link can be to blame
+        self.may_overtake = link["reorder"] > 0 or link["duplicate"] > 0  # an old PARAM_SET may come late
         self.world = Simulation(air=air, station=self.new_station())
         self.names = [*INTEGERS[:size], *FLOATS[:size], *VOLATILE, SWITCH]
         self.open: list[Begun] = []
@@ -321,7 +331,22 @@ class Sessions(RuleBasedStateMachine):
         name = data.draw(st.sampled_from([*self.names, "NOT_THERE"]))
         subject = self.pick(data.draw(st.sampled_from([False, False, True])))
         subject.moved(self.world.now)
+        subject.acts += 1
         self.begin(subject, lambda: self.machine_of(subject).write(name, number, self.world.now))
+
+    @precondition(lambda self: self.is_known)
+    @rule(data=st.data(), size=st.integers(1, 40))
+    def set_many(self, data: st.DataObject, size: int) -> None:
+        """Write many values, among them those of a group, and the switch that shows or hides it."""
+        some = st.sampled_from([*self.names, SWITCH, *GROUP, "NOT_THERE"])
+        pairs = data.draw(st.lists(st.tuples(some, st.integers(0, 50)), min_size=1, max_size=size))
+        subject = self.pick(data.draw(st.sampled_from([False, False, True])))
+        machine = self.machine_of(subject)
+        is_alone = not len(machine.writes)
+        subject.moved(self.world.now)
+        subject.acts += 1
+        acts = subject.acts if is_alone else None
+        self.begin(subject, lambda: machine.write_many(pairs, self.world.now), acts=acts, pairs=pairs)
 
     @precondition(lambda self: self.open)
     @rule(data=st.data())
@@ -458,6 +483,8 @@ class Sessions(RuleBasedStateMachine):
                 machine.end_fetch(begun.operation, self.world.now)
             elif isinstance(begun.operation, Read):
                 machine.reads.release(begun.operation)
+            elif isinstance(begun.operation, WriteBatch):
+                machine.write_batches.end(begun.operation, self.world.now)
 
     @invariant()
     def synced_is_true(self) -> None:
@@ -476,10 +503,12 @@ class Sessions(RuleBasedStateMachine):
         if not self.is_known:
             return
         mine = len(self.open)
+        batches = sum(isinstance(begun.operation, WriteBatch) for begun in self.open)
         most = len(self.names) + 10
         for machine in self.world.station.components.values():
             assert len(machine.reads) <= REQUESTED_INDICES_MAX + mine + 3 * most
-            assert len(machine.writes) <= mine
+            assert len(machine.writes) <= mine + batches * WRITES_MAX
+            assert len(machine.write_batches) <= batches
             assert len(machine.table.params) <= most
             assert len(machine.table.dirty) <= most
             assert len(machine.sync._moved) <= most
@@ -496,8 +525,7 @@ class Sessions(RuleBasedStateMachine):
         self.become_calm()
         for begun in self.open:
             assert begun.operation.done, f"{begun.operation!r} has not ended"
-            self.check(begun)
-        self.open.clear()
+        self.what_ended_is_right()
         self.synced_is_true()
         self.kept_up_is_true()
         for subject in self.subjects:
@@ -509,6 +537,7 @@ class Sessions(RuleBasedStateMachine):
         machine = self.machine_of(subject)
         assert len(machine.reads) == 0
         assert len(machine.writes) == 0
+        assert len(machine.write_batches) == 0
         assert machine.fetch is None
         if self.upkeep.policy is Policy.AUTO and not (self.is_dead and subject is self.subject):
             fetch = machine.begin_fetch(self.world.now, refresh=True)
@@ -556,6 +585,7 @@ class Sessions(RuleBasedStateMachine):
     def become(self, link: Link) -> None:
         """The link is another from now on; what is on its way arrives."""
         self.is_bad |= self.is_never_good(link)
+        self.may_overtake |= link["reorder"] > 0 or link["duplicate"] > 0
         for way in (self.world.air.uplink, self.world.air.downlink):
             FaultyLink(**link)  # such a link can be
             for what, value in link.items():
@@ -606,22 +636,38 @@ class Sessions(RuleBasedStateMachine):
 
     def moved(self) -> None:
         self.subject.moved(self.world.now)
+        self.subject.acts += 1
 
-    def begin(self, subject: Subject, call: Callable[[], Read | Write | Fetch]) -> None:
+    def begin(
+        self,
+        subject: Subject,
+        call: Callable[[], Read | Write | WriteBatch | Fetch],
+        *,
+        acts: int | None = None,
+        pairs: Sequence[tuple[str, int]] = (),
+    ) -> None:
         """Begin something; of a component that is lost, nothing can be asked."""
         try:
             operation = call()
         except NoReply:
             assert self.machine_of(subject).presence.is_lost
             return
-        self.begun(subject, operation)
+        self.begun(subject, operation, acts=acts, pairs=pairs)
         self.world.exchange()
 
-    def begun(self, subject: Subject, operation: Read | Write | Fetch) -> None:
+    def begun(
+        self,
+        subject: Subject,
+        operation: Read | Write | WriteBatch | Fetch,
+        *,
+        acts: int | None = None,
+        pairs: Sequence[tuple[str, int]] = (),
+    ) -> None:
         settled_at = max(subject.changed_at, self.back_at) + SETTLING
         is_moving = self.world.now < settled_at or len(self.machine_of(subject).writes)
         changes = None if is_moving else subject.changes
-        self.open.append(Begun(operation, subject, changes))  # type: ignore[arg-type]  # only its end counts
+        begun = Begun(operation, subject, changes, acts, pairs)  # type: ignore[arg-type]  # only its end counts
+        self.open.append(begun)
 
     def cancel_one(self, begun: Begun) -> None:
         machine = self.machine_of(begun.subject)
@@ -629,6 +675,11 @@ class Sessions(RuleBasedStateMachine):
         if isinstance(operation, Write):
             machine.writes.cancel(operation, self.world.now)
             begun.subject.moved(self.world.now)
+            begun.subject.acts += 1
+        elif isinstance(operation, WriteBatch):
+            machine.write_batches.end(operation, self.world.now)
+            begun.subject.moved(self.world.now)
+            begun.subject.acts += 1
         elif isinstance(operation, Fetch):
             machine.end_fetch(operation, self.world.now)
         elif isinstance(operation, Read):
@@ -645,6 +696,26 @@ class Sessions(RuleBasedStateMachine):
             is_moving = begun.changes != begun.subject.changes
             if result.complete and not is_moving and (result.source == "stream" or result.hash is not None):
                 self.compare(begun.subject, result)
+
+        elif isinstance(operation, WriteBatch) and operation.result is not None:
+            self.check_batch(begun, operation.result)
+
+    def check_batch(self, begun: Begun, outcomes: Sequence[SetOutcome]) -> None:
+        """Each value has an outcome; what is set is what the vehicle has, unless it was changed since."""
+        assert [(each.name, each.requested) for each in outcomes] == [*begun.pairs]
+        vehicle = begun.subject.vehicle
+        is_undisturbed = begun.acts == begun.subject.acts
+        last = {each.name: each for each in outcomes}
+        for each in outcomes:
+            assert (each.error is None) == (each.result is not None) == each.is_set
+            assert each.name != "NOT_THERE" or not each.is_set
+        if is_undisturbed and not self.may_overtake and not vehicle.high_latency:
+            later_unknown = {each.name for each in outcomes if each.status is SetStatus.UNKNOWN}
+            for name, each in last.items():
+                if each.result is not None and name not in later_unknown:
+                    assert vehicle.values.get(name, each.result.actual) == each.result.actual, name
+            if self.misfortunes.is_plain and not self.is_bad:
+                assert not {each.status for each in outcomes} & {SetStatus.UNKNOWN, SetStatus.NOT_TRIED}
 
     def look(self, subject: Subject) -> None:
         machine = self.machine_of(subject)

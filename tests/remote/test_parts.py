@@ -235,6 +235,8 @@ ERRORS: list[ParamClientError] = [
     VehicleArmed("no", **WHOM),
     AnotherVehicle(1, 1, "this", "that"),
     NoReply("A of 1/1", attempts=4, waited=2.1234),
+    NoReply("an autopilot", attempts=0, waited=2.0, hint="Nothing was received on udpin:0.0.0.0:14550."),
+    UnknownParameter("1/1 has no B. Did you mean A?", system=1, component=1, name="B", nearest=("A",)),
     LinkError("gone", link="udpin:0.0.0.0:14550"),
     CacheError("broken"),
     InvalidParameters({"A": "is too large", "B": "is no number"}),

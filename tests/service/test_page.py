@@ -303,6 +303,48 @@ def test_the_outcome_of_each(visit: Callable[..., Sight], bench: Bench) -> None:
 
 
 @needs_browser
+def test_all_changes_go_out_in_one_request(sight: Sight, bench: Bench) -> None:
+    wanted = {
+        "MC_ROLL_P": 6.25,
+        "MC_PITCH_P": 6.25,
+        "MC_YAW_P": 2.25,
+        "MC_ROLLRATE_P": 0.25,
+    }
+    bodies: list[Any] = []
+    sight.page.on(
+        "request", lambda each: bodies.append(each.post_data_json) if each.method == "PATCH" else None
+    )
+    before = {name: bench.px4.values[name] for name in wanted}
+    for name, value in wanted.items():
+        sight.stage(name, str(value))
+    sight.send()
+    for name in wanted:
+        expect(sight.line(name)).to_contain_text("accepted")
+    assert bodies == [{"values": dict(sorted(wanted.items()))}]
+    assert {name: bench.px4.values[name] for name in wanted} == wanted
+    bench.ask("PATCH", "/components/1/1/params?link=px4", {"values": before})
+
+
+@needs_browser
+def test_changes_whose_response_is_lost_may_have_been_written(sight: Sight) -> None:
+    def lose(route: Route) -> None:
+        if route.request.method == "PATCH":
+            route.abort("connectionreset")
+        else:
+            route.continue_()
+
+    sight.page.route("**/params?**", lose)
+    sight.stage("MC_ROLL_P", "6.5")
+    sight.stage("MC_PITCH_P", "6.5")
+    sight.send()
+    for name in ("MC_ROLL_P", "MC_PITCH_P"):
+        expect(sight.line(name)).to_contain_text("sent, not acknowledged")
+    expect(sight.spoken).to_contain_text("2 sent, not acknowledged.")
+    sight.dialog.get_by_role("button", name="Done").click()
+    expect(sight.bar).to_contain_text("2 changes staged")
+
+
+@needs_browser
 def test_what_is_no_value_cannot_be_staged_and_what_is_out_of_range_is_doubted(sight: Sight) -> None:
     editor = sight.open("MC_ROLL_P")
     field = editor.get_by_role("textbox")

@@ -127,6 +127,8 @@ async def test_who_is_not_heard_in_time_is_a_problem_that_says_so() -> None:
         assert told["error"] == "NoReply"
         assert told["waited"] == pytest.approx(2, abs=0.01)
         assert "system id 7" in told["detail"]
+        assert told["hint"] == "Received on sim:custom so far: 1/1."
+        assert told["detail"].endswith(told["hint"])
         problem(await browser.get("/api/v1/components/7/1"), 404, "unknown-component")
 
 

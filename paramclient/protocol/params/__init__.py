@@ -11,7 +11,6 @@
 `file_download`: the packed parameter file over MAVFTP.
 `foreign_list`: a list that another station has requested.
 `hash_check`: what an announced hash proves about a downloaded table.
-`hash_exclusions`: the parameters that PX4 excludes from its hash.
 `list_download`: PARAM_REQUEST_LIST and the repair of its gaps.
 `list_estimate`: the expected duration of a list.
 `list_stream`: progress, pace, losses and end of a running list.

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from paramclient.model.hash_exclusions import find_volatile
 from paramclient.protocol.params.fetch_notes import MOVED, NO_HASH_BEFORE_DOWNLOAD, UNPROVEN
 from paramclient.protocol.params.fetch_result import Announcement
-from paramclient.protocol.params.hash_exclusions import find_volatile
 from paramclient.protocol.params.table import Table
 
 __all__ = ["HashCheck"]

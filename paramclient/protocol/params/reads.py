@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Container
+from collections.abc import Collection
 from typing import Final, Protocol, TypeAlias
 
 from paramclient.errors import (
@@ -15,6 +15,7 @@ from paramclient.errors import (
     UnknownParameter,
     VehicleError,
 )
+from paramclient.model.similar_names import did_you_mean, nearest_names
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
@@ -64,12 +65,16 @@ class KnownParams(Protocol):
     """The part of a table that tells an unknown parameter from a lost response."""
 
     @property
-    def params(self) -> Container[str]:
+    def params(self) -> Collection[str]:
         """The known names."""
 
     @property
     def count(self) -> int | None:
         """The number of parameters in the list; None while it is unknown."""
+
+    @property
+    def live_count(self) -> int | None:
+        """The count that the component has sent on this link; None if it is only that of the cache."""
 
 
 class Reads(Machine):
@@ -79,7 +84,8 @@ class Reads(Machine):
     Silence is not a response: PX4 up to 1.17 and ArduPilot do not respond to a read of a parameter that they
     do not have. A silent read is therefore accompanied by a control read of an index that exists. If the
     control reads are answered, and a name that nothing has announced or an index that is not below the count
-    is not, the link is not the cause: the parameter is unknown.
+    is not, the link is not the cause: the parameter is unknown. An index that is not below a count which the
+    component has sent itself is unknown in any case: on a slow link, control reads may end too late to tell.
 
     Args:
         context, table: the component's.
@@ -344,6 +350,9 @@ class Reads(Machine):
         self.reset_timeouts()
 
     def _timeout_error(self, read: Read, now: float) -> Exception:
+        count = self._table.live_count
+        if isinstance(read.key, int) and count is not None and read.key >= count:
+            return self._unknown(read.key, f": it has {count}, counted from 0")
         if self._seems_unknown(read):
             return self._unknown(read.key, ": it did not respond to reads of it, and responds to other reads")
         return NoReply(self._name(read.key), attempts=read.attempts, waited=now - read.begun_at)
@@ -352,7 +361,12 @@ class Reads(Machine):
         system, component = self._target
         name, index = (key, None) if isinstance(key, str) else (None, key)
         text = f"{system}/{component} has no {f'parameter {index}' if name is None else name}{reason}"
-        return UnknownParameter(text, system=system, component=component, name=name, index=index)
+        nearest = () if name is None else nearest_names(name, self._table.params)
+        if nearest:
+            text = f"{text}.{did_you_mean(nearest)}"
+        return UnknownParameter(
+            text, system=system, component=component, name=name, index=index, nearest=nearest
+        )
 
     def _name(self, key: Key) -> str:
         what = key if isinstance(key, str) else f"parameter {key}"

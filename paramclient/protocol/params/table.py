@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from struct import unpack
 from typing import Final, NamedTuple
 
+from paramclient.model.hash_exclusions import hash_of
 from paramclient.model.params import (
     CACHED,
     COMPACT_NO_INDEX,
@@ -41,7 +42,6 @@ from paramclient.model.values import (
 from paramclient.protocol.ftp.param_pck import Pack
 from paramclient.protocol.params.change import Added, Change, Removed
 from paramclient.protocol.params.change_origin import is_ours
-from paramclient.protocol.params.hash_exclusions import hash_of
 from paramclient.protocol.wire import NO_INDEX, PARAMETERS_MAX, ParamValue
 
 __all__ = ["NAMES_MAX", "Observation", "NameQuota", "Table"]
@@ -169,6 +169,11 @@ class Table:
             self._hash_is_stale = False
             self._hash = hash_of(self.listed_bits(), leave_out=self.volatile)
         return self._hash
+
+    @property
+    def live_count(self) -> int | None:
+        """The count that the component has sent on this link; None if it is only that of the cache."""
+        return self.count if self._latest > -math.inf else None
 
     def confirm(self, announced: int, volatile: frozenset[str], *, proven: bool) -> None:
         """Record that the vehicle announced this hash for exactly this table.

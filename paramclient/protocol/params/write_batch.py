@@ -9,7 +9,14 @@ from enum import StrEnum
 from functools import partial
 from typing import Final
 
-from paramclient.errors import ContestedAddress, NoReply, ParamClientError, UsageError, VehicleError
+from paramclient.errors import (
+    ContestedAddress,
+    NoReply,
+    ParamClientError,
+    UsageError,
+    ValueNotApplied,
+    VehicleError,
+)
 from paramclient.model.values import Value
 from paramclient.protocol.params.writes import SetResult, Write
 from paramclient.protocol.requests.machine import Machine
@@ -62,6 +69,13 @@ class SetOutcome:
     def is_set(self) -> bool:
         """Whether the vehicle has acknowledged the value, also if it adjusted it."""
         return self.status in (SetStatus.ACCEPTED, SetStatus.ADJUSTED)
+
+    @property
+    def actual(self) -> Value | None:
+        """The value that the vehicle has reported after the write; None if it has reported none."""
+        if self.result is not None:
+            return self.result.actual
+        return self.error.actual if isinstance(self.error, ValueNotApplied) else None
 
     def __str__(self) -> str:
         if self.result is not None and self.error is None:

@@ -1,15 +1,18 @@
 /** Review of staged changes, their results, and undo. */
 
-import { Problem, at, request } from "./api.js";
+import { at, request } from "./api.js";
 import { announce, button, el, setText } from "./dom.js";
 import { closeDialog, openDialog } from "./dialogs.js";
 import { valueText } from "./details.js";
 import { keyOf, store } from "./store.js";
 import { defaultOf, doubt, many, meaningOf, sameText } from "./values.js";
 
-const AT_ONCE = 4;
-/** Timeout of a write in milliseconds; on a lossy link the service retries for long and has its own timeout. */
+/** Values in one request, fewer than the service accepts. */
+const VALUES_PER_REQUEST = 1000;
+/** Timeout of a request in milliseconds; on a lossy link the service retries for long and has its own timeout. */
 const WRITE_TIMEOUT = 120_000;
+/** Milliseconds by which each value extends the timeout: four times what one takes on a radio of 9600 baud. */
+const WRITE_TIMEOUT_PER_VALUE = 400;
 
 export const OUTCOMES = {
   accepted: { text: "accepted", kind: "good" },
@@ -18,6 +21,8 @@ export const OUTCOMES = {
   adjusted: { text: "adjusted", kind: "warn" },
   unproven: { text: "sent, not proven", kind: "warn" },
   skipped: { text: "left out", kind: "quiet" },
+  unknown: { text: "sent, not acknowledged", kind: "warn" },
+  "not tried": { text: "not tried", kind: "quiet" },
   refused: { text: "refused", kind: "bad" },
   failed: { text: "failed", kind: "bad" },
 };
@@ -117,10 +122,7 @@ export async function review() {
     sent = { names: new Set(lines.keys()), outcomes: [], at: Date.now() };
     table.sent = sent;
     const queue = [...lines.values()];
-    const worker = async () => {
-      for (let line = queue.shift(); line; line = queue.shift()) sent.outcomes.push(await sendOne(component, line));
-    };
-    await Promise.all(Array.from({ length: AT_ONCE }, worker));
+    while (queue.length) sent.outcomes.push(...(await sendTogether(component, queue.splice(0, VALUES_PER_REQUEST))));
     for (const each of sent.outcomes) if (each.isTaken) table.pending.delete(each.name);
     isSending = false;
     store.tell("pending");
@@ -229,43 +231,67 @@ function inWords(value, row) {
   const meaning = meaningOf(value, row?.info, row?.type);
   return `${value} ${meaning || (row?.info?.units ?? "")}`.trim();
 }
-/** Writes one change and shows its result in its row. */
-async function sendOne(component, { change, rowNow, element, remark, away }) {
-  const { name, text, send } = change;
+
+/** Writes changes in one request and shows the result of each in its row. Returns the outcomes. */
+async function sendTogether(component, lines) {
+  const parts = lines.map((line) => ({ line, outcome: outcomeBefore(line) }));
+  const open = parts.filter(({ outcome }) => outcome.status !== "skipped");
+  for (const { line } of open) {
+    line.away.replaceChildren();
+    line.element.classList.add("busy");
+    line.remark.textContent = "sending …";
+  }
+  if (open.length) await writeValues(component, open);
+  for (const { line, outcome } of open) {
+    const { text, kind } = OUTCOMES[outcome.status] ?? { text: outcome.status, kind: "warn" };
+    line.element.classList.remove("busy");
+    line.remark.replaceChildren(
+      el("b", { class: `outcome ${kind}`, text }),
+      outcome.reason ? ` ${outcome.reason}` : "",
+    );
+  }
+  return parts.map(({ outcome }) => outcome);
+}
+
+/** The outcome of a change before it is sent; `skipped` if the vehicle no longer has the parameter. */
+function outcomeBefore({ change: { name }, rowNow }) {
   const row = rowNow();
   if (!row) return { name, isTaken: false, status: "skipped" };
-  const before = { text: row.text, restore: row.document.bits ? { bits: row.document.bits } : row.document.value };
-  const outcome = {
+  return {
     name,
-    before: before.text,
-    restore: before.restore,
+    before: row.text,
+    restore: row.document.bits ? { bits: row.document.bits } : row.document.value,
+    type: row.type,
     isTaken: false,
     isLate: Boolean(row.info?.reboot_required),
   };
-  away.replaceChildren();
-  element.classList.add("busy");
-  remark.textContent = "sending …";
+}
+
+/** Sends the changes, and completes their outcomes. */
+async function writeValues(component, parts) {
   try {
     const { results } = await request(
       "PATCH",
       at(component, "/params"),
-      { values: { [name]: send } },
-      { timeout: WRITE_TIMEOUT },
+      { values: Object.fromEntries(parts.map(({ line: { change } }) => [change.name, change.send])) },
+      { timeout: WRITE_TIMEOUT + parts.length * WRITE_TIMEOUT_PER_VALUE },
     );
-    const result = results[name];
-    if (result?.problem) throw new Problem(result.problem.status, result.problem);
-    outcome.status = result.status ?? "accepted";
-    outcome.isTaken = true;
-    outcome.reason =
-      outcome.status === "adjusted"
-        ? `The vehicle changed ${text} to ${valueText(result.actual, row.type)}.`
-        : (result.reason ?? "");
+    for (const { line, outcome } of parts) complete(outcome, results[outcome.name], line.change.text);
   } catch (error) {
-    outcome.status = error.document?.type?.endsWith(":no-reply") || !error.status ? "failed" : "refused";
-    outcome.reason = error.message;
+    // only a documented problem says that nothing was written
+    const status = error.document?.type && error.status !== 500 ? "not tried" : "unknown";
+    for (const { outcome } of parts) {
+      outcome.status = status;
+      outcome.reason = error.message;
+    }
   }
-  const { text: word, kind } = OUTCOMES[outcome.status] ?? { text: outcome.status, kind: "warn" };
-  element.classList.remove("busy");
-  remark.replaceChildren(el("b", { class: `outcome ${kind}`, text: word }), outcome.reason ? ` ${outcome.reason}` : "");
-  return outcome;
+}
+
+function complete(outcome, result, text) {
+  outcome.status = result.status;
+  outcome.isTaken = ["accepted", "adjusted"].includes(result.status);
+  if (result.problem) outcome.reason = result.problem.detail ?? result.problem.title;
+  else if (result.status === "adjusted")
+    outcome.reason = `The vehicle changed ${text} to ${valueText(result.actual, outcome.type)}.`;
+  else outcome.reason = result.note ?? "";
 }

@@ -21,6 +21,7 @@ from paramclient.documents.results import NotSetDoc, SetManyDoc, SetResultDoc
 from paramclient.errors import ParamClientError, UnknownParameter, UsageError
 from paramclient.model.params import copy_params
 from paramclient.model.patterns import NameChoice
+from paramclient.model.similar_names import did_you_mean, nearest_names
 from paramclient.model.values import Param, Value
 from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome, SetStatus
 from paramclient.service.followed_component import FollowedComponent
@@ -291,5 +292,7 @@ def _texts_with_metadata(
 
 def _unknown(target: FollowedComponent, name: str) -> UnknownParameter:
     system, component = target.address
+    nearest = nearest_names(name, target.component.params)
     what = f"{system}/{component} has no known parameter {name!r}. POST …/read requests it from the vehicle"
-    return UnknownParameter(what, system=system, component=component, name=name)
+    what += f".{did_you_mean(nearest)}" if nearest else ""
+    return UnknownParameter(what, system=system, component=component, name=name, nearest=nearest)

@@ -36,6 +36,7 @@ class Desk:
         self.now = 0.0
         self.sent: list[str | int] = []
         self.count: int | None = COUNT
+        self.live_count: int | None = COUNT
         self.retry = RetryPolicy()
         self.round_trip = self.retry.round_trip
         for _ in range(60):

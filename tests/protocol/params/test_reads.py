@@ -44,6 +44,7 @@ class Desk:
         self.sent: list[Key] = []
         self.params = set(known)
         self.count = count
+        self.live_count: int | None = None
         self.reads = Reads(Context((1, 1), self._send, retry=self.retry), self)
 
     def _send(self, message: Message) -> None:
@@ -667,3 +668,25 @@ def test_what_is_read_in_the_background_keeps_to_the_pace() -> None:
         desk.now += 0.0003
         desk.hear(f"P{number}")
     assert len(desk.take()) <= 12
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_an_index_beyond_the_count_is_unknown_also_where_control_reads_come_too_late(seed: int) -> None:
+    """With 0.3 s of delay and of jitter, the attempts may end before enough control reads are answered."""
+    vehicle = ArduPilotVehicle(table={f"P_{number}": number for number in range(6)}, live=(), ftp=False)
+    world = Simulation(air=Air.symmetric([vehicle], delay=0.3, jitter=0.3, seed=seed))
+    error = world.error_of(lambda: world.get(6))
+    assert isinstance(error, UnknownParameter), error
+    assert error.index == 6
+
+
+def test_an_index_beyond_the_count_of_the_cache_may_exist() -> None:
+    """The vehicle may have more parameters by now: a dead link does not tell."""
+    desk = Desk(count=5)
+    read = desk.ask(7)
+    desk.pass_time(120.0)
+    assert isinstance(read.error, NoReply)
+    desk.live_count = 5
+    read = desk.ask(7)
+    desk.pass_time(120.0)
+    assert isinstance(read.error, UnknownParameter)

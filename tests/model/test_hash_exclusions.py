@@ -6,9 +6,9 @@ from collections.abc import Iterable
 
 import pytest
 
+from paramclient.model import hash_exclusions
+from paramclient.model.hash_exclusions import find_volatile
 from paramclient.model.values import Param, px4_hash
-from paramclient.protocol.params import hash_exclusions
-from paramclient.protocol.params.hash_exclusions import find_volatile
 from paramclient.sim import px4_table
 from tests.simulation import known
 

@@ -15,7 +15,7 @@ from typing import Final
 
 from paramclient.model.values import crc32_px4
 
-__all__ = ["find_volatile", "hash_of"]
+__all__ = ["find_volatile", "hash_of", "usual_volatile"]
 
 HASHED_PARAMETERS_MAX: Final = 1_000_000
 """Parameters hashed while single names are tried, about 0.1 s: each attempt hashes the whole table."""
@@ -66,6 +66,11 @@ def find_volatile(
         if crc32_px4(b"".join(chunk for name, chunk in chunks if name not in candidate)) == announced:
             return candidate, True
     return guess or frozenset(), False
+
+
+def usual_volatile(names: Iterable[str]) -> frozenset[str]:
+    """Return those of the names that PX4 usually excludes from its hash."""
+    return frozenset(name for name in names if _group_of(name) is not None)
 
 
 def hash_of(bits: Mapping[str, int], *, leave_out: frozenset[str]) -> int:

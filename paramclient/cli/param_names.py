@@ -1,0 +1,165 @@
+"""Parameter names in arguments: patterns, upper and lower case, and suggestions for unknown names."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import anyio.to_thread
+
+from paramclient.cache import ParamCache
+from paramclient.cli.session import CommandSession
+from paramclient.client.component import Component
+from paramclient.errors import CacheError, ParamClientError, UnknownParameter
+from paramclient.model.group_switches import is_group_switch
+from paramclient.model.identity import autopilot_name
+from paramclient.model.patterns import NameChoice, is_pattern
+from paramclient.model.similar_names import did_you_mean, nearest_names
+from paramclient.model.values import check_name
+
+__all__ = ["ChosenNames", "cached_names", "check_given", "may_appear", "suggest", "unmatched_text"]
+
+CACHED_TABLES_MAX: Final = 20
+"""Tables of the cache whose names are suggested, those of the vehicles heard last: few firmwares differ."""
+_CAPITALS: Final = ("px4", "ardupilot")
+"""Autopilots whose parameters all have names in capitals."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChosenNames:
+    """The parameters of a vehicle that names and patterns choose.
+
+    Attributes:
+        names: the names, in the vehicle's spelling; those that the vehicle may not have are among them.
+        errors: errors by pattern for the patterns without a match.
+    """
+
+    names: list[str]
+    errors: dict[str, ParamClientError]
+
+    @classmethod
+    def of(cls, component: Component, given: Iterable[str]) -> ChosenNames:
+        """Choose among the known parameters of a component."""
+        names: dict[str, None] = {}
+        errors: dict[str, ParamClientError] = {}
+        for text in given:
+            if not is_pattern(text):
+                names[_spelled(text, component)] = None
+                continue
+            chosen, _ = NameChoice([text]).divide(component.params)
+            names |= dict.fromkeys(sorted(chosen))
+            if not chosen:
+                errors[text] = _no_match(text, component)
+        return cls(list(names), errors)
+
+
+def check_given(given: Iterable[str]) -> list[str]:
+    """Return names and patterns without repetitions.
+
+    Raises:
+        UsageError: a name is not a valid param_id.
+    """
+    return [text if is_pattern(text) else check_name(text) for text in dict.fromkeys(given)]
+
+
+def may_appear(text: str, component: Component) -> bool:
+    """Return whether a name or pattern is of a group that a parameter of the vehicle shows, and hides now."""
+    return any(
+        not param.value
+        and is_group_switch(name, component.autopilot)
+        and text.upper().startswith(f"{name.rpartition('_')[0]}_")
+        for name, param in dict(component.params).items()
+    )
+
+
+async def suggest(
+    session: CommandSession, errors: dict[str, ParamClientError]
+) -> dict[str, ParamClientError]:
+    """Return the errors with suggestions from the cache for names to which the vehicle has no similar one."""
+    cache = session.client.cache
+    if cache is None or not any(map(_lacks_suggestion, errors.values())):
+        return errors
+    known = await anyio.to_thread.run_sync(cached_names, cache, session.component.autopilot)
+    return {name: _with_suggestion(error, known) for name, error in errors.items()}
+
+
+def cached_names(cache: ParamCache, autopilot: str | None = None) -> frozenset[str]:
+    """Return the names of the parameters in the cache; none if the cache cannot be read.
+
+    Args:
+        cache: the cache.
+        autopilot: only those of this autopilot; None for all.
+    """
+    names: set[str] = set()
+    try:
+        summaries = [
+            each
+            for each in cache.components()
+            if autopilot in (None, autopilot_name(each.autopilot), autopilot_name(each.identity.autopilot))
+        ]
+        for each in summaries[:CACHED_TABLES_MAX]:
+            table = cache.load(each.key, each.component)
+            names.update(() if table is None else table.params)
+    except CacheError:
+        return frozenset()
+    return frozenset(names)
+
+
+def unmatched_text(
+    unmatched: Sequence[str], known: Collection[str], others: Callable[[], Collection[str]]
+) -> str:
+    """Return names and patterns without a match in words, each with the most similar names.
+
+    Args:
+        unmatched: the names and patterns.
+        known: the names of the vehicle.
+        others: returns further names, for a name without a similar one among `known`.
+    """
+    texts = []
+    for text in unmatched:
+        nearest: Sequence[str] = ()
+        if not is_pattern(text):
+            nearest = nearest_names(text, known) or nearest_names(text, others())
+        texts.append(f"{text} (did you mean {', '.join(nearest)}?)" if nearest else text)
+    return ", ".join(texts)
+
+
+def _spelled(name: str, component: Component) -> str:
+    """Return the vehicle's spelling of a name, whatever its upper and lower case."""
+    if name in component.params:
+        return name
+    upper = name.upper()
+    known = next((each for each in component.params if each.upper() == upper), None)
+    return known or (upper if component.autopilot in _CAPITALS else name)
+
+
+def _no_match(pattern: str, component: Component) -> UnknownParameter:
+    who = f"{component.system}/{component.component}"
+    return UnknownParameter(
+        f"{who} has no parameter that matches {pattern}",
+        system=component.system,
+        component=component.component,
+        name=pattern,
+    )
+
+
+def _lacks_suggestion(error: ParamClientError) -> bool:
+    return isinstance(error, UnknownParameter) and not error.nearest and not is_pattern(error.name or "*")
+
+
+def _with_suggestion(error: ParamClientError, known: Collection[str]) -> ParamClientError:
+    if not _lacks_suggestion(error):
+        return error
+    assert isinstance(error, UnknownParameter)
+    assert error.name is not None
+    nearest = nearest_names(error.name, known)
+    if not nearest:
+        return error
+    return UnknownParameter(
+        f"{error}.{did_you_mean(nearest)}",
+        system=error.system,
+        component=error.component,
+        name=error.name,
+        nearest=nearest,
+    )

@@ -1,0 +1,189 @@
+"""The subcommands search and info: parameters by words, and all that is known of one. They need no link."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Final
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from paramclient.cache import CachedComponent, HistoryEntry, ParamCache
+from paramclient.cli.exit_codes import ExitCode
+from paramclient.cli.metadata import MetadataChoice, from_file, known_of_table, print_descriptions
+from paramclient.cli.options import CacheOptions
+from paramclient.cli.output import local_time, print_document, print_line, print_table, report, say
+from paramclient.cli.param_names import unmatched_text
+from paramclient.cli.sources import tables_in
+from paramclient.errors import NotInCache
+from paramclient.metadata import Metadata, ParamInfo
+from paramclient.model.identity import autopilot_name
+from paramclient.model.values import check_name, format_value, type_name
+from paramclient.model.wording import counted
+
+__all__ = ["info", "search"]
+
+CHANGES_SHOWN: Final = 5
+"""Last changes of a parameter that info prints, so that the values stay in view; history prints all."""
+
+_DEFAULTS: Final = CacheOptions()
+
+
+def search(
+    word: str,
+    /,
+    *words: str,
+    vehicle: str | None = None,
+    limit: Annotated[int | None, Parameter(validator=Number(gte=1))] = None,
+    metadata: MetadataChoice = None,
+    options: CacheOptions = _DEFAULTS,
+) -> ExitCode:
+    """Find parameters whose name, description or value names contain all words, in upper or lower case.
+
+    Searches the tables in the cache, with the stored metadata of their firmware, and the file of --metadata.
+    Parameters with the words in their name come first, then those with the words in the short description.
+    Exit code 1: nothing was found.
+
+    Args:
+        word: A word or a part of one.
+        words: Further words.
+        vehicle: Search only this vehicle in the cache: its system id, its hardware id, or its key.
+        limit: Print at most this number of parameters.
+        metadata: A file that describes parameters. Default: the stored metadata of each vehicle's firmware.
+    """
+    wanted = [each.casefold() for each in (word, *words)]
+    found = _Known.of(options, vehicle, from_file(metadata, offline=True))
+    ranked = sorted(
+        (rank, name) for name in found.names if (rank := _rank(name, found.info(name), wanted)) is not None
+    )
+    names = [name for _, name in ranked[:limit]]
+    if options.json:
+        from paramclient.documents.cached import FoundDoc, FoundParamDoc  # only here: loads pydantic
+
+        rows = [FoundParamDoc.of(name, found.info(name), found.having(name)) for name in names]
+        print_document(FoundDoc(results=rows))
+    elif names:
+        print_table(["name", "value", "vehicle", "description"], map(found.cells, names), right="value")
+        if len(ranked) > len(names):
+            say(f"{len(names)} of {counted(len(ranked), 'parameter')} shown")
+    if not names:
+        report(f"nothing found; {counted(len(found.names), 'parameter')} searched")
+        return ExitCode.INCOMPLETE
+    return ExitCode.DONE
+
+
+def info(
+    name: str,
+    /,
+    *,
+    vehicle: str | None = None,
+    metadata: MetadataChoice = None,
+    options: CacheOptions = _DEFAULTS,
+) -> ExitCode:
+    """Print what is known of a parameter: description, range, value names, cached values, last changes.
+
+    Args:
+        name: The parameter, in upper or lower case.
+        vehicle: Only of this vehicle in the cache: its system id, its hardware id, or its key.
+        metadata: A file that describes parameters. Default: the stored metadata of each vehicle's firmware.
+    """
+    check_name(name)
+    found = _Known.of(options, vehicle, from_file(metadata, offline=True))
+    spelled = {each.upper(): each for each in found.names}.get(name.upper())
+    described = None if spelled is None else found.info(spelled)
+    if spelled is None:  # a description of a group, FOO{n}_BAR, is not among the names
+        described, spelled = found.info(name.upper()), name.upper()
+    tables = found.having(spelled)
+    if described is None and not tables:
+        text = unmatched_text([name], found.names, lambda: ())
+        raise NotInCache(f"no parameter of the cache is called {text}")
+    with ParamCache(options.cache) as cache:
+        changes = {
+            (each.key, each.component): cache.history(each.key, each.component, spelled, CHANGES_SHOWN)
+            for each in tables
+        }
+    if options.json:
+        from paramclient.documents.cached import ParamInfoDoc  # only here: loads pydantic
+
+        print_document(ParamInfoDoc.of(spelled, described, tables, changes))
+        return ExitCode.DONE
+    print_descriptions([spelled], Metadata.of([described] if described is not None else []))
+    for table in tables:
+        print_line("")
+        for line in _lines_of(table, spelled, described, changes[table.key, table.component]):
+            print_line(line)
+    return ExitCode.DONE
+
+
+@dataclass(frozen=True)
+class _Known:
+    """The cached tables, and the metadata of each."""
+
+    tables: Sequence[CachedComponent]
+    metadata: Sequence[Metadata]
+    names: frozenset[str]
+
+    @classmethod
+    def of(cls, options: CacheOptions, vehicle: str | None, described: Metadata | None) -> _Known:
+        """Load the tables of all vehicles, or of one."""
+        with ParamCache(options.cache) as cache:
+            summaries = tables_in(cache, vehicle, None)
+            loaded = (cache.load(each.key, each.component) for each in summaries)
+            tables = [table for table in loaded if table is not None]
+            found = [described]
+            if described is None:
+                found = [known_of_table(cache.path, table) for table in tables]
+        metadata = list({id(each): each for each in found if each is not None}.values())
+        names = {name for table in tables for name in table.params}
+        if not tables or described is not None:
+            names.update(name for each in metadata for name in each if "{" not in name)
+        return cls(tables, metadata, frozenset(names))
+
+    def info(self, name: str) -> ParamInfo | None:
+        """Return the description of a parameter, or None."""
+        return next((known for each in self.metadata if (known := each.find(name)) is not None), None)
+
+    def having(self, name: str) -> list[CachedComponent]:
+        """Return the tables with this parameter."""
+        return [table for table in self.tables if name in table.params]
+
+    def cells(self, name: str) -> tuple[object, ...]:
+        """Return the row of a found parameter. The value is that of the only vehicle that has it."""
+        tables = self.having(name)
+        described = self.info(name)
+        param = tables[0].params[name] if len(tables) == 1 else None
+        return (
+            name,
+            None if param is None else format_value(param.value, param.type),
+            ", ".join(f"{each.system}/{each.component}" for each in tables),
+            None if described is None else described.short_description,
+        )
+
+
+def _rank(name: str, described: ParamInfo | None, wanted: Iterable[str]) -> int | None:
+    """Return 0 if all words are in the name, 1 with the short description, 2 elsewhere; None if not."""
+    places = [name.casefold()]
+    if described is not None:
+        places.append(f"{places[0]} {described.short_description}".casefold())
+        named = " ".join([*described.values.values(), *described.bits.values(), described.group])
+        places.append(f"{places[1]} {described.long_description} {named}".casefold())
+    return next((rank for rank, text in enumerate(places) if all(word in text for word in wanted)), None)
+
+
+def _lines_of(
+    table: CachedComponent, name: str, described: ParamInfo | None, changes: Sequence[HistoryEntry]
+) -> Iterator[str]:
+    """Yield the lines about the value of one vehicle."""
+    param = table.params[name]
+    meaning = "" if described is None else described.text(param.value) or ""
+    yield f"{table.system}/{table.component} {autopilot_name(table.autopilot)} ({table.key})"
+    value = format_value(param.value, param.type)
+    yield f"  value: {value}{f' ({meaning})' if meaning else ''}, {type_name(param.type)}"
+    if param.default is not None:
+        yield f"  default of the firmware: {format_value(param.default, param.type)}"
+    yield f"  heard: {local_time(table.heard_at[name])}"
+    for entry in changes:
+        new = "removed" if entry.new is None else format_value(entry.new.value, entry.new.type)
+        old = format_value(entry.old.value, entry.old.type)
+        yield f"  changed: {local_time(entry.at)}  {old} -> {new}  ({entry.by})"

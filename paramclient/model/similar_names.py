@@ -1,0 +1,53 @@
+"""Parameter names that are similar to a mistyped one."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+from typing import Final
+
+__all__ = ["did_you_mean", "nearest_names", "unknown_name"]
+
+SIMILAR_NAMES_MAX: Final = 3
+"""Names that are suggested for one mistyped name, so that the message stays short."""
+SIMILARITY_MIN: Final = 0.8
+"""Ratio of `difflib.SequenceMatcher` from which two names count as similar: names of ten characters that
+differ in two of them. Unrelated names share more than half by chance: `ATC_RAT_RLL_P` and `ATC_RAT_YAW_P`."""
+AFFIX_LENGTH: Final = 2
+"""Characters at the start or at the end that two names must share before they are compared: a comparison
+is slow."""
+
+
+def nearest_names(name: str, names: Iterable[str]) -> tuple[str, ...]:
+    """Return the names most similar to `name`, most similar first, at most `SIMILAR_NAMES_MAX`.
+
+    Upper and lower case do not matter: a name that differs only in them is the first one. `name` itself is
+    left out. It takes less than 1 ms for the names of an autopilot.
+    """
+    wanted = name.upper()
+    head, tail = wanted[:AFFIX_LENGTH], wanted[-AFFIX_LENGTH:]
+    matcher = difflib.SequenceMatcher(autojunk=False)
+    matcher.set_seq2(wanted)
+    scored = []
+    for other in sorted(names):
+        upper = other.upper()
+        if not (upper.startswith(head) or upper.endswith(tail)) or other == name:
+            continue
+        matcher.set_seq1(upper)
+        if matcher.real_quick_ratio() >= SIMILARITY_MIN and matcher.quick_ratio() >= SIMILARITY_MIN:
+            scored.append((-matcher.ratio(), other))
+    return tuple(other for score, other in sorted(scored)[:SIMILAR_NAMES_MAX] if -score >= SIMILARITY_MIN)
+
+
+def did_you_mean(nearest: Sequence[str]) -> str:
+    """Return the suggestion of similar names as a sentence that begins with a space; "" without any."""
+    if not nearest:
+        return ""
+    *others, last = nearest
+    return f" Did you mean {', '.join(others)} or {last}?" if others else f" Did you mean {last}?"
+
+
+def unknown_name(name: object, names: Iterable[str]) -> KeyError:
+    """Return the KeyError for a parameter that a mapping does not have, with the most similar names."""
+    nearest = nearest_names(name, names) if isinstance(name, str) else ()
+    return KeyError(f"no parameter {name}.{did_you_mean(nearest)}" if nearest else f"no parameter {name}")

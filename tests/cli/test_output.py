@@ -1,0 +1,158 @@
+"""Tables on narrow terminals, times with their zone, closed outputs, and files that are no logs."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from paramclient.cli.output import local_time, print_table
+from paramclient.cli.time_arguments import parse_time
+from paramclient.sim import PX4Vehicle
+from tests.commands import Command, Put, behind, in_process, leaping
+
+COLUMNS = ["name", "value", "type", "index", "trust"]
+ROWS = [
+    ("MC_ROLL_P", "4.0", "REAL32", 547, "live"),
+    ("CAL_MAG0_XCOMP_1", "-16777216.5", "REAL32", 12, "verified"),
+]
+Print = Callable[..., list[str]]
+
+
+@pytest.fixture
+def printed(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Print:
+    """Print a table on a terminal of some width; return its lines without styles."""
+
+    def call(width: int, columns: list[str], rows: list[tuple[object, ...]], right: str = "") -> list[str]:
+        monkeypatch.setenv("COLUMNS", str(width))
+        monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+        print_table(columns, rows, right=right)
+        return re.sub("\x1b\\[[0-9;]*m", "", capsys.readouterr().out).splitlines()
+
+    return call
+
+
+@pytest.mark.parametrize("width", [16, 24, 40, 53, 54, 80])
+def test_no_value_is_broken_in_two(printed: Print, width: int) -> None:
+    lines = printed(width, COLUMNS, ROWS, right="value index")
+    assert max(map(len, lines)) <= max(width, 18)  # the longest value is whole in any case
+    words = " ".join(lines).split()
+    assert words == [*COLUMNS, *(str(cell) for row in ROWS for cell in row)]
+    assert (len(lines) == 3) == (width >= 54)
+
+
+def test_rows_of_several_lines_are_indented(printed: Print) -> None:
+    assert printed(40, COLUMNS, ROWS, right="value index") == [
+        "name                    value  type",
+        "  index  trust",
+        "MC_ROLL_P                 4.0  REAL32",
+        "    547  live",
+        "CAL_MAG0_XCOMP_1  -16777216.5  REAL32",
+        "     12  verified",
+    ]
+
+
+def test_sentences_in_the_last_column_are_wrapped_at_spaces(printed: Print) -> None:
+    reason = "the vehicle keeps its own value and gives no reason"
+    lines = printed(40, ["name", "reason"], [("MC_ROLL_P", reason)])
+    assert len(lines) > 2
+    assert max(map(len, lines)) <= 40
+    assert " ".join(" ".join(lines[1:]).split()) == f"MC_ROLL_P {reason}"
+
+
+# times
+
+
+@pytest.fixture
+def in_zone(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setenv("TZ", "XYZ-05:30")
+    time.tzset()
+    yield
+    monkeypatch.undo()
+    time.tzset()
+
+
+@pytest.mark.usefixtures("in_zone")
+def test_times_are_local_with_their_zone_and_can_be_given_back(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    at = 1_795_000_000.125
+    assert local_time(at) == "2026-11-18T16:36:40.125+05:30"
+    assert parse_time(local_time(at), at + 1) == at
+    leaping(monkeypatch)
+    command: Command = in_process(capsys, "--cache", str(tmp_path / "cache"))
+    put: Put = behind(monkeypatch, "sim:px4")
+    vehicle = PX4Vehicle(table={"A": 1, "B": 2})
+    assert command("fetch", put(vehicle)).code == 0
+    assert command("set", put(vehicle), "A", 3).code == 0
+    local = r"[0-9-]{10}T[0-9:.]{12}\+05:30"
+    history = command("history", 1, "--since", "1h ago")
+    assert re.fullmatch(local, history.rows[1][0])
+    assert re.fullmatch(f"since {local}\n", history.err)
+    assert re.search(f"synced {local}", command("show", 1).err)
+    assert re.fullmatch(local, command("cache", "list").rows[1][4])
+    [line] = command("history", 1, "--json").json["history"]
+    assert line["time"].endswith("Z")
+    assert parse_time(line["time"], time.time() + 1000) == pytest.approx(
+        parse_time(history.rows[1][0], time.time() + 1000)
+    )
+
+
+def test_without_an_offset_the_zone_is_z() -> None:
+    assert local_time(0.0) in ("1970-01-01T00:00:00.000Z", local_time(0.0))
+    assert "+00:00" not in local_time(0.0)
+
+
+# closed outputs
+
+
+@pytest.mark.parametrize("words", [["-h"], ["cache", "--help"], []])
+def test_help_whose_reader_closes_it_is_no_error(words: list[str]) -> None:
+    program = f"import sys; from paramclient.__main__ import main; sys.argv[1:] = {words}; main()"
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as helping:
+        assert helping.stdout is not None
+        assert helping.stderr is not None
+        helping.stdout.close()
+        assert helping.wait(60) == 0
+        assert helping.stderr.read() == b""
+
+
+# import
+
+
+@pytest.mark.parametrize(
+    ("content", "kind"),
+    [
+        (b"", "the file is empty"),
+        (b"dear diary\n", "a text file, and no log"),
+        (b"MC_ROLL_P,4.5\nMC_YAW_P,2\n", "a parameter file (mission-planner), and no log"),
+        (b"SQLite format 3\0" + bytes(100), "an SQLite database, and no log"),
+        (bytes(range(256)), "neither a telemetry log (.tlog) nor an on-board log (.bin, .ulg)"),
+        (None, "No such file or directory"),
+    ],
+)
+def test_import_says_what_a_file_is_that_is_no_log(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, content: bytes | None, kind: str
+) -> None:
+    file = tmp_path / "flight.tlog"
+    if content is not None:
+        file.write_bytes(content)
+    outcome = in_process(capsys)("import", file, "--cache", tmp_path / "cache")
+    assert (outcome.code, outcome.out) == (2, "")
+    assert kind in outcome.err
+    assert outcome.err.count("\n") == 1
+
+
+def test_px4_scripts_are_not_offered_for_save(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    command = in_process(capsys)
+    assert "px4-script" not in command("save", "--help").out
+    refused = command("save", "sim:px4", tmp_path / "rc.txt", "--form", "px4-script")
+    assert refused.code == 2
+    assert "mission-planner" in refused.err

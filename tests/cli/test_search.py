@@ -1,0 +1,91 @@
+"""The subcommands search and info: cached parameters by words, and all that is known of one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from paramclient.sim import ArduPilotVehicle, PX4Vehicle
+from tests.commands import Command, Put, behind, in_process, leaping
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Command:
+    """Run the command line in this process, on simulated time, with the cached tables of two vehicles."""
+    leaping(monkeypatch)
+    run = in_process(capsys, "--cache", str(tmp_path / "cache.sqlite3"))
+    put: Put = behind(monkeypatch, "sim:px4")
+    px4 = PX4Vehicle(metadata=True)
+    assert run("fetch", put(px4)).code == 0
+    assert run("set", put(px4), "MC_ROLL_P", 6.5, "MC_ROLL_P", 7.5).code == 0
+    assert run("get", put(px4), "MC_ROLL_P", "--metadata", "vehicle").code == 0
+    assert run("fetch", put(ArduPilotVehicle(system=2))).code == 0
+    return run
+
+
+def test_search_finds_names_descriptions_and_value_names(command: Command) -> None:
+    found = command("search", "ROLL", "gain", "--json")
+    assert found.code == 0
+    first = found.json["results"][0]
+    assert first["name"].startswith("MC_ROLL")
+    assert "roll" in first["description"].lower()
+    assert len(first["vehicles"]) == 1
+    by_name = command("search", "mc_roll_p")
+    assert by_name.rows[1][:3] == ["MC_ROLL_P", "7.5", "1/1"]
+    assert any("EKF2_GPS_CTRL" in row for row in command("search", "heading", "gps").rows)
+    of_one = command("search", "rtl_alt", "--vehicle", 2, "--json").json["results"]
+    assert "RTL_ALT" in [each["name"] for each in of_one]
+    assert command("search", "rtl_alt", "--vehicle", 1).code == 1
+
+
+def test_search_limits_and_reports_nothing(command: Command) -> None:
+    some = command("search", "mc_", "--limit", 2)
+    assert len(some.rows) == 3
+    assert some.err.startswith("2 of ")
+    nothing = command("search", "xyzzy")
+    assert (nothing.code, nothing.out) == (1, "")
+    assert nothing.err.startswith("paramclient: nothing found; ")
+    assert command("search", "xyzzy", "--json").json == {"results": []}
+
+
+def test_info_prints_description_values_and_changes(command: Command) -> None:
+    known = command("info", "mc_roll_p")
+    assert known.code == 0
+    lines = [line.strip() for line in known.out.splitlines()]
+    assert lines[1].startswith("MC_ROLL_P: ")
+    assert "range: 0 to 12 1/s" in lines
+    assert "value: 7.5, REAL32" in lines
+    assert [line.split("  ", 1)[1] for line in lines if line.startswith("changed: ")] == [
+        "4.0 -> 6.5  (us)",
+        "6.5 -> 7.5  (us)",
+    ]
+    document = command("info", "MC_ROLL_P", "--json").json
+    assert (document["name"], document["metadata"]["units"]) == ("MC_ROLL_P", "1/s")
+    [vehicle] = document["vehicles"]
+    assert (vehicle["system"], vehicle["param"]["value"]) == (1, 7.5)
+    assert [each["new"] for each in vehicle["changes"]] == [6.5, 7.5]
+
+
+def test_info_of_an_unknown_name_suggests_others(command: Command) -> None:
+    wrong = command("info", "MC_ROLLP")
+    assert (wrong.code, wrong.out) == (5, "")
+    assert "MC_ROLLP (did you mean MC_ROLL_P?)" in wrong.err
+    assert command("info", "RTL_ALT", "--vehicle", 1).code == 5
+    assert "2/1 ardupilot" in command("info", "RTL_ALT").out
+
+
+def test_a_metadata_file_is_searched_without_a_table(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    file = tmp_path / "apm.pdef.xml"
+    file.write_text(
+        '<paramfile><vehicles><parameters name="ArduCopter"><param name="ArduCopter:FENCE_ALT" '
+        'humanName="Fence Altitude" documentation="Highest altitude."><field name="Units">m</field></param>'
+        "</parameters></vehicles></paramfile>"
+    )
+    run = in_process(capsys, "--cache", str(tmp_path / "none.sqlite3"), "--metadata", str(file))
+    assert run("search", "highest").rows[1] == ["FENCE_ALT", "Fence Altitude"]
+    assert "FENCE_ALT: Fence Altitude" in run("info", "fence_alt").out

@@ -1,0 +1,157 @@
+"""The subcommand set with many pairs: one outcome for each, also when the vehicle or the user ends it."""
+
+from __future__ import annotations
+
+import re
+import signal
+from typing import Any
+
+import pytest
+
+from paramclient.cli import session as cli_session
+from paramclient.links import SimLink
+from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
+from tests.commands import Command, Outcome, Put, behind, in_process, leaping
+from tests.ways import ServedClient
+
+NAMES = [f"P_{number:02}" for number in range(60)]
+PAIRS = [word for name in NAMES for word in (name, "7")]
+TABLE: dict[str, Any] = dict.fromkeys(NAMES, 1)
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Run the command line in this process, on simulated time and without a cache."""
+    leaping(monkeypatch)
+    run = in_process(capsys)
+    return lambda *words: run(*words, "--no-cache")
+
+
+@pytest.fixture
+def put(monkeypatch: pytest.MonkeyPatch) -> Put:
+    """Connect every URL to a simulated vehicle."""
+    return behind(monkeypatch, "sim:custom")
+
+
+class Ending(GenericVehicle):
+    """A vehicle that does something else instead of its 41st set, and sets nothing from then on."""
+
+    def _on_set(self, request: Any, sender: Any) -> None:
+        if self.requests["PARAM_SET"] <= 40:
+            super()._on_set(request, sender)
+        elif self.requests["PARAM_SET"] == 41:
+            self.end()
+
+    def _on_read(self, request: Any, sender: Any) -> None:
+        if self.requests["PARAM_SET"] <= 40:
+            super()._on_read(request, sender)
+
+    def end(self) -> None:
+        """Keep silent from now on, also about reads."""
+
+
+class Interrupting(Ending):
+    def end(self) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+
+def statuses(outcome: Outcome) -> dict[str, str]:
+    return {each["name"]: each["status"] for each in outcome.json["results"]}
+
+
+@pytest.mark.parametrize("kind", [PX4Vehicle, ArduPilotVehicle])
+def test_many_pairs_are_in_flight_at_a_time(command: Command, put: Put, kind: Any) -> None:
+    """One after the other, 60 writes would take 12 s on this link."""
+    vehicle = kind(table=TABLE)
+    done = command("set", put(Air.symmetric([vehicle], delay=0.1)), *PAIRS)
+    assert done.code == 0
+    assert set(vehicle.values.values()) == {7}
+    found = re.match(r"60 of 60 set on 1/1 \w+ in (\d+\.\d+) s, ", done.err)
+    assert found
+    assert float(found[1]) < 3.0
+    assert [row[0] for row in done.rows[1:]] == NAMES
+
+
+def test_every_value_has_an_outcome_of_its_own(command: Command, put: Put) -> None:
+    vehicle = ArduPilotVehicle(
+        table={"A": 1.0, "COUNT": 3, "FIXED": 2.0}, read_only=["FIXED"], live=(), ftp=False, param_error=True
+    )
+    words = ["A", 5, "NO_SUCH", 1, "COUNT", 7.6, "FIXED", 9, "A", 6]
+    done = command("set", put(vehicle), *words)
+    assert done.code == 1
+    assert [[row[0], row[-1]] for row in done.rows[1:]] == [
+        ["A", "accepted"],
+        ["NO_SUCH", "refused"],
+        ["COUNT", "adjusted"],
+        ["FIXED", "refused"],
+        ["A", "accepted"],
+    ]
+    assert done.err.startswith("3 of 5 set, 2 refused on 1/1 ardupilot in ")
+    assert "NO_SUCH: " in done.err
+    assert "FIXED: " in done.err
+    assert vehicle.values["A"] == 6
+
+
+@pytest.mark.parametrize("over_service", [False, True])
+def test_a_vehicle_that_ends_in_the_middle_loses_no_outcome(
+    command: Command, put: Put, monkeypatch: pytest.MonkeyPatch, over_service: bool
+) -> None:
+    vehicle = Ending(TABLE)
+    url = put(vehicle)
+    if over_service:
+        serve(monkeypatch, vehicle)
+    done = command("set", url, *PAIRS, "--json")
+    found = statuses(done)
+    assert done.code == 3
+    assert [*found] == NAMES
+    accepted = {name for name in NAMES if found[name] == "accepted"}
+    written = {name for name, value in vehicle.values.items() if value == 7}
+    assert set() < accepted <= written
+    assert {found[name] for name in NAMES if name not in accepted} == {"unknown", "not tried"}
+    assert {found[name] for name in written - accepted} <= {"unknown"}
+    assert {each["error"] for each in done.json["results"] if each["name"] not in accepted} == {"NoReply"}
+    assert done.err.count("\n") == 2, "one line for those sent, one for the others"
+    not_tried = [name for name in NAMES if found[name] == "not tried"]
+    assert f"paramclient: {', '.join(not_tried[:10])}" in done.err, "one line for those of one cause"
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_ctrl_c_prints_the_outcomes_so_far(command: Command, put: Put, as_json: bool) -> None:
+    vehicle = Interrupting(TABLE)
+    done = command("set", put(Air.symmetric([vehicle], delay=0.02)), *PAIRS, *(["--json"] if as_json else []))
+    assert done.code == 130
+    assert "interrupted: the outcome of " in done.err
+    found = statuses(done) if as_json else {row[0]: row[-1] for row in done.rows[1:]}
+    assert [*found] == NAMES
+    accepted = [name for name in NAMES if found[name] == "accepted"]
+    assert accepted
+    assert all(vehicle.values[name] == 7 for name in accepted)
+    assert {found[name] for name in NAMES if name not in accepted} == {"unknown"}
+    assert command("set", put(GenericVehicle(TABLE)), *PAIRS).code == 0
+
+
+def test_over_a_service_all_pairs_are_one_request(
+    command: Command, put: Put, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vehicle = PX4Vehicle(table=TABLE)
+    url = put(vehicle)
+    client = serve(monkeypatch, Air.symmetric([vehicle], delay=0.1))
+    done = command("set", url, *PAIRS)
+    assert done.code == 0, done.err
+    assert set(vehicle.values.values()) == {7}
+    assert len(client) == 1
+    found = re.match(r"60 of 60 set on 1/1 px4 in (\d+\.\d+) s, ", done.err)
+    assert found
+    assert float(found[1]) < 3.0
+
+
+def serve(monkeypatch: pytest.MonkeyPatch, far_end: Endpoint) -> list[ServedClient]:
+    """Connect every URL to a service that has this vehicle; return the clients that were made."""
+    made: list[ServedClient] = []
+
+    def client(url: str, **options: Any) -> ServedClient:
+        made.append(ServedClient(SimLink(far_end, "sim:custom")))
+        return made[-1]
+
+    monkeypatch.setattr(cli_session, "ParamClient", client)
+    return made
