@@ -337,11 +337,13 @@ def test_the_simulators_load_only_when_a_link_asks_for_them() -> None:
                 assert not (each.runs_at_import and room_of(target) == "sim"), f"{module}:{each.line}"
 
 
-def test_only_the_command_uvicorns_protocols_and_the_ports_of_windows_know_asyncio() -> None:
-    """The library runs on trio too: see `tests/client/test_backends.py`. uvicorn runs on asyncio alone."""
+def test_few_modules_know_an_event_loop_by_name() -> None:
+    """The library runs on trio too: see `tests/client/test_backends.py`. uvicorn runs on asyncio alone, and
+    so do serial ports on Windows. anyio cannot start a task that belongs to no other task."""
     loops = {"asyncio", "trio"}
     uses = {module for module in MODULES for each in imports_of(module) if each.top in loops}
     assert {module for module in uses if not is_command(module)} == {
+        "paramclient.client.client_task",
         "paramclient.links.transport",
         "paramclient.service.connections",
     }

@@ -3,6 +3,7 @@
 - `arguments`: argument defaults and checks.
 - `cache_writer`: writes parameter tables to the cache.
 - `client`: `ParamClient`, the public class.
+- `client_task`: the task that keeps a client open from `open` to `aclose`.
 - `component`: `Component`, the public interface of one component.
 - `loop_scheduler`: CPU time and list downloads shared among the links of one event loop.
 - `events`: public events and their stream.

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Self, TypeAlias
 
 from paramclient.cache import ParamCache
 from paramclient.client.arguments import COMPONENT_TIMEOUT
+from paramclient.client.client_task import ClientTask
 from paramclient.client.component import Component
 from paramclient.client.events import Events
 from paramclient.client.fetch_all import FetchedAll
@@ -52,6 +53,8 @@ class ParamClient:
     are written to the cache, and no task, socket or thread remains. Exceptions of the body propagate
     unchanged. Before that, open file sessions are closed on board, also if the body is cancelled. If a
     vehicle does not acknowledge, this takes at most `SESSION_CLOSE_TIMEOUT` (2 s).
+
+    Where an `async with` does not fit, such as in `python -m asyncio`, call `open` and `aclose`.
 
     A dropped TCP connection, an unplugged serial port or a failed UDP socket is reopened with backoff while
     the client is open. Waiting calls continue after the reconnection, and unacknowledged requests are sent
@@ -99,6 +102,9 @@ class ParamClient:
             entered before, or the telemetry log exists or cannot be created.
         LinkError: on entering: the link, or the link to the other program, cannot be opened.
     """
+
+    _task: ClientTask | None = None
+    _is_entered = False
 
     def __init__(
         self,
@@ -149,12 +155,55 @@ class ParamClient:
 
     async def __aenter__(self) -> Self:
         await self._implementation.open()
+        self._is_entered = True
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        await self._implementation.close(failed=kind is not None)
+        try:
+            await self._implementation.close(failed=kind is not None)
+        finally:
+            self._is_entered = False
+
+    async def open(self) -> Self:
+        """Open the client without an `async with`, until `aclose`. Return the client.
+
+        For a REPL, and for frameworks that start and stop their parts in different tasks. The client runs in
+        a task of its own, which ends with `aclose`, or with the event loop if `aclose` is not called; if the
+        loop does not cancel its tasks, as when `python -m asyncio` is left, values of the last 0.25 s may be
+        missing in the cache. An unexpected error in a task of the client ends the client: it is logged,
+        waiting calls and new ones raise ClientClosed with the error as the cause, and `aclose` raises it.
+
+        Cancellation closes the client again.
+
+        Raises:
+            UsageError: the client was opened before, or the telemetry log exists or cannot be created.
+            LinkError: the link, or the link to the other program, cannot be opened.
+            ClientClosed: `aclose` was called meanwhile.
+        """
+        task = ClientTask(self._implementation, self.link.name)
+        if self._task is None and not self._is_entered:
+            self._task = task
+        await task.open()
+        return self
+
+    async def aclose(self) -> None:
+        """Close a client that `open` has opened, as on exit from an `async with`.
+
+        Any task may call it, also while `open` or another `aclose` is running. It has no effect on a client
+        that is not open, or closed already. Cancellation skips no step except waiting for a hash.
+
+        Raises:
+            UsageError: the client was entered with `async with`, which closes it on exit.
+        """
+        if self._is_entered:
+            raise UsageError(
+                "the client was opened by `async with`, which closes it: leave its body instead of calling"
+                " aclose"
+            )
+        if self._task is not None:
+            await self._task.close()
 
     @property
     def components(self) -> Mapping[Address, Component]:

@@ -543,7 +543,7 @@ class LinkClient(LocalClient):
         if self.link_task.broken is not None:
             raise self.link_task.broken.with_traceback(None)
         if self._tasks is None:
-            raise ClientClosed("the client is not open; use it as `async with`", link=self._link.name)
+            raise ClientClosed("the client is not open; use `async with` or `open`", link=self._link.name)
 
     async def _let_hashes_settle(self) -> None:
         """Wait for the hash after writes of this client, if it cannot be computed locally."""

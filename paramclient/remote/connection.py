@@ -174,7 +174,7 @@ class Connection:
             raise error.with_traceback(None)
         if not self._was_there:
             name = self._requests.name
-            raise ClientClosed("the client is not open; use it as `async with`", link=name)
+            raise ClientClosed("the client is not open; use `async with` or `open`", link=name)
 
     def end(self, error: LinkError) -> None:
         """Fail all calls permanently with this error."""

@@ -1,0 +1,341 @@
+"""`open` and `aclose`: a client without an `async with`, on asyncio and on trio."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import anyio
+import anyio.abc
+import anyio.lowlevel
+import pytest
+
+from paramclient import ClientClosed, LinkError, ParamCache, ParamClient, UsageError
+from paramclient.client import client_task
+from paramclient.links import Peer, SimLink
+from paramclient.remote import RemoteClient
+from paramclient.service import Hub, create_app
+from paramclient.sim import Endpoint
+from tests.asgi import ASGITransport
+from tests.cable import TIMEOUT
+from tests.shell import Tap, a_client, bits, generic, small_px4
+
+pytestmark = pytest.mark.anyio
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(params=["asyncio", "trio"])
+def anyio_backend(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture(autouse=True)
+def nothing_remains() -> Iterator[None]:
+    """No task and no thread of ours outlives its client."""
+    yield
+    assert not client_task._running
+    assert [thread.name for thread in threading.enumerate() if "paramclient" in thread.name] == []
+
+
+@asynccontextmanager
+async def beside() -> AsyncIterator[anyio.abc.TaskGroup]:
+    """Tasks beside the test, which end with it."""
+    with anyio.fail_after(TIMEOUT):
+        async with anyio.create_task_group() as tasks:
+            yield tasks
+            tasks.cancel_scope.cancel()
+
+
+async def in_a_task(tasks: anyio.abc.TaskGroup, call: Callable[[], Any]) -> Any:
+    """What a call in a task of its own returns. The task has ended then."""
+    results: list[Any] = []
+    ended = anyio.Event()
+
+    async def work() -> None:
+        results.append(await call())
+        ended.set()
+
+    tasks.start_soon(work)
+    await ended.wait()
+    return results[0]
+
+
+class SlowLink(SimLink):
+    """A link that opens when it is let.
+
+    Attributes:
+        may_open: lets it open.
+        is_open: whether it is open.
+    """
+
+    def __init__(self, endpoint: Endpoint) -> None:
+        super().__init__(endpoint, "tcp:slow:5760")
+        self.may_open = anyio.Event()
+        self.is_open = False
+
+    async def open(self) -> None:
+        await self.may_open.wait()
+        await super().open()
+        self.is_open = True
+
+    async def close(self) -> None:
+        self.is_open = False
+        await super().close()
+
+
+class FaultyLink(SimLink):
+    """A link with a mistake in its program.
+
+    Attributes:
+        fails: makes the next read fail.
+    """
+
+    def __init__(self, endpoint: Endpoint) -> None:
+        super().__init__(endpoint, "tcp:faulty:5760")
+        self.fails = anyio.Event()
+
+    async def receive(self) -> list[tuple[Peer, bytes]]:
+        await self.fails.wait()
+        raise ZeroDivisionError("a mistake")
+
+
+async def test_a_client_is_used_between_open_and_aclose(tmp_path: Path) -> None:
+    vehicle = small_px4(burst=50, period=0.001)
+    client = ParamClient(vehicle, cache=tmp_path / "cache")
+    with anyio.fail_after(TIMEOUT):
+        assert await client.open() is client
+        component = await client.component()
+        assert (await component.fetch_all()).complete
+        assert (await component.set("PARAM_01", 77)).status == "accepted"
+        await client.aclose()
+        with pytest.raises(ClientClosed):
+            await component.get("PARAM_01")
+    with ParamCache(tmp_path / "cache") as cache:
+        assert bits(cache.component(system=1).params) == bits(vehicle.params)
+
+
+async def test_opened_used_and_closed_in_different_tasks() -> None:
+    client = a_client(generic())
+    async with beside() as tasks:
+        await in_a_task(tasks, client.open)
+        component = await in_a_task(tasks, client.component)
+        assert (await component.get("PARAM_01")).value == 1
+        await in_a_task(tasks, client.aclose)
+        assert " closed, " in repr(client)
+
+
+async def test_a_cancel_scope_around_open_does_not_reach_the_client() -> None:
+    client = a_client(generic())
+    async with beside():
+        with anyio.CancelScope() as scope:
+            await client.open()
+            scope.cancel()
+        assert (await (await client.component()).get("PARAM_01")).value == 1
+        await client.aclose()
+
+
+async def test_opened_and_closed_twice() -> None:
+    client = a_client(generic())
+    async with beside():
+        await client.aclose()  # of a client that is not open
+        await client.open()
+        with pytest.raises(UsageError, match="opened only once"):
+            await client.open()
+        with pytest.raises(UsageError, match="opened only once"):
+            await client.__aenter__()
+        assert (await (await client.component()).get("PARAM_01")).value == 1
+        await client.aclose()
+        await client.aclose()
+        with pytest.raises(UsageError, match="opened only once"):
+            await client.open()
+
+
+async def test_several_tasks_close_at_once() -> None:
+    client = a_client(generic())
+    await client.open()
+    async with beside():
+        async with anyio.create_task_group() as tasks:
+            for _ in range(3):
+                tasks.start_soon(client.aclose)
+        assert " closed, " in repr(client)
+
+
+async def test_async_with_closes_what_it_opens() -> None:
+    client = a_client(generic())
+    async with beside():
+        async with client:
+            with pytest.raises(UsageError, match="leave its body"):
+                await client.aclose()
+            with pytest.raises(UsageError, match="opened only once"):
+                await client.open()
+            assert (await (await client.component()).get("PARAM_01")).value == 1
+        await client.aclose()
+
+
+async def test_closing_ends_the_calls_of_other_tasks() -> None:
+    tap = Tap(generic())
+    client = a_client(tap)
+    endings: list[type[BaseException]] = []
+
+    async def wait() -> None:
+        try:
+            await component.get("PARAM_01")
+        except LinkError as error:
+            endings.append(type(error))
+
+    async with beside():
+        await client.open()
+        component = await client.component()
+        tap.is_deaf = True
+        async with anyio.create_task_group() as tasks:
+            for _ in range(2):
+                tasks.start_soon(wait)
+            await anyio.lowlevel.checkpoint()
+            await client.aclose()
+    assert endings == [ClientClosed] * 2
+
+
+async def test_a_link_that_cannot_be_opened() -> None:
+    client = a_client("tcp:127.0.0.1:1")
+    async with beside():
+        with pytest.raises(LinkError, match="refused"):
+            await client.open()
+        await client.aclose()
+
+
+@pytest.mark.parametrize("how", ["cancelled", "aclose"])
+async def test_opening_is_given_up(how: str) -> None:
+    link = SlowLink(generic())
+    client = a_client(link)
+    async with beside() as tasks:
+        if how == "cancelled":
+            with anyio.CancelScope() as scope:
+                tasks.start_soon(_when_it_waits, link, scope.cancel)
+                await client.open()
+            assert scope.cancelled_caught
+        else:
+            tasks.start_soon(client.aclose)
+            with pytest.raises(ClientClosed, match="while it was being opened"):
+                await client.open()
+        assert not client_task._running
+        link.may_open.set()
+        await client.aclose()
+        with pytest.raises(ClientClosed):
+            await client.component()
+    assert not link.is_open
+
+
+async def _when_it_waits(link: SlowLink, call: Callable[[], object]) -> None:
+    """Call something when the link is waiting to be opened."""
+    while not link.may_open.statistics().tasks_waiting:
+        await anyio.lowlevel.checkpoint()
+    call()
+
+
+async def test_a_cancelled_aclose_closes_nevertheless(tmp_path: Path) -> None:
+    vehicle = small_px4(burst=50, period=0.001)
+    client = ParamClient(vehicle, cache=tmp_path / "cache")
+    async with beside():
+        await client.open()
+        await (await client.component()).fetch_all()
+        with anyio.CancelScope() as scope:
+            scope.cancel()
+            await client.aclose()
+        assert scope.cancelled_caught
+        assert not client_task._running
+    with ParamCache(tmp_path / "cache") as cache:
+        assert len(cache.component(system=1).params) == len(vehicle.params)
+
+
+async def test_an_error_in_a_task_of_the_client_reaches_its_callers(caplog: pytest.LogCaptureFixture) -> None:
+    link = FaultyLink(generic())
+    client = a_client(link)
+    async with beside():
+        await client.open()
+        link.fails.set()
+        with caplog.at_level(logging.ERROR, "paramclient"), pytest.raises(ClientClosed) as waiting:
+            await client.component(timeout=None)
+        while client_task._running:
+            await anyio.lowlevel.checkpoint()
+        with pytest.raises(ClientClosed) as late:
+            await client.component()
+        with pytest.raises(ExceptionGroup) as closing:
+            await client.aclose()
+        await client.aclose()  # it was told once
+    assert closing.group_contains(ZeroDivisionError)
+    assert late.value.__cause__ is waiting.value.__cause__ is closing.value
+    assert [record.getMessage() for record in caplog.records] == [
+        "tcp:faulty:5760: an unexpected error has ended the client"
+    ]
+
+
+@pytest.mark.parametrize("anyio_backend", ["asyncio"])
+async def test_over_a_service() -> None:
+    async with beside() as tasks, Hub([("sim", lambda: a_client(generic()))], cache=False) as hub:
+        client = RemoteClient("http://127.0.0.1:8765", transport=ASGITransport(create_app(hub)))
+        await in_a_task(tasks, client.open)
+        component = await client.component()
+        assert (await component.get("PARAM_01")).value == 1
+        await in_a_task(tasks, client.aclose)
+        with pytest.raises(ClientClosed):
+            await component.get("PARAM_01")
+
+
+LEFT_OPEN = """
+import {loop} as loop
+from paramclient import ParamClient
+async def main():
+    vehicle = await (await ParamClient("sim:px4").open()).component()
+    await vehicle.fetch_all()
+    await vehicle.set("MC_ROLL_P", 7.25)
+loop.run({main})
+"""
+
+
+@pytest.mark.parametrize("loop", ["asyncio", "trio"])
+def test_a_client_that_is_left_open_is_closed_with_the_event_loop(loop: str, tmp_path: Path) -> None:
+    program = LEFT_OPEN.format(loop=loop, main="main()" if loop == "asyncio" else "main")
+    assert run("-W", "error", "-c", program, cache=tmp_path) == ""
+    assert "7.25" in run("-m", "paramclient", "show", "1", "MC_ROLL_P", cache=tmp_path)
+
+
+TYPED = """
+from paramclient import ParamClient
+client = await ParamClient("sim:px4").open()
+vehicle = await client.only_component()
+await vehicle.fetch_all()
+print("value", (await vehicle.get("MC_ROLL_P")).value)
+await client.aclose()
+print(client)
+"""
+
+
+@pytest.mark.parametrize("repl", ["asyncio", "trio"])
+def test_typed_into_a_repl(repl: str, tmp_path: Path) -> None:
+    printed = run("-m", repl, cache=tmp_path, typed=TYPED)
+    assert "value 4.0" in printed
+    assert "<ParamClient sim:px4 closed, 1 component>" in printed
+
+
+def run(*arguments: str, cache: Path, typed: str = "") -> str:
+    """What a Python program prints, with a cache of its own."""
+    done = subprocess.run(
+        [sys.executable, *arguments],
+        env=os.environ | {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(cache)},
+        input=typed,
+        capture_output=True,
+        encoding="utf-8",
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr, done.stderr
+    return done.stdout
