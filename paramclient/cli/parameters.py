@@ -476,6 +476,12 @@ class _Written:
         return self.name, format_value(self.requested, ParamType.REAL64), actual, self.status
 
 
+def _number_held(error: ParamClientError) -> Value | None:
+    """Return the value that the vehicle kept, or None where the error does not tell a number."""
+    actual = error.actual if isinstance(error, ValueNotApplied) else None
+    return None if isinstance(actual, str) else actual
+
+
 async def _write(
     session: CommandSession, name: str, value: int | float, *, force: bool, durable: bool
 ) -> _Written:
@@ -488,7 +494,7 @@ async def _write(
             name,
             ParamType.REAL32 if known is None else known.type,
             requested=value,
-            actual=error.actual if isinstance(error, ValueNotApplied) else None,
+            actual=_number_held(error),
             status=status_of(error),
             reason=str(error),
             code=code_of(error),

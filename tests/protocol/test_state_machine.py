@@ -18,7 +18,7 @@ from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_result import FetchResult, Policy
 from paramclient.protocol.params.list_download import REQUESTED_INDICES_MAX
-from paramclient.protocol.params.reads import Read
+from paramclient.protocol.params.reads import Read, ValueRead
 from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.params.writes import Write
 from paramclient.protocol.requests.operation import Operation
@@ -456,7 +456,7 @@ class Sessions(RuleBasedStateMachine):
             machine = self.machine_of(begun.subject)
             if isinstance(begun.operation, Fetch):
                 machine.end_fetch(begun.operation, self.world.now)
-            elif isinstance(begun.operation, Read):
+            elif isinstance(begun.operation, ValueRead):
                 machine.reads.release(begun.operation)
 
     @invariant()
@@ -631,7 +631,7 @@ class Sessions(RuleBasedStateMachine):
             begun.subject.moved(self.world.now)
         elif isinstance(operation, Fetch):
             machine.end_fetch(operation, self.world.now)
-        elif isinstance(operation, Read):
+        elif isinstance(operation, ValueRead):
             machine.reads.release(operation)
 
     def check(self, begun: Begun) -> None:

@@ -1,0 +1,128 @@
+"""The table of a component's extended parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+
+from paramclient.model.ext_params import ExtParam
+from paramclient.model.values import Trust
+from paramclient.protocol.ext.change import ExtChange
+from paramclient.protocol.params.table import NameQuota
+from paramclient.protocol.wire import PARAMETERS_MAX
+
+__all__ = ["ExtTable"]
+
+
+class ExtTable:
+    """The extended parameters of one component, apart from its plain ones.
+
+    Args:
+        room: the name count shared by all tables of the link.
+
+    Attributes:
+        params: by name, in the order of first reception. Shared with readers; never replaced.
+        count: the latest param_count, or None. Indices are valid for this count only.
+        moments: when each value was last observed, by name, in seconds of the core's clock.
+        changed_by: the author of the last change of each value, by name.
+    """
+
+    def __init__(self, room: NameQuota | None = None) -> None:
+        self._room = NameQuota() if room is None else room
+        self.params: dict[str, ExtParam] = {}
+        self.count: int | None = None
+        self.moments: dict[str, float] = {}
+        self.changed_by: dict[str, str] = {}
+        self._names: dict[int, str] = {}  # by index
+
+    @property
+    def complete(self) -> bool:
+        """Whether the table has a parameter for every index below `count`."""
+        return self.count is not None and len(self._names) >= self.count
+
+    def use_count(self, count: int) -> bool:
+        """Take the param_count of a message; return whether it is another one: all indices are then
+        unknown."""
+        if count == self.count or not 1 <= count <= PARAMETERS_MAX:
+            return False
+        is_another = self.count is not None
+        self.count = count
+        if is_another:
+            self._names.clear()
+            for name, param in self.params.items():
+                self.params[name] = param.with_index(None)
+        return is_another
+
+    def use_index(self, name: str, index: int) -> None:
+        """Take the index of a known parameter."""
+        if self.count is None or index >= self.count:
+            return
+        before = self._names.get(index)
+        if before is not None and before != name and before in self.params:
+            self.params[before] = self.params[before].with_index(None)
+        old = self.params[name].index
+        if old is not None and old != index and self._names.get(old) == name:
+            del self._names[old]
+        self._names[index] = name
+        self.params[name] = self.params[name].with_index(index)
+
+    def store(self, param: ExtParam, by: str, moment: float) -> ExtChange | None:
+        """Store an observed value; return its change, or None where the value is known.
+
+        An older observation than the stored one is ignored, as is a new name in a full table.
+
+        Args:
+            param: the value. Its index is not stored; see `use_index`.
+            by: the author of the change, if it is one.
+            moment: when the value came from the link.
+        """
+        name = param.name
+        old = self.params.get(name)
+        if old is None:
+            if not self._room.has_capacity(len(self.params)):
+                return None
+            self._room.taken += 1
+        elif self.moments.get(name, moment) > moment and old.trust is not Trust.CACHED:
+            return None
+        self.moments[name] = moment
+        self.params[name] = param.with_index(None if old is None else old.index)
+        if old is not None and old.same_value(param):
+            return None
+        self.changed_by[name] = by
+        return ExtChange(name, old, self.params[name], by)
+
+    def keep_only(self, names: Collection[str]) -> list[ExtChange]:
+        """Remove all other parameters: a complete list was without them."""
+        return [self._remove(name) for name in list(self.params) if name not in names]
+
+    def restore(self, params: Mapping[str, ExtParam], moments: Mapping[str, float]) -> list[ExtChange]:
+        """Load a cached table; values received on this link stay."""
+        changes = []
+        for name, param in params.items():
+            if name in self.params or not self._room.has_capacity(len(self.params)):
+                continue
+            self._room.taken += 1
+            self.params[name] = param.with_trust(Trust.CACHED).with_index(None)
+            if name in moments:
+                self.moments[name] = moments[name]
+            changes.append(ExtChange(name, None, self.params[name]))
+        return changes
+
+    def doubt(self) -> None:
+        """Mark all values as cached: another vehicle may have the address, or this one has restarted."""
+        for name, param in self.params.items():
+            self.params[name] = param.with_trust(Trust.CACHED)
+
+    def forget(self) -> list[ExtChange]:
+        """Remove everything: another vehicle has the address."""
+        self.count = None
+        self._names.clear()
+        return [self._remove(name) for name in list(self.params)]
+
+    def _remove(self, name: str) -> ExtChange:
+        param = self.params.pop(name)
+        self.moments.pop(name, None)
+        self.changed_by.pop(name, None)
+        self._room.taken -= 1
+        if param.index is not None and self._names.get(param.index) == name:
+            del self._names[param.index]
+        return ExtChange(name, param, None)
