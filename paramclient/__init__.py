@@ -37,6 +37,7 @@ from paramclient.client.events import (
     Resynced,
     Uncontested,
 )
+from paramclient.client.extended_params import ExtChanges, ExtParams
 from paramclient.client.fetch_all import FetchedAll
 from paramclient.client.files import Ftp
 from paramclient.client.signing import Signing, key_from_environment, read_key
@@ -50,6 +51,8 @@ from paramclient.errors import (
     CommandRefused,
     CommandResult,
     ContestedAddress,
+    ExtAckResult,
+    ExtSetRefused,
     FileError,
     FileErrorCode,
     FileTransferError,
@@ -63,11 +66,13 @@ from paramclient.errors import (
     ParamClientError,
     ParamErrorCode,
     Refused,
+    SetFailed,
     TypeMismatch,
     UnknownParameter,
     UnknownVehicle,
     UsageError,
     ValueNotApplied,
+    ValueUnsupported,
     VehicleArmed,
     VehicleError,
 )
@@ -81,11 +86,16 @@ from paramclient.model.comparison import (
     defaults_of,
     same_value,
 )
+from paramclient.model.ext_params import ExtParam, ExtParamType, ExtSettable
 from paramclient.model.identity import Identity
 from paramclient.model.params import ParamMap
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.renames import Rename, Renames
 from paramclient.model.values import Encoding, Param, ParamType, Settable, Trust
+from paramclient.protocol.ext.change import ExtChange
+from paramclient.protocol.ext.fetch import ExtFetchResult
+from paramclient.protocol.ext.write_batch import ExtSetManyResult, ExtSetOutcome
+from paramclient.protocol.ext.writes import ExtSetResult
 from paramclient.protocol.ftp import DirectoryEntry
 from paramclient.protocol.params.change import Added, Change, Removed
 from paramclient.protocol.params.fetch_result import FetchResult, Policy, Progress
@@ -122,6 +132,18 @@ __all__ = [
     "Encoding",
     "Event",
     "Events",
+    "ExtAckResult",
+    "ExtChange",
+    "ExtChanges",
+    "ExtFetchResult",
+    "ExtParam",
+    "ExtParamType",
+    "ExtParams",
+    "ExtSetManyResult",
+    "ExtSetOutcome",
+    "ExtSetRefused",
+    "ExtSetResult",
+    "ExtSettable",
     "FetchResult",
     "FetchedAll",
     "FileError",
@@ -168,6 +190,7 @@ __all__ = [
     "Renames",
     "Resynced",
     "Sample",
+    "SetFailed",
     "SetManyResult",
     "SetOutcome",
     "SetResult",
@@ -190,6 +213,7 @@ __all__ = [
     "UnknownVehicle",
     "UsageError",
     "ValueNotApplied",
+    "ValueUnsupported",
     "VehicleArmed",
     "VehicleError",
     "WrittenParam",

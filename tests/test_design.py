@@ -215,6 +215,7 @@ COUNTERPARTS = {
     "signing": "MAVLink signing: frames, keys of a client, the command",
     "table": "the table: of parameters, of extended ones",
     "traffic": "traffic on a link: counted, as a document",
+    "write_batch": "many writes: of parameters, of extended ones",
     "writes": "writes: of parameters, of extended ones",
 }
 """Names of modules that stand in several rooms, and of what each is the room's part."""

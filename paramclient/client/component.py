@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 
+from paramclient.client.extended_params import ExtParams
 from paramclient.client.subscription import Changes
 from paramclient.model.identity import Identity
 from paramclient.model.params import ParamMap
@@ -61,6 +62,15 @@ class Component(ABC):
     @abstractmethod
     def encoding_reason(self) -> str:
         """The reason for `encoding`, as text."""
+
+    @property
+    @abstractmethod
+    def ext(self) -> ExtParams:
+        """The extended parameters of the component (PARAM_EXT_*), with their own calls.
+
+        Raises:
+            UsageError: the client is one over a service, which does not serve them.
+        """
 
     @property
     @abstractmethod

@@ -27,6 +27,7 @@ from paramclient.protocol.ext.change import ExtChange
 from paramclient.protocol.ext.extended import ExtendedParams
 from paramclient.protocol.ext.fetch import ExtFetch
 from paramclient.protocol.ext.reads import ExtRead
+from paramclient.protocol.ext.write_batch import ExtWriteBatch
 from paramclient.protocol.ext.writes import ExtWrite
 from paramclient.protocol.ftp import FileTransfers
 from paramclient.protocol.params.boot_values import BootValues
@@ -798,6 +799,24 @@ class ComponentMachine:
             encode_ext_value(value, known.type)
         return self.ext.write(name, value, now, asker)
 
+    def write_many_ext(
+        self, pairs: Sequence[tuple[str, ExtValue]], now: float, asker: str | None = None
+    ) -> ExtWriteBatch:
+        """Write several extended parameters; end the batch with `ext.batches.end`.
+
+        Raises:
+            UsageError: nothing may be sent.
+            NoReply: the component is lost. Nothing was sent.
+        """
+        self.check_present(f"PARAM_EXT_SET to {self.system}/{self.component}", now)
+
+        def begin(name: str, value: ExtValue, at: float) -> ExtWrite:
+            return self.write_ext(name, value, at, asker)
+
+        batch = ExtWriteBatch(pairs, begin, self.ext.writes.cancel, now)
+        self.ext.batches.begin(batch, now)
+        return batch
+
     def begin_ext_fetch(self, now: float) -> ExtFetch:
         """Begin a fetch of the extended parameters, or join the one in progress; give it back with
         `ext.fetches.end`.
@@ -1157,7 +1176,7 @@ class ComponentMachine:
     def _fail_writes(self, error: ParamClientError, now: float) -> None:
         self.write_batches.fail_all(error, now)
         self.writes.fail_all(error, now)
-        self.ext.writes.fail_all(error, now)
+        self.ext.fail_writes(error, now)
 
     def _doubt_identity(self, now: float) -> None:
         """Doubt the table: another vehicle may respond by now."""

@@ -5,5 +5,6 @@
 `fetch`: PARAM_EXT_REQUEST_LIST and the repair of its gaps.
 `reads`: PARAM_EXT_REQUEST_READ.
 `table`: the extended parameters.
+`write_batch`: many PARAM_EXT_SETs in one call.
 `writes`: PARAM_EXT_SET.
 """

@@ -11,6 +11,7 @@ from paramclient.protocol.ext.change import ExtChange
 from paramclient.protocol.ext.fetch import ExtFetch, ExtFetches
 from paramclient.protocol.ext.reads import ExtRead, ExtReads
 from paramclient.protocol.ext.table import ExtTable
+from paramclient.protocol.ext.write_batch import ExtWriteBatches
 from paramclient.protocol.ext.writes import ExtWrite, ExtWrites
 from paramclient.protocol.params.change_origin import Authors
 from paramclient.protocol.params.reads import Key
@@ -48,7 +49,7 @@ class ExtendedParams(Machine):
 
     Attributes:
         table: the parameters.
-        reads, writes, fetches: the exchanges.
+        reads, writes, batches, fetches: the exchanges.
         may_read: whether values may be read again without a request of the user.
     """
 
@@ -67,6 +68,7 @@ class ExtendedParams(Machine):
         self.table = ExtTable(room)
         self.reads = ExtReads(context, self.table, share)
         self.writes = ExtWrites(context, self.reads, self.table, host, self._store)
+        self.batches = ExtWriteBatches(context.target)
         self.fetches = ExtFetches(context, self.reads, self.table, self.report)
         self._authors = Authors()
         self._checks = ValueChecks()
@@ -196,6 +198,7 @@ class ExtendedParams(Machine):
 
     def lose(self, now: float) -> None:
         """End everything with NoReply: the component is lost."""
+        self.batches.lose(now)
         self.fetches.lose(now)
         self.writes.lose(now)
         self.reads.lose(now)
@@ -204,9 +207,14 @@ class ExtendedParams(Machine):
     def fail_all(self, error: Exception, now: float) -> None:
         """End every operation with the error."""
         self.fetches.fail_all(error, now)
-        self.writes.fail_all(error, now)
+        self.fail_writes(error, now)
         self.reads.fail_all(error, now)
         self._checks.clear()
+
+    def fail_writes(self, error: Exception, now: float) -> None:
+        """End the writes with the error."""
+        self.batches.fail_all(error, now)
+        self.writes.fail_all(error, now)
 
     def _store(self, param: ExtParam, by: str, moment: float, now: float | None = None) -> None:
         """Store an observed value, and report its change."""
