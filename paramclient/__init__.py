@@ -13,7 +13,9 @@ from __future__ import annotations
 
 from paramclient.cache import (
     CachedComponent,
+    CachedExtTable,
     CachedVehicle,
+    ExtHistoryEntry,
     FleetDiff,
     FleetValue,
     FleetVehicle,
@@ -114,6 +116,7 @@ __all__ = [
     "AnotherVehicle",
     "CacheError",
     "CachedComponent",
+    "CachedExtTable",
     "CachedVehicle",
     "Change",
     "Changes",
@@ -136,6 +139,7 @@ __all__ = [
     "ExtChange",
     "ExtChanges",
     "ExtFetchResult",
+    "ExtHistoryEntry",
     "ExtParam",
     "ExtParamType",
     "ExtParams",

@@ -2,6 +2,7 @@
 
 - `cells`: database cells: checks of their types, times and identities.
 - `database_url`: URL of a PostgreSQL database.
+- `ext_records`, `ext_tables`: extended parameters: records; updates, reads and copies.
 - `file_ownership`: owner and access rights of files.
 - `fleet`: comparison of parameters across vehicles.
 - `interface`: `Store`, the interface of a file and of a shared database.
@@ -31,6 +32,7 @@
 
 from __future__ import annotations
 
+from paramclient.cache.ext_records import CachedExtTable, ExtHistoryEntry, ExtTableUpdate, StoredExtParam
 from paramclient.cache.fleet import FleetDiff, FleetValue, FleetVehicle, Holder, NameSpread
 from paramclient.cache.interrupted_setups import CutOff, RunningSetup, SetupNotes
 from paramclient.cache.observed_table import HeardParams, UnixTimes
@@ -59,10 +61,13 @@ __all__ = [
     "CLOCK_SLACK",
     "CacheChange",
     "CachedComponent",
+    "CachedExtTable",
     "CachedSummary",
     "CachedVehicle",
     "CopyResult",
     "CutOff",
+    "ExtHistoryEntry",
+    "ExtTableUpdate",
     "FleetDiff",
     "FleetValue",
     "FleetVehicle",
@@ -77,6 +82,7 @@ __all__ = [
     "SetupNotes",
     "Snapshot",
     "SnapshotSummary",
+    "StoredExtParam",
     "StoredParam",
     "TableState",
     "TableUpdate",

@@ -442,6 +442,7 @@ class LinkClient(LocalClient):
                 continue
             if isinstance(event, ExtParamChanged):
                 self._components[machine.address].ext.take_change(event.change)
+                is_to_be_written = True
                 continue
             logger.debug("%s", event)
             if isinstance(event, Fetched):

@@ -130,6 +130,8 @@ def make_older(path: Path, version: int) -> None:
             )
             connection.execute("UPDATE component SET checksum = ? WHERE id = ?", (checksum(rows), owner))
         connection.execute("DROP TABLE packed")
+        for table in ("ext_param", "ext_history", "ext_table"):
+            connection.execute(f"DROP TABLE {table}")
         if version < 3:
             connection.executescript(
                 "DROP TABLE snapshot; DROP TABLE setback; DROP TABLE birth; DROP INDEX history_of_param;"
@@ -459,7 +461,7 @@ def sound_with(at: int, byte: int) -> Callable[[Path], None]:
         (lambda path: other_program(path, APPLICATION_ID), "tables are not those of version 0"),
         (lambda path: other_program(path, APPLICATION_ID, 1), "tables are not those of version 1"),
         (sound_but("PRAGMA user_version = -1"), "tables are not those of version -1"),
-        (sound_but("DROP TABLE history"), "tables are not those of version 4"),
+        (sound_but("DROP TABLE history"), "tables are not those of version 5"),
         (sound_but("ALTER TABLE packed RENAME COLUMN params TO rows"), "tables are not those"),
         (sound_but("UPDATE component SET count = 'much'"), "a cell holds 'much'"),
         (sound_but("UPDATE history SET name = CAST(x'ff' || owner AS TEXT)"), "UTF-8"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Protocol
 
 from paramclient.errors import ExtAckResult
@@ -157,6 +158,15 @@ class ExtendedParams(Machine):
         """Report changes."""
         for change in changes:
             self._host.ext_changed(change)
+
+    def use_cached(self, params: Mapping[str, ExtParam], moments: Mapping[str, float]) -> None:
+        """Load the cached table, also one that another station has written since.
+
+        Args:
+            params: the cached parameters.
+            moments: when each value was observed last, in seconds of the core's clock.
+        """
+        self.report(self.table.restore(params, moments))
 
     def doubt(self) -> None:
         """Doubt all values: another vehicle may have the address, or this one has restarted."""

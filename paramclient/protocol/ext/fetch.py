@@ -292,7 +292,7 @@ class ExtFetches(Machine):
             return
         result = self._result(fetch, now, ())
         if result.complete:
-            self._removed(self._table.keep_only(set(fetch.received.values())))
+            self._removed(self._table.keep_only(set(fetch.received.values()), now))
             result = self._result(fetch, now, ())
             self.last = result
         self._leave(fetch)

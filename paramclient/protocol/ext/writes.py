@@ -91,7 +91,7 @@ class ExtWrite(Operation[ExtSetResult]):
         self.request = ExtWriteAttempts(policy)
         self.wanted: ExtParam | None = None
         self.before: ExtParam | None = None
-        self.made: ExtParam | None = None  # the value after an earlier PARAM_EXT_SET, if not the old one
+        self.made: ExtParam | None = None  # the value that an earlier PARAM_EXT_SET has led to
         self.refusal: ExtSetRefused | None = None  # one that may belong to an earlier write
         self.is_answered = False  # an acknowledgement that proves nothing came after the last PARAM_EXT_SET
         self.is_sent = False
@@ -365,13 +365,16 @@ class ExtWrites(Machine):
             self._succeed(write, actual, now)
             return
         is_made_again = write.made is not None and write.made.same_value(actual)
-        if write.is_answered and is_made_again:
+        is_last = write.request.should_give_up(now)
+        if write.is_answered and (is_made_again or is_last):
             self._succeed(write, actual, now)
-        elif write.request.should_give_up(now):
+        elif is_last:
             self._fail(write, self._not_applied(write, actual), now)
         else:
+            # the old value: the PARAM_EXT_SET may be lost, and the acknowledgement that of an earlier write
             is_old = write.before is not None and write.before.same_value(actual)
-            write.made = None if is_old else actual
+            is_made = write.is_answered and not (is_old and self._may_be_late(write, now))
+            write.made = actual if is_made else None
             self._transmit(write, now)
 
     def _succeed(self, write: ExtWrite, actual: ExtParam, now: float) -> None:

@@ -44,7 +44,7 @@ def value_for(name: str, number: int) -> ExtValue:
     """A value of the type of a name."""
     kind = TABLE[name][0]
     if kind is KINDS.CUSTOM:
-        return f"text {number}" if number % 2 else bytes([255, number % 256])
+        return f"text {number}" if number % 2 else bytes([255, number + 1])
     return float(number) if kind in (KINDS.REAL32, KINDS.REAL64) else number
 
 

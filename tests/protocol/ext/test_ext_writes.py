@@ -126,6 +126,18 @@ def test_a_value_that_the_camera_changes_is_adjusted() -> None:
     assert session.params["CAM_ISO"].value == 3200
 
 
+@pytest.mark.parametrize("pause", [0.0, 5.0])
+def test_a_value_that_is_changed_to_the_old_one_is_adjusted(pause: float) -> None:
+    camera = Camera(limits={"CAM_ISO": (100, 3200)})
+    session = CameraSession(camera)
+    session.set_ext("CAM_ISO", 9000)
+    session.run(pause)
+    began = session.now
+    done = session.set_ext("CAM_ISO", 8000)
+    assert (done.status, done.actual) == ("adjusted", 3200)
+    assert session.now - began < 1.0
+
+
 def test_unknown_names() -> None:
     session = CameraSession(Camera())
     session.fetch_ext()
