@@ -197,6 +197,7 @@ COUNTERPARTS = {
     "change": "a change: of a parameter, of an extended one",
     "diff": "the comparison: the command and its document",
     "events": "events: on the wire, for users, over HTTP",
+    "extended": "extended parameters: on the wire, in the command",
     "fetch": "a fetch: of parameters, of extended ones",
     "fleet": "several vehicles: in the cache, as a command, as a document, in a set-up",
     "formats": "the format of a file, told by its content: parameters, metadata",

@@ -4,6 +4,7 @@
 - Subcommands: `parameters` (fetch, get, set, watch), `offline` (show, cache), `logs` (import), `apply`
   (apply, verify, restore), `save`, `diff`, `history`, `fleet`, `link`, `check`, `ports`, `signing`, `serve`,
   `token` and `simulate` (sim).
+- `extended`: extended parameters in these subcommands.
 - `sources`, `targets`: the parameters and the vehicles that an argument names. `time_arguments`: times.
 - `session`, `options`: an open link with its vehicle; options that several subcommands share.
 - `output`, `param_rows`, `results`, `metadata`, `exit_codes`: tables, JSON, metadata and exit codes.

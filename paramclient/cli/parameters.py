@@ -13,6 +13,15 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from paramclient.cli.exit_codes import ExitCode, code_of, status_of
+from paramclient.cli.extended import (
+    check_choice,
+    fetch_extended,
+    get_extended,
+    is_extended_session,
+    may_be_extended,
+    set_extended,
+    text_pairs,
+)
 from paramclient.cli.metadata import (
     DESCRIBED_COLUMNS,
     MetadataChoice,
@@ -86,6 +95,8 @@ async def fetch(
     accept: Literal["verified", "sampled"] = "verified",
     sample: Annotated[int | None, Parameter(validator=Number(gte=1))] = None,
     policy: Policy = Policy.AUTO,
+    extended: bool = False,
+    plain: bool = False,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
     """Fetch all parameters. Uses the cache if the vehicle's hash matches, otherwise downloads.
@@ -100,10 +111,18 @@ async def fetch(
             agrees; the probability that the sample shows a change is printed.
         sample: Number of parameters in the sample. Default: 30.
         policy: Requests that may be sent to the vehicle: all that are needed, only for its hash, or none.
+        extended: Use the extended parameters (PARAM_EXT_*) of the component, as of a camera. Without it, a
+            camera, gimbal or other payload is asked whether it has them.
+        plain: Use the plain parameters, also of a component that has extended ones.
     """
+    check_choice(extended=extended, plain=plain)
     if sample is not None and accept != "sampled":
         raise UsageError("--sample needs --accept sampled")
     async with connect(url, options, policy=policy) as session:
+        if await is_extended_session(session, extended=extended, plain=plain or changed):
+            if accept != "verified":
+                raise UsageError("--accept is for plain parameters; add --plain")
+            return await fetch_extended(session)
         result = await _fetch_all(session, refresh=refresh, accept=accept, sample=sample or SAMPLE_SIZE)
         with suppress(NoReply):
             await session.component.refreshed(timeout=session.deadline.left(REFRESH_TIMEOUT))
@@ -146,6 +165,8 @@ async def get(
     /,
     *names: str,
     metadata: MetadataChoice = None,
+    extended: bool = False,
+    plain: bool = False,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
     """Read single parameters from the vehicle.
@@ -155,10 +176,16 @@ async def get(
         name: The parameter.
         names: Further parameters.
         metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
+        extended: Use the extended parameters (PARAM_EXT_*) of the component, as of a camera. Without it, a
+            camera, gimbal or other payload is asked whether it has them.
+        plain: Use the plain parameters, also of a component that has extended ones.
     """
+    check_choice(extended=extended, plain=plain)
     described = from_file(metadata)
     wanted = [check_name(each) for each in dict.fromkeys((name, *names))]
     async with connect(url, options) as session:
+        if await is_extended_session(session, extended=extended, plain=plain):
+            return await get_extended(session, wanted)
         params, errors = await _get_all(session, wanted)
         if described is None:
             described = await known_of_session(session, metadata)
@@ -182,11 +209,14 @@ async def set_(
     force: bool = False,
     durable: bool = False,
     metadata: MetadataChoice = None,
+    extended: bool = False,
+    plain: bool = False,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
     """Write parameters in the order given, and verify each by the value that the vehicle reports.
 
-    A value is a decimal or hexadecimal number (0x1F), nan or inf. As NAME=VALUE, it may also be the name of a
+    A value is a decimal or hexadecimal number (0x1F), nan or inf; of an extended parameter also text, or
+    bytes as hex:00FF. As NAME=VALUE, it may also be the name of a
     value, or names of bits separated by |, if metadata describes the parameter: it is downloaded from the
     vehicle unless --metadata names a file. All parameters are tried even if one is refused. If several
     vehicles are heard, --system must choose one.
@@ -199,12 +229,27 @@ async def set_(
         force: Send NaN and infinity also to PX4, which cannot save them and may stop, and to ArduPilot.
         durable: Continue only when the value and its history are on the disk and survive a power loss.
         metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
+        extended: Use the extended parameters (PARAM_EXT_*) of the component, as of a camera. Without it, a
+            camera, gimbal or other payload is asked whether it has them.
+        plain: Use the plain parameters, also of a component that has extended ones.
     """
-    wanted = parse_pairs(pairs)
+    check_choice(extended=extended, plain=plain)
     described = from_file(metadata)
-    if described is not None:
-        wanted = [*resolved(wanted, described)]
+    wanted: list[tuple[str, int | float | str]] = []
+    texts: list[tuple[str, str]] = []
+    if may_be_extended(options, extended=extended, plain=plain):
+        texts = text_pairs(pairs)
+    else:
+        wanted = parse_pairs(pairs)
+        if described is not None:
+            wanted = [*resolved(wanted, described)]
     async with connect(url, options, only=True) as session:
+        if texts:
+            if await is_extended_session(session, extended=extended, plain=plain):
+                if settle or force or durable or metadata is not None:
+                    raise UsageError("--settle, --force, --durable and --metadata are for plain parameters")
+                return await set_extended(session, texts)
+            wanted = parse_pairs(pairs)
         if described is None:
             has_names = any(isinstance(value, str) for _, value in wanted)
             described = await known_of_session(session, metadata, must=has_names)

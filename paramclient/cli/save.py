@@ -11,6 +11,7 @@ import anyio.to_thread
 from cyclopts import Parameter
 
 from paramclient.cli.exit_codes import ExitCode
+from paramclient.cli.extended import is_extended_source, save_extended
 from paramclient.cli.offline import tables_of
 from paramclient.cli.options import CacheOptions, LinkOptions
 from paramclient.cli.output import print_document, printable, progress_bar, report, say
@@ -39,6 +40,7 @@ async def save(
     changed: bool = False,
     all_: Annotated[bool, Parameter(name="--all")] = False,
     refresh: bool = False,
+    extended: bool = False,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
     """Write the parameters of a vehicle to a file, in the file format of any ground station.
@@ -56,7 +58,12 @@ async def save(
         changed: Write only parameters that differ from the firmware's defaults.
         all_: Write all components of the vehicle, if the file format can hold several.
         refresh: Download all parameters even if the cache is up to date.
+        extended: Use extended parameters (PARAM_EXT_*), as of a camera.
     """
+    if extended or is_extended_source(where):
+        if changed or all_:
+            raise UsageError("--changed and --all are for plain parameters")
+        return await save_extended(where, file, form, options)
     form = format_of_name(str(file)) if form is None else form
     if form is FileForm.PX4_SCRIPT:
         raise UsageError("start scripts of PX4 cannot be written, only read; choose another file format")
