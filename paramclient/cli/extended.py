@@ -34,6 +34,7 @@ from paramclient.model.ext_params import (
     ext_type_name,
     format_ext_value,
 )
+from paramclient.model.notation import time_text
 from paramclient.model.values import check_name
 from paramclient.model.wording import counted, first_of
 from paramclient.protocol.ext.write_batch import ExtSetOutcome
@@ -45,6 +46,8 @@ __all__ = [
     "diff_extended",
     "fetch_extended",
     "get_extended",
+    "history_extended",
+    "is_extended_link",
     "is_extended_session",
     "is_extended_source",
     "may_be_extended",
@@ -52,6 +55,7 @@ __all__ = [
     "set_extended",
     "show_extended",
     "text_pairs",
+    "verify_extended",
 ]
 
 PROBE_TIMEOUT: Final = 2.0
@@ -290,37 +294,12 @@ async def apply_extended(url: str, file: str, options: LinkOptions, *, dry_run: 
     content = read_extended_file(file)
     async with connect(url, options, only=True) as session:
         component = session.component
-        if content.component not in (None, component.component):
-            raise FileError(
-                f"it has the parameters of component {content.component}, and {session.label} is chosen",
-                source=file,
-            )
-        now = await component.ext.fetch_all(timeout=session.deadline.left())
-        if not now.complete:
-            raise NoReply(f"all extended parameters of {session.label}", attempts=0, waited=now.elapsed)
-        unknown = [name for name in content.params if name not in now.params]
-        mismatched = [
-            name
-            for name, param in content.params.items()
-            if name in now.params and param.type != now.params[name].type
-        ]
-        changes = {
-            name: param
-            for name, param in content.params.items()
-            if name in now.params and name not in mismatched and not param.same_value(now.params[name])
-        }
-        if unknown:
-            names = first_of(unknown, NAMES_SHOWN_MAX)
-            report(f"{session.label} does not have {names}")
-        for name in mismatched:
-            types = [ext_type_name(each[name].type) for each in (now.params, content.params)]
-            report(f"{name} is {types[0]} on {session.label}, and {types[1]} in {file}")
-        faulty = bool(unknown or mismatched)
+        changes, now, faulty = await _compared(session, content, file)
         if dry_run or not changes:
-            _print_plan(session, changes, now.params, is_dry=dry_run)
+            _print_plan(session, changes, now, is_dry=dry_run)
             return ExitCode.INCOMPLETE if faulty or changes else ExitCode.DONE
         if not (yes or options.json) and sys.stdin.isatty() and sys.stderr.isatty():
-            _print_plan(session, changes, now.params, is_dry=True)
+            _print_plan(session, changes, now, is_dry=True)
             sys.stderr.write("go on? [y/N] ")
             sys.stderr.flush()
             await anyio.wait_readable(sys.stdin)  # Ctrl-C could not end a thread that reads
@@ -338,6 +317,62 @@ async def apply_extended(url: str, file: str, options: LinkOptions, *, dry_run: 
                 held = "not there" if name not in after.params else _text(after.params[name])
                 report(f"{name}: {session.label} has {held}, and the file {_text(param)}")
         return max(code, ExitCode.INCOMPLETE) if faulty else code
+
+
+async def verify_extended(url: str, file: str, options: LinkOptions) -> ExitCode:
+    """Compare the extended parameters of a component with a file. Writes nothing."""
+    content = read_extended_file(file)
+    async with connect(url, options) as session:
+        changes, now, faulty = await _compared(session, content, file)
+        if options.json:
+            from paramclient.documents.extended_output import ExtDiffDoc  # only here: loads pydantic
+
+            entries = [(name, now[name], param, "different") for name, param in changes.items()]
+            print_document(ExtDiffDoc.of(entries, is_same=not changes and not faulty))
+        else:
+            if changes:
+                rows = ((name, _text(now[name]), _text(param)) for name, param in changes.items())
+                print_table(["name", "now", "wanted"], rows)
+            held = sum(name in now and param.same_value(now[name]) for name, param in content.params.items())
+            say(printable(f"{session.label} has {held} of {len(content.params)} values of {file}"))
+    return ExitCode.DIFFERENT if changes or faulty else ExitCode.DONE
+
+
+def history_extended(
+    vehicle: str,
+    name: str | None,
+    component: int | None,
+    options: CacheOptions,
+    *,
+    limit: int | None,
+    since: float | None,
+) -> ExitCode:
+    """Print the changes of a vehicle's extended parameters, the newest last."""
+    with ParamCache(options.cache) as cache:
+        key = tables_in(cache, vehicle, None)[0].key
+        entries = cache.ext_history(key, component, name, limit, since)
+    if options.json:
+        from paramclient.documents.extended_output import ExtHistoryDoc  # only here: loads pydantic
+
+        print_document(ExtHistoryDoc.of(entries))
+        return ExitCode.DONE
+    rows = (
+        (time_text(each.at), each.component, each.name, _text(each.old), _text(each.new), each.by)
+        for each in entries
+    )
+    print_table(["time", "component", "name", "old", "new", "by"], rows)
+    return ExitCode.DONE
+
+
+async def is_extended_link(text: str, options: LinkOptions) -> bool:
+    """Return whether an argument names a link, and the component that the options name speaks the extended
+    protocol."""
+    is_link = not (is_file(text) or names_vehicle(text))
+    if not is_link or options.listen_only or not may_be_extended(options, extended=False, plain=False):
+        return False
+    check_link(text)
+    async with connect(text, options) as session:
+        return await is_extended_session(session, extended=False, plain=False)
 
 
 # internal
@@ -423,6 +458,37 @@ async def _source(text: str, options: LinkOptions) -> ExtParamFile:
         return ExtParamFile(
             params, result.system, result.component, time.time(), f"link {session.client.link.name}"
         )
+
+
+async def _compared(
+    session: CommandSession, content: ExtParamFile, file: str
+) -> tuple[dict[str, ExtParam], Mapping[str, ExtParam], bool]:
+    """Return the parameters of a file that differ, those of the component, and whether the component lacks
+    some or has them in another type, which is reported."""
+    component = session.component
+    if content.component not in (None, component.component):
+        raise FileError(
+            f"it has the parameters of component {content.component}, and {session.label} is chosen",
+            source=file,
+        )
+    result = await component.ext.fetch_all(timeout=session.deadline.left())
+    if not result.complete:
+        raise NoReply(f"all extended parameters of {session.label}", attempts=0, waited=result.elapsed)
+    now = result.params
+    unknown = [name for name in content.params if name not in now]
+    if unknown:
+        report(f"{session.label} does not have {first_of(unknown, NAMES_SHOWN_MAX)}")
+    changes = {}
+    is_mismatched = False
+    for name, param in content.params.items():
+        held = now.get(name)
+        if held is not None and held.type != param.type:
+            is_mismatched = True
+            types = ext_type_name(held.type), ext_type_name(param.type)
+            report(f"{name} is {types[0]} on {session.label}, and {types[1]} in {file}")
+        elif held is not None and not held.same_value(param):
+            changes[name] = param
+    return changes, now, bool(unknown) or is_mismatched
 
 
 def _print_plan(

@@ -11,6 +11,7 @@ from cyclopts.validators import Number
 
 from paramclient.cache import CutOff, HistoryEntry, ParamCache, SetupNotes, SnapshotSummary
 from paramclient.cli.exit_codes import ExitCode
+from paramclient.cli.extended import history_extended
 from paramclient.cli.options import CacheOptions, Id
 from paramclient.cli.output import print_document, print_table
 from paramclient.cli.sources import tables_in
@@ -33,6 +34,7 @@ def history(
     since: str | None = None,
     limit: Annotated[int | None, Parameter(validator=Number(gte=1))] = None,
     snapshots: bool = False,
+    extended: bool = False,
     options: CacheOptions = _DEFAULTS,
 ) -> ExitCode:
     """Print the changes of a vehicle's values: time, old and new value, author. The newest change is last.
@@ -47,12 +49,17 @@ def history(
         since: Print only changes from this time on: 2h ago, yesterday, '2026-11-20 14:00'.
         limit: Print at most this number of changes, the newest ones.
         snapshots: Print the snapshots instead of the changes.
+        extended: Use extended parameters (PARAM_EXT_*), as of a camera.
     """
     begin = None if since is None else parse_time(since, time.time())
     if snapshots and name is not None:
         raise UsageError("--snapshots lists whole tables and takes no parameter name")
     if name is not None:
         check_name(name)
+    if extended:
+        if snapshots:
+            raise UsageError("there are no snapshots of extended parameters")
+        return history_extended(vehicle, name, component, options, limit=limit, since=begin)
     with ParamCache(options.cache) as cache:
         key = tables_in(cache, vehicle, None)[0].key
         if snapshots:

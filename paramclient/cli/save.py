@@ -11,7 +11,7 @@ import anyio.to_thread
 from cyclopts import Parameter
 
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.extended import is_extended_source, save_extended
+from paramclient.cli.extended import is_extended_link, is_extended_source, save_extended
 from paramclient.cli.offline import tables_of
 from paramclient.cli.options import CacheOptions, LinkOptions
 from paramclient.cli.output import print_document, printable, progress_bar, report, say
@@ -60,7 +60,8 @@ async def save(
         refresh: Download all parameters even if the cache is up to date.
         extended: Use extended parameters (PARAM_EXT_*), as of a camera.
     """
-    if extended or is_extended_source(where):
+    extended = extended or is_extended_source(where)
+    if extended or (not (changed or all_ or refresh) and await is_extended_link(where, options)):
         if changed or all_:
             raise UsageError("--changed and --all are for plain parameters")
         return await save_extended(where, file, form, options)

@@ -8,18 +8,22 @@ from typing import TYPE_CHECKING
 
 from paramclient.documents.document import Document, Maybe, Scalar
 from paramclient.model.ext_params import ExtParam, ExtParamType, ExtValue, ext_type_name
+from paramclient.model.notation import time_text
 from paramclient.model.values import shortest_float
 
 if TYPE_CHECKING:
+    from paramclient.cache import ExtHistoryEntry
     from paramclient.files import FileForm
     from paramclient.files.extended_document import ExtParamFile
     from paramclient.protocol.ext.fetch import ExtFetchResult
     from paramclient.protocol.ext.write_batch import ExtSetOutcome
 
 __all__ = [
+    "ExtChangeDoc",
     "ExtDiffDoc",
     "ExtDifferenceDoc",
     "ExtFetchOutputDoc",
+    "ExtHistoryDoc",
     "ExtParamDoc",
     "ExtParamsOutputDoc",
     "ExtSavedDoc",
@@ -148,6 +152,42 @@ class ExtDiffDoc(Document):
                 )
                 for name, left, right, standing in entries
             ],
+        )
+
+
+class ExtChangeDoc(Document):
+    """One change of an extended parameter; see `ExtHistoryEntry`. `at` is in unix seconds."""
+
+    time: str
+    at: float
+    component: int
+    name: str
+    old: ExtParamDoc
+    new: ExtParamDoc | None
+    by: str
+
+
+class ExtHistoryDoc(Document):
+    """Changes of extended parameters, the newest last."""
+
+    history: list[ExtChangeDoc]
+
+    @classmethod
+    def of(cls, entries: Iterable[ExtHistoryEntry]) -> ExtHistoryDoc:
+        """Return the document of lines of history."""
+        return cls(
+            history=[
+                ExtChangeDoc(
+                    time=time_text(each.at),
+                    at=each.at,
+                    component=each.component,
+                    name=each.name,
+                    old=ExtParamDoc.of(each.old),
+                    new=None if each.new is None else ExtParamDoc.of(each.new),
+                    by=each.by,
+                )
+                for each in entries
+            ]
         )
 
 

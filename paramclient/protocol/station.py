@@ -328,6 +328,7 @@ class Station:
             machine.presence.age(unseen)
             machine.peers.age(unseen)
             machine.table.age(unseen)
+            machine.ext.table.age(unseen)
         if not self._is_paused:
             self._outbox.clear()  # meant for the components before it
             self.resume(now)

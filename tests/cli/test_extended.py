@@ -199,3 +199,45 @@ def test_a_component_without_them_is_told(command: Command, put: Put) -> None:
     url = put(PX4Vehicle(table={"A": 1}))
     done = command("fetch", url, "--extended")
     assert (done.code, "no reply: extended parameters of 1/1" in done.err) == (3, True)
+
+
+def test_verify_compares_with_a_file(command: Command, put: Put, tmp_path: Path) -> None:
+    camera = small()
+    url = put(camera)
+    file = tmp_path / "camera.json"
+    assert command("save", url, file, *CAMERA).code == 0, "found without the option"
+    same = command("verify", url, file, *CAMERA)
+    assert (same.code, same.out) == (0, "")
+    assert same.err == f"1/100 no autopilot has 4 of 4 values of {file}\n"
+    camera.set_ext_param("CAM_NAME", "Rear")
+    other = command("verify", url, file, *CAMERA)
+    assert (other.code, other.rows[1:]) == (1, [["CAM_NAME", "Rear", "Front"]])
+    document = command("verify", url, file, *CAMERA, "--json").json
+    assert (document["is_same"], document["extended"][0]["left"]["value"]) == (False, "Rear")
+    camera.remove_ext_param("CAM_NAME")
+    lacking = command("verify", url, file, *CAMERA)
+    assert (lacking.code, "does not have CAM_NAME" in lacking.err) == (1, True)
+    assert command("verify", url, file, *CAMERA, "--include", "*").code == 2
+    assert not camera.requests["PARAM_EXT_SET"]
+
+
+def test_save_finds_plain_ones_of_such_a_component(command: Command, put: Put, tmp_path: Path) -> None:
+    url = put(GenericVehicle({"A": 1}, component=100))
+    file = tmp_path / "camera.yaml"
+    assert command("save", url, file, *CAMERA).code == 0
+    assert "paramclient: 1" in file.read_text()
+
+
+def test_the_history_of_extended_parameters(command: Command, put: Put) -> None:
+    url = put(small())
+    assert command("set", url, *CAMERA, "CAM_NAME", "Rear", "CAM_KEY", "hex:01").code == 0
+    told = command("history", 1, "--extended")
+    assert [row[1:] for row in told.rows[1:]] == [
+        ["100", "CAM_NAME", "Front", "Rear", "us"],
+        ["100", "CAM_KEY", "hex:ff00fe", "hex:01", "us"],
+    ]
+    assert len(command("history", 1, "CAM_NAME", "--extended").rows) == 2
+    document = command("history", 1, "--extended", "--limit", 1, "--json").json
+    assert [(each["name"], each["new"]["hex"]) for each in document["history"]] == [("CAM_KEY", "01")]
+    assert command("history", 1, "--extended", "--snapshots").code == 2
+    assert command("history", 1).rows[1:] == []

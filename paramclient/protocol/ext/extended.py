@@ -17,7 +17,7 @@ from paramclient.protocol.ext.writes import ExtWrite, ExtWrites
 from paramclient.protocol.params.change_origin import Authors
 from paramclient.protocol.params.reads import Key
 from paramclient.protocol.params.table import NameQuota
-from paramclient.protocol.params.value_check import REREADS_MAX, ValueChecks
+from paramclient.protocol.params.value_check import READS_PAUSE, REREADS_MAX, ValueChecks
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.pacing import LinkBandwidth
@@ -132,7 +132,7 @@ class ExtendedParams(Machine):
             return
         if not self._context.may_send:
             self._store(param, self._authors.of(name, now), now if moment is None else moment, now)
-        elif self.may_read and known is not None:
+        elif known is not None:
             self._checks.ask(name, now)
 
     def foreign_set(self, name: str, station: str, now: float) -> None:
@@ -240,7 +240,11 @@ class ExtendedParams(Machine):
         self.report([change])
 
     def _read_due(self, now: float) -> None:
-        """Read the values again that may be older than a change."""
+        """Read the values again that may be older than a change; without reads, they are no longer live."""
         for name in self._checks.due(now):
-            if self.may_read and len(self.reads) < REREADS_MAX:
+            if not self.may_read:
+                self.table.doubt_value(name)
+            elif len(self.reads) < REREADS_MAX:
                 self.reads.ask(name, now, urgent=False)
+            else:
+                self._checks.ask(name, now + READS_PAUSE)

@@ -174,6 +174,17 @@ class ExtTable:
         for name, param in self.params.items():
             self.params[name] = param.with_trust(Trust.CACHED)
 
+    def doubt_value(self, name: str) -> None:
+        """Mark one value as cached: it may be older than a change."""
+        if name in self.params:
+            self.params[name] = self.params[name].with_trust(Trust.CACHED)
+
+    def age(self, unseen: float) -> None:
+        """Move all moments back by the seconds of a system suspend that the core's clock does not have."""
+        for moments in (self.moments, self.gone):
+            moments.update({name: at - unseen for name, at in moments.items()})
+        self.overwritten = [(param, by, at - unseen) for param, by, at in self.overwritten]
+
     def forget(self) -> list[ExtChange]:
         """Remove everything: another vehicle has the address."""
         self.count = None

@@ -15,7 +15,7 @@ from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.wire import ParamExtValue, ParamValue
 
-__all__ = ["LATER_CHANGE_TIME", "REREADS_MAX", "Rereads", "ValueChecks"]
+__all__ = ["LATER_CHANGE_TIME", "READS_PAUSE", "REREADS_MAX", "Rereads", "ValueChecks"]
 
 AMBIGUITY_WINDOW: Final = 0.3
 """Seconds after a change in which a PARAM_VALUE with the previous value is ambiguous: ArduPilot takes the

@@ -286,10 +286,25 @@ def test_a_restart_begins_the_list_again() -> None:
     session.run(2.0)
     fetch = session.camera.begin_ext_fetch(session.now)
     session.run(0.2)
+    assert "PARAM_000" in session.params
     camera.reboot(session.now, down=1.0)
+    camera.set_ext_param("PARAM_000", 77)
     assert session.outcome(fetch).complete
     session.camera.ext.fetches.end(fetch)
     assert session.values == camera.ext_values
+
+
+def test_requests_are_of_mavlink_2_whatever_the_component_has_sent() -> None:
+    station = Station(link="sim:test", is_stream=False)
+    beat = wire.encode(wire.Heartbeat(30, 8), system=1, component=100, sequence=0, version=1)
+    station.receive(beat, "peer", 0.0)
+    machine = station.components[1, 100]
+    assert machine.version == 1
+    machine.begin_ext_fetch(0.0)
+    machine.read_ext("A", 0.0)
+    framer = wire.Framer({320, 321}, stream=False)
+    frames = [frame for data, _ in station.data_to_send() for frame in framer.receive(data)]
+    assert [(frame.message_id, frame.version) for frame in frames] == [(321, 2), (320, 2)]
 
 
 def test_a_listener_takes_what_others_request() -> None:

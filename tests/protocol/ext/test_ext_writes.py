@@ -16,9 +16,13 @@ from paramclient.errors import (
     ValueUnsupported,
 )
 from paramclient.model.ext_params import ExtParam, ExtValue
+from paramclient.model.values import Trust
 from paramclient.protocol import wire
 from paramclient.protocol.ext.writes import LATE_ACK_TIME
+from paramclient.protocol.params.fetch_result import Policy
+from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.requests.retry import EXT_PROGRESS_TIMEOUT
+from paramclient.protocol.station import Station
 from paramclient.protocol.wire import ParamExtAck, ParamExtRequestRead, ParamExtSet
 from paramclient.sim import Camera
 from tests.protocol.ext.camera import CameraSession, lossy
@@ -318,3 +322,30 @@ def test_nothing_is_written_while_another_vehicle_may_have_the_address() -> None
     assert not session.sent_of(ParamExtSet)
     assert session.outcome(write).actual == 2
     assert not session.camera.ext.writes.is_held
+
+
+def test_without_reads_a_change_by_another_station_makes_a_value_cached() -> None:
+    station = Station(
+        link="sim:test",
+        is_stream=False,
+        upkeep=SyncSettings.chosen(None, Policy.CACHE_ONLY, listen_only=False, is_log=False),
+    )
+    session = CameraSession(Camera({"A": 1}), station=station)
+    assert session.get_ext("A").trust is Trust.LIVE
+    acknowledge(session, "A", b"\5", 6, ExtAckResult.ACCEPTED)
+    session.run(1.0)
+    assert (session.params["A"].value, session.params["A"].trust) == (1, Trust.CACHED)
+    assert len(session.sent_of(ParamExtRequestRead)) == 1
+    assert session.set_ext("A", 7).actual == 7
+
+
+def test_moments_are_moved_back_by_a_suspend() -> None:
+    session = CameraSession(Camera({"A": 1}))
+    session.fetch_ext()
+    table = session.camera.ext.table
+    before = table.moments["A"]
+    session.set_ext("A", 2)
+    session.station.handle_suspend(100.0, session.now)
+    assert table.moments["A"] == pytest.approx(session.now - 100.0, abs=0.5)
+    [(replaced, by, moment)] = table.overwritten
+    assert (replaced.value, by, moment) == (1, "vehicle", before - 100.0)
