@@ -92,6 +92,7 @@ class ExtWrite(Operation[ExtSetResult]):
         self.wanted: ExtParam | None = None
         self.before: ExtParam | None = None
         self.made: ExtParam | None = None  # the value that an earlier PARAM_EXT_SET has led to
+        self.told: ExtParam | None = None  # the other value that the component has accepted instead
         self.refusal: ExtSetRefused | None = None  # one that may belong to an earlier write
         self.is_answered = False  # an acknowledgement that proves nothing came after the last PARAM_EXT_SET
         self.is_sent = False
@@ -206,6 +207,7 @@ class ExtWrites(Machine):
             write.request.progressed(now, is_sure=is_sure)
             write.is_answered = False
             write.verify_at = math.inf
+            self._release(write)  # the value before the end of the work decides nothing
         elif message.param_result == ExtAckResult.ACCEPTED:
             actual = ExtParam.of(message.param_id, message.raw, message.param_type)
             assert write.wanted is not None, "it is active"
@@ -214,6 +216,8 @@ class ExtWrites(Machine):
                 self._stored(actual, write.by, now)
                 self._succeed(write, actual, now)
             else:
+                if not self._may_be_late(write, now):
+                    write.told = actual
                 self._verify_later(write, now)
         else:
             error = self._refusal(write, message.param_result)
@@ -366,7 +370,8 @@ class ExtWrites(Machine):
             return
         is_made_again = write.made is not None and write.made.same_value(actual)
         is_last = write.request.should_give_up(now)
-        if write.is_answered and (is_made_again or is_last):
+        is_told = write.is_answered or (write.told is not None and write.told.same_value(actual))
+        if (write.is_answered and is_made_again) or (is_last and is_told):
             self._succeed(write, actual, now)
         elif is_last:
             self._fail(write, self._not_applied(write, actual), now)
@@ -374,7 +379,10 @@ class ExtWrites(Machine):
             # the old value: the PARAM_EXT_SET may be lost, and the acknowledgement that of an earlier write
             is_old = write.before is not None and write.before.same_value(actual)
             is_made = write.is_answered and not (is_old and self._may_be_late(write, now))
-            write.made = actual if is_made else None
+            if is_made:
+                write.made = actual
+            elif not is_made_again:
+                write.made = None
             self._transmit(write, now)
 
     def _succeed(self, write: ExtWrite, actual: ExtParam, now: float) -> None:
@@ -390,7 +398,9 @@ class ExtWrites(Machine):
         """End a write without an acknowledgement: with an error that says what was read meanwhile."""
         actual = self._table.params.get(write.name)
         has_read = actual is not None and write.request.needs_read and actual.trust is not Trust.CACHED
-        if actual is not None and has_read:
+        if actual is not None and has_read and write.told is not None and write.told.same_value(actual):
+            self._succeed(write, actual, now)
+        elif actual is not None and has_read:
             self._fail(write, self._not_applied(write, actual), now)
         else:
             self._fail(write, self._no_reply(write, now), now)

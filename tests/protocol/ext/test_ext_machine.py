@@ -162,7 +162,8 @@ class Extended(RuleBasedStateMachine):
         elif isinstance(error, SetFailed):
             assert name == "BROKEN"
         elif isinstance(error, ValueNotApplied):
-            assert name in self.was_cancelled or self.changed_at >= write.begun_at - SETTLING
+            is_disturbed = name in self.was_cancelled or self.changed_at >= write.begun_at - SETTLING
+            assert is_disturbed, (error, write.begun_at, self.session.now)
         else:
             assert isinstance(error, NoReply), error
 
