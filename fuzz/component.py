@@ -21,7 +21,7 @@ from paramclient.protocol.params import change_origin, table
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_result import Policy, Sampled
 from paramclient.protocol.params.passive import PassiveFetch
-from paramclient.protocol.params.reads import Read
+from paramclient.protocol.params.reads import ValueRead
 from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.params.writes import Write
 from paramclient.protocol.requests.operation import Operation
@@ -357,7 +357,7 @@ class _Session:
         match operation:
             case Fetch():
                 machine.end_fetch(operation, self.now)
-            case Read():
+            case ValueRead():
                 machine.reads.release(operation)
             case Write():
                 machine.writes.cancel(operation, self.now)

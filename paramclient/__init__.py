@@ -14,7 +14,9 @@ from __future__ import annotations
 from paramclient.cache import (
     AddedTable,
     CachedComponent,
+    CachedExtTable,
     CachedVehicle,
+    ExtHistoryEntry,
     FleetDiff,
     FleetValue,
     FleetVehicle,
@@ -38,6 +40,7 @@ from paramclient.client.events import (
     Resynced,
     Uncontested,
 )
+from paramclient.client.extended_params import ExtChanges, ExtParams
 from paramclient.client.fetch_all import FetchedAll
 from paramclient.client.files import Ftp
 from paramclient.client.reset import ResetResult
@@ -52,6 +55,8 @@ from paramclient.errors import (
     CommandRefused,
     CommandResult,
     ContestedAddress,
+    ExtAckResult,
+    ExtSetRefused,
     FileError,
     FileErrorCode,
     FileTransferError,
@@ -65,11 +70,13 @@ from paramclient.errors import (
     ParamClientError,
     ParamErrorCode,
     Refused,
+    SetFailed,
     TypeMismatch,
     UnknownParameter,
     UnknownVehicle,
     UsageError,
     ValueNotApplied,
+    ValueUnsupported,
     VehicleArmed,
     VehicleError,
 )
@@ -83,11 +90,16 @@ from paramclient.model.comparison import (
     defaults_of,
     same_value,
 )
+from paramclient.model.ext_params import ExtParam, ExtParamType, ExtSettable
 from paramclient.model.identity import Identity
 from paramclient.model.params import ParamMap
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.renames import Rename, Renames
 from paramclient.model.values import Encoding, Param, ParamType, Settable, Trust
+from paramclient.protocol.ext.change import ExtChange
+from paramclient.protocol.ext.fetch import ExtFetchResult
+from paramclient.protocol.ext.write_batch import ExtSetManyResult, ExtSetOutcome
+from paramclient.protocol.ext.writes import ExtSetResult
 from paramclient.protocol.ftp import DirectoryEntry
 from paramclient.protocol.params.change import Added, Change, Removed
 from paramclient.protocol.params.fetch_result import FetchResult, Policy, Progress
@@ -107,6 +119,7 @@ __all__ = [
     "AnotherVehicle",
     "CacheError",
     "CachedComponent",
+    "CachedExtTable",
     "CachedVehicle",
     "Change",
     "Changes",
@@ -125,6 +138,19 @@ __all__ = [
     "Encoding",
     "Event",
     "Events",
+    "ExtAckResult",
+    "ExtChange",
+    "ExtChanges",
+    "ExtFetchResult",
+    "ExtHistoryEntry",
+    "ExtParam",
+    "ExtParamType",
+    "ExtParams",
+    "ExtSetManyResult",
+    "ExtSetOutcome",
+    "ExtSetRefused",
+    "ExtSetResult",
+    "ExtSettable",
     "FetchResult",
     "FetchedAll",
     "FileError",
@@ -172,6 +198,7 @@ __all__ = [
     "ResetResult",
     "Resynced",
     "Sample",
+    "SetFailed",
     "SetManyResult",
     "SetOutcome",
     "SetResult",
@@ -194,6 +221,7 @@ __all__ = [
     "UnknownVehicle",
     "UsageError",
     "ValueNotApplied",
+    "ValueUnsupported",
     "VehicleArmed",
     "VehicleError",
     "WrittenParam",

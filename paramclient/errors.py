@@ -12,7 +12,10 @@ The tree shows the cause of each error::
     ├── VehicleError                  the vehicle responded with an error or another value
     │   ├── UnknownParameter          the vehicle has no parameter of that name or index
     │   ├── Refused                   the vehicle gave a reason: PARAM_ERROR, or ArduPilot's text
-    │   │   └── CommandRefused        the vehicle refused a command: MAV_RESULT
+    │   │   ├── CommandRefused        the vehicle refused a command: MAV_RESULT
+    │   │   └── ExtSetRefused         the component did not set an extended parameter: PARAM_EXT_ACK
+    │   │       ├── ValueUnsupported  it does not support the value, or has no such parameter
+    │   │       └── SetFailed         it could not set the value
     │   ├── TypeMismatch              the parameter has a type that cannot hold the value
     │   ├── ValueNotApplied           the vehicle kept another value and gave no reason
     │   ├── VehicleArmed              the vehicle is armed, and setting while armed was not allowed
@@ -43,6 +46,8 @@ __all__ = [
     "CommandRefused",
     "CommandResult",
     "ContestedAddress",
+    "ExtAckResult",
+    "ExtSetRefused",
     "FileError",
     "FileErrorCode",
     "FileTransferError",
@@ -56,11 +61,13 @@ __all__ = [
     "ParamClientError",
     "ParamErrorCode",
     "Refused",
+    "SetFailed",
     "TypeMismatch",
     "UnknownParameter",
     "UnknownVehicle",
     "UsageError",
     "ValueNotApplied",
+    "ValueUnsupported",
     "VehicleArmed",
     "VehicleError",
 ]
@@ -108,6 +115,23 @@ class CommandResult(IntEnum):
         """Return the result in words; an unknown result as its number."""
         try:
             return CommandResult(code).name.lower().replace("_", " ")
+        except ValueError:
+            return f"result {code}"
+
+
+class ExtAckResult(IntEnum):
+    """PARAM_ACK: the results in a PARAM_EXT_ACK (MAVLink common message set)."""
+
+    ACCEPTED = 0
+    VALUE_UNSUPPORTED = 1
+    FAILED = 2
+    IN_PROGRESS = 3
+
+    @staticmethod
+    def name_of(code: int) -> str:
+        """Return the result in words; an unknown result as its number."""
+        try:
+            return ExtAckResult(code).name.lower().replace("_", " ")
         except ValueError:
             return f"result {code}"
 
@@ -322,6 +346,27 @@ class CommandRefused(Refused):
         self.reason = reason
 
 
+class ExtSetRefused(Refused):
+    """The component refused to set an extended parameter with a PARAM_EXT_ACK.
+
+    Attributes:
+        code: the number in PARAM_EXT_ACK, comparable with `ExtAckResult`.
+        reason: the code in words.
+    """
+
+    def __init__(self, message: str, *, system: int, component: int, code: int, name: str) -> None:
+        super().__init__(message, system=system, component=component, code=code, name=name)
+        self.reason = ExtAckResult.name_of(code)
+
+
+class ValueUnsupported(ExtSetRefused):
+    """The component does not support the value, or the parameter: PARAM_ACK_VALUE_UNSUPPORTED."""
+
+
+class SetFailed(ExtSetRefused):
+    """The component could not set the value: PARAM_ACK_FAILED."""
+
+
 class TypeMismatch(VehicleError):
     """The vehicle's parameter has another type than PARAM_SET had."""
 
@@ -341,8 +386,8 @@ class ValueNotApplied(VehicleError):
         system: int,
         component: int,
         name: str,
-        requested: float | int | bytes,
-        actual: float | int | bytes,
+        requested: float | int | str | bytes,
+        actual: float | int | str | bytes,
     ) -> None:
         super().__init__(message, system=system, component=component, name=name)
         self.requested = requested

@@ -28,6 +28,7 @@ MACHINES = CORE | {
 PROTOCOL = MACHINES | {
     "protocol",
     "protocol.params",
+    "protocol.ext",
     "protocol.vehicle",
     "protocol.stats",
     "protocol.scheduler",
@@ -47,6 +48,7 @@ MAY_IMPORT = {
     "protocol.ftp": MACHINES,
     "protocol.stats": CORE,
     "protocol.params": MACHINES | {"protocol.scheduler", "protocol.vehicle"},
+    "protocol.ext": MACHINES | {"protocol.params"},
     "protocol.vehicle": CORE | {"protocol.requests", "protocol.addresses"},
     "protocol": PROTOCOL,
     "sim": CORE | {"protocol.ftp.packets", "protocol.ftp.param_pck"},
@@ -191,8 +193,11 @@ COUNTERPARTS = {
     "check": "the check of a vehicle: the command and its document",
     "client": "the client: over a link, over a service",
     "component": "a component: for users, over a service, on the wire, as a document",
+    "change": "a change: of a parameter, of an extended one",
     "diff": "the comparison: the command and its document",
     "events": "events: on the wire, for users, over HTTP",
+    "extended": "extended parameters: on the wire, in the command",
+    "fetch": "a fetch: of parameters, of extended ones",
     "fleet": "several vehicles: in the cache, as a command, as a document, in a set-up",
     "formats": "the format of a file, told by its content: parameters, metadata",
     "history": "the history: the command, its document, its route",
@@ -205,9 +210,13 @@ COUNTERPARTS = {
     "ports": "serial ports: the list, the command",
     "problems": "errors of the service: told by it, understood by its client",
     "px4": "what is PX4's: its metadata, its simulated vehicle",
+    "reads": "reads: of parameters, of extended ones",
     "results": "results: of a set-up, as documents, printed",
     "signing": "MAVLink signing: frames, keys of a client, the command",
+    "table": "the table: of parameters, of extended ones",
     "traffic": "traffic on a link: counted, as a document",
+    "write_batch": "many writes: of parameters, of extended ones",
+    "writes": "writes: of parameters, of extended ones",
 }
 """Names of modules that stand in several rooms, and of what each is the room's part."""
 

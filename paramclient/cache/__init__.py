@@ -2,6 +2,7 @@
 
 - `cells`: database cells: checks of their types, times and identities.
 - `database_url`: URL of a PostgreSQL database.
+- `ext_records`, `ext_tables`: extended parameters: records; updates, reads and copies.
 - `file_ownership`: owner and access rights of files.
 - `file_table`: a parameter file as the table of a vehicle.
 - `fleet`: comparison of parameters across vehicles.
@@ -32,6 +33,7 @@
 
 from __future__ import annotations
 
+from paramclient.cache.ext_records import CachedExtTable, ExtHistoryEntry, ExtTableUpdate, StoredExtParam
 from paramclient.cache.file_table import AddedTable
 from paramclient.cache.fleet import FleetDiff, FleetValue, FleetVehicle, Holder, NameSpread
 from paramclient.cache.interrupted_setups import CutOff, RunningSetup, SetupNotes
@@ -62,10 +64,13 @@ __all__ = [
     "CLOCK_SLACK",
     "CacheChange",
     "CachedComponent",
+    "CachedExtTable",
     "CachedSummary",
     "CachedVehicle",
     "CopyResult",
     "CutOff",
+    "ExtHistoryEntry",
+    "ExtTableUpdate",
     "FleetDiff",
     "FleetValue",
     "FleetVehicle",
@@ -80,6 +85,7 @@ __all__ = [
     "SetupNotes",
     "Snapshot",
     "SnapshotSummary",
+    "StoredExtParam",
     "StoredParam",
     "TableState",
     "TableUpdate",

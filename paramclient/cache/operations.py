@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 from typing import Generic, TypeVar
 
 from paramclient.cache import snapshots
+from paramclient.cache.ext_records import ExtTableUpdate
+from paramclient.cache.ext_tables import save_ext
 from paramclient.cache.merge import merge
 from paramclient.cache.reconciliation import reconcile
 from paramclient.cache.records import Snapshot, TableUpdate
@@ -17,7 +19,7 @@ from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import is_portable_name
 
-__all__ = ["Merge", "StoreOperation", "Remove", "Save", "StoreSnapshot"]
+__all__ = ["Merge", "StoreOperation", "Remove", "Save", "SaveExt", "StoreSnapshot"]
 
 T_co = TypeVar("T_co", covariant=True)
 
@@ -66,6 +68,25 @@ class Save(StoreOperation[None]):
 
     def do(self, session: Session) -> None:
         reconcile(session, self.updates, None if self.clock is None else self.clock())
+
+
+@dataclass(frozen=True)
+class SaveExt(StoreOperation[None]):
+    """Write updates of extended parameters, see `ParamCache.save_ext`.
+
+    Attributes:
+        updates, clock: as in `Save`.
+    """
+
+    updates: Sequence[ExtTableUpdate]
+    clock: Callable[[], float] | None = field(default=None, compare=False)
+
+    @property
+    def tables(self) -> Iterable[tuple[str, int | None]]:
+        return {(each.identity.key, each.component) for each in self.updates}
+
+    def do(self, session: Session) -> None:
+        save_ext(session, self.updates, None if self.clock is None else self.clock())
 
 
 @dataclass(frozen=True)

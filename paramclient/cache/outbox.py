@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from paramclient.cache.cells import Damaged, identity_cells, read_identity
-from paramclient.cache.operations import Merge, Save, StoreOperation, StoreSnapshot
+from paramclient.cache.ext_records import ExtTableUpdate, StoredExtParam
+from paramclient.cache.operations import Merge, Save, SaveExt, StoreOperation, StoreSnapshot
 from paramclient.cache.param_columns import COLUMN_NAMES, StoredParam
 from paramclient.cache.records import TableState, TableUpdate
 from paramclient.cache.snapshots import read_written, written_cells
@@ -201,6 +202,8 @@ def packed(operation: StoreOperation[object]) -> bytes:
     data: list[Any]
     if isinstance(operation, Save):
         data = ["save", [_update_cells(each) for each in operation.updates]]
+    elif isinstance(operation, SaveExt):
+        data = ["save ext", [_ext_update_cells(each) for each in operation.updates]]
     elif isinstance(operation, Merge):
         based_on = [[*key, at] for key, at in operation.based_on.items()]
         data = ["merge", [_update_cells(each) for each in operation.updates], based_on]
@@ -227,6 +230,8 @@ def unpacked(data: object) -> StoreOperation[object]:
         kind, *rest = json.loads(zlib.decompress(data).decode("utf-8", "surrogatepass"))
         if kind == "save":
             return Save([_update(each) for each in rest[0]])
+        if kind == "save ext":
+            return SaveExt([_ext_update(each) for each in rest[0]])
         if kind == "merge":
             return Merge(
                 [_update(each) for each in rest[0]], {(key, number): at for key, number, at in rest[1]}
@@ -269,6 +274,37 @@ def _update(data: list[Any]) -> TableUpdate:
         replace=is_whole,
         whole_at=whole_at,
     )
+
+
+def _ext_update_cells(update: ExtTableUpdate) -> list[Any]:
+    return [
+        identity_cells(update.identity),
+        update.component,
+        update.autopilot,
+        update.at,
+        [[*row[:2], row.raw.hex(), *row[3:]] for row in update.params],
+        dict(update.removed),
+        update.count,
+        update.complete,
+    ]
+
+
+def _ext_update(data: list[Any]) -> ExtTableUpdate:
+    who, component, autopilot, at, rows, removed, count, complete = data
+    return ExtTableUpdate(
+        identity=read_identity(who),
+        component=component,
+        autopilot=autopilot,
+        at=at,
+        params=[_ext_row(*row) for row in rows],
+        removed=removed,
+        count=count,
+        complete=complete,
+    )
+
+
+def _ext_row(name: str, number: int, raw: str, index: int | None, heard_at: float, by: str) -> StoredExtParam:
+    return StoredExtParam(name, number, bytes.fromhex(raw), index, heard_at, by)
 
 
 def _item_cells(item: StoredParam) -> list[Any]:

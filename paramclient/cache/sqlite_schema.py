@@ -154,6 +154,36 @@ MIGRATIONS: Final[tuple[Step, ...]] = (
         "DROP TABLE param",
     ),
     ("ALTER TABLE component ADD COLUMN source TEXT",),
+    (
+        # Extended parameters: apart from the plain ones, as a component may have a name in both tables.
+        """CREATE TABLE ext_table (
+            owner INTEGER PRIMARY KEY REFERENCES component (id) ON DELETE CASCADE,
+            count INTEGER,
+            complete INTEGER NOT NULL,
+            checksum INTEGER NOT NULL
+        )""",
+        """CREATE TABLE ext_param (
+            owner INTEGER NOT NULL REFERENCES component (id) ON DELETE CASCADE,
+            name TEXT NOT NULL,
+            type INTEGER NOT NULL,
+            raw BLOB NOT NULL,
+            param_index INTEGER,
+            heard_at REAL NOT NULL,
+            PRIMARY KEY (owner, name)
+        ) WITHOUT ROWID""",
+        """CREATE TABLE ext_history (
+            id INTEGER PRIMARY KEY,
+            owner INTEGER NOT NULL REFERENCES component (id) ON DELETE CASCADE,
+            at REAL NOT NULL,
+            name TEXT NOT NULL,
+            by TEXT NOT NULL,
+            old_type INTEGER NOT NULL,
+            old_raw BLOB NOT NULL,
+            new_type INTEGER,
+            new_raw BLOB
+        )""",
+        "CREATE INDEX ext_history_of_component ON ext_history (owner)",
+    ),
 )
 """Changes from each schema version to the next. The version is the number of steps executed. Released steps
 never change."""

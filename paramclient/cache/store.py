@@ -13,11 +13,13 @@ import platformdirs
 
 from paramclient.cache import fleet, snapshots, tables
 from paramclient.cache.database_url import DatabaseAddress, is_address
+from paramclient.cache.ext_records import CachedExtTable, ExtHistoryEntry, ExtTableUpdate
+from paramclient.cache.ext_tables import load_ext
 from paramclient.cache.file_table import AddedTable, FileTable
 from paramclient.cache.fleet import FleetDiff
 from paramclient.cache.interface import Store
 from paramclient.cache.lookup import find_vehicle
-from paramclient.cache.operations import Merge, Remove, Save, StoreSnapshot
+from paramclient.cache.operations import Merge, Remove, Save, SaveExt, StoreSnapshot
 from paramclient.cache.records import (
     CacheChange,
     CachedComponent,
@@ -148,6 +150,82 @@ class ParamCache:
         updates = (update,) if isinstance(update, TableUpdate) else tuple(update)
         if updates:
             self._store.do(Save(updates, clock))
+
+    def save_ext(
+        self, updates: Sequence[ExtTableUpdate], *, clock: Callable[[], float] | None = None
+    ) -> None:
+        """Write updates of extended parameters, in one transaction.
+
+        The later of two observations of a parameter counts; an older one that comes later is dropped. A
+        changed or removed value leaves a line of history.
+
+        Args:
+            updates: the updates.
+            clock: as in `save`.
+
+        Raises:
+            UsageError: a time is not in unix seconds.
+        """
+        if updates:
+            self._store.do(SaveExt(tuple(updates), clock))
+
+    def load_ext(self, key: str, component: int) -> CachedExtTable | None:
+        """Return the extended parameters of a vehicle's component; None if there are none.
+
+        Args:
+            key: `Identity.key`.
+            component: component id.
+        """
+        found = self._store.read(lambda session: load_ext(session, key, component))
+        if found is not None:
+            self._store.follow(key, component)
+        return found
+
+    def extended(
+        self, vehicle: str | None = None, *, system: int | None = None, component: int = 100
+    ) -> CachedExtTable:
+        """Return the extended parameters of the only component that matches.
+
+        Args:
+            vehicle: as for `components`.
+            system: its system id.
+            component: component id; that of a camera is 100.
+
+        Raises:
+            UnknownVehicle: no table matches. `vehicles` and the message list the existing ones.
+            AmbiguousVehicle: tables of several vehicles match.
+            NotInCache: the component has no extended parameters in the cache.
+        """
+
+        def work(session: Session) -> CachedExtTable:
+            key = self._choose(session, vehicle, system=system, component=component)
+            found = load_ext(session, key, component)
+            if found is None:
+                raise NotInCache(f"{key}, component {component}, has no extended parameters in the cache")
+            return found
+
+        return self._store.read(work)
+
+    def ext_history(
+        self,
+        vehicle: str,
+        component: int | None = None,
+        name: str | None = None,
+        limit: int | None = None,
+        since: float | None = None,
+    ) -> list[ExtHistoryEntry]:
+        """Return the changes of a vehicle's extended parameters, newest last.
+
+        Args:
+            vehicle, component, name, limit, since: as in `history`.
+
+        Raises:
+            UnknownVehicle: no vehicle in the cache has this name.
+            AmbiguousVehicle: several vehicles have this name.
+        """
+        return self._store.read(
+            lambda session: session.ext_history(self._choose(session, vehicle), component, name, limit, since)
+        )
 
     def sync(self) -> None:
         """Sync all earlier writes to the disk, safe from power loss.

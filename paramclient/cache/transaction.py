@@ -8,13 +8,24 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar, Final, TypeAlias
 
-from paramclient.cache.cells import cells, identity_cells, read_identity, time_cell
+from paramclient.cache.cells import Damaged, cells, identity_cells, read_identity, time_cell
+from paramclient.cache.ext_records import (
+    ExtHistoryEntry,
+    ExtLine,
+    StoredExtParam,
+    ext_checksum,
+    read_ext_line,
+    read_ext_rows,
+)
 from paramclient.cache.param_columns import StoredParam, StoredTable, checksum, read_param
 from paramclient.cache.records import CachedSummary, CachedVehicle, HistoryEntry, SnapshotSummary, TableUpdate
+from paramclient.model.ext_params import ExtParam
+from paramclient.model.values import Trust
 
-__all__ = ["Line", "NumberedLine", "Session"]
+__all__ = ["ExtState", "Line", "NumberedLine", "Session"]
 
 Line: TypeAlias = tuple[Any, ...]
 """A history line: at, name, by; type, bits, is_raw of the old value, and of the new one, or three None."""
@@ -28,6 +39,24 @@ _IDENTITY: Final = (
 )
 _LINE: Final = "at, name, by, old_type, old_bits, old_is_raw, new_type, new_bits, new_is_raw"
 _SUMMARY: Final = "s.id, vehicle, component, at, reason, size, s.hash, s.complete"
+
+
+_EXT_LINE: Final = "at, name, by, old_type, old_raw, new_type, new_raw"
+
+
+@dataclass(frozen=True, slots=True)
+class ExtState:
+    """State of a table of extended parameters.
+
+    Attributes:
+        count: param_count of the component, or None.
+        complete: whether the table has every index below it.
+        checksum: checksum of its parameters.
+    """
+
+    count: int | None
+    complete: bool
+    checksum: int
 
 
 class Session(ABC):
@@ -461,6 +490,96 @@ class Session(ABC):
         [(number,)] = self._all("SELECT max(id) FROM snapshot WHERE owner = ? AND at = ?", (owner, when))
         return None if number is None else int(number)
 
+    # extended parameters
+
+    def ext_state(self, owner: int) -> ExtState | None:
+        """Return the state of a table of extended parameters; None if there is none."""
+        found = self._all("SELECT count, complete, checksum FROM ext_table WHERE owner = ?", (owner,))
+        for row in found:
+            count, complete, crc = cells(row, "Iii")
+            return ExtState(count, bool(complete), crc)
+        return None
+
+    def put_ext_state(self, owner: int, state: ExtState) -> None:
+        """Write the state of a table of extended parameters."""
+        self._do(
+            "INSERT INTO ext_table (owner, count, complete, checksum) VALUES (?, ?, ?, ?)"
+            " ON CONFLICT (owner) DO UPDATE SET (count, complete, checksum)"
+            " = (excluded.count, excluded.complete, excluded.checksum)",
+            (owner, state.count, int(state.complete), state.checksum),
+        )
+
+    def ext_rows(self, owner: int) -> dict[str, StoredExtParam]:
+        """Return the extended parameters of a table by name, in the order of their indices, then names.
+
+        Raises:
+            Damaged: the checksum does not match.
+        """
+        rows = read_ext_rows(
+            self._all(
+                "SELECT name, type, raw, param_index, heard_at FROM ext_param WHERE owner = ?"
+                " ORDER BY param_index IS NULL, param_index, name",
+                (owner,),
+            )
+        )
+        state = self.ext_state(owner)
+        if ext_checksum(rows) != (ext_checksum({}) if state is None else state.checksum):
+            raise Damaged("a table of extended parameters is not what was written")
+        return rows
+
+    def put_ext_rows(
+        self, owner: int, before: Mapping[str, StoredExtParam], after: Mapping[str, StoredExtParam]
+    ) -> None:
+        """Write the changed rows of a table of extended parameters, and delete those that are gone."""
+        self._many(
+            "DELETE FROM ext_param WHERE owner = ? AND name = ?",
+            [(owner, name) for name in before if name not in after],
+        )
+        self._many(
+            "INSERT INTO ext_param (owner, name, type, raw, param_index, heard_at) VALUES (?, ?, ?, ?, ?, ?)"
+            " ON CONFLICT (owner, name) DO UPDATE SET (type, raw, param_index, heard_at)"
+            " = (excluded.type, excluded.raw, excluded.param_index, excluded.heard_at)",
+            [(owner, *row[:-1]) for name, row in after.items() if before.get(name) != row],
+        )
+
+    def ext_lines(self, owner: int) -> list[ExtLine]:
+        """Return the history lines of extended parameters of a table, in order."""
+        rows = self._all(f"SELECT {_EXT_LINE} FROM ext_history WHERE owner = ? ORDER BY id", (owner,))
+        return list(map(read_ext_line, rows))
+
+    def add_ext_lines(self, owner: int, lines: Sequence[ExtLine]) -> None:
+        """Append history lines of extended parameters in this order."""
+        self._many(
+            f"INSERT INTO ext_history (owner, {_EXT_LINE}) VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+            [(owner, *line) for line in lines],
+        )
+
+    def trim_ext_lines(self, owner: int, keep: int) -> None:
+        """Delete all but the newest history lines of extended parameters of a table."""
+        self._do(
+            "DELETE FROM ext_history WHERE owner = ? AND id <="
+            f" (SELECT id FROM ext_history WHERE owner = ? ORDER BY id DESC LIMIT 1 OFFSET {int(keep)})",
+            (owner, owner),
+        )
+
+    def ext_history(
+        self, key: str, component: int | None, name: str | None, limit: int | None, since: float | None
+    ) -> list[ExtHistoryEntry]:
+        """Return the history of a vehicle's extended parameters, newest last."""
+        end = "" if limit is None or limit < 0 else f" LIMIT {int(limit)}"
+        rows = self._all(
+            f"SELECT component, {_EXT_LINE} FROM ext_history h JOIN component c ON c.id = owner"
+            " WHERE vehicle = ? AND component = coalesce(?, component) AND name = coalesce(?, name)"
+            f" AND at >= coalesce(?, at) ORDER BY h.id DESC{end}",
+            (key, component, name, since),
+        )
+        return [_ext_entry(row) for row in reversed(rows)]
+
+    def drop_ext(self, owner: int) -> None:
+        """Delete the extended parameters of a table with their history."""
+        for table in ("ext_param", "ext_history", "ext_table"):
+            self._do(f"DELETE FROM {table} WHERE owner = ?", (owner,))
+
     # fleet comparison
 
     def tables_of(self, component: int) -> list[tuple[int, str, int, bool]]:
@@ -562,6 +681,15 @@ def _entry(row: Sequence[object]) -> HistoryEntry:
         new=None if None in new else read_param(name, *new),
         by=by,
     )
+
+
+def _ext_entry(row: Sequence[Any]) -> ExtHistoryEntry:
+    [component] = cells(row[:1], "i")
+    at, name, by, old_type, old_raw, new_type, new_raw = read_ext_line(row[1:])
+    old = ExtParam.of(name, old_raw, old_type, None, Trust.CACHED)
+    is_gone = new_type is None or new_raw is None
+    new = None if is_gone else ExtParam.of(name, new_raw or b"", new_type or 0, None, Trust.CACHED)
+    return ExtHistoryEntry(at, component, name, old, new, by)
 
 
 def _snapshot(row: Sequence[object]) -> SnapshotSummary:

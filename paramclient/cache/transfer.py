@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
+from paramclient.cache.ext_tables import ExtDump, put_ext, take_ext
 from paramclient.cache.operations import StoreOperation
 from paramclient.cache.param_columns import StoredParam
 from paramclient.cache.records import CachedSummary, CachedVehicle, TableState, TableUpdate
@@ -63,6 +64,7 @@ class TableDump:
         added_names: name, time, and number of history lines at the appearance of the name.
         clock_rollbacks: periods, from and until, that the clock has passed twice.
         shots: its snapshots by number.
+        ext: its extended parameters, or None.
     """
 
     vehicle: CachedVehicle
@@ -73,6 +75,7 @@ class TableDump:
     added_names: tuple[tuple[str, float, int], ...]
     clock_rollbacks: tuple[tuple[float, float], ...]
     shots: Mapping[int, StoredSnapshot]
+    ext: ExtDump | None = None
 
     def lacks(self, other: TableDump) -> str | None:
         """Return what this table lacks of another one; None if it has all of it, or later data."""
@@ -88,6 +91,8 @@ class TableDump:
         shots = {shot.crc for shot in self.shots.values()}
         if len(shots) < SNAPSHOTS and any(shot.crc not in shots for shot in other.shots.values()):
             return "a snapshot"
+        if other.ext is not None:
+            return "its extended parameters" if self.ext is None else self.ext.lacks(other.ext)
         return None
 
     def was_removed(self, name: str) -> bool:
@@ -219,6 +224,7 @@ def take_whole(
         births,
         tuple(session.clock_rollbacks(owner)),
         shots,
+        take_ext(session, owner),
     )
 
 
@@ -244,6 +250,7 @@ def put_whole(session: Session, whole: TableDump) -> int:
     )
     write_state(session, owner, _state(table))
     session.describe(owner, known_since=whole.known_since)
+    put_ext(session, owner, whole.ext)
     return owner
 
 
@@ -277,9 +284,12 @@ def _joined(there: TableDump, new: TableDump) -> TableDump:
     rows = {name: row for name, row in rows.items() if name in later.rows or not later.was_removed(name)}
     table = later.table if hashed(rows) == hashed(later.rows) else replace(later.table, hash=None)
     lines = sorted(dict.fromkeys((*there.lines, *new.lines)), key=lambda line: float(line[0]))
+    ext = there.ext or new.ext
+    if there.ext is not None and new.ext is not None:
+        ext = there.ext.joined(new.ext)
     for whole in (there, new):
         if set(lines) == set(whole.lines) and whole is later:
-            return replace(whole, table=table, rows=rows)
+            return replace(whole, table=table, rows=rows, ext=ext)
     return TableDump(
         later.vehicle,
         table,
@@ -289,6 +299,7 @@ def _joined(there: TableDump, new: TableDump) -> TableDump:
         (),
         (),
         {},
+        ext,
     )
 
 

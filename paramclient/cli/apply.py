@@ -17,6 +17,7 @@ from cyclopts.validators import Number
 
 from paramclient.cache import ParamCache
 from paramclient.cli.exit_codes import ExitCode, code_of
+from paramclient.cli.extended import apply_extended, is_extended_source, verify_extended
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_session
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import print_document, printable, progress_bar, report, say
@@ -134,6 +135,13 @@ async def apply(
         full: Also print parameters that are unchanged or left out.
         yes: Do not ask for confirmation.
     """
+    if is_extended_source(file):
+        if include or reboot or backup or over or all_vehicles or renames or metadata or durable:
+            raise UsageError(
+                f"{file} has extended parameters; --include, --reboot, --backup, --overlay, --all, "
+                "--renames, --metadata and --durable are for plain ones"
+            )
+        return await apply_extended(url, file, options, dry_run=dry_run, yes=yes)
     check_pattern("--overlay", over, all_vehicles=all_vehicles)
     check_pattern("--backup", backup, all_vehicles=all_vehicles)
     chosen = from_file(metadata)
@@ -213,6 +221,13 @@ async def verify(
             the ranges of values, and for parameters that take effect after a reboot.
         full: Also print parameters that have the wanted value or are left out.
     """
+    if is_extended_source(file):
+        if include or over or all_vehicles or renames or metadata:
+            raise UsageError(
+                f"{file} has extended parameters; --include, --overlay, --all, --renames and --metadata are "
+                "for plain ones"
+            )
+        return await verify_extended(url, file, options)
     check_pattern("--overlay", over, all_vehicles=all_vehicles)
     chosen = from_file(metadata)
     rules = read_rules(renames)

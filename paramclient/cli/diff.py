@@ -8,6 +8,7 @@ from typing import Annotated, Final
 from cyclopts import Parameter
 
 from paramclient.cli.exit_codes import ExitCode
+from paramclient.cli.extended import diff_extended, is_extended_source
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_sets, meaning_of, units_of
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import Coloured, print_document, print_table, printable, say
@@ -40,6 +41,7 @@ async def diff(
     everything: Annotated[bool, Parameter(name="--all")] = False,
     renames: str | None = None,
     metadata: MetadataChoice = None,
+    extended: bool = False,
     options: LinkOptions = _OPTIONS,
 ) -> ExitCode:
     """Compare the parameters of two files, links or vehicles in the cache.
@@ -57,7 +59,12 @@ async def diff(
         renames: A YAML file of names that firmware versions have changed. A parameter that only one side has
             is compared with that of its other name.
         metadata: A file that describes parameters. Default: the stored metadata of the vehicles' firmware.
+        extended: Use extended parameters (PARAM_EXT_*), as of a camera.
     """
+    if extended or is_extended_source(left) or is_extended_source(right):
+        if base is not None or only or renames is not None or metadata is not None:
+            raise UsageError("--base, --only, --renames and --metadata are for plain parameters")
+        return await diff_extended(left, right, options, partial=partial, everything=everything)
     chosen = from_file(metadata, offline=True)
     rules = read_rules(renames)
     third_source = [] if base is None or base == DEFAULTS else [base]

@@ -11,6 +11,7 @@ from cyclopts.validators import Number
 
 from paramclient.cache import CutOff, HistoryEntry, ParamCache, SetupNotes, SnapshotSummary
 from paramclient.cli.exit_codes import ExitCode
+from paramclient.cli.extended import history_extended
 from paramclient.cli.options import CacheOptions, Id
 from paramclient.cli.output import local_time, print_document, print_table, say
 from paramclient.cli.param_names import cached_names, check_given, unmatched_text
@@ -34,6 +35,7 @@ def history(
     since: str | None = None,
     limit: Annotated[int | None, Parameter(validator=Number(gte=1))] = None,
     snapshots: bool = False,
+    extended: bool = False,
     options: CacheOptions = _DEFAULTS,
 ) -> ExitCode:
     """Print the changes of a vehicle's values: time, old and new value, author. The newest change is last.
@@ -49,6 +51,7 @@ def history(
             without a zone is of this computer's time zone, as the printed ones are.
         limit: Print at most this number of changes, the newest ones.
         snapshots: Print the snapshots instead of the changes.
+        extended: Use extended parameters (PARAM_EXT_*), as of a camera.
     """
     begin = None if since is None else parse_time(since, time.time())
     if begin is not None and not options.json:
@@ -56,6 +59,13 @@ def history(
     wanted = check_given(names)
     if snapshots and wanted:
         raise UsageError("--snapshots lists whole tables and takes no parameter name")
+    if extended:
+        if snapshots:
+            raise UsageError("there are no snapshots of extended parameters")
+        if len(wanted) > 1:
+            raise UsageError("--extended takes one parameter name")
+        name = wanted[0] if wanted else None
+        return history_extended(vehicle, name, component, options, limit=limit, since=begin)
     with ParamCache(options.cache) as cache:
         key = tables_in(cache, vehicle, None)[0].key
         if snapshots:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 from paramclient.cache import CachedComponent, CachedSummary, ParamCache
 from paramclient.cache.database_url import is_address
 from paramclient.cli.exit_codes import ExitCode
+from paramclient.cli.extended import is_extended_source, show_extended
 from paramclient.cli.logs import cache_of_log
 from paramclient.cli.metadata import (
     DESCRIBED_COLUMNS,
@@ -59,6 +60,7 @@ def show(
     component: Id = None,
     changed: bool = False,
     metadata: MetadataChoice = None,
+    extended: bool = False,
     options: CacheOptions = _DEFAULTS,
 ) -> ExitCode:
     """Print the cached parameters of a vehicle, or those of a parameter file or a telemetry log.
@@ -73,7 +75,12 @@ def show(
         names: Print only these parameters of a vehicle, with their metadata: names in upper or lower case, or
             patterns such as "MC_*".
         metadata: A file that describes parameters. Default: the stored metadata of the vehicle's firmware.
+        extended: Use extended parameters (PARAM_EXT_*), as of a camera.
     """
+    if extended or (vehicle is not None and is_extended_source(vehicle)):
+        if changed or metadata is not None:
+            raise UsageError("--changed and --metadata are for plain parameters")
+        return show_extended(vehicle, names, component, options)
     if vehicle is not None and is_file(vehicle):
         if names or metadata is not None:
             raise UsageError("names and --metadata go with a vehicle in the cache, not with a parameter file")

@@ -14,6 +14,12 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from paramclient.cli.exit_codes import ExitCode, code_of
+from paramclient.cli.extended import (
+    check_choice,
+    fetch_extended,
+    get_extended,
+    is_extended_session,
+)
 from paramclient.cli.metadata import (
     DESCRIBED_COLUMNS,
     MetadataChoice,
@@ -84,6 +90,8 @@ async def fetch(
     accept: Literal["verified", "sampled"] = "verified",
     sample: Annotated[int | None, Parameter(validator=Number(gte=1))] = None,
     policy: Policy = Policy.AUTO,
+    extended: bool = False,
+    plain: bool = False,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
     """Fetch all parameters. Uses the cache if the vehicle's hash matches, otherwise downloads.
@@ -100,6 +108,9 @@ async def fetch(
             agrees; the probability that the sample shows a change is printed.
         sample: Number of parameters in the sample. Default: 30.
         policy: Requests that may be sent to the vehicle: all that are needed, only for its hash, or none.
+        extended: Use the extended parameters (PARAM_EXT_*) of the component, as of a camera. Without it, a
+            camera, gimbal or other payload is asked whether it has them.
+        plain: Use the plain parameters, also of a component that has extended ones.
     """
     if names:
         given = shlex.quote(names[0])
@@ -107,9 +118,14 @@ async def fetch(
             f"fetch takes no names, as it fetches all: `paramclient get {url} {given}` reads only some, "
             f"`paramclient fetch {url} --only {given}` fetches all and prints some"
         )
+    check_choice(extended=extended, plain=plain)
     if sample is not None and accept != "sampled":
         raise UsageError("--sample needs --accept sampled")
     async with connect(url, options, policy=policy) as session:
+        if await is_extended_session(session, extended=extended, plain=plain or changed):
+            if accept != "verified":
+                raise UsageError("--accept is for plain parameters; add --plain")
+            return await fetch_extended(session)
         result = await _fetch_all(session, refresh=refresh, accept=accept, sample=sample or SAMPLE_SIZE)
         with suppress(NoReply):
             await session.component.refreshed(timeout=session.deadline.left(REFRESH_TIMEOUT))
@@ -157,6 +173,8 @@ async def get(
     /,
     *names: str,
     metadata: MetadataChoice = None,
+    extended: bool = False,
+    plain: bool = False,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
     """Read parameters from the vehicle.
@@ -167,10 +185,16 @@ async def get(
             fetched, from the cache if the vehicle's hash matches.
         names: Further parameters and patterns.
         metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
+        extended: Use the extended parameters (PARAM_EXT_*) of the component, as of a camera. Without it, a
+            camera, gimbal or other payload is asked whether it has them.
+        plain: Use the plain parameters, also of a component that has extended ones.
     """
+    check_choice(extended=extended, plain=plain)
     described = from_file(metadata)
     wanted = check_given((name, *names))
     async with connect(url, options) as session:
+        if await is_extended_session(session, extended=extended, plain=plain):
+            return await get_extended(session, wanted)
         params, errors = await _get_chosen(session, wanted)
         if described is None:
             described = await known_of_session(session, metadata)

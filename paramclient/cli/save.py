@@ -12,6 +12,7 @@ import anyio.to_thread
 from cyclopts import Parameter
 
 from paramclient.cli.exit_codes import ExitCode
+from paramclient.cli.extended import is_extended_link, is_extended_source, save_extended
 from paramclient.cli.offline import tables_of
 from paramclient.cli.options import CacheOptions, LinkOptions
 from paramclient.cli.output import print_document, printable, progress_bar, report, say
@@ -45,6 +46,7 @@ async def save(
     only: Annotated[tuple[str, ...], Parameter(show_default=False)] = (),
     all_: Annotated[bool, Parameter(name="--all")] = False,
     refresh: bool = False,
+    extended: bool = False,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
     """Write the parameters of a vehicle to a file, in the file format of any ground station.
@@ -63,7 +65,13 @@ async def save(
         only: Write only this name or pattern, such as "MC_*". May be given several times.
         all_: Write all components of the vehicle, if the file format can hold several.
         refresh: Download all parameters even if the cache is up to date.
+        extended: Use extended parameters (PARAM_EXT_*), as of a camera.
     """
+    extended = extended or is_extended_source(where)
+    if extended or (not (changed or all_ or refresh or only) and await is_extended_link(where, options)):
+        if changed or all_ or only:
+            raise UsageError("--changed, --only and --all are for plain parameters")
+        return await save_extended(where, file, None if form is None else FileForm(form), options)
     written = format_of_name(str(file)) if form is None else FileForm(form)
     if all_ and options.component is not None:
         raise UsageError("--all and --component exclude each other")

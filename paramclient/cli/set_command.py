@@ -12,6 +12,13 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from paramclient.cli.exit_codes import ExitCode, code_of
+from paramclient.cli.extended import (
+    check_choice,
+    is_extended_session,
+    may_be_extended,
+    set_extended,
+    text_pairs,
+)
 from paramclient.cli.metadata import (
     MetadataChoice,
     from_file,
@@ -35,7 +42,7 @@ from paramclient.cli.output import (
 from paramclient.cli.param_names import suggest
 from paramclient.cli.session import CommandSession, connect
 from paramclient.client.arguments import SETTLE_MAX
-from paramclient.errors import ParamClientError, UnknownParameter
+from paramclient.errors import ParamClientError, UnknownParameter, UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.values import ParamType, Value, format_value
 from paramclient.model.wording import counted, first_of
@@ -61,15 +68,18 @@ async def set_(
     force: bool = False,
     durable: bool = False,
     metadata: MetadataChoice = None,
+    extended: bool = False,
+    plain: bool = False,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
     """Write parameters in the order given, and verify each by the value that the vehicle reports.
 
-    A value is a decimal or hexadecimal number (0x1F), nan or inf. As NAME=VALUE, it may also be the name of a
-    value, or names of bits separated by |, if metadata describes the parameter: it is downloaded from the
-    vehicle unless --metadata names a file. Many writes are in flight at a time; values of one name, and
-    switches such as *_ENABLE, are written one after the other. A refused value does not stop the others. If
-    several vehicles are heard, --system must choose one.
+    A value is a decimal or hexadecimal number (0x1F), nan or inf; of an extended parameter also text, or
+    bytes as hex:00FF. As NAME=VALUE, it may also be the name of a value, or names of bits separated by |, if
+    metadata describes the parameter: it is downloaded from the vehicle unless --metadata names a file. Many
+    writes are in flight at a time; values of one name, and switches such as *_ENABLE, are written one after
+    the other. A refused value does not stop the others. If several vehicles are heard, --system must choose
+    one.
 
     Args:
         url: The link.
@@ -79,12 +89,27 @@ async def set_(
         force: Send NaN and infinity also to PX4, which cannot save them and may stop, and to ArduPilot.
         durable: End only when all values and their history are on the disk and survive a power loss.
         metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
+        extended: Use the extended parameters (PARAM_EXT_*) of the component, as of a camera. Without it, a
+            camera, gimbal or other payload is asked whether it has them.
+        plain: Use the plain parameters, also of a component that has extended ones.
     """
-    wanted = parse_pairs(pairs)
+    check_choice(extended=extended, plain=plain)
     described = from_file(metadata)
-    if described is not None:
-        wanted = [*resolved(wanted, described)]
+    wanted: list[tuple[str, int | float | str]] = []
+    texts: list[tuple[str, str]] = []
+    if may_be_extended(options, extended=extended, plain=plain):
+        texts = text_pairs(pairs)
+    else:
+        wanted = parse_pairs(pairs)
+        if described is not None:
+            wanted = [*resolved(wanted, described)]
     async with connect(url, options, only=True) as session:
+        if texts:
+            if await is_extended_session(session, extended=extended, plain=plain):
+                if settle or force or durable or metadata is not None:
+                    raise UsageError("--settle, --force, --durable and --metadata are for plain parameters")
+                return await set_extended(session, texts)
+            wanted = parse_pairs(pairs)
         if described is None:
             has_names = any(isinstance(value, str) for _, value in wanted)
             described = await known_of_session(session, metadata, must=has_names)

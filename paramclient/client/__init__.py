@@ -6,11 +6,12 @@
 - `client_task`: the task that keeps a client open from `open` to `aclose`.
 - `component`: `Component`, the public interface of one component.
 - `loop_scheduler`: CPU time and list downloads shared among the links of one event loop.
+- `extended_params`: `ExtParams`, the public interface of extended parameters.
 - `events`: public events and their stream.
 - `fetch_all`: fetches of several components in parallel.
 - `files`: MAVFTP calls.
 - `forwarding`: frames to and from one other program.
-- `link_client`, `link_component`: the implementation over a link of this process.
+- `link_client`, `link_component`, `link_extended_params`: the implementation over a link of this process.
 - `link_task`: link reader, sender and reconnection.
 - `local`: internal interface of a client and a component on a link of this process.
 - `recording`: telemetry log of a link.

@@ -20,8 +20,11 @@ from paramclient.cache import (
     CLOCK_SLACK,
     CacheChange,
     CachedComponent,
+    CachedExtTable,
+    ExtTableUpdate,
     HeardParams,
     ParamCache,
+    StoredExtParam,
     StoredParam,
     TableState,
     TableUpdate,
@@ -30,6 +33,7 @@ from paramclient.cache import (
 from paramclient.client.worker_thread import Worker
 from paramclient.errors import CacheError, UsageError
 from paramclient.links.clock_offset import seconds_ahead
+from paramclient.model.ext_params import ExtParam
 from paramclient.model.identity import Identity
 from paramclient.model.params import Params
 from paramclient.model.values import Param
@@ -181,14 +185,14 @@ class WriteThrough:
         self._bringing.add(machine)
         try:
             while self._has_capacity(machine, identity):
-                cached = await self._load(machine, identity)
+                cached, extended = await self._load(machine, identity)
                 logger.debug("cached under %s/%s: %s", identity.key, machine.component, cached or "nothing")
                 current = self._identity_of(machine)
                 if current is None or (current.key == identity.key and self.follow(machine, current)):
                     return False
                 if current.key == identity.key:
                     if self._has_capacity(machine, current):  # others may have used it meanwhile
-                        self._keep(machine, current, cached)
+                        self._keep(machine, current, cached, extended)
                     break
                 identity = current  # another vehicle has replaced it meanwhile
             return True
@@ -205,13 +209,15 @@ class WriteThrough:
         A component may never report its identity. Its table is written if it is complete.
         """
         known = self._identity_of(machine)
-        if not (machine.table.complete or (known is not None and machine.table.params)):
+        has_values = bool(machine.table.params or machine.ext.table.params)
+        is_complete = machine.table.complete or machine.ext.table.complete
+        if not (is_complete or (known is not None and has_values)):
             return
         identity = known or machine.identity
         if not self.follow(machine, identity):
-            cached = await self._load(machine, identity)
+            cached, extended = await self._load(machine, identity)
             if self._has_capacity(machine, identity):
-                self._keep(machine, identity, cached)
+                self._keep(machine, identity, cached, extended)
 
     def synced(self, machine: ComponentMachine, *, is_whole: bool) -> None:
         """Record that the table was verified now; `is_whole`: by a full download."""
@@ -227,6 +233,9 @@ class WriteThrough:
         machine.table.take_dirty()
         machine.table.take_overwritten()
         machine.table.take_gone()
+        machine.ext.table.take_dirty()
+        machine.ext.table.take_gone()
+        machine.ext.table.take_overwritten()
 
     def remove_component(self, machine: ComponentMachine) -> None:
         """Remove a component that is no longer followed."""
@@ -235,7 +244,10 @@ class WriteThrough:
     @property
     def is_held_back(self) -> bool:
         """Whether a component with queued values may be another vehicle by now, so that writing must wait."""
-        return any(machine.table.dirty and self._is_doubted(machine) for machine in self._kept)
+        return any(
+            (machine.table.dirty or machine.ext.table.dirty) and self._is_doubted(machine)
+            for machine in self._kept
+        )
 
     def wake(self) -> None:
         """Run the writer: there may be new values."""
@@ -327,7 +339,7 @@ class WriteThrough:
                 if not await self._write(portion):
                     return False
                 portion, size = [], 0
-        return await self._write(portion)
+        return await self._write(portion) and await self._write_extended(times)
 
     def _is_for_later(self, kept: _CachedComponent) -> bool:
         """Return whether a running fetch delivers more values that are written together later."""
@@ -361,6 +373,55 @@ class WriteThrough:
             self._begin_anew(cache.replacements)
         return is_written
 
+    async def _write_extended(self, times: UnixTimes) -> bool:
+        """Write the changed extended parameters of all components. Return False if the write failed."""
+        cache = self._cache
+        if cache is None:
+            return True
+        news = [new for kept in self._kept.values() if (new := self._ext_news_of(kept, times)) is not None]
+        if not news:
+            return True
+        is_written = False
+        try:
+            updates = [new.update for new in news]
+            is_written = await self._save_extended(cache, updates)
+        finally:
+            for new in news:
+                if not is_written and self._kept.get(new.kept.machine) is new.kept:
+                    new.take_back()
+        if is_written:
+            self._failure = None
+            self._begin_anew(cache.replacements)
+        return is_written
+
+    def _ext_news_of(self, kept: _CachedComponent, times: UnixTimes) -> _PendingExtUpdate | None:
+        """Return the update of a table of extended parameters since the last write, or None."""
+        machine, table = kept.machine, kept.machine.ext.table
+        state = (table.count, table.complete)
+        if not table.complete and kept.ext_state is not None and table.count in (None, kept.ext_state[0]):
+            state = kept.ext_state  # a part of a table that is complete in the cache
+        is_news = bool(table.dirty or table.gone) or (table.count is not None and state != kept.ext_state)
+        if not is_news or self._is_doubted(machine):
+            return None
+        before, kept.ext_state = kept.ext_state, state
+        dirty, gone, overwritten = table.take_dirty(), table.take_gone(), table.take_overwritten()
+        earlier = [StoredExtParam.of(param, times(moment), by) for param, by, moment in overwritten]
+        update = ExtTableUpdate(
+            identity=kept.identity,
+            component=machine.component,
+            autopilot=machine.identification.autopilot or 0,
+            at=times.at,
+            params=earlier
+            + [
+                StoredExtParam.of(table.params[name], times(table.moments.get(name, math.inf)), by)
+                for name, by in dirty.items()
+            ],
+            removed={name: times(moment) for name, moment in gone.items()},
+            count=state[0],
+            complete=state[1],
+        )
+        return _PendingExtUpdate(kept, dirty, gone, overwritten, before, update)
+
     def _hear_of(self, change: CacheChange) -> None:
         """Record that another station has written to a table."""
         self._news.add(change)
@@ -375,6 +436,10 @@ class WriteThrough:
                 cached = await self._run(partial(self._cache.load, identity.key, machine.component))
                 if cached is not None and self._kept.get(machine) is kept:
                     machine.renew(cached.params, self._moments(cached))
+                    self._renewed()
+                extended = await self._run(partial(self._cache.load_ext, identity.key, machine.component))
+                if extended is not None and self._kept.get(machine) is kept:
+                    machine.ext.use_cached(extended.params, self._moments(extended))
                     self._renewed()
 
     def _begin_anew(self, replacements: int) -> None:
@@ -391,10 +456,15 @@ class WriteThrough:
             kept.state = None
             for name in table.params:
                 table.dirty.setdefault(name, "vehicle")
+            kept.ext_state = None
+            kept.machine.ext.table.mark_dirty()
         self.wake()
 
     async def _save(self, cache: ParamCache, updates: list[TableUpdate]) -> bool:
         return await self._run(partial(_save, cache, updates, self._clock)) is not None
+
+    async def _save_extended(self, cache: ParamCache, updates: list[ExtTableUpdate]) -> bool:
+        return await self._run(partial(_save_ext, cache, updates, self._clock)) is not None
 
     def _has_capacity(self, machine: ComponentMachine, identity: Identity) -> bool:
         """Return whether the table of a vehicle may be cached, within the limits of the session."""
@@ -423,12 +493,22 @@ class WriteThrough:
         self._vehicles[address] = vehicles | {identity.key}
         return True
 
-    async def _load(self, machine: ComponentMachine, identity: Identity) -> CachedComponent | None:
+    async def _load(
+        self, machine: ComponentMachine, identity: Identity
+    ) -> tuple[CachedComponent | None, CachedExtTable | None]:
+        """Return the cached tables of a component: plain and extended parameters."""
         if self._cache is None:
-            return None
-        return await self._run(partial(self._cache.load, identity.key, machine.component))
+            return None, None
+        found = await self._run(partial(_load_both, self._cache, identity.key, machine.component))
+        return (None, None) if found is None else found
 
-    def _keep(self, machine: ComponentMachine, identity: Identity, cached: CachedComponent | None) -> None:
+    def _keep(
+        self,
+        machine: ComponentMachine,
+        identity: Identity,
+        cached: CachedComponent | None,
+        extended: CachedExtTable | None,
+    ) -> None:
         table = machine.table
         whole_at = self._now() + table.slept if table.complete else None
         kept = _CachedComponent(machine, identity, whole_at=whole_at, written_at=anyio.current_time())
@@ -456,6 +536,10 @@ class WriteThrough:
             kept.state = None if table.is_displaced else self._state(machine, kept)
         if machine.sync.synced:
             kept.proven_at = self._now() + table.slept
+        machine.ext.table.mark_dirty()
+        if extended is not None:
+            machine.ext.use_cached(extended.params, self._moments(extended))
+            kept.ext_state = (extended.count, extended.complete)
 
     def _present_times(self) -> UnixTimes:
         """Return the conversion of component times to unix times, by the current clock of the computer.
@@ -474,7 +558,7 @@ class WriteThrough:
         self._flushed_at = (now, times.at)
         return times
 
-    def _moments(self, cached: CachedComponent) -> dict[str, float]:
+    def _moments(self, cached: CachedComponent | CachedExtTable) -> dict[str, float]:
         """Return the observation times of the values of a cached table, in component time."""
         self._look()
         now = self._now()
@@ -555,7 +639,8 @@ class WriteThrough:
     def _tell_of_loss(self) -> None:
         """Log a warning for each component with values that were not written."""
         for machine, kept in self._kept.items():
-            values, earlier = len(machine.table.dirty), len(machine.table.overwritten)
+            values = len(machine.table.dirty) + len(machine.ext.table.dirty)
+            earlier = len(machine.table.overwritten) + len(machine.ext.table.overwritten)
             if values or earlier:
                 logger.warning(
                     "%d/%d (%s): not written to the cache, and lost: %d %s and %d earlier %s, as %s",
@@ -582,6 +667,7 @@ class _CachedComponent:
         proven_at: time of a verification since the last write, in component time with `Table.slept`, or None.
         whole_at: time of a full download since the last write, likewise.
         written_at: time of the last write, by the clock of the event loop.
+        ext_state: count and completeness of the extended parameters, as written last, or None.
     """
 
     machine: ComponentMachine
@@ -591,6 +677,7 @@ class _CachedComponent:
     proven_at: float | None = None
     whole_at: float | None = None
     written_at: float = 0.0
+    ext_state: tuple[int | None, bool] | None = None
 
 
 @dataclass(slots=True)
@@ -618,6 +705,23 @@ class _PendingUpdates:
             self.dirty, self.overwritten, self.gone, self.changed, self.params
         )
         kept.state = None
+
+
+@dataclass(slots=True)
+class _PendingExtUpdate:
+    """An update of extended parameters in a write, kept to queue it again after a failure."""
+
+    kept: _CachedComponent
+    dirty: dict[str, str]
+    gone: dict[str, float]
+    overwritten: list[tuple[ExtParam, str, float]]
+    state: tuple[int | None, bool] | None
+    update: ExtTableUpdate
+
+    def take_back(self) -> None:
+        """Queue the update again after a failed write."""
+        self.kept.ext_state = self.state
+        self.kept.machine.ext.table.put_back(self.dirty, self.gone, self.overwritten)
 
 
 def choose_cache(
@@ -655,6 +759,17 @@ def _firmware(identity: Identity) -> tuple[int, str]:
 def _save(cache: ParamCache, updates: list[TableUpdate], clock: Callable[[], float]) -> bool:
     cache.save(updates, clock=clock)
     return True
+
+
+def _save_ext(cache: ParamCache, updates: list[ExtTableUpdate], clock: Callable[[], float]) -> bool:
+    cache.save_ext(updates, clock=clock)
+    return True
+
+
+def _load_both(
+    cache: ParamCache, key: str, component: int
+) -> tuple[CachedComponent | None, CachedExtTable | None]:
+    return cache.load(key, component), cache.load_ext(key, component)
 
 
 def _sync(cache: ParamCache) -> bool:

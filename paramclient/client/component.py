@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 
 import anyio
 
+from paramclient.client.extended_params import ExtParams
 from paramclient.client.reset import ResetChoice, ResetResult
 from paramclient.client.subscription import Changes
 from paramclient.errors import UsageError
@@ -66,6 +67,15 @@ class Component(ABC):
     @abstractmethod
     def encoding_reason(self) -> str:
         """The reason for `encoding`, as text."""
+
+    @property
+    @abstractmethod
+    def ext(self) -> ExtParams:
+        """The extended parameters of the component (PARAM_EXT_*), with their own calls.
+
+        Raises:
+            UsageError: the client is one over a service, which does not serve them.
+        """
 
     @property
     @abstractmethod

@@ -44,6 +44,7 @@ from paramclient.protocol.events import (
     ComponentReplaced,
     ComponentUncontested,
     Event,
+    ExtParamChanged,
     Fetched,
     ParamChanged,
     ParamsMoved,
@@ -437,6 +438,10 @@ class LinkClient(LocalClient):
             machine = event.machine
             if isinstance(event, ParamChanged | ParamsMoved):
                 self._components[machine.address].take_change(event)
+                is_to_be_written = True
+                continue
+            if isinstance(event, ExtParamChanged):
+                self._components[machine.address].ext.take_change(event.change)
                 is_to_be_written = True
                 continue
             logger.debug("%s", event)

@@ -20,6 +20,7 @@ from paramclient.client.arguments import (
     check_writes,
 )
 from paramclient.client.component import Component
+from paramclient.client.link_extended_params import LinkExtParams
 from paramclient.client.local import LocalClient, LocalComponent
 from paramclient.client.signing import timestamp_now
 from paramclient.client.subscription import Changes
@@ -86,6 +87,7 @@ class LinkComponent(LocalComponent):
         self.system = machine.system
         self.component = machine.component
         self.params = ParamMap(machine.table.params)
+        self._ext = LinkExtParams(self)
         self._cache_is_read = anyio.Event()
 
     @property
@@ -108,6 +110,11 @@ class LinkComponent(LocalComponent):
     def encoding_reason(self) -> str:
         """See `Component.encoding_reason`."""
         return self.machine.identification.encoding_reason
+
+    @property
+    def ext(self) -> LinkExtParams:
+        """See `Component.ext`."""
+        return self._ext
 
     @property
     def count(self) -> int | None:
@@ -464,6 +471,7 @@ class LinkComponent(LocalComponent):
         """End all streams of changes: with this error, or with None at the end of a log."""
         for changes in list(self._subscriptions):
             changes.end(error)
+        self._ext.end(error)
 
     # waiting
 

@@ -2,6 +2,7 @@
 
 - `formats`, `param_file`, `disk`: the format of a file, its content, reading and replacing it.
 - `line_formats`, `script`, `param_pck`, `document_format`, `document_schema`: one module for each kind.
+- `extended_document`: files of extended parameters.
 - `rename_file`: files of names that firmware versions have changed.
 - `text`, `includes`, `yamltext`: lines and bad lines, `@include` lines, YAML with JSON's rules.
 """

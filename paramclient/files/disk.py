@@ -15,7 +15,7 @@ from paramclient.files.formats import LARGEST_FILE, Content, dumps, loads
 from paramclient.files.includes import Includes
 from paramclient.files.param_file import FileForm, ParamFile, format_of_name, parse_format
 
-__all__ = ["read_bytes", "read_file", "write_file"]
+__all__ = ["read_bytes", "read_file", "replace_file", "write_file"]
 
 if sys.platform == "win32":
     _OPEN_FLAGS: Final = os.O_BINARY | os.O_NOINHERIT  # text mode would convert line ends
@@ -87,6 +87,20 @@ def write_file(
     source = os.fspath(path)
     form = format_of_name(source) if form is None else parse_format(form)
     data = dumps(content, form=form, target=source)
+    replace_file(source, data)
+    return form
+
+
+def replace_file(source: str, data: bytes) -> None:
+    """Replace a file atomically by one with this content; on failure, leave the old file unchanged.
+
+    Args:
+        source: the file. If it is a symbolic link, its target is replaced.
+        data: the new content.
+
+    Raises:
+        FileError: writing failed.
+    """
     try:
         _replace(Path(os.path.realpath(source)), data, source)
     except FileError:
@@ -95,7 +109,6 @@ def write_file(
         raise FileError(f"cannot be written: {error.strerror}", source=source) from error
     except ValueError as error:  # a NUL in the path
         raise FileError(f"cannot be written: {error}", source=source) from error
-    return form
 
 
 def _read(source: str) -> bytes:

@@ -25,7 +25,17 @@ from paramclient.files.text import excerpt, is_plain, time_of
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, Value, format_value, shortest_float, type_name
 
-__all__ = ["is_document", "read_json", "read_yaml", "write_json", "write_yaml"]
+__all__ = [
+    "is_document",
+    "parse_json",
+    "parse_yaml",
+    "read_json",
+    "read_yaml",
+    "write_json",
+    "write_yaml",
+    "yaml_flow",
+    "yaml_key",
+]
 
 VERSION: Final = 1
 """Version of the format, written to documents and required in documents that are read."""
@@ -33,7 +43,7 @@ VERSION: Final = 1
 PROBLEM_LENGTH_MAX: Final = 300
 """Characters of one problem in an error, so that a long field does not make the error unreadable."""
 
-_first_key: Final = re.compile(r"""["']?paramclient["']?[ \t]*:""").match
+_first_key: Final = re.compile(r"""["']?paramclient(?:_extended)?["']?[ \t]*:""").match
 _plain_key: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*").fullmatch
 _YAML_WORDS: Final = frozenset({"y", "n", "yes", "no", "on", "off", "true", "false", "null"})
 """Words, in any case, that YAML does not parse as text unless quoted."""
@@ -52,8 +62,17 @@ def read_json(text: str, source: str, params_max: int | None = None) -> ParamFil
     Raises:
         FileError: invalid JSON, a repeated key, or not a valid document.
     """
+    return _file(parse_json(text, source), FileForm.JSON, source, text, params_max)
+
+
+def parse_json(text: str, source: str) -> object:
+    """Return the content of a JSON text without repeated keys.
+
+    Raises:
+        FileError: invalid JSON, or a repeated key.
+    """
     try:
-        content = json.loads(
+        content: object = json.loads(
             text,
             object_pairs_hook=_unique,
             parse_constant=_no_constant,
@@ -72,7 +91,7 @@ def read_json(text: str, source: str, params_max: int | None = None) -> ParamFil
     except ValueError as error:
         line = _line_of(text, error.args[1], last=True) if len(error.args) > 1 else None
         raise FileError(str(error.args[0]), source=source, line=line) from None
-    return _file(content, FileForm.JSON, source, text, params_max)
+    return content
 
 
 def read_yaml(text: str, source: str, params_max: int | None = None) -> ParamFile:
@@ -84,15 +103,24 @@ def read_yaml(text: str, source: str, params_max: int | None = None) -> ParamFil
     Raises:
         FileError: invalid YAML, a repeated key, or not a valid document; or PyYAML is not installed.
     """
+    return _file(parse_yaml(text, source), FileForm.YAML, source, text, params_max)
+
+
+def parse_yaml(text: str, source: str) -> object:
+    """Return the content of a YAML text, with JSON's rules.
+
+    Raises:
+        FileError: invalid YAML, or a repeated key; or PyYAML is not installed.
+    """
     if find_spec("yaml") is None:
         raise FileError("YAML is read with PyYAML: pip install 'paramclient[yaml]'", source=source)
     from paramclient.files.yamltext import InvalidYaml, load  # imported here because it needs the extra
 
     try:
-        content = load(text)
+        content: object = load(text)
     except InvalidYaml as error:
         raise FileError(f"expected YAML: {error}", source=source, line=error.line, expected="YAML") from None
-    return _file(content, FileForm.YAML, source, text, params_max)
+    return content
 
 
 def write_json(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
@@ -131,21 +159,23 @@ def write_yaml(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
     yield f"paramclient: {VERSION}"
     if header:
         yield "header:"
-        yield from (f"  - {_flow(line)}" for line in header)
+        yield from (f"  - {yaml_flow(line)}" for line in header)
     yield "sets:"
     for each in sets:
         mark = "-"
         for key, content in _set_fields(each).items():
-            yield f"  {mark} {key}: {_flow(content)}"
+            yield f"  {mark} {key}: {yaml_flow(content)}"
             mark = " "
         yield f"  {mark} params:"
         for param in each.values():
-            yield f"      {_key(param.name)}: {_flow(_fields(param))}"
+            yield f"      {yaml_key(param.name)}: {yaml_flow(_fields(param))}"
 
 
 def _file(content: object, form: FileForm, source: str, text: str, params_max: int | None) -> ParamFile:
     from paramclient.files.document_schema import InvalidDocument, parse  # imported here: loads pydantic
 
+    if isinstance(content, dict) and "paramclient_extended" in content:
+        raise FileError("it has extended parameters, and plain ones are expected", source=source)
     try:
         sets, header = parse(content, source, params_max)
     except InvalidDocument as error:
@@ -258,10 +288,10 @@ def _json(content: object) -> str:
     return json.dumps(content, allow_nan=False)
 
 
-def _flow(content: object) -> str:
+def yaml_flow(content: object) -> str:
     """Return a value in YAML, on one line."""
     if isinstance(content, dict):
-        return f"{{{', '.join(f'{_key(key)}: {_flow(each)}' for key, each in content.items())}}}"
+        return f"{{{', '.join(f'{yaml_key(key)}: {yaml_flow(each)}' for key, each in content.items())}}}"
     if isinstance(content, str):
         return _beyond_ascii.sub(_escaped, json.dumps(content, ensure_ascii=False))
     text = _json(content)
@@ -269,8 +299,9 @@ def _flow(content: object) -> str:
     return _exponent.sub(r"\1.0\2", text)
 
 
-def _key(key: str) -> str:
-    return key if _plain_key(key) and key.lower() not in _YAML_WORDS else _flow(key)
+def yaml_key(key: str) -> str:
+    """Return a key in YAML, quoted where a parser would take it for something else."""
+    return key if _plain_key(key) and key.lower() not in _YAML_WORDS else yaml_flow(key)
 
 
 def _escaped(match: re.Match[str]) -> str:

@@ -26,10 +26,14 @@ FORMS: Final = """\
   tcpin:HOST:PORT     accept connections of vehicles; also tcpin:PORT
   serial:DEVICE:BAUD  a serial port; also /dev/ttyACM0,57600 and COM5:115200
   sim:px4             a simulated vehicle in this process; also sim:ardupilot, sim:px4?loss=0.05&seed=1
+  sim:camera          a simulated camera with extended parameters, component 100
   replay:FILE         a telemetry log (.tlog); also replay:FILE?speed=10, and speed=0 for full speed
   udpin://HOST:PORT   // may follow the first colon of each; write an IPv6 address in brackets
   http://HOST:PORT    not a link, but a service with links (paramclient serve); also https://HOST"""
 """The accepted forms of a link name, for messages."""
+
+SIMULATED: Final = ("px4", "ardupilot", "camera")
+"""What a `sim:` link simulates."""
 
 DEFAULT_BAUD: Final = 57600
 """Baud rate of a serial device without one: that of telemetry radios, and MAVSDK's and MAVProxy's default. A
@@ -201,8 +205,8 @@ def _serial(rest: str) -> LinkSpec:
 
 def _sim(rest: str) -> LinkSpec:
     autopilot, _, query = rest.partition("?")
-    if autopilot.lower() not in ("px4", "ardupilot"):
-        _fail("simulated vehicles are px4 and ardupilot")
+    if autopilot.lower() not in SIMULATED:
+        _fail("simulated vehicles are px4, ardupilot and camera")
     options: dict[str, int | float] = {}
     try:
         pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=True, max_num_fields=32)

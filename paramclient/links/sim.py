@@ -6,6 +6,7 @@ vehicle on a real link, for other programs.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
 import anyio
@@ -17,7 +18,7 @@ from paramclient.links.names import LinkSpec
 
 if TYPE_CHECKING:
     from paramclient.links.link import Link, Peer
-    from paramclient.sim import Endpoint
+    from paramclient.sim import Endpoint, Vehicle
 
 __all__ = ["SimLink", "serve_endpoint", "simulated"]
 
@@ -123,10 +124,16 @@ async def serve_endpoint(
 
 def simulated(spec: LinkSpec) -> SimLink:
     """Return the vehicle of a `sim:` name, behind a faulty link with the faults of its options."""
-    from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle  # imported here: loads parameter tables
+    from paramclient.sim import (
+        Air,
+        ArduPilotVehicle,
+        Camera,
+        PX4Vehicle,
+    )  # imported here: loads parameter tables
 
     faults: dict[str, Any] = dict(spec.options)
-    make = PX4Vehicle if spec.host == "px4" else ArduPilotVehicle
+    kinds = {"px4": PX4Vehicle, "ardupilot": ArduPilotVehicle, "camera": Camera}
+    make: Callable[..., Vehicle] = kinds[spec.host]
     vehicle = make(system=faults.pop("system", 1), param_error=bool(faults.pop("param_error", 0)))
     return SimLink(Air.symmetric([vehicle], **faults) if faults else vehicle, spec.name)
 

@@ -15,8 +15,8 @@ class ImportedTable:
         key: the key of the vehicle's tables in the cache.
         system, component: its address.
         autopilot: MAV_AUTOPILOT of its heartbeat, or None.
-        params: the number of received parameters.
-        complete: whether the table is complete.
+        params: the number of received parameters, plain and extended.
+        complete: whether the plain table is complete; the extended one if there are no plain parameters.
         hash: the PX4 hash that confirms the table at the end of the log, or None.
         notes: parts that were skipped of files that a ground station read over MAVFTP, in sentences.
     """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from functools import partial
@@ -11,7 +12,7 @@ from typing import Final
 import anyio
 import anyio.lowlevel
 
-from paramclient.cache import CachedComponent, ParamCache, TableUpdate
+from paramclient.cache import CachedComponent, CachedExtTable, ExtTableUpdate, ParamCache, TableUpdate
 from paramclient.client.cache_writer import CACHE_FLUSH_INTERVAL, WriteThrough
 from paramclient.links.replay import LOG_PEER
 from paramclient.links.tlog import Record, open_log, read_records
@@ -116,7 +117,7 @@ class _Import:
         finally:
             await writer.close()
         heard = (machines[address] for address in sorted(machines))
-        return tuple(self._imported_table(each) for each in heard if each.table.params or each.fetches.notes)
+        return tuple(self._imported_table(each) for each in heard if _is_told(each))
 
     async def _follow(self) -> None:
         """Handle the station's events, as the client does."""
@@ -154,17 +155,22 @@ class _Import:
 
     def _imported_table(self, machine: ComponentMachine) -> ImportedTable:
         identity = self._identity_of(machine) or machine.identity
-        complete = machine.table.complete
+        complete = machine.table.complete if machine.table.params else machine.ext.table.complete
         return ImportedTable(
             identity.key,
             machine.system,
             machine.component,
             machine.identification.autopilot,
-            params=len(machine.table.params),
+            params=len(machine.table.params) + len(machine.ext.table.params),
             complete=complete,
-            hash=machine.table.hash if complete else None,
+            hash=machine.table.hash if machine.table.complete else None,
             notes=machine.fetches.notes,
         )
+
+
+def _is_told(machine: ComponentMachine) -> bool:
+    """Return whether the log has parameters of a component, or something to say of them."""
+    return bool(machine.table.params or machine.ext.table.params or machine.fetches.notes)
 
 
 class _LogWriter(WriteThrough):
@@ -183,6 +189,7 @@ class _LogWriter(WriteThrough):
         )
         self._kept_tables = cache
         self._updates: list[TableUpdate] = []
+        self._ext_updates: list[ExtTableUpdate] = []
         self._based_on: dict[tuple[str, int], float] = {}
         self._has_asked: set[tuple[str, int]] = set()
         self._has_values: set[tuple[str, int]] = set()
@@ -191,18 +198,28 @@ class _LogWriter(WriteThrough):
         """Write all collected updates."""
         work = partial(self._kept_tables.merge, self._updates, based_on=self._based_on)
         await self._worker.run(work)
+        await self._worker.run(partial(self._kept_tables.save_ext, self._ext_updates, clock=time.time))
 
-    async def _load(self, machine: ComponentMachine, identity: Identity) -> CachedComponent | None:
-        """Return the cached table if it is older; only once, as later updates are not written yet."""
+    async def _load(
+        self, machine: ComponentMachine, identity: Identity
+    ) -> tuple[CachedComponent | None, CachedExtTable | None]:
+        """Return the cached table if it is older; only once, as later updates are not written yet.
+
+        Extended parameters need no cached table: they are compared with it when they are written.
+        """
         key = (identity.key, machine.component)
         if key in self._has_asked:
-            return None
+            return None, None
         self._has_asked.add(key)
         cached = await self._worker.run(partial(self._kept_tables.load, *key))
         if cached is None or cached.updated_at >= self._clock():
-            return None
+            return None, None
         self._based_on[key] = cached.updated_at
-        return cached
+        return cached, None
+
+    async def _save_extended(self, cache: ParamCache, updates: list[ExtTableUpdate]) -> bool:
+        self._ext_updates += updates
+        return True
 
     async def _save(self, cache: ParamCache, updates: list[TableUpdate]) -> bool:
         for update in updates:

@@ -3,6 +3,7 @@ words.
 
 - `values`, `params`, `paramset`, `identity`: types and encodings, tables, sets without a vehicle, vehicle
   identity.
+- `ext_params`: extended parameters, with text and 64-bit values.
 - `comparison`, `patterns`, `notation`: comparison of sets, selection of names, JSON notation.
 - `group_switches`: parameters that others depend on.
 - `hash_exclusions`: the parameters that PX4 excludes from its hash.

@@ -9,6 +9,7 @@
 `system_id_change`: the search for a vehicle under a new system id.
 `wire`: frames, messages, signatures.
 `params`: the parameter protocol.
+`ext`: the extended parameter protocol.
 `requests`: timeouts, retries and pacing.
 `vehicle`: identification, presence, commands, reboot.
 `ftp`: MAVFTP.

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Final, Protocol
 
 from paramclient.errors import NoReply, ParamClientError, UsageError
+from paramclient.model.ext_params import ExtValue, encode_ext_value
 from paramclient.model.group_switches import is_group_switch
 from paramclient.model.identity import Identity, autopilot_name, reason_against_non_finite
 from paramclient.model.params import unpack_fields
@@ -22,6 +23,12 @@ from paramclient.model.values import (
     is_portable_name,
 )
 from paramclient.protocol.addresses import Address, Peer, PeerAddress, peer_in_words
+from paramclient.protocol.ext.change import ExtChange
+from paramclient.protocol.ext.extended import ExtendedParams
+from paramclient.protocol.ext.fetch import ExtFetch
+from paramclient.protocol.ext.reads import ExtRead
+from paramclient.protocol.ext.write_batch import ExtWriteBatch
+from paramclient.protocol.ext.writes import ExtWrite
 from paramclient.protocol.ftp import FileTransfers
 from paramclient.protocol.params.boot_values import BootValues
 from paramclient.protocol.params.change import Change
@@ -45,6 +52,7 @@ from paramclient.protocol.stats.trace import Trace, discard
 from paramclient.protocol.vehicle.boot_time_requests import BootTimeRequests
 from paramclient.protocol.vehicle.claims import Claim, PeerRelation
 from paramclient.protocol.vehicle.commands import Commands, MessageRequests
+from paramclient.protocol.vehicle.extended_kinds import expects_extended
 from paramclient.protocol.vehicle.identification import Identification
 from paramclient.protocol.vehicle.metadata_location import MetadataRequests
 from paramclient.protocol.vehicle.peers import NO_PEER, ComponentPeers, Contest
@@ -64,6 +72,8 @@ from paramclient.protocol.wire import (
     HighLatency2,
     Message,
     ParamError,
+    ParamExtAck,
+    ParamExtValue,
     ParamValue,
     StatusText,
     SystemTime,
@@ -104,6 +114,9 @@ class ComponentObserver(Protocol):
 
     def changed(self, machine: ComponentMachine, change: Change) -> None:
         """A parameter appeared, changed or was removed; called for each change with `tells_changes`."""
+
+    def ext_changed(self, machine: ComponentMachine, change: ExtChange) -> None:
+        """An extended parameter appeared, changed or was removed."""
 
     def moved(self, machine: ComponentMachine) -> None:
         """Parameters have changed; called once for several changes without `tells_changes`."""
@@ -155,6 +168,7 @@ class ComponentMachine:
         commands: its commands.
         messages: the messages that are requested from it.
         clock_requests: the requests for its time since boot.
+        ext: its extended parameters.
         start_values: the reads of values that it measures at each boot.
         restarts: its reboot on command.
         rereads: the values to be read again.
@@ -257,13 +271,20 @@ class ComponentMachine:
         self.tells_changes = True
         self.has_moved = False
         self.rereads = Rereads(context, self.reads, self.table, self.sync, upkeep.policy)
+        self.ext = ExtendedParams(
+            context,
+            self,
+            share=scheduler.turns.share,
+            room=room,
+            may_read=upkeep.policy is Policy.AUTO,
+        )
         self._authors = self.rereads.authors
         self._checks = self.rereads.checks
         self.writes.left_open = self._authors.foreign_set
         self._machines: tuple[Machine, ...] = (
             *(self.reads, self.name_searches, self.sync, self.writes, self.files, self.commands),
             *(self.restarts, self.fetches, self.messages, self.identification, self.descriptions),
-            *(self.clock_requests, self.start_values, self.rereads, self.write_batches),
+            *(self.clock_requests, self.start_values, self.rereads, self.ext, self.write_batches),
         )
         """Each machine stands behind those that it uses or calls. They end in reverse order: a machine does
         not take the end of another one for a result, and is not called after its own end."""
@@ -289,9 +310,20 @@ class ComponentMachine:
     @property
     def may_be_written(self) -> bool:
         """Whether it is certain which vehicle receives a write, and in which encoding."""
+        return self.identification.may_be_written and self.is_recipient_certain
+
+    @property
+    def is_recipient_certain(self) -> bool:
+        """Whether it is certain which vehicle receives a write."""
         home = self.peers.home
         is_open = any(each.context.may_be_another or each.peers.is_rival(home) for each in self._autopilots())
-        return self.identification.may_be_written and not is_open
+        return not self.context.may_be_another and not is_open
+
+    @property
+    def expects_extended(self) -> bool:
+        """Whether it speaks the extended parameter protocol: it has done so, or is a kind of component that
+        does."""
+        return self.ext.is_spoken or expects_extended(self.identification.vehicle_type, self.component)
 
     @property
     def may_use_file(self) -> bool:
@@ -377,6 +409,7 @@ class ComponentMachine:
         is_asked = len(self.reads) > in_background or len(self.writes) > 0 or not self.files.is_idle
         is_asked = is_asked or len(self.commands) > 0 or self.restarts.current is not None
         is_asked = is_asked or self.descriptions.is_asking or len(self.name_searches) > 0
+        is_asked = is_asked or self.ext.is_busy
         return is_asked or self.fetch is not None or self.identification.is_asking
 
     @property
@@ -429,6 +462,10 @@ class ComponentMachine:
             elif addressee in (self._own, (0, 0)) and not self.writes.refused(message, now):
                 self.reads.refused(message, now)
                 self.name_searches.refused(message, now)
+        elif isinstance(message, ParamExtValue):
+            self.ext.receive_value(message, now, moment)
+        elif isinstance(message, ParamExtAck):
+            self.ext.receive_ack(message, now, moment)
         elif isinstance(message, CommandAck):
             self.messages.acknowledged(message, now)
             self.commands.acknowledged(message, now)
@@ -589,6 +626,11 @@ class ComponentMachine:
             return
         self._authors.foreign_set(self.spelling(name), station, now, raw)
 
+    def foreign_ext_set(self, name: str, station: str, now: float) -> None:
+        """Record another station's PARAM_EXT_SET to this component."""
+        self.reschedule()
+        self.ext.foreign_set(name, station, now)
+
     def foreign_file_request(self, message: FileTransfer, station: tuple[int, int], now: float) -> None:
         """Process another station's request for a file of this component."""
         self.reschedule()
@@ -692,10 +734,7 @@ class ComponentMachine:
                 Nothing was sent.
             NoReply: the component is lost. Nothing was sent.
         """
-        self.check_present(f"PARAM_SET {name} to {self.system}/{self.component}", now)
-        for each in (self, *self._autopilots()):
-            if each.identification.is_unconfirmed:
-                each.identification.doubt(now)
+        self._check_writable(f"PARAM_SET {name}", now)
         name = self.spelling(name)
         known = self.table.params.get(name)
         if known is not None and known.trust is not Trust.CACHED and self.may_be_written:
@@ -736,6 +775,66 @@ class ComponentMachine:
             return is_group_switch(self.spelling(name), autopilot)
 
         return self.write_batches.begin(pairs, BatchRules(begin, self.writes.cancel, is_switch), now)
+
+    def read_ext(self, key: Key, now: float) -> ExtRead:
+        """Read one extended parameter; give it back with `ext.reads.release`.
+
+        Raises:
+            NoReply: the component is lost. Nothing was sent.
+        """
+        what = key if isinstance(key, str) else f"extended parameter {key}"
+        self.check_present(f"{what} of {self.system}/{self.component}", now)
+        return self.ext.read(key, now)
+
+    def write_ext(self, name: str, value: ExtValue, now: float, asker: str | None = None) -> ExtWrite:
+        """Write one extended parameter; end it with `ext.writes.cancel`.
+
+        Raises:
+            UsageError: the type is known and the value does not fit it. Nothing was sent.
+            NoReply: the component is lost. Nothing was sent.
+        """
+        self._check_writable(f"PARAM_EXT_SET {name}", now)
+        known = self.ext.table.params.get(name)
+        if known is not None and known.trust is not Trust.CACHED and self.is_recipient_certain:
+            encode_ext_value(value, known.type)
+        return self.ext.write(name, value, now, asker)
+
+    def write_many_ext(
+        self, pairs: Sequence[tuple[str, ExtValue]], now: float, asker: str | None = None
+    ) -> ExtWriteBatch:
+        """Write several extended parameters; end the batch with `ext.batches.end`.
+
+        Raises:
+            UsageError: nothing may be sent.
+            NoReply: the component is lost. Nothing was sent.
+        """
+        self.check_present(f"PARAM_EXT_SET to {self.system}/{self.component}", now)
+
+        def begin(name: str, value: ExtValue, at: float) -> ExtWrite:
+            return self.write_ext(name, value, at, asker)
+
+        batch = ExtWriteBatch(pairs, begin, self.ext.writes.cancel, now)
+        self.ext.batches.begin(batch, now)
+        return batch
+
+    def begin_ext_fetch(self, now: float) -> ExtFetch:
+        """Begin a fetch of the extended parameters, or join the one in progress; give it back with
+        `ext.fetches.end`.
+
+        Raises:
+            ContestedAddress: several vehicles use its address.
+            NoReply: the component is lost. Nothing was sent.
+        """
+        self.reschedule()
+        self.check_present(f"the extended parameters of {self.system}/{self.component}", now)
+        return self.ext.begin_fetch(now)
+
+    def _check_writable(self, what: str, now: float) -> None:
+        """Check that a write can be sent, and confirm an identity that is open."""
+        self.check_present(f"{what} to {self.system}/{self.component}", now)
+        for each in (self, *self._autopilots()):
+            if each.identification.is_unconfirmed:
+                each.identification.doubt(now)
 
     def begin_restart(self, now: float, *, returns: bool = True) -> Reboot:
         """Reboot the component, or join the reboot in progress; give it back with `end_restart`.
@@ -945,6 +1044,7 @@ class ComponentMachine:
         self.sync.forget()
         self.fetches.forget()
         self.following.forget()
+        self.ext.forget(now)
         self._checks.clear()
         self._known_as = None
         self.restarts.vehicle_replaced(now)
@@ -982,6 +1082,7 @@ class ComponentMachine:
     def _doubt(self) -> None:
         """Doubt everything known: it counts again when the vehicle has confirmed it."""
         self.table.doubt(Trust.LIVE, Trust.VERIFIED)
+        self.ext.doubt()
         self.sync.doubt()
         if self.fetch is not None:
             self.fetch.doubt()
@@ -1029,6 +1130,7 @@ class ComponentMachine:
         if not is_of_this_run:
             self._doubt()
         self.following.forget()
+        self.ext.restart(now)
         self.rereads.clear()
         self.sync.check(now)
         self.identification.doubt(now)
@@ -1053,13 +1155,15 @@ class ComponentMachine:
             if self.identification.is_autopilot:
                 self.clock_requests.want_baseline(now)
         for each in self._companions:
-            if each.writes.queues:
+            if each.writes.queues or each.ext.writes.queues:
                 each._follow_permission(now)
 
     def _follow_permission(self, now: float) -> None:
         """Continue the writes, or end them with an error where the identity of the vehicle, or of its
         autopilot, was requested without success."""
         self.reschedule()
+        if self.ext.writes.is_held and self.is_recipient_certain:
+            self.ext.writes.proceed(now)
         if self.writes.is_held and self.may_be_written:
             self.writes.proceed(now)
             return
@@ -1072,6 +1176,7 @@ class ComponentMachine:
     def _fail_writes(self, error: ParamClientError, now: float) -> None:
         self.write_batches.fail_all(error, now)
         self.writes.fail_all(error, now)
+        self.ext.fail_writes(error, now)
 
     def _doubt_identity(self, now: float) -> None:
         """Doubt the table: another vehicle may respond by now."""
@@ -1096,6 +1201,10 @@ class ComponentMachine:
 
     def _fetched(self, result: FetchResult) -> None:
         self._observer.fetched(self, result)
+
+    def ext_changed(self, change: ExtChange) -> None:
+        """Report a change of an extended parameter."""
+        self._observer.ext_changed(self, change)
 
     def _report(self, changes: list[Change]) -> None:
         for change in changes:

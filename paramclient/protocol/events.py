@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.ext.change import ExtChange
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.fetch_result import FetchResult
 from paramclient.protocol.vehicle.peers import Contest
@@ -23,6 +24,7 @@ __all__ = [
     "ComponentUncontested",
     "Event",
     "EventMaker",
+    "ExtParamChanged",
     "Fetched",
     "ParamChanged",
     "ParamsMoved",
@@ -105,6 +107,14 @@ class ParamChanged(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
+class ExtParamChanged:
+    """An extended parameter appeared, changed or was removed."""
+
+    machine: ComponentMachine
+    change: ExtChange
+
+
+@dataclass(frozen=True, slots=True)
 class ParamsMoved:
     """Parameters have changed, without an event for each."""
 
@@ -145,6 +155,7 @@ Event: TypeAlias = (
     | ComponentUncontested
     | ComponentForgotten
     | ParamChanged
+    | ExtParamChanged
     | ParamsMoved
     | Fetched
     | TableResynced
@@ -200,6 +211,10 @@ class EventMaker:
     def changed(self, machine: ComponentMachine, change: Change) -> None:
         """See `ComponentObserver`."""
         self._emit(ParamChanged(machine, change))
+
+    def ext_changed(self, machine: ComponentMachine, change: ExtChange) -> None:
+        """See `ComponentObserver`."""
+        self._emit(ExtParamChanged(machine, change))
 
     def moved(self, machine: ComponentMachine) -> None:
         """See `ComponentObserver`."""

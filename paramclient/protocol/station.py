@@ -43,6 +43,10 @@ from paramclient.protocol.wire import (
     Heartbeat,
     HighLatency2,
     Message,
+    ParamExtRequestList,
+    ParamExtRequestRead,
+    ParamExtSet,
+    ParamExtValue,
     ParamRequestList,
     ParamSetMessage,
     ParamValue,
@@ -73,11 +77,13 @@ STREAM_PEERS_MAX: Final = 256
 EARLY_REQUESTS_MAX: Final = 32
 """Requests for parameter files that are kept for components that are not known yet: a log may begin with the
 read of one."""
-HANDLED_IDS: Final = frozenset({0, 2, 22, 23, 77, 110, 148, 235, 253, 345, 397})
+HANDLED_IDS: Final = frozenset({0, 2, 22, 23, 77, 110, 148, 235, 253, 322, 323, 324, 345, 397})
 """The message ids that the core handles: HEARTBEAT, SYSTEM_TIME, PARAM_VALUE, PARAM_SET (of other stations),
-COMMAND_ACK, FILE_TRANSFER_PROTOCOL, AUTOPILOT_VERSION, HIGH_LATENCY2, STATUSTEXT, PARAM_ERROR,
-COMPONENT_METADATA."""
-_SETS: Final = frozenset({23})
+COMMAND_ACK, FILE_TRANSFER_PROTOCOL, AUTOPILOT_VERSION, HIGH_LATENCY2, STATUSTEXT, PARAM_EXT_VALUE,
+PARAM_EXT_SET (of other stations), PARAM_EXT_ACK, PARAM_ERROR, COMPONENT_METADATA."""
+_SETS: Final = frozenset({23, 323})
+_MAVLINK2_REQUESTS: Final = (ParamExtRequestRead, ParamExtRequestList, ParamExtSet)
+"""Requests that exist in MAVLink 2 only: a component that has sent MAVLink 1 so far may understand them."""
 _TELEMETRY_CLOCKS: Final = {
     number: at for number, at in BOOT_CLOCK_OFFSETS.items() if number not in HANDLED_IDS
 }
@@ -242,10 +248,10 @@ class Station:
 
     def overhear(self, data: bytes, now: float) -> None:
         """Process a frame that another program sends to the vehicles over this link: it may be a
-        PARAM_SET."""
+        PARAM_SET or a PARAM_EXT_SET."""
         for frame in Framer(_SETS, stream=False).receive(data):
             message = decode(frame)
-            if isinstance(message, ParamSetMessage):
+            if isinstance(message, ParamSetMessage | ParamExtSet):
                 self._receive_foreign_set(message, (frame.system, frame.component), now)
 
     def tick(self, now: float) -> None:
@@ -322,6 +328,7 @@ class Station:
             machine.presence.age(unseen)
             machine.peers.age(unseen)
             machine.table.age(unseen)
+            machine.ext.table.age(unseen)
         if not self._is_paused:
             self._outbox.clear()  # meant for the components before it
             self.resume(now)
@@ -529,7 +536,7 @@ class Station:
             return
         if isinstance(message, Heartbeat | HighLatency2) and message.autopilot != MAV_AUTOPILOT_INVALID:
             self._awaits_autopilot = False
-        if isinstance(message, ParamSetMessage):
+        if isinstance(message, ParamSetMessage | ParamExtSet):
             self._receive_foreign_set(message, sender, now)
             return
         if isinstance(message, FileTransfer):
@@ -573,7 +580,7 @@ class Station:
 
     def _meet(self, sender: Address, peer: Peer, message: Message, now: float) -> ComponentMachine | None:
         """Add a component on its first message; only messages that show parameters make one."""
-        is_sign = isinstance(message, Heartbeat | HighLatency2 | ParamValue)
+        is_sign = isinstance(message, Heartbeat | HighLatency2 | ParamValue | ParamExtValue)
         if not (is_sign or self._is_awaited_file(message, sender)) or not self._has_capacity(now):
             return None
         system, component = sender
@@ -642,11 +649,17 @@ class Station:
         self._foreign += machine.peers.foreign
         self._reporter.forgotten(machine)
 
-    def _receive_foreign_set(self, message: ParamSetMessage, sender: Address, now: float) -> None:
+    def _receive_foreign_set(
+        self, message: ParamSetMessage | ParamExtSet, sender: Address, now: float
+    ) -> None:
         station = f"station {sender[0]}/{sender[1]}"
         for machine in self.components.values():
             is_target = message.target_component in (machine.component, COMP_ID_ALL)
-            if is_target and message.target_system in (machine.system, 0):
+            if not is_target or message.target_system not in (machine.system, 0):
+                continue
+            if isinstance(message, ParamExtSet):
+                machine.foreign_ext_set(message.param_id, station, now)
+            else:
                 machine.foreign_set(message.param_id, message.raw, station, now)
 
     def _receive_foreign_file_request(self, message: FileTransfer, sender: Address, now: float) -> None:
@@ -697,6 +710,8 @@ class Station:
         if self.listens_only:
             return
         own_system, own_component = self.own
+        if isinstance(message, _MAVLINK2_REQUESTS):
+            version = 2
         data = encode(
             message, system=own_system, component=own_component, sequence=self._sequence, version=version
         )

@@ -15,6 +15,7 @@ from paramclient.client.arguments import (
     check_writes,
 )
 from paramclient.client.component import Component
+from paramclient.client.extended_params import ExtParams
 from paramclient.client.local import not_given
 from paramclient.client.subscription import Changes
 from paramclient.errors import LinkError, NoReply, ParamClientError
@@ -126,6 +127,11 @@ class RemoteComponent(Component):
     def encoding_reason(self) -> str:
         """See `Component.encoding_reason`."""
         return str(self._mirrored.document["encoding_reason"])
+
+    @property
+    def ext(self) -> ExtParams:
+        """Raise UsageError: the service does not serve extended parameters."""
+        raise not_given("extended parameters")
 
     @property
     def count(self) -> int | None:

@@ -18,7 +18,8 @@ every run has the same outcome. A complete session is a loop::
 The vehicles behave as measured on real ones, with the real timing. The docstrings of `PX4Vehicle` and
 `ArduPilotVehicle` describe the differences between the two.
 
-- `px4`, `ardupilot`, `generic`: the vehicles. `vehicle`, `device`: their base classes.
+- `px4`, `ardupilot`, `generic`: the vehicles. `camera`: a camera with extended parameters.
+- `vehicle`, `device`: their base classes.
 - `param_table`, `ftp`, `metadata`: parameter tables, the MAVFTP server, metadata files.
 - `air`, `other`: the faulty link, a second ground station.
 """
@@ -27,6 +28,7 @@ from __future__ import annotations
 
 from paramclient.sim.air import Air, Endpoint, FaultyLink
 from paramclient.sim.ardupilot import ArduPilotVehicle
+from paramclient.sim.camera import Camera, camera_table
 from paramclient.sim.generic import GenericVehicle
 from paramclient.sim.other import OtherStation
 from paramclient.sim.param_table import SimParam, Table, ardupilot_table, px4_table
@@ -36,6 +38,7 @@ from paramclient.sim.vehicle import Vehicle
 __all__ = [
     "Air",
     "ArduPilotVehicle",
+    "Camera",
     "Endpoint",
     "FaultyLink",
     "GenericVehicle",
@@ -45,5 +48,6 @@ __all__ = [
     "Table",
     "Vehicle",
     "ardupilot_table",
+    "camera_table",
     "px4_table",
 ]

@@ -333,6 +333,9 @@ class Device(ABC):
             wire.ParamRequestRead
             | wire.ParamRequestList
             | wire.ParamSetMessage
+            | wire.ParamExtRequestRead
+            | wire.ParamExtRequestList
+            | wire.ParamExtSet
             | wire.CommandLong
             | wire.FileTransfer
             | wire.SetupSigning,
@@ -393,6 +396,9 @@ _NAMES = {
     wire.ParamRequestRead: "PARAM_REQUEST_READ",
     wire.ParamRequestList: "PARAM_REQUEST_LIST",
     wire.ParamSetMessage: "PARAM_SET",
+    wire.ParamExtRequestRead: "PARAM_EXT_REQUEST_READ",
+    wire.ParamExtRequestList: "PARAM_EXT_REQUEST_LIST",
+    wire.ParamExtSet: "PARAM_EXT_SET",
     wire.CommandLong: "COMMAND_LONG",
     wire.FileTransfer: "FILE_TRANSFER_PROTOCOL",
     wire.SetupSigning: "SETUP_SIGNING",

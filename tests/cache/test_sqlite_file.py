@@ -118,6 +118,8 @@ def sound_file() -> bytes:
 def make_older(path: Path, version: int) -> None:
     """Make of the present file what an earlier version would have made."""
     with connect(path) as connection:
+        for table in ("ext_param", "ext_history", "ext_table"):
+            connection.execute(f"DROP TABLE {table}")
         connection.execute("ALTER TABLE component DROP COLUMN source")
         connection.execute(f"PRAGMA user_version = {version}")
         if version == 4:

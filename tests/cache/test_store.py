@@ -38,7 +38,7 @@ from paramclient.cache.transaction import Line, Session
 from paramclient.cache.transfer import take_whole
 from paramclient.errors import CacheError, UsageError
 from paramclient.model.values import Param, ParamType
-from tests.cache import test_cache, test_file_table, test_fleet, test_snapshots
+from tests.cache import test_cache, test_ext_tables, test_file_table, test_fleet, test_snapshots
 from tests.caches import NOW, PX4, stored, update, values, whole_table
 from tests.client.test_observation_times import interleaved
 from tests.commands import in_process
@@ -72,6 +72,10 @@ OF_A_FILE = {
     # they have fixtures of their own
     "test_what_is_claimed_of_any_moment_is_what_was_so",
     "test_every_value_comes_back_to_the_last_bit",
+    # damage of a file, and what needs no store
+    "test_damage_is_noticed",
+    "test_queued_writes_come_back",
+    "test_a_queued_write_that_is_none_is_damaged",
 }
 
 
@@ -86,6 +90,7 @@ def asked_of(module: ModuleType) -> dict[str, object]:
 globals().update(
     asked_of(test_cache) | asked_of(test_file_table) | asked_of(test_fleet) | asked_of(test_snapshots)
 )
+globals().update(asked_of(test_ext_tables))
 three = test_cache.three
 
 
@@ -146,6 +151,7 @@ def fragile(own_server: Server, tmp_path: Path) -> Iterator[tuple[Server, ParamC
 
 def emptied(url: str) -> None:
     tables = "vehicle, component, param, history, birth, setback, snapshot, writer"
+    tables += ", ext_table, ext_param, ext_history"
     with psycopg.connect(url, options="-c search_path=paramclient", autocommit=True) as connection:
         [(is_there,)] = connection.execute("SELECT to_regclass('vehicle') IS NOT NULL")
         if is_there:
@@ -453,6 +459,39 @@ def test_a_station_works_on_locally_and_catches_up(fragile: tuple[Server, ParamC
     assert told(a, "PARAM_1") == [(10, 1, 10), (20, 10, 20)], "the copy has what the database had"
     assert a.away is not None
     running.start()
+
+
+def test_a_station_keeps_extended_parameters_and_catches_up(
+    fragile: tuple[Server, ParamCache, ParamCache],
+) -> None:
+    running, a, b = fragile
+    a.save_ext([test_ext_tables.learnt(CAM_MODE=1, CAM_NAME="Front", complete=True, count=2)])
+    assert b.load_ext(PX4.key, 100) is not None
+    until(lambda: is_copied(b))
+    running.kill()
+    assert test_ext_tables.values_in(b) == {"CAM_MODE": 1, "CAM_NAME": "Front"}
+    b.save_ext([test_ext_tables.learnt(CAM_MODE=7, at=NOW + 20, by="us")])
+    a.save_ext([test_ext_tables.learnt(CAM_MODE=3, CAM_NAME=b"\xff", at=NOW + 10)])
+    at_a: list[CacheChange] = []
+    a.subscribe(at_a.append)
+    running.start()
+    until(lambda: a.away is None and b.away is None)
+    until(lambda: at_a)
+    for cache in (a, b):
+        assert test_ext_tables.values_in(cache) == {"CAM_MODE": 7, "CAM_NAME": b"\xff"}
+        assert {each.at - NOW for each in cache.ext_history(PX4.key, name="CAM_NAME")} == {10.0}
+    until(lambda: is_copied(a))
+    running.kill()
+    assert test_ext_tables.values_in(a) == {"CAM_MODE": 7, "CAM_NAME": b"\xff"}
+    running.start()
+
+
+def test_a_damaged_table_of_extended_parameters_is_an_error(path: str, cache: ParamCache) -> None:
+    cache.save_ext([test_ext_tables.learnt(CAM_MODE=1)])
+    with psycopg.connect(path, options="-c search_path=paramclient", autocommit=True) as connection:
+        connection.execute("UPDATE ext_param SET raw = '\\x05'")
+    with pytest.raises(CacheError, match="extended parameters is not what was written"):
+        cache.load_ext(PX4.key, 100)
 
 
 def is_copied(cache: ParamCache) -> bool:

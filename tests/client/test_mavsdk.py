@@ -20,17 +20,22 @@ from typing import Any
 import anyio
 import pytest
 from mavsdk import ComponentType, Configuration, ConnectionResult, Mavsdk, log_subscribe, log_unsubscribe
+from mavsdk.plugins.camera_server import CameraServer
 from mavsdk.plugins.ftp_server import FtpServer
 from mavsdk.plugins.param_server import ParamServer
 
 from paramclient import (
     Encoding,
+    ExtParamType,
     LinkError,
+    NoReply,
     ParamClient,
     ParamType,
+    SetFailed,
     UnknownParameter,
     UsageError,
 )
+from paramclient.client.local import local
 from paramclient.links import Peer
 from tests.shell import PATIENCE, bits, residue, until
 
@@ -296,3 +301,98 @@ async def test_its_files_are_read_to_the_last_byte(loss: float, tmp_path: Path) 
                 }
                 for name, content in contents.items():
                     assert await files.read(f"/{name}") == content, name
+
+
+# extended parameters
+
+TEXTS = {"TEXT": "hello", "LONGEST": "x" * 128, "SIXTEEN_LETTERS_": "Übergröße", "EMPTY": ""}
+
+
+@asynccontextmanager
+async def with_extended(
+    kind: ComponentType, loss: float = 0.0
+) -> AsyncIterator[tuple[ParamClient, ParamServer]]:
+    """A client and a component of this kind, whose parameters are served by both protocols."""
+    configuration = Configuration.create_with_component_type(kind)
+    try:
+        with Mavsdk(configuration) as mavsdk:
+            vehicle = Vehicle(mavsdk)
+            for name, text in TEXTS.items():
+                vehicle.server.provide_param_custom(name, text)
+            if kind is ComponentType.CAMERA:
+                CameraServer(mavsdk.server_component())
+            async with ParamClient(LossyLink(vehicle, loss, seed=2), cache=False) as client:
+                with anyio.fail_after(PATIENCE):
+                    yield client, vehicle.server
+    finally:
+        configuration.destroy()
+
+
+ADDRESSES = {ComponentType.CAMERA: (1, 100), ComponentType.AUTOPILOT: (1, 1)}
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("kind", list(ADDRESSES))
+@pytest.mark.parametrize("loss", [0.0, 0.1])
+async def test_extended_parameters_of_every_type_that_it_has(kind: ComponentType, loss: float) -> None:
+    async with with_extended(kind, loss) as (client, server):
+        component = await client.component(*ADDRESSES[kind])
+        ext = component.ext
+        assert ext.is_expected is (kind is ComponentType.CAMERA)
+        result = await ext.fetch_all()
+        assert result.complete
+        assert (result.count, len(result.params)) == (1000 + len(TEXTS), 1000 + len(TEXTS))
+        for name, value in VALUES.items():
+            param = result.params[name]
+            is_whole = isinstance(value, int)
+            assert param.type is (ExtParamType.INT32 if is_whole else ExtParamType.REAL32)
+            assert int.from_bytes(param.raw, "little") == BITS[name]
+        for name, text in TEXTS.items():
+            param = result.params[name]
+            assert (param.value, param.type) == (text, ExtParamType.CUSTOM)
+            assert await ext.get(name) == param
+            assert param.index is not None
+            assert await ext.get(param.index) == param
+        assert (await ext.set("INT_001", -5000000)).actual == -5000000
+        assert server.retrieve_param_int("INT_001") == -5000000
+        assert (await ext.set("FLOAT_0000000001", 0.1)).actual == float32(0.1)
+        for text in ("", "y" * 128, "grün"):
+            done = await ext.set("TEXT", text)
+            assert (done.status, done.actual) == ("accepted", text)
+            assert server.retrieve_param_custom("TEXT") == text.encode()
+        assert not local(component).machine.is_busy
+
+
+@pytest.mark.asyncio
+async def test_what_it_does_with_other_extended_writes() -> None:
+    async with with_extended(ComponentType.CAMERA) as (client, server):
+        component = await client.component(1, 100)
+        ext = component.ext
+        await ext.fetch_all()
+        done = await ext.set("TEXT", b"A\0B")
+        assert (done.status, done.actual) == ("adjusted", "A"), "it cuts values at the first zero"
+        with pytest.raises(UnknownParameter):
+            await ext.set("NO_SUCH", 1)
+        with pytest.raises(UnknownParameter):
+            await ext.get("NO_SUCH")
+        table = local(component).machine.ext.table
+        known = table.params["INT_001"]
+        table.params["INT_001"] = type(known).of("INT_001", b"text", ExtParamType.CUSTOM, known.index)
+        with pytest.raises(SetFailed):
+            await ext.set("INT_001", "text")
+        result = await ext.set_many(dict.fromkeys(list(VALUES)[:100], 7))
+        assert [each.name for each in result.outcomes if not each.is_set] == ["INT_001"]
+        assert server.retrieve_param_int("INT_099") == 7
+
+
+@pytest.mark.asyncio
+async def test_its_two_tables_are_apart() -> None:
+    async with with_extended(ComponentType.CAMERA) as (client, _):
+        component = await client.component(1, 100)
+        plain = await component.fetch_all()
+        assert (plain.count, len(component.ext.params)) == (1000, 0)
+        extended = await component.ext.fetch_all()
+        assert (extended.count, component.count) == (1000 + len(TEXTS), 1000)
+        assert not set(TEXTS) & set(component.params)
+        with pytest.raises((NoReply, UnknownParameter)):
+            await component.get("TEXT", timeout=5.0)

@@ -18,7 +18,7 @@ from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_result import FetchResult, Policy
 from paramclient.protocol.params.list_download import REQUESTED_INDICES_MAX
-from paramclient.protocol.params.reads import Read
+from paramclient.protocol.params.reads import Read, ValueRead
 from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.params.write_batch import SetOutcome, SetStatus, WriteBatch
 from paramclient.protocol.params.writes import Write
@@ -481,7 +481,7 @@ class Sessions(RuleBasedStateMachine):
             machine = self.machine_of(begun.subject)
             if isinstance(begun.operation, Fetch):
                 machine.end_fetch(begun.operation, self.world.now)
-            elif isinstance(begun.operation, Read):
+            elif isinstance(begun.operation, ValueRead):
                 machine.reads.release(begun.operation)
             elif isinstance(begun.operation, WriteBatch):
                 machine.write_batches.end(begun.operation, self.world.now)
@@ -682,7 +682,7 @@ class Sessions(RuleBasedStateMachine):
             begun.subject.acts += 1
         elif isinstance(operation, Fetch):
             machine.end_fetch(operation, self.world.now)
-        elif isinstance(operation, Read):
+        elif isinstance(operation, ValueRead):
             machine.reads.release(operation)
 
     def check(self, begun: Begun) -> None:

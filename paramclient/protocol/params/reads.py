@@ -1,11 +1,15 @@
-"""PARAM_REQUEST_READ: order, pacing and outcomes. For timeouts and retries see `requests.retry`."""
+"""PARAM_REQUEST_READ: order, pacing and outcomes. For timeouts and retries see `requests.retry`.
+
+`ValueReads` has what the reads of plain and of extended parameters share.
+"""
 
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections import deque
 from collections.abc import Collection
-from typing import Final, Protocol, TypeAlias
+from typing import ClassVar, Final, Generic, Protocol, TypeAlias, TypeVar
 
 from paramclient.errors import (
     NoReply,
@@ -21,12 +25,21 @@ from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.requests.pacing import LinkBandwidth, Pace
 from paramclient.protocol.requests.retry import ReadAttempts, ReadRetries, RetryPolicy
-from paramclient.protocol.wire import PARAMETERS_MAX, ParamError, ParamRequestRead, ParamValue
+from paramclient.protocol.wire import (
+    PARAMETERS_MAX,
+    Message,
+    ParamError,
+    ParamExtValue,
+    ParamRequestRead,
+    ParamValue,
+)
 
-__all__ = ["Key", "Read", "Reads"]
+__all__ = ["Key", "Read", "Reads", "ValueRead", "ValueReads"]
 
 Key: TypeAlias = str | int
 """The parameter of a read: a name, or an index."""
+
+Response = TypeVar("Response", bound=ParamValue | ParamExtValue)
 
 CONTROL_INDEX: Final = 0
 """The index of the control read: every component with parameters has it. Used until another index is known to
@@ -35,8 +48,8 @@ COPY_RESERVE: Final = 2.0
 """Requests that the pacing must still allow when a request is sent again early."""
 
 
-class Read(Operation[ParamValue]):
-    """One PARAM_REQUEST_READ and its response, shared by all callers of the same parameter.
+class ValueRead(Operation[Response]):
+    """One request for a parameter and its response, shared by all callers of the same parameter.
 
     Attributes:
         key: name or index.
@@ -61,6 +74,10 @@ class Read(Operation[ParamValue]):
         return self.request.count
 
 
+Read: TypeAlias = ValueRead[ParamValue]
+"""One PARAM_REQUEST_READ and its response."""
+
+
 class KnownParams(Protocol):
     """The part of a table that tells an unknown parameter from a lost response."""
 
@@ -77,9 +94,9 @@ class KnownParams(Protocol):
         """The count that the component has sent on this link; None if it is only that of the cache."""
 
 
-class Reads(Machine):
-    """The reads of one component: paced by how fast it serves them, callers' reads before those of a
-    download.
+class ValueReads(Machine, Generic[Response]):
+    """The reads of one component by one protocol: paced by how fast it serves them, callers' reads before
+    those of a download.
 
     Silence is not a response: PX4 up to 1.17 and ArduPilot do not respond to a read of a parameter that they
     do not have. A silent read is therefore accompanied by a control read of an index that exists. If the
@@ -103,6 +120,9 @@ class Reads(Machine):
         sent_at: when a request was sent last.
     """
 
+    _what: ClassVar[str] = "parameter"
+    """What is read, in messages."""
+
     def __init__(
         self,
         context: Context,
@@ -118,11 +138,11 @@ class Reads(Machine):
         self._trace = context.trace
         self.asked = self.retries = 0
         self.pace = Pace(context.round_trip, share)
-        self._open: dict[Key, Read] = {}
-        self._in_flight: dict[Key, Read] = {}
-        self._again: deque[Read] = deque()
-        self._caller_queue: deque[Read] = deque()
-        self._fetch_queue: deque[Read] = deque()
+        self._open: dict[Key, ValueRead[Response]] = {}
+        self._in_flight: dict[Key, ValueRead[Response]] = {}
+        self._again: deque[ValueRead[Response]] = deque()
+        self._caller_queue: deque[ValueRead[Response]] = deque()
+        self._fetch_queue: deque[ValueRead[Response]] = deque()
         self.answered_at = self.sent_at = -math.inf
         self.list_runs_again = False
         self.is_idle = True
@@ -142,15 +162,15 @@ class Reads(Machine):
             return key in self._table.params
         return self._table.count is None or key < self._table.count
 
-    def awaits(self, message: ParamValue) -> bool:
+    def awaits(self, message: Response) -> bool:
         """Return whether this is the response to an open read."""
         return message.param_id in self._open or message.param_index in self._open
 
-    def ask(self, key: Key, now: float, *, urgent: bool = True) -> Read:
+    def ask(self, key: Key, now: float, *, urgent: bool = True) -> ValueRead[Response]:
         """Begin a read, or join an open one of the same parameter. Give it back with `release`."""
         read = self._open.get(key)
         if read is None:
-            read = Read(key, self._policy, now)
+            read = ValueRead(key, self._policy, now)
             self.asked += 1
             self._open[key] = read
             (self._caller_queue if urgent else self._fetch_queue).append(read)
@@ -162,7 +182,7 @@ class Reads(Machine):
         self._send_waiting(now, may_copy=False)  # other reads may begin at the same moment
         return read
 
-    def release(self, read: Read) -> None:
+    def release(self, read: ValueRead[Response]) -> None:
         """Give a read back. The last holder drops it."""
         read.holders -= 1
         if read.holders <= 0:
@@ -171,7 +191,7 @@ class Reads(Machine):
                 self._reschedule()
                 self._drop(read)
 
-    def heard(self, message: ParamValue, now: float) -> None:
+    def heard(self, message: Response, now: float) -> None:
         """Process a PARAM_VALUE of the component, after the table has stored it."""
         name, _, _, count, index = message
         wanted = self._open
@@ -194,7 +214,7 @@ class Reads(Machine):
             self._send_waiting(now)
         self._hear_control(index, count, now, is_answer=is_answer)
 
-    def defer(self, message: ParamValue, until: float, now: float) -> None:
+    def defer(self, message: Response, until: float, now: float) -> None:
         """Ignore a response whose value may be older than a PARAM_SET, and request it again at `until`."""
         is_answer = False
         for key in (message.param_id, message.param_index):
@@ -235,7 +255,7 @@ class Reads(Machine):
         system, component = self._target
         name, index = (key, None) if isinstance(key, str) else (None, key)
         words = ParamErrorCode.name_of(message.error)
-        what = name if name is not None else f"parameter {index}"
+        what = name if name is not None else f"{self._what} {index}"
         if message.error == ParamErrorCode.DOES_NOT_EXIST:
             return self._unknown(key)
         if message.error == ParamErrorCode.TYPE_MISMATCH:
@@ -324,7 +344,7 @@ class Reads(Machine):
                 self._drop(read)
                 read.fail(error, now)
 
-    def _due_at(self, read: Read) -> float:
+    def _due_at(self, read: ValueRead[Response]) -> float:
         """Return when a read in flight times out, or is sent again."""
         return min(read.request.due_at, read.ask_again_at)
 
@@ -334,10 +354,10 @@ class Reads(Machine):
         in_flight = sum(1 + each.copies for each in requests if each.sent_at < math.inf)
         return self._retries.serving_time(in_flight, self.pace.quickest)
 
-    def _seems_unknown(self, read: Read) -> bool:
+    def _seems_unknown(self, read: ValueRead[Response]) -> bool:
         return self._retries.seems_unknown(read.request, is_known=self._is_known(read.key))
 
-    def _count_answer(self, read: Read, now: float) -> None:
+    def _count_answer(self, read: ValueRead[Response], now: float) -> None:
         self._note_response(now)
         if self.list_runs_again and isinstance(read.key, int):
             return
@@ -349,7 +369,7 @@ class Reads(Machine):
         self.answered_at = now
         self.reset_timeouts()
 
-    def _timeout_error(self, read: Read, now: float) -> Exception:
+    def _timeout_error(self, read: ValueRead[Response], now: float) -> Exception:
         count = self._table.live_count
         if isinstance(read.key, int) and count is not None and read.key >= count:
             return self._unknown(read.key, f": it has {count}, counted from 0")
@@ -360,7 +380,7 @@ class Reads(Machine):
     def _unknown(self, key: Key, reason: str = "") -> UnknownParameter:
         system, component = self._target
         name, index = (key, None) if isinstance(key, str) else (None, key)
-        text = f"{system}/{component} has no {f'parameter {index}' if name is None else name}{reason}"
+        text = f"{system}/{component} has no {f'{self._what} {index}' if name is None else name}{reason}"
         nearest = () if name is None else nearest_names(name, self._table.params)
         if nearest:
             text = f"{text}.{did_you_mean(nearest)}"
@@ -369,7 +389,7 @@ class Reads(Machine):
         )
 
     def _name(self, key: Key) -> str:
-        what = key if isinstance(key, str) else f"parameter {key}"
+        what = key if isinstance(key, str) else f"{self._what} {key}"
         return f"{what} of {self._target[0]}/{self._target[1]}"
 
     @property
@@ -377,7 +397,7 @@ class Reads(Machine):
         """Whether no request is unanswered: one more cannot make a queue."""
         return not self._in_flight and self.answered_at >= self.sent_at
 
-    def _transmit(self, read: Read, now: float, *, is_charged: bool = True) -> None:
+    def _transmit(self, read: ValueRead[Response], now: float, *, is_charged: bool = True) -> None:
         read.request.sent(now)
         self.retries += read.attempts > 1
         read.request.serving_time = self._time_to_serve() if self.pace.is_batched else 0.0
@@ -388,12 +408,13 @@ class Reads(Machine):
         if read.key != self.control and self._retries.needs_control(read.request, is_known=is_known):
             self._send_control(now)
 
-    def _request(self, read: Read, now: float) -> None:
+    def _request(self, read: ValueRead[Response], now: float) -> None:
         self.sent_at = now
-        if isinstance(read.key, int):
-            self._send(ParamRequestRead(*self._target, "", read.key))
-        else:
-            self._send(ParamRequestRead(*self._target, read.key, -1))
+        self._send(self._message_for(read.key))
+
+    @abstractmethod
+    def _message_for(self, key: Key) -> Message:
+        """Return the request for a parameter."""
 
     def _send_control(self, now: float) -> None:
         """Send a control read, unless another one or a read of that index is in flight."""
@@ -403,7 +424,7 @@ class Reads(Machine):
             self.control = CONTROL_INDEX  # the vehicle has fewer parameters by now
         self._control_index = self.control
         self.pace.sent(now)
-        self._send(ParamRequestRead(*self._target, "", self.control))
+        self._send(self._message_for(self.control))
 
     def _send_waiting(self, now: float, *, may_copy: bool = True) -> None:
         """Send waiting requests as the rate limit allows; on an idle link, send copies instead of waiting.
@@ -431,7 +452,7 @@ class Reads(Machine):
             self.pace.sent(now)
             self._request(read_again, now)
 
-    def _copy_wanted(self) -> Read | None:
+    def _copy_wanted(self) -> ValueRead[Response] | None:
         """Return a read for which a copy is worthwhile while its response may be on the way."""
         if not self.is_idle or not self._in_flight:
             return None
@@ -442,8 +463,17 @@ class Reads(Machine):
         is_in_flight = fewest.request.sent_at < math.inf
         return fewest if fewest.request.copies < most and is_in_flight else None
 
-    def _drop(self, read: Read) -> None:
+    def _drop(self, read: ValueRead[Response]) -> None:
         del self._open[read.key]
         self._in_flight.pop(read.key, None)
         if not self._open:
             self.pace.idle()
+
+
+class Reads(ValueReads[ParamValue]):
+    """The PARAM_REQUEST_READs to one component; see `ValueReads`."""
+
+    def _message_for(self, key: Key) -> Message:
+        if isinstance(key, int):
+            return ParamRequestRead(*self._target, "", key)
+        return ParamRequestRead(*self._target, key, -1)

@@ -13,9 +13,9 @@ from paramclient.protocol.params.table import Table
 from paramclient.protocol.params.writes import Write
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
-from paramclient.protocol.wire import ParamValue
+from paramclient.protocol.wire import ParamExtValue, ParamValue
 
-__all__ = ["LATER_CHANGE_TIME", "Rereads", "ValueChecks"]
+__all__ = ["LATER_CHANGE_TIME", "READS_PAUSE", "REREADS_MAX", "Rereads", "ValueChecks"]
 
 AMBIGUITY_WINDOW: Final = 0.3
 """Seconds after a change in which a PARAM_VALUE with the previous value is ambiguous: ArduPilot takes the
@@ -132,7 +132,7 @@ class ValueChecks:
         return bool(self._replaced)
 
     def replaced(
-        self, name: str, number: int, old: bytes, new: ParamValue, now: float, sent_at: float
+        self, name: str, number: int, old: bytes, new: ParamValue | ParamExtValue, now: float, sent_at: float
     ) -> None:
         """Record that a value has changed.
 
@@ -151,7 +151,7 @@ class ValueChecks:
         if len(self._replaced) > REPLACED_MAX:
             del self._replaced[next(iter(self._replaced))]
 
-    def ambiguous_until(self, message: ParamValue, now: float, *, is_wanted: bool) -> float:
+    def ambiguous_until(self, message: ParamValue | ParamExtValue, now: float, *, is_wanted: bool) -> float:
         """Return until when the value of a message may be older than the last change.
 
         Args:

@@ -23,7 +23,16 @@ from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.requests.pacing import WriteWindow
 
-__all__ = ["BatchRules", "SetManyResult", "SetOutcome", "SetStatus", "WriteBatch", "WriteBatches"]
+__all__ = [
+    "UNANSWERED_WRITES_MAX",
+    "BatchRules",
+    "SetManyResult",
+    "SetOutcome",
+    "SetStatus",
+    "WriteBatch",
+    "WriteBatches",
+    "is_refusal",
+]
 
 UNANSWERED_WRITES_MAX: Final = 3
 """Consecutive writes without an acknowledgement, each after all its attempts, after which no further write is
@@ -75,7 +84,8 @@ class SetOutcome:
         """The value that the vehicle has reported after the write; None if it has reported none."""
         if self.result is not None:
             return self.result.actual
-        return self.error.actual if isinstance(self.error, ValueNotApplied) else None
+        actual = self.error.actual if isinstance(self.error, ValueNotApplied) else None
+        return None if isinstance(actual, str) else actual
 
     def __str__(self) -> str:
         if self.result is not None and self.error is None:
@@ -178,7 +188,7 @@ class WriteBatch(Operation[tuple[SetOutcome, ...]]):
             try:
                 write = self._rules.begin(name, value, now)
             except ParamClientError as error:
-                if _is_refusal(error):
+                if is_refusal(error):
                     self._record(number, SetStatus.REFUSED, error=error)
                 else:
                     self.stop(error)
@@ -259,7 +269,7 @@ class WriteBatch(Operation[tuple[SetOutcome, ...]]):
             self._record(number, SetStatus(result.status), result=result)
             return
         assert isinstance(error, ParamClientError)
-        if _is_refusal(error):
+        if is_refusal(error):
             self._unanswered = 0
             self._record(number, SetStatus.REFUSED, error=error)
         else:
@@ -336,7 +346,7 @@ class WriteBatches(Machine):
             batch.stop(error)
 
 
-def _is_refusal(error: ParamClientError) -> bool:
+def is_refusal(error: ParamClientError) -> bool:
     """Return whether an error is about one value; otherwise it is about the vehicle or the link."""
     return isinstance(error, (UsageError, VehicleError)) and not isinstance(error, ContestedAddress)
 

@@ -4,10 +4,10 @@
 request has a class of its own, whose objects count the attempts of one request:
 
 - `Attempts`: the rule that the others refine.
-- `WriteAttempts`: PARAM_SET.
+- `WriteAttempts`: PARAM_SET. `ExtWriteAttempts`: PARAM_EXT_SET.
 - `CommandAttempts`: COMMAND_LONG. `MessageAttempts`, `VersionAttempts`: MAV_CMD_REQUEST_MESSAGE.
 - `ReadAttempts`, `ReadRetries`: PARAM_REQUEST_READ. `NameRetries`: the search for names.
-- `ListAttempts`: PARAM_REQUEST_LIST.
+- `ListAttempts`: PARAM_REQUEST_LIST. `ExtListAttempts`: PARAM_EXT_REQUEST_LIST.
 - `FileAttempts`, `BurstAttempts`, `BlockRetries`: MAVFTP. `OpenRetries`: the parameter file.
 - `Schedule`, `ClockSchedule`: requests at fixed times, where no round trip is measured.
 
@@ -51,6 +51,8 @@ __all__ = [
     "BurstAttempts",
     "ClockSchedule",
     "CommandAttempts",
+    "ExtListAttempts",
+    "ExtWriteAttempts",
     "FileAttempts",
     "ListAttempts",
     "MessageAttempts",
@@ -324,6 +326,57 @@ class WriteAttempts(Attempts):
         """Seconds from another value than the written one until the value is read: an old response is at most
         about one round trip ahead of the valid one."""
         return max(self.timeout / 2, OLD_VALUE_DELAY_MIN)
+
+
+# PARAM_EXT_SET
+
+EXT_PROGRESS_TIMEOUT: Final = 10.0
+"""Seconds for which PARAM_ACK_IN_PROGRESS is valid. The component sends the result without a request; only a
+lost one needs another PARAM_EXT_SET, which a component at work answers with its state (MAVLink,
+common.xml)."""
+EXT_PROGRESS_TIMEOUT_LOSSY: Final = 2.0
+"""The same in seconds on a link that loses packets, and so results."""
+
+
+class ExtWriteAttempts(WriteAttempts):
+    """The attempts of one PARAM_EXT_SET.
+
+    Attributes:
+        progress_at: when the component reported last that it works on the write, or None.
+    """
+
+    __slots__ = ("progress_at",)
+
+    def __init__(self, policy: RetryPolicy) -> None:
+        super().__init__(policy)
+        self.progress_at: float | None = None
+
+    @property
+    def due_at(self) -> float:
+        """When the attempt, or the result after a report of progress, counts as lost."""
+        if self.progress_at is None:
+            return self.sent_at + self.timeout
+        is_lossy = self._policy.is_lossy
+        return self.progress_at + (EXT_PROGRESS_TIMEOUT_LOSSY if is_lossy else EXT_PROGRESS_TIMEOUT)
+
+    def sent(self, now: float) -> None:
+        super().sent(now)
+        self.progress_at = None
+
+    def progressed(self, now: float, *, is_sure: bool) -> None:
+        """Record a report of progress: the component has the request, so that earlier attempts do not
+        count."""
+        self.answered(now, is_sure=is_sure)
+        self.progress_at = now
+        self.count = min(self.count, 1)
+
+    def answered(self, now: float, *, is_sure: bool = True) -> None:
+        if self.progress_at is None:  # later acknowledgements are no response to the request
+            super().answered(now, is_sure=is_sure)
+
+    def timed_out(self) -> None:
+        if self.progress_at is None:
+            super().timed_out()
 
 
 # COMMAND_LONG
@@ -905,6 +958,52 @@ class ListAttempts(Attempts):
         if longest is None:
             return max(LIST_SILENCE_MIN if is_near_end else STREAM_PAUSE_MAX, timeout)
         return max(QUIET_GAPS * longest, SILENCE_AT_PACE_MIN if is_near_end else STREAM_PAUSE_MAX)
+
+
+EXT_UNHEARD_ATTEMPTS: Final = 6
+"""Requests for the list to a component that has never sent an extended parameter: with half of the exchanges
+lost, all of them are lost once in 60 times."""
+EXT_LISTS_MAX: Final = 3
+"""Requests for a list of extended parameters, after which missing ones are read singly."""
+EXT_SINGLE_READS: Final = 16
+"""Missing extended parameters that are read singly in any case: sooner done than another list."""
+EXT_SINGLE_READS_SHARE: Final = 0.25
+"""The same as a share of all."""
+
+
+class ExtListAttempts(ListAttempts):
+    """The requests for a list of extended parameters, until its first value.
+
+    Most components have no extended parameters, and do not say so: a component that has never sent one is
+    given up after a few attempts, and its silence tells nothing of the link. `ListAttempts` waits longer,
+    for a vehicle that boots.
+
+    Attributes:
+        is_spoken: whether the component has sent an extended parameter.
+    """
+
+    __slots__ = ("is_spoken",)
+
+    def __init__(self, policy: RetryPolicy, now: float, *, is_spoken: bool) -> None:
+        super().__init__(policy, now)
+        self.is_spoken = is_spoken
+
+    def should_list_again(self, missing: int, count: int, lists: int) -> bool:
+        """Return whether to request the list again rather than to read what it lacks.
+
+        Args:
+            missing: the number of missing parameters.
+            count: the number of all parameters.
+            lists: the number of lists so far.
+        """
+        return lists < EXT_LISTS_MAX and missing > max(EXT_SINGLE_READS, EXT_SINGLE_READS_SHARE * count)
+
+    def should_give_up(self, now: float) -> bool:
+        return super().should_give_up(now) if self.is_spoken else self.count >= EXT_UNHEARD_ATTEMPTS
+
+    def timed_out(self) -> None:
+        if self.is_spoken:
+            super().timed_out()
 
 
 # MAVFTP requests

@@ -9,6 +9,9 @@ from paramclient.protocol.wire import (
     CommandLong,
     FileTransfer,
     Message,
+    ParamExtRequestList,
+    ParamExtRequestRead,
+    ParamExtSet,
     ParamRequestList,
     ParamRequestRead,
     ParamSetMessage,
@@ -40,6 +43,12 @@ class LazyMessageText:
                 return "PARAM_REQUEST_LIST"
             case ParamSetMessage(param_id=name, raw=raw, param_type=number):
                 return f"PARAM_SET {name} to {raw.hex()} of type {number}"
+            case ParamExtRequestRead(param_id=name, param_index=index):
+                return f"PARAM_EXT_REQUEST_READ {name if index < 0 else index}"
+            case ParamExtRequestList():
+                return "PARAM_EXT_REQUEST_LIST"
+            case ParamExtSet(param_id=name, raw=raw, param_type=number):
+                return f"PARAM_EXT_SET {name} to {raw.hex()} of type {number}"
             case CommandLong(command=command, params=params):
                 return f"COMMAND_LONG {command} ({params[0]:g})"
             case FileTransfer(payload=payload):

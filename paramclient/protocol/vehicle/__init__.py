@@ -4,6 +4,7 @@
 `boot_time_sampling`: reads of clocks in telemetry.
 `claims`: what one peer sends under an address.
 `commands`: COMMAND_LONG, and the messages that are requested with it.
+`extended_kinds`: kinds of components with extended parameters.
 `identification`: identity and parameter encoding.
 `kinds`: autopilots and vehicle types as text.
 `metadata_location`: COMPONENT_METADATA.

@@ -13,6 +13,7 @@ from typing import Final
 from paramclient.protocol.wire.frames import Frame, build_frame
 from paramclient.protocol.wire.messages import (
     COMPONENT_METADATA_ID,
+    PARAM_EXT_VALUE_ID,
     PARAM_VALUE_ID,
     AutopilotVersion,
     CommandAck,
@@ -23,6 +24,11 @@ from paramclient.protocol.wire.messages import (
     HighLatency2,
     Message,
     ParamError,
+    ParamExtAck,
+    ParamExtRequestList,
+    ParamExtRequestRead,
+    ParamExtSet,
+    ParamExtValue,
     ParamRequestList,
     ParamRequestRead,
     ParamSetMessage,
@@ -95,6 +101,9 @@ _PARAM_VALUE = struct.Struct("<4sHH16sB")
 _PARAM_SET = struct.Struct("<4sBB16sB")
 _STATUSTEXT = struct.Struct("<B50s")  # the extension fields, for long texts in pieces, are not read
 _PARAM_ERROR = struct.Struct("<hBB16sB")
+_PARAM_EXT_VALUE = struct.Struct("<HH16s128sB")
+_PARAM_EXT_SET = struct.Struct("<BB16s128sB")
+_PARAM_EXT_ACK = struct.Struct("<16s128sBB")
 _FILE_TRANSFER = struct.Struct("<BBB251s")
 _SYSTEM_TIME = struct.Struct("<QI")
 _HIGH_LATENCY2 = struct.Struct("<24xBB16x")
@@ -155,6 +164,30 @@ def _decode_param_error(payload: bytes) -> ParamError:
     return ParamError(system, component, text_of(name), index, error)
 
 
+def _decode_param_ext_request_read(payload: bytes) -> ParamExtRequestRead:
+    index, system, component, name = _fields(_PARAM_REQUEST_READ, payload)
+    return ParamExtRequestRead(system, component, text_of(name), index)
+
+
+def _decode_param_ext_request_list(payload: bytes) -> ParamExtRequestList:
+    return ParamExtRequestList(*_fields(_PARAM_REQUEST_LIST, payload))
+
+
+def _decode_param_ext_value(payload: bytes) -> ParamExtValue:
+    count, index, name, raw, number = _fields(_PARAM_EXT_VALUE, payload)
+    return ParamExtValue(text_of(name), raw, number, count, index)
+
+
+def _decode_param_ext_set(payload: bytes) -> ParamExtSet:
+    system, component, name, raw, number = _fields(_PARAM_EXT_SET, payload)
+    return ParamExtSet(system, component, text_of(name), raw, number)
+
+
+def _decode_param_ext_ack(payload: bytes) -> ParamExtAck:
+    name, raw, number, result = _fields(_PARAM_EXT_ACK, payload)
+    return ParamExtAck(text_of(name), raw, number, result)
+
+
 def _decode_file_transfer(payload: bytes) -> FileTransfer:
     return FileTransfer(*_fields(_FILE_TRANSFER, payload))
 
@@ -192,6 +225,11 @@ _DECODERS: dict[int, Callable[[bytes], Message]] = {
     235: _decode_high_latency2,
     253: _decode_statustext,
     256: _decode_setup_signing,
+    320: _decode_param_ext_request_read,
+    321: _decode_param_ext_request_list,
+    PARAM_EXT_VALUE_ID: _decode_param_ext_value,
+    323: _decode_param_ext_set,
+    324: _decode_param_ext_ack,
     345: _decode_param_error,
     COMPONENT_METADATA_ID: _decode_component_metadata,
 }
@@ -255,6 +293,23 @@ _ENCODERS: dict[type, Callable[..., tuple[int, bytes]]] = {
     ParamError: lambda m: (
         345,
         _PARAM_ERROR.pack(m.param_index, m.target_system, m.target_component, _name(m.param_id), m.error),
+    ),
+    ParamExtRequestRead: lambda m: (
+        320,
+        _PARAM_REQUEST_READ.pack(m.param_index, m.target_system, m.target_component, _name(m.param_id)),
+    ),
+    ParamExtRequestList: lambda m: (321, _PARAM_REQUEST_LIST.pack(m.target_system, m.target_component)),
+    ParamExtValue: lambda m: (
+        PARAM_EXT_VALUE_ID,
+        _PARAM_EXT_VALUE.pack(m.param_count, m.param_index, _name(m.param_id), m.raw, m.param_type),
+    ),
+    ParamExtSet: lambda m: (
+        323,
+        _PARAM_EXT_SET.pack(m.target_system, m.target_component, _name(m.param_id), m.raw, m.param_type),
+    ),
+    ParamExtAck: lambda m: (
+        324,
+        _PARAM_EXT_ACK.pack(_name(m.param_id), m.raw, m.param_type, m.param_result),
     ),
     SystemTime: lambda m: (2, _SYSTEM_TIME.pack(m.time_unix_usec, m.time_boot_ms)),
     HighLatency2: lambda m: (235, _HIGH_LATENCY2.pack(m.type, m.autopilot)),

@@ -45,8 +45,14 @@ __all__ = [
     "PARAMETERS_MAX",
     "Message",
     "NO_INDEX",
+    "PARAM_EXT_VALUE_ID",
     "PARAM_VALUE_ID",
     "ParamError",
+    "ParamExtAck",
+    "ParamExtRequestList",
+    "ParamExtRequestRead",
+    "ParamExtSet",
+    "ParamExtValue",
     "ParamRequestList",
     "ParamRequestRead",
     "ParamSetMessage",
@@ -84,6 +90,7 @@ MAV_STATE_ACTIVE: Final = 4
 HEARTBEAT_ID: Final = 0
 SYSTEM_TIME_ID: Final = 2
 PARAM_VALUE_ID: Final = 22
+PARAM_EXT_VALUE_ID: Final = 322
 AUTOPILOT_VERSION_ID: Final = 148
 COMPONENT_METADATA_ID: Final = 397
 MAV_CMD_PREFLIGHT_STORAGE: Final = 245
@@ -189,6 +196,53 @@ class ParamError:
 
 
 @dataclass(frozen=True, slots=True)
+class ParamExtRequestRead:
+    """PARAM_EXT_REQUEST_READ by `param_index`, or by `param_id` where the index is −1."""
+
+    target_system: int
+    target_component: int
+    param_id: str
+    param_index: int = -1
+
+
+@dataclass(frozen=True, slots=True)
+class ParamExtRequestList:
+    target_system: int
+    target_component: int
+
+
+class ParamExtValue(NamedTuple):
+    """PARAM_EXT_VALUE, with the fields of `ParamValue`; `raw` has 128 bytes, undecoded."""
+
+    param_id: str
+    raw: bytes
+    param_type: int
+    param_count: int
+    param_index: int
+
+
+@dataclass(frozen=True, slots=True)
+class ParamExtSet:
+    """PARAM_EXT_SET; `raw` has up to 128 bytes, 128 when decoded."""
+
+    target_system: int
+    target_component: int
+    param_id: str
+    raw: bytes
+    param_type: int
+
+
+@dataclass(frozen=True, slots=True)
+class ParamExtAck:
+    """PARAM_EXT_ACK; `raw` is the new value if the result is PARAM_ACK_ACCEPTED."""
+
+    param_id: str
+    raw: bytes
+    param_type: int
+    param_result: int
+
+
+@dataclass(frozen=True, slots=True)
 class StatusText:
     severity: int
     text: str
@@ -251,6 +305,11 @@ Message: TypeAlias = (
     | ParamValue
     | ParamSetMessage
     | ParamError
+    | ParamExtRequestRead
+    | ParamExtRequestList
+    | ParamExtValue
+    | ParamExtSet
+    | ParamExtAck
     | StatusText
     | FileTransfer
     | SystemTime

@@ -1,0 +1,158 @@
+"""Tables of extended parameters and their history: updates, reads, and copies between stores.
+
+The rules are those of plain tables, without hash, snapshots and earlier states: the later of two observations
+of a value counts, and every change of a stored value leaves a line of history in the same transaction. An
+observation that comes later than a newer one is dropped.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from paramclient.cache.cells import time_cell
+from paramclient.cache.ext_records import (
+    CachedExtTable,
+    ExtLine,
+    ExtTableUpdate,
+    StoredExtParam,
+    ext_checksum,
+)
+from paramclient.cache.param_columns import BY_VEHICLE
+from paramclient.cache.reconciliation import reconcile
+from paramclient.cache.records import TableUpdate
+from paramclient.cache.snapshots import CLOCK_SLACK
+from paramclient.cache.tables import HISTORY_LINES
+from paramclient.cache.transaction import ExtState, Session
+from paramclient.model.ext_params import ExtParam
+
+__all__ = ["ExtDump", "load_ext", "put_ext", "save_ext", "take_ext"]
+
+
+@dataclass(frozen=True)
+class ExtDump:
+    """All stored data of one table of extended parameters.
+
+    Attributes:
+        count, complete: as in `CachedExtTable`.
+        rows: its parameters by name.
+        lines: its history lines, in order.
+    """
+
+    count: int | None
+    complete: bool
+    rows: Mapping[str, StoredExtParam]
+    lines: tuple[ExtLine, ...]
+
+    @property
+    def heard_last(self) -> float:
+        """The time of the last observation; minus infinity for an empty table."""
+        return max((row.heard_at for row in self.rows.values()), default=-math.inf)
+
+    def lacks(self, other: ExtDump) -> str | None:
+        """Return what this table lacks of another one; None if it has all of it, or later data."""
+        removed = {line[1] for line in self.lines if line[5] is None}
+        for name, row in other.rows.items():
+            mine = self.rows.get(name)
+            if (mine is None and name not in removed) or (mine is not None and mine.heard_at < row.heard_at):
+                return f"extended parameter {name}"
+        first = self.lines[0][0] if len(self.lines) >= HISTORY_LINES else 0.0
+        if any(line[0] >= first for line in set(other.lines) - set(self.lines)):
+            return "a line of the history of extended parameters"
+        return None
+
+    def joined(self, other: ExtDump) -> ExtDump:
+        """Return the union of one table of two stores: the later observation of a value counts."""
+        rows = dict(self.rows)
+        for name, row in other.rows.items():
+            mine = rows.get(name)
+            if mine is None or mine.heard_at < row.heard_at:
+                rows[name] = row
+        lines = sorted(dict.fromkeys((*self.lines, *other.lines)), key=lambda line: line[0])
+        gone = {line[1]: line[0] for line in lines if line[5] is None}
+        rows = {name: row for name, row in rows.items() if row.heard_at > gone.get(name, -math.inf)}
+        later = max(self, other, key=lambda each: each.heard_last)
+        is_complete = later.complete and set(rows) == set(later.rows)
+        return ExtDump(later.count, is_complete, rows, tuple(lines[-HISTORY_LINES:]))
+
+
+def save_ext(session: Session, updates: Iterable[ExtTableUpdate], present: float | None = None) -> None:
+    """Write updates, see `ParamCache.save_ext`.
+
+    Args:
+        session: the transaction.
+        updates: the updates, in order of execution.
+        present: current time by the clock of the updates, in unix seconds; None uses `at` of each update.
+    """
+    for update in updates:
+        for row in update.params:
+            time_cell(row.heard_at)
+        known = TableUpdate(
+            identity=update.identity, component=update.component, autopilot=update.autopilot, at=update.at
+        )
+        reconcile(session, [known], present)
+        owner = session.owner_of(update.identity.key, update.component)
+        assert owner is not None, "it was written just now"
+        now = max(time_cell(update.at), 0.0 if present is None else present)
+        _write(session, owner, update, math.inf if session.is_shared else now + CLOCK_SLACK)
+
+
+def _write(session: Session, owner: int, update: ExtTableUpdate, horizon: float) -> None:
+    """Write the values of an update. A stored time after `horizon` is older than every observation."""
+    before = session.ext_rows(owner)
+    after = dict(before)
+    lines: list[ExtLine] = []
+    for name, at in update.removed.items():
+        old = after.get(name)
+        if old is not None and not at < old.heard_at <= horizon:
+            del after[name]
+            lines.append((time_cell(at), name, BY_VEHICLE, old.type, old.raw, None, None))
+    for new in update.params:
+        old = after.get(new.name)
+        if old is None:
+            after[new.name] = new._replace(by="")
+        elif not new.heard_at < old.heard_at <= horizon:
+            index = old.param_index if new.param_index is None else new.param_index
+            after[new.name] = new._replace(param_index=index, by="")
+            if not old.param.same_value(new.param):
+                lines.append((new.heard_at, new.name, new.by, old.type, old.raw, new.type, new.raw))
+    state = session.ext_state(owner)
+    count = update.count if update.count is not None or state is None else state.count
+    complete = update.complete
+    if complete is None:
+        complete = state is not None and state.complete
+    session.put_ext_rows(owner, before, after)
+    session.put_ext_state(owner, ExtState(count, complete, ext_checksum(after)))
+    if lines:
+        session.add_ext_lines(owner, lines)
+        session.trim_ext_lines(owner, HISTORY_LINES)
+
+
+def load_ext(session: Session, key: str, component: int) -> CachedExtTable | None:
+    """Return the extended parameters of a component; None if there are none."""
+    owner = session.owner_of(key, component)
+    state = None if owner is None else session.ext_state(owner)
+    if owner is None or state is None:
+        return None
+    rows = session.ext_rows(owner)
+    params: dict[str, ExtParam] = {name: row.param for name, row in rows.items()}
+    heard_at = {name: row.heard_at for name, row in rows.items()}
+    return CachedExtTable(key, component, params, heard_at, state.count, state.complete)
+
+
+def take_ext(session: Session, owner: int) -> ExtDump | None:
+    """Return all stored data of a table of extended parameters; None if there is none."""
+    state = session.ext_state(owner)
+    if state is None:
+        return None
+    return ExtDump(state.count, state.complete, session.ext_rows(owner), tuple(session.ext_lines(owner)))
+
+
+def put_ext(session: Session, owner: int, whole: ExtDump | None) -> None:
+    """Replace a table of extended parameters; None removes it."""
+    session.drop_ext(owner)
+    if whole is not None:
+        session.put_ext_rows(owner, {}, whole.rows)
+        session.put_ext_state(owner, ExtState(whole.count, whole.complete, ext_checksum(whole.rows)))
+        session.add_ext_lines(owner, whole.lines)

@@ -1,0 +1,534 @@
+"""Extended parameters in the subcommands fetch, get, set, show, save, diff and apply."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+import anyio
+import anyio.to_thread
+
+from paramclient.cache import CachedExtTable, ParamCache
+from paramclient.cli.exit_codes import ExitCode, code_of
+from paramclient.cli.options import CacheOptions, LinkOptions
+from paramclient.cli.output import print_document, print_table, printable, progress_bar, report, say
+from paramclient.cli.session import CommandSession, connect
+from paramclient.cli.sources import check_link, is_file, names_vehicle, tables_in
+from paramclient.errors import FileError, NoReply, NotInCache, UnknownParameter, UsageError
+from paramclient.files import FileForm
+from paramclient.files.extended_document import (
+    ExtParamFile,
+    is_extended_file,
+    read_extended_file,
+    write_extended_file,
+)
+from paramclient.model.ext_params import (
+    ExtParam,
+    ExtParamType,
+    ExtValue,
+    check_ext_value,
+    encode_ext_value,
+    ext_type_name,
+    format_ext_value,
+)
+from paramclient.model.notation import time_text
+from paramclient.model.values import check_name
+from paramclient.model.wording import counted, first_of
+from paramclient.protocol.ext.write_batch import ExtSetOutcome
+from paramclient.protocol.vehicle.extended_kinds import expects_extended
+
+__all__ = [
+    "apply_extended",
+    "check_choice",
+    "diff_extended",
+    "fetch_extended",
+    "get_extended",
+    "history_extended",
+    "is_extended_link",
+    "is_extended_session",
+    "is_extended_source",
+    "may_be_extended",
+    "save_extended",
+    "set_extended",
+    "show_extended",
+    "text_pairs",
+    "verify_extended",
+]
+
+PROBE_TIMEOUT: Final = 2.0
+"""Seconds in which a component of a kind that usually has extended parameters must send one, before its plain
+ones are used: four attempts, where nothing is known of the link."""
+HEX: Final = "hex:"
+"""The prefix of a value that is given as bytes in hexadecimal."""
+NAMES_SHOWN_MAX: Final = 20
+"""Names that a message lists; it gives the number of further ones."""
+
+
+def check_choice(*, extended: bool, plain: bool) -> None:
+    """Check that not both protocols are chosen.
+
+    Raises:
+        UsageError: they are.
+    """
+    if extended and plain:
+        raise UsageError("--extended and --plain exclude each other")
+
+
+def may_be_extended(options: LinkOptions, *, extended: bool, plain: bool) -> bool:
+    """Return whether the component that the options name may turn out to have extended parameters."""
+    is_likely = options.component is not None and expects_extended(None, options.component)
+    return extended or (is_likely and not plain)
+
+
+async def is_extended_session(session: CommandSession, *, extended: bool, plain: bool) -> bool:
+    """Return whether to use the extended parameters of the component.
+
+    Without a choice of the user, a component that usually has them is asked for its first one.
+    """
+    if extended or plain or session.client.listens_only:
+        return extended
+    if not _has_extended_calls(session):
+        return False
+    ext = session.component.ext
+    if ext.is_spoken or not ext.is_expected:
+        return ext.is_spoken
+    try:
+        await ext.get(0, timeout=session.deadline.left(PROBE_TIMEOUT))
+    except (NoReply, UnknownParameter):
+        return False
+    return True
+
+
+def is_extended_source(text: str) -> bool:
+    """Return whether an argument names a file of extended parameters."""
+    return is_file(text) and is_extended_file(text)
+
+
+# fetch, get, set
+
+
+async def fetch_extended(session: CommandSession) -> ExitCode:
+    """Fetch and print all extended parameters."""
+    options = session.options
+    component = session.component
+    with progress_bar(f"fetching {session.label}") as progress:
+        result = await component.ext.fetch_all(timeout=session.deadline.left(), progress=progress)
+    for note in result.notes:
+        report(note)
+    params = _by_index(result.params.values())
+    if options.json:
+        from paramclient.documents.extended_output import ExtFetchOutputDoc  # only here: loads pydantic
+
+        print_document(ExtFetchOutputDoc.of(result, params))
+    else:
+        print_table([*_COLUMNS, "trust"], ((*_cells(each), each.trust) for each in params), right="index")
+        of = "" if result.count is None or not result.missing else f" of {result.count}"
+        say(
+            printable(
+                f"{len(params)}{of} extended parameters of {session.label} from {result.source} in "
+                f"{result.elapsed:.2f} s"
+            )
+        )
+    if result.missing:
+        indices = first_of(result.missing, NAMES_SHOWN_MAX)
+        report(f"incomplete: indices {indices} of {session.label} were not received; run the command again")
+        return ExitCode.INCOMPLETE
+    return ExitCode.DONE
+
+
+async def get_extended(session: CommandSession, names: Sequence[str]) -> ExitCode:
+    """Read and print single extended parameters."""
+    found: dict[str, ExtParam] = {}
+    errors: list[NoReply | UnknownParameter] = []
+
+    async def read(name: str) -> None:
+        try:
+            found[name] = await session.component.ext.get(name, timeout=session.deadline.left())
+        except (NoReply, UnknownParameter) as error:
+            errors.append(error)
+
+    async with anyio.create_task_group() as tasks:
+        for name in names:
+            tasks.start_soon(read, name)
+    params = [found[name] for name in names if name in found]
+    if session.options.json:
+        from paramclient.documents.extended_output import ExtParamsOutputDoc  # only here: loads pydantic
+
+        print_document(ExtParamsOutputDoc.of(params))
+    elif params:
+        print_table(_COLUMNS, map(_cells, params), right="index")
+    for error in errors:
+        report(str(error))
+    return max((code_of(error) for error in errors), default=ExitCode.DONE)
+
+
+def text_pairs(words: Sequence[str]) -> list[tuple[str, str]]:
+    """Parse the arguments of `set`, as `NAME VALUE` or `NAME=VALUE`, without reading the values.
+
+    Raises:
+        UsageError: a name has no value, or is invalid.
+    """
+    pairs: list[tuple[str, str]] = []
+    left = iter(words)
+    for word in left:
+        name, equals, text = word.partition("=")
+        value = text if equals else next(left, None)
+        if value is None:
+            raise UsageError(f"{name}: there is no value")
+        pairs.append((check_name(name), value))
+    if not pairs:
+        raise UsageError("set takes pairs of NAME and VALUE, or NAME=VALUE")
+    return pairs
+
+
+async def set_extended(session: CommandSession, pairs: Sequence[tuple[str, str]]) -> ExitCode:
+    """Write extended parameters, and print the outcomes."""
+    await session.check_only()
+    values: list[tuple[str, ExtValue]] = []
+    for name, text in pairs:
+        known = await session.component.ext.get(name, timeout=session.deadline.left())
+        values.append((name, value_of(name, text, known.type)))
+    result = await session.component.ext.set_many(values, timeout=session.deadline.left())
+    _print_outcomes(session, result.outcomes)
+    return _code_of_outcomes(result.outcomes)
+
+
+def value_of(name: str, text: str, number: int) -> ExtValue:
+    """Return the value that a text gives in a type: a number, text, or bytes after `hex:`.
+
+    Raises:
+        UsageError: the text is no value of this type.
+    """
+    value: ExtValue = text
+    try:
+        if text.startswith(HEX):
+            value = bytes.fromhex(text.removeprefix(HEX))
+        elif number in (ExtParamType.REAL32, ExtParamType.REAL64):
+            value = float(text)
+        elif ExtParamType.UINT8 <= number <= ExtParamType.INT64:
+            value = int(text, 0)
+    except ValueError:
+        raise UsageError(f"{name}: {text!r} is not a value of type {ext_type_name(number)}") from None
+    try:
+        encode_ext_value(check_ext_value(value), number)
+    except UsageError as error:
+        raise UsageError(f"{name}: {error}") from None
+    return value
+
+
+# show, save, diff
+
+
+def show_extended(
+    vehicle: str | None, names: Sequence[str], component: int | None, options: CacheOptions
+) -> ExitCode:
+    """Print extended parameters of a file, or cached ones."""
+    if vehicle is not None and is_file(vehicle):
+        file = read_extended_file(vehicle)
+        params, told = list(file.params.values()), f"{len(file.params)} extended parameters from {vehicle}"
+    else:
+        table = _cached(vehicle, component, options)
+        params = _by_index(table.params.values())
+        told = f"{len(params)} extended parameters of {table.key}, component {table.component}"
+    if names:
+        unknown = [name for name in names if not any(each.name == name for each in params)]
+        if unknown:
+            raise NotInCache(f"not among the extended parameters: {', '.join(unknown)}")
+        params = [each for each in params if each.name in names]
+    if options.json:
+        from paramclient.documents.extended_output import ExtParamsOutputDoc  # only here: loads pydantic
+
+        print_document(ExtParamsOutputDoc.of(params))
+    else:
+        print_table(_COLUMNS, map(_cells, params), right="index")
+        say(printable(told))
+    return ExitCode.DONE
+
+
+async def save_extended(where: str, file: Path, form: FileForm | None, options: LinkOptions) -> ExitCode:
+    """Write extended parameters to a file. An incomplete table is not written."""
+    content = await _source(where, options)
+    form = await anyio.to_thread.run_sync(lambda: write_extended_file(file, content, form=form))
+    if options.json:
+        from paramclient.documents.extended_output import ExtSavedDoc  # only here: loads pydantic
+
+        print_document(ExtSavedDoc.of(str(file), form, content))
+    else:
+        whose = f"{content.system}/{content.component}"
+        say(printable(f"{len(content.params)} extended parameters of {whose} written to {file} ({form})"))
+    return ExitCode.DONE
+
+
+async def diff_extended(
+    left: str, right: str, options: LinkOptions, *, partial: bool, everything: bool
+) -> ExitCode:
+    """Compare the extended parameters of two sources."""
+    first, second = await _source(left, options), await _source(right, options)
+    names = list(first.params) if partial else list(dict.fromkeys((*first.params, *second.params)))
+    pairs = [(name, first.params.get(name), second.params.get(name)) for name in names]
+    entries = [(name, one, two, _standing(one, two)) for name, one, two in pairs]
+    different = [entry for entry in entries if entry[3] != "same"]
+    shown = entries if everything else different
+    if options.json:
+        from paramclient.documents.extended_output import ExtDiffDoc  # only here: loads pydantic
+
+        print_document(ExtDiffDoc.of(shown, is_same=not different))
+    else:
+        if shown:
+            rows = ((name, _text(one), _text(two), word) for name, one, two, word in shown)
+            print_table(["name", "left", "right", "is"], rows)
+        for side, content in (("left", first), ("right", second)):
+            say(printable(f"{side}: {len(content.params)} extended parameters from {content.source}"))
+        say(f"{len(entries) - len(different)} same, {len(different)} different")
+    return ExitCode.DIFFERENT if different else ExitCode.DONE
+
+
+# apply
+
+
+async def apply_extended(url: str, file: str, options: LinkOptions, *, dry_run: bool, yes: bool) -> ExitCode:
+    """Write the differing values of a file of extended parameters, and verify them by another download."""
+    content = read_extended_file(file)
+    async with connect(url, options, only=True) as session:
+        component = session.component
+        changes, now, faulty = await _compared(session, content, file)
+        if dry_run or not changes:
+            _print_plan(session, changes, now, is_dry=dry_run)
+            return ExitCode.INCOMPLETE if faulty or changes else ExitCode.DONE
+        if not (yes or options.json) and sys.stdin.isatty() and sys.stderr.isatty():
+            _print_plan(session, changes, now, is_dry=True)
+            sys.stderr.write("go on? [y/N] ")
+            sys.stderr.flush()
+            await anyio.wait_readable(sys.stdin)  # Ctrl-C could not end a thread that reads
+            if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+                return ExitCode.INCOMPLETE
+        await session.check_only()
+        values = {name: param.value for name, param in changes.items()}
+        result = await component.ext.set_many(values, timeout=session.deadline.left())
+        after = await component.ext.fetch_all(timeout=session.deadline.left())
+        _print_outcomes(session, result.outcomes)
+        code = _code_of_outcomes(result.outcomes)
+        for name, param in changes.items():
+            if name not in after.params or not param.same_value(after.params[name]):
+                code = max(code, ExitCode.INCOMPLETE)
+                held = "not there" if name not in after.params else _text(after.params[name])
+                report(f"{name}: {session.label} has {held}, and the file {_text(param)}")
+        return max(code, ExitCode.INCOMPLETE) if faulty else code
+
+
+async def verify_extended(url: str, file: str, options: LinkOptions) -> ExitCode:
+    """Compare the extended parameters of a component with a file. Writes nothing."""
+    content = read_extended_file(file)
+    async with connect(url, options) as session:
+        changes, now, faulty = await _compared(session, content, file)
+        if options.json:
+            from paramclient.documents.extended_output import ExtDiffDoc  # only here: loads pydantic
+
+            entries = [(name, now[name], param, "different") for name, param in changes.items()]
+            print_document(ExtDiffDoc.of(entries, is_same=not changes and not faulty))
+        else:
+            if changes:
+                rows = ((name, _text(now[name]), _text(param)) for name, param in changes.items())
+                print_table(["name", "now", "wanted"], rows)
+            held = sum(name in now and param.same_value(now[name]) for name, param in content.params.items())
+            say(printable(f"{session.label} has {held} of {len(content.params)} values of {file}"))
+    return ExitCode.DIFFERENT if changes or faulty else ExitCode.DONE
+
+
+def history_extended(
+    vehicle: str,
+    name: str | None,
+    component: int | None,
+    options: CacheOptions,
+    *,
+    limit: int | None,
+    since: float | None,
+) -> ExitCode:
+    """Print the changes of a vehicle's extended parameters, the newest last."""
+    with ParamCache(options.cache) as cache:
+        key = tables_in(cache, vehicle, None)[0].key
+        entries = cache.ext_history(key, component, name, limit, since)
+    if options.json:
+        from paramclient.documents.extended_output import ExtHistoryDoc  # only here: loads pydantic
+
+        print_document(ExtHistoryDoc.of(entries))
+        return ExitCode.DONE
+    rows = (
+        (time_text(each.at), each.component, each.name, _text(each.old), _text(each.new), each.by)
+        for each in entries
+    )
+    print_table(["time", "component", "name", "old", "new", "by"], rows)
+    return ExitCode.DONE
+
+
+async def is_extended_link(text: str, options: LinkOptions) -> bool:
+    """Return whether an argument names a link, and the component that the options name speaks the extended
+    protocol."""
+    is_link = not (is_file(text) or names_vehicle(text))
+    if not is_link or options.listen_only or not may_be_extended(options, extended=False, plain=False):
+        return False
+    check_link(text)
+    async with connect(text, options) as session:
+        return await is_extended_session(session, extended=False, plain=False)
+
+
+# internal
+
+_COLUMNS: Final = ("name", "value", "type", "index")
+"""Columns of the table of extended parameters."""
+
+
+def _has_extended_calls(session: CommandSession) -> bool:
+    """Return whether the component is on a link of this process: a service has no extended parameters."""
+    try:
+        return session.component.ext is not None
+    except UsageError:
+        return False
+
+
+def _cells(param: ExtParam) -> tuple[object, ...]:
+    return param.name, _text(param), ext_type_name(param.type), param.index
+
+
+def _text(param: ExtParam | None) -> str | None:
+    return None if param is None else _value_text(param.value, param.type)
+
+
+def _value_text(value: ExtValue, number: int) -> str:
+    return f"{HEX}{value.hex()}" if isinstance(value, bytes) else format_ext_value(value, number)
+
+
+def _by_index(params: Iterable[ExtParam]) -> list[ExtParam]:
+    return sorted(params, key=lambda param: (param.index is None, param.index or 0, param.name))
+
+
+def _standing(left: ExtParam | None, right: ExtParam | None) -> str:
+    if left is None or right is None:
+        return "only right" if left is None else "only left"
+    return "same" if left.same_value(right) else "different"
+
+
+def _cached(vehicle: str | None, component: int | None, options: CacheOptions) -> CachedExtTable:
+    """Return the only cached table of extended parameters that fits.
+
+    Raises:
+        NotInCache: there is none.
+        UsageError: there are several.
+    """
+    with ParamCache(options.cache) as cache:
+        found = [cache.load_ext(each.key, each.component) for each in tables_in(cache, vehicle, component)]
+        tables = [table for table in found if table is not None]
+    if not tables:
+        raise NotInCache("there are no extended parameters of that vehicle in the cache")
+    if len(tables) > 1:
+        known = ", ".join(f"{table.key}/{table.component}" for table in tables)
+        raise UsageError(f"several tables fit: {known}; choose a vehicle, and a --component")
+    return tables[0]
+
+
+async def _source(text: str, options: LinkOptions) -> ExtParamFile:
+    """Return the extended parameters of a file, a cached vehicle or a link.
+
+    Raises:
+        NoReply: a table of a link is incomplete, or nothing was received.
+        NotInCache: a cached table is incomplete, or there is none.
+    """
+    if is_file(text):
+        return read_extended_file(text)
+    if names_vehicle(text):
+        if options.place is False:
+            raise UsageError(f"{text!r} is a vehicle in the cache, which --no-cache excludes")
+        table = _cached(text, options.component, CacheOptions(cache=options.cache))
+        if not table.complete:
+            raise NotInCache(f"the table of {table.key}, component {table.component}, is incomplete")
+        params = {param.name: param for param in _by_index(table.params.values())}
+        at = max(table.heard_at.values(), default=None)
+        return ExtParamFile(params, None, table.component, at, f"cache {table.key}")
+    check_link(text)
+    async with connect(text, options) as session:
+        with progress_bar(f"fetching {session.label}") as progress:
+            result = await session.component.ext.fetch_all(timeout=session.deadline.left(), progress=progress)
+        if not result.complete:
+            missing = counted(len(result.missing), "extended parameter")
+            raise NoReply(f"{missing} of {session.label}", attempts=0, waited=result.elapsed)
+        params = {param.name: param for param in _by_index(result.params.values())}
+        return ExtParamFile(
+            params, result.system, result.component, time.time(), f"link {session.client.link.name}"
+        )
+
+
+async def _compared(
+    session: CommandSession, content: ExtParamFile, file: str
+) -> tuple[dict[str, ExtParam], Mapping[str, ExtParam], bool]:
+    """Return the parameters of a file that differ, those of the component, and whether the component lacks
+    some or has them in another type, which is reported."""
+    component = session.component
+    if content.component not in (None, component.component):
+        raise FileError(
+            f"it has the parameters of component {content.component}, and {session.label} is chosen",
+            source=file,
+        )
+    result = await component.ext.fetch_all(timeout=session.deadline.left())
+    if not result.complete:
+        raise NoReply(f"all extended parameters of {session.label}", attempts=0, waited=result.elapsed)
+    now = result.params
+    unknown = [name for name in content.params if name not in now]
+    if unknown:
+        report(f"{session.label} does not have {first_of(unknown, NAMES_SHOWN_MAX)}")
+    changes = {}
+    is_mismatched = False
+    for name, param in content.params.items():
+        held = now.get(name)
+        if held is not None and held.type != param.type:
+            is_mismatched = True
+            types = ext_type_name(held.type), ext_type_name(param.type)
+            report(f"{name} is {types[0]} on {session.label}, and {types[1]} in {file}")
+        elif held is not None and not held.same_value(param):
+            changes[name] = param
+    return changes, now, bool(unknown) or is_mismatched
+
+
+def _print_plan(
+    session: CommandSession, changes: Mapping[str, ExtParam], now: Mapping[str, ExtParam], *, is_dry: bool
+) -> None:
+    if session.options.json:
+        from paramclient.documents.extended_output import ExtDiffDoc  # only here: loads pydantic
+
+        entries = [(name, now[name], param, "different") for name, param in changes.items()]
+        print_document(ExtDiffDoc.of(entries, is_same=not changes))
+        return
+    if changes:
+        rows = ((name, _text(now[name]), _text(param)) for name, param in changes.items())
+        print_table(["name", "now", "wanted"], rows)
+    verb = "would be set" if is_dry else "set"
+    say(printable(f"{len(changes)} of {session.label} {verb}"))
+
+
+def _print_outcomes(session: CommandSession, outcomes: Sequence[ExtSetOutcome]) -> None:
+    if session.options.json:
+        from paramclient.documents.extended_output import ExtWritesOutputDoc  # only here: loads pydantic
+
+        print_document(ExtWritesOutputDoc.of(outcomes))
+    else:
+        rows = (
+            (
+                each.name,
+                _value_text(each.requested, ExtParamType.REAL64),
+                None if each.result is None else _text(each.result.param),
+                each.status.value,
+            )
+            for each in outcomes
+        )
+        print_table(["name", "requested", "actual", "status"], rows)
+        say(printable(f"{sum(each.is_set for each in outcomes)} of {len(outcomes)} set on {session.label}"))
+    for each in outcomes:
+        if each.error is not None:
+            report(f"{each.name}: {each.error}")
+
+
+def _code_of_outcomes(outcomes: Iterable[ExtSetOutcome]) -> ExitCode:
+    errors = [each.error for each in outcomes if each.error is not None]
+    return max((code_of(error) for error in errors), default=ExitCode.DONE)

@@ -1,0 +1,241 @@
+"""LinkExtParams: the implementation of `ExtParams` over a link of this process."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from types import MappingProxyType
+
+import anyio
+
+from paramclient.client.arguments import PROGRESS_CALL_INTERVAL, check_asked_name, check_requested_name
+from paramclient.client.extended_params import ExtChanges, ExtParams
+from paramclient.client.local import LocalComponent
+from paramclient.errors import CacheError, NoReply, ParamClientError
+from paramclient.model.ext_params import ExtParam, ExtSettable, check_ext_value
+from paramclient.protocol.ext.change import ExtChange
+from paramclient.protocol.ext.fetch import ExtFetch, ExtFetchResult
+from paramclient.protocol.ext.write_batch import ExtSetManyResult, ExtSetOutcome, ExtWriteBatch
+from paramclient.protocol.ext.writes import ExtSetResult
+from paramclient.protocol.params.change_origin import check_author
+from paramclient.protocol.params.fetch_result import Policy, Progress
+
+__all__ = ["LinkExtParams"]
+
+EXT_TIMEOUT_NOTE = "The fetch of extended parameters ended at its timeout."
+"""Note of a partial result that a timeout ended."""
+
+
+class LinkExtParams(ExtParams):
+    """The extended parameters of a component on a link of this process. See `ExtParams` for the calls.
+
+    Args:
+        component: the component.
+    """
+
+    def __init__(self, component: LocalComponent) -> None:
+        self._component = component
+        self._machine = component.machine
+        self._subscriptions: weakref.WeakSet[ExtChanges] = weakref.WeakSet()
+        self.params = MappingProxyType(component.machine.ext.table.params)
+
+    def __repr__(self) -> str:
+        machine = self._machine
+        of = "" if self.count is None or self.is_complete else f" of {self.count}"
+        return f"<ExtParams {machine.system}/{machine.component} {len(self.params)}{of} extended params>"
+
+    @property
+    def count(self) -> int | None:
+        """See `ExtParams.count`."""
+        return self._machine.ext.table.count
+
+    @property
+    def is_spoken(self) -> bool:
+        """See `ExtParams.is_spoken`."""
+        return self._machine.ext.is_spoken
+
+    @property
+    def is_expected(self) -> bool:
+        """See `ExtParams.is_expected`."""
+        return self._machine.expects_extended
+
+    @property
+    def is_complete(self) -> bool:
+        """See `ExtParams.is_complete`."""
+        return self._machine.ext.table.complete
+
+    async def get(self, name: str | int, *, timeout: float | None = None) -> ExtParam:
+        """See `ExtParams.get`."""
+        check_requested_name(name)
+        machine = self._machine
+        self._component.client.check_open()
+        read = machine.read_ext(name, anyio.current_time())
+        what = f"{name if isinstance(name, str) else f'extended parameter {name}'} of {self._whose}"
+        try:
+            message = await self._component.wait(read, timeout, lambda: (what, read.attempts))
+        finally:
+            machine.ext.reads.release(read)
+        known = machine.ext.table.params.get(message.param_id)
+        if known is None or (isinstance(name, int) and known.index != name):
+            return ExtParam.of(message.param_id, message.raw, message.param_type)
+        return known
+
+    async def set(
+        self,
+        name: str,
+        value: ExtSettable,
+        *,
+        timeout: float | None = None,
+        asker: str | None = None,
+    ) -> ExtSetResult:
+        """See `ExtParams.set`."""
+        machine = self._machine
+        check_asked_name(name)
+        checked = check_ext_value(value)
+        self._component.client.check_open()
+        write = machine.write_ext(name, checked, anyio.current_time(), check_author(asker))
+        what = f"PARAM_EXT_SET {name} to {self._whose}"
+        try:
+            return await self._component.wait(write, timeout, lambda: (what, write.attempts))
+        finally:
+            machine.ext.writes.cancel(write, anyio.current_time())
+
+    async def set_many(
+        self,
+        values: Mapping[str, ExtSettable] | Iterable[tuple[str, ExtSettable]],
+        *,
+        progress: Callable[[ExtSetOutcome], None] | None = None,
+        timeout: float | None = None,
+        asker: str | None = None,
+    ) -> ExtSetManyResult:
+        """See `ExtParams.set_many`."""
+        given = values.items() if isinstance(values, Mapping) else values
+        pairs = [(check_asked_name(name), check_ext_value(value)) for name, value in given]
+        machine = self._machine
+        self._component.client.check_open()
+        began = anyio.current_time()
+        batch = machine.write_many_ext(pairs, began, check_author(asker))
+        try:
+            outcomes = await self._wait_for_batch(batch, timeout, progress)
+        finally:
+            machine.ext.batches.end(batch, anyio.current_time())
+        elapsed = anyio.current_time() - began
+        return ExtSetManyResult(machine.system, machine.component, outcomes, batch.failure, elapsed)
+
+    async def _wait_for_batch(
+        self, batch: ExtWriteBatch, timeout: float | None, progress: Callable[[ExtSetOutcome], None] | None
+    ) -> tuple[ExtSetOutcome, ...]:
+        """Wait until a batch ends, or give it up at the timeout; report the outcomes as they arrive."""
+        reported = 0
+
+        def report() -> None:
+            nonlocal reported
+            for outcome in batch.ended[reported:]:
+                reported += 1
+                if progress is not None:
+                    progress(outcome)
+
+        self._component.wake()
+        with anyio.move_on_after(timeout):
+            while not batch.done:
+                news = anyio.Event()
+                batch.on_outcome = news.set
+                report()
+                await news.wait()
+        now = anyio.current_time()
+        if not batch.done:
+            what = f"PARAM_EXT_SET {', '.join(batch.open_names)} to {self._whose}"
+            batch.give_up(NoReply(what, attempts=batch.attempts, waited=now - batch.begun_at), now)
+        report()
+        assert batch.result is not None
+        return batch.result
+
+    async def fetch_all(
+        self,
+        *,
+        timeout: float | None = None,
+        progress: Callable[[Progress], None] | None = None,
+    ) -> ExtFetchResult:
+        """See `ExtParams.fetch_all`."""
+        component, machine = self._component, self._machine
+        component.client.check_open()
+        began = anyio.current_time()
+        deadline = None if timeout is None else began + timeout
+        station = component.client.station
+        if station.policy is not Policy.AUTO and not station.listens_only:
+            return self._known(station.policy)
+        fetch = machine.begin_ext_fetch(anyio.current_time())
+        try:
+            return await self._wait_for_fetch(fetch, deadline, progress)
+        finally:
+            machine.ext.fetches.end(fetch)
+            component.wake()
+
+    def changes(self) -> ExtChanges:
+        """See `ExtParams.changes`."""
+        changes = ExtChanges()
+        self._subscriptions.add(changes)
+        client = self._component.client
+        if client.is_over:
+            changes.end(client.link_task.ended)
+        return changes
+
+    # called by the component
+
+    def take_change(self, change: ExtChange) -> None:
+        """Push a change to all streams."""
+        for changes in list(self._subscriptions):
+            changes.push(change)
+
+    def end(self, error: ParamClientError | None) -> None:
+        """End all streams: with this error, or with None at the end of a log."""
+        for changes in list(self._subscriptions):
+            changes.end(error)
+
+    @property
+    def _whose(self) -> str:
+        return f"{self._machine.system}/{self._machine.component}"
+
+    def _known(self, policy: Policy) -> ExtFetchResult:
+        """Return the known table where the policy allows no download."""
+        if not self.params:
+            raise CacheError(
+                f"no extended parameter of {self._whose} is known, and the policy is {policy}: nothing may be"
+                " downloaded"
+            )
+        machine = self._machine
+        params = dict(self.params)
+        return ExtFetchResult(machine.system, machine.component, params, self.count, (), "cache", 0.0)
+
+    async def _wait_for_fetch(
+        self, fetch: ExtFetch, deadline: float | None, progress: Callable[[Progress], None] | None
+    ) -> ExtFetchResult:
+        """Wait until a fetch ends, or return its partial result at the deadline."""
+        fetches = self._machine.ext.fetches
+        ended = anyio.Event()
+        fetch.on_done.append(ended.set)
+        self._component.wake()
+        try:
+            while not fetch.done:
+                now = anyio.current_time()
+                if deadline is not None and now >= deadline:
+                    if not fetch.has_begun:
+                        what = f"extended parameters of {self._whose}"
+                        attempts = fetch.request.count
+                        raise NoReply(what, attempts=attempts, waited=now - fetch.begun_at)
+                    return fetches.partial(fetch, now, EXT_TIMEOUT_NOTE)
+                until = now + PROGRESS_CALL_INTERVAL if progress is not None else None
+                if deadline is not None:
+                    until = deadline if until is None else min(until, deadline)
+                with anyio.move_on_after(None if until is None else until - now):
+                    await ended.wait()
+                if progress is not None:
+                    progress(fetches.progress(fetch, anyio.current_time()))
+        finally:
+            with suppress(ValueError):
+                fetch.on_done.remove(ended.set)
+        if fetch.error is not None:
+            raise fetch.error
+        assert fetch.result is not None
+        return fetch.result

@@ -1,0 +1,220 @@
+"""Documents of extended parameters that subcommands print."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
+from paramclient.documents.document import Document, Maybe, Scalar
+from paramclient.model.ext_params import ExtParam, ExtParamType, ExtValue, ext_type_name
+from paramclient.model.notation import time_text
+from paramclient.model.values import shortest_float
+
+if TYPE_CHECKING:
+    from paramclient.cache import ExtHistoryEntry
+    from paramclient.files import FileForm
+    from paramclient.files.extended_document import ExtParamFile
+    from paramclient.protocol.ext.fetch import ExtFetchResult
+    from paramclient.protocol.ext.write_batch import ExtSetOutcome
+
+__all__ = [
+    "ExtChangeDoc",
+    "ExtDiffDoc",
+    "ExtDifferenceDoc",
+    "ExtFetchOutputDoc",
+    "ExtHistoryDoc",
+    "ExtParamDoc",
+    "ExtParamsOutputDoc",
+    "ExtSavedDoc",
+    "ExtWriteDoc",
+    "ExtWritesOutputDoc",
+]
+
+
+class ExtParamDoc(Document):
+    """One extended parameter; its name is the key of the document.
+
+    `value` is null for bytes that are no text; `hex` has the bytes of every value.
+    """
+
+    value: Scalar | None
+    type: str
+    index: int | None
+    hex: str
+
+    @classmethod
+    def of(cls, param: ExtParam) -> ExtParamDoc:
+        """Return the document of a parameter, without its name."""
+        kind = ext_type_name(param.type)
+        return cls(
+            value=ext_value_json(param.value, param.type), type=kind, index=param.index, hex=param.raw.hex()
+        )
+
+
+class ExtParamsOutputDoc(Document):
+    """Extended parameters by name."""
+
+    extended: dict[str, ExtParamDoc]
+
+    @classmethod
+    def of(cls, params: Iterable[ExtParam]) -> ExtParamsOutputDoc:
+        """Return the document of parameters."""
+        return cls(extended={param.name: ExtParamDoc.of(param) for param in params})
+
+
+class ExtFetchOutputDoc(Document):
+    """A fetched table of extended parameters; `missing` are indices that were not received."""
+
+    system: int
+    component: int
+    count: int | None
+    source: str
+    missing: list[int]
+    elapsed_s: float
+    extended: dict[str, ExtParamDoc]
+
+    @classmethod
+    def of(cls, result: ExtFetchResult, params: Iterable[ExtParam]) -> ExtFetchOutputDoc:
+        """Return the document of a fetch."""
+        return cls(
+            system=result.system,
+            component=result.component,
+            count=result.count,
+            source=result.source,
+            missing=list(result.missing),
+            elapsed_s=round(result.elapsed, 3),
+            extended={param.name: ExtParamDoc.of(param) for param in params},
+        )
+
+
+class ExtWriteDoc(Document):
+    """The outcome of one write of an extended parameter."""
+
+    name: str
+    requested: Scalar | None
+    actual: Scalar | None
+    status: str
+    reason: Maybe[str] = None
+
+    @classmethod
+    def of(cls, outcome: ExtSetOutcome) -> ExtWriteDoc:
+        """Return the document of an outcome."""
+        result = outcome.result
+        return cls(
+            name=outcome.name,
+            requested=ext_value_json(outcome.requested, ExtParamType.REAL64),
+            actual=None if result is None else ext_value_json(result.actual, result.param.type),
+            status=outcome.status.value,
+            reason=None if outcome.error is None else str(outcome.error),
+        )
+
+
+class ExtWritesOutputDoc(Document):
+    """The outcomes of writes of extended parameters, in order."""
+
+    results: list[ExtWriteDoc]
+
+    @classmethod
+    def of(cls, outcomes: Iterable[ExtSetOutcome]) -> ExtWritesOutputDoc:
+        """Return the document of outcomes."""
+        return cls(results=[ExtWriteDoc.of(each) for each in outcomes])
+
+
+class ExtDifferenceDoc(Document):
+    """One compared extended parameter."""
+
+    name: str
+    left: ExtParamDoc | None
+    right: ExtParamDoc | None
+    standing: str
+
+
+class ExtDiffDoc(Document):
+    """A comparison of extended parameters."""
+
+    is_same: bool
+    extended: list[ExtDifferenceDoc]
+
+    @classmethod
+    def of(
+        cls, entries: Sequence[tuple[str, ExtParam | None, ExtParam | None, str]], *, is_same: bool
+    ) -> ExtDiffDoc:
+        """Return the document of a comparison: name, left, right and standing of each entry."""
+        return cls(
+            is_same=is_same,
+            extended=[
+                ExtDifferenceDoc(
+                    name=name,
+                    left=None if left is None else ExtParamDoc.of(left),
+                    right=None if right is None else ExtParamDoc.of(right),
+                    standing=standing,
+                )
+                for name, left, right, standing in entries
+            ],
+        )
+
+
+class ExtChangeDoc(Document):
+    """One change of an extended parameter; see `ExtHistoryEntry`. `at` is in unix seconds."""
+
+    time: str
+    at: float
+    component: int
+    name: str
+    old: ExtParamDoc
+    new: ExtParamDoc | None
+    by: str
+
+
+class ExtHistoryDoc(Document):
+    """Changes of extended parameters, the newest last."""
+
+    history: list[ExtChangeDoc]
+
+    @classmethod
+    def of(cls, entries: Iterable[ExtHistoryEntry]) -> ExtHistoryDoc:
+        """Return the document of lines of history."""
+        return cls(
+            history=[
+                ExtChangeDoc(
+                    time=time_text(each.at),
+                    at=each.at,
+                    component=each.component,
+                    name=each.name,
+                    old=ExtParamDoc.of(each.old),
+                    new=None if each.new is None else ExtParamDoc.of(each.new),
+                    by=each.by,
+                )
+                for each in entries
+            ]
+        )
+
+
+class ExtSavedDoc(Document):
+    """A written file of extended parameters."""
+
+    file: str
+    format: str
+    system: int | None
+    component: int | None
+    count: int
+
+    @classmethod
+    def of(cls, file: str, form: FileForm, content: ExtParamFile) -> ExtSavedDoc:
+        """Return the document of a written file."""
+        count = len(content.params)
+        return cls(
+            file=file, format=form.value, system=content.system, component=content.component, count=count
+        )
+
+
+def ext_value_json(value: ExtValue, number: int) -> Scalar | None:
+    """Return a value in strict JSON: NaN and infinities as text; None for bytes."""
+    if isinstance(value, bytes):
+        return None
+    if not isinstance(value, float):
+        return value
+    if math.isfinite(value):
+        return shortest_float(value) if number == ExtParamType.REAL32 else value
+    return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"

@@ -1,0 +1,26 @@
+"""A change of one extended parameter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from paramclient.model.ext_params import ExtParam
+
+__all__ = ["ExtChange"]
+
+
+@dataclass(frozen=True, slots=True)
+class ExtChange:
+    """One extended parameter that appeared, changed its value or was removed.
+
+    Attributes:
+        name: param_id.
+        old: the parameter before, or None for a new one.
+        new: the parameter now, or None when the component no longer has it.
+        by: the author, as in `Change`.
+    """
+
+    name: str
+    old: ExtParam | None
+    new: ExtParam | None
+    by: str = "vehicle"

@@ -1,0 +1,243 @@
+"""Extended parameters on the command line, with a simulated camera behind the link."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from paramclient.sim import Air, Camera, GenericVehicle, PX4Vehicle
+from tests.commands import Command, Put, behind, in_process, leaping
+
+URL = "udpin:0.0.0.0:14550"
+CAMERA = ("--component", 100)
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Run the command line in this process, on simulated time, with a new cache."""
+    leaping(monkeypatch)
+    return in_process(capsys, "--cache", str(tmp_path / "cache.sqlite3"))
+
+
+@pytest.fixture
+def put(monkeypatch: pytest.MonkeyPatch) -> Put:
+    """Connect every link to simulated vehicles."""
+    return behind(monkeypatch, URL)
+
+
+def small() -> Camera:
+    return Camera({"CAM_MODE": 1, "CAM_NAME": "Front", "CAM_KEY": b"\xff\0\xfe", "CAM_EV": 0.5})
+
+
+def test_fetch_finds_them(command: Command, put: Put) -> None:
+    url = put(small())
+    done = command("fetch", url, *CAMERA)
+    assert done.code == 0
+    assert done.rows == [
+        ["name", "value", "type", "index", "trust"],
+        ["CAM_MODE", "1", "INT32", "0", "live"],
+        ["CAM_NAME", "Front", "CUSTOM", "1", "live"],
+        ["CAM_KEY", "hex:ff00fe", "CUSTOM", "2", "live"],
+        ["CAM_EV", "0.5", "REAL32", "3", "live"],
+    ]
+    assert done.err.startswith("4 extended parameters of 1/100 no autopilot from stream in 0.")
+    document = command("fetch", url, *CAMERA, "--extended", "--json").json
+    assert (document["count"], document["missing"], document["component"]) == (4, [], 100)
+    assert document["extended"]["CAM_KEY"] == {"value": None, "type": "CUSTOM", "index": 2, "hex": "ff00fe"}
+    assert document["extended"]["CAM_NAME"]["value"] == "Front"
+
+
+def test_a_component_with_plain_parameters_alone_is_found_too(command: Command, put: Put) -> None:
+    url = put(GenericVehicle({"A": 1, "B": 2.5}, component=100))
+    done = command("fetch", url, *CAMERA)
+    assert (done.code, [row[0] for row in done.words[1:]]) == (0, ["A", "B"])
+    assert command("set", url, *CAMERA, "A", 5).code == 0
+    assert command("get", url, *CAMERA, "A").words[1][:2] == ["A", "5"]
+
+
+def test_plain_ones_of_a_component_that_has_both(command: Command, put: Put) -> None:
+    url = put(Camera({"A": "text"}, plain={"A": 7}))
+    assert command("get", url, "A", *CAMERA).words[1][:2] == ["A", "text"]
+    assert command("get", url, "A", *CAMERA, "--plain").words[1][:2] == ["A", "7"]
+    assert command("fetch", url, *CAMERA, "--plain").words[1][:2] == ["A", "7"]
+    assert command("set", url, *CAMERA, "--plain", "A", 8).code == 0
+    both = command("fetch", url, *CAMERA, "--plain", "--extended")
+    assert (both.code, both.err) == (2, "paramclient: --extended and --plain exclude each other\n")
+
+
+def test_a_kind_that_cannot_be_told_needs_the_option(command: Command, put: Put) -> None:
+    camera = Camera({"A": "text"}, component=191, plain={"A": 7})
+    camera._heartbeat = GenericVehicle({}, component=191)._heartbeat
+    url = put(camera)
+    assert command("get", url, "A", "--component", 191).words[1][:2] == ["A", "7"]
+    assert command("get", url, "A", "--component", 191, "--extended").words[1][:2] == ["A", "text"]
+
+
+def test_get_and_set(command: Command, put: Put) -> None:
+    camera = small()
+    url = put(camera)
+    done = command(
+        "set", url, *CAMERA, "CAM_NAME", "-Rear-", "CAM_MODE=0x10", "CAM_KEY", "hex:00ff", "CAM_EV", 1
+    )
+    assert done.code == 0, done.err
+    assert done.rows[1:] == [
+        ["CAM_NAME", "-Rear-", "-Rear-", "accepted"],
+        ["CAM_MODE", "16", "16", "accepted"],
+        ["CAM_KEY", "hex:00ff", "hex:00ff", "accepted"],
+        ["CAM_EV", "1.0", "1.0", "accepted"],
+    ]
+    assert camera.ext_values == {"CAM_NAME": "-Rear-", "CAM_MODE": 16, "CAM_KEY": b"\0\xff", "CAM_EV": 1.0}
+    found = command("get", url, "CAM_NAME", "NO_SUCH", *CAMERA)
+    assert (found.code, found.words[1][:2]) == (1, ["CAM_NAME", "-Rear-"])
+    assert "1/100 has no NO_SUCH" in found.err
+    assert (
+        command("get", url, "CAM_NAME", *CAMERA, "--json").json["extended"]["CAM_NAME"]["value"] == "-Rear-"
+    )
+
+
+def test_refusals_have_a_status_and_an_exit_code(command: Command, put: Put) -> None:
+    url = put(Camera({"A": 1, "B": 2, "C": 3}, supported={"A": [1]}, failing=["B"], limits={"C": (0, 5)}))
+    done = command("set", url, *CAMERA, "A", 2, "B", 5, "C", 9)
+    assert done.code == 1
+    assert done.rows[1:] == [["A", "2", "refused"], ["B", "5", "refused"], ["C", "9", "5", "adjusted"]]
+    assert "A: 1/100 did not set A to 2: value unsupported" in done.err
+    document = command("set", url, *CAMERA, "A", 2, "--json").json
+    assert document["results"][0]["status"] == "refused"
+    for words, why in (
+        (("A", "text"), "A: 'text' is not a value of type INT32"),
+        (("A", "hex:0g"), "is not a value of type INT32"),
+        (("A", 2**40), "does not fit INT32"),
+        (("A",), "A: there is no value"),
+        (("A", 1, "--durable"), "--durable and --metadata are for plain parameters"),
+    ):
+        failed = command("set", url, *CAMERA, *words)
+        assert (failed.code, why in failed.err) == (2, True), failed.err
+
+
+def test_files_and_comparisons(command: Command, put: Put, tmp_path: Path) -> None:
+    camera = small()
+    url = put(camera)
+    for ending in ("json", "yaml"):
+        file = tmp_path / f"camera.{ending}"
+        saved = command("save", url, file, *CAMERA, "--extended")
+        assert (saved.code, saved.err) == (
+            0,
+            f"4 extended parameters of 1/100 written to {file} ({ending})\n",
+        )
+        assert command("show", file).words[1][:2] == ["CAM_MODE", "1"]
+        same = command("diff", file, url, *CAMERA)
+        assert (same.code, same.out) == (0, "")
+    camera.set_ext_param("CAM_NAME", "Rear")
+    camera.remove_ext_param("CAM_EV")
+    other = command("diff", file, url, *CAMERA)
+    assert other.code == 1
+    assert other.rows[1:] == [["CAM_NAME", "Front", "Rear", "different"], ["CAM_EV", "0.5", "only left"]]
+    document = command("diff", file, url, *CAMERA, "--json").json
+    assert [each["standing"] for each in document["extended"]] == ["different", "only left"]
+    refused = command("save", url, tmp_path / "camera.param", *CAMERA, "--extended")
+    assert (refused.code, "cannot hold extended parameters" in refused.err) == (2, True)
+    assert command("diff", file, url, *CAMERA, "--only", "CAM_*").code == 2
+
+
+def test_apply_writes_what_differs_and_reads_it_back(command: Command, put: Put, tmp_path: Path) -> None:
+    camera = small()
+    url = put(camera)
+    file = tmp_path / "camera.yaml"
+    assert command("save", url, file, *CAMERA, "--extended").code == 0
+    camera.set_ext_param("CAM_NAME", "Rear")
+    camera.set_ext_param("CAM_MODE", 9)
+    camera.set_ext_param("CAM_KEY", b"\1")
+    dry = command("apply", url, file, *CAMERA, "--dry-run")
+    assert (dry.code, dry.rows[1:]) == (
+        1,
+        [["CAM_MODE", "9", "1"], ["CAM_NAME", "Rear", "Front"], ["CAM_KEY", "hex:01", "hex:ff00fe"]],
+    )
+    assert camera.ext_values["CAM_MODE"] == 9
+    done = command("apply", url, file, *CAMERA)
+    assert (done.code, [row[-1] for row in done.rows[1:]]) == (0, ["accepted"] * 3), done.err
+    assert camera.ext_values == {"CAM_MODE": 1, "CAM_NAME": "Front", "CAM_KEY": b"\xff\0\xfe", "CAM_EV": 0.5}
+    again = command("apply", url, file, *CAMERA)
+    assert (again.code, again.err) == (0, "0 of 1/100 no autopilot set\n")
+    assert command("apply", url, file, *CAMERA, "--reboot").code == 2
+
+
+def test_apply_tells_what_it_cannot_do(command: Command, put: Put, tmp_path: Path) -> None:
+    file = tmp_path / "camera.yaml"
+    assert command("save", put(small()), file, *CAMERA, "--extended").code == 0
+    url = put(Camera({"CAM_MODE": 2, "CAM_NAME": 5}, supported={"CAM_MODE": [2]}))
+    done = command("apply", url, file, *CAMERA)
+    assert done.code == 1
+    for words in (
+        "does not have CAM_KEY, CAM_EV",
+        "CAM_NAME is INT32 on 1/100 no autopilot, and CUSTOM in",
+        "CAM_MODE: 1/100 no autopilot has 2, and the file 1",
+    ):
+        assert words in done.err
+    wrong = command("apply", put(Camera(component=101)), file, "--component", 101)
+    assert (wrong.code, "it has the parameters of component 100" in wrong.err) == (2, True)
+
+
+def test_they_are_shown_without_a_link(command: Command, put: Put) -> None:
+    url = put(Air.symmetric([PX4Vehicle(table={"A": 1}), small()]))
+    assert command("fetch", url).code == 0
+    assert command("fetch", url, *CAMERA).code == 0
+    shown = command("show", "--extended", *CAMERA)
+    assert (shown.code, [row[0] for row in shown.rows[1:]]) == (
+        0,
+        ["CAM_MODE", "CAM_NAME", "CAM_KEY", "CAM_EV"],
+    )
+    assert command("show", 1, "CAM_NAME", "--extended").rows[1:] == [["CAM_NAME", "Front", "CUSTOM", "1"]]
+    assert command("show", 1, "--extended", "--json").json["extended"]["CAM_MODE"]["value"] == 1
+    assert command("show", 1, "NO_SUCH", "--extended").code == 5
+    assert command("show", 1, "--component", 1, "--extended").code == 5
+    assert command("show", 1, "--extended", "--changed").code == 2
+    assert command("diff", 1, url, "--extended", *CAMERA).code == 0
+
+
+def test_a_component_without_them_is_told(command: Command, put: Put) -> None:
+    url = put(PX4Vehicle(table={"A": 1}))
+    done = command("fetch", url, "--extended")
+    assert (done.code, "no reply: extended parameters of 1/1" in done.err) == (3, True)
+
+
+def test_verify_compares_with_a_file(command: Command, put: Put, tmp_path: Path) -> None:
+    camera = small()
+    url = put(camera)
+    file = tmp_path / "camera.json"
+    assert command("save", url, file, *CAMERA).code == 0, "found without the option"
+    same = command("verify", url, file, *CAMERA)
+    assert (same.code, same.out) == (0, "")
+    assert same.err == f"1/100 no autopilot has 4 of 4 values of {file}\n"
+    camera.set_ext_param("CAM_NAME", "Rear")
+    other = command("verify", url, file, *CAMERA)
+    assert (other.code, other.rows[1:]) == (1, [["CAM_NAME", "Rear", "Front"]])
+    document = command("verify", url, file, *CAMERA, "--json").json
+    assert (document["is_same"], document["extended"][0]["left"]["value"]) == (False, "Rear")
+    camera.remove_ext_param("CAM_NAME")
+    lacking = command("verify", url, file, *CAMERA)
+    assert (lacking.code, "does not have CAM_NAME" in lacking.err) == (1, True)
+    assert command("verify", url, file, *CAMERA, "--include", "*").code == 2
+    assert not camera.requests["PARAM_EXT_SET"]
+
+
+def test_save_finds_plain_ones_of_such_a_component(command: Command, put: Put, tmp_path: Path) -> None:
+    url = put(GenericVehicle({"A": 1}, component=100))
+    file = tmp_path / "camera.yaml"
+    assert command("save", url, file, *CAMERA).code == 0
+    assert "paramclient: 1" in file.read_text()
+
+
+def test_the_history_of_extended_parameters(command: Command, put: Put) -> None:
+    url = put(small())
+    assert command("set", url, *CAMERA, "CAM_NAME", "Rear", "CAM_KEY", "hex:01").code == 0
+    told = command("history", 1, "--extended")
+    assert [row[1:] for row in told.rows[1:]] == [
+        ["100", "CAM_NAME", "Front", "Rear", "us"],
+        ["100", "CAM_KEY", "hex:ff00fe", "hex:01", "us"],
+    ]
+    assert len(command("history", 1, "CAM_NAME", "--extended").rows) == 2
+    document = command("history", 1, "--extended", "--limit", 1, "--json").json
+    assert [(each["name"], each["new"]["hex"]) for each in document["history"]] == [("CAM_KEY", "01")]
+    assert command("history", 1, "--extended", "--snapshots").code == 2
+    assert command("history", 1).rows[1:] == []

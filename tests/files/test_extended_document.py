@@ -1,0 +1,160 @@
+"""Files of extended parameters: what is written comes back, and what is none is told."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from paramclient.errors import FileError
+from paramclient.files import read_file
+from paramclient.files.extended_document import (
+    ExtParamFile,
+    is_extended_file,
+    read_extended_file,
+    write_extended_file,
+)
+from paramclient.model.ext_params import ExtParam, ExtParamType
+from paramclient.model.values import Trust
+from paramclient.sim import Camera
+
+KINDS = ExtParamType
+ODD_NAN = struct.pack("<I", 0x7FC00001)
+
+
+def cached(name: str, raw: bytes, kind: int = KINDS.CUSTOM) -> ExtParam:
+    return ExtParam.of(name, raw, kind, None, Trust.CACHED)
+
+
+def every_kind() -> dict[str, ExtParam]:
+    params = {
+        name: param.with_index(None).with_trust(Trust.CACHED) for name, param in Camera().ext_params.items()
+    }
+    more = [
+        cached("NAN", struct.pack("<f", math.nan), KINDS.REAL32),
+        cached("ODD_NAN", ODD_NAN, KINDS.REAL32),
+        cached("INFINITE", struct.pack("<d", -math.inf), KINDS.REAL64),
+        cached("NO", 'off: "yes"\n\ttab 🚁 grün # 1'.encode()),
+        cached("EMPTY", b""),
+        cached("NUMBER", b"0x10"),
+        cached("BYTES", b"\xff\0\xfe"),
+        cached("UNKNOWN", b"\1\2", 77),
+        cached("NULL", b"null"),
+    ]
+    return params | {param.name: param for param in more}
+
+
+@pytest.mark.parametrize("ending", ["json", "yaml", "yml"])
+def test_what_is_written_comes_back(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"camera.{ending}"
+    params = every_kind()
+    write_extended_file(path, ExtParamFile(params, 1, 100, 1_700_000_000.0, "link sim:camera"))
+    assert is_extended_file(path)
+    found = read_extended_file(path)
+    assert dict(found.params) == params
+    assert list(found.params) == list(params)
+    assert [param.value for param in found.params.values() if not math.isnan(as_number(param))] == [
+        param.value for param in params.values() if not math.isnan(as_number(param))
+    ]
+    assert (found.system, found.component, found.source) == (1, 100, str(path))
+
+
+def as_number(param: ExtParam) -> float:
+    return param.value if isinstance(param.value, float) else 0.0
+
+
+@pytest.mark.parametrize("ending", ["json", "yaml"])
+@given(raw=st.binary(max_size=128) | st.text(max_size=30).map(str.encode))
+def test_any_custom_value_comes_back(
+    tmp_path_factory: pytest.TempPathFactory, ending: str, raw: bytes
+) -> None:
+    path = tmp_path_factory.getbasetemp() / f"any.{ending}"
+    param = cached("A", raw[:128])
+    write_extended_file(path, ExtParamFile({"A": param}))
+    assert read_extended_file(path).params["A"] == param
+
+
+@pytest.mark.parametrize("ending", ["param", "parm", "params", "pck"])
+def test_formats_that_cannot_hold_them(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"camera.{ending}"
+    with pytest.raises(FileError, match=r"cannot hold extended parameters; write \.json or \.yaml"):
+        write_extended_file(path, ExtParamFile(every_kind()))
+    assert not path.exists()
+
+
+def test_nothing_is_written_without_parameters(tmp_path: Path) -> None:
+    with pytest.raises(FileError, match="no parameters"):
+        write_extended_file(tmp_path / "a.json", ExtParamFile({}))
+
+
+def test_the_two_kinds_of_files_are_told_apart(tmp_path: Path) -> None:
+    plain, extended = tmp_path / "plain.yaml", tmp_path / "camera.yaml"
+    plain.write_text("paramclient: 1\nsets:\n  - params:\n      A: {value: 1, type: INT32}\n")
+    write_extended_file(extended, ExtParamFile(every_kind()))
+    assert not is_extended_file(plain)
+    with pytest.raises(FileError, match="paramclient_extended is missing"):
+        read_extended_file(plain)
+    with pytest.raises(FileError, match="it has extended parameters, and plain ones are expected"):
+        read_file(extended)
+    write_extended_file(tmp_path / "camera.json", ExtParamFile(every_kind()))
+    with pytest.raises(FileError, match="it has extended parameters, and plain ones are expected"):
+        read_file(tmp_path / "camera.json")
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"value": 1}, "is no type"),
+        ({"value": 1, "type": "TYPE_5"}, "is no type"),
+        ({"value": 1, "type": "EXT_TYPE_999"}, "is no type"),
+        ({"type": "CUSTOM"}, "either value or hex"),
+        ({"value": 1, "hex": "00", "type": "INT32"}, "either value or hex"),
+        ({"value": 1, "type": "INT32", "more": 1}, "expected value or hex, and type"),
+        ({"value": True, "type": "INT32"}, "must be a number or text"),
+        ({"value": None, "type": "INT32"}, "must be a number or text"),
+        ({"value": 300, "type": "UINT8"}, "does not fit UINT8"),
+        ({"value": "one", "type": "UINT8"}, "'one' is not a number"),
+        ({"value": 1, "type": "CUSTOM"}, "1 is not text"),
+        ({"value": "x" * 129, "type": "CUSTOM"}, "129 bytes"),
+        ({"hex": "0", "type": "CUSTOM"}, "invalid extended parameters"),
+        ({"hex": 5, "type": "CUSTOM"}, "invalid extended parameters"),
+        ({"hex": "0102", "type": "INT32"}, "hex is not a value of type INT32"),
+        ({"hex": "00" * 129, "type": "CUSTOM"}, "hex is not a value of type CUSTOM"),
+        (5, "expected value or hex, and type"),
+    ],
+)
+def test_what_is_invalid_is_told(tmp_path: Path, fields: object, words: str) -> None:
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps({"paramclient_extended": 1, "params": {"CAM": fields}}))
+    with pytest.raises(FileError, match=words) as caught:
+        read_extended_file(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("", "the key paramclient_extended is missing"),
+        ("{", "expected JSON"),
+        ('{"paramclient_extended": 2, "params": {}}', "unknown version 2"),
+        ('{"paramclient_extended": 1}', "invalid extended parameters: params"),
+        ('{"paramclient_extended": 1, "params": []}', "params must have parameters"),
+        ('{"paramclient_extended": 1, "params": {}}', "params must have parameters"),
+        (
+            '{"paramclient_extended": 1, "system": 0, "params": {"A": {"hex": "", "type": "CUSTOM"}}}',
+            "1 to 255",
+        ),
+        ('{"paramclient_extended": 1, "params": {"": {}}}', "is no name"),
+        ('{"paramclient_extended": 1, "params": {"A": {}, "A": {}}}', "occurs twice"),
+    ],
+)
+def test_documents_that_are_none(tmp_path: Path, content: str, words: str) -> None:
+    path = tmp_path / "camera.json"
+    path.write_text(content)
+    with pytest.raises(FileError, match=words):
+        read_extended_file(path)

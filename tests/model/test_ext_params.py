@@ -1,0 +1,164 @@
+"""Values of extended parameters: encoding by type, text and bytes, equality."""
+
+from __future__ import annotations
+
+import decimal
+import math
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from paramclient.errors import UsageError
+from paramclient.model.ext_params import (
+    EXT_VALUE_SIZE,
+    ExtParam,
+    ExtParamType,
+    ExtSettable,
+    ExtValue,
+    check_ext_value,
+    decode_ext_value,
+    encode_ext_value,
+    ext_type_name,
+    format_ext_value,
+)
+from paramclient.model.values import ParamType, Trust
+
+KINDS = ExtParamType
+NAN = struct.pack("<f", math.nan)
+
+
+def test_the_numeric_types_have_the_numbers_of_plain_ones() -> None:
+    assert {kind.name: int(kind) for kind in ParamType} == {
+        kind.name: int(kind) for kind in ExtParamType if kind is not ExtParamType.CUSTOM
+    }
+
+
+@pytest.mark.parametrize(
+    ("number", "value", "raw"),
+    [
+        (KINDS.UINT8, 255, b"\xff"),
+        (KINDS.INT8, -2, b"\xfe"),
+        (KINDS.UINT16, 513, b"\x01\x02"),
+        (KINDS.INT16, -2, b"\xfe\xff"),
+        (KINDS.UINT32, 2**32 - 1, b"\xff" * 4),
+        (KINDS.INT32, -5_000_000, struct.pack("<i", -5_000_000)),
+        (KINDS.UINT64, 2**64 - 1, b"\xff" * 8),
+        (KINDS.INT64, -(2**63), bytes(7) + b"\x80"),
+        (KINDS.REAL32, 0.5, struct.pack("<f", 0.5)),
+        (KINDS.REAL64, 0.1, struct.pack("<d", 0.1)),
+        (KINDS.CUSTOM, "", b""),
+        (KINDS.CUSTOM, "Kamera für vorn", "Kamera für vorn".encode()),
+        (KINDS.CUSTOM, "x" * 128, b"x" * 128),
+        (KINDS.CUSTOM, "two\nlines\t", b"two\nlines\t"),
+        (KINDS.CUSTOM, b"\xff\xfe", b"\xff\xfe"),
+        (KINDS.CUSTOM, b"a\0b", b"a\0b"),
+        (KINDS.CUSTOM, b"\x1b[0m", b"\x1b[0m"),
+        (77, b"\x01\x02", b"\x01\x02"),
+        (0, b"", b""),
+    ],
+)
+def test_values_of_every_type(number: int, value: ExtValue, raw: bytes) -> None:
+    assert encode_ext_value(value, number) == raw
+    in_message = raw.ljust(EXT_VALUE_SIZE, b"\0")
+    assert decode_ext_value(in_message, number) == value
+    param = ExtParam.of("A", in_message, number, 3)
+    assert (param.name, param.value, param.type, param.index, param.raw) == ("A", value, number, 3, raw)
+    assert type(param.value) is type(value)
+    assert ExtParam.of("A", raw, number, 3) == param
+
+
+def test_bytes_behind_a_number_do_not_count() -> None:
+    one, other = (ExtParam.of("A", b"\x05\0\0\0" + rest, KINDS.INT32) for rest in (b"", b"rubbish"))
+    assert one == other
+    assert one.value == 5
+
+
+@given(st.binary(max_size=128))
+def test_every_custom_value_can_be_set_again(data: bytes) -> None:
+    param = ExtParam.of("A", data.ljust(128, b"\0"), KINDS.CUSTOM)
+    assert encode_ext_value(param.value, KINDS.CUSTOM) == param.raw == data.rstrip(b"\0")
+    if isinstance(param.value, str):
+        assert check_ext_value(param.value) == param.value
+
+
+@pytest.mark.parametrize(
+    ("value", "number", "words"),
+    [
+        (256, KINDS.UINT8, "does not fit UINT8, which holds 0 to 255"),
+        (2**63, KINDS.INT64, "does not fit INT64"),
+        (1.5, KINDS.INT32, "not a whole number"),
+        (math.inf, KINDS.INT32, "not a whole number"),
+        (1e39, KINDS.REAL32, "beyond the range of REAL32"),
+        (10**400, KINDS.REAL64, "beyond the range of REAL64"),
+        ("5", KINDS.INT32, "'5' is not a number, and the parameter is INT32"),
+        (b"5", KINDS.REAL32, "is not a number"),
+        (5, KINDS.CUSTOM, "5 is not text or bytes, and the parameter is CUSTOM"),
+        ("5", 77, "'5' is not bytes, and the parameter is EXT_TYPE_77"),
+        (5, 77, "is not bytes"),
+    ],
+)
+def test_values_that_do_not_fit(value: ExtValue, number: int, words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        encode_ext_value(value, number)
+
+
+@pytest.mark.parametrize(
+    ("given_value", "value"),
+    [
+        (True, 1),
+        (decimal.Decimal("0.5"), 0.5),
+        (3, 3),
+        ("text", "text"),
+        (b"\0", b"\0"),
+        ("é" * 64, "é" * 64),
+    ],
+)
+def test_what_a_caller_may_give(given_value: ExtSettable, value: ExtValue) -> None:
+    assert check_ext_value(given_value) == value
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        ("x" * 129, "129 bytes; an extended parameter holds 128"),
+        ("é" * 65, "130 bytes"),
+        (bytes(129), "129 bytes"),
+        ("a\0b", "without NUL"),
+        ("\ud800", "UTF-8"),
+        (None, "not NoneType"),
+        (decimal.Decimal("sNaN"), "number in the range of a float"),
+    ],
+)
+def test_what_a_caller_may_not_give(value: ExtSettable, words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        check_ext_value(value)
+
+
+def test_a_whole_float_fits_an_integer() -> None:
+    assert encode_ext_value(3.0, KINDS.INT16) == b"\x03\0"
+
+
+def test_equality_is_that_of_values() -> None:
+    def real(value: float) -> ExtParam:
+        return ExtParam.of("A", struct.pack("<f", value), KINDS.REAL32)
+
+    assert real(0.0).same_value(real(-0.0))
+    assert not real(0.0).same_value(real(1.0))
+    assert ExtParam.of("A", NAN, KINDS.REAL32).same_value(ExtParam.of("A", NAN, KINDS.REAL32))
+    assert not ExtParam.of("A", b"", KINDS.CUSTOM).same_value(ExtParam.of("A", b"\x80", KINDS.CUSTOM))
+    assert not ExtParam.of("A", b"\1", KINDS.UINT8).same_value(ExtParam.of("A", b"\1", KINDS.INT8))
+    wide = [struct.pack("<d", value) for value in (0.0, -0.0)]
+    assert ExtParam.of("A", wide[0], KINDS.REAL64).same_value(ExtParam.of("A", wide[1], KINDS.REAL64))
+
+
+def test_trust_index_and_text() -> None:
+    param = ExtParam.of("CAM_NAME", b"Front", KINDS.CUSTOM, 2)
+    assert param.with_trust(Trust.CACHED).trust is Trust.CACHED
+    assert param.with_trust(Trust.LIVE) is param
+    assert param.with_index(None).index is None
+    assert param.with_index(2) is param
+    assert str(param) == "CAM_NAME = Front"
+    assert [format_ext_value(*each) for each in ((b"\1\2", 11), (0.1, 9), (7, 7))] == ["0x0102", "0.1", "7"]
+    assert [ext_type_name(each) for each in (KINDS.CUSTOM, 5, 77)] == ["CUSTOM", "UINT32", "EXT_TYPE_77"]

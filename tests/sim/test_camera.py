@@ -1,0 +1,119 @@
+"""The simulated camera: its answers, and the arguments that it rejects."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from paramclient.errors import ExtAckResult, UsageError
+from paramclient.model.ext_params import ExtParamType
+from paramclient.protocol import wire
+from paramclient.protocol.wire import (
+    Message,
+    ParamExtAck,
+    ParamExtRequestList,
+    ParamExtRequestRead,
+    ParamExtSet,
+    ParamExtValue,
+)
+from paramclient.sim import Camera
+
+UINT32 = ExtParamType.UINT32
+
+
+def ask(camera: Camera, message: Message, now: float = 1.0, *, until: float | None = None) -> list[Message]:
+    """What the camera sends in answer."""
+    camera.tick(0.0)
+    camera.data_to_send()
+    camera.receive(wire.encode(message, system=255, component=190, sequence=0), now)
+    camera.tick(now if until is None else until)
+    framer = wire.Framer({322, 324}, stream=False)
+    found = [wire.decode(frame) for data in camera.data_to_send() for frame in framer.receive(data)]
+    return [message for message in found if message is not None]
+
+
+def set_mode(value: int, number: int = UINT32, name: str = "CAM_MODE") -> ParamExtSet:
+    return ParamExtSet(1, 100, name, bytes([value]), number)
+
+
+def result(camera: Camera, request: ParamExtSet) -> tuple[int, int]:
+    """The value and the result of its acknowledgement."""
+    (answer,) = ask(camera, request)
+    assert isinstance(answer, ParamExtAck)
+    return answer.raw[0], answer.param_result
+
+
+def test_it_answers_reads_of_what_it_has() -> None:
+    camera = Camera()
+    by_name = ask(camera, ParamExtRequestRead(1, 100, "CAM_MODE"))
+    assert by_name == [ParamExtValue("CAM_MODE", b"\1".ljust(128, b"\0"), UINT32, 16, 0)]
+    assert ask(camera, ParamExtRequestRead(1, 100, "", 0)) == by_name
+    assert ask(camera, ParamExtRequestRead(1, 100, "NO_SUCH")) == []
+    assert ask(camera, ParamExtRequestRead(1, 100, "", 16)) == []
+    assert ask(camera, ParamExtRequestRead(1, 1, "CAM_MODE")) == []
+    assert camera.requests["PARAM_EXT_REQUEST_READ"] == 4
+
+
+def test_it_sends_its_list_in_bursts() -> None:
+    camera = Camera()
+    assert len(ask(camera, ParamExtRequestList(1, 100), until=1.0)) == 5
+    camera.tick(2.0)
+    assert len(camera.data_to_send()) >= 11
+    assert ask(Camera({}), ParamExtRequestList(1, 100), until=3.0) == []
+
+
+def test_results_of_sets() -> None:
+    camera = Camera(supported={"CAM_MODE": [0, 1]}, failing=["CAM_ISO"], limits={"CAM_EXPMODE": (0, 3)})
+    assert result(camera, set_mode(0)) == (0, ExtAckResult.ACCEPTED)
+    assert result(camera, set_mode(2)) == (0, ExtAckResult.VALUE_UNSUPPORTED)
+    assert result(camera, set_mode(1, ExtParamType.UINT8)) == (0, ExtAckResult.FAILED)
+    assert result(camera, set_mode(1, name="CAM_ISO")) == (100, ExtAckResult.FAILED)
+    assert result(camera, set_mode(9, ExtParamType.UINT8, "CAM_EXPMODE")) == (3, ExtAckResult.ACCEPTED)
+    assert ask(camera, set_mode(1, name="NO_SUCH")) == []
+
+
+def test_a_slow_change() -> None:
+    camera = Camera(slow={"CAM_MODE": 2.0})
+    assert result(camera, set_mode(0)) == (1, ExtAckResult.IN_PROGRESS)
+    assert result(camera, set_mode(5)) == (1, ExtAckResult.IN_PROGRESS)
+    assert camera.next_deadline() is not None
+    camera.tick(3.1)
+    assert camera.ext_values["CAM_MODE"] == 0
+    assert result(camera, set_mode(0)) == (0, ExtAckResult.ACCEPTED)
+
+
+def test_changes_on_board() -> None:
+    camera = Camera({"A": 1, "B": "text", "C": 0.5})
+    assert {name: param.type for name, param in camera.ext_params.items()} == {
+        "A": ExtParamType.INT32,
+        "B": ExtParamType.CUSTOM,
+        "C": ExtParamType.REAL32,
+    }
+    camera.set_ext_param("B", "other")
+    camera.remove_ext_param("A")
+    assert camera.ext_values == {"B": "other", "C": 0.5}
+    assert camera.ext_param("C").index == 1
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"table": {"": 1}},
+        {"table": {"A": "x" * 129}},
+        {"table": {"A": (ExtParamType.UINT8, 300)}},
+        {"failing": ["NO_SUCH"]},
+        {"slow": {"NO_SUCH": 1.0}},
+        {"limits": {"NO_SUCH": (0, 1)}},
+        {"supported": {"CAM_MODE": ["text"]}},
+        {"component": 256},
+    ],
+)
+def test_arguments_that_it_rejects(arguments: dict[str, Any]) -> None:
+    with pytest.raises(UsageError):
+        Camera(**arguments)
+    camera = Camera({"A": 1})
+    with pytest.raises(UsageError):
+        camera.set_ext_param("A", "text")
+    with pytest.raises(UsageError):
+        camera.remove_ext_param("B")
