@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from paramclient.errors import FileErrorCode, FileTransferError, LinkError, NoReply, UsageError
 from paramclient.model.values import ParamType, crc32_px4
 from paramclient.protocol import wire
-from paramclient.protocol.ftp import DirectoryEntry, FileRead, FileTransfers, param_pck
+from paramclient.protocol.ftp import DirectoryEntry, FileRead, FileTransfers, FileWrite, param_pck
 from paramclient.protocol.ftp.file_read import WINDOW_MIN
 from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.ftp.param_pck import PackedParam
@@ -1090,6 +1090,7 @@ class TestWriting:
         first = desk.next(Opcode.WRITE_FILE)
         assert (first.data, first.offset, first.session) == (b"abc", 0, 9)
         desk.answer(first)
+        assert isinstance(write, FileWrite)
         assert write.written == 3
         second = desk.next(Opcode.WRITE_FILE)
         assert (second.data, second.offset) == (b"de", 3)
@@ -1219,6 +1220,106 @@ def test_whatever_a_server_says_it_ends(junk: list[Packet], what: str) -> None:
     desk.pass_time()
     assert job.done
     assert desk.transfers.is_idle
+
+
+class TestWritingAtOnce:
+    """A file of a header and four blocks, written with its header last."""
+
+    def begin(self, desk: Desk, *, may_commit: bool = True) -> Operation[None]:
+        job = desk.transfers.write_whole(
+            PARAMS, bytes(range(14)), desk.now, may_commit=lambda now: may_commit, write_size=2
+        )
+        desk.answer(desk.next(Opcode.CREATE_FILE))
+        return job
+
+    def test_four_blocks_are_in_flight_and_the_header_ends_the_file(self) -> None:
+        desk = Desk()
+        job = self.begin(desk)
+        blocks = desk.take()
+        assert [packet.offset for packet in blocks] == [6, 8, 10, 12]
+        assert {packet.opcode for packet in blocks} == {Opcode.WRITE_FILE}
+        for block in blocks[:3]:
+            desk.answer(block)
+            assert desk.take() == []
+        desk.answer(blocks[3])
+        first, again, end, _ = desk.take()
+        assert first == again
+        assert (first.opcode, first.offset, first.data) == (Opcode.WRITE_FILE, 0, bytes(range(6)))
+        assert end.opcode == Opcode.TERMINATE_SESSION
+        desk.answer(first)
+        assert not desk.transfers.is_idle
+        desk.answer(end)
+        assert job.done
+        assert job.error is None
+
+    def test_a_block_that_a_later_one_has_overtaken_is_sent_again_at_once(self) -> None:
+        desk = Desk()
+        self.begin(desk)
+        _, second, *_ = desk.take()
+        desk.answer(second)
+        assert desk.next(Opcode.WRITE_FILE).offset == 6
+
+    def test_nothing_ends_the_file_while_a_block_is_missing(self) -> None:
+        desk = Desk()
+        self.begin(desk)
+        for block in desk.take()[1:]:
+            desk.answer(block)
+        desk.pass_time(0.5)
+        assert {packet.offset for packet in desk.take()} == {6}
+
+    def test_a_block_that_is_never_acknowledged_ends_the_write_without_its_beginning(self) -> None:
+        desk = Desk()
+        job = self.begin(desk)
+        sent: list[Packet] = []
+        while not job.done:
+            sent += desk.take()
+            desk.pass_time(1.0)
+        assert isinstance(job.error, NoReply)
+        assert 0 not in {packet.offset for packet in sent if packet.opcode == Opcode.WRITE_FILE}
+        assert desk.take()[-1].opcode == Opcode.TERMINATE_SESSION
+
+    def test_a_write_that_may_not_be_committed_is_closed_without_its_beginning(self) -> None:
+        desk = Desk()
+        job = self.begin(desk, may_commit=False)
+        for block in desk.take():
+            desk.answer(block)
+        desk.answer(desk.next(Opcode.TERMINATE_SESSION))
+        assert isinstance(job.error, UsageError)
+
+    def test_the_beginning_is_repeated_with_the_end_until_it_is_acknowledged(self) -> None:
+        desk = Desk()
+        job = self.begin(desk)
+        for block in desk.take():
+            desk.answer(block)
+        first, *_ = desk.take()
+        desk.pass_time(1.1)
+        again = [packet.opcode for packet in desk.take()]
+        assert Opcode.WRITE_FILE in again
+        assert Opcode.TERMINATE_SESSION in again
+        desk.answer(first)
+        desk.pass_time(1.1)
+        later = desk.take()
+        assert {packet.opcode for packet in later} == {Opcode.TERMINATE_SESSION}
+        desk.answer(later[0])
+        assert job.error is None
+        assert job.done
+
+
+def test_checksums_are_requested_in_parallel() -> None:
+    desk = Desk()
+    job = desk.transfers.checksums(["a", "b", "c", "d", "e"], desk.now)
+    requests = desk.take()
+    assert [packet.data for packet in requests] == [b"a", b"b", b"c", b"d"]
+    desk.answer(requests[1], (7).to_bytes(4, "little"))
+    last = desk.next(Opcode.CALC_FILE_CRC32)
+    assert last.data == b"e"
+    for request in (last, requests[3], requests[0]):
+        desk.answer(request, (9).to_bytes(4, "little"))
+    assert not desk.transfers.is_idle
+    desk.answer(requests[2], code=FileErrorCode.FILE_NOT_FOUND)
+    assert job.result == (9, 7, None, 9, 9)
+    with pytest.raises(UsageError, match="no file"):
+        desk.transfers.checksums([], desk.now)
 
 
 # Whole transfers
@@ -1442,10 +1543,15 @@ class TestOnTheAir:
         ]
         ground.outcome(ground.transfers.write(PARAMS, param_pck.encode_upload(rows), ground.now))
         assert {vehicle.param(row.name).value for row in rows} == {5}
-        damaged = param_pck.encode_upload([PackedParam("RTL_ALT", ParamType.INT16, 5)])[:-1]
-        with pytest.raises(FileTransferError, match="does not take") as caught:
-            ground.outcome(ground.transfers.write(PARAMS, damaged, ground.now))
-        assert caught.value.errno == 22
+        ground.settle()
+
+    def test_a_damaged_parameter_file_is_taken_without_a_word(self) -> None:
+        vehicle = ardupilot()
+        ground = Ground(vehicle)
+        before = vehicle.param("RTL_ALT")
+        damaged = param_pck.encode_upload([PackedParam("RTL_ALT", ParamType.INT16, 5)]) + b"x"
+        ground.outcome(ground.transfers.write(PARAMS, damaged, ground.now))
+        assert vehicle.param("RTL_ALT") == before
         ground.settle()
 
     def test_a_value_that_changes_meanwhile_is_the_old_or_the_new_one(self) -> None:
