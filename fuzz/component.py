@@ -28,7 +28,7 @@ from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.station import Station
 from paramclient.protocol.stats import traffic
 from paramclient.protocol.vehicle.metadata_location import MetadataRequest
-from paramclient.protocol.vehicle.reboot import Reboot
+from paramclient.protocol.vehicle.reboot_command import Reboot
 from paramclient.protocol.wire import HASH_CHECK, NO_INDEX, Framer, Message
 
 __all__ = ["LONGEST", "run"]
@@ -88,13 +88,13 @@ class _Session:
         self.is_paused = False
         self.listens = options >= LISTENS
         policy = Policy.CACHE_ONLY if self.listens else policy
-        self.upkeep = SyncSettings(
+        self.sync_settings = SyncSettings(
             interval, without_hash=bool(options & 2), policy=policy, listens_only=self.listens
         )
         self.station = Station(
             link="fuzz",
             is_stream=bool(options & 1),
-            upkeep=self.upkeep,
+            sync_settings=self.sync_settings,
             counts_traffic=bool(options & 4),
             encoding=(None, None, Encoding.BYTEWISE, Encoding.C_CAST)[options >> 5 & 3],
         )
@@ -175,7 +175,7 @@ class _Session:
 
     def check(self, machine: ComponentMachine, system: int, component: int) -> None:
         held = machine.table
-        assert (system, component) != self.station.own
+        assert (system, component) != self.station.own_address
         assert system != 0
         assert len(held.params) <= 12
         prefix = _prefix(system)
@@ -362,9 +362,9 @@ class _Session:
             case Write():
                 machine.writes.cancel(operation, self.now)
             case MetadataRequest():
-                machine.descriptions.release(operation)
+                machine.metadata_requests.release(operation)
             case Reboot():
-                machine.end_restart(operation, self.now)
+                machine.end_reboot(operation, self.now)
             case _:
                 machine.files.release(operation, self.now)  # type: ignore[arg-type]  # all other kinds are handled above
 
@@ -372,7 +372,7 @@ class _Session:
         machine, how = self.machine(), self.draw.number()
         if machine is not None:
             sampled = Sampled(1 + how % 5, 0) if how & 16 else None
-            refresh = bool(how & 32) and sampled is None and self.upkeep.policy is Policy.AUTO
+            refresh = bool(how & 32) and sampled is None and self.sync_settings.policy is Policy.AUTO
             with suppress(NoReply, UsageError):
                 self.keep(machine, machine.begin_fetch(self.now, refresh=refresh, sampled=sampled))
 
@@ -407,12 +407,12 @@ class _Session:
         machine, returns = self.machine(), bool(self.draw.number() & 1)
         if machine is not None:
             with suppress(NoReply, UsageError):
-                self.keep(machine, machine.begin_restart(self.now, returns=returns))
+                self.keep(machine, machine.begin_reboot(self.now, returns=returns))
 
     def ask_description(self) -> None:
         machine = self.machine()
         if machine is not None and not self.listens:
-            self.keep(machine, machine.descriptions.ask(self.now))
+            self.keep(machine, machine.metadata_requests.ask(self.now))
 
     def file(self) -> None:
         machine, what = self.machine(), self.draw.number() % 5

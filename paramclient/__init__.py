@@ -108,7 +108,7 @@ from paramclient.protocol.params.sync import SyncState
 from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome, SetStatus
 from paramclient.protocol.params.writes import SetResult
 from paramclient.protocol.stats.traffic import ComponentTraffic, MessageTraffic, RadioStatus, TrafficReport
-from paramclient.protocol.vehicle.peers import Contest
+from paramclient.protocol.vehicle.address_contest import Contest
 from paramclient.protocol.wire import Refusal, SigningKey, SigningPolicy, SigningReport, SigningStream
 from paramclient.version import __version__
 

@@ -27,7 +27,7 @@
 - `store`: `ParamCache`, the public class.
 - `param_columns`: the stored form of a parameter, and its columns in both databases.
 - `tables`: tables and their history.
-- `transaction`: `Session`, one transaction in SQL.
+- `transaction`: `Transaction`, one transaction in SQL.
 - `transfer`: copies of tables between stores.
 """
 
@@ -54,7 +54,7 @@ from paramclient.cache.records import (
 )
 from paramclient.cache.snapshots import CLOCK_SLACK, SNAPSHOTS
 from paramclient.cache.store import ParamCache, default_path
-from paramclient.cache.tables import HISTORY_LINES
+from paramclient.cache.tables import HISTORY_ENTRIES_MAX
 from paramclient.cache.transfer import CopyResult
 
 __all__ = [
@@ -74,7 +74,7 @@ __all__ = [
     "FleetDiff",
     "FleetValue",
     "FleetVehicle",
-    "HISTORY_LINES",
+    "HISTORY_ENTRIES_MAX",
     "HeardParams",
     "HistoryEntry",
     "Holder",

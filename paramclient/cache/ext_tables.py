@@ -23,8 +23,8 @@ from paramclient.cache.param_columns import BY_VEHICLE
 from paramclient.cache.reconciliation import reconcile
 from paramclient.cache.records import TableUpdate
 from paramclient.cache.snapshots import CLOCK_SLACK
-from paramclient.cache.tables import HISTORY_LINES
-from paramclient.cache.transaction import ExtState, Session
+from paramclient.cache.tables import HISTORY_ENTRIES_MAX
+from paramclient.cache.transaction import ExtState, Transaction
 from paramclient.model.ext_params import ExtParam
 
 __all__ = ["ExtDump", "load_ext", "put_ext", "save_ext", "take_ext"]
@@ -57,7 +57,7 @@ class ExtDump:
             mine = self.rows.get(name)
             if (mine is None and name not in removed) or (mine is not None and mine.heard_at < row.heard_at):
                 return f"extended parameter {name}"
-        first = self.lines[0][0] if len(self.lines) >= HISTORY_LINES else 0.0
+        first = self.lines[0][0] if len(self.lines) >= HISTORY_ENTRIES_MAX else 0.0
         if any(line[0] >= first for line in set(other.lines) - set(self.lines)):
             return "a line of the history of extended parameters"
         return None
@@ -74,14 +74,16 @@ class ExtDump:
         rows = {name: row for name, row in rows.items() if row.heard_at > gone.get(name, -math.inf)}
         later = max(self, other, key=lambda each: each.heard_last)
         is_complete = later.complete and set(rows) == set(later.rows)
-        return ExtDump(later.count, is_complete, rows, tuple(lines[-HISTORY_LINES:]))
+        return ExtDump(later.count, is_complete, rows, tuple(lines[-HISTORY_ENTRIES_MAX:]))
 
 
-def save_ext(session: Session, updates: Iterable[ExtTableUpdate], present: float | None = None) -> None:
+def save_ext(
+    transaction: Transaction, updates: Iterable[ExtTableUpdate], present: float | None = None
+) -> None:
     """Write updates, see `ParamCache.save_ext`.
 
     Args:
-        session: the transaction.
+        transaction: the transaction.
         updates: the updates, in order of execution.
         present: current time by the clock of the updates, in unix seconds; None uses `at` of each update.
     """
@@ -91,16 +93,16 @@ def save_ext(session: Session, updates: Iterable[ExtTableUpdate], present: float
         known = TableUpdate(
             identity=update.identity, component=update.component, autopilot=update.autopilot, at=update.at
         )
-        reconcile(session, [known], present)
-        owner = session.owner_of(update.identity.key, update.component)
+        reconcile(transaction, [known], present)
+        owner = transaction.owner_of(update.identity.key, update.component)
         assert owner is not None, "it was written just now"
         now = max(time_cell(update.at), 0.0 if present is None else present)
-        _write(session, owner, update, math.inf if session.is_shared else now + CLOCK_SLACK)
+        _write(transaction, owner, update, math.inf if transaction.is_shared else now + CLOCK_SLACK)
 
 
-def _write(session: Session, owner: int, update: ExtTableUpdate, horizon: float) -> None:
+def _write(transaction: Transaction, owner: int, update: ExtTableUpdate, horizon: float) -> None:
     """Write the values of an update. A stored time after `horizon` is older than every observation."""
-    before = session.ext_rows(owner)
+    before = transaction.ext_rows(owner)
     after = dict(before)
     lines: list[ExtLine] = []
     for name, at in update.removed.items():
@@ -117,42 +119,44 @@ def _write(session: Session, owner: int, update: ExtTableUpdate, horizon: float)
             after[new.name] = new._replace(param_index=index, by="")
             if not old.param.same_value(new.param):
                 lines.append((new.heard_at, new.name, new.by, old.type, old.raw, new.type, new.raw))
-    state = session.ext_state(owner)
+    state = transaction.ext_state(owner)
     count = update.count if update.count is not None or state is None else state.count
     complete = update.complete
     if complete is None:
         complete = state is not None and state.complete
-    session.put_ext_rows(owner, before, after)
-    session.put_ext_state(owner, ExtState(count, complete, ext_checksum(after)))
+    transaction.put_ext_rows(owner, before, after)
+    transaction.put_ext_state(owner, ExtState(count, complete, ext_checksum(after)))
     if lines:
-        session.add_ext_lines(owner, lines)
-        session.trim_ext_lines(owner, HISTORY_LINES)
+        transaction.add_ext_lines(owner, lines)
+        transaction.trim_ext_lines(owner, HISTORY_ENTRIES_MAX)
 
 
-def load_ext(session: Session, key: str, component: int) -> CachedExtTable | None:
+def load_ext(transaction: Transaction, key: str, component: int) -> CachedExtTable | None:
     """Return the extended parameters of a component; None if there are none."""
-    owner = session.owner_of(key, component)
-    state = None if owner is None else session.ext_state(owner)
+    owner = transaction.owner_of(key, component)
+    state = None if owner is None else transaction.ext_state(owner)
     if owner is None or state is None:
         return None
-    rows = session.ext_rows(owner)
+    rows = transaction.ext_rows(owner)
     params: dict[str, ExtParam] = {name: row.param for name, row in rows.items()}
     heard_at = {name: row.heard_at for name, row in rows.items()}
     return CachedExtTable(key, component, params, heard_at, state.count, state.complete)
 
 
-def take_ext(session: Session, owner: int) -> ExtDump | None:
+def take_ext(transaction: Transaction, owner: int) -> ExtDump | None:
     """Return all stored data of a table of extended parameters; None if there is none."""
-    state = session.ext_state(owner)
+    state = transaction.ext_state(owner)
     if state is None:
         return None
-    return ExtDump(state.count, state.complete, session.ext_rows(owner), tuple(session.ext_lines(owner)))
+    return ExtDump(
+        state.count, state.complete, transaction.ext_rows(owner), tuple(transaction.ext_lines(owner))
+    )
 
 
-def put_ext(session: Session, owner: int, whole: ExtDump | None) -> None:
+def put_ext(transaction: Transaction, owner: int, whole: ExtDump | None) -> None:
     """Replace a table of extended parameters; None removes it."""
-    session.drop_ext(owner)
+    transaction.drop_ext(owner)
     if whole is not None:
-        session.put_ext_rows(owner, {}, whole.rows)
-        session.put_ext_state(owner, ExtState(whole.count, whole.complete, ext_checksum(whole.rows)))
-        session.add_ext_lines(owner, whole.lines)
+        transaction.put_ext_rows(owner, {}, whole.rows)
+        transaction.put_ext_state(owner, ExtState(whole.count, whole.complete, ext_checksum(whole.rows)))
+        transaction.add_ext_lines(owner, whole.lines)

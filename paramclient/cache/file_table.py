@@ -9,7 +9,7 @@ from typing import Final
 
 from paramclient.cache.param_columns import StoredParam
 from paramclient.cache.records import CachedSummary, TableState, TableUpdate
-from paramclient.cache.transaction import Session
+from paramclient.cache.transaction import Transaction
 from paramclient.errors import UsageError
 from paramclient.model.hash_exclusions import hash_of, usual_volatile
 from paramclient.model.identity import Identity, version_difference
@@ -76,11 +76,11 @@ class _Reference:
     volatile_known: bool = False
 
     @classmethod
-    def find(cls, session: Session, identity: Identity, component: int) -> _Reference:
+    def find(cls, transaction: Transaction, identity: Identity, component: int) -> _Reference:
         """Return that of the vehicle's own table, or of the largest one of the same firmware."""
         fits = [
             (owner, each)
-            for owner, each in session.summaries()
+            for owner, each in transaction.summaries()
             if each.component == component
             and each.source is None
             and each.size
@@ -92,7 +92,7 @@ class _Reference:
             fits, key=lambda pair: (pair[1].complete, pair[1].key == identity.key, pair[1].size)
         )
         words = f"the cached table of {best.system}/{best.component} ({best.key})"
-        return cls(words, session.table(owner), best.complete, best.volatile_known)
+        return cls(words, transaction.table(owner), best.complete, best.volatile_known)
 
     @property
     def listed(self) -> list[str]:
@@ -116,17 +116,17 @@ class FileTable:
     params: ParamSet
     at: float
 
-    def update(self, session: Session, kept: CachedSummary | None) -> tuple[TableUpdate, AddedTable]:
+    def update(self, transaction: Transaction, kept: CachedSummary | None) -> tuple[TableUpdate, AddedTable]:
         """Return the update that replaces the stored table, and its description.
 
         Args:
-            session: the transaction.
+            transaction: the transaction.
             kept: the stored table; None if there is none.
 
         Raises:
             UsageError: types are unknown, a value does not fit its type, or a name is not valid.
         """
-        reference = _Reference.find(session, self.identity, self.component)
+        reference = _Reference.find(transaction, self.identity, self.component)
         notes = [*self._notes(reference)]
         typed = self._typed(reference)
         missing = [name for name in reference.listed if name not in typed]

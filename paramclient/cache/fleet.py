@@ -1,8 +1,8 @@
 """Fleet comparison: parameters of many vehicles, the vehicles that differ, and since when.
 
 Only the requested parameters are read, and they are grouped by value before they are converted: a fleet has
-many vehicles and few values. Checksums of whole tables are not verified here. Each function with a session
-runs inside the transaction of its caller.
+many vehicles and few values. Checksums of whole tables are not verified here. Each function with a
+transaction runs inside the transaction of its caller.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Final, TypeAlias
 
 from paramclient.cache.cells import cells
 from paramclient.cache.param_columns import read_param
-from paramclient.cache.transaction import Session
+from paramclient.cache.transaction import Transaction
 from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import Param, same_bits
 
@@ -168,16 +168,18 @@ def spread(
     )
 
 
-def fleet_diff(session: Session, component: int, wanted: Mapping[str, WrittenParam | None]) -> FleetDiff:
+def fleet_diff(
+    transaction: Transaction, component: int, wanted: Mapping[str, WrittenParam | None]
+) -> FleetDiff:
     """Compare all vehicles with wanted values, by name; with None, compare them with each other."""
     owners = {
         owner: FleetVehicle(key, system, complete)
-        for owner, key, system, complete in session.tables_of(component)
+        for owner, key, system, complete in transaction.tables_of(component)
     }
     places = {owner: place for place, owner in enumerate(owners)}
     holders = [Holder(vehicle) for vehicle in owners.values()]
     values: defaultdict[str, dict[Cells, list[Holder]]] = defaultdict(dict)
-    for row, same in session.holders(list(owners), list(wanted)).items():
+    for row, same in transaction.holders(list(owners), list(wanted)).items():
         name, *value = cells(row, "siii")
         values[name][tuple(value)] = [holders[place] for place in sorted(places[each] for each in same)]
     names = []
@@ -187,10 +189,10 @@ def fleet_diff(session: Session, component: int, wanted: Mapping[str, WrittenPar
             having = {holder.vehicle.key for same in values[name].values() for holder in same}
             without = [holder for holder in holders if holder.vehicle.key not in having]
         names.append(spread(name, written, values[name], without))
-    return FleetDiff(component, tuple(owners.values()), tuple(_dated(session, owners, names)))
+    return FleetDiff(component, tuple(owners.values()), tuple(_dated(transaction, owners, names)))
 
 
-def names_like(session: Session, component: int, pattern: str) -> list[str]:
+def names_like(transaction: Transaction, component: int, pattern: str) -> list[str]:
     """Return the names of all vehicles that match a shell pattern, in alphabetical order.
 
     A text without pattern characters is returned unchanged, whether any vehicle has it or not.
@@ -198,12 +200,12 @@ def names_like(session: Session, component: int, pattern: str) -> list[str]:
     start = pattern[: next((at for at, sign in enumerate(pattern) if sign in "*?["), len(pattern))]
     if start == pattern:
         return [pattern]
-    names = session.names_between(component, start, f"{start}\U0010ffff")
+    names = transaction.names_between(component, start, f"{start}\U0010ffff")
     return sorted(name for name in names if fnmatchcase(name, pattern))
 
 
 def _dated(
-    session: Session, owners: Mapping[int, FleetVehicle], names: Iterable[NameSpread]
+    transaction: Transaction, owners: Mapping[int, FleetVehicle], names: Iterable[NameSpread]
 ) -> Iterator[NameSpread]:
     """Add the times to the vehicles that differ."""
     names = list(names)
@@ -212,7 +214,7 @@ def _dated(
         for holder in (*_others(each), *each.lacking):
             standing_out[holder.vehicle.key].append(each.name)
     ids = {vehicle.key: owner for owner, vehicle in owners.items()}
-    found = _times(session, {ids[key]: some for key, some in standing_out.items()})
+    found = _times(transaction, {ids[key]: some for key, some in standing_out.items()})
     times = {key: found[ids[key]] for key in standing_out}
 
     def dated(holders: Iterable[Holder], name: str) -> tuple[Holder, ...]:
@@ -234,13 +236,13 @@ def _others(of: NameSpread) -> Iterator[Holder]:
 
 
 def _times(
-    session: Session, named: Mapping[int, Sequence[str]]
+    transaction: Transaction, named: Mapping[int, Sequence[str]]
 ) -> Mapping[int, dict[str, tuple[float, bool]]]:
     """Return, by table and name, the time since when the value exists, and whether it is that of a change."""
     rows: list[tuple[int, str, str, int, float]] = []
     for start in range(0, max(map(len, named.values()), default=0), _NAMES_PER_STATEMENT):
         parts = {owner: names[start : start + _NAMES_PER_STATEMENT] for owner, names in named.items()}
-        rows += session.since({owner: names for owner, names in parts.items() if names})
+        rows += transaction.value_dates({owner: names for owner, names in parts.items() if names})
     known = {owner: at for owner, _, what, _, at in rows if what == "known"}
     times: defaultdict[int, dict[str, tuple[float, bool]]] = defaultdict(dict)
     for owner, name, what, _, at in rows:

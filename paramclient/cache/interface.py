@@ -8,7 +8,7 @@ from typing import Protocol, TypeVar
 
 from paramclient.cache.operations import StoreOperation
 from paramclient.cache.records import CacheChange
-from paramclient.cache.transaction import Session
+from paramclient.cache.transaction import Transaction
 
 __all__ = ["Store"]
 
@@ -39,7 +39,7 @@ class Store(Protocol):
         """Number of times that a new file was created, or found in place of the previous one."""
         ...
 
-    def read(self, work: Callable[[Session], T]) -> T:
+    def read(self, work: Callable[[Transaction], T]) -> T:
         """Run a function that only reads, in one transaction, and return its result.
 
         Raises:

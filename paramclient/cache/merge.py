@@ -8,8 +8,8 @@ from typing import Final
 
 from paramclient.cache.param_columns import BY_VEHICLE, StoredParam
 from paramclient.cache.records import CachedSummary, CachedVehicle, TableUpdate
-from paramclient.cache.tables import HISTORY_LINES, applied, check_times, hashed, save
-from paramclient.cache.transaction import Line, Session
+from paramclient.cache.tables import HISTORY_ENTRIES_MAX, apply_update, check_times, hashed, save
+from paramclient.cache.transaction import Line, Transaction
 
 __all__ = ["merge"]
 
@@ -19,7 +19,7 @@ observation, or later by the delay of a slow disk."""
 
 
 def merge(
-    session: Session,
+    transaction: Transaction,
     updates: Sequence[TableUpdate],
     based_on: Mapping[tuple[str, int], float],
 ) -> None:
@@ -30,7 +30,7 @@ def merge(
         key = (update.identity.key, update.component)
         past = tables.get(key)
         if past is None:
-            past = tables[key] = _TableMerge(session, based_on.get(key))
+            past = tables[key] = _TableMerge(transaction, based_on.get(key))
         past.take(update)
     for past in tables.values():
         past.finish()
@@ -41,7 +41,7 @@ class _TableMerge:
     """Merge of the updates of one table.
 
     Attributes:
-        session: the transaction.
+        transaction: the transaction.
         based_on: `updated_at` of the stored table on which the updates are based, or None.
         owner: id of the table in the database, or None before it exists.
         goes_on: whether the updates continue from the stored table.
@@ -49,7 +49,7 @@ class _TableMerge:
         lines: new history lines, to be inserted by time.
     """
 
-    session: Session
+    transaction: Transaction
     based_on: float | None
     owner: int | None = None
     goes_on: bool = False
@@ -58,7 +58,7 @@ class _TableMerge:
 
     def take(self, update: TableUpdate) -> None:
         """Merge one update."""
-        vehicle, found = _standing(self.session, update)
+        vehicle, found = _standing(self.transaction, update)
         if found is None:
             self.goes_on = True
             self._save(update, vehicle)
@@ -80,7 +80,7 @@ class _TableMerge:
         found = [self.overtaken.pop(name) for name in names if name in self.overtaken]
         if self.owner is None or not found:
             return
-        kept = self.session.table(self.owner)
+        kept = self.transaction.table(self.owner)
         for item in found:
             new = kept.get(item.name)
             if new is None or item.same_value(new) or self._lines(item.name, item.heard_at, new.heard_at):
@@ -93,31 +93,31 @@ class _TableMerge:
         if not self.lines:
             return
         assert self.owner is not None
-        lines: list[tuple[int | None, Line]] = list(self.session.lines(self.owner))
+        lines: list[tuple[int | None, Line]] = list(self.transaction.lines(self.owner))
         for new in self.lines:
             later = (place for place, (_, line) in enumerate(lines) if line[0] > new[0])
             lines.insert(next(later, len(lines)), (None, new))
-        dropped, lines = lines[:-HISTORY_LINES], lines[-HISTORY_LINES:]
-        self.session.replace_lines(self.owner, lines)
+        dropped, lines = lines[:-HISTORY_ENTRIES_MAX], lines[-HISTORY_ENTRIES_MAX:]
+        self.transaction.replace_lines(self.owner, lines)
         if dropped:
-            self.session.forget(self.owner, max(line[0] for _, line in dropped))
+            self.transaction.raise_known_since(self.owner, max(line[0] for _, line in dropped))
 
     def _save(self, update: TableUpdate, vehicle: CachedVehicle | None) -> None:
         if vehicle is not None and vehicle.last_seen > update.at:
             update = replace(update, identity=vehicle.identity)
-        save(self.session, [update])
+        save(self.transaction, [update])
         self._widen(update, vehicle)
 
     def _widen(self, update: TableUpdate, vehicle: CachedVehicle | None) -> None:
         """Extend the first and last time of the vehicle by the time of an update."""
         if vehicle is not None:
             first, last = min(vehicle.first_seen, update.at), max(vehicle.last_seen, update.at)
-            self.session.set_seen_times(vehicle.key, first, last)
+            self.transaction.set_seen_times(vehicle.key, first, last)
 
     def _bring_in(self, update: TableUpdate, table: CachedSummary) -> None:
         """Merge an older update: only values without a later observation change the table."""
         assert self.owner is not None
-        before = self.session.table(self.owner)
+        before = self.transaction.table(self.owner)
         whole_at = table.synced_at if table.complete and table.synced_at is not None else float("-inf")
         later: list[StoredParam] = []
         heard = {item.name for item in update.params}
@@ -126,8 +126,8 @@ class _TableMerge:
         for item in update.params:
             name = item.name
             row = before.get(name)
-            gone_at = self.session.gone_at(self.owner, name) if row is None else row.heard_at
-            if (max(whole_at, gone_at) if row is None else gone_at) < item.heard_at:
+            removed_at = self.transaction.removal_time(self.owner, name) if row is None else row.heard_at
+            if (max(whole_at, removed_at) if row is None else removed_at) < item.heard_at:
                 # its index may belong to another count
                 later.append(item._replace(param_index=None))
                 continue
@@ -136,12 +136,12 @@ class _TableMerge:
             if row is not None and before_it is not None:
                 self.lines += self._line(before_it, item)
         self.catch_up(item.name for item in later)
-        after, changes, births = applied(replace(update, params=later, removed=(), replace=False), before)
+        after, changes, added = apply_update(replace(update, params=later, removed=(), replace=False), before)
         if after != before:
-            self.session.put_table(self.owner, before, after)
+            self.transaction.put_table(self.owner, before, after)
             if hashed(before) != hashed(after):
-                self.session.describe(self.owner, hash=None)
-        self.session.record_added_names(self.owner, births)
+                self.transaction.update_component(self.owner, hash=None)
+        self.transaction.record_added_names(self.owner, added)
         self.lines += changes
 
     def _line(self, old: StoredParam, new: StoredParam) -> Iterator[Line]:
@@ -155,13 +155,13 @@ class _TableMerge:
     def _lines(self, name: str, after: float, until: float) -> list[Line]:
         """Return the new values of a parameter in a period, from its history lines."""
         assert self.owner is not None
-        return self.session.values_between(self.owner, name, after, until)
+        return self.transaction.values_between(self.owner, name, after, until)
 
 
 def _standing(
-    session: Session, update: TableUpdate
+    transaction: Transaction, update: TableUpdate
 ) -> tuple[CachedVehicle | None, tuple[int, CachedSummary] | None]:
     """Return the stored vehicle and table of an update, or None for each that does not exist."""
     key = update.identity.key
-    vehicle = next(iter(session.vehicles(key)), None)
-    return vehicle, next(iter(session.summaries(key, update.component)), None)
+    vehicle = next(iter(transaction.vehicles(key)), None)
+    return vehicle, next(iter(transaction.summaries(key, update.component)), None)

@@ -13,7 +13,7 @@ from paramclient.cache.ext_tables import save_ext
 from paramclient.cache.merge import merge
 from paramclient.cache.reconciliation import reconcile
 from paramclient.cache.records import Snapshot, TableUpdate
-from paramclient.cache.transaction import Session
+from paramclient.cache.transaction import Transaction
 from paramclient.errors import NotInCache
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet
@@ -39,10 +39,10 @@ class StoreOperation(ABC, Generic[T_co]):
         """Key and component of the tables that it may change; None as component: all of the vehicle."""
 
     @abstractmethod
-    def do(self, session: Session) -> T_co:
+    def do(self, transaction: Transaction) -> T_co:
         """Execute the operation in a transaction, and return its result."""
 
-    def done(self, session: Session) -> T_co | None:
+    def done(self, transaction: Transaction) -> T_co | None:
         """Return the result of an earlier `do` that was committed but whose result was lost."""
         return None
 
@@ -66,8 +66,8 @@ class Save(StoreOperation[None]):
     def tables(self) -> Iterable[tuple[str, int | None]]:
         return {(each.identity.key, each.component) for each in self.updates}
 
-    def do(self, session: Session) -> None:
-        reconcile(session, self.updates, None if self.clock is None else self.clock())
+    def do(self, transaction: Transaction) -> None:
+        reconcile(transaction, self.updates, None if self.clock is None else self.clock())
 
 
 @dataclass(frozen=True)
@@ -85,8 +85,8 @@ class SaveExt(StoreOperation[None]):
     def tables(self) -> Iterable[tuple[str, int | None]]:
         return {(each.identity.key, each.component) for each in self.updates}
 
-    def do(self, session: Session) -> None:
-        save_ext(session, self.updates, None if self.clock is None else self.clock())
+    def do(self, transaction: Transaction) -> None:
+        save_ext(transaction, self.updates, None if self.clock is None else self.clock())
 
 
 @dataclass(frozen=True)
@@ -105,8 +105,8 @@ class Merge(StoreOperation[None]):
     def tables(self) -> Iterable[tuple[str, int | None]]:
         return {(each.identity.key, each.component) for each in self.updates}
 
-    def do(self, session: Session) -> None:
-        merge(session, self.updates, self.based_on)
+    def do(self, transaction: Transaction) -> None:
+        merge(transaction, self.updates, self.based_on)
 
 
 @dataclass(frozen=True)
@@ -137,9 +137,9 @@ class StoreSnapshot(StoreOperation[Snapshot]):
     def tables(self) -> Iterable[tuple[str, int | None]]:
         return [(self.vehicle if isinstance(self.vehicle, str) else self.vehicle.key, self.component)]
 
-    def do(self, session: Session) -> Snapshot:
+    def do(self, transaction: Transaction) -> Snapshot:
         [(key, _)] = self.tables
-        owner = session.owner_of(key, self.component)
+        owner = transaction.owner_of(key, self.component)
         if owner is None:
             if isinstance(self.vehicle, str):
                 raise NotInCache(f"the table of {key}, component {self.component}, has just been removed")
@@ -147,13 +147,13 @@ class StoreSnapshot(StoreOperation[Snapshot]):
             new = TableUpdate(
                 identity=self.vehicle, component=self.component, autopilot=autopilot, at=self.at
             )
-            owner = session.upsert_table(new)
-        [(_, kept)] = session.summaries(key, self.component)
+            owner = transaction.upsert_table(new)
+        [(_, kept)] = transaction.summaries(key, self.component)
         identity = kept.identity if isinstance(self.vehicle, str) else self.vehicle
-        shown = self.resolved(session)
+        shown = self.resolved(transaction)
         assert shown.params is not None
         return snapshots.store(
-            session,
+            transaction,
             owner,
             replace(shown.params, identity=identity),
             at=self.at,
@@ -163,25 +163,25 @@ class StoreSnapshot(StoreOperation[Snapshot]):
             number=self.number,
         )
 
-    def done(self, session: Session) -> Snapshot:
+    def done(self, transaction: Transaction) -> Snapshot:
         """Return the stored snapshot of this time."""
         [(key, _)] = self.tables
-        owner = session.owner_of(key, self.component)
-        number = None if owner is None else session.snapshot_at(owner, snapshots.kept_time(self.at))
+        owner = transaction.owner_of(key, self.component)
+        number = None if owner is None else transaction.snapshot_at(owner, snapshots.kept_time(self.at))
         if owner is None or number is None:
             raise NotInCache(f"the table of {key}, component {self.component}, has just been removed")
-        return snapshots.snapshot(session, owner, number)
+        return snapshots.snapshot(transaction, owner, number)
 
-    def resolved(self, session: Session) -> StoreSnapshot:
+    def resolved(self, transaction: Transaction) -> StoreSnapshot:
         """Return this operation with the parameters of the stored table, if it has none of its own."""
         if self.params is not None:
             return self
         [(key, _)] = self.tables
-        found = session.summaries(key, self.component)
+        found = transaction.summaries(key, self.component)
         if not found:
             raise NotInCache(f"the table of {key}, component {self.component}, has just been removed")
         [(owner, kept)] = found
-        return replace(self, params=_kept(session, owner), hash=kept.hash, complete=kept.complete)
+        return replace(self, params=_kept(transaction, owner), hash=kept.hash, complete=kept.complete)
 
 
 @dataclass(frozen=True)
@@ -202,14 +202,14 @@ class Remove(StoreOperation[int]):
     def tables(self) -> Iterable[tuple[str, int | None]]:
         return [(self.key, self.component)]
 
-    def do(self, session: Session) -> int:
-        return session.remove(self.key, self.component)
+    def do(self, transaction: Transaction) -> int:
+        return transaction.remove(self.key, self.component)
 
-    def done(self, session: Session) -> int:
+    def done(self, transaction: Transaction) -> int:
         """Return the number of tables at the time of the call."""
         return self.known
 
 
-def _kept(session: Session, owner: int) -> ParamSet:
-    rows = session.table(owner).values()
+def _kept(transaction: Transaction, owner: int) -> ParamSet:
+    rows = transaction.table(owner).values()
     return ParamSet.of(row.param for row in rows if is_portable_name(row.name))

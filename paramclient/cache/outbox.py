@@ -15,9 +15,9 @@ from paramclient.cache.operations import Merge, Save, SaveExt, StoreOperation, S
 from paramclient.cache.param_columns import COLUMN_NAMES, StoredParam
 from paramclient.cache.records import TableState, TableUpdate
 from paramclient.cache.snapshots import read_written, written_cells
-from paramclient.cache.sqlite import SqliteSession
+from paramclient.cache.sqlite import SqliteTransaction
 from paramclient.cache.sqlite_file import Database
-from paramclient.cache.transaction import Session
+from paramclient.cache.transaction import Transaction
 from paramclient.cache.transfer import TableDump, put_snapshots, put_whole
 from paramclient.model.paramset import ParamSet
 
@@ -86,11 +86,11 @@ class LocalCopy:
 
     def begin(self) -> None:
         """Create the file if it does not exist, after the database was reached."""
-        self._write(lambda session: None)
+        self._write(lambda transaction: None)
 
-    def read(self, work: Callable[[Session], T]) -> T:
+    def read(self, work: Callable[[Transaction], T]) -> T:
         """Run a function that only reads, in one transaction, and return its result."""
-        return self.database.read(lambda connection: work(SqliteSession(connection, is_shared=True)))
+        return self.database.read(lambda connection: work(SqliteTransaction(connection, is_shared=True)))
 
     def do(self, operation: StoreOperation[T]) -> T:
         """Execute an operation that the database has executed."""
@@ -99,9 +99,9 @@ class LocalCopy:
     def spool(self, operation: StoreOperation[T], writer: str, number: int) -> T:
         """Execute an operation and queue it for the database, in one transaction."""
 
-        def work(session: SqliteSession) -> T:
-            result = operation.do(session)
-            session.connection.execute(
+        def work(transaction: SqliteTransaction) -> T:
+            result = operation.do(transaction)
+            transaction.connection.execute(
                 "INSERT INTO outbox (writer, number, operation) VALUES (?, ?, ?)",
                 (writer, number, packed(operation)),
             )
@@ -112,8 +112,8 @@ class LocalCopy:
     def waiting(self, limit: int) -> list[QueuedOperation]:
         """Return queued operations, the oldest first, without those that the database has refused."""
 
-        def work(session: SqliteSession) -> list[QueuedOperation]:
-            found = session.connection.execute(
+        def work(transaction: SqliteTransaction) -> list[QueuedOperation]:
+            found = transaction.connection.execute(
                 "SELECT id, writer, number, operation FROM outbox WHERE refused IS NULL ORDER BY id LIMIT ?",
                 (limit,),
             )
@@ -127,17 +127,17 @@ class LocalCopy:
     def mark_delivered(self, entries: Sequence[QueuedOperation], tables: Iterable[_Key]) -> None:
         """Remove executed operations from the queue, and mark these tables as stale."""
 
-        def work(session: SqliteSession) -> None:
+        def work(transaction: SqliteTransaction) -> None:
             done = [(each.id,) for each in entries]
-            session.connection.executemany("DELETE FROM outbox WHERE id = ?", done)
-            session.connection.executemany("REPLACE INTO mirrored VALUES (?, ?, -1)", list(tables))
+            transaction.connection.executemany("DELETE FROM outbox WHERE id = ?", done)
+            transaction.connection.executemany("REPLACE INTO mirrored VALUES (?, ?, -1)", list(tables))
 
         self._write(work)
 
     def refuse(self, entry: QueuedOperation, why: str) -> None:
         """Mark an operation as refused by the database. It stays in the file."""
         self._write(
-            lambda session: session.connection.execute(
+            lambda transaction: transaction.connection.execute(
                 "UPDATE outbox SET refused = ? WHERE id = ?", (why, entry.id)
             )
         )
@@ -145,8 +145,8 @@ class LocalCopy:
     def revisions(self) -> dict[_Key, int]:
         """Return the copied revision of each table."""
 
-        def work(session: SqliteSession) -> dict[_Key, int]:
-            found = session.connection.execute("SELECT vehicle, component, revision FROM mirrored")
+        def work(transaction: SqliteTransaction) -> dict[_Key, int]:
+            found = transaction.connection.execute("SELECT vehicle, component, revision FROM mirrored")
             return {(key, component): revision for key, component, revision in found}
 
         return self._write(work) if self.exists else {}
@@ -154,41 +154,45 @@ class LocalCopy:
     def set_copied_revision(self, key: _Key, revision: int | None) -> None:
         """Set the copied revision of a table; None if it is no longer a copy."""
 
-        def work(session: SqliteSession) -> None:
+        def work(transaction: SqliteTransaction) -> None:
             if revision is None:
-                session.connection.execute("DELETE FROM mirrored WHERE (vehicle, component) = (?, ?)", key)
+                transaction.connection.execute(
+                    "DELETE FROM mirrored WHERE (vehicle, component) = (?, ?)", key
+                )
             else:
-                session.connection.execute("REPLACE INTO mirrored VALUES (?, ?, ?)", (*key, revision))
+                transaction.connection.execute("REPLACE INTO mirrored VALUES (?, ?, ?)", (*key, revision))
 
         self._write(work)
 
     def mirror(self, key: _Key, whole: TableDump | None, revision: int | None) -> None:
         """Replace a table with that of the database; None removes it."""
 
-        def work(session: SqliteSession) -> None:
+        def work(transaction: SqliteTransaction) -> None:
             if whole is None:
-                session.remove(*key)
-                session.connection.execute("DELETE FROM mirrored WHERE (vehicle, component) = (?, ?)", key)
+                transaction.remove(*key)
+                transaction.connection.execute(
+                    "DELETE FROM mirrored WHERE (vehicle, component) = (?, ?)", key
+                )
             else:
-                owner = put_whole(session, whole)
-                put_snapshots(session, owner, whole)
-                session.connection.execute("REPLACE INTO mirrored VALUES (?, ?, ?)", (*key, revision))
+                owner = put_whole(transaction, whole)
+                put_snapshots(transaction, owner, whole)
+                transaction.connection.execute("REPLACE INTO mirrored VALUES (?, ?, ?)", (*key, revision))
 
         self._write(work)
 
     def snapshots(self, key: _Key) -> frozenset[int]:
         """Return the numbers of the snapshots of a table in this file."""
-        return self.read(lambda session: frozenset(each.id for each in session.snapshots(*key)))
+        return self.read(lambda transaction: frozenset(each.id for each in transaction.snapshots(*key)))
 
     def close(self) -> None:
         """Close the file."""
         self.database.close()
 
-    def _write(self, work: Callable[[SqliteSession], T], *, durable: bool = False) -> T:
+    def _write(self, work: Callable[[SqliteTransaction], T], *, durable: bool = False) -> T:
         def whole(connection: Any) -> T:
             for statement in _TABLES:
                 connection.execute(statement)
-            return work(SqliteSession(connection, is_shared=True))
+            return work(SqliteTransaction(connection, is_shared=True))
 
         return self.database.write(whole, durable=durable)
 

@@ -28,7 +28,7 @@ from paramclient.cache.param_columns import (
     read_rows,
 )
 from paramclient.cache.postgres_schema import CHANNEL, MIGRATIONS, SCHEMA
-from paramclient.cache.transaction import Session
+from paramclient.cache.transaction import Transaction
 from paramclient.cache.transfer import LOCAL_NUMBERS_MIN
 from paramclient.errors import CacheError, UsageError
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     import psycopg
     from psycopg_pool import ConnectionPool
 
-__all__ = ["Unavailable", "PostgresDatabase", "PostgresSession", "Revisions"]
+__all__ = ["Unavailable", "PostgresDatabase", "PostgresTransaction", "Revisions"]
 
 CONNECT_TIMEOUT: Final = 3
 """Timeout in seconds for a connection to the database; after it, the local copy is used."""
@@ -122,7 +122,7 @@ class PostgresDatabase:
             pool, self._pool = self._pool, None
         _end(pool)
 
-    def read(self, work: Callable[[Session], T]) -> T:
+    def read(self, work: Callable[[Transaction], T]) -> T:
         """Run a function that only reads, in one consistent snapshot, and return its result.
 
         Raises:
@@ -131,10 +131,10 @@ class PostgresDatabase:
         """
         with self._translated(), self._connection() as connection:
             connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ READ ONLY")
-            return work(PostgresSession(connection))
+            return work(PostgresTransaction(connection))
 
     def read_with_revision(
-        self, work: Callable[[Session], T], table: tuple[str, int]
+        self, work: Callable[[Transaction], T], table: tuple[str, int]
     ) -> tuple[T, int | None]:
         """Run a function that only reads one table. Return its result and the revision of the table.
 
@@ -143,7 +143,7 @@ class PostgresDatabase:
         """
         with self._translated(), self._connection() as connection:
             connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ READ ONLY")
-            return work(PostgresSession(connection)), _revisions(connection, [table[0]]).get(table)
+            return work(PostgresTransaction(connection)), _revisions(connection, [table[0]]).get(table)
 
     def write(
         self, operations: Sequence[tuple[StoreOperation[Any], str, int]]
@@ -196,9 +196,9 @@ class PostgresDatabase:
                     " WHERE current_setting('synchronous_commit') = 'off'"
                 )
             before = _revisions(connection, keys)
-            session = PostgresSession(connection)
+            transaction = PostgresTransaction(connection)
             results = [
-                operation.do(session) if _is_new(connection, writer, number) else None
+                operation.do(transaction) if _is_new(connection, writer, number) else None
                 for operation, writer, number in operations
             ]
             connection.execute(
@@ -267,7 +267,7 @@ class PostgresDatabase:
         return {**defaults, **given, "options": f"{chosen} {given.get('options', '')}".strip()}
 
 
-class PostgresSession(Session):
+class PostgresTransaction(Transaction):
     """One transaction in PostgreSQL."""
 
     is_shared = True
@@ -292,11 +292,11 @@ class PostgresSession(Session):
     ) -> None:
         if before is None:
             before = self._rows(owner)
-        gone = list(before.keys() - after.keys())
-        if gone:
-            self._do("DELETE FROM param WHERE owner = ? AND name = ANY (?)", (owner, gone))
+        removed = list(before.keys() - after.keys())
+        if removed:
+            self._do("DELETE FROM param WHERE owner = ? AND name = ANY (?)", (owner, removed))
         self._put_rows(owner, {name: row for name, row in sorted(after.items()) if before.get(name) != row})
-        self.describe(owner, checksum=checksum(after))
+        self.update_component(owner, checksum=checksum(after))
 
     def heard_last(self, owner: int) -> float:
         [(at,)] = self._all("SELECT max(heard_at) FROM param WHERE owner = ?", (owner,))
@@ -345,7 +345,7 @@ class PostgresSession(Session):
         holders = {tuple(value): [each for each in having if each in meant] for *value, having in found}
         return {value: some for value, some in holders.items() if some}
 
-    def since(self, named: Mapping[int, Sequence[str]]) -> list[tuple[int, str, str, int, float]]:
+    def value_dates(self, named: Mapping[int, Sequence[str]]) -> list[tuple[int, str, str, int, float]]:
         owners = list(named)
         found = [
             (owner, "", "known", 0, at)

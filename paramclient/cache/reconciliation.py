@@ -25,7 +25,7 @@ from paramclient.cache.param_columns import BY_VEHICLE, StoredParam
 from paramclient.cache.records import CachedSummary, TableState, TableUpdate
 from paramclient.cache.snapshots import CLOCK_SLACK
 from paramclient.cache.tables import (
-    applied,
+    apply_update,
     check_times,
     forget_other_firmware,
     hashed,
@@ -33,22 +33,22 @@ from paramclient.cache.tables import (
     write_lines,
     write_state,
 )
-from paramclient.cache.transaction import Line, NumberedLine, Session
+from paramclient.cache.transaction import Line, NumberedLine, Transaction
 
 __all__ = ["TableHistory", "reconcile"]
 
 
-def reconcile(session: Session, updates: Iterable[TableUpdate], present: float | None = None) -> None:
+def reconcile(transaction: Transaction, updates: Iterable[TableUpdate], present: float | None = None) -> None:
     """Write updates, see `ParamCache.save`.
 
     Args:
-        session: the transaction.
+        transaction: the transaction.
         updates: the updates, in order of execution.
         present: current time by the clock of the updates, in unix seconds; None uses `at` of each update.
     """
     for update in updates:
         check_times(update)
-        _reconcile(session, update, max(time_cell(update.at), 0.0 if present is None else present))
+        _reconcile(transaction, update, max(time_cell(update.at), 0.0 if present is None else present))
 
 
 @dataclass
@@ -58,14 +58,14 @@ class TableHistory:
     Attributes:
         lines: history lines in order, each with its number, or None for a new line.
         known_since: time since which the states of the table are known, or None.
-        births: by name, the time at which it appeared or, for a changed parameter of the first table, at
+        added: by name, the time at which it appeared or, for a changed parameter of the first table, at
             which its first value was observed; the earliest of these times.
         new_added_names: new or earlier times from the inserted observations.
     """
 
     lines: list[tuple[int | None, Line]]
     known_since: float | None = None
-    births: Mapping[str, float] = field(default_factory=dict)
+    added: Mapping[str, float] = field(default_factory=dict)
     new_added_names: dict[str, float] = field(default_factory=dict)
 
     def observe(
@@ -91,7 +91,7 @@ class TableHistory:
             if has_come_back:
                 self._insert((kept.heard_at, name, BY_VEHICLE, *seen.value, *kept.value))
                 return
-            since = self._born(name, self.known_since)
+            since = self._added_at(name, self.known_since)
             is_new = since is None or at < since
             if is_known or not is_new:
                 self._insert((at, name, by, *kept.value, *seen.value))
@@ -103,10 +103,10 @@ class TableHistory:
         old, new = tuple(values[:3]), tuple(values[3:])
         if seen.has_value(old) or has_come_back:  # the time at which it became `old` is not known
             return
-        born = self._born(name)
-        if born is not None and at < born <= later and not is_known:  # it was `old` at `born`
+        added_at = self._added_at(name)
+        if added_at is not None and at < added_at <= later and not is_known:  # it was `old` at `added_at`
             self.new_added_names[name] = at
-            self._insert((born, name, BY_VEHICLE, *seen.value, *old), before=place)
+            self._insert((added_at, name, BY_VEHICLE, *seen.value, *old), before=place)
             return
         if seen.has_value(new):
             if later - at > SAME_CHANGE_MAX:  # the change was earlier than recorded
@@ -116,9 +116,9 @@ class TableHistory:
         self.lines[place] = (number, (later, name, later_by, *seen.value, *new))
         self._insert((at, name, by, *old, *seen.value))
 
-    def _born(self, name: str, default: float | None = None) -> float | None:
+    def _added_at(self, name: str, default: float | None = None) -> float | None:
         """Return the recorded time before which a name is unknown; a new record is the earlier one."""
-        return self.new_added_names.get(name, self.births.get(name, default))
+        return self.new_added_names.get(name, self.added.get(name, default))
 
     def add(self, line: Line) -> None:
         """Insert a line by its time."""
@@ -130,52 +130,52 @@ class TableHistory:
         self.lines.insert(place if before is None else min(place, before), (None, line))
 
 
-def _reconcile(session: Session, update: TableUpdate, present: float) -> None:
+def _reconcile(transaction: Transaction, update: TableUpdate, present: float) -> None:
     """Write one update: identity, values, history and the state of the table."""
     key, at = update.identity.key, update.at
-    horizon = math.inf if session.is_shared else present + CLOCK_SLACK
-    vehicle = next(iter(session.vehicles(key)), None)
+    horizon = math.inf if transaction.is_shared else present + CLOCK_SLACK
+    vehicle = next(iter(transaction.vehicles(key)), None)
     if vehicle is not None and at < vehicle.last_seen <= horizon:
         update = replace(update, identity=vehicle.identity)
-    forget_other_firmware(session, update.identity)
-    found = next(iter(session.summaries(key, update.component)), None)
-    owner = session.upsert_table(update)
+    forget_other_firmware(transaction, update.identity)
+    found = next(iter(transaction.summaries(key, update.component)), None)
+    owner = transaction.upsert_table(update)
     if vehicle is not None:
         last = vehicle.last_seen if vehicle.last_seen <= horizon else at
-        session.set_seen_times(key, min(vehicle.first_seen, at), max(last, at))
+        transaction.set_seen_times(key, min(vehicle.first_seen, at), max(last, at))
     table = None if found is None else found[1]
     is_late = False
     if table is not None:
         if table.updated_at > horizon:
-            session.add_setback(owner, present, table.updated_at)
+            transaction.add_clock_rollback(owner, present, table.updated_at)
         elif table.updated_at > at:
             is_late = True
-            session.describe(owner, updated_at=table.updated_at)
+            transaction.update_component(owner, updated_at=table.updated_at)
     before: Mapping[str, StoredParam] = {}
     after = before
     agrees = is_whole = True
     if update.params or update.removed or update.replace:  # otherwise it has only the state of the table
-        before = session.table(owner)
-        seen = _Seen(session, owner, table, before, horizon)
-        after, agrees, is_whole = _write_values(session, owner, update, seen, is_late=is_late)
+        before = transaction.table(owner)
+        seen = _Seen(transaction, owner, table, before, horizon)
+        after, agrees, is_whole = _write_values(transaction, owner, update, seen, is_late=is_late)
     state = update.table if table is None else _respectful(update, table)
     if state is not None and is_whole and (state.complete or not is_late):
         if agrees:
-            write_state(session, owner, state)
+            write_state(transaction, owner, state)
         elif state.complete and table is not None and not table.complete:
-            write_state(session, owner, replace(state, hash=None))  # the hash belongs to other values
+            write_state(transaction, owner, replace(state, hash=None))  # the hash belongs to other values
         else:
             state = None
     else:
         state = None
     if state is not None and state.complete:
-        session.begin(owner, at)
+        transaction.set_known_since(owner, at)
     if state is None and hashed(before) != hashed(after):
-        session.describe(owner, hash=None)
+        transaction.update_component(owner, hash=None)
 
 
 def _write_values(
-    session: Session, owner: int, update: TableUpdate, seen: _Seen, *, is_late: bool
+    transaction: Transaction, owner: int, update: TableUpdate, seen: _Seen, *, is_late: bool
 ) -> tuple[Mapping[str, StoredParam], bool, bool]:
     """Write the values of an update.
 
@@ -189,17 +189,17 @@ def _write_values(
     agrees = True
     if seen.table is not None and not all(seen.is_news(name, at) for name, at in heard_times(update.params)):
         part, older, agrees = _divided(update, seen, is_late=is_late)
-    gone: Collection[str] = update.removed
+    removed: Collection[str] = update.removed
     if update.replace:
-        gone = before.keys() - {name for name, _ in heard_times(update.params)} if before else ()
-    stays = {name for name in gone if name in before and not seen.is_news(name, update.gone_at(name))}
-    after, lines, births = applied(part, before, stays.union(item.name for item in older))
+        removed = before.keys() - {name for name, _ in heard_times(update.params)} if before else ()
+    stays = {name for name in removed if name in before and not seen.is_news(name, update.removal_time(name))}
+    after, lines, added = apply_update(part, before, stays.union(item.name for item in older))
     if len(after) != len(before) or after != before:
-        session.put_table(owner, before, after)
-    session.record_added_names(owner, births)
+        transaction.put_table(owner, before, after)
+    transaction.record_added_names(owner, added)
     if lines:
-        session.add_first_times(owner, _first_changes(session, owner, before, dict(births), lines))
-    _write_past(session, owner, older, lines, seen)
+        transaction.add_first_times(owner, _first_changes(transaction, owner, before, dict(added), lines))
+    _write_past(transaction, owner, older, lines, seen)
     return after, agrees, not (stays and update.replace)
 
 
@@ -239,30 +239,30 @@ def _divided(
 
 
 def _first_changes(
-    session: Session,
+    transaction: Transaction,
     owner: int,
     before: Mapping[str, StoredParam],
-    births: Mapping[str, float],
+    added: Mapping[str, float],
     lines: Sequence[Line],
 ) -> list[tuple[str, float]]:
     """Return the observation times of first-table values that change now, as their rows lose these times.
 
     Args:
-        session: the transaction.
+        transaction: the transaction.
         owner: id of the table.
         before: its rows.
-        births: new names with the times of their first observations.
+        added: new names with the times of their first observations.
         lines: the changes.
     """
-    _, _, known_since = session.described(owner)
+    _, _, known_since = transaction.component_row(owner)
     until = math.inf if known_since is None else known_since
     first = {
-        name: before[name].heard_at if name in before else births.get(name, math.inf)
+        name: before[name].heard_at if name in before else added.get(name, math.inf)
         for name in {line[1] for line in lines}
     }
     changed = {name for name, at in first.items() if at < until}
     if changed:
-        changed -= session.first_times(owner).keys()
+        changed -= transaction.first_times(owner).keys()
     return [(name, first[name]) for name in sorted(changed)]
 
 
@@ -271,20 +271,20 @@ class _Seen:
     """The stored state of a table before an update.
 
     Attributes:
-        session: the transaction.
+        transaction: the transaction.
         owner: id of the table.
         table: the table; None if there was none.
         rows: its parameters.
         horizon: unix seconds; later stored times are from before the clock was set back.
-        gone: times of the last removals by name, loaded on first use.
+        removal_times: times of the last removals by name, loaded on first use.
     """
 
-    session: Session
+    transaction: Transaction
     owner: int
     table: CachedSummary | None
     rows: Mapping[str, StoredParam]
     horizon: float
-    gone: Mapping[str, float] | None = None
+    removal_times: Mapping[str, float] | None = None
 
     def is_news(self, name: str, at: float) -> bool:
         """Return whether the cache has no later observation of a parameter.
@@ -301,13 +301,13 @@ class _Seen:
         is_whole = table.complete and table.size >= (table.count or 0)  # a new file may have only a part
         if is_whole and table.synced_at is not None and table.synced_at > at:
             return False
-        if self.gone is None:
-            self.gone = self.session.gone(self.owner)
-        return self.gone.get(name, -math.inf) <= at
+        if self.removal_times is None:
+            self.removal_times = self.transaction.removal_times(self.owner)
+        return self.removal_times.get(name, -math.inf) <= at
 
 
 def _write_past(
-    session: Session,
+    transaction: Transaction,
     owner: int,
     older: Sequence[StoredParam],
     lines: Sequence[Line],
@@ -318,29 +318,29 @@ def _write_past(
     if not times:
         return
     since = min(times)
-    if not older and not since < session.last_line_at(owner) <= seen.horizon:
-        write_lines(session, owner, sorted(lines, key=_time_of))
+    if not older and not since < transaction.last_line_at(owner) <= seen.horizon:
+        write_lines(transaction, owner, sorted(lines, key=_time_of))
         return
-    _, _, known_since = session.described(owner)
-    kept: list[NumberedLine] = session.lines_from(owner, since)
+    _, _, known_since = transaction.component_row(owner)
+    kept: list[NumberedLine] = transaction.lines_from(owner, since)
     ahead = max((place for place, (_, line) in enumerate(kept, 1) if line[0] > seen.horizon), default=0)
     kept = kept[ahead:]
-    past = TableHistory(list(kept), known_since, session.first_times(owner))
+    past = TableHistory(list(kept), known_since, transaction.first_times(owner))
     for item in older:
-        became = session.last_became(owner, item.name, since)
+        became = transaction.last_became(owner, item.name, since)
         past.observe(item, seen.rows.get(item.name), ahead=became)
     for line in lines:  # after the observations, which refer to the rows before these changes
         past.add(line)
-    session.add_first_times(owner, past.new_added_names.items())
+    transaction.add_first_times(owner, past.new_added_names.items())
     if past.lines == kept:
         return
     if past.lines[: len(kept)] == kept:
-        session.add_lines(owner, [line for _, line in past.lines[len(kept) :]])
+        transaction.add_lines(owner, [line for _, line in past.lines[len(kept) :]])
     else:
-        session.replace_lines(owner, past.lines, start=kept[0][0])
-    at = session.trim_lines(owner, tables.HISTORY_LINES)
+        transaction.replace_lines(owner, past.lines, start=kept[0][0])
+    at = transaction.trim_lines(owner, tables.HISTORY_ENTRIES_MAX)
     if at is not None:
-        session.forget(owner, at)
+        transaction.raise_known_since(owner, at)
 
 
 def _respectful(update: TableUpdate, table: CachedSummary) -> TableState | None:

@@ -91,7 +91,7 @@ class TableUpdate:
     replace: bool = False
     whole_at: float | None = None
 
-    def gone_at(self, name: str) -> float:
+    def removal_time(self, name: str) -> float:
         """Return the time at which a name that this update removes was found missing."""
         at = self.removed_at.get(name)
         if at is None:

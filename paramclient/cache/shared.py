@@ -29,7 +29,7 @@ from paramclient.cache.operations import Remove, StoreOperation, StoreSnapshot
 from paramclient.cache.outbox import LocalCopy, QueuedOperation
 from paramclient.cache.postgres import PostgresDatabase, Revisions, Unavailable
 from paramclient.cache.records import CacheChange, Snapshot
-from paramclient.cache.transaction import Session
+from paramclient.cache.transaction import Transaction
 from paramclient.cache.transfer import LOCAL_NUMBERS_MIN, MergeTable, take_whole
 from paramclient.errors import CacheError, UsageError
 
@@ -64,13 +64,13 @@ class SharedStore:
     def __init__(self, address: DatabaseAddress, path: Path) -> None:
         self.path = path
         self.place = address.place
-        self._link = _Link(address, path)
-        self._finalizer = weakref.finalize(self, self._link.close)
+        self._connection = _Connection(address, path)
+        self._finalizer = weakref.finalize(self, self._connection.close)
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Repaired problems of the local copy: one text for each file that was renamed."""
-        return tuple(self._link.local.database.notes)
+        return tuple(self._connection.local.database.notes)
 
     @property
     def replacements(self) -> int:
@@ -80,31 +80,31 @@ class SharedStore:
     @property
     def away(self) -> str | None:
         """Why the local copy is used at present; None while the database is used."""
-        return self._link.away
+        return self._connection.away
 
-    def read(self, work: Callable[[Session], T]) -> T:
+    def read(self, work: Callable[[Transaction], T]) -> T:
         """See `Store.read`."""
-        return self._link.read(work)
+        return self._connection.read(work)
 
     def do(self, operation: StoreOperation[T]) -> T:
         """See `Store.do`. Without a connection, the operation is queued for the database."""
-        result: T = self._link.do(operation)
+        result: T = self._connection.do(operation)
         return result
 
     def follow(self, key: str, component: int) -> None:
         """See `Store.follow`."""
-        self._link.follow((key, component))
+        self._connection.follow((key, component))
 
     def subscribe(self, told: Callable[[CacheChange], None]) -> Callable[[], None]:
         """See `Store.subscribe`."""
-        return self._link.subscribe(told)
+        return self._connection.subscribe(told)
 
     def close(self) -> None:
         """End the thread, and close the database connections and the file."""
         self._finalizer()
 
 
-class _Link:
+class _Connection:
     """Database connection, listener thread and local copy of a store.
 
     Attributes:
@@ -127,14 +127,14 @@ class _Link:
         self._state = threading.Lock()  # held briefly for access to the following attributes
         self._listener: psycopg.Connection[tuple[Any, ...]] | None = None
         self._thread: threading.Thread | None = None
-        self._bell, self._ringer = socket.socketpair()
-        self._bell.setblocking(False)
+        self._wake_reader, self._wake_writer = socket.socketpair()
+        self._wake_reader.setblocking(False)
         self._revisions: Revisions = {}
         self._wanted: set[tuple[str, int]] = set()
         self._subscribers: list[Callable[[CacheChange], None]] = []
 
     # calls of the store
-    def read(self, work: Callable[[Session], T]) -> T:
+    def read(self, work: Callable[[Transaction], T]) -> T:
         for is_second in (False, True):
             if not self._ensure_connected(at_once=is_second):
                 break
@@ -201,8 +201,8 @@ class _Link:
                 self._listener.close()
             self._database.close()
             self.local.close()
-        self._bell.close()
-        self._ringer.close()
+        self._wake_reader.close()
+        self._wake_writer.close()
 
     # connection to the database
 
@@ -379,7 +379,7 @@ class _Link:
     def _listen(self) -> None:
         pause = RETRY_INTERVAL_MIN
         with selectors.DefaultSelector() as selector:
-            selector.register(self._bell, selectors.EVENT_READ)
+            selector.register(self._wake_reader, selectors.EVENT_READ)
             while not self._is_closed:
                 if self._is_here and self._listener is not None:
                     pause = RETRY_INTERVAL_MIN
@@ -441,11 +441,11 @@ class _Link:
 
     def _wake_listener(self) -> None:
         with suppress(OSError):
-            self._ringer.send(b"!")
+            self._wake_writer.send(b"!")
 
     def _drain_wakeup(self) -> None:
         with suppress(OSError):
-            self._bell.recv(4096)
+            self._wake_reader.recv(4096)
 
 
 def _touched(operation: StoreOperation[Any], known: Revisions) -> Iterator[tuple[str, int]]:

@@ -23,7 +23,7 @@ from typing import Any, Final
 from paramclient.cache.cells import Damaged, identity_cells, read_identity, time_cell
 from paramclient.cache.param_columns import StoredParam, read_param
 from paramclient.cache.records import Snapshot
-from paramclient.cache.transaction import Session
+from paramclient.cache.transaction import Transaction
 from paramclient.errors import NotInCache
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
@@ -37,7 +37,7 @@ __all__ = [
     "snapshot",
     "state_at",
     "store",
-    "watch_clock",
+    "record_clock_rollback",
     "written_cells",
 ]
 
@@ -50,17 +50,17 @@ CLOCK_SLACK: Final = 5.0
 may wait this long for the lock before it writes (`LOCK_WAIT_MAX`)."""
 
 
-def watch_clock(session: Session, key: str, component: int, at: float) -> None:
+def record_clock_rollback(transaction: Transaction, key: str, component: int, at: float) -> None:
     """Record that the clock was set back, if a table is written at an earlier time than before."""
-    written_at = session.updated_at(key, component)
+    written_at = transaction.updated_at(key, component)
     if written_at is not None and written_at > at + CLOCK_SLACK:
-        owner = session.owner_of(key, component)
+        owner = transaction.owner_of(key, component)
         assert owner is not None
-        session.add_setback(owner, at, written_at)
+        transaction.add_clock_rollback(owner, at, written_at)
 
 
 def store(
-    session: Session,
+    transaction: Transaction,
     owner: int,
     params: ParamSet,
     *,
@@ -73,7 +73,7 @@ def store(
     """Store a snapshot of a table, and delete the oldest ones beyond `SNAPSHOTS`.
 
     Args:
-        session: the transaction.
+        transaction: the transaction.
         owner: id of the table.
         params: the parameters, with the identity of the vehicle.
         at: time of the snapshot, in unix seconds.
@@ -87,20 +87,20 @@ def store(
     text = reason.encode("utf-8", "backslashreplace").decode()  # a file name in it may not be UTF-8
     text = text.replace("\0", "\\x00")  # PostgreSQL's text type does not allow NUL
     row = (kept_time(at), text, len(params), hash, int(complete))
-    number = session.add_snapshot(owner, row, blob, _checksum(row, blob), number)
-    session.trim_snapshots(owner, SNAPSHOTS)
-    return snapshot(session, owner, number)
+    number = transaction.add_snapshot(owner, row, blob, _checksum(row, blob), number)
+    transaction.trim_snapshots(owner, SNAPSHOTS)
+    return snapshot(transaction, owner, number)
 
 
-def snapshot(session: Session, owner: int, number: int) -> Snapshot:
+def snapshot(transaction: Transaction, owner: int, number: int) -> Snapshot:
     """Return a snapshot of a table.
 
     Raises:
         NotInCache: the table has no snapshot with this number, or it is damaged.
     """
-    found = session.snapshot(owner, number)
+    found = transaction.snapshot(owner, number)
     if found is None:
-        raise NotInCache(_no_such(session, owner, number))
+        raise NotInCache(_no_such(transaction, owner, number))
     summary, row, blob, expected = found
     try:
         if not isinstance(blob, bytes) or _checksum(row, blob) != expected:
@@ -129,12 +129,12 @@ def kept_time(at: float) -> float:
 
 
 def state_at(
-    session: Session, owner: int, identity: Identity, rows: Mapping[str, StoredParam], when: float
+    transaction: Transaction, owner: int, identity: Identity, rows: Mapping[str, StoredParam], when: float
 ) -> ParamSet:
     """Return a table as it was known at a given time.
 
     Args:
-        session: the transaction.
+        transaction: the transaction.
         owner: id of the table.
         identity: the last known identity of the vehicle.
         rows: the current table.
@@ -144,10 +144,10 @@ def state_at(
         NotInCache: the history begins later, or the clock has passed this time twice.
     """
     when = time_cell(when)
-    _, number, since = session.described(owner)
-    exact = session.snapshot_at(owner, when)
+    _, number, since = transaction.component_row(owner)
+    exact = transaction.snapshot_at(owner, when)
     if exact is not None:
-        return snapshot(session, owner, exact).params
+        return snapshot(transaction, owner, exact).params
     who = f"{identity.key}, component {number}"
     if since is None or when < since:
         reach = (
@@ -155,15 +155,15 @@ def state_at(
             if since is None
             else f"at {_text(when)} is not known: what is kept of its history begins at {_text(since)}"
         )
-        raise NotInCache(f"the state of {who} {reach}{_older(session, owner, when)}")
-    twice = session.setback_over(owner, when)
+        raise NotInCache(f"the state of {who} {reach}{_older(transaction, owner, when)}")
+    twice = transaction.clock_rollback_over(owner, when)
     if twice is not None:
         back, until = twice
         raise NotInCache(
             f"the state of {who} at {_text(when)} is ambiguous: the clock of this computer was set back"
-            f" from {_text(until)} to {_text(back)}{_older(session, owner, when)}"
+            f" from {_text(until)} to {_text(back)}{_older(transaction, owner, when)}"
         )
-    first = _first_events_after(session, owner, when)
+    first = _first_events_after(transaction, owner, when)
     state = {name: first.get(name, row.value) for name, row in rows.items()} | first
     params = {}
     for name, value in state.items():
@@ -177,13 +177,13 @@ def state_at(
 _Taken = tuple[int, int, int] | None
 
 
-def _first_events_after(session: Session, owner: int, when: float) -> dict[str, _Taken]:
+def _first_events_after(transaction: Transaction, owner: int, when: float) -> dict[str, _Taken]:
     """Return, by name, the value before the first event after a given time."""
     events: list[tuple[int, int, str, _Taken]] = [
         (line, 0, name, (old_type, old_bits, old_is_raw))
-        for line, (_, name, _, old_type, old_bits, old_is_raw, *_) in session.lines(owner, when)
+        for line, (_, name, _, old_type, old_bits, old_is_raw, *_) in transaction.lines(owner, when)
     ]
-    for line, name in session.births_after(owner, when):
+    for line, name in transaction.added_names_after(owner, when):
         events.append((line, 1, name, None))  # after the last line at that time
     first: dict[str, _Taken] = {}
     for _, _, name, value in sorted(events, key=lambda event: event[:2]):
@@ -191,16 +191,16 @@ def _first_events_after(session: Session, owner: int, when: float) -> dict[str, 
     return first
 
 
-def _older(session: Session, owner: int, when: float) -> str:
+def _older(transaction: Transaction, owner: int, when: float) -> str:
     """Return the nearest snapshots of a time, for messages."""
-    found = session.snapshots_around(owner, when)
+    found = transaction.snapshots_around(owner, when)
     listed = " and ".join(f"snapshot {number} of {_text(at)}" for number, at in found)
     return f"; there is {listed}" if listed else "; there is no snapshot"
 
 
-def _no_such(session: Session, owner: int, number: int) -> str:
-    key, component, _ = session.described(owner)
-    kept = [str(each.id) for each in session.snapshots(key, component)]
+def _no_such(transaction: Transaction, owner: int, number: int) -> str:
+    key, component, _ = transaction.component_row(owner)
+    kept = [str(each.id) for each in transaction.snapshots(key, component)]
     listed = f"those kept are {', '.join(kept)}" if kept else "none is kept"
     return f"there is no snapshot {number} of {key}, component {component}: {listed}"
 

@@ -14,9 +14,9 @@ from paramclient.cache.packed_table import Packed, packed_row, row_checksum
 from paramclient.cache.param_columns import StoredParam, StoredTable, checksum
 from paramclient.cache.records import CacheChange
 from paramclient.cache.sqlite_file import Database
-from paramclient.cache.transaction import Session
+from paramclient.cache.transaction import Transaction
 
-__all__ = ["SqliteSession", "SqliteStore"]
+__all__ = ["SqliteTransaction", "SqliteStore"]
 
 _EMPTY_CHECKSUM: Final = checksum({})
 """Checksum of a table without parameters, which has no packed row."""
@@ -65,15 +65,15 @@ class SqliteStore:
         """Do nothing: a file has no notifications."""
         return _nothing
 
-    def read(self, work: Callable[[Session], T]) -> T:
+    def read(self, work: Callable[[Transaction], T]) -> T:
         """See `Store.read`."""
-        return self._database.read(lambda connection: work(SqliteSession(connection)))
+        return self._database.read(lambda connection: work(SqliteTransaction(connection)))
 
     def do(self, operation: StoreOperation[T]) -> T:
         """See `Store.do`."""
 
         def work(connection: sqlite3.Connection) -> T:
-            return operation.do(SqliteSession(connection))
+            return operation.do(SqliteTransaction(connection))
 
         return self._database.write(work, durable=operation.is_durable)
 
@@ -82,7 +82,7 @@ class SqliteStore:
         self._database.close()
 
 
-class SqliteSession(Session):
+class SqliteTransaction(Transaction):
     """One transaction in a file. A write transaction holds the file's only write lock."""
 
     SIZE: ClassVar[str] = "ifnull((SELECT size FROM packed WHERE owner = c.id), 0)"
@@ -104,7 +104,7 @@ class SqliteSession(Session):
     ) -> None:
         if not after:
             self._do("DELETE FROM packed WHERE owner = ?", (owner,))
-            self.describe(owner, checksum=_EMPTY_CHECKSUM)
+            self.update_component(owner, checksum=_EMPTY_CHECKSUM)
             return
         row = packed_row(after)
         # updated in place: for a blob of equal length, only changed pages are written
@@ -114,7 +114,7 @@ class SqliteSession(Session):
             " = (excluded.size, excluded.heard_last, excluded.params)",
             (owner, *row),
         )
-        self.describe(owner, checksum=row_checksum(*row))
+        self.update_component(owner, checksum=row_checksum(*row))
 
     def heard_last(self, owner: int) -> float:
         found = self._all("SELECT heard_last FROM packed WHERE owner = ?", (owner,))
@@ -140,7 +140,7 @@ class SqliteSession(Session):
                     found[value].append(owner)
         return found
 
-    def since(self, named: Mapping[int, Sequence[str]]) -> list[tuple[int, str, str, int, float]]:
+    def value_dates(self, named: Mapping[int, Sequence[str]]) -> list[tuple[int, str, str, int, float]]:
         found: list[tuple[int, str, str, int, float]] = []
         for owner, names in named.items():
             marks = ", ".join("?" * len(names))

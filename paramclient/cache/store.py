@@ -31,7 +31,7 @@ from paramclient.cache.records import (
     TableUpdate,
 )
 from paramclient.cache.sqlite import SqliteStore
-from paramclient.cache.transaction import Session
+from paramclient.cache.transaction import Transaction
 from paramclient.cache.transfer import CopyResult, copy_store
 from paramclient.errors import CacheError, NotInCache, UnknownVehicle, UsageError
 from paramclient.model.identity import Identity
@@ -176,7 +176,7 @@ class ParamCache:
             key: `Identity.key`.
             component: component id.
         """
-        found = self._store.read(lambda session: load_ext(session, key, component))
+        found = self._store.read(lambda transaction: load_ext(transaction, key, component))
         if found is not None:
             self._store.follow(key, component)
         return found
@@ -197,9 +197,9 @@ class ParamCache:
             NotInCache: the component has no extended parameters in the cache.
         """
 
-        def work(session: Session) -> CachedExtTable:
-            key = self._choose(session, vehicle, system=system, component=component)
-            found = load_ext(session, key, component)
+        def work(transaction: Transaction) -> CachedExtTable:
+            key = self._choose(transaction, vehicle, system=system, component=component)
+            found = load_ext(transaction, key, component)
             if found is None:
                 raise NotInCache(f"{key}, component {component}, has no extended parameters in the cache")
             return found
@@ -224,7 +224,9 @@ class ParamCache:
             AmbiguousVehicle: several vehicles have this name.
         """
         return self._store.read(
-            lambda session: session.ext_history(self._choose(session, vehicle), component, name, limit, since)
+            lambda transaction: transaction.ext_history(
+                self._choose(transaction, vehicle), component, name, limit, since
+            )
         )
 
     def sync(self) -> None:
@@ -292,24 +294,24 @@ class ParamCache:
         if not params:
             raise UsageError(f"{params.source or 'the file'} has no parameters")
 
-        def work(session: Session) -> tuple[TableUpdate, AddedTable]:
+        def work(transaction: Transaction) -> tuple[TableUpdate, AddedTable]:
             identity = params.identity if vehicle is None else vehicle
             if isinstance(identity, str):
-                identity = self._named(session, identity, params.identity)
+                identity = self._named(transaction, identity, params.identity)
             elif identity is None:
                 what = params.source or "the file"
                 raise UsageError(f"{what} does not tell its vehicle; name one of the cache")
-            kept = next((each for _, each in session.summaries(identity.key, number)), None)
+            kept = next((each for _, each in transaction.summaries(identity.key, number)), None)
             since = moment
             if kept is not None and kept.size:
-                owner = session.owner_of(kept.key, number)
+                owner = transaction.owner_of(kept.key, number)
                 assert owner is not None, "it was found in the same transaction"
-                last = max(session.heard_last(owner), kept.synced_at or 0.0)
+                last = max(transaction.heard_last(owner), kept.synced_at or 0.0)
                 if last > moment:
                     if kept.source is None and not force:
                         raise UsageError(_newer(kept, last, moment))
                     since = max(time.time(), last)
-            return FileTable(identity, number, params, since).update(session, kept)
+            return FileTable(identity, number, params, since).update(transaction, kept)
 
         update, added = self._store.read(work)
         self.save(update)
@@ -322,14 +324,14 @@ class ParamCache:
             key: `Identity.key`.
             component: component id.
         """
-        found = self._store.read(lambda session: self._load(session, key, component))
+        found = self._store.read(lambda transaction: self._load(transaction, key, component))
         if found is not None:
             self._store.follow(key, component)
         return found
 
     def vehicles(self) -> list[CachedVehicle]:
         """Return all vehicles, the last seen first."""
-        return self._store.read(lambda session: session.vehicles())
+        return self._store.read(lambda transaction: transaction.vehicles())
 
     def components(self, vehicle: str | None = None) -> list[CachedSummary]:
         """Return all tables without parameters, ordered as `vehicles()`, then by component id.
@@ -343,9 +345,9 @@ class ParamCache:
             AmbiguousVehicle: several vehicles have this name.
         """
 
-        def work(session: Session) -> list[CachedSummary]:
-            key = None if vehicle is None else self._choose(session, vehicle)
-            return [summary for _, summary in session.summaries(key)]
+        def work(transaction: Transaction) -> list[CachedSummary]:
+            key = None if vehicle is None else self._choose(transaction, vehicle)
+            return [summary for _, summary in transaction.summaries(key)]
 
         return self._store.read(work)
 
@@ -364,9 +366,9 @@ class ParamCache:
             AmbiguousVehicle: tables of several vehicles match. `vehicles` and the message list them.
         """
 
-        def work(session: Session) -> CachedComponent:
-            key = self._choose(session, vehicle, system=system, component=component)
-            found = self._load(session, key, component)
+        def work(transaction: Transaction) -> CachedComponent:
+            key = self._choose(transaction, vehicle, system=system, component=component)
+            found = self._load(transaction, key, component)
             assert found is not None, "what was chosen exists for the whole transaction"
             return found
 
@@ -382,7 +384,7 @@ class ParamCache:
     ) -> list[HistoryEntry]:
         """Return the changes of a vehicle's values, newest last.
 
-        The cache keeps the newest `HISTORY_LINES` (10,000) of each table.
+        The cache keeps the newest `HISTORY_ENTRIES_MAX` (10,000) of each table.
 
         Args:
             vehicle: as for `components`.
@@ -397,7 +399,9 @@ class ParamCache:
         """
 
         return self._store.read(
-            lambda session: session.history(self._choose(session, vehicle), component, name, limit, since)
+            lambda transaction: transaction.history(
+                self._choose(transaction, vehicle), component, name, limit, since
+            )
         )
 
     def snapshot(self, vehicle: str, component: int, *, reason: str, at: float | None = None) -> Snapshot:
@@ -417,7 +421,7 @@ class ParamCache:
         """
 
         moment = time.time() if at is None else at
-        key, _ = self._store.read(lambda session: self._table(session, vehicle, component))
+        key, _ = self._store.read(lambda transaction: self._table(transaction, vehicle, component))
         return self._store.do(StoreSnapshot(key, component, None, moment, reason))
 
     def store_snapshot(
@@ -452,7 +456,7 @@ class ParamCache:
         moment = time.time() if at is None else at
         who = vehicle
         if isinstance(vehicle, str):
-            who, _ = self._store.read(lambda session: self._table(session, vehicle, component))
+            who, _ = self._store.read(lambda transaction: self._table(transaction, vehicle, component))
         return self._store.do(StoreSnapshot(who, component, params, moment, reason, hash, complete))
 
     def snapshots(self, vehicle: str, component: int | None = None) -> list[SnapshotSummary]:
@@ -466,16 +470,18 @@ class ParamCache:
             UnknownVehicle: no vehicle in the cache has this name.
             AmbiguousVehicle: several vehicles have this name.
         """
-        return self._store.read(lambda session: session.snapshots(self._choose(session, vehicle), component))
+        return self._store.read(
+            lambda transaction: transaction.snapshots(self._choose(transaction, vehicle), component)
+        )
 
     def state_at(self, vehicle: str, component: int, when: float) -> ParamSet:
         """Return a table as it was at a given time.
 
         The result is exact if a snapshot has this time. Otherwise it is computed backwards from the current
         table with the history lines, and has the last values received before that time. It is available back
-        to the time when the table was first complete, or to the newest dropped history line (`HISTORY_LINES`)
-        if that is later. Names received for the first time after `when` are not included. Only snapshots have
-        defaults and the firmware of the vehicle.
+        to the time when the table was first complete, or to the newest dropped history line
+        (`HISTORY_ENTRIES_MAX`) if that is later. Names received for the first time after `when` are not
+        included. Only snapshots have defaults and the firmware of the vehicle.
 
         Args:
             vehicle: as for `components`.
@@ -491,13 +497,13 @@ class ParamCache:
                 the clock of this computer was set back over it.
         """
 
-        def work(session: Session) -> ParamSet:
-            key, owner = self._table(session, vehicle, component)
+        def work(transaction: Transaction) -> ParamSet:
+            key, owner = self._table(transaction, vehicle, component)
             if isinstance(when, int):
-                return snapshots.snapshot(session, owner, when).params
-            [(_, state)] = session.summaries(key, component)
-            rows = session.table(owner)
-            return snapshots.state_at(session, owner, state.identity, rows, when)
+                return snapshots.snapshot(transaction, owner, when).params
+            [(_, state)] = transaction.summaries(key, component)
+            rows = transaction.table(owner)
+            return snapshots.state_at(transaction, owner, state.identity, rows, when)
 
         return self._store.read(work)
 
@@ -518,10 +524,10 @@ class ParamCache:
         names = () if written is not None else tuple(wanted)
         number = component or (written and written.component) or 1
 
-        def work(session: Session) -> FleetDiff:
-            chosen = {name: fleet.names_like(session, number, name) for name in names}
+        def work(transaction: Transaction) -> FleetDiff:
+            chosen = {name: fleet.names_like(transaction, number, name) for name in names}
             plain: dict[str, None] = dict.fromkeys(each for like in chosen.values() for each in like)
-            found = fleet.fleet_diff(session, number, plain if written is None else written)
+            found = fleet.fleet_diff(transaction, number, plain if written is None else written)
             if not found.vehicles:
                 raise NotInCache(f"the cache {self.place} holds no table of component {number}")
             held = {each.name for each in found.names if each.values}
@@ -586,21 +592,21 @@ class ParamCache:
             AmbiguousVehicle: several vehicles have this name.
         """
 
-        def work(session: Session) -> tuple[str, int]:
-            key = self._choose(session, vehicle)
-            return key, len(session.summaries(key, component))
+        def work(transaction: Transaction) -> tuple[str, int]:
+            key = self._choose(transaction, vehicle)
+            return key, len(transaction.summaries(key, component))
 
         key, known = self._store.read(work)
         return self._store.do(Remove(key, component, known))
 
-    def _named(self, session: Session, name: str, new: Identity | None) -> Identity:
+    def _named(self, transaction: Transaction, name: str, new: Identity | None) -> Identity:
         """Return the identity of the vehicle with this name, which may be one that the cache does not have.
 
         Raises:
             UnknownVehicle, AmbiguousVehicle: as `components`.
         """
         try:
-            key = self._choose(session, name)
+            key = self._choose(transaction, name)
         except UnknownVehicle:
             if new is None:
                 raise
@@ -608,25 +614,27 @@ class ParamCache:
             with suppress(UnknownVehicle):
                 return find_vehicle([one], name, place="").identity
             raise
-        [found] = session.vehicles(key)
+        [found] = transaction.vehicles(key)
         return found.identity
 
-    def _table(self, session: Session, vehicle: str, component: int) -> tuple[str, int]:
+    def _table(self, transaction: Transaction, vehicle: str, component: int) -> tuple[str, int]:
         """Return the key of the only vehicle with this name, and the id of its table."""
-        key = self._choose(session, vehicle, component=component)
-        owner = session.owner_of(key, component)
+        key = self._choose(transaction, vehicle, component=component)
+        owner = transaction.owner_of(key, component)
         assert owner is not None, "what was chosen exists for the whole transaction"
         return key, owner
 
-    def _load(self, session: Session, key: str, component: int) -> CachedComponent | None:
+    def _load(self, transaction: Transaction, key: str, component: int) -> CachedComponent | None:
         def history(name: str | None, limit: int | None) -> list[HistoryEntry]:
-            return self._store.read(lambda session: session.history(key, component, name, limit, None))
+            return self._store.read(
+                lambda transaction: transaction.history(key, component, name, limit, None)
+            )
 
-        return tables.component(session, key, component, history=history)
+        return tables.component(transaction, key, component, history=history)
 
     def _choose(
         self,
-        session: Session,
+        transaction: Transaction,
         vehicle: str | None,
         *,
         system: int | None = None,
@@ -634,7 +642,7 @@ class ParamCache:
     ) -> str:
         """Return the key of the only vehicle that matches; see `paramclient.cache.lookup`."""
         return find_vehicle(
-            session.vehicles(), vehicle, place=self.place, system=system, component=component
+            transaction.vehicles(), vehicle, place=self.place, system=system, component=component
         ).key
 
 

@@ -1,9 +1,9 @@
 """Tables and their history lines. Each function runs inside the transaction of its caller.
 
-Only `applied` creates history lines: it compares every new value with the stored one, and a difference gives
-a line, written in the same transaction. Therefore every change of a stored value has its line, and if two
-processes receive the same change, the second one has nothing to write. `reconcile` and `merge` decide which
-values count.
+Only `apply_update` creates history lines: it compares every new value with the stored one, and a difference
+gives a line, written in the same transaction. Therefore every change of a stored value has its line, and if
+two processes receive the same change, the second one has nothing to write. `reconcile` and `merge` decide
+which values count.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from paramclient.cache.cells import are_times, time_cell
 from paramclient.cache.observed_table import HeardParams
 from paramclient.cache.param_columns import BY_VEHICLE, StoredParam
 from paramclient.cache.records import CachedComponent, HistoryEntry, TableState, TableUpdate
-from paramclient.cache.transaction import Line, Session
+from paramclient.cache.transaction import Line, Transaction
 from paramclient.model.identity import Identity
 
 __all__ = [
-    "HISTORY_LINES",
-    "applied",
+    "HISTORY_ENTRIES_MAX",
+    "apply_update",
     "check_times",
     "component",
     "forget_other_firmware",
@@ -32,59 +32,61 @@ __all__ = [
     "write_state",
 ]
 
-HISTORY_LINES: Final = 10_000
+HISTORY_ENTRIES_MAX: Final = 10_000
 """Maximum number of history lines of each table, the newest: about 1 MB, and years of tuning by hand. Each
 `save` writes a line for each changed value, so values that change many times a second should be collected
 first."""
 
 
-def save(session: Session, updates: Iterable[TableUpdate]) -> None:
+def save(transaction: Transaction, updates: Iterable[TableUpdate]) -> None:
     """Write updates in order. All of them are later than the stored values."""
     for update in updates:
-        forget_other_firmware(session, update.identity)
-        snapshots.watch_clock(session, update.identity.key, update.component, time_cell(update.at))
-        owner = session.upsert_table(update)
+        forget_other_firmware(transaction, update.identity)
+        snapshots.record_clock_rollback(
+            transaction, update.identity.key, update.component, time_cell(update.at)
+        )
+        owner = transaction.upsert_table(update)
         before: Mapping[str, StoredParam] = {}
         after = before
         if update.params or update.removed or update.replace:  # otherwise it has only the state of the table
-            before = session.table(owner)
-            after, lines, births = applied(update, before)
+            before = transaction.table(owner)
+            after, lines, added = apply_update(update, before)
             if len(after) != len(before) or after != before:
-                session.put_table(owner, before, after)
-            session.record_added_names(owner, births)
-            write_lines(session, owner, lines)
+                transaction.put_table(owner, before, after)
+            transaction.record_added_names(owner, added)
+            write_lines(transaction, owner, lines)
         if update.table is not None:
-            write_state(session, owner, update.table)
+            write_state(transaction, owner, update.table)
             if update.table.complete:
-                session.begin(owner, update.at)
+                transaction.set_known_since(owner, update.at)
         elif hashed(before) != hashed(after):
-            session.describe(owner, hash=None)
+            transaction.update_component(owner, hash=None)
 
 
 def component(
-    session: Session,
+    transaction: Transaction,
     key: str,
     number: int,
     *,
     history: Callable[[str | None, int | None], list[HistoryEntry]],
 ) -> CachedComponent | None:
     """Return a table with its parameters; None if there is none."""
-    for owner, summary in session.summaries(key, number):
-        return CachedComponent.of(summary, session.columns(owner), history=history)
+    for owner, summary in transaction.summaries(key, number):
+        return CachedComponent.of(summary, transaction.columns(owner), history=history)
     return None
 
 
-def forget_other_firmware(session: Session, identity: Identity) -> None:
+def forget_other_firmware(transaction: Transaction, identity: Identity) -> None:
     """If a vehicle has another firmware than before, remove defaults and state of the previous one."""
-    for owner in session.of_other_firmware(identity.key, identity.firmware, identity.git_hash):
-        before = session.table(owner)
+    for owner in transaction.of_other_firmware(identity.key, identity.firmware, identity.git_hash):
+        before = transaction.table(owner)
         after = {name: row._replace(default_bits=None) for name, row in before.items()}
         if after != before:
-            session.put_table(owner, before, after)
-        session.describe(owner, file_works=None)
+            transaction.put_table(owner, before, after)
+        transaction.update_component(owner, file_works=None)
 
 
-def applied(
+def apply_update(
     update: TableUpdate, before: Mapping[str, StoredParam], stays: Collection[str] = ()
 ) -> tuple[Mapping[str, StoredParam], list[Line], Iterable[tuple[str, float]]]:
     """Return the rows after an update, its history lines, and the new names with their times.
@@ -99,23 +101,23 @@ def applied(
         if first is not None:
             return first, [], zip(first, first.column("heard_at"), strict=True)
     after = dict(before)
-    births: list[tuple[str, float]] = []
-    news = list(update.params)
-    heard = {item.name for item in news}
+    added: list[tuple[str, float]] = []
+    observations = list(update.params)
+    heard = {item.name for item in observations}
     lines: list[Line] = [
-        (update.gone_at(name), name, BY_VEHICLE, *after.pop(name).value, None, None, None)
+        (update.removal_time(name), name, BY_VEHICLE, *after.pop(name).value, None, None, None)
         for name in dict.fromkeys(before if update.replace else update.removed)
         if name in before and name not in heard and name not in stays
     ]
-    for item in news:
+    for item in observations:
         name = item.name
         old = after.get(name)
         after[name] = item.stored_over(old, keeps_index=not update.replace)
         if old is None:
-            births.append((name, item.heard_at))
+            added.append((name, item.heard_at))
         elif not old.same_value(item):
             lines.append((item.heard_at, name, item.by, *old.value, *item.value))
-    return after, lines, births
+    return after, lines, added
 
 
 def check_times(update: TableUpdate) -> None:
@@ -142,21 +144,21 @@ def hashed(rows: Mapping[str, StoredParam]) -> dict[str, tuple[int, int, int]]:
     return {name: row.hashed for name, row in rows.items() if row.hashed is not None}
 
 
-def write_lines(session: Session, owner: int, lines: Sequence[Line]) -> None:
-    """Append history lines, and delete the oldest beyond `HISTORY_LINES`."""
+def write_lines(transaction: Transaction, owner: int, lines: Sequence[Line]) -> None:
+    """Append history lines, and delete the oldest beyond `HISTORY_ENTRIES_MAX`."""
     if not lines:
         return
-    session.add_lines(owner, lines)
-    at = session.trim_lines(owner, HISTORY_LINES)
+    transaction.add_lines(owner, lines)
+    at = transaction.trim_lines(owner, HISTORY_ENTRIES_MAX)
     if at is not None:
-        session.forget(owner, at)
+        transaction.raise_known_since(owner, at)
 
 
-def write_state(session: Session, owner: int, state: TableState) -> None:
+def write_state(transaction: Transaction, owner: int, state: TableState) -> None:
     """Write the state of a table as a whole."""
     if state.source is not None or state.synced_at is not None:
-        session.describe(owner, source=state.source)
-    session.describe(
+        transaction.update_component(owner, source=state.source)
+    transaction.update_component(
         owner,
         hash=state.hash,
         count=state.count,

@@ -1,4 +1,4 @@
-"""Session: one transaction on the tables of a cache.
+"""Transaction: one transaction on the tables of a cache.
 
 The statements are SQL that both SQLite and PostgreSQL accept, with `?` for each value. `sqlite` and
 `postgres` implement the differences. Other modules interpret the rows and have no SQL.
@@ -25,7 +25,7 @@ from paramclient.cache.records import CachedSummary, CachedVehicle, HistoryEntry
 from paramclient.model.ext_params import ExtParam
 from paramclient.model.values import Trust
 
-__all__ = ["ExtState", "Line", "NumberedLine", "Session"]
+__all__ = ["ExtState", "Line", "NumberedLine", "Transaction"]
 
 Line: TypeAlias = tuple[Any, ...]
 """A history line: at, name, by; type, bits, is_raw of the old value, and of the new one, or three None."""
@@ -59,7 +59,7 @@ class ExtState:
     checksum: int
 
 
-class Session(ABC):
+class Transaction(ABC):
     """The tables within one transaction. An `owner` is the id of a component's table in this database.
 
     Attributes:
@@ -97,7 +97,7 @@ class Session(ABC):
         found = self._all("SELECT id FROM component WHERE vehicle = ? AND component = ?", (key, component))
         return int(found[0][0]) if found else None
 
-    def described(self, owner: int) -> tuple[str, int, float | None]:
+    def component_row(self, owner: int) -> tuple[str, int, float | None]:
         """Return key and component id of a table, and the time since which its states are known, or None."""
         [row] = self._all("SELECT vehicle, component, known_since FROM component WHERE id = ?", (owner,))
         key, component, since = cells(row, "siF")
@@ -162,7 +162,7 @@ class Session(ABC):
         )
         return [int(owner) for (owner,) in found]
 
-    def describe(self, owner: int, **cells_: object) -> None:
+    def update_component(self, owner: int, **cells_: object) -> None:
         """Set columns of a table as a whole, by column name."""
         named = ", ".join(f"{name} = ?" for name in cells_)
         values = (int(cell) if isinstance(cell, bool) else cell for cell in cells_.values())
@@ -311,14 +311,14 @@ class Session(ABC):
         found = self._all("SELECT at FROM history WHERE owner = ? ORDER BY id DESC LIMIT 1", (owner,))
         return max((float(at) for (at,) in found), default=float("-inf"))
 
-    def gone(self, owner: int) -> Mapping[str, float]:
+    def removal_times(self, owner: int) -> Mapping[str, float]:
         """Return the time of the last removal of each removed parameter, by name."""
         found = self._all(
             "SELECT name, max(at) FROM history WHERE owner = ? AND new_type IS NULL GROUP BY name", (owner,)
         )
         return dict(cells(row, "sf") for row in found)
 
-    def gone_at(self, owner: int, name: str) -> float:
+    def removal_time(self, owner: int, name: str) -> float:
         """Return the time of the last removal of a parameter; minus infinity if it was never removed."""
         [(at,)] = self._all(
             "SELECT max(at) FROM history WHERE owner = ? AND name = ? AND new_type IS NULL", (owner, name)
@@ -327,11 +327,11 @@ class Session(ABC):
 
     # records for earlier states, in addition to the lines
 
-    def begin(self, owner: int, at: float) -> None:
+    def set_known_since(self, owner: int, at: float) -> None:
         """Set the time since which the states of a table are known, unless it is set."""
         self._do("UPDATE component SET known_since = ? WHERE id = ? AND known_since IS NULL", (at, owner))
 
-    def forget(self, owner: int, at: float) -> None:
+    def raise_known_since(self, owner: int, at: float) -> None:
         """Mark the states of a table up to this time as unknown."""
         self._do(
             "UPDATE component SET known_since = CASE WHEN known_since > ? THEN known_since ELSE ? END"
@@ -345,11 +345,11 @@ class Session(ABC):
                 (owner, owner),
             )
 
-    def record_added_names(self, owner: int, births: Iterable[tuple[str, float]]) -> None:
+    def record_added_names(self, owner: int, added: Iterable[tuple[str, float]]) -> None:
         """Record new names after the last line, if the states of the table are known."""
-        _, _, known_since = self.described(owner)
+        _, _, known_since = self.component_row(owner)
         if known_since is not None:
-            self.add_first_times(owner, births)
+            self.add_first_times(owner, added)
 
     def add_first_times(self, owner: int, times: Iterable[tuple[str, float]]) -> None:
         """Record names with their first times, after the last line. The earlier of two times counts."""
@@ -377,32 +377,32 @@ class Session(ABC):
         return [(since, until) for since, until in (cells(row, "ff") for row in found)]
 
     def put_past(
-        self, owner: int, lines: Sequence[Line], setbacks: Iterable[tuple[float, float]]
+        self, owner: int, lines: Sequence[Line], clock_rollbacks: Iterable[tuple[float, float]]
     ) -> Sequence[int]:
-        """Replace history and setbacks of a table. Return the numbers of the lines."""
+        """Replace history and clock_rollbacks of a table. Return the numbers of the lines."""
         for table in ("history", "birth", "setback"):
             self._do(f"DELETE FROM {table} WHERE owner = ?", (owner,))
-        for since, until in setbacks:
-            self.add_setback(owner, since, until)
+        for since, until in clock_rollbacks:
+            self.add_clock_rollback(owner, since, until)
         return self._put_lines(owner, lines)
 
-    def put_births(self, owner: int, births: Iterable[tuple[str, float, int]]) -> None:
+    def put_added_names(self, owner: int, added: Iterable[tuple[str, float, int]]) -> None:
         """Record new names: name, time, and number of the preceding line."""
         self._many(
             "INSERT INTO birth (owner, name, at, line) VALUES (?, ?, ?, ?)",
-            [(owner, *birth) for birth in births],
+            [(owner, *birth) for birth in added],
         )
 
-    def births_after(self, owner: int, when: float) -> list[tuple[int, str]]:
+    def added_names_after(self, owner: int, when: float) -> list[tuple[int, str]]:
         """Return the names that appeared after a given time, each with the number of the preceding line."""
         found = self._all("SELECT line, name FROM birth WHERE owner = ? AND at > ?", (owner, when))
         return [(line, name) for line, name in (cells(row, "is") for row in found)]
 
-    def add_setback(self, owner: int, since: float, until: float) -> None:
+    def add_clock_rollback(self, owner: int, since: float, until: float) -> None:
         """Record a period that the clock has passed twice."""
         self._do("INSERT INTO setback (owner, since, until) VALUES (?, ?, ?)", (owner, since, until))
 
-    def setback_over(self, owner: int, when: float) -> tuple[float, float] | None:
+    def clock_rollback_over(self, owner: int, when: float) -> tuple[float, float] | None:
         """Return a period, from and until, that the clock has passed twice and that includes this time."""
         found = self._all(
             "SELECT since, until FROM setback WHERE owner = ? AND since <= ? AND until > ?",
@@ -602,7 +602,7 @@ class Session(ABC):
         """Return the ids of tables by name, type, bits, is_raw of these parameters, in arbitrary order."""
 
     @abstractmethod
-    def since(self, named: Mapping[int, Sequence[str]]) -> list[tuple[int, str, str, int, float]]:
+    def value_dates(self, named: Mapping[int, Sequence[str]]) -> list[tuple[int, str, str, int, float]]:
         """Return times that date the current values of some parameters, by table.
 
         The rows have owner, name, what, line, at. For "heard", `at` is the last observation of the value; for
@@ -629,7 +629,7 @@ class Session(ABC):
         """Insert a row into a table with an `id`, and return the id."""
 
     def _put_lines(self, owner: int, lines: Sequence[Line], start: int = 0) -> Sequence[int]:
-        numbers = self._numbers(len(lines))  # above the deleted ones, so that births refer to either clearly
+        numbers = self._numbers(len(lines))  # above the deleted ones, so that added refer to either clearly
         self._do("DELETE FROM history WHERE owner = ? AND id >= ?", (owner, start))
         self._many(
             f"INSERT INTO history (id, owner, {_LINE}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",

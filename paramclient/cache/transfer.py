@@ -12,8 +12,8 @@ from paramclient.cache.operations import StoreOperation
 from paramclient.cache.param_columns import StoredParam
 from paramclient.cache.records import CachedSummary, CachedVehicle, TableState, TableUpdate
 from paramclient.cache.snapshots import SNAPSHOTS
-from paramclient.cache.tables import HISTORY_LINES, hashed, write_state
-from paramclient.cache.transaction import Line, Session
+from paramclient.cache.tables import HISTORY_ENTRIES_MAX, hashed, write_state
+from paramclient.cache.transaction import Line, Transaction
 from paramclient.errors import CacheError, UsageError
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ class TableDump:
                 mine is not None and mine.heard_at < row.heard_at
             ):
                 return f"parameter {name}"
-        gone = self.lines[0][0] if len(self.lines) >= HISTORY_LINES else 0.0
+        gone = self.lines[0][0] if len(self.lines) >= HISTORY_ENTRIES_MAX else 0.0
         if any(line[0] >= gone for line in set(other.lines) - set(self.lines)):
             return "a line of history"
         shots = {shot.crc for shot in self.shots.values()}
@@ -127,15 +127,15 @@ class MergeTable(StoreOperation[None]):
     def tables(self) -> Iterable[tuple[str, int | None]]:
         return [(self.whole.table.key, self.whole.table.component)]
 
-    def do(self, session: Session) -> None:
+    def do(self, transaction: Transaction) -> None:
         table = self.whole.table
-        there = take_whole(session, table.key, table.component)
-        owner = put_whole(session, self.whole if there is None else _joined(there, self.whole))
+        there = take_whole(transaction, table.key, table.component)
+        owner = put_whole(transaction, self.whole if there is None else _joined(there, self.whole))
         mine = set() if there is None else {shot.crc for shot in there.shots.values()}
         for number, shot in self.whole.shots.items():
             if shot.crc not in mine and shot.blob is not None:
-                is_free = number < LOCAL_NUMBERS_MIN and not session.has_snapshot(number)
-                session.add_snapshot(owner, shot.row, shot.blob, shot.crc, number if is_free else None)
+                is_free = number < LOCAL_NUMBERS_MIN and not transaction.has_snapshot(number)
+                transaction.add_snapshot(owner, shot.row, shot.blob, shot.crc, number if is_free else None)
 
 
 def copy_store(
@@ -157,7 +157,7 @@ def copy_store(
     """
     if source.place == target.place:
         raise UsageError(f"{source.place} cannot be copied to itself")
-    listed = source.read(lambda session: [summary for _, summary in session.summaries()])
+    listed = source.read(lambda transaction: [summary for _, summary in transaction.summaries()])
     written = params = lines = shots = 0
     for number, each in enumerate(listed, start=1):
         if progress is not None:
@@ -181,12 +181,12 @@ def copy_store(
 
 
 def take_whole(
-    session: Session, key: str, component: int, having: Collection[int] = frozenset()
+    transaction: Transaction, key: str, component: int, having: Collection[int] = frozenset()
 ) -> TableDump | None:
     """Return all stored data of a table; None if there is none.
 
     Args:
-        session: the transaction.
+        transaction: the transaction.
         key: key of the vehicle.
         component: component id.
         having: numbers of snapshots whose parameters are not needed.
@@ -195,21 +195,21 @@ def take_whole(
         Damaged: the parameters are damaged.
         CacheError: a snapshot is damaged.
     """
-    found = session.summaries(key, component)
+    found = transaction.summaries(key, component)
     if not found:
         return None
     [(owner, table)] = found
-    [vehicle] = session.vehicles(key)
-    _, _, known_since = session.described(owner)
-    numbered = session.lines(owner)
+    [vehicle] = transaction.vehicles(key)
+    _, _, known_since = transaction.component_row(owner)
+    numbered = transaction.lines(owner)
     order = {number: place for place, (number, _) in enumerate(numbered, start=1)}
-    births = tuple(
+    added = tuple(
         (name, at, max((place for number, place in order.items() if number <= line), default=0))
-        for name, line, at in session.added_names(owner)
+        for name, line, at in transaction.added_names(owner)
     )
     shots = {}
-    for summary in session.snapshots(key, component):
-        kept = session.snapshot(owner, summary.id)
+    for summary in transaction.snapshots(key, component):
+        kept = transaction.snapshot(owner, summary.id)
         assert kept is not None
         _, row, blob, crc = kept
         if not isinstance(blob, bytes) or not isinstance(crc, int):
@@ -219,21 +219,21 @@ def take_whole(
         vehicle,
         table,
         known_since,
-        session.table(owner),
+        transaction.table(owner),
         tuple(line for _, line in numbered),
-        births,
-        tuple(session.clock_rollbacks(owner)),
+        added,
+        tuple(transaction.clock_rollbacks(owner)),
         shots,
-        take_ext(session, owner),
+        take_ext(transaction, owner),
     )
 
 
-def put_whole(session: Session, whole: TableDump) -> int:
+def put_whole(transaction: Transaction, whole: TableDump) -> int:
     """Replace a table in a store, except its snapshots. Return its id."""
     table = whole.table
-    known = next(iter(session.vehicles(table.key)), None)
+    known = next(iter(transaction.vehicles(table.key)), None)
     last = whole.vehicle if known is None or known.last_seen <= whole.vehicle.last_seen else known
-    owner = session.upsert_table(
+    owner = transaction.upsert_table(
         TableUpdate(
             identity=last.identity,
             component=table.component,
@@ -242,30 +242,30 @@ def put_whole(session: Session, whole: TableDump) -> int:
         )
     )
     first = whole.vehicle.first_seen if known is None else min(known.first_seen, whole.vehicle.first_seen)
-    session.set_seen_times(table.key, first, last.last_seen)
-    session.put_table(owner, None, whole.rows)
-    numbers = session.put_past(owner, whole.lines, whole.clock_rollbacks)
-    session.put_births(
+    transaction.set_seen_times(table.key, first, last.last_seen)
+    transaction.put_table(owner, None, whole.rows)
+    numbers = transaction.put_past(owner, whole.lines, whole.clock_rollbacks)
+    transaction.put_added_names(
         owner, [(name, at, numbers[place - 1] if place else 0) for name, at, place in whole.added_names]
     )
-    write_state(session, owner, _state(table))
-    session.describe(owner, known_since=whole.known_since)
-    put_ext(session, owner, whole.ext)
+    write_state(transaction, owner, _state(table))
+    transaction.update_component(owner, known_since=whole.known_since)
+    put_ext(transaction, owner, whole.ext)
     return owner
 
 
-def put_snapshots(session: Session, owner: int, whole: TableDump) -> None:
+def put_snapshots(transaction: Transaction, owner: int, whole: TableDump) -> None:
     """Replace the snapshots of a table by those of another store, with equal numbers."""
-    there = {each.id for each in session.snapshots(whole.table.key, whole.table.component)}
-    session.drop_snapshots(there - whole.shots.keys())
+    there = {each.id for each in transaction.snapshots(whole.table.key, whole.table.component)}
+    transaction.drop_snapshots(there - whole.shots.keys())
     for number, shot in whole.shots.items():
         if number not in there and shot.blob is not None:
-            session.add_snapshot(owner, shot.row, shot.blob, shot.crc, number)
+            transaction.add_snapshot(owner, shot.row, shot.blob, shot.crc, number)
 
 
 def _lacking(target: Store, whole: TableDump) -> str | None:
     key, component = whole.table.key, whole.table.component
-    there = target.read(lambda session: take_whole(session, key, component))
+    there = target.read(lambda transaction: take_whole(transaction, key, component))
     return "everything" if there is None else there.lacks(whole)
 
 
@@ -295,7 +295,7 @@ def _joined(there: TableDump, new: TableDump) -> TableDump:
         table,
         max(there.table.updated_at, new.table.updated_at),
         rows,
-        tuple(lines[-HISTORY_LINES:]),
+        tuple(lines[-HISTORY_ENTRIES_MAX:]),
         (),
         (),
         {},

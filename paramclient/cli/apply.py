@@ -403,7 +403,7 @@ async def _confirm(
     """Show the changes and ask for confirmation. Return true without a question if there are none."""
     for vehicle, error in errors.items():
         report(f"{vehicle.label}: {error}")
-    if not any(plan.steps or (reboot and plan.unstarted) for plan in plans.values()):
+    if not any(plan.steps or (reboot and plan.awaiting_reboot) for plan in plans.values()):
         return True
     show_planned(plans, reboot=reboot, full=full)
     sys.stderr.write("go on? [y/N] ")

@@ -175,7 +175,7 @@ def _planned_rows(plan: Plan, *, reboot: bool, full: bool) -> Iterator[Cells]:
         if reboot and stage.reboot_first:
             has_started = True
             yield [number, None, None, None, Coloured("reboot", "yellow"), "the vehicle reboots"]
-    if reboot and not has_started and (plan.reboot_for or plan.unstarted):
+    if reboot and not has_started and (plan.reboot_for or plan.awaiting_reboot):
         yield [None, None, None, None, Coloured("reboot", "yellow"), "the vehicle reboots"]
     for row in plan.rows.values():
         if row.status is not PlanStatus.SET and (full or _is_notable(row)):

@@ -1,4 +1,4 @@
-"""WriteThrough: loads cached tables, and writes new values to the cache in batches, in a thread."""
+"""CacheWriter: loads cached tables, and writes new values to the cache in batches, in a thread."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from paramclient.model.values import Param
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.params.table import Observation
 
-__all__ = ["WriteThrough", "choose_cache"]
+__all__ = ["CacheWriter", "choose_cache"]
 
 CACHE_FLUSH_INTERVAL: Final = 0.25
 """Seconds from a change to its commit, unless the computer is overloaded: changes are collected for this
@@ -71,7 +71,7 @@ logger = logging.getLogger(__name__)
 Result = TypeVar("Result")
 
 
-class WriteThrough:
+class CacheWriter:
     """Writes the tables of one client to its cache, and loads cached tables of new components.
 
     A cache error causes one warning in the log until the next successful write. Values that could not be
@@ -83,7 +83,7 @@ class WriteThrough:
         identity_of: returns the identity of a component's vehicle; None while it is not settled.
         is_doubted: returns whether another vehicle may use the address of a component by now.
         renewed: called when a write of another station has updated tables.
-        look: called before times are converted to unix times, to detect suspend of the computer.
+        detect_suspend: called before times are converted to unix times, to detect suspend of the computer.
         clock: returns unix seconds; None for the clock of this computer.
         now: returns the time of the components.
     """
@@ -96,7 +96,7 @@ class WriteThrough:
         identity_of: Callable[[ComponentMachine], Identity | None],
         is_doubted: Callable[[ComponentMachine], bool],
         renewed: Callable[[], None] | None = None,
-        look: Callable[[], None] | None = None,
+        detect_suspend: Callable[[], None] | None = None,
         clock: Callable[[], float] | None = None,
         now: Callable[[], float] = anyio.current_time,
     ) -> None:
@@ -104,12 +104,12 @@ class WriteThrough:
         self._identity_of = identity_of
         self._is_doubted = is_doubted
         self._renewed = _nothing if renewed is None else renewed
-        self._look = _nothing if look is None else look
+        self._detect_suspend = _nothing if detect_suspend is None else detect_suspend
         self._clock = _time_of_day if clock is None else clock
         self._now = now
         self._owned = owned
         self._worker = Worker("paramclient cache")
-        self._kept: dict[ComponentMachine, _CachedComponent] = {}
+        self._cached: dict[ComponentMachine, _CachedComponent] = {}
         self._flushing = anyio.Lock()
         self._failure: CacheError | UsageError | None = None  # None after a successful write
         self._failures = 0
@@ -118,14 +118,14 @@ class WriteThrough:
         self._something_to_write = anyio.Event()
         self._waiting_since = -math.inf  # time at which that was set
         self._commit_time = 0.0
-        self._bringing: set[ComponentMachine] = set()
+        self._loading: set[ComponentMachine] = set()
         self._vehicles: dict[tuple[int, int], set[str]] = {}  # keys of identities cached in this session
-        self._has_refused = self._has_refused_twin = False
+        self._has_refused = self._has_refused_same_identity = False
         self._replacements = 0 if cache is None else cache.replacements
         self._has_written = False
         self._are_many = False
-        self._news: set[CacheChange] = set()
-        self._end_news: Callable[[], None] = _nothing
+        self._other_writes: set[CacheChange] = set()
+        self._unsubscribe: Callable[[], None] = _nothing
         self._flushed_at = (math.inf, -math.inf)  # by the components' clock, and in unix seconds
 
     async def open(self) -> None:
@@ -134,22 +134,22 @@ class WriteThrough:
             for each in await self._run(self._cache.components) or ():
                 address = (each.system, each.component)
                 self._tables[address] = self._tables.get(address, False) or each.hash is not None
-            told = partial(_pass_on, anyio.lowlevel.current_token(), self._hear_of)
-            self._end_news = await self._run(partial(self._cache.subscribe, told)) or _nothing
+            told = partial(_pass_on, anyio.lowlevel.current_token(), self._record_other_write)
+            self._unsubscribe = await self._run(partial(self._cache.subscribe, told)) or _nothing
 
     async def close(self) -> None:
         """Write all new values, log a warning for lost ones, and end the thread."""
-        self._end_news()
+        self._unsubscribe()
         is_written = False
         try:
             is_written = await self.flush() and await self.flush()  # the second rewrites a replaced file
         finally:
             if not is_written:
-                self._tell_of_loss()
+                self._log_lost_values()
             cache = self._cache if self._owned else None
             await self._worker.close(_nothing if cache is None else cache.close)
 
-    async def aside(self, work: Callable[[], Result]) -> Result:
+    async def run_in_thread(self, work: Callable[[], Result]) -> Result:
         """Run a blocking call in the cache's thread after queued calls. Cancellation does not stop it."""
         return await self._worker.run(work)
 
@@ -166,7 +166,7 @@ class WriteThrough:
 
         If the identity is that of another vehicle, the values queued for the previous vehicle are discarded.
         """
-        kept = self._kept.get(machine)
+        kept = self._cached.get(machine)
         if kept is not None and kept.identity.key == identity.key:
             kept.identity = identity
             return True
@@ -174,15 +174,15 @@ class WriteThrough:
             self.discard_queued(machine)
         return False
 
-    async def bring(self, machine: ComponentMachine, identity: Identity) -> bool:
+    async def load_cached(self, machine: ComponentMachine, identity: Identity) -> bool:
         """Load the table that is cached under an identity, and write new values under it from now on.
 
         Return False if the call has no effect: another call for the component is running, or the identity is
         no longer settled.
         """
-        if machine in self._bringing:
+        if machine in self._loading:
             return False
-        self._bringing.add(machine)
+        self._loading.add(machine)
         try:
             while self._has_capacity(machine, identity):
                 cached, extended = await self._load(machine, identity)
@@ -192,16 +192,16 @@ class WriteThrough:
                     return False
                 if current.key == identity.key:
                     if self._has_capacity(machine, current):  # others may have used it meanwhile
-                        self._keep(machine, current, cached, extended)
+                        self._begin_caching(machine, current, cached, extended)
                     break
                 identity = current  # another vehicle has replaced it meanwhile
             return True
         finally:
-            self._bringing.discard(machine)
+            self._loading.discard(machine)
 
-    def is_bringing(self, machine: ComponentMachine) -> bool:
+    def is_loading(self, machine: ComponentMachine) -> bool:
         """Return whether `load_cached` is running for a component."""
-        return machine in self._bringing
+        return machine in self._loading
 
     async def save_on_close(self, machine: ComponentMachine) -> None:
         """Write the table of a component that closes before its identity was settled or its cache loaded.
@@ -217,36 +217,36 @@ class WriteThrough:
         if not self.follow(machine, identity):
             cached, extended = await self._load(machine, identity)
             if self._has_capacity(machine, identity):
-                self._keep(machine, identity, cached, extended)
+                self._begin_caching(machine, identity, cached, extended)
 
     def synced(self, machine: ComponentMachine, *, is_whole: bool) -> None:
         """Record that the table was verified now; `is_whole`: by a full download."""
-        kept = self._kept.get(machine)
+        kept = self._cached.get(machine)
         if kept is not None:
-            kept.proven_at = self._now() + machine.table.slept
+            kept.proven_at = self._now() + machine.table.suspended
             if is_whole:
                 kept.whole_at = kept.proven_at
 
     def discard_queued(self, machine: ComponentMachine) -> None:
         """Discard the queued values of a component: several vehicles use its address, or did until now."""
-        self._kept.pop(machine, None)
+        self._cached.pop(machine, None)
         machine.table.take_dirty()
         machine.table.take_overwritten()
-        machine.table.take_gone()
+        machine.table.take_removed_at()
         machine.ext.table.take_dirty()
-        machine.ext.table.take_gone()
+        machine.ext.table.take_removed_at()
         machine.ext.table.take_overwritten()
 
     def remove_component(self, machine: ComponentMachine) -> None:
         """Remove a component that is no longer followed."""
-        self._kept.pop(machine, None)
+        self._cached.pop(machine, None)
 
     @property
     def is_held_back(self) -> bool:
         """Whether a component with queued values may be another vehicle by now, so that writing must wait."""
         return any(
             (machine.table.dirty or machine.ext.table.dirty) and self._is_doubted(machine)
-            for machine in self._kept
+            for machine in self._cached
         )
 
     def wake(self) -> None:
@@ -269,7 +269,7 @@ class WriteThrough:
                 await anyio.sleep(RETRY_INTERVAL)
             if self.is_held_back or not is_written:
                 self.wake()
-            await self._take_news()
+            await self._apply_other_writes()
 
     async def flush(self, *, is_last: bool = True) -> bool:
         """Write new values. Return False if the write failed. Cancellation loses no value.
@@ -296,7 +296,7 @@ class WriteThrough:
         """Return why values of a component cannot be written at present; None if they can."""
         if self._cache is None:
             return "the client has no cache"
-        if machine not in self._kept or self._is_doubted(machine):
+        if machine not in self._cached or self._is_doubted(machine):
             return f"it is not known which vehicle {machine.system}/{machine.component} is"
         return None
 
@@ -324,15 +324,15 @@ class WriteThrough:
         portion: list[_PendingUpdates] = []
         size = 0
         times = self._present_times()
-        fetches = sum(machine.fetch is not None for machine in self._kept)
+        fetches = sum(machine.fetch is not None for machine in self._cached)
         self._are_many = fetches > (
             0 if self._are_many else UNBATCHED_FETCHES_MAX
         )  # until the last has ended
-        for kept in list(self._kept.values()) if self._cache is not None else ():
+        for kept in list(self._cached.values()) if self._cache is not None else ():
             if self._are_many and not is_last and self._is_for_later(kept):
                 self.wake()
-            elif self._kept.get(kept.machine) is kept:
-                for new in self._news_of(kept, times):
+            elif self._cached.get(kept.machine) is kept:
+                for new in self._updates_of(kept, times):
                     portion.append(new)
                     size += len(new.update.params)
             if size >= TRANSACTION_PARAMS:
@@ -361,16 +361,16 @@ class WriteThrough:
             is_written = await self._save(cache, [new.update for new in news])
         finally:
             for new in news:
-                if not is_written and self._kept.get(new.kept.machine) is new.kept:
-                    new.take_back()
-            for kept in self._kept.values() if self._failure is not None else ():
+                if not is_written and self._cached.get(new.kept.machine) is new.kept:
+                    new.requeue()
+            for kept in self._cached.values() if self._failure is not None else ():
                 kept.machine.table.keeps_all = True
         if is_written:
             self._failure = None
-            for kept in self._kept.values():
+            for kept in self._cached.values():
                 kept.machine.table.keeps_all = False
             logger.debug("written: %s values", sum(len(new.update.params) for new in news))
-            self._begin_anew(cache.replacements)
+            self._requeue_if_replaced(cache.replacements)
         return is_written
 
     async def _write_extended(self, times: UnixTimes) -> bool:
@@ -378,7 +378,7 @@ class WriteThrough:
         cache = self._cache
         if cache is None:
             return True
-        news = [new for kept in self._kept.values() if (new := self._ext_news_of(kept, times)) is not None]
+        news = [new for kept in self._cached.values() if (new := self._ext_news_of(kept, times)) is not None]
         if not news:
             return True
         is_written = False
@@ -387,11 +387,11 @@ class WriteThrough:
             is_written = await self._save_extended(cache, updates)
         finally:
             for new in news:
-                if not is_written and self._kept.get(new.kept.machine) is new.kept:
-                    new.take_back()
+                if not is_written and self._cached.get(new.kept.machine) is new.kept:
+                    new.requeue()
         if is_written:
             self._failure = None
-            self._begin_anew(cache.replacements)
+            self._requeue_if_replaced(cache.replacements)
         return is_written
 
     def _ext_news_of(self, kept: _CachedComponent, times: UnixTimes) -> _PendingExtUpdate | None:
@@ -404,7 +404,7 @@ class WriteThrough:
         if not is_news or self._is_doubted(machine):
             return None
         before, kept.ext_state = kept.ext_state, state
-        dirty, gone, overwritten = table.take_dirty(), table.take_gone(), table.take_overwritten()
+        dirty, gone, overwritten = table.take_dirty(), table.take_removed_at(), table.take_overwritten()
         earlier = [StoredExtParam.of(param, times(moment), by) for param, by, moment in overwritten]
         update = ExtTableUpdate(
             identity=kept.identity,
@@ -422,37 +422,37 @@ class WriteThrough:
         )
         return _PendingExtUpdate(kept, dirty, gone, overwritten, before, update)
 
-    def _hear_of(self, change: CacheChange) -> None:
+    def _record_other_write(self, change: CacheChange) -> None:
         """Record that another station has written to a table."""
-        self._news.add(change)
+        self._other_writes.add(change)
         self.wake()
 
-    async def _take_news(self) -> None:
+    async def _apply_other_writes(self) -> None:
         """Update cached values from the newer writes of other stations."""
-        news, self._news = self._news, set()
-        for kept in list(self._kept.values()):
+        news, self._other_writes = self._other_writes, set()
+        for kept in list(self._cached.values()):
             machine, identity = kept.machine, kept.identity
             if CacheChange(identity.key, machine.component) in news and self._cache is not None:
                 cached = await self._run(partial(self._cache.load, identity.key, machine.component))
-                if cached is not None and self._kept.get(machine) is kept:
+                if cached is not None and self._cached.get(machine) is kept:
                     machine.renew(cached.params, self._moments(cached))
                     self._renewed()
                 extended = await self._run(partial(self._cache.load_ext, identity.key, machine.component))
-                if extended is not None and self._kept.get(machine) is kept:
+                if extended is not None and self._cached.get(machine) is kept:
                     machine.ext.use_cached(extended.params, self._moments(extended))
                     self._renewed()
 
-    def _begin_anew(self, replacements: int) -> None:
+    def _requeue_if_replaced(self, replacements: int) -> None:
         """Queue all values again if the cache file was replaced: the new file lacks earlier writes."""
         is_another = replacements != self._replacements and (self._has_written or bool(self._tables))
         self._replacements = replacements
         self._has_written = True
         if not is_another:
             return
-        for kept in self._kept.values():
+        for kept in self._cached.values():
             table = kept.machine.table
             if table.complete and kept.whole_at is None:
-                kept.whole_at = self._now() + table.slept
+                kept.whole_at = self._now() + table.suspended
             kept.state = None
             for name in table.params:
                 table.dirty.setdefault(name, "vehicle")
@@ -469,17 +469,17 @@ class WriteThrough:
     def _has_capacity(self, machine: ComponentMachine, identity: Identity) -> bool:
         """Return whether the table of a vehicle may be cached, within the limits of the session."""
         address = (machine.system, machine.component)
-        twins = [each for each in self._kept.values() if _is_twin(each, machine, identity)]
-        if twins:
-            if not self._has_refused_twin:
+        others = [each for each in self._cached.values() if _has_same_identity(each, machine, identity)]
+        if others:
+            if not self._has_refused_same_identity:
                 logger.warning(
                     "%d/%d at %s has the same identity as the vehicle at %s (%s): its table is not cached",
                     *address,
                     machine.peer_in_words,
-                    twins[0].machine.peer_in_words,
+                    others[0].machine.peer_in_words,
                     identity.key,
                 )
-            self._has_refused_twin = True
+            self._has_refused_same_identity = True
             return False
         vehicles = self._vehicles.get(address, set())
         if identity.key in vehicles:
@@ -502,7 +502,7 @@ class WriteThrough:
         found = await self._run(partial(_load_both, self._cache, identity.key, machine.component))
         return (None, None) if found is None else found
 
-    def _keep(
+    def _begin_caching(
         self,
         machine: ComponentMachine,
         identity: Identity,
@@ -510,9 +510,9 @@ class WriteThrough:
         extended: CachedExtTable | None,
     ) -> None:
         table = machine.table
-        whole_at = self._now() + table.slept if table.complete else None
+        whole_at = self._now() + table.suspended if table.complete else None
         kept = _CachedComponent(machine, identity, whole_at=whole_at, written_at=anyio.current_time())
-        self._kept[machine] = kept
+        self._cached[machine] = kept
         for name in table.params:
             table.dirty.setdefault(name, "vehicle")
         if cached is not None:
@@ -533,9 +533,9 @@ class WriteThrough:
             if is_same and machine.fetches.file_works is None:
                 machine.fetches.file_works = cached.file_works
             kept.synced_at = cached.synced_at
-            kept.state = None if table.is_displaced else self._state(machine, kept)
+            kept.state = None if table.has_outdated_indices else self._state(machine, kept)
         if machine.sync.synced:
-            kept.proven_at = self._now() + table.slept
+            kept.proven_at = self._now() + table.suspended
         machine.ext.table.mark_dirty()
         if extended is not None:
             machine.ext.use_cached(extended.params, self._moments(extended))
@@ -547,7 +547,7 @@ class WriteThrough:
         If the clock was set back by less than `CLOCK_SLACK` since the last flush, values received since then
         get later times than the values written then.
         """
-        self._look()
+        self._detect_suspend()
         since, last = self._flushed_at
         ahead = seconds_ahead(self._clock, self._now)
         now = self._now()
@@ -560,28 +560,28 @@ class WriteThrough:
 
     def _moments(self, cached: CachedComponent | CachedExtTable) -> dict[str, float]:
         """Return the observation times of the values of a cached table, in component time."""
-        self._look()
+        self._detect_suspend()
         now = self._now()
         ahead = seconds_ahead(self._clock, self._now)
         if not math.isfinite(ahead):
             return {}
         return {name: min(at - ahead, now) for name, at in cached.heard_at.items()}
 
-    def _news_of(self, kept: _CachedComponent, times: UnixTimes) -> list[_PendingUpdates]:
+    def _updates_of(self, kept: _CachedComponent, times: UnixTimes) -> list[_PendingUpdates]:
         """Return the updates of a table since the last write, and mark them as written."""
         machine, table = kept.machine, kept.machine.table
         if self._is_doubted(machine):
             return []
         proven_at, kept.proven_at = kept.proven_at, None
         if proven_at is not None:
-            kept.synced_at = times(proven_at - table.slept)
+            kept.synced_at = times(proven_at - table.suspended)
         state = self._state(machine, kept)
         if not (table.dirty or kept.whole_at is not None or state != kept.state):
             return []
         changed = table.changed
         dirty = table.take_dirty()
         overwritten = table.take_overwritten()
-        gone = table.take_gone()
+        removed_at = table.take_removed_at()
         whole_at, kept.whole_at = kept.whole_at, None
         is_whole = whole_at is not None
         kept.state = state
@@ -608,17 +608,21 @@ class WriteThrough:
                 ],
             ),
             removed=[name for name in dirty if name not in known],
-            removed_at={name: times(moment) for name, moment in gone.items()},
+            removed_at={name: times(moment) for name, moment in removed_at.items()},
             replace=is_whole,
-            whole_at=None if whole_at is None else times(whole_at - table.slept),
+            whole_at=None if whole_at is None else times(whole_at - table.suspended),
         )
-        return [_PendingUpdates(kept, dirty, overwritten, gone, changed, params, update, proven_at, whole_at)]
+        return [
+            _PendingUpdates(
+                kept, dirty, overwritten, removed_at, changed, params, update, proven_at, whole_at
+            )
+        ]
 
     def _state(self, machine: ComponentMachine, kept: _CachedComponent) -> TableState:
         table = machine.table
         return TableState(
             hash=table.hash if table.complete else None,
-            count=None if table.is_displaced else table.count,  # the cache keeps the previous indices
+            count=None if table.has_outdated_indices else table.count,  # the cache keeps the previous indices
             complete=table.complete,
             volatile_known=table.volatile_known,
             synced_at=kept.synced_at,
@@ -636,9 +640,9 @@ class WriteThrough:
             self._failures += 1
             return None
 
-    def _tell_of_loss(self) -> None:
+    def _log_lost_values(self) -> None:
         """Log a warning for each component with values that were not written."""
-        for machine, kept in self._kept.items():
+        for machine, kept in self._cached.items():
             values = len(machine.table.dirty) + len(machine.ext.table.dirty)
             earlier = len(machine.table.overwritten) + len(machine.ext.table.overwritten)
             if values or earlier:
@@ -664,7 +668,8 @@ class _CachedComponent:
         identity: the identity under which its table is written.
         state: the table state written last, or None.
         synced_at: time of the last verification, in unix seconds, or None.
-        proven_at: time of a verification since the last write, in component time with `Table.slept`, or None.
+        proven_at: time of a verification since the last write, in component time with `Table.suspended`, or
+            None.
         whole_at: time of a full download since the last write, likewise.
         written_at: time of the last write, by the clock of the event loop.
         ext_state: count and completeness of the extended parameters, as written last, or None.
@@ -687,14 +692,14 @@ class _PendingUpdates:
     kept: _CachedComponent
     dirty: dict[str, str]
     overwritten: list[Observation]
-    gone: dict[str, float]
+    removed_at: dict[str, float]
     changed: dict[str, tuple[float, str]]
     params: Params
     update: TableUpdate
     proven_at: float | None
     whole_at: float | None
 
-    def take_back(self) -> None:
+    def requeue(self) -> None:
         """Queue the updates again after a failed write."""
         kept = self.kept
         if kept.proven_at is None:
@@ -702,7 +707,7 @@ class _PendingUpdates:
         if kept.whole_at is None:
             kept.whole_at = self.whole_at
         kept.machine.table.restore_unwritten(
-            self.dirty, self.overwritten, self.gone, self.changed, self.params
+            self.dirty, self.overwritten, self.removed_at, self.changed, self.params
         )
         kept.state = None
 
@@ -718,7 +723,7 @@ class _PendingExtUpdate:
     state: tuple[int | None, bool] | None
     update: ExtTableUpdate
 
-    def take_back(self) -> None:
+    def requeue(self) -> None:
         """Queue the update again after a failed write."""
         self.kept.ext_state = self.state
         self.kept.machine.ext.table.put_back(self.dirty, self.gone, self.overwritten)
@@ -741,7 +746,7 @@ def choose_cache(
     return ParamCache(None if cache is None or cache is True else cache)
 
 
-def _is_twin(kept: _CachedComponent, machine: ComponentMachine, identity: Identity) -> bool:
+def _has_same_identity(kept: _CachedComponent, machine: ComponentMachine, identity: Identity) -> bool:
     """Return whether a cached component has equal ids and identity at another peer."""
     other = kept.machine
     has_equal_ids = (other.system, other.component) == (machine.system, machine.component)

@@ -9,7 +9,7 @@ from typing import Final, TypeAlias
 from paramclient.client.component import Component
 from paramclient.client.subscription import Subscription
 from paramclient.protocol import events as protocol
-from paramclient.protocol.vehicle.peers import Contest
+from paramclient.protocol.vehicle.address_contest import Contest
 
 __all__ = [
     "Contested",

@@ -16,7 +16,7 @@ import anyio.abc
 
 from paramclient.cache import ParamCache
 from paramclient.client.arguments import COMPONENT_TIMEOUT, address_in_words, silence_in_words
-from paramclient.client.cache_writer import WriteThrough, choose_cache
+from paramclient.client.cache_writer import CacheWriter, choose_cache
 from paramclient.client.component import Component
 from paramclient.client.events import Events, public_event
 from paramclient.client.fetch_all import FetchedAll, FleetFetch
@@ -131,36 +131,36 @@ class LinkClient(LocalClient):
             system=options.system,
             component=options.component,
             encoding=options.encoding,
-            upkeep=SyncSettings.chosen(
+            sync_settings=SyncSettings.chosen(
                 options.watch_interval, options.policy, listen_only=options.listen_only, is_log=is_log
             ),
             split_peers=options.split_peers,
             counts_traffic=options.traffic,
             trace=protocol_logger.debug,
         )
-        self.cache_writer = WriteThrough(
+        self.cache_writer = CacheWriter(
             self.cache,
             owned=self.cache is not options.cache,
             identity_of=self.station.identity_of,
             is_doubted=self.station.is_doubted,
             renewed=self._dispatch,
-            look=lambda: self.link_task.look_at_the_clock(),
+            detect_suspend=lambda: self.link_task.detect_suspend(),
         )
         self._subscriptions: weakref.WeakSet[Events] = weakref.WeakSet()
         self._components: dict[Address, LinkComponent] = {}
         self._tasks: anyio.abc.TaskGroup | None = None
         self._outlasting: list[anyio.CancelScope] = []
-        self._beside = LinkTaps(options.tlog, options.forward, is_stream=self._link.is_stream)
+        self._link_taps = LinkTaps(options.tlog, options.forward, is_stream=self._link.is_stream)
         self.link_task = LinkTask(
             self._link,
             self.station,
             dispatch=self._dispatch,
             end=self._end,
-            taps=self._beside.taps,
-            may_rest=self._beside.forwarder is None,
+            taps=self._link_taps.taps,
+            may_rest=self._link_taps.forwarder is None,
         )
         if not self.listens_only:
-            self._beside.share(self.link_task.send_for_another)
+            self._link_taps.share(self.link_task.send_for_another)
         self._downloads = self._cache_hits = 0
         signing = options.signing
         if isinstance(signing, SigningKey):
@@ -226,7 +226,7 @@ class LinkClient(LocalClient):
         try:
             await self._link.open()
             await self.cache_writer.open()
-            await self._beside.open()
+            await self._link_taps.open()
             if self._keeper is not None:
                 self.station.begin_signing(*await self._keeper.open())
         except BaseException:
@@ -240,7 +240,7 @@ class LinkClient(LocalClient):
         tasks.start_soon(self._run_until_files_closed, self.link_task.read, name="paramclient reader")
         tasks.start_soon(self._run_until_files_closed, self.link_task.send, name="paramclient sender")
         tasks.start_soon(self.cache_writer.run, name="paramclient cache writer")
-        self._beside.start(tasks)
+        self._link_taps.start(tasks)
         if self._keeper is not None:
             tasks.start_soon(self._keeper.run, name="paramclient timestamp keeper")
 
@@ -287,7 +287,7 @@ class LinkClient(LocalClient):
                         if self._keeper is not None:
                             await self._keeper.close()
                     finally:
-                        await self._beside.close()
+                        await self._link_taps.close()
 
     def events(self) -> Events:
         """See `ParamClient.events`."""
@@ -318,7 +318,7 @@ class LinkClient(LocalClient):
         began = anyio.current_time()
         with anyio.move_on_after(timeout):
             while (found := self._find(system, component, peer)) is None and not self.station.is_over:
-                await self.link_task.news.wait()
+                await self.link_task.activity.wait()
                 self.check_open()
             if found is not None:
                 await found.wait_for_cache()
@@ -344,13 +344,13 @@ class LinkClient(LocalClient):
         machine = None
         with anyio.move_on_after(timeout), station.looking_for_others():
             while True:
-                news, now = self.link_task.news, anyio.current_time()
+                activity, now = self.link_task.activity, anyio.current_time()
                 since = station.listening_since
                 machine = choice.look(station.at_peer(peer), now, listening_since=since)
                 if machine is not None or station.is_over:
                     break
                 with anyio.move_on_after(None if choice.due == math.inf else choice.due - now):
-                    await news.wait()
+                    await activity.wait()
                 await self.link_task.wait_for_reader(choice.due)
                 self.check_open()
             if machine is not None:
@@ -383,7 +383,7 @@ class LinkClient(LocalClient):
             while not search.look(self.station.components, anyio.current_time()):
                 self.wake()
                 with anyio.move_on_after(SEARCH_INTERVAL):
-                    await self.link_task.news.wait()
+                    await self.link_task.activity.wait()
                 self.check_open()
             found = self._components[search.address]
             await found.wait_for_cache()
@@ -426,7 +426,7 @@ class LinkClient(LocalClient):
 
     # events of the protocol core
     async def _load(self, component: LinkComponent, identity: Identity) -> None:
-        if await self.cache_writer.bring(component.machine, identity):
+        if await self.cache_writer.load_cached(component.machine, identity):
             component.cache_was_read()
             self.cache_writer.wake()
             self._dispatch()
@@ -461,7 +461,7 @@ class LinkClient(LocalClient):
             elif isinstance(event, ComponentUncontested | ComponentReplaced):
                 self.cache_writer.discard_queued(machine)
             elif isinstance(event, ComponentIdentified):
-                self.link_task.tell()
+                self.link_task.notify()
                 for component in self._components.values():
                     if component.machine.vehicle == machine.vehicle:
                         self._read_cache(component)
@@ -557,7 +557,7 @@ class LinkClient(LocalClient):
                 machine.is_settling and machine.table.complete and not machine.table.volatile_known
                 for machine in self.station.components.values()
             ):
-                await self.link_task.news.wait()
+                await self.link_task.activity.wait()
 
     async def _run_until_files_closed(self, work: Callable[[], Awaitable[None]]) -> None:
         """Run a task until file sessions are closed, also if a scope around the client is cancelled."""
@@ -596,13 +596,13 @@ class LinkClient(LocalClient):
         carrier, files = self.link_task, machine.files
 
         def tell(now: float) -> None:
-            carrier.tell()
+            carrier.notify()
 
         self.wake()
         while files.is_closing and not (carrier.is_disconnected or carrier.ended or machine.presence.is_lost):
             if tell not in files.on_closed:
                 files.on_closed.append(tell)
-            await carrier.news.wait()
+            await carrier.activity.wait()
 
     @property
     def _has_one_vehicle(self) -> bool:

@@ -42,7 +42,7 @@ from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome, W
 from paramclient.protocol.params.writes import SetResult
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.station import Station
-from paramclient.protocol.vehicle.peers import Contest
+from paramclient.protocol.vehicle.address_contest import Contest
 from paramclient.protocol.wire import (
     MAV_MODE_FLAG_SAFETY_ARMED,
     NO_INDEX,
@@ -369,12 +369,12 @@ class LinkComponent(LocalComponent):
         moves = system is not None and system != self.system
         deadline = anyio.current_time() + (REBOOT_TIMEOUT if timeout is None else timeout)
         machine = self.machine
-        restart = machine.begin_restart(anyio.current_time(), returns=not moves)
+        restart = machine.begin_reboot(anyio.current_time(), returns=not moves)
         try:
             left = deadline - anyio.current_time()
             await self.wait(restart, left, lambda: (restart.stage, restart.attempts))
         finally:
-            machine.end_restart(restart, anyio.current_time())
+            machine.end_reboot(restart, anyio.current_time())
         if system is None or not moves:
             return self
         return await self.client.successor(self, system, timeout=deadline - anyio.current_time())
@@ -396,7 +396,7 @@ class LinkComponent(LocalComponent):
     def is_cache_due(self, now: float) -> bool:
         """See `LocalComponent.is_cache_due`."""
         writer = self.client.cache_writer
-        timeout = CACHE_TIMEOUT if writer.is_bringing(self.machine) else IDENTITY_TIMEOUT
+        timeout = CACHE_TIMEOUT if writer.is_loading(self.machine) else IDENTITY_TIMEOUT
         return (
             self._cache_is_read.is_set()
             or not writer.may_have(self.system, self.component)
@@ -453,7 +453,7 @@ class LinkComponent(LocalComponent):
         """Publish a change of a parameter, or reset the state after a change of several."""
         if isinstance(event, ParamChanged):
             self._publish(event.change)
-        self.machine.tells_changes, self.machine.has_moved = len(self._subscriptions) > 0, False
+        self.machine.tells_changes, self.machine.has_changed = len(self._subscriptions) > 0, False
 
     def _publish(self, change: Change) -> None:
         """Push a change to all streams."""

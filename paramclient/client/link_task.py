@@ -99,7 +99,7 @@ class LinkTask:
         is_disconnected: whether the link is disconnected and being reopened.
         broken: the error that calls raise now, or None.
         ended: the error that all calls raise permanently, or None.
-        news: set, and replaced, when data was received, the link drops or the calls fail.
+        activity: set, and replaced, when data was received, the link drops or the calls fail.
     """
 
     def __init__(
@@ -115,23 +115,23 @@ class LinkTask:
         self.is_disconnected = False
         self.broken: LinkError | None = None
         self.ended: LinkError | None = None
-        self.news = anyio.Event()
+        self.activity = anyio.Event()
         self._link = link
         self._station = station
         self._dispatch = dispatch
         self._end = end
         self._taps = taps
         self._may_rest = may_rest
-        self._of_others: deque[bytes] = deque()
+        self._forwarded: deque[bytes] = deque()
         self._something_to_send = anyio.Event()
         self._sent = anyio.Event()  # set after each sent frame
         self._behind_since = math.inf  # start of the backlog of the reader
         self._read_at = -math.inf
         self._due = math.inf  # next deadline of the sender
-        self._held_up_at = -math.inf  # last time at which the sender ran late by more than `READ_GAP_MIN`
+        self._sender_late_at = -math.inf  # last time at which the sender ran late by more than `READ_GAP_MIN`
         self._arrived_at = -math.inf  # arrival time of the last chunk of a link that does not report it
         self._unseen = 0.0  # seconds of suspend since the last read that the loop's clock has left out
-        self._is_taking = False  # whether the reader processes data, or waits for its turn to do so
+        self._is_processing = False  # whether the reader processes data, or waits for its turn to do so
         self._suspend = SuspendDetector()
         self._reading, self._sending = anyio.Lock(), anyio.Lock()
 
@@ -146,7 +146,7 @@ class LinkTask:
                 loop.unregister(self)
 
     async def _read(self, loop: LoopScheduler) -> None:
-        self._is_taking, self._behind_since = False, math.inf
+        self._is_processing, self._behind_since = False, math.inf
         before = drained_at = anyio.current_time()
         while True:
             asked_at = anyio.current_time()
@@ -160,7 +160,7 @@ class LinkTask:
                 drained_at = anyio.current_time()
                 continue
             now = anyio.current_time()
-            self._look_at_the_clock(now)
+            self._detect_suspend(now)
             moments = self._moments(len(chunks), drained_at, asked_at, now)
             drained_at = now if len(chunks) < BACKLOG_DATAGRAMS_MIN else drained_at
             is_news = not chunks
@@ -173,15 +173,15 @@ class LinkTask:
             self._read_at = math.inf
             rest = zip(chunks, moments, strict=True)
             if loop.needs_turns(len(chunks), self._station.scheduler):
-                self._is_taking = True
+                self._is_processing = True
                 is_news |= await self._take_turns(rest, loop)
-                self._is_taking = False
+                self._is_processing = False
             is_news |= self._take(rest, math.inf)
             now = self._read_at = anyio.current_time()
             loop.record_processed(self, now)
             if is_news:
                 self._dispatch()
-                self.tell()
+                self.notify()
                 self._something_to_send.set()
             elif self._may_rest and not self._station.is_waiting:
                 await self._rest(min(READ_PAUSE, PAUSE_DATAGRAMS_MAX * (now - before) / max(1, len(chunks))))
@@ -205,8 +205,8 @@ class LinkTask:
         arrived_at: Sequence[float] = getattr(self._link, "arrived_at", ())
         if len(arrived_at) == count:
             return [min(max(at, now - longest), now) for at in arrived_at]
-        was_held_up = now - self._held_up_at < READ_GAP_MIN or now - self._due > READ_GAP_MIN
-        is_late = was_held_up or asked_at - drained_at > READ_GAP_MIN
+        was_sender_late = now - self._sender_late_at < READ_GAP_MIN or now - self._due > READ_GAP_MIN
+        is_late = was_sender_late or asked_at - drained_at > READ_GAP_MIN
         at = now - longest if is_late else now
         self._arrived_at = max(at, min(self._arrived_at + ARRIVAL_STEP, now))
         return [self._arrived_at] * count
@@ -256,7 +256,7 @@ class LinkTask:
         while self.ended is None:
             self._something_to_send = anyio.Event()
             now = anyio.current_time()
-            self._look_at_the_clock(now)
+            self._detect_suspend(now)
             self._suspend.expect(math.inf)  # a slow link may block the sender
             self._due = math.inf
             is_behind = self._is_behind(now)
@@ -269,9 +269,9 @@ class LinkTask:
                 self._sent.set()
             for data, peer in to_send:
                 await self._transmit(data, peer)
-            for _ in range(min(len(self._of_others), FORWARDED_PER_TURN)):
-                await self._transmit(self._of_others.popleft(), None)
-            if self._of_others:
+            for _ in range(min(len(self._forwarded), FORWARDED_PER_TURN)):
+                await self._transmit(self._forwarded.popleft(), None)
+            if self._forwarded:
                 continue
             due = station.next_deadline()
             now = anyio.current_time()
@@ -285,7 +285,7 @@ class LinkTask:
                 await self._something_to_send.wait()
             now = anyio.current_time()
             if now - due > READ_GAP_MIN:
-                self._held_up_at = now
+                self._sender_late_at = now
             if self._behind_since < math.inf or now - due > LOOP_LATENCY_MIN:
                 await anyio.sleep(READER_TIME)
             elif now >= due:
@@ -294,8 +294,8 @@ class LinkTask:
 
     def send_for_another(self, frame: bytes) -> None:
         """Queue a frame of another program for every peer. Drop it if the queue is full or the link away."""
-        if len(self._of_others) < FORWARDED_QUEUE_MAX and not self.is_disconnected:
-            self._of_others.append(frame)
+        if len(self._forwarded) < FORWARDED_QUEUE_MAX and not self.is_disconnected:
+            self._forwarded.append(frame)
             self._station.overhear(frame, anyio.current_time())
             self._something_to_send.set()
 
@@ -303,14 +303,14 @@ class LinkTask:
         """Run the sender: something is to be sent, or a deadline has changed."""
         self._something_to_send.set()
 
-    def tell(self) -> None:
-        """Wake the tasks that wait for `news`."""
-        news, self.news = self.news, anyio.Event()
-        news.set()
+    def notify(self) -> None:
+        """Wake the tasks that wait for `activity`."""
+        activity, self.activity = self.activity, anyio.Event()
+        activity.set()
 
-    def look_at_the_clock(self) -> None:
+    def detect_suspend(self) -> None:
         """Detect suspend of the computer, or a stopped process."""
-        self._look_at_the_clock(anyio.current_time())
+        self._detect_suspend(anyio.current_time())
 
     async def wait_for_reader(self, due: float) -> None:
         """Wait until received data has been read, if the reader has a backlog or this call is late.
@@ -330,7 +330,7 @@ class LinkTask:
 
     def _is_behind(self, now: float) -> bool:
         """Return whether received data is still unread, so that no request may time out."""
-        return self._is_taking or self._behind_since <= now < self._read_at + LOOP_LATENCY_MIN
+        return self._is_processing or self._behind_since <= now < self._read_at + LOOP_LATENCY_MIN
 
     async def _transmit(self, data: bytes, peer: Peer | None) -> None:
         for tap in self._taps:
@@ -339,7 +339,7 @@ class LinkTask:
         with suppress(LinkError):
             await self._link.send(data, peer)
 
-    def _look_at_the_clock(self, now: float) -> None:
+    def _detect_suspend(self, now: float) -> None:
         """Detect a suspension, and suspend the deadlines of the core for its duration."""
         unseen = self._suspend.unseen(now)
         if unseen is not None:
@@ -358,8 +358,8 @@ class LinkTask:
         """Reopen the link with backoff, without a time limit. Calls fail after `LINK_TIMEOUT`."""
         logger.warning("%s; reconnecting", error)
         self.is_disconnected = True
-        self.tell()
-        self._of_others.clear()
+        self.notify()
+        self._forwarded.clear()
         self._station.pause()
         for tap in self._taps:
             tap.pause()
@@ -389,4 +389,4 @@ class LinkTask:
         """
         self.broken = error
         self._station.fail_all(error, anyio.current_time())
-        self.tell()
+        self.notify()

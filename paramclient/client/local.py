@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from typing import Protocol, TypeVar
 
 from paramclient.cache import ParamCache
-from paramclient.client.cache_writer import WriteThrough
+from paramclient.client.cache_writer import CacheWriter
 from paramclient.client.component import Component
 from paramclient.client.events import Events
 from paramclient.client.link_task import LinkTask
@@ -38,7 +38,7 @@ class LocalClient(Protocol):
     Attributes:
         cache: the cache of its tables, or None.
         station: the protocol core of the link.
-        link_task: the tasks that read and send; `news` is set when anything was received.
+        link_task: the tasks that read and send; `activity` is set when anything was received.
         cache_writer: writes tables to the cache, in a thread of its own.
         opened_at: when the client was opened, by the clock of the event loop.
     """
@@ -46,7 +46,7 @@ class LocalClient(Protocol):
     cache: ParamCache | None
     station: Station
     link_task: LinkTask
-    cache_writer: WriteThrough
+    cache_writer: CacheWriter
     opened_at: float
 
     @property

@@ -94,11 +94,13 @@ class LoopScheduler:
             now: time of the event loop.
             is_behind: whether the link itself has a backlog.
         """
-        turns = scheduler.turns
+        admission = scheduler.list_admission
         if is_behind:
             scheduler.lists_max = 1
         else:
-            scheduler.lists_max = self.most_lists(reader, turns.bursts, now, awaited=turns.awaited(now))
+            scheduler.lists_max = self.most_lists(
+                reader, admission.bursts, now, awaited=admission.awaited(now)
+            )
         scheduler.is_crowded = self.is_busy_without(reader)
 
     def most_lists(self, reader: object, bursts: int, now: float, *, awaited: int = 0) -> float:

@@ -166,7 +166,7 @@ class _Diagnosis:
         """Wait until AUTOPILOT_VERSION was received or finally refused, at most `VERSION_TIMEOUT`."""
         with anyio.move_on_after(self._left(VERSION_TIMEOUT)):
             while not self._local.machine.identification.settled:
-                await self._local.client.link_task.news.wait()
+                await self._local.client.link_task.activity.wait()
 
     async def _measure_round_trips(self) -> tuple[float, ...]:
         """Return the seconds from command to acknowledgement, for commands that were sent once, sorted."""
@@ -334,7 +334,7 @@ class _Diagnosis:
     def _make_link_report(self, round_trips: tuple[float, ...]) -> LinkReport:
         client, component = self._client, self._component
         report = client.traffic_report()
-        own = self._local.client.station.own
+        own = self._local.client.station.own_address
         address = (component.system, component.component)
         mine = next((each for each in report.components if (each.system, each.component) == address), None)
         sent = 0 if mine is None else mine.frames - mine.repeated + mine.lost

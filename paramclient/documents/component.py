@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from paramclient.client.component import Component
     from paramclient.model.identity import Identity
     from paramclient.protocol.params.fetch_result import FetchResult, Progress
-    from paramclient.protocol.vehicle.peers import Contest
+    from paramclient.protocol.vehicle.address_contest import Contest
 
 __all__ = ["ComponentDoc", "ComponentsDoc", "ContestDoc", "IdentityDoc", "LastFetchDoc", "ProgressDoc"]
 

@@ -11,7 +11,7 @@ from paramclient.documents.document import Document, Maybe, Scalar
 from paramclient.model.identity import version_text
 from paramclient.model.notation import typed, value_json
 from paramclient.model.values import Value, type_name
-from paramclient.provision.planning import PlanStatus, RowStanding
+from paramclient.provision.planning import PlanStatus, RowComparison
 from paramclient.provision.results import ApplyStatus
 
 if TYPE_CHECKING:
@@ -152,7 +152,7 @@ class PlanDoc(Document):
 class VerifiedRowDoc(Document):
     """The comparison of one parameter with the wanted one; see `PlanRow.standing`."""
 
-    standing: RowStanding = Field(validation_alias="is", serialization_alias="is")
+    standing: RowComparison = Field(validation_alias="is", serialization_alias="is")
     type: str | None
     before: Scalar | None
     wanted: Scalar
@@ -173,7 +173,7 @@ class VerifiedDoc(Document):
     system: int
     component: int
     met: bool
-    counts: dict[RowStanding, int]
+    counts: dict[RowComparison, int]
     params: dict[str, VerifiedRowDoc]
     firmware: Maybe[FirmwareDoc] = None
 
@@ -188,7 +188,7 @@ class VerifiedDoc(Document):
             system=system,
             component=component,
             met=plan.is_met,
-            counts={standing: sum(row.standing is standing for row in rows) for standing in RowStanding},
+            counts={standing: sum(row.standing is standing for row in rows) for standing in RowComparison},
             params={row.name: VerifiedRowDoc.of(row) for row in rows if full or not row.is_met},
             firmware=FirmwareDoc.of(plan),
         )

@@ -93,7 +93,7 @@ class SocketLink(ABC):
         self._port = spec.port
         self._socket: socket.socket | None = None
         self._openings = 0
-        self._end: tuple[str, OSError | None] = ("closed", None)
+        self._close_reason: tuple[str, OSError | None] = ("closed", None)
 
     @property
     def address(self) -> tuple[str, int] | None:
@@ -139,7 +139,7 @@ class SocketLink(ABC):
     def _discard(self) -> None:
         """Close the socket and wake waiting tasks. An `open` in progress fails from now on."""
         self._openings += 1
-        self._end = ("closed", None)
+        self._close_reason = ("closed", None)
         if self._socket is not None:
             close_socket(self._socket)
             self._socket = None
@@ -147,7 +147,7 @@ class SocketLink(ABC):
     def _fail(self, problem: str, cause: OSError | None = None) -> NoReturn:
         """Close the link because of an error; tasks that wait elsewhere get the same LinkError."""
         self._discard()
-        self._end = (problem, cause)
+        self._close_reason = (problem, cause)
         raise self._error(problem) from cause
 
     def _open_socket(self) -> socket.socket:
@@ -165,7 +165,7 @@ class SocketLink(ABC):
     def _check(self, opening: int) -> None:
         """Raise LinkError if the link has been closed since it was opened as `opening`."""
         if opening != self._openings:
-            problem, cause = self._end
+            problem, cause = self._close_reason
             raise self._error(problem) from cause
 
     @property

@@ -92,9 +92,9 @@ class SerialLink:
         self.device = spec.host
         self.baud = spec.port
         self._port: _Port | None = None
-        self._far = SerialDevice(0, spec.host)
+        self._peer = SerialDevice(0, spec.host)
         self._openings = 0
-        self._end: tuple[str, OSError | None] = ("closed", None)
+        self._close_reason: tuple[str, OSError | None] = ("closed", None)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.name} {'closed' if self._port is None else 'open'}>"
@@ -117,7 +117,7 @@ class SerialLink:
             await port.close()
         self._check(opening)
         self._port = port
-        self._far = self._far._replace(number=self._far.number + 1)
+        self._peer = self._peer._replace(number=self._peer.number + 1)
 
     async def receive(self) -> list[tuple[Peer, bytes]]:
         """See `Link.receive`: one chunk of up to `READ_SIZE` bytes."""
@@ -128,7 +128,7 @@ class SerialLink:
             await self._fail(opening, f"lost {self.device}: unplugged, or reset ({reason(error)})", error)
         if not data:
             await self._fail(opening, f"lost {self.device}: unplugged, or hung up")
-        return [(self._far, data)]
+        return [(self._peer, data)]
 
     async def send(self, data: bytes, peer: Peer | None) -> None:
         """See `Link.send`. Waits for space until `STALL_TIMEOUT`; then the port counts as lost.
@@ -137,7 +137,7 @@ class SerialLink:
         """
         await anyio.lowlevel.checkpoint()
         port, opening = self._opened(), self._openings
-        if peer is not None and peer != self._far:
+        if peer is not None and peer != self._peer:
             return
         timeout = STALL_TIMEOUT + SYSTEM_BUFFER * BITS_PER_BYTE / self.baud
         with anyio.move_on_after(timeout) as wait:
@@ -156,7 +156,7 @@ class SerialLink:
     async def _discard(self, problem: str, cause: OSError | None = None) -> None:
         """Close the port and wake waiting tasks. An `open` in progress fails from now on."""
         self._openings += 1
-        self._end = (problem, cause)
+        self._close_reason = (problem, cause)
         port, self._port = self._port, None
         if port is not None:
             await port.close()
@@ -170,7 +170,7 @@ class SerialLink:
     def _check(self, opening: int) -> None:
         """Raise LinkError if the link has been closed since it was opened as `opening`."""
         if opening != self._openings:
-            problem, cause = self._end
+            problem, cause = self._close_reason
             raise self._error(problem) from cause
 
     def _opened(self) -> _Port:
@@ -306,11 +306,11 @@ async def _in_thread(work: Callable[[], T], *, undo: Callable[[T], object], grac
     except BaseException:
         with lock:
             is_wanted = False
-            came_too_early = bool(results)
+            finished_before_cancel = bool(results)
         with anyio.move_on_after(grace, shield=True):
             await ended.wait()
             thread.join()
-        if came_too_early:
+        if finished_before_cancel:
             undo(results[0])
         raise
     thread.join()

@@ -48,7 +48,7 @@ class TcpOut(SocketLink):
 
     def __init__(self, spec: LinkSpec) -> None:
         super().__init__(spec)
-        self._far = TcpConnection(0, spec.host, spec.port)
+        self._peer = TcpConnection(0, spec.host, spec.port)
 
     async def receive(self) -> list[tuple[Peer, bytes]]:
         """See `Link.receive`: one chunk of up to `READ_SIZE` bytes."""
@@ -63,7 +63,7 @@ class TcpOut(SocketLink):
                 self._fail(f"connection to {self._target} lost: {reason(error)}", error)
             if not data:
                 self._fail(f"connection closed by {self._target}")
-            return [(self._far, data)]
+            return [(self._peer, data)]
 
     async def send(self, data: bytes, peer: Peer | None) -> None:
         """See `Link.send`. Waits at most `SEND_TIMEOUT` for space; then the connection counts as dropped.
@@ -73,7 +73,7 @@ class TcpOut(SocketLink):
         await anyio.lowlevel.checkpoint()
         sock = self._open_socket()
         opening = self._openings
-        if peer is not None and peer != self._far:
+        if peer is not None and peer != self._peer:
             return
         try:
             await _send_all(sock, data)
@@ -96,7 +96,7 @@ class TcpOut(SocketLink):
                     raise
             else:
                 break
-        self._far = self._far._replace(number=self._far.number + 1)
+        self._peer = self._peer._replace(number=self._peer.number + 1)
 
 
 class TcpIn(SocketLink):

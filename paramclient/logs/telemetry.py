@@ -13,7 +13,7 @@ import anyio
 import anyio.lowlevel
 
 from paramclient.cache import CachedComponent, CachedExtTable, ExtTableUpdate, ParamCache, TableUpdate
-from paramclient.client.cache_writer import CACHE_FLUSH_INTERVAL, WriteThrough
+from paramclient.client.cache_writer import CACHE_FLUSH_INTERVAL, CacheWriter
 from paramclient.links.replay import LOG_PEER
 from paramclient.links.tlog import Record, open_log, read_records
 from paramclient.logs.imported_table import ImportedTable
@@ -85,7 +85,7 @@ class _Import:
         self._versions = said[AUTOPILOT_VERSION_ID]
         self._at = 0.0
         self._station = Station(
-            link=name, is_stream=False, upkeep=SyncSettings.chosen(None, "auto", is_log=True)
+            link=name, is_stream=False, sync_settings=SyncSettings.chosen(None, "auto", is_log=True)
         )
         self._writer = _LogWriter(
             cache,
@@ -145,7 +145,7 @@ class _Import:
     async def _bring(self, machine: ComponentMachine) -> None:
         identity = self._identity_of(machine)
         if identity is not None and not self._writer.follow(machine, identity):
-            await self._writer.bring(machine, identity)
+            await self._writer.load_cached(machine, identity)
 
     def _identity_of(self, machine: ComponentMachine) -> Identity | None:
         """Return the vehicle's identity; without one in the log, an identity that is unique to the log."""
@@ -173,7 +173,7 @@ def _is_told(machine: ComponentMachine) -> bool:
     return bool(machine.table.params or machine.ext.table.params or machine.fetches.notes)
 
 
-class _LogWriter(WriteThrough):
+class _LogWriter(CacheWriter):
     """Collects the updates of the tables, with the times of the log, until `merge`."""
 
     def __init__(

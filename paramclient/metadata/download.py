@@ -172,11 +172,11 @@ async def announced_metadata(component: Component, timeout: float | None) -> Com
     what = f"COMPONENT_METADATA of {component.system}/{component.component}"
     machine, now = asked.machine, anyio.current_time()
     machine.check_present(what, now)
-    ask = machine.descriptions.ask(now)
+    ask = machine.metadata_requests.ask(now)
     try:
         return await asked.wait(ask, timeout, lambda: (what, ask.attempts))
     finally:
-        machine.descriptions.release(ask)
+        machine.metadata_requests.release(ask)
 
 
 def _places_of_parameters(general: bytes, source: str) -> list[tuple[str, int | None]]:

@@ -50,15 +50,15 @@ from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.scheduler import Scheduler
 from paramclient.protocol.stats.trace import Trace, discard
+from paramclient.protocol.vehicle.address_contest import NO_PEER, ComponentPeers, Contest
 from paramclient.protocol.vehicle.boot_time_requests import BootTimeRequests
-from paramclient.protocol.vehicle.claims import Claim, PeerRelation
 from paramclient.protocol.vehicle.commands import Commands, MessageRequests
 from paramclient.protocol.vehicle.extended_kinds import expects_extended
 from paramclient.protocol.vehicle.identification import Identification
 from paramclient.protocol.vehicle.metadata_location import MetadataRequests
-from paramclient.protocol.vehicle.peers import NO_PEER, ComponentPeers, Contest
+from paramclient.protocol.vehicle.peer_claims import Claim, PeerRelation
 from paramclient.protocol.vehicle.presence import Presence
-from paramclient.protocol.vehicle.reboot import Reboot, Reboots
+from paramclient.protocol.vehicle.reboot_command import Reboot, Reboots
 from paramclient.protocol.wire import (
     HASH_CHECK,
     MAV_AUTOPILOT_ARDUPILOTMEGA,
@@ -119,7 +119,7 @@ class ComponentObserver(Protocol):
     def ext_changed(self, machine: ComponentMachine, change: ExtChange) -> None:
         """An extended parameter appeared, changed or was removed."""
 
-    def moved(self, machine: ComponentMachine) -> None:
+    def params_changed(self, machine: ComponentMachine) -> None:
         """Parameters have changed; called once for several changes without `tells_changes`."""
 
     def fetched(self, machine: ComponentMachine, result: FetchResult) -> None:
@@ -134,19 +134,19 @@ class ComponentMachine:
 
     Args:
         system, component: its address.
-        own: system and component that requests are sent as.
+        own_address: system and component that requests are sent as.
         link: the link's canonical name, part of an identity without a hardware id.
         send: takes each message for the component, in order.
         observer: receives what happens to the component.
         send_to: takes each message for one of its peers; None where there is only one.
         encoding: the user's choice of its encoding, or None.
-        upkeep: what is done for its table without a request of the user.
+        sync_settings: what is done for its table without a request of the user.
         companions: the components of its vehicle, to which it adds itself; None for a vehicle with one.
         read_clock: enables `boot_clock` calls with clocks from its telemetry for a while; see
             `BootTimeSampling`.
         peer: its peer, where components are told apart by peer; otherwise None.
         scheduler: the scheduler of the link; None for a link with one component.
-        room: the name count shared by the tables of the link; None likewise.
+        name_quota: the name count shared by the tables of the link; None likewise.
         trace: receives each step.
 
     Attributes:
@@ -161,24 +161,24 @@ class ComponentMachine:
         round_trip: round-trip time and loss of its responses.
         presence: whether its messages are received.
         peers: the peers that send with its address, and whether several vehicles do.
-        following: the list that another station has requested, while none of ours runs.
+        foreign_list: the list that another station has requested, while none of ours runs.
         sync: whether the table still matches the vehicle's.
         files: its files over MAVFTP.
         uploads: its parameter file as a way to write many values.
-        descriptions: the location of its metadata.
+        metadata_requests: the location of its metadata.
         name_searches: the searches for names that may not exist.
         commands: its commands.
         messages: the messages that are requested from it.
-        clock_requests: the requests for its time since boot.
+        boot_time_requests: the requests for its time since boot.
         ext: its extended parameters.
-        start_values: the reads of values that it measures at each boot.
-        restarts: its reboot on command.
+        boot_values: the reads of values that it measures at each boot.
+        reboots: its reboot on command.
         rereads: the values to be read again.
         fetches: the fetches of its table.
         tells_changes: whether the observer is called for each change. An event for each value of a long list
             takes a tenth of the time of the value itself, and the garbage collector visits all waiting
             events.
-        has_moved: whether an unhandled event reports changes; the consumer of events resets it.
+        has_changed: whether an unhandled event reports changes; the consumer of events resets it.
     """
 
     def __init__(
@@ -186,22 +186,22 @@ class ComponentMachine:
         system: int,
         component: int,
         *,
-        own: tuple[int, int],
+        own_address: tuple[int, int],
         link: str,
         send: Callable[[Message], None],
         observer: ComponentObserver,
         send_to: Callable[[Message, Peer], None] | None = None,
         encoding: Encoding | None = None,
-        upkeep: SyncSettings | None = None,
+        sync_settings: SyncSettings | None = None,
         companions: list[ComponentMachine] | None = None,
         read_clock: Callable[[float], None] = lambda now: None,
         peer: Peer | None = None,
         scheduler: Scheduler | None = None,
-        room: NameQuota | None = None,
+        name_quota: NameQuota | None = None,
         trace: Trace = discard,
     ) -> None:
         target = (system, component)
-        upkeep = upkeep or SyncSettings()
+        sync_settings = sync_settings or SyncSettings()
         self.system = system
         self.component = component
         self.address: Address = target if peer is None else PeerAddress(system, component, peer)
@@ -211,9 +211,9 @@ class ComponentMachine:
         self._scheduler = scheduler
         self.reschedule = scheduler.reporter(self)
         context = Context(
-            *(target, self._send, own),
+            *(target, self._send, own_address),
             trace=trace,
-            may_send=not upkeep.listens_only,
+            may_send=not sync_settings.listens_only,
             reschedule=self.reschedule,
         )
         self.context = context
@@ -221,73 +221,80 @@ class ComponentMachine:
         self.round_trip = context.round_trip
         self.messages = MessageRequests(context)
         self.identification = Identification(context, self.messages, link, encoding)
-        self.table = Table(self.identification.encoding, room)
-        self.reads = Reads(context, self.table, scheduler.turns.share)
+        self.table = Table(self.identification.encoding, name_quota)
+        self.reads = Reads(context, self.table, scheduler.list_admission.bandwidth)
         self.writes = Writes(context, self.reads, self.table, permission=self)
         self.write_batches = WriteBatches(target)
         self.presence = Presence()
         self.peers = ComponentPeers(target, self, may_ask=context.may_send)
         self.files = FileTransfers(context)
         self.uploads = Uploads(context, self.files, self.table)
-        check_pace = SyncInterval(upkeep.interval, is_chosen=upkeep.without_hash)
+        sync_interval = SyncInterval(sync_settings.interval, is_chosen=sync_settings.without_hash)
         self.sync = Sync(
-            context, self.reads, self.table, upkeep, check_pace, self.presence, self.files, host=self
+            context,
+            self.reads,
+            self.table,
+            sync_settings,
+            sync_interval,
+            self.presence,
+            self.files,
+            host=self,
         )
-        self.descriptions = MetadataRequests(context, self.messages)
+        self.metadata_requests = MetadataRequests(context, self.messages)
         self.commands = Commands(context)
-        self.clock_requests = BootTimeRequests(context, self.messages, self.presence)
-        self.start_values = BootValues(context, self.reads, self.table, self.sync)
-        self.restarts = Reboots(
+        self.boot_time_requests = BootTimeRequests(context, self.messages, self.presence)
+        self.boot_values = BootValues(context, self.reads, self.table, self.sync)
+        self.reboots = Reboots(
             context,
             self.commands,
             self.identification,
             self.presence,
-            self.clock_requests,
-            self._restart_noticed,
+            self.boot_time_requests,
+            self._reboot_noticed,
         )
-        self.following = ForeignList()
-        means = FetchContext(
+        self.foreign_list = ForeignList()
+        fetch_context = FetchContext(
             context,
             self.reads,
             self.table,
-            scheduler.turns,
+            scheduler.list_admission,
             self.files,
-            changed=self._moved,
+            changed=self._fetch_changed,
             doubt=self._doubt_identity,
-            following=self.following,
+            foreign_list=self.foreign_list,
         )
-        self.fetches = Fetches(means, self.sync, upkeep, check_pace, ended=self._fetched)
-        self.name_searches = NameSearches(context, self.reads, self.table, self.following)
+        self.fetches = Fetches(fetch_context, self.sync, sync_settings, sync_interval, ended=self._fetched)
+        self.name_searches = NameSearches(context, self.reads, self.table, self.foreign_list)
         # without requests there are no reads: the lists of other stations take their place
         overheard = self.fetches.overheard
         self._value_heard = self.reads.heard if overheard is None else overheard.heard
-        self._own = own
+        self._own_address = own_address
         self._observer = observer
         self._transmit = send
         self._send_to = send_to or (lambda message, peer: send(message))
-        self._policy = upkeep.policy
-        self._listens_only = upkeep.listens_only
+        self._fetch_policy = sync_settings.policy
+        self._listens_only = sync_settings.listens_only
         self._read_clock = read_clock
         self._companions: list[ComponentMachine] = [] if companions is None else companions
         self._companions.append(self)
         self._known_as: str | None = None  # the key of the reported identity
         self.tells_changes = True
-        self.has_moved = False
-        self.rereads = Rereads(context, self.reads, self.table, self.sync, upkeep.policy)
+        self.has_changed = False
+        self.rereads = Rereads(context, self.reads, self.table, self.sync, sync_settings.policy)
         self.ext = ExtendedParams(
             context,
             self,
-            share=scheduler.turns.share,
-            room=room,
-            may_read=upkeep.policy is Policy.AUTO,
+            share=scheduler.list_admission.bandwidth,
+            room=name_quota,
+            may_read=sync_settings.policy is Policy.AUTO,
         )
         self._authors = self.rereads.authors
         self._checks = self.rereads.checks
-        self.writes.left_open = self._authors.foreign_set
+        self.writes.on_outcome_unknown = self._authors.foreign_set
         self._machines: tuple[Machine, ...] = (
             *(self.reads, self.name_searches, self.sync, self.writes, self.files, self.commands),
-            *(self.restarts, self.fetches, self.messages, self.identification, self.descriptions),
-            *(self.clock_requests, self.start_values, self.rereads, self.ext, self.write_batches),
+            *(self.reboots, self.fetches, self.messages, self.identification, self.metadata_requests),
+            *(self.boot_time_requests, self.boot_values, self.rereads, self.ext, self.write_batches),
         )
         """Each machine stands behind those that it uses or calls. They end in reverse order: a machine does
         not take the end of another one for a result, and is not called after its own end."""
@@ -358,9 +365,9 @@ class ComponentMachine:
         return (each for each in self._companions if each is not self and each.identification.is_autopilot)
 
     @property
-    def is_restarting(self) -> bool:
+    def is_rebooting(self) -> bool:
         """Whether a reboot on command is in progress."""
-        return self.restarts.is_under_way
+        return self.reboots.is_in_progress
 
     @property
     def is_identified(self) -> bool:
@@ -410,8 +417,8 @@ class ComponentMachine:
         """Whether anything is in progress except reads of volatile values after a hash match."""
         in_background = 0 if self.refresh is None else self.refresh.in_flight
         is_asked = len(self.reads) > in_background or len(self.writes) > 0 or not self.files.is_idle
-        is_asked = is_asked or len(self.commands) > 0 or self.restarts.current is not None
-        is_asked = is_asked or self.descriptions.is_asking or len(self.name_searches) > 0
+        is_asked = is_asked or len(self.commands) > 0 or self.reboots.current is not None
+        is_asked = is_asked or self.metadata_requests.is_asking or len(self.name_searches) > 0
         is_asked = is_asked or self.ext.is_busy
         return is_asked or self.fetch is not None or self.identification.is_asking
 
@@ -448,7 +455,7 @@ class ComponentMachine:
             if self.presence.heartbeat(message, now):
                 self._rebooted(now)
             elif state not in (None, message.system_status):
-                self.clock_requests.want(now)
+                self.boot_time_requests.want(now)
             self.rereads.forget_old(now)
             if self.fetches.overheard is not None:
                 self.fetches.overheard.file.tick(now)  # in a log the time advances with messages only
@@ -463,7 +470,7 @@ class ComponentMachine:
             addressee = (message.target_system, message.target_component)
             if message.param_index < 0 and not is_portable_name(message.param_id):
                 self.table.leave_out(message.param_id)
-            elif addressee in (self._own, (0, 0)) and not self.writes.refused(message, now):
+            elif addressee in (self._own_address, (0, 0)) and not self.writes.refused(message, now):
                 self.reads.refused(message, now)
                 self.name_searches.refused(message, now)
         elif isinstance(message, ParamExtValue):
@@ -484,7 +491,7 @@ class ComponentMachine:
             if self.fetches.overheard is not None:
                 self.fetches.overheard.file.reply_heard(message, now)
         elif isinstance(message, ComponentMetadata):
-            self.descriptions.heard(message, now)
+            self.metadata_requests.heard(message, now)
         elif isinstance(message, HighLatency2):
             self._kind_told(message, now)
             self.presence.high_latency()
@@ -517,8 +524,8 @@ class ComponentMachine:
             moment: when it came from the link, if earlier; None for `now`.
         """
         self._heard(now, version)
-        who = self.identification
-        who.heard(now)
+        identification = self.identification
+        identification.heard(now)
         name, _, number, count, index = message
         if not is_portable_name(name):
             if name:
@@ -533,14 +540,14 @@ class ComponentMachine:
             self.reads.heard(message, now)
             return
         table = self.table
-        if who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA:
+        if identification.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA:
             if not name.isupper():
                 name = _in_capitals(name)
                 message = message._replace(param_id=name)
             if number == ParamType.REAL32 and index == NO_INDEX:
                 message = table.with_known_type(message)
         if count != table.count and count <= PARAMETERS_MAX:
-            self._count_moved(count, now)
+            self._count_changed(count, now)
         authors = self._authors
         writes = self.writes
         by = writes.author(name) if writes.queues else None
@@ -568,7 +575,7 @@ class ComponentMachine:
         if fetch is not None:
             fetch.heard(message, now)
         elif not self.reads.awaits(message):
-            self.following.heard(message, now)
+            self.foreign_list.heard(message, now)
         if writes.queues:
             writes.heard(message, now)
         self._value_heard(message, now)
@@ -585,18 +592,18 @@ class ComponentMachine:
             self._rebooted(now, by_clock=True)
         started_at = self.presence.started_at
         if started_at is not None and self.presence.clock_at == now:
-            self.start_values.clock_told(now - started_at, now)
+            self.boot_values.clock_told(now - started_at, now)
 
     def _numbering_began(self, silent_since: float, now: float) -> None:
         """Process a possible new frame numbering, as after a reboot: the clock decides whether it is one.
 
         A fetch that was interrupted does not wait for the clock.
         """
-        if self.restarts.numbering_began(now):
+        if self.reboots.numbering_began(now):
             return
-        self.clock_requests.want(now)
+        self.boot_time_requests.want(now)
         if now - silent_since >= NUMBERING_SILENCE and self.fetches.seems_restarted(silent_since, now):
-            self.following.forget()
+            self.foreign_list.forget()
             self._doubt()
 
     def _note_replaced(self, change: Change, message: ParamValue, now: float) -> None:
@@ -616,7 +623,7 @@ class ComponentMachine:
         if fetch is not None:
             fetch.heard(message, now)
         elif not self.reads.awaits(message):
-            self.following.heard(message, now)
+            self.foreign_list.heard(message, now)
         self.writes.defer(message, until)
         if self.fetches.overheard is not None:
             self.fetches.overheard.heard(message, now)
@@ -857,8 +864,8 @@ class ComponentMachine:
             if each.identification.is_unconfirmed:
                 each.identification.doubt(now)
 
-    def begin_restart(self, now: float, *, returns: bool = True) -> Reboot:
-        """Reboot the component, or join the reboot in progress; give it back with `end_restart`.
+    def begin_reboot(self, now: float, *, returns: bool = True) -> Reboot:
+        """Reboot the component, or join the reboot in progress; give it back with `end_reboot`.
 
         Args:
             now: the time.
@@ -867,17 +874,17 @@ class ComponentMachine:
         Raises:
             NoReply: the component is lost. Nothing was sent.
         """
-        if not self.restarts.is_under_way:
+        if not self.reboots.is_in_progress:
             self.check_present(f"the restart of {self.system}/{self.component}", now)
         self._read_clock(now)
         self.reschedule()
-        self.start_values.stop()
-        return self.restarts.begin(now, returns=returns)
+        self.boot_values.stop()
+        return self.reboots.begin(now, returns=returns)
 
-    def end_restart(self, restart: Reboot, now: float) -> None:
+    def end_reboot(self, reboot: Reboot, now: float) -> None:
         """Give a reboot back. The last holder ends it; whether the command takes effect is then unknown."""
         self.reschedule()
-        self.restarts.end(restart, now)
+        self.reboots.end(reboot, now)
 
     def begin_fetch(
         self,
@@ -905,7 +912,7 @@ class ComponentMachine:
         """
         self.check_uncontested()
         self.reschedule()
-        if self.fetch is None and self._policy is not Policy.CACHE_ONLY:
+        if self.fetch is None and self._fetch_policy is not Policy.CACHE_ONLY:
             self.check_present(f"the parameters of {self.system}/{self.component}", now)
         return self.fetches.begin(
             now, refresh=refresh, listed=listed, by_list=by_list, check=check, sampled=sampled
@@ -950,7 +957,7 @@ class ComponentMachine:
 
     # peers
 
-    def peer_moved(self, claim: Claim, now: float, verdict: PeerRelation) -> None:
+    def home_changed(self, claim: Claim, now: float, verdict: PeerRelation) -> None:
         """Take another peer as the one with the address, and request its identity."""
         if verdict is PeerRelation.OTHER:
             self._replaced(now)
@@ -960,7 +967,7 @@ class ComponentMachine:
                 self.sync.check(now)
             self.identification.doubt(now)
         self._take_claim(claim, now)
-        self.clock_requests.want(now)
+        self.boot_time_requests.want(now)
 
     def contest_began(self, contest: Contest, now: float) -> None:
         """End all operations with an error: several vehicles use the address."""
@@ -981,7 +988,7 @@ class ComponentMachine:
         self._known_as = None
         self.sync.check(now)
         self._take_claim(claim, now)
-        self.clock_requests.want(now)
+        self.boot_time_requests.want(now)
 
     def _forget_companions(self, error: ParamClientError, now: float) -> None:
         """Forget the autopilot's other components after a contest: their messages may be of either
@@ -1065,11 +1072,11 @@ class ComponentMachine:
         self.sync.forget()
         self.fetches.forget()
         self.uploads.forget()
-        self.following.forget()
+        self.foreign_list.forget()
         self.ext.forget(now)
         self._checks.clear()
         self._known_as = None
-        self.restarts.vehicle_replaced(now)
+        self.reboots.vehicle_replaced(now)
         self.commands.lose(now, ": another vehicle has this address now")
         self.name_searches.lose(now)
         what = f"writes to {self.system}/{self.component}: another vehicle has this address now"
@@ -1096,9 +1103,9 @@ class ComponentMachine:
         if version > self.version:
             self.version = version
 
-    def _count_moved(self, count: int, now: float) -> None:
+    def _count_changed(self, count: int, now: float) -> None:
         if self.table.count is not None:
-            self.sync.count_moved(now)
+            self.sync.count_changed(now)
         self.table.change_count(count)
 
     def _doubt(self) -> None:
@@ -1133,11 +1140,11 @@ class ComponentMachine:
             self.identification.doubt(now)
         elif presence.was_away(silence) and silence < math.inf:
             self.identification.doubt(now)
-        self.restarts.silence_ended(silence, now)
+        self.reboots.silence_ended(silence, now)
         if presence.has_beaten:  # without heartbeats, no message is ever overdue
             self.sync.silence(now)
 
-    def _restart_noticed(self, now: float) -> None:
+    def _reboot_noticed(self, now: float) -> None:
         """Process a reboot on command that the clock has not shown, or not by going back."""
         self.presence.forget_clock(now)
         self._rebooted(now)
@@ -1146,20 +1153,20 @@ class ComponentMachine:
         """Process a reboot: unsaved values are lost, and a list starts again."""
         self._observer.rebooted(self)
         self.fetches.interrupt(now)
-        self.start_values.restarted(now, by_clock=by_clock)
+        self.boot_values.restarted(now, by_clock=by_clock)
         started_at = self.presence.started_at if by_clock else None
         is_of_this_run = started_at is not None and self.fetches.are_since(started_at)
         if not is_of_this_run:
             self._doubt()
-        self.following.forget()
+        self.foreign_list.forget()
         self.ext.restart(now)
         self.rereads.clear()
         self.sync.check(now)
         self.identification.doubt(now)
-        self.restarts.rebooted(now)
+        self.reboots.rebooted(now)
         if not by_clock:
-            self.clock_requests.want(now)
-        if self.fetch is not None and self.fetch.is_under_way and not is_of_this_run:
+            self.boot_time_requests.want(now)
+        if self.fetch is not None and self.fetch.is_receiving and not is_of_this_run:
             self.fetch.restart(now)
 
     def _follow_identity(self, now: float) -> None:
@@ -1170,12 +1177,12 @@ class ComponentMachine:
         name = autopilot_name(MAV_AUTOPILOT_PX4 if autopilot is None else autopilot)  # may be one
         self.writes.against_non_finite = reason_against_non_finite(name)
         if self.fetch is not None:
-            self.fetch.look(now)
+            self.fetch.check_file(now)
         if self.identification.settled and self._known_as != self.identity.key:
             self._known_as = self.identity.key
             self._observer.identified(self)
             if self.identification.is_autopilot:
-                self.clock_requests.want_baseline(now)
+                self.boot_time_requests.want_baseline(now)
         for each in self._companions:
             if each.writes.queues or each.ext.writes.queues:
                 each._follow_permission(now)
@@ -1205,7 +1212,7 @@ class ComponentMachine:
         if self.identification.settled and now - self.identification.known_at > IDENTITY_VALID_TIME:
             self.identification.ask_again(now)
 
-    def _moved(self, changes: list[Change]) -> None:
+    def _fetch_changed(self, changes: list[Change]) -> None:
         """Report changes that a fetch has found without a PARAM_VALUE."""
         for change in changes:
             self.sync.changed(change.name, change.by)
@@ -1213,7 +1220,7 @@ class ComponentMachine:
 
     def _write_ended(self, write: Write) -> None:
         now = write.ended_at
-        self.restarts.write_ended(now)
+        self.reboots.write_ended(now)
         self.sync.write_ended(now)
         self.rereads.write_ended(write, now)
 
@@ -1235,9 +1242,9 @@ class ComponentMachine:
     def _tell(self, change: Change) -> None:
         if self.tells_changes:
             self._observer.changed(self, change)
-        elif not self.has_moved:
-            self.has_moved = True
-            self._observer.moved(self)
+        elif not self.has_changed:
+            self.has_changed = True
+            self._observer.params_changed(self)
 
 
 def _in_capitals(name: str) -> str:

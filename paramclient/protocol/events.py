@@ -10,7 +10,7 @@ from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.ext.change import ExtChange
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.fetch_result import FetchResult
-from paramclient.protocol.vehicle.peers import Contest
+from paramclient.protocol.vehicle.address_contest import Contest
 
 __all__ = [
     "ComponentContested",
@@ -216,7 +216,7 @@ class EventMaker:
         """See `ComponentObserver`."""
         self._emit(ExtParamChanged(machine, change))
 
-    def moved(self, machine: ComponentMachine) -> None:
+    def params_changed(self, machine: ComponentMachine) -> None:
         """See `ComponentObserver`."""
         self._emit(ParamsMoved(machine))
 

@@ -64,14 +64,14 @@ class ListStatistics(NamedTuple):
     """The statistics of a list since its request.
 
     Attributes:
-        came: values by which it advanced.
-        passed: indices that it passed, including lost ones.
+        received: values by which it advanced.
+        covered: indices that it covered, including lost ones.
         longest: the longest recent time between two values, in seconds.
         is_bursty: whether most values are received together.
     """
 
-    came: int
-    passed: int
+    received: int
+    covered: int
     longest: float
     is_bursty: bool
 
@@ -108,11 +108,11 @@ class ListAdmission:
     bursts therefore begin one after the other, and none while unread data is waiting.
 
     Attributes:
-        share: the bandwidth that all reads of the link may use together.
+        bandwidth: the bandwidth that all reads of the link may use together.
     """
 
     def __init__(self) -> None:
-        self.share = LinkBandwidth()
+        self.bandwidth = LinkBandwidth()
         self._are_bursty = False  # whether the lists judged last come in bursts: on a fast link
         self._now = -math.inf
         self._limit = 1
@@ -130,7 +130,7 @@ class ListAdmission:
         self._newest: set[QueuedList] = set()
         self._marked_at: float | None = None  # when that was
         self._paces: dict[QueuedList, float] = {}  # at the last look
-        self._came = self._passed = 0  # of all lists while there was enough bandwidth
+        self._received = self._covered = 0  # of all lists while there was enough bandwidth
 
     @property
     def is_free(self) -> bool:
@@ -140,56 +140,56 @@ class ListAdmission:
     @property
     def bursts(self) -> int:
         """The number of lists in bursts."""
-        return sum(not stream.is_awaited and stream.seen().is_bursty for stream in self._running)
+        return sum(not queued.is_awaited and queued.seen().is_bursty for queued in self._running)
 
     def awaited(self, now: float) -> int:
         """Return the number of lists about to start: nothing was received of them, within their timeout."""
-        return sum(stream.is_awaited and stream.silent_at > now for stream in self._running)
+        return sum(queued.is_awaited and queued.silent_at > now for queued in self._running)
 
-    def ask(self, stream: QueuedList, now: float) -> None:
+    def ask(self, queued: QueuedList, now: float) -> None:
         """Request a turn; `QueuedList.begin` is called at once or later. Give it back with `release`."""
         self._now = now
         if not self._running and now - self._idle_since > MEASUREMENT_LIFETIME:
             self._limit = 1
-            self._failures = self._came = self._passed = self._shown = 0
+            self._failures = self._received = self._covered = self._shown = 0
             self._again_at = -math.inf
         if not self._waiting and self._free_slots() > 0:
-            self._begin(stream, now)
+            self._begin(queued, now)
         else:
-            self._waiting[stream] = None
+            self._waiting[queued] = None
 
-    def has_begun(self, stream: QueuedList) -> None:
+    def has_begun(self, queued: QueuedList) -> None:
         """Record a list that was requested without a turn."""
-        self._running[stream] = _NOTHING
+        self._running[queued] = _NOTHING
         is_one_more = len(self._running) > self._shown  # otherwise it replaces a finished list
         if is_one_more or not self._are_bursty:
-            self._newest.add(stream)
+            self._newest.add(queued)
             self._marked_at = None
 
-    def release(self, stream: QueuedList, *, is_cut: bool = False) -> None:
+    def release(self, queued: QueuedList, *, is_cut: bool = False) -> None:
         """Give a turn back. The next list begins with the next `tick`.
 
         Args:
-            stream: the holder of the turn.
+            queued: the holder of the turn.
             is_cut: whether the list went silent before its end.
         """
-        if self._running.pop(stream, None) is None:
-            self._waiting.pop(stream, None)
+        if self._running.pop(queued, None) is None:
+            self._waiting.pop(queued, None)
             return
-        self._newest.discard(stream)
-        self._paces.pop(stream, None)
+        self._newest.discard(queued)
+        self._paces.pop(queued, None)
         if is_cut and self._running:
             self._fail(len(self._running))
         if not self._running:
             self._idle_since = self._now
 
-    def is_beside_others(self, stream: QueuedList) -> bool:
+    def is_parallel_to_others(self, queued: QueuedList) -> bool:
         """Return whether other lists run, also on other links that share the event loop."""
-        return self._is_crowded or any(each is not stream and not each.is_awaited for each in self._running)
+        return self._is_crowded or any(each is not queued and not each.is_awaited for each in self._running)
 
-    def beside_others_at(self, stream: QueuedList) -> float:
+    def parallel_to_others_at(self, queued: QueuedList) -> float:
         """Return when another list ran last."""
-        return max(self._crowded_at, -math.inf if self._lone is stream else self._lone_at)
+        return max(self._crowded_at, -math.inf if self._lone is queued else self._lone_at)
 
     def tick(self, now: float, *, most: float = math.inf, is_crowded: bool = False) -> bool:
         """Begin further lists if there is bandwidth; return whether any has begun.
@@ -200,7 +200,7 @@ class ListAdmission:
             is_crowded: whether lists of other links share the event loop.
         """
         self._now = now
-        coming = [stream for stream in self._running if not stream.is_awaited]
+        coming = [queued for queued in self._running if not queued.is_awaited]
         self._is_crowded = is_crowded
         if len(coming) > 1 or is_crowded:
             self._crowded_at = now
@@ -212,13 +212,13 @@ class ListAdmission:
         if self._waiting and not self._newest and self._again_at <= now:
             self._newest.update(coming if self._are_bursty else self._running)
         if self._newest:
-            self._look(now)
+            self._judge_bandwidth(now)
         begins = min(self._free_slots(), len(self._waiting))
         begins = int(min(begins, most - self._active()))
         for _ in range(begins):
-            stream = next(iter(self._waiting))
-            del self._waiting[stream]
-            self._begin(stream, now)
+            queued = next(iter(self._waiting))
+            del self._waiting[queued]
+            self._begin(queued, now)
         return begins > 0
 
     def next_deadline(self) -> float:
@@ -227,10 +227,10 @@ class ListAdmission:
             return math.inf
         if self._active() < self._limit:
             return self._now if self._free_slots() > 0 else self._next_at
-        times = [stream.silent_at for stream in self._running if stream.silent_at > self._now]
+        times = [queued.silent_at for queued in self._running if queued.silent_at > self._now]
         if not self._newest:
             # lists in bursts are judged on arrival: while all are awaited, nothing is due
-            if not self._are_bursty or any(not stream.is_awaited for stream in self._running):
+            if not self._are_bursty or any(not queued.is_awaited for queued in self._running):
                 times.append(max(self._again_at, self._now))
         elif self._marked_at is not None:
             times.append(self._marked_at + JUDGED_TIME)
@@ -242,13 +242,13 @@ class ListAdmission:
         self._paces.clear()
         self._marked_at = None
 
-    def _begin(self, stream: QueuedList, now: float) -> None:
-        self.has_begun(stream)
+    def _begin(self, queued: QueuedList, now: float) -> None:
+        self.has_begun(queued)
         self._begun_at = now
-        stream.begin(now)
+        queued.begin(now)
 
     def _active(self) -> int:
-        return sum(stream.silent_at > self._now for stream in self._running)
+        return sum(queued.silent_at > self._now for queued in self._running)
 
     @property
     def _next_at(self) -> float:
@@ -257,16 +257,16 @@ class ListAdmission:
 
     def _free_slots(self) -> int:
         """Return how many lists may begin now."""
-        room = self._limit - self._active()
+        slots = self._limit - self._active()
         if self._are_bursty:
-            room = min(room, max(GROWTH_BURSTY - len(self._running), int(self._now >= self._next_at)))
-        return room
+            slots = min(slots, max(GROWTH_BURSTY - len(self._running), int(self._now >= self._next_at)))
+        return slots
 
-    def _look(self, now: float) -> None:
+    def _judge_bandwidth(self, now: float) -> None:
         """Judge by the statistics whether the newest lists had enough bandwidth."""
-        active = [stream for stream in self._running if stream.silent_at > now]
+        active = [queued for queued in self._running if queued.silent_at > now]
         judged = self._newest.intersection(active) if self._are_bursty else active
-        if any(stream.is_awaited for stream in judged):
+        if any(queued.is_awaited for queued in judged):
             return
         if not active:  # all are silent: nothing is known of the link, and its bandwidth is free
             self._limit *= GROWTH
@@ -274,39 +274,39 @@ class ListAdmission:
             return
         if self._marked_at is None:
             self._marked_at = now
-            for stream in active:
-                self._running[stream] = stream.seen()
+            for queued in active:
+                self._running[queued] = queued.seen()
             return
         since = now - self._marked_at
-        came = passed = earlier = 0
+        received = covered = earlier = 0
         expected = 0.0
         is_shown = is_bursty = True
         paces = {}
-        for stream in active:
-            seen, mark = stream.seen(), self._running[stream]
-            if seen.passed < mark.passed:  # restarted
+        for queued in active:
+            seen, mark = queued.seen(), self._running[queued]
+            if seen.covered < mark.covered:  # restarted
                 mark = _NOTHING
-            one_came, one_passed = seen.came - mark.came, seen.passed - mark.passed
-            if stream in self._newest:
+            one_received, one_covered = seen.received - mark.received, seen.covered - mark.covered
+            if queued in self._newest:
                 gaps = JUDGED_GAPS_BURSTY if seen.is_bursty else JUDGED_GAPS
-                is_shown = is_shown and one_came >= JUDGED_VALUES_MIN and since >= gaps * seen.longest
+                is_shown = is_shown and one_received >= JUDGED_VALUES_MIN and since >= gaps * seen.longest
                 is_bursty = is_bursty and seen.is_bursty
-            came += one_came
-            passed += one_passed
-            paces[stream] = one_passed / since if since > 0 else 0.0
-            if stream in self._paces:
-                earlier += one_passed
-                expected += self._paces[stream] * since
+            received += one_received
+            covered += one_covered
+            paces[queued] = one_covered / since if since > 0 else 0.0
+            if queued in self._paces:
+                earlier += one_covered
+                expected += self._paces[queued] * since
         if not is_shown and now < self._marked_at + JUDGED_TIME:
             return
         self._are_bursty = is_bursty
         is_slower = expected >= EXPECTED_VALUES_MIN and not is_bursty and earlier < PACE_DROP * expected
-        if is_slower or self._is_lossier(came, passed):
+        if is_slower or self._has_loss_risen(received, covered):
             self._fail(len(active) - len(self._newest) or len(active) // 2 * self._are_bursty)
         else:
             self._shown = max(self._shown, len(active))
-            self._came += came
-            self._passed += passed
+            self._received += received
+            self._covered += covered
             self._paces = paces
             # several lists that began together show nothing of a single one
             if now >= self._again_at and (expected or len(active) == 1):
@@ -326,14 +326,14 @@ class ListAdmission:
         self._again_at = self._now + min(retry * 2**self._failures, RETRY_DELAY_MAX)
         self._failures += 1
 
-    def _is_lossier(self, came: int, passed: int) -> bool:
+    def _has_loss_risen(self, received: int, covered: int) -> bool:
         """Return whether more was lost in this window than the link usually loses."""
-        if not passed or not self._passed:
+        if not covered or not self._covered:
             return False
-        before = 1 - self._came / self._passed
-        rise = 1 - came / passed - before
-        pooled = 1 - (came + self._came) / (passed + self._passed)
-        deviation = math.sqrt(pooled * (1 - pooled) * (1 / passed + 1 / self._passed))
+        before = 1 - self._received / self._covered
+        rise = 1 - received / covered - before
+        pooled = 1 - (received + self._received) / (covered + self._covered)
+        deviation = math.sqrt(pooled * (1 - pooled) * (1 / covered + 1 / self._covered))
         return rise > max(LOSS_RISE_MIN, LOSS_RISE_DEVIATIONS * deviation)
 
 
@@ -370,13 +370,13 @@ class Scheduler:
     the link's bandwidth, when other components have ended their requests, is used from its next deadline on.
 
     Attributes:
-        turns: the turns of the lists.
+        list_admission: which lists run.
         lists_max: the limit of parallel lists by the event-loop latency. Set by the shell.
         is_crowded: whether lists of other links share the event loop. Set by the shell.
     """
 
     def __init__(self) -> None:
-        self.turns = ListAdmission()
+        self.list_admission = ListAdmission()
         self.lists_max = math.inf
         self.is_crowded = False
         self._now = -math.inf
@@ -437,7 +437,7 @@ class Scheduler:
         for component in self._take_due(now):
             component.tick(now)
             self._changed[component] = None
-        if self.turns.tick(now, most=self.lists_max, is_crowded=self.is_crowded):
+        if self.list_admission.tick(now, most=self.lists_max, is_crowded=self.is_crowded):
             self.reschedule_all()
 
     def next_deadline(self) -> float:
@@ -448,7 +448,7 @@ class Scheduler:
         order = self._order
         while order and self._deadlines.get(order[0][1]) != order[0][0]:
             heappop(order)
-        lists = self.turns.next_deadline()
+        lists = self.list_admission.next_deadline()
         if self.lists_max < math.inf:  # a waiting list has a deadline, but may not begin yet
             lists = max(lists, self._now + LIMIT_RECHECK_INTERVAL)
         return min(lists, order[0][0]) if order else lists

@@ -24,9 +24,9 @@ from paramclient.protocol.requests.retry import HEARTBEAT_REQUESTS
 from paramclient.protocol.scheduler import Scheduler
 from paramclient.protocol.stats.trace import LazyMessageText, Trace, discard
 from paramclient.protocol.stats.traffic import Traffic
+from paramclient.protocol.vehicle.address_contest import NO_PEER
 from paramclient.protocol.vehicle.boot_time_sampling import BootTimeSampling
 from paramclient.protocol.vehicle.commands import message_requests
-from paramclient.protocol.vehicle.peers import NO_PEER
 from paramclient.protocol.wire import (
     AUTOPILOT_COMPONENT,
     BOOT_CLOCK_OFFSETS,
@@ -101,7 +101,7 @@ class Station:
         is_stream: whether frames may be spread over several chunks.
         system, component: our address.
         encoding: of all components, by the user's choice; None: judged by the evidence.
-        upkeep: what is done for tables without a request of the user; by default nothing.
+        sync_settings: what is done for tables without a request of the user; by default nothing.
         split_peers: whether components with equal ids but different peers are different components.
         counts_traffic: whether all traffic of the link is counted, which takes time for each frame.
         trace: receives each step.
@@ -128,18 +128,18 @@ class Station:
         system: int = 255,
         component: int = 190,
         encoding: Encoding | None = None,
-        upkeep: SyncSettings | None = None,
+        sync_settings: SyncSettings | None = None,
         split_peers: bool = False,
         counts_traffic: bool = False,
         trace: Trace = discard,
     ) -> None:
         self.traffic = Traffic(is_stream=is_stream) if counts_traffic else None
         self.link = link
-        self.listens_only = upkeep is not None and upkeep.listens_only
-        self.is_log = upkeep is not None and upkeep.is_log
+        self.listens_only = sync_settings is not None and sync_settings.listens_only
+        self.is_log = sync_settings is not None and sync_settings.is_log
         self.is_over = False
         self.listening_since = -math.inf
-        self.own: Address = NO_ADDRESS if self.listens_only else (system, component)
+        self.own_address: Address = NO_ADDRESS if self.listens_only else (system, component)
         self.components: dict[Address, ComponentMachine] = {}
         self.bytes_received = 0
         self.bytes_sent = self.frames_sent = 0
@@ -147,8 +147,8 @@ class Station:
         self._frames = self._skipped = self._damaged = 0  # of removed framers
         self._is_stream = is_stream
         self._encoding = encoding
-        self.policy = Policy.AUTO if upkeep is None else upkeep.policy
-        self._upkeep = upkeep
+        self.policy = Policy.AUTO if sync_settings is None else sync_settings.policy
+        self._sync_settings = sync_settings
         # for datagrams of all peers
         self._framer = Framer(HANDLED_IDS, occasional=_TELEMETRY_CLOCKS, stream=False)
         self._clock_sampling = BootTimeSampling(self._take_clocks)
@@ -158,26 +158,26 @@ class Station:
         self._reporter = EventMaker(self._events.append)
         self._sequence = 0
         self._signer: Signer | None = None
-        self._is_watched = counts_traffic  # one check in the hot path for both
+        self._needs_raw_data = counts_traffic  # one check in the hot path for both
         self.verifier: Verifier | None = None
         self._heartbeat_at = math.inf if self.listens_only else -math.inf
         self._is_paused = False
         self.scheduler = Scheduler()
-        self._splits = split_peers
-        self._of_vehicle: dict[tuple[int, Peer], list[ComponentMachine]] = {}
-        self._room = NameQuota()
+        self._splits_peers = split_peers
+        self._by_vehicle: dict[tuple[int, Peer], list[ComponentMachine]] = {}
+        self._name_quota = NameQuota()
         self._early_requests: deque[tuple[FileTransfer, Address]] = deque(maxlen=EARLY_REQUESTS_MAX)
         self._full_until = -math.inf
         self._awaits_autopilot = not self.listens_only  # none was received yet
         self._heartbeat_requested_at = -math.inf
         self._heartbeat_requests = 0
-        self._foreign = 0  # of forgotten components
+        self._ignored_messages = 0  # of forgotten components
         self._looks_for_others = 0  # callers of `looking_for_others`
 
     def begin_signing(self, signer: Signer, verifier: Verifier) -> None:
         """Sign what is sent and accept what the verifier accepts from now on; call it before `receive`."""
         self._signer = signer
-        self._is_watched = True
+        self._needs_raw_data = True
         self.verifier = verifier
         self._framer.guard = verifier.accepts
         self._awaits_autopilot = False  # would verify each signature twice
@@ -203,13 +203,13 @@ class Station:
             moment: when they came from the link, if earlier; None for `now`.
         """
         self.bytes_received += len(data)
-        if self._is_watched:
-            self._watch(data, peer, now)
+        if self._needs_raw_data:
+            self._before_decoding(data, peer, now)
         frames = self._cut_stream(data, peer) if self._is_stream else self._framer.receive(data)
         clocks = 0
         for frame in frames:
             number, system, component, _, payload, version = frame
-            address = PeerAddress(system, component, peer) if self._splits else (system, component)
+            address = PeerAddress(system, component, peer) if self._splits_peers else (system, component)
             machine = self.components.get(address)
             if number == PARAM_VALUE_ID and component == COMP_ID_MISSIONPLANNER and self._is_made_up(machine):
                 continue
@@ -217,7 +217,7 @@ class Station:
                 peers = machine.peers
                 if peer == peers.speaker:
                     peers.heard_at = now
-                elif not self._takes(machine, peer, now):
+                elif not self._accepts(machine, peer, now):
                     continue
                 machine.receive_value(decode_param_value(payload), now, version, moment)
             elif number in _TELEMETRY_CLOCKS:
@@ -309,7 +309,7 @@ class Station:
         self.listening_since = now
         if not self.listens_only:
             self._heartbeat_at = now
-        self.scheduler.turns.resume(now)
+        self.scheduler.list_admission.resume(now)
         for machine in self.components.values():
             machine.resume(now)
 
@@ -352,7 +352,9 @@ class Station:
     @property
     def foreign(self) -> int:
         """Messages that were ignored because their peer may be another vehicle."""
-        return self._foreign + sum(machine.peers.foreign for machine in self.components.values())
+        return self._ignored_messages + sum(
+            machine.peers.ignored_messages for machine in self.components.values()
+        )
 
     @property
     def is_waiting(self) -> bool:
@@ -394,7 +396,7 @@ class Station:
         first = self.components.get(self._key(system, AUTOPILOT_COMPONENT, peer))
         if first is not None and first.identification.is_autopilot:
             return first
-        for machine in self._of_vehicle.get((system, peer), ()):
+        for machine in self._by_vehicle.get((system, peer), ()):
             if machine.identification.is_autopilot:
                 return machine
         return None
@@ -439,8 +441,8 @@ class Station:
         The list is requested once for all components if they are all known ones of the system, none of them
         has a table worth resuming, a fetch in progress or a file to serve, and no other list runs.
         """
-        is_new = self.scheduler.turns.is_free and not any(
-            machine.fetch is not None or machine.following.is_running(now) for machine in machines
+        is_new = self.scheduler.list_admission.is_free and not any(
+            machine.fetch is not None or machine.foreign_list.is_running(now) for machine in machines
         )
         may_list = self.policy is Policy.AUTO
         is_fresh = refresh or not any(m.can_hit or present_of(m.table, m.reads) for m in machines)
@@ -448,7 +450,7 @@ class Station:
         if len(machines) > 1 and may_list and is_new and is_fresh and not has_file:
             system = machines[0].system
             known = [
-                each for each in self._of_vehicle[machines[0].vehicle] if each.identification.has_parameters
+                each for each in self._by_vehicle[machines[0].vehicle] if each.identification.has_parameters
             ]
             have_one_peer = len({machine.peers.home for machine in machines}) == 1
             if len(known) == len(machines) and have_one_peer:
@@ -464,7 +466,7 @@ class Station:
             if machine.fetches.overheard is not None:
                 machine.fetches.overheard.file.tick(now)
 
-    def _watch(self, data: bytes, peer: Peer, now: float) -> None:
+    def _before_decoding(self, data: bytes, peer: Peer, now: float) -> None:
         """Pass received bytes to traffic counts and the search for heartbeats, before they are decoded."""
         if self._signer is not None:
             self._signer.advance(now)
@@ -499,7 +501,7 @@ class Station:
             address = (frame.system, frame.component)
             is_autopilot = frame.component == AUTOPILOT_COMPONENT and frame.system != 0
             known = self.components.get(self._key(*address, peer))
-            if is_autopilot and address != self.own and not (known and known.presence.has_beaten):
+            if is_autopilot and address != self.own_address and not (known and known.presence.has_beaten):
                 self._heartbeat_requested_at = now
                 if self._awaits_autopilot:
                     self._heartbeat_requests += 1
@@ -532,7 +534,7 @@ class Station:
     def _receive_other(self, frame: Frame, peer: Peer, now: float, moment: float | None) -> None:
         """Process a frame that is not a value of a known component."""
         sender = (frame.system, frame.component)
-        if sender == self.own or frame.system == 0 or (message := decode(frame)) is None:
+        if sender == self.own_address or frame.system == 0 or (message := decode(frame)) is None:
             return
         if isinstance(message, Heartbeat | HighLatency2) and message.autopilot != MAV_AUTOPILOT_INVALID:
             self._awaits_autopilot = False
@@ -542,12 +544,12 @@ class Station:
         if isinstance(message, FileTransfer):
             self._receive_foreign_file_request(message, sender, now)
         address = self._key(*sender, peer)
-        machine = self.components.get(address) or self._meet(sender, peer, message, now)
+        machine = self.components.get(address) or self._add_component(sender, peer, message, now)
         if machine is None:
             return
         if not machine.identification.has_parameters:
             machine.peers.follow(peer)
-        elif not machine.peers.hears(message, peer, now):
+        elif not machine.peers.accepts_identifying(message, peer, now):
             if machine.peers.contest is not None and peer == machine.peers.home:
                 machine.receive_contested(message, now, version=frame.version)
                 if isinstance(message, Heartbeat):
@@ -563,12 +565,12 @@ class Station:
         """Process the time since boot in a telemetry frame. Trailing zeros may be cut off."""
         at = _TELEMETRY_CLOCKS[number]
         boot_ms = int.from_bytes(payload[at : at + 4], "little")
-        if machine.identification.has_parameters and not machine.peers.hears_clock(
+        if machine.identification.has_parameters and not machine.peers.accepts_clock(
             number, boot_ms, peer, now
         ):
             return
         machine.boot_clock(number, boot_ms, now)
-        if machine.restarts.current is None and not machine.peers.wants_clocks:
+        if machine.reboots.current is None and not machine.peers.wants_clocks:
             self._clock_sampling.sampled(machine.address, now)
 
     def _take_clocks(self, takes: bool) -> None:
@@ -576,16 +578,18 @@ class Station:
             framer.takes_occasional = takes
 
     def _key(self, system: int, component: int, peer: Peer) -> Address:
-        return PeerAddress(system, component, peer) if self._splits else (system, component)
+        return PeerAddress(system, component, peer) if self._splits_peers else (system, component)
 
-    def _meet(self, sender: Address, peer: Peer, message: Message, now: float) -> ComponentMachine | None:
+    def _add_component(
+        self, sender: Address, peer: Peer, message: Message, now: float
+    ) -> ComponentMachine | None:
         """Add a component on its first message; only messages that show parameters make one."""
         is_sign = isinstance(message, Heartbeat | HighLatency2 | ParamValue | ParamExtValue)
         if not (is_sign or self._is_awaited_file(message, sender)) or not self._has_capacity(now):
             return None
         system, component = sender
         address = self._key(system, component, peer)
-        vehicle = (system, peer if self._splits else None)
+        vehicle = (system, peer if self._splits_peers else None)
         machine: ComponentMachine | None = None
 
         def send(message: Message) -> None:
@@ -597,18 +601,18 @@ class Station:
         machine = ComponentMachine(
             system,
             component,
-            own=self.own,
-            link=f"{self.link}#{peer_in_words(peer)}" if self._splits else self.link,
+            own_address=self.own_address,
+            link=f"{self.link}#{peer_in_words(peer)}" if self._splits_peers else self.link,
             send=send,
             observer=self._reporter,
             send_to=send_to,
             encoding=self._encoding,
-            upkeep=self._upkeep,
-            companions=self._of_vehicle.setdefault(vehicle, []),
+            sync_settings=self._sync_settings,
+            companions=self._by_vehicle.setdefault(vehicle, []),
             read_clock=lambda now: self._clock_sampling.open(address, now),
-            peer=peer if self._splits else None,
+            peer=peer if self._splits_peers else None,
             scheduler=self.scheduler,
-            room=self._room,
+            name_quota=self._name_quota,
             trace=self._trace,
         )
         self.components[address] = machine
@@ -640,13 +644,13 @@ class Station:
         """Remove a component and its records: another one may take its address."""
         address = machine.address
         del self.components[address]
-        self._of_vehicle[machine.vehicle].remove(machine)
-        if not self._of_vehicle[machine.vehicle]:
-            del self._of_vehicle[machine.vehicle]
+        self._by_vehicle[machine.vehicle].remove(machine)
+        if not self._by_vehicle[machine.vehicle]:
+            del self._by_vehicle[machine.vehicle]
         self._clock_sampling.close(address)
         self.scheduler.remove(machine)
         machine.reads.pace.idle()
-        self._foreign += machine.peers.foreign
+        self._ignored_messages += machine.peers.ignored_messages
         self._reporter.forgotten(machine)
 
     def _receive_foreign_set(
@@ -667,7 +671,9 @@ class Station:
         target = (message.target_system, message.target_component)
         if self.listens_only and target not in self.components and opens_parameter_file(message):
             self._early_requests.append((message, sender))
-        machines = self.components.values() if self._splits else self._of_vehicle.get((target[0], None), ())
+        machines = (
+            self.components.values() if self._splits_peers else self._by_vehicle.get((target[0], None), ())
+        )
         for machine in machines:
             if machine.system == target[0] and message.target_component in (machine.component, COMP_ID_ALL):
                 machine.foreign_file_request(message, sender, now)
@@ -678,12 +684,12 @@ class Station:
             return False
         return any(_is_for(request, sender) for request, _ in self._early_requests)
 
-    def _takes(self, machine: ComponentMachine, peer: Peer, now: float) -> bool:
+    def _accepts(self, machine: ComponentMachine, peer: Peer, now: float) -> bool:
         """Return whether to accept a message that cannot tell vehicles apart."""
         if not machine.identification.has_parameters:
             machine.peers.follow(peer)
             return True
-        return machine.peers.takes(peer, now)
+        return machine.peers.accepts(peer, now)
 
     def _peer_of(self, address: Address) -> Peer | None:
         """Return the peer of a component, else of its autopilot, else any of the system; None for all.
@@ -696,7 +702,7 @@ class Station:
         own, autopilot = self.components.get(address), self.autopilot_of(*vehicle)
         if own is not None and own.peers.has_left:
             return NO_PEER
-        machines = [each for each in (own, autopilot, *self._of_vehicle.get(vehicle, ())) if each is not None]
+        machines = [each for each in (own, autopilot, *self._by_vehicle.get(vehicle, ())) if each is not None]
         return next((each.peers.home for each in machines if each.peers.home is not NO_PEER), None)
 
     def _send(self, message: Message, address: Address, version: int) -> None:
@@ -709,7 +715,7 @@ class Station:
         """Queue a message for a peer, or with None for all."""
         if self.listens_only:
             return
-        own_system, own_component = self.own
+        own_system, own_component = self.own_address
         if isinstance(message, _MAVLINK2_REQUESTS):
             version = 2
         data = encode(

@@ -263,7 +263,7 @@ class ApplyRun:
             return False
         if done:
             return done[-1].reboot_first and bool(self._reboot_for)
-        is_reboot_due = bool(self.plan.unstarted) or self._pending_system_id() is not None
+        is_reboot_due = bool(self.plan.awaiting_reboot) or self._pending_system_id() is not None
         return bool(self._reboot_for) or (is_reboot_due and not self._reboots)
 
     def _pending_system_id(self) -> int | None:
@@ -560,11 +560,11 @@ class ApplyRun:
         if (path := self._options.backup) is not None:
             from paramclient.files import write_file
 
-            await client.cache_writer.aside(lambda: write_file(path, inspection.table))
+            await client.cache_writer.run_in_thread(lambda: write_file(path, inspection.table))
         cache = client.cache
         if cache is not None and self.plan.steps:
             await client.cache_writer.write_all()  # the history then has the values from before the change
-            await client.cache_writer.aside(
+            await client.cache_writer.run_in_thread(
                 lambda: cache.store_snapshot(
                     component.identity,
                     component.component,

@@ -35,7 +35,7 @@ __all__ = [
     "Plan",
     "PlanRow",
     "PlanStatus",
-    "RowStanding",
+    "RowComparison",
     "Stage",
     "Step",
     "overlay",
@@ -92,7 +92,7 @@ class PlanStatus(StrEnum):
     """The value is invalid; `PlanRow.reason` gives the reason."""
 
 
-class RowStanding(StrEnum):
+class RowComparison(StrEnum):
     """The comparison of a vehicle's parameter with the wanted one."""
 
     SAME = "same"
@@ -155,18 +155,18 @@ class PlanRow:
         return self.before is None or not _is_same(self.target.value, self.before, self.type)
 
     @property
-    def standing(self) -> RowStanding:
+    def standing(self) -> RowComparison:
         """How the vehicle's parameter compares with the wanted one."""
         if self.category == MISSING:
-            return RowStanding.MISSING
+            return RowComparison.MISSING
         if self.status is PlanStatus.SKIPPED:
-            return RowStanding.LEFT_OUT
-        return RowStanding.SAME if self.status is PlanStatus.UNCHANGED else RowStanding.DIFFERENT
+            return RowComparison.LEFT_OUT
+        return RowComparison.SAME if self.status is PlanStatus.UNCHANGED else RowComparison.DIFFERENT
 
     @property
     def is_met(self) -> bool:
         """Whether the vehicle has the wanted value, or the parameter is left out."""
-        return self.standing in (RowStanding.SAME, RowStanding.LEFT_OUT)
+        return self.standing in (RowComparison.SAME, RowComparison.LEFT_OUT)
 
     def __str__(self) -> str:
         kind = ParamType.REAL32 if self.type is None else self.type
@@ -239,8 +239,8 @@ class Plan:
         identity: the vehicle of the plan, if `current` names it.
         force: whether to send values that the autopilot cannot store.
         renames: the names that firmware versions have changed, or None.
-        unstarted: switches that are on and whose group is missing: they take effect after a reboot, and the
-            vehicle may not have rebooted since they were set.
+        awaiting_reboot: switches that are on and whose group is missing: they take effect after a reboot,
+            and the vehicle may not have rebooted since they were set.
     """
 
     wanted: ParamSet
@@ -249,7 +249,7 @@ class Plan:
     extra: tuple[str, ...] = ()
     include: tuple[str, ...] = ()
     identity: Identity | None = None
-    unstarted: tuple[str, ...] = ()
+    awaiting_reboot: tuple[str, ...] = ()
     force: bool = False
     renames: Renames | None = None
 
@@ -350,11 +350,11 @@ def plan(
     )
     rows = {name: planner.row(each) for name, each in wanted.items()}
     stages = planner.stages(rows)
-    unstarted = planner.unstarted(rows)
+    awaiting_reboot = planner.awaiting_reboot(rows)
     rows = planner.settle_missing(rows, stages)
     named = {row.target.name for row in rows.values()}
     extra = tuple(name for name in current if name not in named)
-    return Plan(wanted, rows, stages, extra, given, identity, unstarted, force, renames)
+    return Plan(wanted, rows, stages, extra, given, identity, awaiting_reboot, force, renames)
 
 
 def overlay(base: ParamSet, over: ParamSet) -> ParamSet:
@@ -498,7 +498,7 @@ class _Planner:
             stages.append(Stage("parameters that may end the connection", tuple(last), is_last=True))
         return tuple(stages)
 
-    def unstarted(self, rows: Mapping[str, PlanRow]) -> tuple[str, ...]:
+    def awaiting_reboot(self, rows: Mapping[str, PlanRow]) -> tuple[str, ...]:
         """Return switches whose missing group may appear after a reboot."""
         missing = [
             each

@@ -28,7 +28,7 @@ from paramclient.protocol.params.sampling import SAMPLE_SIZE
 from paramclient.protocol.params.sync import SyncState
 from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome, SetStatus
 from paramclient.protocol.params.writes import SetResult
-from paramclient.protocol.vehicle.peers import Contest
+from paramclient.protocol.vehicle.address_contest import Contest
 from paramclient.protocol.wire import PARAMETERS_MAX, SigningKey
 from paramclient.remote.connection import Connection, run_with_progress
 from paramclient.remote.decoding import (

@@ -303,7 +303,9 @@ class Hub:
                 self._check_open()
                 now = anyio.current_time()
                 clients = [(each, local_client(each.client)) for each in chosen if each.client is not None]
-                news = [each.changed for each in chosen] + [client.link_task.news for _, client in clients]
+                news = [each.changed for each in chosen] + [
+                    client.link_task.activity for _, client in clients
+                ]
                 machines = {
                     machine: each
                     for each, client in clients

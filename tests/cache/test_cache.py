@@ -27,7 +27,7 @@ from paramclient.cache import (
     default_path,
     tables,
 )
-from paramclient.cache.transaction import Session
+from paramclient.cache.transaction import Transaction
 from paramclient.errors import AmbiguousVehicle, CacheError, UnknownVehicle, UsageError
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param, ParamType, Trust, same_bits
@@ -295,7 +295,7 @@ def test_history_can_be_asked_for_by_component_name_and_number(path: Path) -> No
 
 
 def test_history_is_bounded_for_each_table(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tables, "HISTORY_LINES", 5)
+    monkeypatch.setattr(tables, "HISTORY_ENTRIES_MAX", 5)
     with ParamCache(path) as cache:
         cache.save(update(*(stored("A", value) for value in range(3))))
         for component in (2, 3):
@@ -854,7 +854,7 @@ def test_when_a_value_was_heard_last(path: Path) -> None:
     with ParamCache(path) as cache:
 
         def heard_last(component: int) -> float:
-            def work(session: Session) -> float:
+            def work(session: Transaction) -> float:
                 owner = session.owner_of(PX4.key, component)
                 assert owner is not None
                 return session.heard_last(owner)

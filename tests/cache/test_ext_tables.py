@@ -19,7 +19,7 @@ from paramclient.cache import ExtTableUpdate, StoredExtParam
 from paramclient.cache.cells import Damaged
 from paramclient.cache.operations import SaveExt
 from paramclient.cache.outbox import packed, unpacked
-from paramclient.cache.tables import HISTORY_LINES
+from paramclient.cache.tables import HISTORY_ENTRIES_MAX
 from paramclient.errors import NotInCache, UnknownVehicle, UsageError
 from paramclient.model.ext_params import ExtParam, ExtParamType, ExtValue, encode_ext_value
 from tests.caches import NOW, PX4, stored, update, values, whole_table
@@ -148,8 +148,8 @@ def test_an_index_stays_until_another_one_is_told(path: Path) -> None:
 
 
 def test_the_history_is_bounded(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("paramclient.cache.ext_tables.HISTORY_LINES", 5)
-    assert HISTORY_LINES > 5
+    monkeypatch.setattr("paramclient.cache.ext_tables.HISTORY_ENTRIES_MAX", 5)
+    assert HISTORY_ENTRIES_MAX > 5
     with ParamCache(path) as cache:
         for number in range(10):
             cache.save_ext([learnt(A=number, at=NOW + number)])

@@ -21,7 +21,7 @@ from paramclient.cache import ParamCache, StoredParam, packed_table, sqlite
 from paramclient.cache.cells import Damaged
 from paramclient.cache.packed_table import Packed, pack, packed_row, row_checksum, unpack
 from paramclient.cache.param_columns import COLUMN_NAMES, COLUMNS, Column, StoredTable
-from paramclient.cache.transaction import Session
+from paramclient.cache.transaction import Transaction
 from paramclient.errors import UsageError
 from paramclient.model.values import ParamType
 from tests.caches import NOW, PX4, cells, stored, update, values, whole_table
@@ -367,8 +367,8 @@ def test_where_names_stand_is_remembered_of_a_few_firmwares(
         for number in range(5):
             cache.save(update(stored("A", number), stored(f"B{number}", 1), component=number + 1))
 
-        def work(session: Session) -> None:
-            assert isinstance(session, sqlite.SqliteSession)
+        def work(session: Transaction) -> None:
+            assert isinstance(session, sqlite.SqliteTransaction)
             owners = [session.owner_of(PX4.key, number + 1) or 0 for number in range(5)]
             found = session.holders([*owners, *owners], ["A", "B3", "C"])
             own = {("A", 6, number, 0): [owner] * 2 for number, owner in enumerate(owners)}

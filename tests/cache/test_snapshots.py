@@ -276,7 +276,7 @@ def test_before_a_table_was_first_complete_nothing_is_claimed(path: Path) -> Non
 def test_where_history_was_dropped_it_says_how_far_it_reaches(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tables, "HISTORY_LINES", 3)
+    monkeypatch.setattr(tables, "HISTORY_ENTRIES_MAX", 3)
     with ParamCache(path) as cache:
         cache.save(update(stored("A", 0), stored("B", 0), table=DONE))
         cache.snapshot(PX4.key, 1, reason="", at=NOW + 1)
@@ -299,7 +299,7 @@ def test_what_is_noted_of_names_and_clocks_goes_with_the_history(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A vehicle whose parameters come and go all the time cannot fill the disk."""
-    monkeypatch.setattr(tables, "HISTORY_LINES", 4)
+    monkeypatch.setattr(tables, "HISTORY_ENTRIES_MAX", 4)
     with ParamCache(path) as cache:
         cache.save(update(stored("A", 0), table=DONE))
         for after in range(0, 3000, 100):
@@ -377,7 +377,7 @@ def test_what_is_claimed_of_any_moment_is_what_was_so(
     for left in shared.vehicles():
         shared.remove(left.key)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tables, "HISTORY_LINES", lines)
+        patch.setattr(tables, "HISTORY_ENTRIES_MAX", lines)
         for wait, params, removed, whole, state in steps:
             now += wait if backwards else abs(wait)
             items = [stored(name, bits, kind, at=now) for name, bits, kind in params]

@@ -26,7 +26,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from paramclient.cache import HISTORY_LINES, ParamCache, StoredParam, lock, sqlite_file
+from paramclient.cache import HISTORY_ENTRIES_MAX, ParamCache, StoredParam, lock, sqlite_file
 from paramclient.cache.cells import Damaged
 from paramclient.cache.packed_table import unpack
 from paramclient.cache.param_columns import checksum
@@ -186,7 +186,7 @@ def whole_batches(path: Path) -> int:
         assert set(tables[0].values()) <= {number}
         if number:
             lines = [entry.new and entry.new.value for entry in cache.history("system:1@x", 1, "P7")]
-            assert lines == list(range(max(2, number - HISTORY_LINES // 100 + 1), number + 1))
+            assert lines == list(range(max(2, number - HISTORY_ENTRIES_MAX // 100 + 1), number + 1))
     assert not cache.notes
     assert not path.exists() or integrity(path) == "ok"
     return number

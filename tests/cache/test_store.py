@@ -32,9 +32,9 @@ from paramclient.cache.cells import Damaged
 from paramclient.cache.database_url import DatabaseAddress
 from paramclient.cache.operations import Save
 from paramclient.cache.outbox import LocalCopy, packed, unpacked
-from paramclient.cache.postgres import PostgresDatabase, PostgresSession, Unavailable
-from paramclient.cache.shared import SharedStore, _Link
-from paramclient.cache.transaction import Line, Session
+from paramclient.cache.postgres import PostgresDatabase, PostgresTransaction, Unavailable
+from paramclient.cache.shared import SharedStore, _Connection
+from paramclient.cache.transaction import Line, Transaction
 from paramclient.cache.transfer import take_whole
 from paramclient.errors import CacheError, UsageError
 from paramclient.model.values import Param, ParamType
@@ -500,10 +500,10 @@ def is_copied(cache: ParamCache) -> bool:
     return link.local.revisions() == link._database.revisions()
 
 
-def link_of(cache: ParamCache) -> _Link:
+def link_of(cache: ParamCache) -> _Connection:
     store = cache._store
     assert isinstance(store, SharedStore)
-    return store._link
+    return store._connection
 
 
 def test_what_only_the_database_can_keep_is_kept_there(
@@ -612,9 +612,9 @@ def test_a_statement_that_takes_too_long_is_ended_by_the_database(
             database.close()
 
 
-def sleeping(session: Session) -> None:
+def sleeping(session: Transaction) -> None:
     """Have the database work for longer than any statement may."""
-    assert isinstance(session, PostgresSession)
+    assert isinstance(session, PostgresTransaction)
     session.connection.execute("SELECT pg_sleep(60)")
 
 
@@ -648,7 +648,7 @@ def test_another_database_under_the_same_name_is_not_taken_for_the_one_before(
 def shown_in_copy(cache: ParamCache) -> Mapping[str, int]:
     store = cache._store
     assert isinstance(store, SharedStore)
-    whole = store._link.local.read(lambda session: take_whole(session, PX4.key, 1))
+    whole = store._connection.local.read(lambda session: take_whole(session, PX4.key, 1))
     assert whole is not None
     return {name: row.bits for name, row in whole.rows.items()}
 

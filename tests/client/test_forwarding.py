@@ -174,7 +174,7 @@ async def test_a_program_that_reads_nothing_holds_nothing_up(monkeypatch: pytest
         assert anyio.current_time() - began < 3.0
         implementation = implementation_of(client)
         assert isinstance(implementation, LinkClient)
-        forwarder = implementation._beside.forwarder
+        forwarder = implementation._link_taps.forwarder
         assert forwarder is not None
         assert len(forwarder._waiting) == 10
         lost = forwarder.lost

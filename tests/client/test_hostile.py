@@ -148,7 +148,7 @@ def test_the_tables_of_a_link_share_a_room(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(table_room, "LINK_NAMES_MAX", 6)
     monkeypatch.setattr(table_room, "NAMES_GUARANTEED", 2)
     room = NameQuota()
-    liar, honest = Table(room=room), Table(room=room)
+    liar, honest = Table(name_quota=room), Table(name_quota=room)
     for name in "ABCDEFGH":
         heard(liar, name)
     assert [*liar.params] == [*"ABCDEF"]
@@ -296,7 +296,7 @@ def test_what_is_remembered_of_the_reads_of_a_file_is_so_much_and_no_more() -> N
     session = Simulation(LiarVehicle("crumbs", system=1))
     job = session.meet().files.read("/crumbs", session.now)
     for number in range(2 * reading_room.LATE_READS_MAX):
-        job._flights[number] = reading_room._Flight(number, number, session.now, 0, False)
+        job._pending_reads[number] = reading_room._PendingRead(number, number, session.now, 0, False)
         job._give_up(number)
     for _ in range(3 * reading_room.BURSTS_MAX):
         job._burst(session.now)
@@ -312,7 +312,7 @@ def test_a_resync_tells_of_so_many_names_and_no_more(monkeypatch: pytest.MonkeyP
     say(session, param_value("ONE_MORE", 1.0, count=9))  # another count: it has fallen behind
     for name in "ABCDE":
         session.machine.sync.changed(name, "vehicle")
-    assert len(session.machine.sync._moved) == 3
+    assert len(session.machine.sync._changed_names) == 3
 
 
 def test_one_head_after_the_other_keeps_no_turn() -> None:
@@ -344,7 +344,7 @@ def test_no_lie_keeps_another_vehicle_from_being_fetched(
     """While the liar is fetched as well: its list is waited for once, and its values count for it alone."""
     monkeypatch.setattr(station_room, "COMPONENTS_MAX", 50)
     honest, liar = listing_ardupilot(), LiarVehicle(lie)
-    station = Station(link="sim:test", is_stream=False, upkeep=SyncSettings(30.0))
+    station = Station(link="sim:test", is_stream=False, sync_settings=SyncSettings(30.0))
     session = Simulation(honest, liar, station=station)
     session.meet()
     session.until(lambda: (66, 1) in session.station.components)
@@ -381,7 +381,9 @@ def test_all_lies_at_once_cost_no_more_than_so_much_memory() -> None:
         for number in range(TEXTS_MAX):
             text_of(b"%d" % number)  # what remembers names is full
         liars = [LiarVehicle(*list(LIES)[start::3], system=66 + start, rate=150) for start in range(3)]
-        station = Station(link="sim:test", is_stream=False, upkeep=SyncSettings(30.0), counts_traffic=True)
+        station = Station(
+            link="sim:test", is_stream=False, sync_settings=SyncSettings(30.0), counts_traffic=True
+        )
         held: list[int] = []
         for now in range(4):
             for liar in liars:
@@ -427,7 +429,7 @@ async def test_one_that_is_another_vehicle_each_time_fills_no_cache(
             liar.say(AutopilotVersion(16, uid=number + 1))
             liar.say(param_value(f"V{number}"))
             await anyio.sleep(LOST_AFTER + 2 * cache_writer.CACHE_FLUSH_INTERVAL)  # till then it may be two
-            assert len(local_client(client).cache_writer._bringing) <= 1
+            assert len(local_client(client).cache_writer._loading) <= 1
     with ParamCache(path) as cache:
         systems = [each.identity.system for each in cache.vehicles()]
         assert systems.count(66) == kept

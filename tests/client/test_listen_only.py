@@ -257,7 +257,7 @@ def test_the_command_listens_too(capsys: pytest.CaptureFixture[str]) -> None:
 
 def station_that_listens() -> Station:
     station = Station(
-        link="test", is_stream=False, upkeep=SyncSettings.chosen(None, "auto", listen_only=True)
+        link="test", is_stream=False, sync_settings=SyncSettings.chosen(None, "auto", listen_only=True)
     )
     say(station, wire.Heartbeat(2, wire.MAV_AUTOPILOT_GENERIC, system_status=4), 0.0)
     return station

@@ -18,7 +18,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, rule, run_sta
 from paramclient import Param, ParamCache, ParamType
 from paramclient.cache import HistoryEntry, UnixTimes
 from paramclient.client import suspend_detection
-from paramclient.client.cache_writer import WriteThrough
+from paramclient.client.cache_writer import CacheWriter
 from paramclient.client.link_task import LinkTask
 from paramclient.links import Peer, create_link
 from paramclient.links.clock_offset import seconds_ahead
@@ -83,7 +83,7 @@ def test_what_did_not_reach_the_cache_is_given_back_with_its_moments() -> None:
     heard(table, 2, "vehicle", 2.0)
     for again in (2.5, 3.0, 3.5):
         changed, params = table.changed, table.params.copy()
-        news = (table.take_dirty(), table.take_overwritten(), table.take_gone(), changed, params)
+        news = (table.take_dirty(), table.take_overwritten(), table.take_removed_at(), changed, params)
         table.restore_unwritten(*news)
         assert table.dirty == {"A": "vehicle"}
         heard(table, 2, "vehicle", again)
@@ -97,7 +97,7 @@ def test_what_is_replaced_on_its_way_to_a_cache_that_does_not_take_it_is_kept(by
     table.take_dirty()
     heard(table, 2, "vehicle", 2.0)
     changed, params = table.changed, table.params.copy()
-    news = (table.take_dirty(), table.take_overwritten(), table.take_gone(), changed, params)
+    news = (table.take_dirty(), table.take_overwritten(), table.take_removed_at(), changed, params)
     heard(table, 3, by, 3.0)
     table.restore_unwritten(*news)
     assert [(each.param.value, each.moment) for each in table.take_overwritten()] == [(2, 2.0)]
@@ -109,7 +109,7 @@ def test_what_is_gone_was_found_missing_when_the_last_value_came() -> None:
     heard(table, 1, "vehicle", 1.0)
     table.store_value(param_value("B", 1.0, index=0, count=1), "vehicle", 2.0)
     table.settle({0: "B"})
-    assert table.take_gone() == {"A": 2.0}
+    assert table.take_removed_at() == {"A": 2.0}
     assert table.params.moments == {"B": 2.0}
 
 
@@ -142,8 +142,8 @@ def test_sleep_that_the_clock_leaves_out_makes_everything_older() -> None:
     table.age(1000.0)
     assert table.params.moments == {"A": -998.0}
     assert [each.moment for each in table.take_overwritten()] == [-999.0]
-    assert table.take_gone() == {"B": -997.0}
-    assert table.slept == 1000.0
+    assert table.take_removed_at() == {"B": -997.0}
+    assert table.suspended == 1000.0
 
 
 # On the way to the cache
@@ -194,7 +194,7 @@ class Side:
     def __init__(self, cache: ParamCache, now: Callable[[], float]) -> None:
         self.socket: list[tuple[float, bytes]] = []
         self.station = Station(link="x", is_stream=False)
-        self.writer = WriteThrough(
+        self.writer = CacheWriter(
             cache,
             owned=False,
             identity_of=self.station.identity_of,
@@ -234,7 +234,7 @@ class Programs(RuleBasedStateMachine):
         for number, side in enumerate(self.sides):
             identity = side.station.identity_of(side.machine)
             assert identity is not None
-            self.runner.run(side.writer.bring(side.machine, identity))
+            self.runner.run(side.writer.load_cached(side.machine, identity))
             self.list_all(number)
 
     def teardown(self) -> None:

@@ -24,7 +24,7 @@ from paramclient import (
     UnknownParameter,
     UsageError,
 )
-from paramclient.client.cache_writer import WriteThrough
+from paramclient.client.cache_writer import CacheWriter
 from paramclient.protocol import wire
 from paramclient.protocol.requests.pacing import WRITES_MAX
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam, Vehicle
@@ -333,7 +333,7 @@ async def test_values_that_are_not_on_the_disk_are_reported_as_such(tmp_path: Pa
         await component.fetch_all()
         assert (await component.set_many({"PARAM_01": 2}, durable=True)).is_complete
         failing = mock.AsyncMock(side_effect=CacheError("disk I/O error"))
-        with mock.patch.object(WriteThrough, "write_durably", failing):
+        with mock.patch.object(CacheWriter, "write_durably", failing):
             result = await component.set_many({"PARAM_01": 3, "NO_SUCH": 1, "PARAM_02": 4}, durable=True)
         assert isinstance(result.error, NotDurable)
         assert isinstance(result["PARAM_02"].error, NotDurable)

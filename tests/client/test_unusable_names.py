@@ -87,7 +87,7 @@ def test_what_is_said_under_such_a_name_is_dropped_and_counted(name: str) -> Non
     session.fetch()
     say(session, param_value(name, 5.0, index=NO_INDEX, count=2))
     say(session, param_value(name, 5.0, index=0, count=7))
-    say(session, ParamError(*session.station.own, name, -1, 1))
+    say(session, ParamError(*session.station.own_address, name, -1, 1))
     say(session, ParamSetMessage(1, 1, name, bytes(4), 9), system=254)
     table = session.machine.table
     assert ([*table.params], table.count, table.left_out, table.left_out_name) == (["A", "B"], 2, 4, name)

@@ -43,7 +43,7 @@ from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import Param, ParamType, from_bits, type_name
 from paramclient.protocol.ftp.packets import DATA_SIZE_MAX
 from paramclient.protocol.params.small_changes import CHANGE_MIN
-from paramclient.protocol.vehicle.reboot import SAVING_TIME
+from paramclient.protocol.vehicle.reboot_command import SAVING_TIME
 from paramclient.protocol.wire import AUTOPILOT_VERSION_ID, message_name
 from paramclient.provision import MISSING, ApplyStatus, apply, restore, verify
 from tests.live.choice import another_value

@@ -21,7 +21,7 @@ from paramclient import (
     UsageError,
 )
 from paramclient.cache import BY_US, StoredParam, TableUpdate
-from paramclient.cache.tables import HISTORY_LINES
+from paramclient.cache.tables import HISTORY_ENTRIES_MAX
 from paramclient.cli import run
 from paramclient.links import LinkKind, ReplayLink, create_link, parse_link
 from paramclient.links.replay import PAUSE_MAX
@@ -430,13 +430,13 @@ def test_values_before_the_identification_keep_their_times(tmp_path: Path) -> No
 def test_history_keeps_the_newest_lines_by_time(tmp_path: Path) -> None:
     cache = tmp_path / "cache"
     names = [f"P{number}" for number in range(1000)]
-    for step in range(HISTORY_LINES // 1000 + 1):
+    for step in range(HISTORY_ENTRIES_MAX // 1000 + 1):
         save(cache, NOW + 1000.0 + step, *(known(name, step) for name in names))
-    assert len(lines(cache)) == HISTORY_LINES
+    assert len(lines(cache)) == HISTORY_ENTRIES_MAX
     log = whole(P0=7).wait(9.0).change("P0", 8).wait(1.0).beat()
     imported(log.write(tmp_path / "flight.tlog"), cache=cache)
     found = lines(cache)
-    assert len(found) == HISTORY_LINES
+    assert len(found) == HISTORY_ENTRIES_MAX
     assert found == sorted(found, key=lambda each: float(str(each[4])))
     assert found[0][4] == 1001.0
 

@@ -213,7 +213,7 @@ async def test_vehicles_without_metadata(make: Any) -> None:
         began = anyio.current_time()
         assert await metadata_of(component) is None
         assert anyio.current_time() - began < 1.5
-        assert not local(component).machine.descriptions.is_asking
+        assert not local(component).machine.metadata_requests.is_asking
 
 
 @swiftly
@@ -303,7 +303,7 @@ async def test_a_vehicle_that_does_not_respond() -> None:
         result = await outcome(metadata_of(component, timeout=0.7))
         assert isinstance(result, NoReply)
         assert anyio.current_time() - began == pytest.approx(0.7, abs=0.01)
-        assert not local(component).machine.descriptions.is_asking
+        assert not local(component).machine.metadata_requests.is_asking
         tap.is_mute = True
         result = await outcome(metadata_of(component))
         assert isinstance(result, NoReply)
@@ -344,7 +344,7 @@ async def test_cancellation_closes_files_and_sessions(tmp_path: Path) -> None:
             component = await client.component()
             with anyio.move_on_after(moment):
                 await metadata_of(component, store=MetadataStore(tmp_path / str(moment)))
-            assert not local(component).machine.descriptions.is_asking
+            assert not local(component).machine.metadata_requests.is_asking
             await anyio.sleep(1.0)
             assert not vehicle.open_files
             assert await metadata_of(component) is not None
@@ -489,9 +489,9 @@ def test_the_request_is_repeated_when_the_link_is_restored() -> None:
     assert len(asked.sent) == 2
     sent: list[Any] = []
     machine = ComponentMachine(
-        1, 1, own=(255, 190), link="link", send=sent.append, observer=EventMaker(lambda _: None)
+        1, 1, own_address=(255, 190), link="link", send=sent.append, observer=EventMaker(lambda _: None)
     )
-    machine.descriptions.ask(0.0)
+    machine.metadata_requests.ask(0.0)
     machine.resume(0.5)
     assert len(sent) == 2
 

@@ -69,7 +69,7 @@ class Desk:
         self.machine = ComponentMachine(
             1,
             1,
-            own=OWN,
+            own_address=OWN,
             link="x",
             send=self.sent.append,
             observer=EventMaker(self.events.append),
@@ -171,7 +171,7 @@ def test_without_tells_changes_several_changes_make_one_event() -> None:
     desk.send_list("A", "B")
     desk.cached(known("C", 1, index=2))
     assert desk.events == [ParamsMoved(desk.machine)]
-    desk.machine.has_moved = False
+    desk.machine.has_changed = False
     desk.hear("A", 7.0)
     assert desk.events == [ParamsMoved(desk.machine)] * 2
     desk.machine.tells_changes = True
@@ -904,7 +904,7 @@ def test_hit_results_do_not_change_afterwards() -> None:
 
 def test_upkeep_goes_on_when_a_vehicle_is_found_whose_count_had_moved() -> None:
     vehicle = ArduPilotVehicle(table={"A": 1, "B_ENABLE": 0}, groups={"B_ENABLE": {"B_X": 5}}, live=())
-    station = Station(link="sim:test", is_stream=False, upkeep=SyncSettings(30.0, without_hash=True))
+    station = Station(link="sim:test", is_stream=False, sync_settings=SyncSettings(30.0, without_hash=True))
     world = Simulation(vehicle, station=station)
     world.fetch()
     world.run(10.0)  # so that its clock tells that it has started again

@@ -46,8 +46,8 @@ class Lane:
 
     def __init__(self) -> None:
         self.began_at = math.inf
-        self.came = 0
-        self.passed = 0
+        self.received = 0
+        self.covered = 0
         self.is_bursty = False
 
     def begin(self, now: float) -> None:
@@ -55,7 +55,7 @@ class Lane:
 
     @property
     def is_awaited(self) -> bool:
-        return self.came == 0
+        return self.received == 0
 
     @property
     def silent_at(self) -> float:
@@ -66,7 +66,7 @@ class Lane:
         return self.began_at < math.inf
 
     def seen(self) -> ListStatistics:
-        return ListStatistics(self.came, self.passed, STEP, self.is_bursty)
+        return ListStatistics(self.received, self.covered, STEP, self.is_bursty)
 
 
 class Road:
@@ -89,8 +89,8 @@ class Road:
             self.now += STEP
             speaking = [lane for lane in self.lanes[silent:] if lane.is_running]
             for lane in speaking:
-                lane.passed += 10
-                lane.came += int(10 * min(room / len(speaking), 1.0))
+                lane.covered += 10
+                lane.received += int(10 * min(room / len(speaking), 1.0))
             self.turns.tick(self.now)
 
     def until(self, wanted: int, *, room: float = math.inf, silent: int = 0, limit: int = 10_000) -> float:
@@ -170,7 +170,7 @@ def test_many_that_are_cut_at_once_have_failed_once() -> None:
 
 
 def test_where_all_of_many_bursts_lose_half_as_many_run() -> None:
-    """None of them came before the others, so nothing says how many of them have room."""
+    """None of them received before the others, so nothing says how many of them have room."""
     road = bursty(100)
     road.until(32)
     road.end(road.lanes[31], is_cut=True)
@@ -254,8 +254,8 @@ def test_no_list_begins_beside_others_while_unread_data_is_waiting() -> None:
         road.end(lane)
     for _ in range(50):
         road.now += STEP
-        road.lanes[0].came += 10
-        road.lanes[0].passed += 10
+        road.lanes[0].received += 10
+        road.lanes[0].covered += 10
         assert not road.turns.tick(road.now, most=1)
     assert road.running == 1
     road.end(road.lanes[0])
@@ -268,7 +268,7 @@ def test_no_list_begins_beside_others_while_unread_data_is_waiting() -> None:
 def test_no_list_begins_before_the_running_ones_are_judged() -> None:
     road = Road(2)
     road.run()
-    while road.lanes[0].came < JUDGED_VALUES_MIN:
+    while road.lanes[0].received < JUDGED_VALUES_MIN:
         assert road.running == 1
         road.run()
 
@@ -293,8 +293,8 @@ def test_what_is_slower_has_no_room_either() -> None:
     for _ in range(100):
         road.now += STEP
         for lane in road.lanes[:2]:
-            lane.passed += 5
-            lane.came += 5
+            lane.covered += 5
+            lane.received += 5
         road.turns.tick(road.now)
     road.end(road.lanes[0])
     road.run()
@@ -319,7 +319,7 @@ def test_where_there_is_never_room_it_is_tried_ever_more_seldom() -> None:
         road.run(50, room=1.0)
         for lane in [lane for lane in road.lanes if lane.is_running][1:]:
             road.end(lane)
-            lane.came = lane.passed = 0
+            lane.received = lane.covered = 0
             road.turns.ask(lane, road.now)
     waits = [later - sooner for sooner, later in pairwise(tried)]
     assert waits == sorted(waits)
@@ -333,8 +333,8 @@ def test_a_link_that_loses_much_anyway_has_room_all_the_same() -> None:
         road.now += STEP
         for lane in road.lanes:
             if lane.is_running:
-                lane.passed += 10
-                lane.came += 6
+                lane.covered += 10
+                lane.received += 6
         road.turns.tick(road.now)
     assert road.running == 20
 
@@ -358,11 +358,11 @@ def test_a_slow_one_does_not_hold_up_the_others() -> None:
     slow = road.lanes[0]
     while road.running < 40 and road.now < 60.0:
         road.now += STEP
-        slow.came = slow.passed = 1 + int(road.now)
+        slow.received = slow.covered = 1 + int(road.now)
         for lane in road.lanes[1:]:
             if lane.is_running:
-                lane.passed += 10
-                lane.came += 10
+                lane.covered += 10
+                lane.received += 10
         road.turns.tick(road.now)
     assert road.now < 3.0
 
@@ -398,7 +398,7 @@ def test_what_was_found_out_is_forgotten_when_no_list_came_for_long() -> None:
     road.run(50, room=1.0)
     for lane in road.lanes:
         road.end(lane)
-        lane.came = lane.passed = 0
+        lane.received = lane.covered = 0
     road.now += MEASUREMENT_LIFETIME + 1
     for lane in road.lanes:
         road.turns.ask(lane, road.now)
@@ -672,10 +672,10 @@ def test_only_lists_that_come_on_other_links_are_beside_it() -> None:
     road = Road(1)
     [lane] = road.lanes
     road.turns.tick(road.now, most=1)
-    assert not road.turns.is_beside_others(lane), "those may be awaited for ever"
+    assert not road.turns.is_parallel_to_others(lane), "those may be awaited for ever"
     road.turns.tick(road.now, most=1, is_crowded=True)
-    assert road.turns.is_beside_others(lane)
-    assert road.turns.beside_others_at(lane) == road.now
+    assert road.turns.is_parallel_to_others(lane)
+    assert road.turns.parallel_to_others_at(lane) == road.now
 
 
 class Timer:
@@ -779,13 +779,13 @@ def test_a_list_that_the_event_loop_does_not_permit_is_tried_again_soon() -> Non
     scheduler, lanes = Scheduler(), [Lane(), Lane()]
     scheduler.lists_max = 1
     for lane in lanes:
-        scheduler.turns.ask(lane, 0.0)
-        lane.passed = lane.came = JUDGED_VALUES_MIN
+        scheduler.list_admission.ask(lane, 0.0)
+        lane.covered = lane.received = JUDGED_VALUES_MIN
     now = 0.0
     for _ in range(100):
         now += STEP
-        lanes[0].passed += 10
-        lanes[0].came += 10
+        lanes[0].covered += 10
+        lanes[0].received += 10
         scheduler.tick(now)
         assert now < scheduler.next_deadline() <= now + max(JUDGED_TIME, LIMIT_RECHECK_INTERVAL)
     assert not lanes[1].is_running

@@ -236,7 +236,7 @@ class Sessions(RuleBasedStateMachine):
         link=links(),
         seed=st.integers(0, 1000),
         misfortunes=st.one_of(st.just(Misfortunes(0.0, frozenset(), None, 1, math.inf)), MISFORTUNES),
-        upkeep=UPKEEPS,
+        sync_settings=UPKEEPS,
         has_camera=st.sampled_from([False, False, True]),
         uptime=st.sampled_from([0.0, 3.0, 12.0]),
         begins_with_fetch=st.sampled_from([True, True, False]),
@@ -248,7 +248,7 @@ class Sessions(RuleBasedStateMachine):
         link: Link,
         seed: int,
         misfortunes: Misfortunes,
-        upkeep: SyncSettings,
+        sync_settings: SyncSettings,
         has_camera: bool,
         uptime: float,
         begins_with_fetch: bool,
@@ -272,7 +272,7 @@ class Sessions(RuleBasedStateMachine):
         vehicles = [subject.vehicle for subject in self.subjects]
         air = Air.symmetric(vehicles, others=others, seed=seed, **link)
         self.misfortunes = misfortunes
-        self.upkeep = upkeep
+        self.sync_settings = sync_settings
         self.is_bad = self.is_never_good(link)  # whether the link can be to blame
         self.may_overtake = link["reorder"] > 0 or link["duplicate"] > 0  # an old PARAM_SET may come late
         self.world = Simulation(air=air, station=self.new_station())
@@ -511,7 +511,7 @@ class Sessions(RuleBasedStateMachine):
             assert len(machine.write_batches) <= batches
             assert len(machine.table.params) <= most
             assert len(machine.table.dirty) <= most
-            assert len(machine.sync._moved) <= most
+            assert len(machine.sync._changed_names) <= most
             assert len(machine._authors._changed_at) <= most
             assert len(machine._authors._doubts) <= most
         known = {subject.address for subject in self.subjects} | {
@@ -539,7 +539,7 @@ class Sessions(RuleBasedStateMachine):
         assert len(machine.writes) == 0
         assert len(machine.write_batches) == 0
         assert machine.fetch is None
-        if self.upkeep.policy is Policy.AUTO and not (self.is_dead and subject is self.subject):
+        if self.sync_settings.policy is Policy.AUTO and not (self.is_dead and subject is self.subject):
             fetch = machine.begin_fetch(self.world.now, refresh=True)
             result = self.world.outcome(fetch, LIMIT)
             machine.end_fetch(fetch, self.world.now)
@@ -552,7 +552,7 @@ class Sessions(RuleBasedStateMachine):
         world = self.world
         # one value after the other under one name looks like a late answer, which is asked for again
         is_flapping = len(self.vehicle.params) < len(self.vehicle.listed) and world.air.others
-        if self.upkeep.interval == math.inf and not is_flapping:
+        if self.sync_settings.interval == math.inf and not is_flapping:
             world.run(SETTLING)
             world.sent.clear()
             world.run(2 * SETTLING)
@@ -563,7 +563,7 @@ class Sessions(RuleBasedStateMachine):
     # tools
 
     def new_station(self) -> Station:
-        return Station(link="sim:test", is_stream=False, upkeep=self.upkeep)
+        return Station(link="sim:test", is_stream=False, sync_settings=self.sync_settings)
 
     @property
     def is_known(self) -> bool:
@@ -611,7 +611,7 @@ class Sessions(RuleBasedStateMachine):
         self.world.run(SETTLING)
 
     def become_calm(self) -> None:
-        """The link is good and nothing changes any more; all ends, and one interval of the upkeep passes."""
+        """The link is good and nothing changes any more; all ends, and one sync interval passes."""
         world = self.world
         self.become(GOOD)
         self.vehicle.high_latency = False
@@ -619,8 +619,8 @@ class Sessions(RuleBasedStateMachine):
         world.until(lambda: not world.station.is_waiting, LIMIT)
         world.run(max(0.0, self.back_at - world.now) + 2 * SETTLING)
         world.until(lambda: not world.station.is_waiting, LIMIT)
-        if self.upkeep.interval < math.inf:
-            world.run(self.upkeep.interval + LOOK)
+        if self.sync_settings.interval < math.inf:
+            world.run(self.sync_settings.interval + LOOK)
             world.until(lambda: not world.station.is_waiting, LIMIT)
 
     def another_sends(self, message: wire.Message, is_heard: bool) -> None:
@@ -740,8 +740,8 @@ class Sessions(RuleBasedStateMachine):
 
     def kept_up_is_true(self) -> None:
         """Tables that are followed without being asked are the vehicles' by now."""
-        upkeep = self.upkeep
-        if upkeep.interval == math.inf or upkeep.policy is not Policy.AUTO:
+        sync_settings = self.sync_settings
+        if sync_settings.interval == math.inf or sync_settings.policy is not Policy.AUTO:
             return
         for subject in self.subjects:
             if not self.is_heard(subject) or (
@@ -749,8 +749,8 @@ class Sessions(RuleBasedStateMachine):
             ):
                 continue
             machine = self.machine_of(subject)
-            is_looked_after = machine.sync.expects_hash or upkeep.without_hash
-            if machine.sync._was_synced and is_looked_after and not machine.sync.is_spared:
+            is_looked_after = machine.sync.expects_hash or sync_settings.without_hash
+            if machine.sync._was_synced and is_looked_after and not machine.sync.must_not_poll:
                 assert machine.sync.synced, machine
                 self.compare_table(subject, machine.table.params, is_volatile_old=machine.sync.expects_hash)
 
@@ -779,7 +779,7 @@ class Sessions(RuleBasedStateMachine):
         if subject is self.subject and self.is_incomplete:
             listed = vehicle.listed
             skipped = {listed[index].name for index in self.misfortunes.dead if index < len(listed)}
-            is_open = self.world.air.others or not self.machine_of(subject).table.passed_over
+            is_open = self.world.air.others or not self.machine_of(subject).table.duplicate_indices
             if len(true) < len(listed) and is_open:
                 skipped.add(INTEGERS[0])  # lists that pass by all the time may hide which one is meant
             skipped |= held.keys() - true.keys()

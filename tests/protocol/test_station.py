@@ -48,7 +48,7 @@ def sent(station: Station) -> list[tuple[Message, int, object]]:
     out = []
     for data, peer in station.data_to_send():
         for each in framer.receive(data):
-            assert (each.system, each.component) == station.own
+            assert (each.system, each.component) == station.own_address
             message = wire.decode(each)
             assert message is not None
             out.append((message, each.version, peer))
@@ -85,7 +85,7 @@ def test_what_our_heartbeat_says() -> None:
     [(message, version, peer)] = sent(station)
     assert message == Heartbeat(MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, system_status=4)
     assert (version, peer) == (2, None)
-    assert station.own == (250, 7)
+    assert station.own_address == (250, 7)
 
 
 def test_a_late_tick_sends_one_heartbeat() -> None:
@@ -214,7 +214,7 @@ def test_only_an_autopilot_is_asked_for_its_heartbeat(system: int, component: in
 
 
 def test_a_listen_only_station_requests_no_heartbeat() -> None:
-    station = Station(link="x", is_stream=False, upkeep=SyncSettings(listens_only=True))
+    station = Station(link="x", is_stream=False, sync_settings=SyncSettings(listens_only=True))
     station.receive(telemetry(), "there", 0.0)
     assert sent(station) == []
 

@@ -891,12 +891,12 @@ async def test_a_reboot_follows_values_that_take_effect_after_it() -> None:
     wanted = written(another("TUNE_01") | {"EK2_ALT_M_NSE": 1.5, "EK2_ENABLE": 1, "FRAME_CLASS": 2})
     async with a_client(tap) as client:
         component = await client.component()
-        unstarted = await apply(component, wanted)
-        assert unstarted.reboots == 0
-        assert unstarted.reboot_required == ("FRAME_CLASS", "EK2_ENABLE")
-        assert unstarted.rows["EK2_ALT_M_NSE"].category == MISSING
+        awaiting_reboot = await apply(component, wanted)
+        assert awaiting_reboot.reboots == 0
+        assert awaiting_reboot.reboot_required == ("FRAME_CLASS", "EK2_ENABLE")
+        assert awaiting_reboot.rows["EK2_ALT_M_NSE"].category == MISSING
         plan = await prepare(component, wanted)
-        assert plan.unstarted == ("EK2_ENABLE",)
+        assert plan.awaiting_reboot == ("EK2_ENABLE",)
         told: list[str] = []
         result = await apply(component, wanted, reboot=True, progress=lambda how: told.append(how.phase))
     assert result.complete

@@ -29,7 +29,7 @@ class ExtTable:
         count: the latest param_count, or None. Indices are valid for this count only.
         moments: when each value was last observed, by name, in seconds of the core's clock.
         dirty: names whose value, type or index changed since the last `take_dirty`, with the author.
-        gone: when each removed name was found missing, since the last `take_gone`.
+        gone: when each removed name was found missing, since the last `take_removed_at`.
         overwritten: values that were replaced before they reached the cache, with author and moment; the
             oldest are dropped above `EXT_OVERWRITTEN_MAX`.
     """
@@ -124,7 +124,7 @@ class ExtTable:
         """The count that the component has sent on this link. The cache gives none."""
         return self.count
 
-    def take_gone(self) -> dict[str, float]:
+    def take_removed_at(self) -> dict[str, float]:
         """Return `gone`, and empty it."""
         gone, self.gone = self.gone, {}
         return gone

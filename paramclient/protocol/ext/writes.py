@@ -185,7 +185,7 @@ class ExtWrites(Machine):
         if queue is None or write not in queue:
             return
         if queue[0] is write:
-            self._leave_open(write, now)
+            self._report_outcome_unknown(write, now)
             self._leave(write, now)
         else:
             queue.remove(write)
@@ -407,14 +407,14 @@ class ExtWrites(Machine):
 
     def _fail(self, write: ExtWrite, error: Exception, now: float) -> None:
         if isinstance(error, NoReply):
-            self._leave_open(write, now)
+            self._report_outcome_unknown(write, now)
             if write.is_sent:
                 error = self._no_reply(write, now)
         self._leave(write, now)
         self._trace("%s/%s %s: not written: %s", *self._target, write.name, error)
         write.fail(error, now)
 
-    def _leave_open(self, write: ExtWrite, now: float) -> None:
+    def _report_outcome_unknown(self, write: ExtWrite, now: float) -> None:
         if write.is_sent:
             self.left_open(write.name, write.by, now)
 

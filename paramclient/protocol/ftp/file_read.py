@@ -60,7 +60,7 @@ SPARE_PIECES: Final = 1_000
 """Further pieces of a file."""
 
 
-class _Flight(NamedTuple):
+class _PendingRead(NamedTuple):
     offset: int
     number: int
     sent_at: float
@@ -109,8 +109,8 @@ class FileRead(FileTransferJob[bytes]):
         self._block_at = math.inf  # the last block of the running burst
         self._overtaken_at = math.inf  # the first read behind that burst was answered before any block of it
         self._first_block: tuple[float, int] | None = None
-        self._flights: dict[int, _Flight] = {}  # by sequence number of the request
-        self._late: dict[int, _Flight] = {}
+        self._pending_reads: dict[int, _PendingRead] = {}  # by sequence number of the request
+        self._late: dict[int, _PendingRead] = {}
         self._unheard = 0  # blocks received before the response to the open
         self._is_silent = False  # silence since the last timed-out request was sent
         self._asked: dict[int, tuple[int, float]] = {}  # unanswered reads by offset: how often, and when last
@@ -152,7 +152,7 @@ class FileRead(FileTransferJob[bytes]):
             and self._code(packet) == FileErrorCode.FILE_NOT_FOUND
         )
 
-    def _is_unheard(self, packet: Packet) -> bool:
+    def _shows_lost_open_reply(self, packet: Packet) -> bool:
         """Return whether this shows that the response to our open was lost: it belongs to the burst behind
         it."""
         if packet.session != self.asked_session or packet.requested != Opcode.BURST_READ_FILE:
@@ -167,7 +167,7 @@ class FileRead(FileTransferJob[bytes]):
         if self.session is None and self._shows_lost_open(packet):
             self._restarts += 1
             self._begin_early(now)
-        if self.session is None and self._is_unheard(packet):
+        if self.session is None and self._shows_lost_open_reply(packet):
             # whether the file is ours is unknown: close it, and start again at the end of the burst
             self._restarts += 1
             self._line.close_session(packet.session)
@@ -180,10 +180,10 @@ class FileRead(FileTransferJob[bytes]):
             self._take_burst(packet, now)
         elif packet.requested == Opcode.READ_FILE:
             sequence = (packet.sequence - 1) & 0xFFFF
-            flight = self._flights.pop(sequence, None) or self._late.pop(sequence, None)
-            if flight is not None:
-                self._take_read(packet, flight, now)
-        self._go_on(now)
+            pending = self._pending_reads.pop(sequence, None) or self._late.pop(sequence, None)
+            if pending is not None:
+                self._take_read(packet, pending, now)
+        self._request_next(now)
 
     def tick(self, now: float) -> None:
         super().tick(now)
@@ -192,11 +192,11 @@ class FileRead(FileTransferJob[bytes]):
         if self._burst_runs and self._quiet_at() <= now:
             self._burst_is_silent(now)
         if not self._burst_runs:
-            for sequence, flight in list(self._flights.items()):
-                if self._flight_deadline(flight) <= now:
+            for sequence, pending in list(self._pending_reads.items()):
+                if self._pending_deadline(pending) <= now:
                     self._give_up(sequence)
-                    self._record_timeout(flight, now)
-        self._go_on(now)
+                    self._record_timeout(pending, now)
+        self._request_next(now)
 
     def next_deadline(self) -> float:
         earliest = super().next_deadline()
@@ -204,8 +204,8 @@ class FileRead(FileTransferJob[bytes]):
             return earliest
         if self._burst_runs:
             earliest = min(earliest, self._quiet_at())
-        elif self._flights:
-            earliest = min(earliest, *map(self._flight_deadline, self._flights.values()))
+        elif self._pending_reads:
+            earliest = min(earliest, *map(self._pending_deadline, self._pending_reads.values()))
         if self._next_wanted() is not None:
             earliest = min(earliest, self._next_read_at)
         return earliest
@@ -213,11 +213,11 @@ class FileRead(FileTransferJob[bytes]):
     def resume(self, now: float) -> None:
         super().resume(now)
         if self.session is not None and not self.is_ended:
-            self._flights.clear()
+            self._pending_reads.clear()
             self._asked.clear()
             self._burst_attempts.restart()
             self._burst_runs = False
-            self._go_on(now)
+            self._request_next(now)
 
     def _opened(self, packet: Packet, now: float) -> None:
         if len(packet.data) >= 4:
@@ -311,15 +311,15 @@ class FileRead(FileTransferJob[bytes]):
             self._burst(now)  # the first one arrived before the open
             return
         else:
-            self._does_not_read(packet, now)
+            self._read_refused(packet, now)
         if is_latest:
             self._stop_burst(now)
 
     def _stop_burst(self, now: float) -> None:
         """End the burst: reads sent meanwhile are answered only now."""
         self._burst_runs = False
-        for sequence, flight in self._flights.items():
-            self._flights[sequence] = flight._replace(sent_at=now, is_only=False)
+        for sequence, pending in self._pending_reads.items():
+            self._pending_reads[sequence] = pending._replace(sent_at=now, is_only=False)
 
     def _quiet_at(self) -> float:
         burst = self._burst_attempts
@@ -340,7 +340,7 @@ class FileRead(FileTransferJob[bytes]):
     @property
     def _next_read_behind_at(self) -> float:
         """When a read is sent behind a burst without a block; infinity after enough of them."""
-        if len(self._flights) >= READS_BEHIND_BURST_MAX:
+        if len(self._pending_reads) >= READS_BEHIND_BURST_MAX:
             return math.inf
         if self._read_behind_at == -math.inf:
             return self._begins_by
@@ -367,53 +367,53 @@ class FileRead(FileTransferJob[bytes]):
 
     # single reads
 
-    def _take_read(self, packet: Packet, flight: _Flight, now: float) -> None:
-        for sequence, other in list(self._flights.items()):
-            if other.number <= flight.number - OVERTAKING_READS:
+    def _take_read(self, packet: Packet, pending: _PendingRead, now: float) -> None:
+        for sequence, other in list(self._pending_reads.items()):
+            if other.number <= pending.number - OVERTAKING_READS:
                 self._give_up(sequence)
                 self._retries.timed_out(1)
-        self._retries.answered(flight.sent_at, now, is_sure=flight.is_only)
-        self._asked.pop(flight.offset, None)
+        self._retries.answered(pending.sent_at, now, is_sure=pending.is_only)
+        self._asked.pop(pending.offset, None)
         if packet.opcode == Opcode.ACK and packet.data:
-            is_ahead = flight.offset >= self._blocks.reached
-            self._keep(packet, flight.offset, now)
-            if is_ahead and self._burst_runs and flight.sent_at >= self._burst_attempts.sent_at:
+            is_ahead = pending.offset >= self._blocks.reached
+            self._keep(packet, pending.offset, now)
+            if is_ahead and self._burst_runs and pending.sent_at >= self._burst_attempts.sent_at:
                 self._overtaken_at = min(self._overtaken_at, now)
             self._may_burst = self._may_burst or (is_ahead and not self._burst_runs)
         elif packet.opcode == Opcode.ACK or self._code(packet) == FileErrorCode.EOF:
-            self._ends_at(flight.offset)
+            self._ends_at(pending.offset)
         else:
-            self._does_not_read(packet, now)
+            self._read_refused(packet, now)
 
     def _give_up(self, sequence: int) -> None:
         """Count a read as lost."""
-        self._late[sequence] = self._flights.pop(sequence)._replace(is_only=False)
+        self._late[sequence] = self._pending_reads.pop(sequence)._replace(is_only=False)
         if len(self._late) > LATE_READS_MAX:
             del self._late[next(iter(self._late))]
 
-    def _record_timeout(self, flight: _Flight, now: float) -> None:
+    def _record_timeout(self, pending: _PendingRead, now: float) -> None:
         """Record an unanswered read; those of one offset that were sent meanwhile count as one."""
-        attempts, counted_at = self._asked.get(flight.offset, (0, -math.inf))
-        if not self._is_wanted(flight.offset) or flight.sent_at < counted_at:
+        attempts, counted_at = self._asked.get(pending.offset, (0, -math.inf))
+        if not self._is_wanted(pending.offset) or pending.sent_at < counted_at:
             return
         attempts += 1
-        self._asked[flight.offset] = attempts, now
-        is_silence = self._line.heard_at < flight.sent_at
+        self._asked[pending.offset] = attempts, now
+        is_silence = self._line.heard_at < pending.sent_at
         if not (is_silence and self._is_silent):  # a silence that all reads share counts once
             self._retries.timed_out(attempts)
         self._is_silent = is_silence
         if self._retries.should_give_up(attempts, now, is_silence=is_silence):
             self.fail(self._no_reply(attempts, now), now)
 
-    def _flight_deadline(self, flight: _Flight) -> float:
-        return self._retries.due_at(flight.sent_at, flight.ahead, self._gap)
+    def _pending_deadline(self, pending: _PendingRead) -> float:
+        return self._retries.due_at(pending.sent_at, pending.ahead, self._gap)
 
     def _is_wanted(self, offset: int) -> bool:
         is_behind = self._blocks.end is None and offset >= self._blocks.reached
         return is_behind or self._blocks.is_missing(offset)
 
     def _is_asked_for(self, offset: int) -> bool:
-        return any(flight.offset == offset for flight in self._flights.values())
+        return any(pending.offset == offset for pending in self._pending_reads.values())
 
     @property
     def _window(self) -> int:
@@ -454,11 +454,11 @@ class FileRead(FileTransferJob[bytes]):
 
     def _next_wanted(self) -> int | None:
         """Return the next offset: an unrequested one, otherwise a copy, if that is worthwhile."""
-        if len(self._flights) >= self._window:
+        if len(self._pending_reads) >= self._window:
             return None
         copies: dict[int, int] = {}
-        for flight in self._flights.values():
-            copies[flight.offset] = copies.get(flight.offset, 0) + 1
+        for pending in self._pending_reads.values():
+            copies[pending.offset] = copies.get(pending.offset, 0) + 1
         wanted = []
         for offset in self._wanted():
             if offset not in copies:
@@ -477,7 +477,9 @@ class FileRead(FileTransferJob[bytes]):
         sequence = self._line.next_sequence()
         is_only = not (self._burst_runs or offset in self._asked or self._is_asked_for(offset))
         self._number += 1
-        self._flights[sequence] = _Flight(offset, self._number, now, len(self._flights), is_only)
+        self._pending_reads[sequence] = _PendingRead(
+            offset, self._number, now, len(self._pending_reads), is_only
+        )
         self._tokens -= 1.0
         # MAVSDK's server refuses to read beyond the end; a growing file is longer by now
         left = self._exact_size - offset
@@ -510,7 +512,7 @@ class FileRead(FileTransferJob[bytes]):
             now,
         )
 
-    def _does_not_read(self, packet: Packet, now: float) -> None:
+    def _read_refused(self, packet: Packet, now: float) -> None:
         """Process a refusal; start again if the session is lost, as when another station resets all."""
         if self._may_reopen(packet):
             self._start_anew()
@@ -521,7 +523,7 @@ class FileRead(FileTransferJob[bytes]):
     def _ends_at(self, offset: int) -> None:
         self._blocks.ends_at(min(offset, self._limit))
 
-    def _go_on(self, now: float) -> None:
+    def _request_next(self, now: float) -> None:
         """Request what is missing, as far as the pace allows; end when all is received."""
         if self.is_ended or self.session is None:
             return

@@ -73,7 +73,7 @@ class FileWrite(FileTransferJob[None]):
             self.finish(None, now)
 
 
-class _Flight(NamedTuple):
+class _PendingRead(NamedTuple):
     offset: int
     number: int
     sent_at: float
@@ -131,7 +131,7 @@ class CommittedWrite(FileTransferJob[None]):
         """Reset all state: nothing is written."""
         self._waiting = [*range(HEADER_SIZE, len(self._data), self._write_size)]
         self._waiting.reverse()  # the next one last
-        self._flights: dict[int, _Flight] = {}  # by sequence number of the request
+        self._pending_reads: dict[int, _PendingRead] = {}  # by sequence number of the request
         self._lost: dict[int, int] = {}  # unanswered requests by offset
         self._is_beginning_written = False
 
@@ -143,7 +143,7 @@ class CommittedWrite(FileTransferJob[None]):
         super().take(packet, now)
         if self.is_ended or self.session is None or packet.requested != Opcode.WRITE_FILE:
             return
-        flight = self._flights.pop((packet.sequence - 1) & 0xFFFF, None)
+        flight = self._pending_reads.pop((packet.sequence - 1) & 0xFFFF, None)
         if flight is None:
             is_beginning = self.is_committed and packet.offset == 0 and packet.session == self.session
             self._is_beginning_written = self._is_beginning_written or (
@@ -161,9 +161,9 @@ class CommittedWrite(FileTransferJob[None]):
         if flight.offset in self._waiting:  # a copy was to be sent
             self._waiting.remove(flight.offset)
         # the server answers in order, so the requests before this one, or their responses, were lost
-        for sequence, other in list(self._flights.items()):
+        for sequence, other in list(self._pending_reads.items()):
             if other.offset == flight.offset:
-                del self._flights[sequence]
+                del self._pending_reads[sequence]
             elif other.number < flight.number:
                 self._give_up(sequence, now)
         self._go_on(now)
@@ -172,49 +172,51 @@ class CommittedWrite(FileTransferJob[None]):
         super().tick(now)
         if self.is_ended or self.session is None:
             return
-        for sequence, flight in list(self._flights.items()):
+        for sequence, flight in list(self._pending_reads.items()):
             if self._due_at(flight) <= now:
                 self._give_up(sequence, now)
         self._go_on(now)
 
     def next_deadline(self) -> float:
-        return min(super().next_deadline(), *map(self._due_at, self._flights.values()), float("inf"))
+        return min(super().next_deadline(), *map(self._due_at, self._pending_reads.values()), float("inf"))
 
     def resume(self, now: float) -> None:
         super().resume(now)
         if self.session is not None and not self.is_ended:
-            self._waiting += [flight.offset for flight in self._flights.values()]
-            self._flights.clear()
+            self._waiting += [flight.offset for flight in self._pending_reads.values()]
+            self._pending_reads.clear()
             self._go_on(now)
 
     def _go_on(self, now: float) -> None:
         """Send what may be sent; commit when all other blocks are written."""
         if self.is_ended or self.session is None or self._has_request:
             return
-        while self._waiting and len(self._flights) < BLOCKS_IN_FLIGHT_MAX:
+        while self._waiting and len(self._pending_reads) < BLOCKS_IN_FLIGHT_MAX:
             self._write(self._waiting.pop(), now)
-        if not self._flights:
+        if not self._pending_reads:
             self._commit(now)
 
     def _write(self, offset: int, now: float) -> None:
         sequence = self._line.next_sequence()
         self._number += 1
-        is_only = not self._flights and offset not in self._lost
-        self._flights[sequence] = _Flight(offset, self._number, now, len(self._flights), is_only)
+        is_only = not self._pending_reads and offset not in self._lost
+        self._pending_reads[sequence] = _PendingRead(
+            offset, self._number, now, len(self._pending_reads), is_only
+        )
         self._send_block(sequence, offset)
 
     def _send_block(self, sequence: int, offset: int) -> None:
         piece = self._data[offset : offset + self._write_size] if offset else self._data[:HEADER_SIZE]
         self._line.send(Packet(sequence, self.session or 0, Opcode.WRITE_FILE, piece, offset=offset))
 
-    def _due_at(self, flight: _Flight) -> float:
+    def _due_at(self, flight: _PendingRead) -> float:
         rate = self._line.byte_rate
         gap = (self._write_size + FRAME_OVERHEAD) / rate if rate else 0.0
         return self._retries.due_at(flight.sent_at, flight.ahead + 1, gap)
 
     def _give_up(self, sequence: int, now: float) -> None:
         """Count a request as lost, and send its block again."""
-        flight = self._flights.pop(sequence)
+        flight = self._pending_reads.pop(sequence)
         lost = self._lost[flight.offset] = self._lost.get(flight.offset, 0) + 1
         self._retries.timed_out(lost)
         is_silence = self._line.heard_at < flight.sent_at

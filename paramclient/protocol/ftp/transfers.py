@@ -103,13 +103,13 @@ class FileChecksums(FileTransferJob[tuple[int | None, ...]]):
         self._paths = [path_bytes(path) for path in paths]
         self._found: dict[int, int | None] = {}
         self._waiting = deque(range(len(paths)))
-        self._flights: dict[int, tuple[int, FileAttempts]] = {}  # by sequence number of the request
+        self._pending_reads: dict[int, tuple[int, FileAttempts]] = {}  # by sequence number of the request
 
     def begin(self, now: float) -> None:
         self._go_on(now)
 
     def take(self, packet: Packet, now: float) -> None:
-        flight = self._flights.pop((packet.sequence - 1) & 0xFFFF, None)
+        flight = self._pending_reads.pop((packet.sequence - 1) & 0xFFFF, None)
         if flight is None or self.is_ended:
             return
         number, attempts = flight
@@ -119,7 +119,7 @@ class FileChecksums(FileTransferJob[tuple[int | None, ...]]):
         self._go_on(now)
 
     def tick(self, now: float) -> None:
-        for sequence, (number, attempts) in list(self._flights.items()):
+        for sequence, (number, attempts) in list(self._pending_reads.items()):
             if attempts.due_at <= now and not self.is_ended:
                 attempts.timed_out()
                 if attempts.should_give_up(now):
@@ -130,23 +130,23 @@ class FileChecksums(FileTransferJob[tuple[int | None, ...]]):
     def next_deadline(self) -> float:
         if self.is_ended:
             return math.inf
-        return min((attempts.due_at for _, attempts in self._flights.values()), default=math.inf)
+        return min((attempts.due_at for _, attempts in self._pending_reads.values()), default=math.inf)
 
     def resume(self, now: float) -> None:
-        for sequence, (number, attempts) in self._flights.items():
+        for sequence, (number, attempts) in self._pending_reads.items():
             attempts.restart()
             self._transmit_flight(sequence, number, attempts, now)
 
     def _go_on(self, now: float) -> None:
         while self._waiting:
             attempts = FileAttempts(self._line.retry, self._line, is_slow=True)
-            if len(self._flights) >= CHECKSUMS_IN_FLIGHT_MAX // attempts.copies:
+            if len(self._pending_reads) >= CHECKSUMS_IN_FLIGHT_MAX // attempts.copies:
                 break
             number = self._waiting.popleft()
             sequence = self._line.next_sequence()
-            self._flights[sequence] = number, attempts
+            self._pending_reads[sequence] = number, attempts
             self._transmit_flight(sequence, number, attempts, now)
-        if not self._flights:
+        if not self._pending_reads:
             self.finish(tuple(self._found[number] for number in range(len(self._paths))), now)
 
     def _transmit_flight(self, sequence: int, number: int, attempts: FileAttempts, now: float) -> None:

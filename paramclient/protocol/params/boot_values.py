@@ -88,7 +88,7 @@ class BootValues(Machine):
             self._read_at = now + FETCH_CHECK_INTERVAL
             return
         self._read_at = math.inf
-        if self._sync.wants_start_values and not self._sync.fetch_quick_file(now):
+        if self._sync.wants_boot_values and not self._sync.fetch_quick_file(now):
             self._waiting = deque(name for name in self._table.params if _MEASURED.fullmatch(name))
             self._ask(now)
 

@@ -70,8 +70,8 @@ class DuplicateNameReads(Operation[None]):
         self._open: dict[str, Read] = {}
         self._answers: dict[str, list[int]] = {}
         first_at = now + max(policy.timeout, READ_DELAY_MIN)
-        self._ask_at = dict.fromkeys(sorted(names.keys() | table.passed_over.keys()), first_at)
-        table.passed_over.clear()
+        self._ask_at = dict.fromkeys(sorted(names.keys() | table.duplicate_indices.keys()), first_at)
+        table.duplicate_indices.clear()
 
     def tick(self, now: float) -> None:
         """Read, once earlier reads are over."""
@@ -119,7 +119,7 @@ class DuplicateNameReads(Operation[None]):
             answers = self._answers.setdefault(name, [])
             answers.append(read.result.param_index)
             if answers[-EQUAL_RESPONSES_MIN:] == [read.result.param_index] * EQUAL_RESPONSES_MIN:
-                self._table.passed_over[name] = frozenset(self.names[name]) - {read.result.param_index}
+                self._table.duplicate_indices[name] = frozenset(self.names[name]) - {read.result.param_index}
             elif len(answers) < RESPONSES_MAX:
                 self._ask_at[name] = read.ended_at + RESPONSE_PAUSE
         if not self._open and not self._ask_at:

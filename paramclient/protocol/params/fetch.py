@@ -90,13 +90,13 @@ class Fetch(Operation[FetchResult]):
         check: the options of a fetch that only the watch has requested; None where a caller waits for the
             table.
         first_value_at: when a list download received its first value; infinity before.
-        begun_anew_at: when the fetch restarted because the component seemed to have restarted; minus infinity
+        restarted_at: when the fetch restarted because the component seemed to have restarted; minus infinity
             where it did not.
     """
 
     def __init__(
         self,
-        means: FetchContext,
+        fetch_context: FetchContext,
         now: float,
         *,
         announced: Announcement | None,
@@ -109,12 +109,12 @@ class Fetch(Operation[FetchResult]):
         sampled: Sampled | None,
     ) -> None:
         super().__init__(now)
-        self._means = means
-        self._context = means.context
-        self._target = means.context.target
-        self._open_retries = OpenRetries(means.context.retry)
-        self._reads = means.reads
-        table = self._table = means.table
+        self._fetch_context = fetch_context
+        self._context = fetch_context.context
+        self._target = fetch_context.context.target
+        self._open_retries = OpenRetries(fetch_context.context.retry)
+        self._reads = fetch_context.reads
+        table = self._table = fetch_context.table
         self._may_use_file = may_use_file
         self._present: Mapping[int, str] | None = None  # the values with which a list would resume
         self._list_pace: ListPace | None = None  # while another station has a file open
@@ -133,10 +133,10 @@ class Fetch(Operation[FetchResult]):
         self._listed = listed
         self._by_list = by_list
         self.check = check
-        self._policy = policy
+        self._fetch_policy = policy
         self._restarts = 0
         self._download_begun_at = now
-        self.begun_anew_at = -math.inf
+        self.restarted_at = -math.inf
         self.holders = 0
         self.download: ListDownload | None = None
         self.file: FileDownload | None = None
@@ -170,7 +170,7 @@ class Fetch(Operation[FetchResult]):
         download = self.download
         if download is None:
             if not self._reads.awaits(message):  # otherwise it is the response to our request
-                self._means.following.heard(message, now)
+                self._fetch_context.foreign_list.heard(message, now)
         elif not download.done:
             if self.first_value_at > now:
                 self.first_value_at = now
@@ -182,7 +182,7 @@ class Fetch(Operation[FetchResult]):
                 self._ask_hash(self._hash_came_meanwhile, now)
 
     def tick(self, now: float) -> None:
-        self.look(now)
+        self.check_file(now)
         if self._repeated is not None:
             self._repeated.tick(now)
         if self._list_pace is not None:
@@ -196,7 +196,7 @@ class Fetch(Operation[FetchResult]):
         deadline = self._list_due_at if self.download is None else self.download.next_deadline()
         return deadline if self._list_pace is None else min(deadline, self._list_pace.next_deadline())
 
-    def look(self, now: float) -> None:
+    def check_file(self, now: float) -> None:
         """Check the state of the file: the component may have none, or the list may be faster."""
         if self.file is not None:
             self.file.look(now)
@@ -218,7 +218,7 @@ class Fetch(Operation[FetchResult]):
             if file.blocked_until is not None and self._list_pace is None:
                 self._measure_list(now)
             elif self._list_due_at <= now:
-                self._begin_list_beside(now)
+                self._begin_list_in_parallel(now)
 
     def doubt(self) -> None:
         """Record that what was announced before proves nothing: changes may have been missed."""
@@ -230,7 +230,7 @@ class Fetch(Operation[FetchResult]):
             self.download.resume(now)
 
     @property
-    def is_about_the_cache(self) -> bool:
+    def may_end_with_cache(self) -> bool:
         """Whether it is still open if the cached table is enough."""
         return not self._has_begun or (self.download is not None and self.download.resumed > 0)
 
@@ -240,7 +240,7 @@ class Fetch(Operation[FetchResult]):
         return self._sampling is not None
 
     @property
-    def is_under_way(self) -> bool:
+    def is_receiving(self) -> bool:
         """Whether parameters were received, which are stale if the vehicle restarts."""
         return self._has_begun or self.is_sampling
 
@@ -276,13 +276,13 @@ class Fetch(Operation[FetchResult]):
         """
         if self.done or not self._has_begun or silent_since - self._download_begun_at > REPEATED_TIME_MAX:
             return False
-        self.begun_anew_at = now
+        self.restarted_at = now
         self.restart(now)
         return True
 
     def finish(self, result: FetchResult, now: float) -> None:
         """End with a result, as soon as no unused file session is open on board."""
-        files = self._means.files
+        files = self._fetch_context.files
         if not files.has_idle_session:
             super().finish(result, now)
         else:
@@ -394,7 +394,7 @@ class Fetch(Operation[FetchResult]):
         table.count = announcement.count
         table.verify()
         notes = () if table.volatile_known else (UNPROVEN,)
-        if self._policy is Policy.HASH_ONLY:
+        if self._fetch_policy is Policy.HASH_ONLY:
             notes = (NOT_REFRESHED,) if table.unhashed() else ()
         self.finish(self._result("cache", announcement.count, (), announcement.hash, now, notes), now)
 
@@ -429,14 +429,14 @@ class Fetch(Operation[FetchResult]):
         self._begin_download(now, present=present_of(self._table, self._reads))
 
     def _begin_download(self, now: float, present: Mapping[int, str] | None = None) -> None:
-        if self._policy is not Policy.AUTO:
+        if self._fetch_policy is not Policy.AUTO:
             self._stay_with_cache(now)
             return
-        means = self._means
+        fetch_context = self._fetch_context
         self._has_begun = True
         self._download_begun_at = now
         self._present = present
-        means.doubt(now)
+        fetch_context.doubt(now)
         may_use_file = self._is_file_check or self._may_use_file()
         if self._listed or self._by_list or self._had_no_file or not may_use_file:
             self._begin_list(now)
@@ -446,10 +446,10 @@ class Fetch(Operation[FetchResult]):
             # once and before the file, so that the response belongs to the time before it
             self._context.send(ParamRequestRead(*self._target, HASH_CHECK, -1))
         file = self.file = FileDownload(
-            means.files,
-            means.turns,
-            means.table,
-            means.changed,
+            fetch_context.files,
+            fetch_context.list_admission,
+            fetch_context.table,
+            fetch_context.changed,
             now,
             context=self._context,
             yields=self.check is not None,
@@ -476,17 +476,17 @@ class Fetch(Operation[FetchResult]):
         """Measure whether the list is faster than waiting for the end of another station's session."""
         gap, count = self._reads.pace.gap, self._table.count
         if gap and count:
-            self._choose(count * gap, now)
+            self._choose_list_or_file(count * gap, now)
             return
         pace = self._list_pace = ListPace(self._reads, now)
 
         def ended() -> None:
             if self._list_pace is pace and pace.result is not None:
-                self._choose(pace.result, pace.ended_at)
+                self._choose_list_or_file(pace.result, pace.ended_at)
 
         pace.on_done.append(ended)
 
-    def _choose(self, list_takes: float, now: float) -> None:
+    def _choose_list_or_file(self, list_takes: float, now: float) -> None:
         """Request the list if it is faster than the file will be."""
         file = self.file
         if file is None or file.blocked_until is None or self.download is not None:
@@ -500,31 +500,31 @@ class Fetch(Operation[FetchResult]):
         )
         if list_takes <= file_takes:
             self._was_in_use = True
-            self._begin_list_beside(now)
+            self._begin_list_in_parallel(now)
 
-    def _begin_list_beside(self, now: float) -> None:
+    def _begin_list_in_parallel(self, now: float) -> None:
         """Request the list while the file is not served."""
         assert self.file is not None
         self.file.give_way()
         self._begin_list(now)
 
     def _begin_list(self, now: float) -> None:
-        means, present = self._means, self._present
+        fetch_context, present = self._fetch_context, self._present
         self._context.trace("%s/%s: the list is wanted, %s there", *self._target, len(present or ()))
-        count, following = self._table.count, means.following
-        if not self._listed and following.is_running(now):
+        count, foreign_list = self._table.count, fetch_context.foreign_list
+        if not self._listed and foreign_list.is_running(now):
             # another station has requested it: another request would restart it for both
-            followed, of = following.hand_over(means.reads)
+            followed, of = foreign_list.hand_over(fetch_context.reads)
             present, count = {**(present or {}), **followed} if of == count else followed, of
         download = self.download = ListDownload(
             self._context,
-            means.reads,
-            means.turns,
+            fetch_context.reads,
+            fetch_context.list_admission,
             now,
             listed=self._listed,
             count=count,
             present=present,
-            beside_file=self.file is not None,
+            parallel_to_file=self.file is not None,
         )
         if download.done:
             self._download_ended(download)
@@ -569,7 +569,7 @@ class Fetch(Operation[FetchResult]):
         if not self._was_in_use:
             self._notes += (NO_FILE.format(file.error),)
         if self.download is not None:
-            self.download.go_on(now)
+            self.download.request_missing(now)
         elif self._list_error is not None:
             self.fail(self._list_error, now)
         elif self._present is not None:
@@ -592,10 +592,12 @@ class Fetch(Operation[FetchResult]):
         table = self._table
         if not table.params:
             whose = "/".join(map(str, self._target))
-            self.fail(CacheError(f"nothing is cached of {whose}, and the policy is {self._policy}"), now)
+            self.fail(
+                CacheError(f"nothing is cached of {whose}, and the policy is {self._fetch_policy}"), now
+            )
             return
         count, missing = table.gaps()
-        note = NOT_ASKED if self._policy is Policy.CACHE_ONLY else NOT_CONFIRMED
+        note = NOT_ASKED if self._fetch_policy is Policy.CACHE_ONLY else NOT_CONFIRMED
         self.finish(self._result("cache", count, missing, None, now, (note,)), now)
 
     def _download_ended(self, download: ListDownload) -> None:
@@ -629,7 +631,7 @@ class Fetch(Operation[FetchResult]):
         """Return whether reads of repeated names are still open."""
         if self._repeated is None:
             names = repeated_names(download.names)
-            if not (names or self._table.passed_over):
+            if not (names or self._table.duplicate_indices):
                 return False
             self._repeated = DuplicateNameReads(
                 names, self._context.retry, self._reads, self._table, download.ended_at
@@ -641,18 +643,18 @@ class Fetch(Operation[FetchResult]):
         """Return whether a hash announced during the download proves the table."""
         if download.missing or not download.is_settled:
             return False
-        self._remove_what_is_gone(download)
+        self._remove_unlisted(download)
         return self._proof.is_given(download.count or 0)
 
-    def _remove_what_is_gone(self, download: ListDownload) -> None:
-        self._means.changed(self._table.settle(download.names))
+    def _remove_unlisted(self, download: ListDownload) -> None:
+        self._fetch_context.changed(self._table.settle(download.names))
 
     def _settle(self, download: ListDownload, read: Read | None, now: float) -> None:
         """End the fetch: the download is over and the hash, if there is one, is known."""
         after = None if read is None else Announcement.answering(read)
         notes: tuple[str, ...] = ()
         if not download.missing:
-            self._remove_what_is_gone(download)
+            self._remove_unlisted(download)
             if not download.is_settled:
                 notes = (UNSETTLED,)
             self._table.unconfirm()

@@ -24,10 +24,10 @@ class Fetches(Machine):
     """The last fetch, the one in progress, and what may be fetched.
 
     Args:
-        means: the objects that each fetch uses.
+        fetch_context: the objects that each fetch uses.
         sync: the component's.
-        upkeep: what may be requested.
-        check_pace: receives the duration of fetches.
+        sync_settings: what may be requested.
+        sync_interval: receives the duration of fetches.
         ended: called with each result for which the vehicle has sent something of its table.
 
     Attributes:
@@ -40,10 +40,10 @@ class Fetches(Machine):
 
     def __init__(
         self,
-        means: FetchContext,
+        fetch_context: FetchContext,
         sync: Sync,
-        upkeep: SyncSettings,
-        check_pace: SyncInterval,
+        sync_settings: SyncSettings,
+        sync_interval: SyncInterval,
         *,
         ended: Callable[[FetchResult], None],
     ) -> None:
@@ -51,15 +51,17 @@ class Fetches(Machine):
         self.last: FetchResult | None = None
         self.file_works: bool | None = None
         self.is_same_firmware = False
-        self._means = means
+        self._fetch_context = fetch_context
         self._sync = sync
-        self._policy = upkeep.policy
+        self._fetch_policy = sync_settings.policy
         self.overheard: PassiveTable | None = None
-        if upkeep.listens_only:
-            self.overheard = PassiveTable(means, sync, whole=self._passive_ended, is_log=upkeep.is_log)
+        if sync_settings.listens_only:
+            self.overheard = PassiveTable(
+                fetch_context, sync, whole=self._passive_ended, is_log=sync_settings.is_log
+            )
         self._ended = ended
-        self._check_pace = check_pace
-        self._begun_anew_at = -math.inf  # of the last fetch
+        self._sync_interval = sync_interval
+        self._restarted_at = -math.inf  # of the last fetch
 
     @property
     def current(self) -> Fetch | None:
@@ -69,7 +71,7 @@ class Fetches(Machine):
     @current.setter
     def current(self, fetch: Fetch | None) -> None:
         self._current = fetch
-        self._means.context.is_fetching = fetch is not None
+        self._fetch_context.context.is_fetching = fetch is not None
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -79,7 +81,7 @@ class Fetches(Machine):
     def may_use_file(self) -> bool:
         """Return whether to request the file: the table has come as one, or the component says that it serves
         it."""
-        return self._means.context.serves_file if self.file_works is None else self.file_works
+        return self._fetch_context.context.serves_file if self.file_works is None else self.file_works
 
     def begin(
         self,
@@ -106,25 +108,25 @@ class Fetches(Machine):
         if fetch is not None and check is None:
             fetch.check = None
         if fetch is not None and (
-            (refresh and fetch.is_about_the_cache) or (sampled is None and fetch.is_sampling)
+            (refresh and fetch.may_end_with_cache) or (sampled is None and fetch.is_sampling)
         ):
             fetch.restart(now)
-        may_sample = self.is_same_firmware and self._policy is Policy.AUTO and not self._sync.is_doubted
+        may_sample = self.is_same_firmware and self._fetch_policy is Policy.AUTO and not self._sync.is_doubted
         if fetch is None and self.overheard is not None:
-            fetch = self.current = PassiveFetch(self._means, self.overheard, now)
+            fetch = self.current = PassiveFetch(self._fetch_context, self.overheard, now)
             if fetch.done:
                 self._overhearing_ended(fetch)
             else:
                 fetch.on_done.append(partial(self._overhearing_ended, fetch))
         elif fetch is None:
             fetch = self.current = Fetch(
-                self._means,
+                self._fetch_context,
                 now,
                 announced=self._sync.announced,
                 refresh=refresh,
                 listed=listed,
                 by_list=by_list,
-                policy=self._policy,
+                policy=self._fetch_policy,
                 may_use_file=self.may_use_file,
                 check=check,
                 sampled=sampled if may_sample else None,
@@ -186,8 +188,8 @@ class Fetches(Machine):
     def are_since(self, started_at: float) -> bool:
         """Return whether the whole table was fetched since the component's boot then, or is about to be."""
         fetch = self.current
-        begun_anew_at = self._begun_anew_at if fetch is None else fetch.begun_anew_at
-        return begun_anew_at >= started_at - BOOT_TIME_TOLERANCE
+        restarted_at = self._restarted_at if fetch is None else fetch.restarted_at
+        return restarted_at >= started_at - BOOT_TIME_TOLERANCE
 
     def forget(self) -> None:
         """Forget everything: another vehicle uses the address."""
@@ -195,12 +197,12 @@ class Fetches(Machine):
             self.overheard.file.forget()
             self.overheard.forget()
         self.file_works = None
-        self._check_pace.forget()
+        self._sync_interval.forget()
         self.is_same_firmware = False
 
     def updated(self, now: float) -> None:
         """Forget what depends on the firmware, as samples of the old one do: it has changed."""
-        self._means.table.forget_defaults()
+        self._fetch_context.table.forget_defaults()
         self.forget()
         if self.current is not None and self.current.is_sampling:
             self.current.restart(now)
@@ -227,15 +229,17 @@ class Fetches(Machine):
 
     def _fetch_ended(self, fetch: Fetch) -> None:
         self.current = None
-        self._means.context.trace("%s/%s: %r", *self._means.context.target, fetch.result or fetch.error)
+        self._fetch_context.context.trace(
+            "%s/%s: %r", *self._fetch_context.context.target, fetch.result or fetch.error
+        )
         if fetch.file_failed is not None:
             self.file_works = not fetch.file_failed
         result = fetch.result
         is_whole = result is not None and result.complete
-        self._begun_anew_at = fetch.begun_anew_at if is_whole else -math.inf
+        self._restarted_at = fetch.restarted_at if is_whole else -math.inf
         if result is None:
             return
         self.last = result
-        self._check_pace.fetched(result, fetch.queue_wait(fetch.ended_at))
+        self._sync_interval.fetched(result, fetch.queue_wait(fetch.ended_at))
         if self._sync.fetched(result, fetch.ended_at):
             self._ended(result)

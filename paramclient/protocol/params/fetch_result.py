@@ -46,20 +46,20 @@ class FetchContext:
     """The objects of the component that a fetch uses.
 
     Attributes:
-        context, reads, table, turns, files: as their names say.
+        context, reads, table, list_admission, files: as their names say.
         changed: called with changes that no PARAM_VALUE brought.
         doubt: called when a table turns out to have changed.
-        following: the list that another station may have requested.
+        foreign_list: the list that another station may have requested.
     """
 
     context: Context
     reads: Reads
     table: Table
-    turns: ListAdmission
+    list_admission: ListAdmission
     files: FileTransfers
     changed: Callable[[list[Change]], None]
     doubt: Callable[[float], None]
-    following: ForeignList
+    foreign_list: ForeignList
 
 
 @dataclass(frozen=True, slots=True)

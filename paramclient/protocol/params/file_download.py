@@ -41,7 +41,7 @@ class FileDownload(Operation[None]):
 
     Args:
         files: the component's.
-        turns: those of the link.
+        list_admission: those of the link.
         table: the table to fill.
         changed: called with the changes.
         now: the time.
@@ -60,7 +60,7 @@ class FileDownload(Operation[None]):
     def __init__(
         self,
         files: FileTransfers,
-        turns: ListAdmission,
+        list_admission: ListAdmission,
         table: Table,
         changed: Callable[[list[Change]], None],
         now: float,
@@ -72,7 +72,7 @@ class FileDownload(Operation[None]):
         self._context = context
         self._yields = yields
         self._files = files
-        self._turns = turns
+        self._list_admission = list_admission
         self._table = table
         self._changed = changed
         self._heard: set[str] = set()
@@ -91,7 +91,7 @@ class FileDownload(Operation[None]):
         self.left_out: tuple[int, ...] = ()
         self._count: int | None = None
         self._waits_since: float | None = now
-        turns.ask(self, now)
+        list_admission.ask(self, now)
 
     @property
     def is_silent(self) -> bool:
@@ -134,7 +134,7 @@ class FileDownload(Operation[None]):
 
     def give_way(self) -> None:
         """Let a list of the same component run in parallel, as long as nothing of the file is received."""
-        self._turns.release(self)
+        self._list_admission.release(self)
 
     def seen(self) -> ListStatistics:
         """Return the statistics in messages: a burst that is repaired separately skips nothing."""
@@ -182,7 +182,7 @@ class FileDownload(Operation[None]):
     def cancel(self, now: float, *, is_served: bool = True) -> None:
         """Cancel the download; the file is closed on board, where the component serves files."""
         job, self._job = self._job, None
-        self._turns.release(self)
+        self._list_admission.release(self)
         if job is not None:
             self._files.release(job, now, is_served=is_served)
 
@@ -232,7 +232,7 @@ class FileDownload(Operation[None]):
         except PackError as error:
             self._is_none(error, now, is_useless=True)
             return
-        self._turns.release(self)
+        self._list_admission.release(self)
         self._fill(pack)
         self.finish(None, now)
 
@@ -240,7 +240,7 @@ class FileDownload(Operation[None]):
         if isinstance(error, FileTransferError):
             self.is_useless = error.is_not_found or error.code == FileErrorCode.UNKNOWN_COMMAND
             self.is_in_use = error.code in BUSY
-        self._turns.release(self)
+        self._list_admission.release(self)
         self.fail(error, now)
 
     def _is_none(self, error: PackError, now: float, *, is_useless: bool = False) -> None:
@@ -249,7 +249,7 @@ class FileDownload(Operation[None]):
             self._read(now)
             return
         self.is_useless = is_useless
-        self._turns.release(self)
+        self._list_admission.release(self)
         self.fail(error, now)
 
     def _fill(self, pack: Pack) -> None:
@@ -261,9 +261,10 @@ class FileDownload(Operation[None]):
         )
         changes += table.remove(
             lambda param: (
-                param.name not in present and (param.index is not None or param.name in table.displaced)
+                param.name not in present
+                and (param.index is not None or param.name in table.outdated_indices)
             )
         )
-        table.displaced.clear()
+        table.outdated_indices.clear()
         table.count = self._count = pack.total
         self._changed(changes)

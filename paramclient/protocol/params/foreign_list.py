@@ -8,7 +8,7 @@ from typing import Final
 
 from paramclient.protocol.params.list_stream import JUMP_MAX
 from paramclient.protocol.params.reads import Reads
-from paramclient.protocol.requests.retry import QUIET_GAPS, STREAM_PAUSE_MAX
+from paramclient.protocol.requests.retry import LIST_END_GAPS, STREAM_PAUSE_MAX
 from paramclient.protocol.wire import NO_INDEX, ParamValue
 
 __all__ = ["ForeignList"]
@@ -74,4 +74,4 @@ class ForeignList:
     @property
     def _quiet(self) -> float:
         """Seconds without a value after which it is over."""
-        return max(QUIET_GAPS * self._longest, STREAM_PAUSE_MAX)
+        return max(LIST_END_GAPS * self._longest, STREAM_PAUSE_MAX)

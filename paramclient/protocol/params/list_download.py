@@ -73,11 +73,11 @@ class ListDownload(Operation[None]):
     to belong to another count or to other names, they are discarded.
 
     Args:
-        context, reads, turns, now: as their names say.
+        context, reads, list_admission, now: as their names say.
         listed: whether the list was requested already.
         count, present: the values of an earlier download: param_count and names by index.
-        beside_file: whether a file was requested that may still bring everything. Then no pass is requested
-            before the end of the previous one.
+        parallel_to_file: whether a file was requested that may still bring everything. Then no pass is
+            requested before the end of the previous one.
 
     Attributes:
         count: the vehicle's param_count; None before the first value.
@@ -95,21 +95,21 @@ class ListDownload(Operation[None]):
         self,
         context: Context,
         reads: Reads,
-        turns: ListAdmission,
+        list_admission: ListAdmission,
         now: float,
         *,
         listed: bool = False,
         count: int | None = None,
         present: Mapping[int, str] | None = None,
-        beside_file: bool = False,
+        parallel_to_file: bool = False,
     ) -> None:
         super().__init__(now)
         self._target = context.target
-        self._policy = context.retry
+        self._retry_policy = context.retry
         self._round_trip = context.round_trip
         self._send = context.send
         self._reads = reads
-        self._turns = turns
+        self._list_admission = list_admission
         self.count = count if present else None
         self.names = dict(present or {})
         self.resumed = len(self.names)
@@ -118,12 +118,12 @@ class ListDownload(Operation[None]):
         self._lost: set[int] = set()
         self.lists = 0
         self.gives_way = False
-        self._is_beside_file = beside_file
+        self._is_parallel_to_file = parallel_to_file
         self.queue_time = 0.0
         self.held_since: float | None = None
         self._passes = 1
         self._empty_passes = 0
-        self._moves = 0
+        self._count_changes = 0
         self._stream = ListStream(now)
         self._asked: dict[int, Read] = {}
         self._next = 0  # below it, every missing index was requested since the end of the list
@@ -144,9 +144,9 @@ class ListDownload(Operation[None]):
             self.lists = 1
             self._request.was_sent()
             self._silent_at = self._request.due_at
-            turns.has_begun(self)
+            list_admission.has_begun(self)
         elif present:
-            self._go_on(now)
+            self._resume_download(now)
         else:
             self._ask_for_turn(now)
 
@@ -171,7 +171,7 @@ class ListDownload(Operation[None]):
     @property
     def is_settled(self) -> bool:
         """Whether the count has stopped changing."""
-        return self._moves < COUNT_CHANGES_MAX
+        return self._count_changes < COUNT_CHANGES_MAX
 
     @property
     def progress(self) -> tuple[int, int | None]:
@@ -238,7 +238,7 @@ class ListDownload(Operation[None]):
         elif self.resumed and self._contradicts(index, name) and count == self.count:
             self._start_over(count)
             self._ask_for_another_pass(now)
-        elif count != self.count and self._moves < COUNT_CHANGES_MAX:
+        elif count != self.count and self._count_changes < COUNT_CHANGES_MAX:
             if index in self._asked or not self._is_streaming:
                 self._other_count = count
                 return
@@ -277,9 +277,9 @@ class ListDownload(Operation[None]):
             self._request.head_heard(now)
             self._silent_at = self._request.due_at
 
-    def go_on(self, now: float) -> None:
+    def request_missing(self, now: float) -> None:
         """Request what is missing: the file will not bring it."""
-        self.gives_way = self._is_beside_file = False
+        self.gives_way = self._is_parallel_to_file = False
         self.tick(now)
 
     def tick(self, now: float) -> None:
@@ -288,7 +288,7 @@ class ListDownload(Operation[None]):
             return
         if self.count is None:
             if self._request.due_at <= now and not self.gives_way:
-                if self._turns.is_beside_others(self):
+                if self._list_admission.is_parallel_to_others(self):
                     self._request.patient_since = now  # the vehicle may have no bandwidth to answer
                 if self._request.should_give_up(now):
                     self._end_unanswered(now)
@@ -320,7 +320,7 @@ class ListDownload(Operation[None]):
         """Repeat what could not be sent: the link is back."""
         self._request.resume(now)
         self._stream.heard_at = now
-        self._silent_at = now + self._policy.timeout
+        self._silent_at = now + self._retry_policy.timeout
 
     def cancel(self) -> None:
         """Cancel the download; a running list goes on and still fills the table."""
@@ -335,12 +335,12 @@ class ListDownload(Operation[None]):
     @property
     def _quiet_at(self) -> float:
         """When a list without further values counts as over."""
-        timeout = self._policy.timeout
+        timeout = self._retry_policy.timeout
         if self._stream.is_awaited and self._passes > 1:
             timeout = min(timeout, self._list_timeout)
         stream = self._stream
         quiet_at = stream.quiet_at(timeout, (self.count or 0) - 1 - stream.front)
-        if stream.is_bursty and self._turns.is_beside_others(self):
+        if stream.is_bursty and self._list_admission.is_parallel_to_others(self):
             # on a link this fast, the cause of a pause is this program or the vehicle
             return max(quiet_at, stream.heard_at + max(LIST_SILENCE_MIN, timeout))
         return quiet_at
@@ -348,11 +348,11 @@ class ListDownload(Operation[None]):
     def _note_answer(self, now: float) -> None:
         if not self._is_answered and self.lists:
             self._is_answered = True
-            self._policy.answered(self._request.sent_at, now, self.lists)
+            self._retry_policy.answered(self._request.sent_at, now, self.lists)
             if self.lists == 1:
                 self._list_timeout = self._request.later_timeout(now - self._request.sent_at)
 
-    def _go_on(self, now: float) -> None:
+    def _resume_download(self, now: float) -> None:
         """Read what is missing, unless a running list will bring it."""
         assert self.count is not None
         self._stream.gap = self._reads.pace.gap or LIST_TIME_ASSUMED / self.count
@@ -373,7 +373,7 @@ class ListDownload(Operation[None]):
 
     def _ask_for_turn(self, now: float) -> None:
         self.held_since = now
-        self._turns.ask(self, now)
+        self._list_admission.ask(self, now)
 
     def _ask_for_list(self, now: float) -> None:
         self._request.sent(now)
@@ -429,8 +429,8 @@ class ListDownload(Operation[None]):
         stream = self._stream
         stream.measure()
         if stream.is_at_pace:
-            came, passed, _, is_bursty = stream.seen()
-            loss = 1 - came / passed if passed else 0.0
+            received, covered, _, is_bursty = stream.seen()
+            loss = 1 - received / covered if covered else 0.0
             self._round_trip.list_loss = 1.0 - (1.0 - loss) ** 2
             gain = PACED_GAIN if self._reads.pace.is_batched else 1.0
             self._reads.pace.stream_seen(stream.gap, loss, BURST_GAIN if is_bursty else gain)
@@ -443,7 +443,7 @@ class ListDownload(Operation[None]):
         self._reads.is_idle = True
         self.held_since = None
         self._reads.pace.stream_ended()
-        self._turns.release(self, is_cut=is_cut)
+        self._list_admission.release(self, is_cut=is_cut)
 
     def _start_over(self, count: int | None) -> None:
         """Start again: the count has changed, and earlier indices may mean other parameters now."""
@@ -451,7 +451,7 @@ class ListDownload(Operation[None]):
             self._learn_pace()
         self._forget_reads()
         self._ahead_at = None
-        self._moves += 1
+        self._count_changes += 1
         self.count = count
         self.names.clear()
         self._lost.clear()
@@ -485,7 +485,7 @@ class ListDownload(Operation[None]):
             self._lost.update(self.missing)
             self._ask_for_another_pass(now)
         else:
-            self._ask_in_order(count, now)
+            self._read_missing_below(count, now)
 
     @property
     def _ending_at(self) -> float:
@@ -514,14 +514,14 @@ class ListDownload(Operation[None]):
         passed_over = sum(index < front for index in missing)
         to_be_lost = round(self._stream_loss * (len(missing) - passed_over))
         if self._asked or not self._another_pass_is_faster(passed_over + to_be_lost):
-            self._ask_in_order(front, now)
-        elif not self._is_beside_file:
+            self._read_missing_below(front, now)
+        elif not self._is_parallel_to_file:
             self._ahead_at = now
             self._request_list()
 
-    def _ask_in_order(self, stop: int, now: float) -> None:
+    def _read_missing_below(self, end: int, now: float) -> None:
         """Read what is missing below an index and was not requested."""
-        while len(self._asked) < REQUESTED_INDICES_MAX and self._next < stop:
+        while len(self._asked) < REQUESTED_INDICES_MAX and self._next < end:
             index = self._next
             self._next += 1
             if not (index in self.names or index in self.given_up or index in self._asked):
@@ -530,9 +530,9 @@ class ListDownload(Operation[None]):
     def _another_pass_is_faster(self, missing: int) -> bool:
         if self.count is None or self._passes >= LISTS_MAX or missing <= MISSING_WITHOUT_LIST_MAX:
             return False
-        if self._empty_passes >= EMPTY_LISTS_MAX or not self._turns.is_free:
+        if self._empty_passes >= EMPTY_LISTS_MAX or not self._list_admission.is_free:
             return False
-        trip = self._round_trip.smoothed or self._policy.timeout
+        trip = self._round_trip.smoothed or self._retry_policy.timeout
         by_pass = self.count * self._stream.gap + trip + self._time_to_read(missing * self._stream_loss)
         if self._reads.pace.is_batched:
             by_pass += len(self._asked) / self._reads.pace.prospect  # the vehicle serves them before its list
@@ -541,8 +541,8 @@ class ListDownload(Operation[None]):
     @property
     def _stream_loss(self) -> float:
         """The packet loss of the last pass, as a share of its values."""
-        came, passed, _, _ = self._stream.seen()
-        return 1.0 - came / passed if passed else 0.0
+        received, covered, _, _ = self._stream.seen()
+        return 1.0 - received / covered if covered else 0.0
 
     def _time_to_read(self, missing: float) -> float:
         """Return the seconds for this many single reads, by the rate and the loss measured on this link.
@@ -550,10 +550,10 @@ class ListDownload(Operation[None]):
         The last one to be answered needs about as many attempts as would lose all of them.
         """
         if missing < 1.0:
-            return missing * self._policy.timeout
+            return missing * self._retry_policy.timeout
         loss = min(max(self._round_trip.seen_loss, 1.0 - (1.0 - self._stream_loss) ** 2), LOSS_MAX)
         tries = math.log(missing) / -math.log(loss) if loss > 0.0 else 0.0
-        return missing / (self._reads.pace.prospect * (1.0 - loss)) + tries * self._policy.timeout / 2
+        return missing / (self._reads.pace.prospect * (1.0 - loss)) + tries * self._retry_policy.timeout / 2
 
     def _ask(self, index: int, now: float) -> None:
         self._lost.add(index)
@@ -575,13 +575,15 @@ class ListDownload(Operation[None]):
     def _unanswered(self, index: int, read: Read) -> None:
         """Decide after an unanswered read whether to repeat it or to give it up."""
         now = read.ended_at
-        if isinstance(read.error, NoReply) and read.begun_at <= self._turns.beside_others_at(self):
+        if isinstance(read.error, NoReply) and read.begun_at <= self._list_admission.parallel_to_others_at(
+            self
+        ):
             self._reads.reset_timeouts()  # the vehicle may have had no bandwidth to answer
         elif not isinstance(read.error, NoReply) or self._seems_dead(index, read):
             self.given_up.add(index)
             return
-        elif self._policy.is_gone(now) or self._reads.is_silent(now):
-            self._give_up_the_rest()
+        elif self._retry_policy.is_silent_too_long(now) or self._reads.is_silent(now):
+            self._give_up_missing()
         self._next = min(self._next, index)
 
     def _seems_dead(self, index: int, read: Read) -> bool:
@@ -608,7 +610,7 @@ class ListDownload(Operation[None]):
         else:
             self.finish(None, now)  # every missing index was requested and given up
 
-    def _give_up_the_rest(self) -> None:
+    def _give_up_missing(self) -> None:
         """Give up all missing indices: no read was answered while one used up its attempts."""
         if not self._is_streaming and self.count is not None:
             self._forget_reads()

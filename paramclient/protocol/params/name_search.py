@@ -63,7 +63,7 @@ class NameSearches(Machine):
 
     Args:
         context, reads, table: the component's.
-        following: the list that another station may have requested.
+        foreign_list: the list that another station may have requested.
     """
 
     def __init__(
@@ -71,14 +71,14 @@ class NameSearches(Machine):
         context: Context,
         reads: Reads,
         table: KnownParams,
-        following: ForeignList,
+        foreign_list: ForeignList,
     ) -> None:
         self._target = context.target
         self._retries = NameRetries(context.retry)
         self._reads = reads
         self._send = context.send
         self._table = table
-        self._following = following
+        self._foreign_list = foreign_list
         self._searches: deque[NameSearch] = deque()
         self._waiting: deque[str] = deque()  # for this pass
         self._silent: list[str] = []  # for the next one
@@ -94,7 +94,7 @@ class NameSearches(Machine):
         request."""
         reads = self._reads
         is_ours = reads.list_runs_again or not reads.is_idle or now < reads.list_until
-        return is_ours or self._following.is_running(now)
+        return is_ours or self._foreign_list.is_running(now)
 
     def begin(self, names: Iterable[str], now: float) -> NameSearch:
         """Begin a search for names, after the open searches.

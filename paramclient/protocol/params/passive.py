@@ -33,7 +33,7 @@ class PassiveTable:
     hash recomputed from the table is the same.
 
     Args:
-        means: the component's.
+        fetch_context: the component's.
         sync: the component's.
         whole: called each time that the table is complete or confirmed.
         is_log: whether the link is a log, which ends.
@@ -48,7 +48,12 @@ class PassiveTable:
     """
 
     def __init__(
-        self, means: FetchContext, sync: Sync, *, whole: Callable[[FetchResult, float], None], is_log: bool
+        self,
+        fetch_context: FetchContext,
+        sync: Sync,
+        *,
+        whole: Callable[[FetchResult, float], None],
+        is_log: bool,
     ) -> None:
         self.names: dict[int, str] = {}
         self.count: int | None = None
@@ -56,8 +61,8 @@ class PassiveTable:
         self.is_log = is_log
         self.is_over = False
         self.file = FileObserver(self._file_came)
-        self._means = means
-        self._table = means.table
+        self._fetch_context = fetch_context
+        self._table = fetch_context.table
         self._sync = sync
         self._whole = whole
         self._began_at = 0.0
@@ -125,7 +130,7 @@ class PassiveTable:
         table, total = self._table, came.pack.total
         if table.count != total:
             if table.count is not None:
-                self._sync.count_moved(now)
+                self._sync.count_changed(now)
             table.change_count(total)
         entries = {index: entry.name for index, entry in came.entries()}
         is_all = len(entries) == total
@@ -141,7 +146,7 @@ class PassiveTable:
         was_whole = len(self.names) == total
         self.names |= names
         self.news_at = now
-        self._means.changed(table.take_pack(came.pack, came.began_at, came.newer, start=came.start))
+        self._fetch_context.changed(table.take_pack(came.pack, came.began_at, came.newer, start=came.start))
         if len(self.names) == total and not was_whole:
             self._complete("ftp" if is_all else "stream", now)
 
@@ -151,7 +156,7 @@ class PassiveTable:
         self._is_whole = True
         self._source = source
         self.file.notes.clear()
-        self._means.changed(table.settle(self.names))
+        self._fetch_context.changed(table.settle(self.names))
         table.complete = True
         table.count = self.count
         announced = self._sync.announced
@@ -174,7 +179,7 @@ class PassiveTable:
     ) -> FetchResult:
         count = (self.count if self.names else self._table.count) or 0
         return FetchResult(
-            *self._means.context.target,
+            *self._fetch_context.context.target,
             self._table.params.copy(),
             source,
             count,
@@ -194,10 +199,10 @@ class PassiveFetch(Fetch):
     only then the last values are known.
     """
 
-    def __init__(self, means: FetchContext, overheard: PassiveTable, now: float) -> None:
+    def __init__(self, fetch_context: FetchContext, overheard: PassiveTable, now: float) -> None:
         self._overheard = overheard
         super().__init__(
-            means,
+            fetch_context,
             now,
             announced=None,
             refresh=False,

@@ -106,7 +106,8 @@ class ValueReads(Machine, Generic[Response]):
 
     Args:
         context, table: the component's.
-        share: the bandwidth that all reads of the link may use together; None for a link with one component.
+        bandwidth: the bandwidth that all reads of the link may use together; None for a link with one
+            component.
 
     Attributes:
         pace: the rate limit of requests.
@@ -130,7 +131,7 @@ class ValueReads(Machine, Generic[Response]):
         share: LinkBandwidth | None = None,
     ) -> None:
         self._target = context.target
-        self._policy = context.retry
+        self._retry_policy = context.retry
         self._retries = ReadRetries(context.retry)
         self._send = context.send
         self._reschedule = context.reschedule
@@ -170,7 +171,7 @@ class ValueReads(Machine, Generic[Response]):
         """Begin a read, or join an open one of the same parameter. Give it back with `release`."""
         read = self._open.get(key)
         if read is None:
-            read = ValueRead(key, self._policy, now)
+            read = ValueRead(key, self._retry_policy, now)
             self.asked += 1
             self._open[key] = read
             (self._caller_queue if urgent else self._fetch_queue).append(read)
@@ -277,7 +278,7 @@ class ValueReads(Machine, Generic[Response]):
 
     def tick(self, now: float) -> None:
         """Repeat timed-out requests and give up reads that are out of attempts."""
-        timeout = self._policy.timeout
+        timeout = self._retry_policy.timeout
         for read in [read for read in self._in_flight.values() if self._due_at(read) <= now]:
             if self._in_flight.get(read.key) is not read:
                 continue  # ended by the end of another read

@@ -98,7 +98,7 @@ class SyncSettings:
         listen_only: bool = False,
         is_log: bool = False,
     ) -> SyncSettings:
-        """Return the upkeep for a user's choice; see `ParamClient`.
+        """Return the settings for a user's choice; see `ParamClient`.
 
         Raises:
             UsageError: no such policy, the interval is too short, or either is chosen where nothing may be
@@ -144,18 +144,18 @@ class Sync(Machine):
     """Follows the hashes that one component announces, and requests them when changes may have been missed.
 
     The reasons are: a write of ours, which changes the hash; changes by others, of which the vehicle may not
-    have pushed all; a gap in the heartbeats, in which a change may have been lost; and the interval of the
-    upkeep, as a PARAM_VALUE of a change is sent once and never repeated. All but the first apply only to a
-    table that was fetched on this link. Nothing is requested in high-latency mode, or on a link measured to
-    be in a low-bandwidth mode, nor, except after changes, while other requests are in flight.
+    have pushed all; a gap in the heartbeats, in which a change may have been lost; and the interval of
+    `SyncSettings`, as a PARAM_VALUE of a change is sent once and never repeated. All but the first apply only
+    to a table that was fetched on this link. Nothing is requested in high-latency mode, or on a link measured
+    to be in a low-bandwidth mode, nor, except after changes, while other requests are in flight.
 
     With each interval, the values that the hash does not cover are read again. For a component without a hash
-    the file, or the list, is fetched, as often as `check_pace` says.
+    the file, or the list, is fetched, as often as `sync_interval` says.
 
     Args:
         context, reads, table, presence, files: the component's.
-        upkeep: what is done without a request.
-        check_pace: the interval of fetches without a hash.
+        sync_settings: what is done without a request.
+        sync_interval: the interval of fetches without a hash.
         host: the component.
 
     Attributes:
@@ -170,8 +170,8 @@ class Sync(Machine):
         context: Context,
         reads: Reads,
         table: Table,
-        upkeep: SyncSettings,
-        check_pace: SyncInterval,
+        sync_settings: SyncSettings,
+        sync_interval: SyncInterval,
         presence: Presence,
         files: FileTransfers,
         host: SyncHost,
@@ -179,8 +179,8 @@ class Sync(Machine):
         self._context = context
         self._reads = reads
         self._table = table
-        self._upkeep = upkeep
-        self._check_pace = check_pace
+        self._sync_settings = sync_settings
+        self._sync_interval = sync_interval
         self._presence = presence
         self._files = files
         self._host = host
@@ -189,19 +189,19 @@ class Sync(Machine):
         self.refresh: VolatileReads | None = None
         self.holds = 0
         self._was_synced = False  # at any time on this link: checks are for such tables only
-        self._moved_by_us_alone = False
+        self._changed_only_by_us = False
         self._settle_at = math.inf  # when to request the hash after our writes
         self._foreign_check_at = math.inf  # when to request the hash after changes by others
         self._foreign_checked_at = -math.inf
         self._check_at = math.inf
         self._checked_at = -math.inf
         self._is_checking = False
-        self._has_count_moved = False  # since the last complete fetch
+        self._has_count_changed = False  # since the last complete fetch
         self._volatile_at = -math.inf  # when values outside the hash may be read again
         self._reads_volatile = False  # after a match of the requested hash
         self._resync: Fetch | None = None
         self._was_marked_unsynced = False  # was synced and is not
-        self._moved: dict[str, None] = {}  # names changed since then
+        self._changed_names: dict[str, None] = {}  # names changed since then
 
     @property
     def state(self) -> SyncState:
@@ -245,12 +245,12 @@ class Sync(Machine):
         """
         if name not in self._table.volatile:
             if not is_ours(by):
-                self._moved_by_us_alone = False
+                self._changed_only_by_us = False
                 if now is not None:
                     self._foreign_changed(now)
             self.expire_hash()
-        if (self._was_marked_unsynced or self._resync is not None) and len(self._moved) < NAMES_MAX:
-            self._moved[name] = None
+        if (self._was_marked_unsynced or self._resync is not None) and len(self._changed_names) < NAMES_MAX:
+            self._changed_names[name] = None
 
     def expire_hash(self) -> None:
         """Mark the last announced hash as stale: it is requested again before it counts."""
@@ -258,15 +258,15 @@ class Sync(Machine):
         if announced is not None and announced.at != _EXPIRED:
             self.announced = replace(announced, at=_EXPIRED)
 
-    def count_moved(self, now: float) -> None:
+    def count_changed(self, now: float) -> None:
         """Process a changed count: the table has changed.
 
         Without a hash, the table is fetched, by list where it does not come as a file.
         """
         self._mark_unsynced()
-        if self._is_kept_up:
-            self._has_count_moved = not self.expects_hash
-            pause = 0.0 if self.expects_hash else self._check_pace.shortest_pause
+        if self._keeps_in_sync:
+            self._has_count_changed = not self.expects_hash
+            pause = 0.0 if self.expects_hash else self._sync_interval.shortest_pause
             self._check_at = min(self._check_at, max(now, self._checked_at + pause))
 
     def silence(self, now: float) -> None:
@@ -274,7 +274,7 @@ class Sync(Machine):
 
         Requests the hash, but no list of a component without one: gaps are frequent on a bad link.
         """
-        if self._is_kept_up and self.expects_hash:
+        if self._keeps_in_sync and self.expects_hash:
             self._check_at = min(self._check_at, max(now, self._checked_at + GAP_CHECK_INTERVAL))
 
     def write_ended(self, now: float) -> None:
@@ -290,8 +290,8 @@ class Sync(Machine):
 
     def check(self, now: float) -> None:
         """Plan a check of the table as soon as the link is idle: the component is back."""
-        may_ask = self._upkeep.policy is not Policy.CACHE_ONLY
-        if may_ask and (self._table.complete or self._is_kept_up):
+        may_ask = self._sync_settings.policy is not Policy.CACHE_ONLY
+        if may_ask and (self._table.complete or self._keeps_in_sync):
             self._is_checking = self.expects_hash
             self._check_at = now
 
@@ -307,11 +307,11 @@ class Sync(Machine):
         if not complete:
             self._mark_unsynced()
         self.synced = complete
-        self._has_count_moved &= not complete
+        self._has_count_changed &= not complete
         self._was_synced |= complete or result.has_moved
-        self._moved_by_us_alone = result.hash is not None
+        self._changed_only_by_us = result.hash is not None
         self._settled(now, now if result.hash is not None else now - result.elapsed)
-        if result.has_moved and self._is_kept_up:
+        if result.has_moved and self._keeps_in_sync:
             self._check_at = now + GAP_CHECK_INTERVAL
         if result.hash is not None:
             self._read_unhashed(result.hash, now)
@@ -325,22 +325,22 @@ class Sync(Machine):
         """Forget everything: another vehicle uses the address."""
         self.announced = None
         self._context.has_hash = None
-        self.synced = self._was_synced = self._moved_by_us_alone = False
-        self._was_marked_unsynced = self._has_count_moved = False
+        self.synced = self._was_synced = self._changed_only_by_us = False
+        self._was_marked_unsynced = self._has_count_changed = False
         self.stop()
 
     # requests
 
     def ask(self, now: float) -> None:
         """Request the hash: ahead of a fetch, to save its round trip, or to detect a change."""
-        if self._upkeep.policy is not Policy.CACHE_ONLY:
+        if self._sync_settings.policy is not Policy.CACHE_ONLY:
             read = self._reads.ask(HASH_CHECK, now)
             read.on_done.append(lambda: self._hash_came(read))
 
     def fetch_quick_file(self, now: float) -> bool:
         """Fetch the table again if its file is fast; return False where it is not, or is not permitted."""
-        may_fetch = self._is_kept_up and not self.is_spared and not self._files.is_in_use(now)
-        if not may_fetch or not self._check_pace.file_is_quick:
+        may_fetch = self._keeps_in_sync and not self.must_not_poll and not self._files.is_in_use(now)
+        if not may_fetch or not self._sync_interval.file_is_quick:
             return False
         self._begin_resync(now, Check(may_list=True))
         return True
@@ -353,7 +353,7 @@ class Sync(Machine):
         if not table.complete or announced.count != table.size:
             return False
         table.verify()
-        self._moved_by_us_alone = True
+        self._changed_only_by_us = True
         return True
 
     def tick(self, now: float) -> None:
@@ -383,36 +383,36 @@ class Sync(Machine):
         self._is_checking = self._reads_volatile = False
 
     @property
-    def is_spared(self) -> bool:
+    def must_not_poll(self) -> bool:
         """Whether the component is lost, or in a mode in which requests are sent for callers only."""
         presence = self._presence
         return presence.is_lost or presence.is_high_latency or self._reads.pace.gap >= LOW_BANDWIDTH_GAP
 
     @property
-    def wants_start_values(self) -> bool:
+    def wants_boot_values(self) -> bool:
         """Whether values measured at boot are to be read again, as no hash covers them."""
-        upkeep = self._upkeep
-        is_kept_up = upkeep.interval < math.inf and upkeep.policy is Policy.AUTO
-        return is_kept_up and not self.expects_hash and not self.is_spared
+        sync_settings = self._sync_settings
+        is_kept_up = sync_settings.interval < math.inf and sync_settings.policy is Policy.AUTO
+        return is_kept_up and not self.expects_hash and not self.must_not_poll
 
     @property
     def may_resync(self) -> bool:
         """Whether a hash mismatch leads to a new fetch."""
-        return self._is_kept_up and not self.is_spared
+        return self._keeps_in_sync and not self.must_not_poll
 
     # private
 
     @property
-    def _is_kept_up(self) -> bool:
+    def _keeps_in_sync(self) -> bool:
         """Whether the table is to be kept in sync."""
-        upkeep = self._upkeep
-        return self._was_synced and upkeep.interval < math.inf and upkeep.policy is Policy.AUTO
+        sync_settings = self._sync_settings
+        return self._was_synced and sync_settings.interval < math.inf and sync_settings.policy is Policy.AUTO
 
     def _mark_unsynced(self) -> None:
         if self.synced:
             self.synced = False
             self._was_marked_unsynced = True
-            self._moved.clear()
+            self._changed_names.clear()
 
     def _not_confirmed(self) -> None:
         """Doubt the verified values: the table was to be confirmed and was not."""
@@ -421,7 +421,7 @@ class Sync(Machine):
 
     def _read_unhashed(self, confirmed: int, now: float, *, again: bool = False) -> None:
         """Read the values that the hash does not cover; `again` is as in `VolatileReads`."""
-        if self._upkeep.policy is not Policy.AUTO:
+        if self._sync_settings.policy is not Policy.AUTO:
             return
         refresh = VolatileReads(self._reads, self._table, confirmed, self._context, now, again=again)
         if not refresh.done:
@@ -436,13 +436,13 @@ class Sync(Machine):
 
     def _foreign_changed(self, now: float) -> None:
         """Process a change by the vehicle or another station. A fetch in progress brings further ones too."""
-        if self._is_kept_up and self.expects_hash and not self._context.is_fetching:
+        if self._keeps_in_sync and self.expects_hash and not self._context.is_fetching:
             earliest = self._foreign_checked_at + FOREIGN_CHECK_INTERVAL
             self._foreign_check_at = max(now + FOREIGN_SETTLING_TIME, earliest)
 
     def _check_after_foreign(self, now: float) -> None:
         """Request the hash, where it can prove the present values: changes by others have stopped."""
-        if self._table.is_provable and not (self._context.is_fetching or self.is_spared):
+        if self._table.is_provable and not (self._context.is_fetching or self.must_not_poll):
             self._foreign_checked_at = now
             self.ask(now)
 
@@ -452,24 +452,24 @@ class Sync(Machine):
             self._check_at = now + IDLE_CHECK_INTERVAL
             return
         self._plan_check(now, now)
-        if self.is_spared:
+        if self.must_not_poll:
             self._is_checking = False
         elif self.expects_hash:
-            self._reads_volatile = self._is_kept_up
+            self._reads_volatile = self._keeps_in_sync
             self.ask(now)
-        elif self._check_at < math.inf or self._has_count_moved:
+        elif self._check_at < math.inf or self._has_count_changed:
             if self._files.is_in_use(now):
                 self._check_at = min(self._check_at, now + FILE_IN_USE_RETRY)
             else:
-                may_list = self._check_pace.may_list or self._has_count_moved
+                may_list = self._sync_interval.may_list or self._has_count_changed
                 self._begin_resync(now, Check(may_list=may_list))
 
     def _plan_check(self, now: float, known_at: float) -> None:
         """Plan the next check to end an interval after the moment of the known table."""
         self._checked_at = now
         self._check_at = math.inf
-        if self._is_kept_up:
-            pace = self._check_pace
+        if self._keeps_in_sync:
+            pace = self._sync_interval
             if self.expects_hash:
                 self._check_at = max(known_at + pace.hash_interval, now)
             else:
@@ -487,7 +487,7 @@ class Sync(Machine):
             elif self._context.has_hash is False:
                 self._context.has_hash = None
             self._is_checking = False
-            if has_none and self._is_kept_up:
+            if has_none and self._keeps_in_sync:
                 self._check_at = now  # blocks checks of tables without one
             return
         if self._context.is_doubted:
@@ -503,13 +503,13 @@ class Sync(Machine):
             self._settled(now, now)
         elif self._context.is_writing or self._context.is_fetching:
             return
-        elif table.hash is None and self._moved_by_us_alone and not self._is_kept_up:
+        elif table.hash is None and self._changed_only_by_us and not self._keeps_in_sync:
             # cannot be recomputed here: the cause may be our writes only, or also a missed change
             self._is_checking = False
         else:
             self._not_confirmed()
             self._is_checking = False
-            if self._is_kept_up and not self.is_spared:
+            if self._keeps_in_sync and not self.must_not_poll:
                 self._begin_resync(now, None)
 
     def _begin_resync(self, now: float, check: Check | None) -> None:
@@ -520,8 +520,8 @@ class Sync(Machine):
             self._host.end_fetch(fetch, fetch.ended_at)
             if isinstance(fetch.error, FileTransferError) and fetch.error.code in BUSY:
                 self._check_at = min(self._check_at, fetch.ended_at + FILE_IN_USE_RETRY)
-            elif self._has_count_moved:
-                pause = max(GAP_CHECK_INTERVAL, self._check_pace.shortest_pause)
+            elif self._has_count_changed:
+                pause = max(GAP_CHECK_INTERVAL, self._sync_interval.shortest_pause)
                 self._check_at = min(self._check_at, fetch.ended_at + pause)
 
         if fetch.done:
@@ -540,7 +540,7 @@ class Sync(Machine):
         self._plan_check(now, known_at)
         if not self.synced:
             return
-        if self._was_marked_unsynced or self._moved:
-            self._host.resynced(tuple(self._moved), self._table.hash)
+        if self._was_marked_unsynced or self._changed_names:
+            self._host.resynced(tuple(self._changed_names), self._table.hash)
         self._was_marked_unsynced = False
-        self._moved.clear()
+        self._changed_names.clear()

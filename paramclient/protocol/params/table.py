@@ -105,7 +105,7 @@ class Table:
 
     Args:
         encoding: how the component encodes values, as far as known.
-        room: the name count shared by all tables of the link; None for a table on its own.
+        name_quota: the name count shared by all tables of the link; None for a table on its own.
 
     Attributes:
         params: by name, in the order of first reception. Shared with readers; never replaced.
@@ -115,13 +115,13 @@ class Table:
         volatile_known: whether a recomputed hash has proven `volatile`.
         complete: whether the table has a parameter for every index below `count`.
         hash: the PX4 hash by which the vehicle would confirm exactly this table, or None while unknown.
-        displaced: names whose index belongs to an earlier count. The vehicle may no longer have them; some
-            may have been received again since.
+        outdated_indices: names whose index belongs to an earlier count. The vehicle may no longer have them;
+            some may have been received again since.
         doubts: how often live values were marked as stale.
-        passed_over: for a name that several parameters share, the indices of the other parameters.
+        duplicate_indices: for a name that several parameters share, the indices of the other parameters.
         dirty: names whose value, type or index changed since the last `take_dirty`.
-        gone: when each removed name was found missing, since the last `take_gone`.
-        slept: seconds of system suspend by which moments were moved back, see `age`.
+        removed_at: when each removed name was found missing, since the last `take_removed_at`.
+        suspended: seconds of system suspend by which moments were moved back, see `age`.
         left_out: PARAM_VALUEs ignored because no parameter file can hold their name, see `leave_out`.
         left_out_name: the last such name, or an empty text.
         keeps_all: whether `overwritten` keeps every value that was replaced before it reached the cache
@@ -130,24 +130,24 @@ class Table:
             or replaced, and the first observation of a changed value that was received again.
     """
 
-    def __init__(self, encoding: Encoding = Encoding.BYTEWISE, room: NameQuota | None = None) -> None:
-        self._room = NameQuota() if room is None else room
+    def __init__(self, encoding: Encoding = Encoding.BYTEWISE, name_quota: NameQuota | None = None) -> None:
+        self._name_quota = NameQuota() if name_quota is None else name_quota
         self.params = Params()
         self._held = self.params.held
         self._defaults = self.params.defaults
         self._moments = self.params.moments
         self._latest = -math.inf  # the moment of the newest observation
         self._changed: dict[str, tuple[float, str]] = {}  # when it changed, author: not yet in the cache
-        self.gone: dict[str, float] = {}
-        self.slept = 0.0
+        self.removed_at: dict[str, float] = {}
+        self.suspended = 0.0
         self.count: int | None = None
         self.volatile: frozenset[str] = frozenset()
         self.volatile_known = False
         self.complete = False
         self._was_complete = False  # before the count changed
-        self.displaced: set[str] = set()
+        self.outdated_indices: set[str] = set()
         self.doubts = 0
-        self.passed_over: dict[str, frozenset[int]] = {}
+        self.duplicate_indices: dict[str, frozenset[int]] = {}
         self.dirty: dict[str, str] = {}
         self.overwritten: list[Observation] = []
         self.keeps_all = False
@@ -220,16 +220,16 @@ class Table:
                 of a known integer.
         """
         name, raw, number, count, given = message
-        if self.passed_over and given in self.passed_over.get(name, ()):
+        if self.duplicate_indices and given in self.duplicate_indices.get(name, ()):
             return None
         everything = self._held
         old = everything.get(name)
         self._latest = moment
         if old is None:  # fast path for a first value
-            room = self._room
-            if not room.has_capacity(len(everything)):
+            quota = self._name_quota
+            if not quota.has_capacity(len(everything)):
                 return None
-            room.taken += 1
+            quota.taken += 1
             place = COMPACT_NO_INDEX if given >= count or count > PARAMETERS_MAX else given
             bits, is_raw = bits_of_wire(raw, number, self._encoding)
             new = everything[name] = pack_fields(bits, number, is_raw, LIVE, place)
@@ -266,7 +266,7 @@ class Table:
         """Store the index of a PARAM_VALUE of a known parameter, without its value."""
         name, _, _, count, given = message
         held = self._held[name]
-        is_index = given < count <= PARAMETERS_MAX and given not in self.passed_over.get(name, ())
+        is_index = given < count <= PARAMETERS_MAX and given not in self.duplicate_indices.get(name, ())
         if is_index and with_index(held, given) != held:
             self._held[name] = with_index(held, given)
             self.dirty.setdefault(name, "vehicle")
@@ -330,9 +330,9 @@ class Table:
         initial = None if default is None else from_bits(default, number)
         old = self._held.get(name)
         if old is None:
-            if not self._room.has_capacity(len(self._held)):
+            if not self._name_quota.has_capacity(len(self._held)):
                 return None
-            self._room.taken += 1
+            self._name_quota.taken += 1
         raw = as_sent(bits, number, self._encoding)
         before = self._defaults.get(name)
         is_same_type = old is None or unpack_fields(old)[1] == number
@@ -472,11 +472,11 @@ class Table:
             if old is not None:
                 if unpack_fields(old)[1] == unpack_fields(cached)[1] and name not in self._filed:
                     changes += self._merge_cached(name, old, cached, default)
-            elif is_portable_name(name) and self._room.has_capacity(len(self._held)):
-                self._room.taken += 1
+            elif is_portable_name(name) and self._name_quota.has_capacity(len(self._held)):
+                self._name_quota.taken += 1
                 new = with_trust_number(cached, CACHED)
                 if not are_placed and is_listed(new):
-                    new = self._displaced(name, new)
+                    new = self._with_outdated_index(name, new)
                 self._held[name] = new
                 if name in seen:
                     self._moments[name] = seen[name]
@@ -515,25 +515,27 @@ class Table:
         if self.count is not None:
             self._was_complete |= self.complete
             self.complete = False
-            self.passed_over.clear()
+            self.duplicate_indices.clear()
             for name, held in self._held.items():
                 if is_listed(held):
-                    self._held[name] = self._displaced(name, held)
+                    self._held[name] = self._with_outdated_index(name, held)
         self.count = count
 
     @property
-    def is_displaced(self) -> bool:
+    def has_outdated_indices(self) -> bool:
         """Whether some names have no valid index since the count changed."""
         held = self._held
-        self.displaced = {name for name in self.displaced if name in held and not is_listed(held[name])}
-        return bool(self.displaced)
+        self.outdated_indices = {
+            name for name in self.outdated_indices if name in held and not is_listed(held[name])
+        }
+        return bool(self.outdated_indices)
 
     def place(self, names: Mapping[int, str]) -> None:
         """Set the indices that a download has determined."""
-        everything, passed_over = self._held, self.passed_over
+        everything, duplicate_indices = self._held, self.duplicate_indices
         for index, name in names.items():
             held = everything.get(name)
-            if held is None or (passed_over and index in passed_over.get(name, ())):
+            if held is None or (duplicate_indices and index in duplicate_indices.get(name, ())):
                 continue
             now = with_index(held, index)
             if now != held:
@@ -544,13 +546,13 @@ class Table:
         """Finish a complete download: set its indices and remove what the vehicle no longer has."""
         self.place(names)
         present = frozenset(names.values())
-        gone = [
+        removed = [
             name
             for name, held in self._held.items()
-            if name not in present and (is_listed(held) or name in self.displaced)
+            if name not in present and (is_listed(held) or name in self.outdated_indices)
         ]
-        self.displaced.clear()
-        return self._remove(gone)
+        self.outdated_indices.clear()
+        return self._remove(removed)
 
     def present(self) -> dict[int, str]:
         """Return the names by index under the present count, without indices that two names claim."""
@@ -673,7 +675,7 @@ class Table:
         self,
         dirty: Mapping[str, str],
         overwritten: Sequence[Observation],
-        gone: Mapping[str, float],
+        removed_at: Mapping[str, float],
         changed: Mapping[str, tuple[float, str]],
         params: Params,
     ) -> None:
@@ -682,7 +684,7 @@ class Table:
         A value that was replaced meanwhile is kept in `overwritten`.
 
         Args:
-            dirty, overwritten, gone, changed: as they were taken.
+            dirty, overwritten, removed_at, changed: as they were taken.
             params: the dirty parameters as they were then.
         """
         replaced = []
@@ -696,12 +698,12 @@ class Table:
                 self._changed[name] = changed[name]
         self.dirty = {**dirty, **self.dirty}
         self.overwritten = [*overwritten, *replaced, *self.overwritten][-OVERWRITTEN_MAX:]
-        self.gone = {**gone, **self.gone}
+        self.removed_at = {**removed_at, **self.removed_at}
 
-    def take_gone(self) -> dict[str, float]:
+    def take_removed_at(self) -> dict[str, float]:
         """Return when each name removed since the last call was found missing."""
-        gone, self.gone = self.gone, {}
-        return gone
+        removed_at, self.removed_at = self.removed_at, {}
+        return removed_at
 
     def age(self, seconds: float) -> None:
         """Move every moment back by time that the core's clock has left out.
@@ -711,12 +713,12 @@ class Table:
         """
         if not seconds:
             return
-        for moments in (self._moments, self.gone):
+        for moments in (self._moments, self.removed_at):
             moments.update({name: moment - seconds for name, moment in moments.items()})
         self._changed = {name: (moment - seconds, by) for name, (moment, by) in self._changed.items()}
         self.overwritten = [each._replace(moment=each.moment - seconds) for each in self.overwritten]
         self._latest -= seconds
-        self.slept += seconds
+        self.suspended += seconds
 
     def _remove(self, names: Collection[str]) -> list[Change]:
         """Remove these names."""
@@ -731,11 +733,11 @@ class Table:
             if name in self.dirty or len(self.dirty) < REMOVED_NAMES_MAX:
                 self.dirty[name] = "vehicle"
                 if self._latest > -math.inf:
-                    self.gone[name] = self._latest
+                    self.removed_at[name] = self._latest
             if self._hash is not None:
                 self._invalidate_hash(name)
             changes.append(_new(Removed, (name, held, None, "vehicle", None, default)))
-        self._room.taken -= len(changes)
+        self._name_quota.taken -= len(changes)
         return changes
 
     def _set_default(self, name: str, default: Value | None) -> None:
@@ -797,8 +799,8 @@ class Table:
         value = from_bits(bits, number, is_raw=is_raw)
         return isinstance(value, int) and abs(value) > _EXACT and as_sent(bits, number, self._encoding) == raw
 
-    def _displaced(self, name: str, held: CompactParam) -> CompactParam:
-        self.displaced.add(name)
+    def _with_outdated_index(self, name: str, held: CompactParam) -> CompactParam:
+        self.outdated_indices.add(name)
         return with_index(held, COMPACT_NO_INDEX)
 
     def _invalidate_hash(self, name: str) -> None:

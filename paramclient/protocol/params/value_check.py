@@ -52,14 +52,14 @@ class Rereads(Machine):
         self._reads = reads
         self._table = table
         self._sync = sync
-        self._policy = policy
+        self._fetch_policy = policy
 
     def write_ended(self, write: Write, now: float) -> None:
         """Plan to read a value after a write, where the vehicle may change it without a PARAM_VALUE."""
         if (
             self._context.is_px4
             and write.result is not None
-            and self._policy is Policy.AUTO
+            and self._fetch_policy is Policy.AUTO
             and not write.settle
         ):
             self.checks.ask(write.name, now + LATER_CHANGE_TIME)
@@ -77,7 +77,7 @@ class Rereads(Machine):
     def tick(self, now: float) -> None:
         """Read the values that are due."""
         for name in self.authors.doubted(now):
-            if self._policy is Policy.AUTO:
+            if self._fetch_policy is Policy.AUTO:
                 self._read(name, now)
         if self.checks.next_deadline() <= now:
             self._read_due(now)
@@ -97,7 +97,7 @@ class Rereads(Machine):
             names = [name for name in names if not self._table.is_hashed(name)]
             self._sync.ask(now)
         for name in names:
-            if self._policy is not Policy.AUTO:
+            if self._fetch_policy is not Policy.AUTO:
                 self._table.doubt_value(name)
             elif not self._read(name, now):
                 self.checks.ask(name, now + READS_PAUSE)

@@ -113,7 +113,7 @@ class Write(Operation[SetResult]):
         self.wanted: Param | None = None
         self.before: Param | None = None
         self.is_answered = False  # a value other than the requested one came after the last PARAM_SET
-        self.made: Param | None = None  # the value after an earlier PARAM_SET, if not the old one
+        self.seen_after_set: Param | None = None  # the value after an earlier PARAM_SET, if not the old one
         self.verify_at = math.inf
         self.read: Read | None = None
         self.was_retyped = False
@@ -170,7 +170,8 @@ class Writes(Machine):
         is_held: whether a write waits for the permission.
         asked, retries: writes so far, and repeated PARAM_SETs.
         against_non_finite: why NaN and infinity must not be sent to the vehicle; "" where they may.
-        left_open: called with the name and the author of a write that ended with its outcome unknown.
+        on_outcome_unknown: called with the name and the author of a write that ended with its outcome
+            unknown.
     """
 
     def __init__(
@@ -182,7 +183,7 @@ class Writes(Machine):
     ) -> None:
         self._context = context
         self._target = context.target
-        self._policy = context.retry
+        self._retry_policy = context.retry
         self._send = context.send
         self._reads = reads
         self._table = table
@@ -193,7 +194,7 @@ class Writes(Machine):
         self.is_held = False
         self.against_non_finite = ""
         self.queues: dict[str, deque[Write]] = {}
-        self.left_open: Callable[[str, str, float], None] = _ignore
+        self.on_outcome_unknown: Callable[[str, str, float], None] = _ignore
 
     def __len__(self) -> int:
         return len(self.queues)
@@ -221,7 +222,7 @@ class Writes(Machine):
         gives it up with `unfile`.
         """
         write = Write(
-            *(name, value, self._policy, now, asker), settle=settle, is_forced=force, is_filed=filed
+            *(name, value, self._retry_policy, now, asker), settle=settle, is_forced=force, is_filed=filed
         )
         self.asked += 1
         queue = self.queues.setdefault(name, deque())
@@ -249,7 +250,7 @@ class Writes(Machine):
         if queue is None or write not in queue:
             return
         if queue[0] is write:
-            self._leave_open(write, now)
+            self._report_outcome_unknown(write, now)
             self._leave(write, now)
         else:
             queue.remove(write)
@@ -471,7 +472,7 @@ class Writes(Machine):
             elif read.error is not None:
                 self._fail(write, read.error, read.ended_at)
             elif write.acknowledged is not None:
-                self._end_watch(write, write.acknowledged, read.ended_at)
+                self._end_settling(write, write.acknowledged, read.ended_at)
             elif write.attempts:
                 self._decide(write, self._params[write.name], read.ended_at)
             else:
@@ -481,14 +482,14 @@ class Writes(Machine):
 
     def _decide(self, write: Write, actual: Param, now: float) -> None:
         """Decide after a read that followed the PARAM_SET and showed a value other than the requested one."""
-        is_made_again = write.made is not None and write.made.same_value(actual)
+        is_made_again = write.seen_after_set is not None and write.seen_after_set.same_value(actual)
         if write.is_answered and is_made_again:
             self._succeed(write, now)
         elif write.request.should_give_up(now):
             self._fail(write, self._not_applied(write, actual), now)
         else:
             is_old = write.before is not None and write.before.same_value(actual)
-            write.made = None if is_old else actual
+            write.seen_after_set = None if is_old else actual
             self._transmit(write, now)
 
     def _succeed(self, write: Write, now: float) -> None:
@@ -514,7 +515,7 @@ class Writes(Machine):
         self._leave(write, now)
         write.finish(result, now)
 
-    def _end_watch(self, write: Write, result: SetResult, now: float) -> None:
+    def _end_settling(self, write: Write, result: SetResult, now: float) -> None:
         """Compare the value that was read after the watch with the acknowledged one."""
         actual = self._params[write.name]
         if not result.param.same_value(actual):
@@ -524,14 +525,14 @@ class Writes(Machine):
 
     def _fail(self, write: Write, error: Exception, now: float) -> None:
         if isinstance(error, NoReply):
-            self._leave_open(write, now)
+            self._report_outcome_unknown(write, now)
         self._leave(write, now)
         self._trace("%s/%s %s: not written: %s", *self._target, write.name, error)
         write.fail(error, now)
 
-    def _leave_open(self, write: Write, now: float) -> None:
+    def _report_outcome_unknown(self, write: Write, now: float) -> None:
         if write.attempts and write.acknowledged is None:
-            self.left_open(write.name, write.by, now)
+            self.on_outcome_unknown(write.name, write.by, now)
 
     def _leave(self, write: Write, now: float) -> None:
         if write.read is not None:

@@ -39,7 +39,7 @@ __all__ = [
     "OVERTAKING_READS",
     "PEER_RECHECKS",
     "PEER_REQUESTS",
-    "QUIET_GAPS",
+    "LIST_END_GAPS",
     "READS_BEHIND_BURST_COPIES_MAX",
     "REBOOT_IDENTITY_REQUESTS",
     "REOPENS_MAX",
@@ -175,12 +175,12 @@ class RetryPolicy:
         first = min(max(FIRST_TIMEOUT, longest), TIMEOUT_MAX)
         return min(first * 2.0 ** (attempts - 1), max(TIMEOUT_MAX, longest))
 
-    def _wait(self, least_at_first: float) -> float:
+    def _wait(self, min_before_variation: float) -> float:
         trip = self.round_trip
         smoothed = trip.smoothed
         base = INITIAL_TIMEOUT if smoothed is None else smoothed + max(4 * trip.variation, GRANULARITY)
         if trip.samples < VARIATION_SAMPLES_MIN and smoothed is not None:
-            base = max(min(base, 2 * smoothed), least_at_first)
+            base = max(min(base, 2 * smoothed), min_before_variation)
         base = max(base, TIMEOUT_MIN)
         return min(base * self._backoff, max(TIMEOUT_MAX, base))
 
@@ -203,13 +203,13 @@ class RetryPolicy:
             ATTEMPTS_MAX,
         )
 
-    def is_gone(self, now: float) -> bool:
+    def is_silent_too_long(self, now: float) -> bool:
         """Return whether nothing at all of the component was received for `SILENCE_MAX`."""
         return now - self.round_trip.heard_at >= SILENCE_MAX
 
     def should_give_up(self, attempts: int, now: float) -> bool:
         """Return whether a request was repeated often enough: `tries` times, or the component is gone."""
-        return attempts >= self.tries or (self.is_gone(now) and attempts >= ATTEMPTS_MIN)
+        return attempts >= self.tries or (self.is_silent_too_long(now) and attempts >= ATTEMPTS_MIN)
 
     def answered(self, sent_at: float, now: float, attempts: int) -> None:
         """Record a response to a request that was sent `attempts` times, the last time at `sent_at`.
@@ -708,13 +708,13 @@ class ReadRetries:
     def should_give_up(self, request: ReadAttempts, now: float, *, is_known: bool) -> bool:
         """Return whether a read is to be given up instead of repeated."""
         silent_for = now - self._silent_since
-        is_mute = request.count >= ATTEMPTS_MIN and silent_for >= 2 * SILENCE_MAX
+        has_no_answers = request.count >= ATTEMPTS_MIN and silent_for >= 2 * SILENCE_MAX
         if (self._silences >= ATTEMPTS_MAX and silent_for >= SILENCE_MAX) or (
-            self._silences >= TIMEOUTS_MAX and is_mute
+            self._silences >= TIMEOUTS_MAX and has_no_answers
         ):
             return True  # none of all these was answered
-        are_enough = request.controls >= CONTROLS_MIN and request.count >= ATTEMPTS_MIN
-        if are_enough and self._loss_probability(request.count) < LOSS_RISK:
+        has_enough_controls = request.controls >= CONTROLS_MIN and request.count >= ATTEMPTS_MIN
+        if has_enough_controls and self._loss_probability(request.count) < LOSS_RISK:
             return True
         # half as many are enough if nothing has announced the parameter and the link serves others
         weight = 2 if self.seems_unknown(request, is_known=is_known) else 1
@@ -864,7 +864,7 @@ LIST_REORDER_DEPTH: Final = 3
 """Later values after which a missing one counts as lost, as in TCP's fast retransmit."""
 LIST_SILENCE_MIN: Final = 0.25
 """Seconds without a value, at least, after which a list may be over, before its pace is known."""
-QUIET_GAPS: Final = 3.0
+LIST_END_GAPS: Final = 3.0
 """A list is over after a pause of this many of its longest gaps; a radio's pauses count among its gaps."""
 SILENCE_AT_PACE_MIN: Final = 0.06
 """Seconds without a value after which a list may be over when its last values are due: PX4 sends every 20 ms,
@@ -933,7 +933,7 @@ class ListAttempts(Attempts):
         self.patient_since = now
 
     def should_give_up(self, now: float) -> bool:
-        is_enough = self._policy.is_gone(now) or self.count >= LIST_ATTEMPTS_MIN
+        is_enough = self._policy.is_silent_too_long(now) or self.count >= LIST_ATTEMPTS_MIN
         return is_enough and now - self.patient_since >= LIST_TIMEOUT
 
     @staticmethod
@@ -957,7 +957,7 @@ class ListAttempts(Attempts):
         is_near_end = left <= TAIL_LENGTH
         if longest is None:
             return max(LIST_SILENCE_MIN if is_near_end else STREAM_PAUSE_MAX, timeout)
-        return max(QUIET_GAPS * longest, SILENCE_AT_PACE_MIN if is_near_end else STREAM_PAUSE_MAX)
+        return max(LIST_END_GAPS * longest, SILENCE_AT_PACE_MIN if is_near_end else STREAM_PAUSE_MAX)
 
 
 EXT_UNHEARD_ATTEMPTS: Final = 6
@@ -1031,7 +1031,7 @@ CLOSE_COPIES_MAX: Final = 4
 UNHEARD_ATTEMPTS_MAX: Final = 16
 """Requests after which a server that has never responded counts as none: with two of three exchanges lost,
 all of them are lost once in 700 times."""
-ATTEMPTS_WITHOUT_BACKOFF: Final = 2
+UNHEARD_ATTEMPTS_WITHOUT_BACKOFF: Final = 2
 """Requests without backoff to a server that has not responded yet."""
 SLOW_ATTEMPTS_WITHOUT_BACKOFF: Final = 4
 """The same of requests on which the server works for long: the first ones may only be lost."""
@@ -1075,7 +1075,9 @@ class FileAttempts(Attempts):
         timeout = policy.repeat_timeout(self.count)
         if self._server.heard_at == -math.inf and policy.round_trip.smoothed is not None:
             # the server may be busy with another station, whose burst nothing interrupts
-            timeout *= 2.0 ** min(max(self.count - ATTEMPTS_WITHOUT_BACKOFF, 0), BACKOFF_DOUBLINGS_MAX)
+            timeout *= 2.0 ** min(
+                max(self.count - UNHEARD_ATTEMPTS_WITHOUT_BACKOFF, 0), BACKOFF_DOUBLINGS_MAX
+            )
         return timeout
 
     @property
@@ -1107,7 +1109,7 @@ class FileAttempts(Attempts):
 
     def should_give_up(self, now: float) -> bool:
         is_unheard = self._server.heard_at == -math.inf  # the loss of requests is unknown
-        if is_unheard and self.count < UNHEARD_ATTEMPTS_MAX and not self._policy.is_gone(now):
+        if is_unheard and self.count < UNHEARD_ATTEMPTS_MAX and not self._policy.is_silent_too_long(now):
             return False
         if self._is_slow and self.count < SLOW_ATTEMPTS_MIN:
             return False

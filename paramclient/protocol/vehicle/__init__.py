@@ -1,14 +1,14 @@
 """Identification, presence, commands, reboot and peers of a vehicle.
 
+`address_contest`: the peers of a component, and contested addresses.
 `boot_time_requests`: requests for SYSTEM_TIME.
 `boot_time_sampling`: reads of clocks in telemetry.
-`claims`: what one peer sends under an address.
 `commands`: COMMAND_LONG, and the messages that are requested with it.
 `extended_kinds`: kinds of components with extended parameters.
 `identification`: identity and parameter encoding.
 `kinds`: autopilots and vehicle types as text.
 `metadata_location`: COMPONENT_METADATA.
-`peers`: the peers of a component, and contested addresses.
+`peer_claims`: what one peer sends under an address.
 `presence`: heartbeats, loss, and detection of reboots.
-`reboot`: a reboot on command.
+`reboot_command`: a reboot on command.
 """

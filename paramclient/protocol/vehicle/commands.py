@@ -93,7 +93,7 @@ class Commands(Machine):
     def __init__(self, context: Context) -> None:
         self._target = context.target
         self._addressees = (context.own, (0, 0))  # MAVLink 1 and older firmware name no addressee
-        self._policy = context.retry
+        self._retry_policy = context.retry
         self._send = context.send
         self._queues: dict[int, deque[Command]] = {}
 
@@ -110,7 +110,7 @@ class Commands(Machine):
             repeats: whether to repeat it automatically while it is not acknowledged; otherwise only `repeat`
                 does.
         """
-        request = CommandAttempts(self._policy, repeats=repeats)
+        request = CommandAttempts(self._retry_policy, repeats=repeats)
         command = Command(number, params, request, now)
         queue = self._queues.setdefault(number, deque())
         queue.append(command)

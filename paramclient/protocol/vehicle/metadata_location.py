@@ -48,7 +48,7 @@ class MetadataRequests(Machine):
 
     def __init__(self, context: Context, messages: MessageRequests) -> None:
         self._target = context.target
-        self._policy = context.retry
+        self._retry_policy = context.retry
         self._messages = messages
         self._asks: list[MetadataRequest] = []
         self._request: MessageRequest | None = None
@@ -63,7 +63,7 @@ class MetadataRequests(Machine):
         request = self._request
         if request is None:
             request = self._request = self._messages.begin(
-                COMPONENT_METADATA_ID, MessageAttempts(self._policy), now, refusals=NOT_SUPPORTED
+                COMPONENT_METADATA_ID, MessageAttempts(self._retry_policy), now, refusals=NOT_SUPPORTED
             )
             request.on_done.append(self._ended)
         ask = MetadataRequest(request.request, now)

@@ -243,5 +243,5 @@ class Presence:
 
     def was_away(self, silence: float) -> bool:
         """Return whether another vehicle may have taken its place in this many seconds."""
-        patience = self.heartbeat_timeout
-        return silence >= (patience if patience < math.inf else LOST_AFTER)
+        timeout = self.heartbeat_timeout
+        return silence >= (timeout if timeout < math.inf else LOST_AFTER)

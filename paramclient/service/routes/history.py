@@ -11,7 +11,7 @@ from typing import Annotated, Any, Final
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from pydantic import Field, model_validator
 
-from paramclient.cache import HISTORY_LINES, CutOff, HistoryEntry
+from paramclient.cache import HISTORY_ENTRIES_MAX, CutOff, HistoryEntry
 from paramclient.documents.cached import CachedTableDoc, VehicleDoc, VehiclesDoc
 from paramclient.documents.document import Body, InParts
 from paramclient.documents.fleet import FleetDiffDoc, NameSpreadDoc
@@ -306,7 +306,7 @@ async def _page(
     """Return the newest lines before a time. Lines of one time stay on one page, because the time selects the
     next page."""
     cache = require_cache(hub)
-    most = limit + 1 if before is None else HISTORY_LINES
+    most = limit + 1 if before is None else HISTORY_ENTRIES_MAX
     lines = await hub.run_in_thread(lambda: cache.history(key, component, name, most, since))
     if before is not None:
         lines = [line for line in lines if line.at < before]
@@ -317,7 +317,9 @@ async def _page(
             hub.run_in_thread, partial(HistoryDoc.of, page, exact=True, cut_off=cut_off)
         )
     if before is None and lines[0].at == page[0].at:  # older lines may have the same time
-        lines = await hub.run_in_thread(lambda: cache.history(key, component, name, HISTORY_LINES, since))
+        lines = await hub.run_in_thread(
+            lambda: cache.history(key, component, name, HISTORY_ENTRIES_MAX, since)
+        )
     oldest = page[0].at
     page = [*_same_moment(lines[: len(lines) - len(page)], oldest), *page]
     if len(page) == len(lines):

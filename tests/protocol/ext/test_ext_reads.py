@@ -312,7 +312,7 @@ def test_a_listener_takes_what_others_request() -> None:
     station = Station(
         link="sim:test",
         is_stream=False,
-        upkeep=SyncSettings.chosen(None, "auto", listen_only=True, is_log=False),
+        sync_settings=SyncSettings.chosen(None, "auto", listen_only=True, is_log=False),
     )
     session = CameraSession(camera, station=station)
     session.other_station(ParamExtRequestList(1, 100))

@@ -328,7 +328,7 @@ def test_without_reads_a_change_by_another_station_makes_a_value_cached() -> Non
     station = Station(
         link="sim:test",
         is_stream=False,
-        upkeep=SyncSettings.chosen(None, Policy.CACHE_ONLY, listen_only=False, is_log=False),
+        sync_settings=SyncSettings.chosen(None, Policy.CACHE_ONLY, listen_only=False, is_log=False),
     )
     session = CameraSession(Camera({"A": 1}), station=station)
     assert session.get_ext("A").trust is Trust.LIVE

@@ -87,13 +87,13 @@ def test_a_name_that_is_repeated_no_longer_is_asked_for() -> None:
     vehicle = PX4Vehicle(table=[*ROWS, SimParam("A", ParamType.INT32, 0)], repeated_names=True)
     world = Simulation(vehicle)
     world.fetch()
-    assert world.machine.table.passed_over == {CUT: {2}}
+    assert world.machine.table.duplicate_indices == {CUT: {2}}
     # another one goes out of use as one comes into it: the count stays, and the name now stands at 2 alone
     vehicle._entries[1].name = "B"
     vehicle._by_name[CUT] = vehicle._entries[2]
     result = world.fetch(refresh=True)
     assert not any(CUT in note for note in result.notes)
-    assert world.machine.table.passed_over == {}
+    assert world.machine.table.duplicate_indices == {}
     assert result.params[CUT].value == 2.0
 
 
@@ -103,12 +103,12 @@ def test_with_another_count_indices_mean_something_else() -> None:
     )
     world = Simulation(vehicle)
     world.fetch()
-    assert world.machine.table.passed_over == {CUT: {1}}
+    assert world.machine.table.duplicate_indices == {CUT: {1}}
     vehicle.use("A")
     world.get("GAIN")
-    assert world.machine.table.passed_over == {}
+    assert world.machine.table.duplicate_indices == {}
     assert world.fetch().params[CUT].value == 1
-    assert world.machine.table.passed_over == {CUT: {2}}
+    assert world.machine.table.duplicate_indices == {CUT: {2}}
 
 
 def test_the_last_one_who_waits_ends_it() -> None:
@@ -123,7 +123,7 @@ def test_the_last_one_who_waits_ends_it() -> None:
     world.run(60.0)
     assert len(machine.reads) == 0
     assert not fetch.done
-    assert machine.table.passed_over == {}
+    assert machine.table.duplicate_indices == {}
 
 
 def repeated(desk: Desk, **names: tuple[int, ...]) -> tuple[DuplicateNameReads, Table]:
@@ -155,7 +155,7 @@ def test_late_values_that_come_in_one_moment_are_one_answer() -> None:
     for _ in range(EQUAL_RESPONSES_MIN):
         answer(desk, asking, "A", 3)
     assert is_so(asking.done)
-    assert table.passed_over == {"A": {5}}
+    assert table.duplicate_indices == {"A": {5}}
 
 
 def test_answers_that_never_agree_leave_it_open() -> None:
@@ -165,7 +165,7 @@ def test_answers_that_never_agree_leave_it_open() -> None:
         assert not asking.done
         answer(desk, asking, "A", (3, 5)[number % 2])
     assert asking.done
-    assert table.passed_over == {}
+    assert table.duplicate_indices == {}
 
 
 def test_a_name_that_is_not_answered_leaves_it_open() -> None:
@@ -175,7 +175,7 @@ def test_a_name_that_is_not_answered_leaves_it_open() -> None:
         answer(desk, asking, "B", 1)
     desk.pass_time()
     assert asking.done
-    assert table.passed_over == {"B": {0}}
+    assert table.duplicate_indices == {"B": {0}}
     table.store_value(param_value("B", 1.0, index=1), "vehicle")
     assert table.store_value(param_value("B", 2.0, index=0), "vehicle") is None
     assert table.params["B"].value == 1.0

@@ -54,7 +54,7 @@ def world_of(
 ) -> Simulation:
     """A session with these vehicles, which have been running for a while; 50 ms there and 50 ms back."""
     air = Air.symmetric(vehicles, loss=loss, delay=0.05, others=others, seed=seed)
-    station = Station(link="sim:test", is_stream=False, upkeep=SyncSettings(30.0))
+    station = Station(link="sim:test", is_stream=False, sync_settings=SyncSettings(30.0))
     world = Simulation(air=air, station=station)
     world.meet()
     world.run(UPTIME - world.now)
@@ -312,7 +312,7 @@ class TestArduPilotStartsAgainInAFetch:
         world = world_of(vehicle, loss=0.0)
         fetch = world.machine.begin_fetch(world.now)
         world.until(lambda: any(isinstance(event, ComponentRebooted) for event in world.events))
-        assert fetch.begun_anew_at == -math.inf
+        assert fetch.restarted_at == -math.inf
         check(world, vehicle, world.outcome(fetch))
         world.machine.end_fetch(fetch, world.now)
 

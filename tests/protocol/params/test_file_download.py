@@ -593,7 +593,9 @@ def upkept(server: Server) -> Simulation:
     session = Simulation(server)
     session.run(10.0)
     server.opened.clear()
-    session.next_session(Station(link="sim:test", is_stream=False, upkeep=SyncSettings.chosen(None, "auto")))
+    session.next_session(
+        Station(link="sim:test", is_stream=False, sync_settings=SyncSettings.chosen(None, "auto"))
+    )
     return session
 
 

@@ -552,8 +552,8 @@ def frames(log: FileLog) -> list[bytes]:
 
 
 def listening() -> Station:
-    upkeep = SyncSettings.chosen(None, "auto", listen_only=True)
-    return Station(link="test", is_stream=False, upkeep=upkeep)
+    sync_settings = SyncSettings.chosen(None, "auto", listen_only=True)
+    return Station(link="test", is_stream=False, sync_settings=sync_settings)
 
 
 def test_a_station_that_only_listens_follows_the_file() -> None:

@@ -211,11 +211,11 @@ def test_when_a_moved_count_was_heard_indices_of_before_are_worth_nothing() -> N
     assert world.set("P001", 0).actual == 0
     table = world.machine.table
     assert (table.count, listed(table)) == (SIZE, [])
-    assert table.is_displaced
+    assert table.has_outdated_indices
     result = world.fetch()
     assert is_right(result, vehicle)
     assert result.resumed == 0
-    assert not world.machine.table.displaced
+    assert not world.machine.table.outdated_indices
     assert not {"GROUP_A", "GROUP_B"} & table.params.keys(), "what the vehicle no longer has has gone"
 
 

@@ -182,7 +182,7 @@ def test_another_firmware_after_a_reboot_is_not_sampled() -> None:
 
 @pytest.mark.parametrize("policy", [Policy.HASH_ONLY, Policy.CACHE_ONLY])
 def test_a_policy_that_allows_no_reads_allows_no_sample(policy: Policy) -> None:
-    station = Station(link="sim:test", is_stream=False, upkeep=SyncSettings.chosen(None, policy))
+    station = Station(link="sim:test", is_stream=False, sync_settings=SyncSettings.chosen(None, policy))
     session = Simulation(generic(), station=station)
     result = session.outcome(sampled(session))
     assert (result.source, result.sample) == ("cache", None)

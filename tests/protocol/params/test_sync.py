@@ -58,14 +58,14 @@ class World(Simulation):
     """A simulation whose station keeps its tables up, with one tapped vehicle after the other."""
 
     def __init__(
-        self, *vehicles: Endpoint, air: Air | None = None, upkeep: SyncSettings | None = None
+        self, *vehicles: Endpoint, air: Air | None = None, sync_settings: SyncSettings | None = None
     ) -> None:
         self.taps = [Tap(vehicle) for vehicle in vehicles]
-        self.upkeep = SyncSettings(INTERVAL) if upkeep is None else upkeep
+        self.sync_settings = SyncSettings(INTERVAL) if sync_settings is None else sync_settings
         super().__init__(*self.taps, air=air, station=self.a_station())
 
     def a_station(self) -> Station:
-        return Station(link="sim:test", is_stream=False, upkeep=self.upkeep)
+        return Station(link="sim:test", is_stream=False, sync_settings=self.sync_settings)
 
     @property
     def tap(self) -> Tap:
@@ -102,11 +102,14 @@ class World(Simulation):
 
 
 def fetched(
-    make: Callable[..., PX4Vehicle] = PX4Vehicle, *, upkeep: SyncSettings | None = None, **options: object
+    make: Callable[..., PX4Vehicle] = PX4Vehicle,
+    *,
+    sync_settings: SyncSettings | None = None,
+    **options: object,
 ) -> tuple[World, PX4Vehicle]:
     """A vehicle whose table was just fetched."""
     vehicle = make(table=TABLE, **options)
-    world = World(vehicle, upkeep=upkeep)
+    world = World(vehicle, sync_settings=sync_settings)
     assert world.fetch().complete
     assert state(world) is SyncState.SYNCED
     world.run(1.0)
@@ -170,7 +173,7 @@ def test_as_long_as_nothing_moves_an_interval_costs_one_question_and_the_volatil
 
 
 def test_without_a_watch_nothing_is_asked() -> None:
-    world, vehicle = fetched(upkeep=SyncSettings())
+    world, vehicle = fetched(sync_settings=SyncSettings())
     world.unheard(vehicle, P07=700)
     world.away(4.0)
     world.run(500.0)
@@ -229,10 +232,10 @@ def test_a_radio_of_57600_baud_is_no_low_bandwidth_mode() -> None:
     assert world.requests() == 1 + VOLATILE
 
 
-@pytest.mark.parametrize("upkeep", [SyncSettings(INTERVAL), SyncSettings(INTERVAL, without_hash=True)])
-def test_a_vehicle_without_a_hash(upkeep: SyncSettings) -> None:
+@pytest.mark.parametrize("sync_settings", [SyncSettings(INTERVAL), SyncSettings(INTERVAL, without_hash=True)])
+def test_a_vehicle_without_a_hash(sync_settings: SyncSettings) -> None:
     vehicle = ArduPilotVehicle(ftp=False, table=PLAIN)
-    world = World(vehicle, upkeep=upkeep)
+    world = World(vehicle, sync_settings=sync_settings)
     world.fetch()
     world.run(1.0)
     world.sent.clear()
@@ -240,7 +243,7 @@ def test_a_vehicle_without_a_hash(upkeep: SyncSettings) -> None:
     world.run(2 * INTERVAL)
     lists = len(world.sent_of(ParamRequestList))
     assert world.requests() == lists, "no hash, no reads"
-    if not upkeep.without_hash:
+    if not sync_settings.without_hash:
         assert lists == 0
         return
     assert lists == 2
@@ -253,7 +256,9 @@ def test_a_vehicle_without_a_hash(upkeep: SyncSettings) -> None:
 
 
 def test_gaps_bring_about_no_lists() -> None:
-    world = World(ArduPilotVehicle(ftp=False, table=PLAIN), upkeep=SyncSettings(INTERVAL, without_hash=True))
+    world = World(
+        ArduPilotVehicle(ftp=False, table=PLAIN), sync_settings=SyncSettings(INTERVAL, without_hash=True)
+    )
     world.fetch()
     world.sent.clear()
     for _ in range(5):
@@ -292,7 +297,9 @@ def test_a_resync_that_fails_is_tried_again() -> None:
 
 
 def test_of_one_that_was_lost_during_its_fetch_nothing_is_asked() -> None:
-    world = World(ArduPilotVehicle(ftp=False, table=PLAIN), upkeep=SyncSettings(INTERVAL, without_hash=True))
+    world = World(
+        ArduPilotVehicle(ftp=False, table=PLAIN), sync_settings=SyncSettings(INTERVAL, without_hash=True)
+    )
     world.fetch()
     fetch = world.machine.begin_fetch(world.now, refresh=True)
     world.until(lambda: fetch.progress(world.now).received > 0)
@@ -307,7 +314,7 @@ def test_of_one_that_was_lost_during_its_fetch_nothing_is_asked() -> None:
 def test_a_table_that_came_as_a_file_is_kept_up_by_its_hash_alone() -> None:
     unknown = [SimParam(row.name, row.type, row.value, volatile=row.name in NAMES[::9]) for row in TABLE]
     vehicle = PX4Vehicle(ftp=True, table=unknown)
-    world = World(air=Air.symmetric([vehicle], delay=0.05), upkeep=SyncSettings(INTERVAL))
+    world = World(air=Air.symmetric([vehicle], delay=0.05), sync_settings=SyncSettings(INTERVAL))
     result = world.fetch()
     assert result.source == "ftp"
     assert result.hash == vehicle.announced_hash(), "it was the same before and after"
@@ -660,7 +667,7 @@ def test_back_without_a_hash_its_values_are_cached_until_they_are_fetched() -> N
 
 
 def test_without_a_watch_it_is_checked_on_return_all_the_same() -> None:
-    world, _ = fetched(upkeep=SyncSettings())
+    world, _ = fetched(sync_settings=SyncSettings())
     world.away(9.0)
     world.run(2.0)
     assert state(world) is SyncState.SYNCED
@@ -953,7 +960,7 @@ def test_a_vehicle_that_never_stops_starting_again_ends_a_fetch() -> None:
 
 
 def offline(memory: Memory, vehicle: Endpoint, policy: Policy) -> World:
-    world = World(vehicle, upkeep=SyncSettings(INTERVAL, policy=policy))
+    world = World(vehicle, sync_settings=SyncSettings(INTERVAL, policy=policy))
     world.meet().use_cached(now=world.now, **memory)
     return world
 
@@ -991,7 +998,7 @@ def test_cache_only_sends_nothing() -> None:
 
 
 def test_cache_only_without_a_cache() -> None:
-    world = World(PX4Vehicle(table=TABLE), upkeep=SyncSettings(policy=Policy.CACHE_ONLY))
+    world = World(PX4Vehicle(table=TABLE), sync_settings=SyncSettings(policy=Policy.CACHE_ONLY))
     assert isinstance(world.error_of(world.fetch), CacheError)
     assert world.machine.fetch is None
     assert world.requests() == 0
@@ -1056,7 +1063,7 @@ def test_hash_only_on_return() -> None:
 @pytest.mark.parametrize("policy", [Policy.CACHE_ONLY, Policy.HASH_ONLY])
 def test_no_list_goes_to_all_components_at_once(policy: Policy) -> None:
     vehicles = [GenericVehicle(table=PLAIN, component=number) for number in (1, 2)]
-    world = World(*vehicles, upkeep=SyncSettings(INTERVAL, policy=policy))
+    world = World(*vehicles, sync_settings=SyncSettings(INTERVAL, policy=policy))
     world.run(10.0)
     world.station.begin_fetches(list(world.station.components.values()), world.now)
     assert world.sent_of(ParamRequestList) == []
@@ -1082,7 +1089,7 @@ def test_a_table_that_moved_while_it_came_is_fetched_again() -> None:
     names = ["A_LATE", "SWITCH", *list(PLAIN)[:12]]
     rows = [SimParam(name, ParamType.INT32, number) for number, name in enumerate(names)]
     vehicle = PX4Vehicle(table=rows, late_use={"SWITCH": ["A_LATE"]})
-    world = World(air=Air.symmetric([vehicle], delay=0.3), upkeep=SyncSettings(INTERVAL))
+    world = World(air=Air.symmetric([vehicle], delay=0.3), sync_settings=SyncSettings(INTERVAL))
     vehicle.when_listed(3, lambda: vehicle.set_param("SWITCH", 9))
     world.until(lambda: (1, 1) in world.station.components)
     fetch = world.machine.begin_fetch(world.now, refresh=True)
@@ -1096,7 +1103,7 @@ def test_a_table_that_moved_while_it_came_is_fetched_again() -> None:
 
 def test_nothing_is_begun_for_a_component_that_is_lost() -> None:
     vehicle = ArduPilotVehicle(ftp=False, table=PLAIN)
-    world = World(vehicle, upkeep=SyncSettings(5.0, without_hash=True))
+    world = World(vehicle, sync_settings=SyncSettings(5.0, without_hash=True))
     world.fetch()
     fetch = world.machine.begin_fetch(world.now, refresh=True)
     vehicle.reboot(world.now, down=math.inf)

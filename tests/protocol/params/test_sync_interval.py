@@ -33,10 +33,10 @@ PATH = b"@PARAM/param.pck"
 
 
 def watched(
-    vehicle: ArduPilotVehicle, *, upkeep: SyncSettings | None = None, air: Air | None = None
+    vehicle: ArduPilotVehicle, *, sync_settings: SyncSettings | None = None, air: Air | None = None
 ) -> tuple[World, ArduPilotVehicle]:
     """An ArduPilot whose table was just fetched, as a file where it serves one."""
-    world = World(*() if air else (vehicle,), air=air, upkeep=upkeep)
+    world = World(*() if air else (vehicle,), air=air, sync_settings=sync_settings)
     assert world.fetch().complete
     world.run(10.0)  # what is measured at the start has been read
     world.sent.clear()
@@ -145,7 +145,7 @@ def test_a_check_whose_file_does_not_come_downloads_no_list() -> None:
 
 def test_a_chosen_interval_lists_where_there_is_no_file_half_of_the_time_at_most() -> None:
     vehicle = listing_ardupilot(table=PLAIN, burst=1, period=0.08)
-    world, _ = watched(vehicle, upkeep=SyncSettings(5.0, without_hash=True))
+    world, _ = watched(vehicle, sync_settings=SyncSettings(5.0, without_hash=True))
     world.run(100.0)
     assert 13 <= len(world.sent_of(ParamRequestList)) <= 16, "the list takes 3.2 s"
 
@@ -166,11 +166,11 @@ def test_a_count_that_moves_all_the_time_is_followed_once_a_second() -> None:
 
 
 @pytest.mark.parametrize("is_heard", [True, False], ids=["heard", "on another link"])
-@pytest.mark.parametrize("upkeep", [SyncSettings(INTERVAL), SyncSettings(INTERVAL, without_hash=True)])
+@pytest.mark.parametrize("sync_settings", [SyncSettings(INTERVAL), SyncSettings(INTERVAL, without_hash=True)])
 def test_while_another_station_has_a_file_open_a_check_skips_its_turn(
-    is_heard: bool, upkeep: SyncSettings
+    is_heard: bool, sync_settings: SyncSettings
 ) -> None:
-    world, vehicle = watched(ArduPilotVehicle(table=PLAIN), upkeep=upkeep)
+    world, vehicle = watched(ArduPilotVehicle(table=PLAIN), sync_settings=sync_settings)
     other = Other(world, is_heard=is_heard)
     world.run(INTERVAL - 20.0)
     other.ask(Opcode.OPEN_FILE_RO, PATH)
@@ -308,9 +308,9 @@ def test_what_px4_changes_after_its_hash_was_asked_for_is_right_one_interval_lat
 # what others change on PX4
 
 
-def quad(seed: int = 0, upkeep: SyncSettings | None = None) -> tuple[World, PX4Vehicle]:
+def quad(seed: int = 0, sync_settings: SyncSettings | None = None) -> tuple[World, PX4Vehicle]:
     vehicle = PX4Vehicle(clamp_delay=None)
-    world = World(vehicle, upkeep=upkeep)
+    world = World(vehicle, sync_settings=sync_settings)
     assert world.fetch().complete
     world.run(3.0 + seed / 10)
     world.sent.clear()
@@ -420,7 +420,7 @@ def test_on_a_slow_link_they_are_read_in_a_twentieth_of_the_time_at_most() -> No
         for axis in "XYZ"
     ]
     vehicle = PX4Vehicle(table=[*TABLE, *(row for row in rows if row.name != "CAL_MAG0_XOFF")])
-    world = World(air=Air.symmetric([vehicle], delay=0.4), upkeep=SyncSettings(10.0))
+    world = World(air=Air.symmetric([vehicle], delay=0.4), sync_settings=SyncSettings(10.0))
     world.fetch()
     world.run(20.0)
     world.sent.clear()
@@ -434,7 +434,7 @@ def test_on_a_slow_link_they_are_read_in_a_twentieth_of_the_time_at_most() -> No
 def test_the_volatile_values_of_one_vehicle_keep_no_other_from_its_check() -> None:
     vehicles = [PX4Vehicle(system=system, table=TABLE) for system in range(1, 41)]
     taps = [Tap(vehicle) for vehicle in vehicles]
-    world = World(air=Air.symmetric(taps, delay=0.3), upkeep=SyncSettings(INTERVAL))
+    world = World(air=Air.symmetric(taps, delay=0.3), sync_settings=SyncSettings(INTERVAL))
     world.run(2.0)
     machines = list(world.station.components.values())
     fetches = [machine.begin_fetch(world.now) for machine in machines]
@@ -451,9 +451,11 @@ def test_the_volatile_values_of_one_vehicle_keep_no_other_from_its_check() -> No
     assert len(world.sent) < 40 * 4 * 3 * 1.3 + 200, "three questions in each interval, and our heartbeats"
 
 
-@pytest.mark.parametrize("upkeep", [SyncSettings(), replace(SyncSettings(INTERVAL), interval=math.inf)])
-def test_without_a_watch_nothing_is_asked_after_foreign_values(upkeep: SyncSettings) -> None:
-    world, vehicle = fetched(upkeep=upkeep)
+@pytest.mark.parametrize(
+    "sync_settings", [SyncSettings(), replace(SyncSettings(INTERVAL), interval=math.inf)]
+)
+def test_without_a_watch_nothing_is_asked_after_foreign_values(sync_settings: SyncSettings) -> None:
+    world, vehicle = fetched(sync_settings=sync_settings)
     world.run(2.0)
     vehicle.set_param("P07", 700)
     world.run(100.0)
@@ -473,8 +475,8 @@ def test_nothing_is_asked_after_foreign_values_in_high_latency_mode() -> None:
 
 def test_a_listen_only_station_sends_nothing_after_changes() -> None:
     vehicle = PX4Vehicle(table=TABLE)
-    upkeep = SyncSettings.chosen(None, "auto", listen_only=True)
-    world = World(vehicle, upkeep=upkeep)
+    sync_settings = SyncSettings.chosen(None, "auto", listen_only=True)
+    world = World(vehicle, sync_settings=sync_settings)
     world.other_station(ParamRequestList(1, 1))
     world.run(5.0)
     for number in range(20):

@@ -25,9 +25,11 @@ def vehicle(*, ftp: bool = True) -> ArduPilotVehicle:
     return ArduPilotVehicle(table=TABLE, groups={"GRIP_ENABLE": GROUP}, live=(), ftp=ftp)
 
 
-def in_sync(*vehicles: ArduPilotVehicle, air: Air | None = None, upkeep: SyncSettings | None = None) -> World:
+def in_sync(
+    *vehicles: ArduPilotVehicle, air: Air | None = None, sync_settings: SyncSettings | None = None
+) -> World:
     """A session whose table was fetched a while ago."""
-    world = World(*vehicles, air=air, upkeep=upkeep)
+    world = World(*vehicles, air=air, sync_settings=sync_settings)
     assert world.fetch().complete
     world.run(10.0)
     assert state(world) is SyncState.SYNCED
@@ -101,7 +103,7 @@ def test_a_list_after_a_changed_count_that_does_not_come_is_requested_again() ->
 
 
 def test_without_a_watch_a_changed_count_requests_nothing() -> None:
-    world = in_sync(board := vehicle(ftp=False), upkeep=SyncSettings())
+    world = in_sync(board := vehicle(ftp=False), sync_settings=SyncSettings())
     board.set_param("GRIP_ENABLE", 1)
     world.run(INTERVAL)
     assert state(world) is SyncState.UNSYNCED

@@ -46,7 +46,7 @@ class Desk:
     """An ArduPilot 1/1 with A = 1 and B = 1, heard long ago, and all that is sent to it."""
 
     def __init__(
-        self, autopilot: int = MAV_AUTOPILOT_ARDUPILOTMEGA, upkeep: SyncSettings | None = None
+        self, autopilot: int = MAV_AUTOPILOT_ARDUPILOTMEGA, sync_settings: SyncSettings | None = None
     ) -> None:
         self.now = 0.0
         self.sent: list[Message] = []
@@ -54,11 +54,11 @@ class Desk:
         self.machine = ComponentMachine(
             1,
             1,
-            own=(255, 190),
+            own_address=(255, 190),
             link="x",
             send=self.sent.append,
             observer=EventMaker(self.events.append),
-            upkeep=upkeep,
+            sync_settings=sync_settings,
         )
         self.machine.reads.is_idle = False
         self.machine.receive(Heartbeat(2, autopilot), self.now)
@@ -204,7 +204,7 @@ def test_px4_has_no_old_values_on_the_way() -> None:
 
 def test_where_nothing_may_be_asked_the_value_is_no_longer_live() -> None:
     desk = Desk(
-        upkeep=SyncSettings(
+        sync_settings=SyncSettings(
             listens_only=True, policy=SyncSettings.chosen(None, "auto", listen_only=True).policy
         )
     )
@@ -249,7 +249,7 @@ def test_a_set_back_is_not_proven_by_a_late_answer() -> None:
 def test_a_restart_makes_the_old_values_possible_again() -> None:
     desk = Desk()
     desk.set(2.0)
-    desk.machine.restarts.current = None
+    desk.machine.reboots.current = None
     desk.machine._rebooted(desk.now)
     desk.hear("A", 1.0)
     assert desk.value == 1.0
@@ -323,8 +323,8 @@ def test_a_simulated_ardupilot_takes_the_value_of_a_read_when_it_is_queued() -> 
 @pytest.mark.parametrize("fetched", [True, False], ids=["whole", "unfetched"])
 def test_a_change_after_the_acknowledgement_is_found_although_nothing_tells_of_it(fetched: bool) -> None:
     vehicle = PX4Vehicle()
-    upkeep = SyncSettings.chosen(None, "auto")
-    station = Station(link="sim:test", is_stream=False, upkeep=upkeep)
+    sync_settings = SyncSettings.chosen(None, "auto")
+    station = Station(link="sim:test", is_stream=False, sync_settings=sync_settings)
     session = Simulation(vehicle, station=station)
     session.meet()
     if fetched:
@@ -349,7 +349,7 @@ def test_a_change_after_the_acknowledgement_is_found_although_nothing_tells_of_i
 
 def test_after_many_writes_the_hash_alone_proves_that_they_have_lasted() -> None:
     vehicle = PX4Vehicle()
-    station = Station(link="sim:test", is_stream=False, upkeep=SyncSettings.chosen(None, "auto"))
+    station = Station(link="sim:test", is_stream=False, sync_settings=SyncSettings.chosen(None, "auto"))
     session = Simulation(vehicle, station=station)
     machine = session.meet()
     session.fetch()

@@ -807,7 +807,7 @@ def test_a_watch_that_cannot_be_ended_says_that_the_value_was_acknowledged() -> 
     desk = Desk()
     desk.knows("A", 1.0)
     left: list[str] = []
-    desk.writes.left_open = lambda name, by, now: left.append(name)
+    desk.writes.on_outcome_unknown = lambda name, by, now: left.append(name)
     lost = desk.writes.set("A", 2.0, desk.now, settle=1.0)
     desk.hear("A", 2.0)
     desk.writes.lose(desk.now)

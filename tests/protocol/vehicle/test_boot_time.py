@@ -162,7 +162,7 @@ def test_nothing_is_asked_where_nothing_is_sent() -> None:
 
 
 class Desk:
-    """The component 1/1 of a kind, with upkeep.
+    """The component 1/1 of a kind, with sync_settings.
 
     Attributes:
         sent: what goes out to it, with the time.
@@ -177,11 +177,11 @@ class Desk:
         self.machine = ComponentMachine(
             1,
             1,
-            own=OWN,
+            own_address=OWN,
             link="x",
             send=lambda message: self.sent.append((self.now, message)),
             observer=EventMaker(self.events.append),
-            upkeep=SyncSettings(interval),
+            sync_settings=SyncSettings(interval),
         )
         self.machine.reads.is_idle = False
         self.hear(heartbeat, sequence=100)
@@ -216,7 +216,7 @@ class Desk:
     def reboots(self) -> int:
         return sum(isinstance(event, ComponentRebooted) for event in self.events)
 
-    def clock_requests(self) -> list[float]:
+    def boot_time_requests(self) -> list[float]:
         return [now for now, message in self.take() if message == CLOCK_REQUEST]
 
     def names_read(self) -> set[str]:
@@ -229,11 +229,11 @@ def test_numbers_that_begin_anew_have_the_clock_requested() -> None:
     desk.take()
     desk.hear(COPTER, sequence=0)
     desk.run(100.3)
-    assert desk.clock_requests() == [100.0, 100.25]
+    assert desk.boot_time_requests() == [100.0, 100.25]
     assert desk.reboots == 0
     desk.hear(SystemTime(0, 160_300))  # it has not started again
     desk.run(104.0)
-    assert desk.clock_requests() == []
+    assert desk.boot_time_requests() == []
     assert desk.reboots == 0
     desk.hear(COPTER, sequence=200)
     desk.hear(COPTER, sequence=2)
@@ -249,10 +249,10 @@ def test_another_state_has_the_clock_requested() -> None:
     desk.take()
     desk.hear(COPTER, sequence=101)
     desk.run(100.5)
-    assert desk.clock_requests() == []
+    assert desk.boot_time_requests() == []
     desk.hear(Heartbeat(2, MAV_AUTOPILOT_ARDUPILOTMEGA, system_status=4), sequence=102)
     desk.run(100.6)
-    assert desk.clock_requests() == [100.5]
+    assert desk.boot_time_requests() == [100.5]
 
 
 def test_telemetry_that_begins_anew_is_a_restart() -> None:
@@ -270,7 +270,7 @@ def test_an_accepted_restart_shows_in_the_numbers_of_the_frames() -> None:
     """ArduCopter: heard 1.2 s after it has accepted, and sends its clock 1.4 s later."""
     desk = Desk()
     desk.run_heard(100.0)
-    restart = desk.machine.begin_restart(desk.now)
+    restart = desk.machine.begin_reboot(desk.now)
     desk.run(100.01)
     desk.hear(ACCEPTED, sequence=31)
     desk.run(101.2)
@@ -280,10 +280,10 @@ def test_an_accepted_restart_shows_in_the_numbers_of_the_frames() -> None:
     desk.run(101.21)
     assert restart.done
     assert restart.error is None
-    desk.machine.end_restart(restart, desk.now)
+    desk.machine.end_reboot(restart, desk.now)
     desk.take()
     desk.run(102.6)
-    assert desk.clock_requests() != []  # a baseline for the next one
+    assert desk.boot_time_requests() != []  # a baseline for the next one
     desk.hear(SystemTime(0, 2_400))
     desk.run(104.0)
     assert desk.reboots == 1
@@ -294,28 +294,28 @@ def test_numbers_that_prove_nothing(after: float, sequence: int) -> None:
     """Before it can have gone off, or in the middle: that waits for the clock."""
     desk = Desk()
     desk.run_heard(100.0)
-    restart = desk.machine.begin_restart(desk.now)
+    restart = desk.machine.begin_reboot(desk.now)
     desk.hear(ACCEPTED, sequence=31)
     desk.run(100.0 + after)
     desk.hear(COPTER, sequence=sequence)
     assert desk.reboots == 0
     desk.hear(SystemTime(0, 200))
     assert desk.reboots == 1
-    desk.machine.end_restart(restart, desk.now)
+    desk.machine.end_reboot(restart, desk.now)
 
 
 def test_numbers_prove_nothing_while_a_clock_goes_on() -> None:
     desk = Desk()
     desk.run_heard(100.0)
-    restart = desk.machine.begin_restart(desk.now)
+    restart = desk.machine.begin_reboot(desk.now)
     desk.hear(ACCEPTED, sequence=31)
     desk.run(100.5)
     desk.machine.boot_clock(ATTITUDE_ID, 160_500, desk.now)
     desk.run(100.6)
     desk.hear(COPTER, sequence=0)
     assert desk.reboots == 0
-    desk.machine.end_restart(restart, desk.now)
-    assert desk.machine.clock_requests.next_deadline() == math.inf
+    desk.machine.end_reboot(restart, desk.now)
+    assert desk.machine.boot_time_requests.next_deadline() == math.inf
 
 
 # values that are measured at each start
@@ -369,7 +369,7 @@ def test_a_vehicle_that_is_met_soon_after_its_start(uptime: float, is_young: boo
     assert desk.names_read() == ({"BARO1_GND_PRESS"} if is_young else set())
 
 
-@pytest.mark.parametrize("desk", [Desk(interval=math.inf), Desk(PX4)], ids=["no upkeep", "a hash"])
+@pytest.mark.parametrize("desk", [Desk(interval=math.inf), Desk(PX4)], ids=["no sync_settings", "a hash"])
 def test_boot_values_are_not_read_where_that_is_not_wanted_or_needed(desk: Desk) -> None:
     desk.value("BARO1_GND_PRESS")
     desk.run_heard(100.0)
@@ -442,11 +442,11 @@ def test_clocks_are_read_all_the_time_while_a_restart_is_awaited() -> None:
     station.receive(wire.encode(AutopilotVersion(0, uid=7), system=1, component=1, sequence=1), "peer", 0.0)
     station.receive(attitude(90_000), "peer", 0.5)
     machine = station.components[1, 1]
-    restart = machine.begin_restart(0.9)
+    restart = machine.begin_reboot(0.9)
     for tenth in range(10, 20):
         station.receive(attitude(90_000 + 100 * tenth), "peer", tenth / 10)
         assert machine.presence.clock_at == tenth / 10
-    machine.end_restart(restart, 2.0)
+    machine.end_reboot(restart, 2.0)
     station.receive(attitude(92_000), "peer", 2.0)
     station.receive(attitude(92_100), "peer", 2.1)
     assert machine.presence.clock_at == 2.0

@@ -10,8 +10,8 @@ from typing import Final, Protocol
 from paramclient.errors import ContestedAddress
 from paramclient.protocol.addresses import Peer
 from paramclient.protocol.requests.retry import PEER_RECHECKS, PEER_REQUESTS
-from paramclient.protocol.vehicle.claims import Claim, PeerRelation, compare, compare_in_turn
 from paramclient.protocol.vehicle.commands import message_requests
+from paramclient.protocol.vehicle.peer_claims import Claim, PeerRelation, compare, compare_in_turn
 from paramclient.protocol.vehicle.presence import LOST_AFTER, Presence
 from paramclient.protocol.wire import (
     AUTOPILOT_VERSION_ID,
@@ -19,7 +19,7 @@ from paramclient.protocol.wire import (
     Message,
 )
 
-__all__ = ["NO_PEER", "ComponentPeers", "Contest", "Host"]
+__all__ = ["NO_PEER", "ComponentPeers", "Contest", "PeersHost"]
 
 CLAIMS_MAX: Final = 8
 """Further peers that are followed for one component. Others are ignored until one of these has been silent
@@ -63,7 +63,7 @@ class Contest:
         return ContestedAddress(self.system, self.component, self.claimants, self.difference)
 
 
-class Host(Protocol):
+class PeersHost(Protocol):
     """The part of a component that `ComponentPeers` uses."""
 
     @property
@@ -71,7 +71,7 @@ class Host(Protocol):
         """Its presence."""
 
     @property
-    def is_restarting(self) -> bool:
+    def is_rebooting(self) -> bool:
         """Whether a reboot on command is in progress."""
 
     @abstractmethod
@@ -91,7 +91,7 @@ class Host(Protocol):
         """Have clocks in telemetry read for a while."""
 
     @abstractmethod
-    def peer_moved(self, claim: Claim, now: float, verdict: PeerRelation) -> None:
+    def home_changed(self, claim: Claim, now: float, verdict: PeerRelation) -> None:
         """Take another peer as the one with the address; the verdict is that of `compare_in_turn`."""
 
     @abstractmethod
@@ -125,10 +125,10 @@ class ComponentPeers:
         speaker: the peer whose messages count without a check: `home`, except during a contest.
         heard_at: when the last message of `home` was received.
         contest: why the address is contested, or None.
-        foreign: messages of other peers that were ignored.
+        ignored_messages: messages of other peers that were ignored.
     """
 
-    def __init__(self, target: tuple[int, int], host: Host, *, may_ask: bool) -> None:
+    def __init__(self, target: tuple[int, int], host: PeersHost, *, may_ask: bool) -> None:
         self._target = target
         self._host = host
         self._may_ask = may_ask
@@ -137,8 +137,8 @@ class ComponentPeers:
         self.speaker: Peer = NO_PEER
         self.heard_at = -math.inf
         self.contest: Contest | None = None
-        self.foreign = 0
-        self._mine: Claim | None = None
+        self.ignored_messages = 0
+        self._home_claim: Claim | None = None
         self._others: dict[Peer, Claim] = {}
         self._look_at = math.inf
         self._began_as: tuple[Claim, tuple[int, int] | None] | None = None  # None where values are mixed
@@ -146,17 +146,19 @@ class ComponentPeers:
     @property
     def is_unclear(self) -> bool:
         """Whether it is open which vehicle is active: nothing received meanwhile may be kept."""
-        mine = self._mine
-        return self.contest is not None or (mine is not None and (mine.is_moving or mine.is_mixed))
+        home_claim = self._home_claim
+        return self.contest is not None or (
+            home_claim is not None and (home_claim.is_unsettled or home_claim.is_mixed)
+        )
 
     def is_rival(self, peer: Peer) -> bool:
         """Return whether a peer also sends for the component without being proven the same vehicle."""
         claim = self._others.get(peer)
         return claim is not None and claim.verdict is not PeerRelation.SAME
 
-    def takes(self, peer: Peer, now: float) -> bool:
+    def accepts(self, peer: Peer, now: float) -> bool:
         """Return whether to accept a message that cannot tell vehicles apart, such as PARAM_VALUE."""
-        self._mine_or(peer, now)
+        self._home_claim_or(peer, now)
         if peer == self.home:
             self.heard_at = now
             return self.contest is None
@@ -164,28 +166,28 @@ class ComponentPeers:
             self._review(now)
         return self._is_path(self._claim_of(peer, now))
 
-    def hears(self, message: Message, peer: Peer, now: float) -> bool:
+    def accepts_identifying(self, message: Message, peer: Peer, now: float) -> bool:
         """Record a message that may tell vehicles apart; return whether to accept it."""
-        mine = self._mine_or(peer, now)
-        claim = mine if peer == self.home else self._claim_of(peer, now)
+        home_claim = self._home_claim_or(peer, now)
+        claim = home_claim if peer == self.home else self._claim_of(peer, now)
         if claim is None:
             return self._is_path(None)
-        claim.take(message, now, self._timeout)
-        if claim is not mine:
+        claim.take(message, now, self._heartbeat_timeout)
+        if claim is not home_claim:
             self._review(now)
             return self._is_path(claim)
         self.heard_at = claim.heard_at = now
-        if claim.is_moving or claim.is_mixed:
+        if claim.is_unsettled or claim.is_mixed:
             self._review(now)
         return self.contest is None
 
-    def hears_clock(self, message_id: int, boot_ms: int, peer: Peer, now: float) -> bool:
+    def accepts_clock(self, message_id: int, boot_ms: int, peer: Peer, now: float) -> bool:
         """Record the time since boot in telemetry; return whether to accept it."""
-        is_taken = self.takes(peer, now)
-        claim = self._mine if peer == self.home else self._others.get(peer)
+        is_taken = self.accepts(peer, now)
+        claim = self._home_claim if peer == self.home else self._others.get(peer)
         if claim is not None:
             claim.take_clock(message_id, boot_ms, now)
-            if claim is self._mine and claim.is_mixed and self.contest is None:
+            if claim is self._home_claim and claim.is_mixed and self.contest is None:
                 self._review(now)
         return is_taken and self.contest is None
 
@@ -198,7 +200,7 @@ class ComponentPeers:
         """Accept the messages of this peer in any case: those of ground stations do not matter."""
         self.home = self.speaker = peer
         self.has_left = False
-        self._mine = None
+        self._home_claim = None
 
     def left(self, peer: Peer, now: float) -> None:
         """Process the end of a peer's connection."""
@@ -212,13 +214,13 @@ class ComponentPeers:
     def forget(self) -> None:
         """Forget all peers: the link is down, and comes back with other peers."""
         self._others.clear()
-        self.home, self.speaker, self._mine = NO_PEER, NO_PEER, None
+        self.home, self.speaker, self._home_claim = NO_PEER, NO_PEER, None
         self.has_left = False
 
     def age(self, seconds: float) -> None:
         """Move all moments back by time that the clock left out."""
         self.heard_at -= seconds
-        for claim in (self._mine, *self._others.values()):
+        for claim in (self._home_claim, *self._others.values()):
             if claim is not None:
                 claim.age(seconds)
 
@@ -234,16 +236,16 @@ class ComponentPeers:
     # private
 
     @property
-    def _timeout(self) -> float:
-        patience = self._host.presence.heartbeat_timeout
-        return patience if patience < math.inf else LOST_AFTER
+    def _heartbeat_timeout(self) -> float:
+        timeout = self._host.presence.heartbeat_timeout
+        return timeout if timeout < math.inf else LOST_AFTER
 
-    def _mine_or(self, peer: Peer, now: float) -> Claim:
+    def _home_claim_or(self, peer: Peer, now: float) -> Claim:
         """Return the claim of the peer with the address; the first peer gets the address."""
-        if self._mine is None:
+        if self._home_claim is None:
             self._settle_at(claim := self._others.pop(peer, None) or Claim(peer, now))
             return claim
-        return self._mine
+        return self._home_claim
 
     def _claim_of(self, peer: Peer, now: float) -> Claim | None:
         """Return the claim of a further peer; None where there are too many."""
@@ -259,20 +261,20 @@ class ComponentPeers:
 
     def _is_path(self, claim: Claim | None) -> bool:
         """Return whether to accept a message of a further peer; count it otherwise."""
-        is_known = claim is not None and (claim.verdict is PeerRelation.SAME or claim is self._mine)
+        is_known = claim is not None and (claim.verdict is PeerRelation.SAME or claim is self._home_claim)
         is_taken = is_known and self.contest is None
-        self.foreign += not is_taken
+        self.ignored_messages += not is_taken
         return is_taken
 
     def _review(self, now: float) -> None:
         """Review the peers: active and silent ones, proven paths, contests."""
-        timeout = self._timeout
+        timeout = self._heartbeat_timeout
         self._others = {p: each for p, each in self._others.items() if now - each.heard_at < timeout}
-        mine = self._mine
-        if mine is not None:
-            mine.settle(now, timeout)
-            if mine.uid.is_moving:
-                self._ask_again(mine, now)
+        home_claim = self._home_claim
+        if home_claim is not None:
+            home_claim.settle(now, timeout)
+            if home_claim.uid.is_unsettled:
+                self._ask_again(home_claim, now)
         difference = ""
         for claim in list(self._others.values()):
             difference = self._judge(claim, now) or difference
@@ -285,72 +287,87 @@ class ComponentPeers:
 
     def _judge(self, claim: Claim, now: float) -> str:
         """Compare a further peer with the one that has the address; return the difference as text."""
-        mine = self._mine
-        if mine is None:
+        home_claim = self._home_claim
+        if home_claim is None:
             return ""
         is_over = claim.verdict is PeerRelation.OTHER or self._is_over(claim, now)
-        claim.verdict, difference = compare(mine, claim, is_over=is_over, may_ask=self._may_ask)
-        tells_nothing_else = claim.kind.current == mine.kind.current and claim.uid.current in (
+        claim.verdict, difference = compare(home_claim, claim, is_over=is_over, may_ask=self._may_ask)
+        tells_nothing_else = claim.kind.current == home_claim.kind.current and claim.uid.current in (
             None,
-            mine.uid.current,
+            home_claim.uid.current,
         )
         is_unproven = claim.verdict is PeerRelation.OPEN or (
             claim.verdict is PeerRelation.OTHER and tells_nothing_else
         )
-        if is_unproven and self._may_ask and now >= claim.asked_at + PEER_REQUESTS.pause_after(claim.asks):
-            claim.asks += 1
+        if (
+            is_unproven
+            and self._may_ask
+            and now >= claim.requested_at + PEER_REQUESTS.pause_after(claim.requests)
+        ):
+            claim.requests += 1
             self._ask(claim, now)
             self._host.read_clock(now)
             is_here = self.home is not NO_PEER
             if is_here and self._host.is_identified:  # otherwise ambiguous acknowledgements
-                self._request(mine, SYSTEM_TIME_ID)
+                self._request(home_claim, SYSTEM_TIME_ID)
         return difference if claim.verdict is PeerRelation.OTHER else ""
 
     def _is_over(self, claim: Claim, now: float) -> bool:
         """Return whether everything was done to identify a further peer."""
         if not self._may_ask:
             return now >= claim.first_at + PEER_REQUESTS.duration
-        return PEER_REQUESTS.is_over(claim.asks, claim.asked_at, now)
+        return PEER_REQUESTS.is_over(claim.requests, claim.requested_at, now)
 
     def _decide(self, difference: str, now: float) -> None:
         """Begin a contest, or end it."""
-        mine = self._mine
-        is_mixed = mine is not None and mine.is_mixed
-        is_here = mine is not None and not self.has_left and now - self.heard_at < self._timeout
+        home_claim = self._home_claim
+        is_mixed = home_claim is not None and home_claim.is_mixed
+        is_here = (
+            home_claim is not None and not self.has_left and now - self.heard_at < self._heartbeat_timeout
+        )
         rivals = [
             each
             for each in self._others.values()
             if each.verdict is PeerRelation.OTHER
             and is_here
             and self.heard_at > each.first_at
-            and not (each.is_by_satellite and mine is not None and each.kind.current == mine.kind.current)
+            and not (
+                each.is_by_satellite
+                and home_claim is not None
+                and each.kind.current == home_claim.kind.current
+            )
         ]
         if self.contest is None and (is_mixed or rivals):
-            assert mine is not None
-            claimants = tuple(each.in_words() for each in (mine, *rivals))
+            assert home_claim is not None
+            claimants = tuple(each.in_words() for each in (home_claim, *rivals))
             if is_mixed:
                 difference = "one peer says both in turn"
             self.contest = Contest(*self._target, claimants, difference)
             self.speaker = NO_PEER
-            self._began_as = None if is_mixed else (mine, mine.kind.current)
+            self._began_as = None if is_mixed else (home_claim, home_claim.kind.current)
             self._host.contest_began(self.contest, now)
         elif self.contest is not None:
             if is_mixed:
                 self._began_as = None
             elif not rivals and is_here:
-                assert mine is not None
+                assert home_claim is not None
                 self.contest = None
                 self.speaker = self.home
                 is_same = self._began_as is not None and (
-                    (mine, mine.kind.current) == self._began_as
-                    or self._in_turn(self._began_as[0], mine) is PeerRelation.SAME
+                    (home_claim, home_claim.kind.current) == self._began_as
+                    or self._in_turn(self._began_as[0], home_claim) is PeerRelation.SAME
                 )
-                self._host.contest_ended(mine, now, is_same=is_same)
+                self._host.contest_ended(home_claim, now, is_same=is_same)
 
     def _follow_id(self, now: float) -> None:
         """Give the address to a peer that has sent a hardware id first: requests go to it."""
-        mine = self._mine
-        if mine is None or mine.uid.current or self._host.is_identified or self.contest is not None:
+        home_claim = self._home_claim
+        if (
+            home_claim is None
+            or home_claim.uid.current
+            or self._host.is_identified
+            or self.contest is not None
+        ):
             return
         for claim in self._others.values():
             if claim.uid.current and now >= claim.version_at + UID_GRACE:
@@ -359,8 +376,8 @@ class ComponentPeers:
 
     def _move_on(self, now: float) -> None:
         """Give the address to an active peer, where the one that has it is silent."""
-        mine = self._mine
-        if mine is None:
+        home_claim = self._home_claim
+        if home_claim is None:
             return
         silence = math.inf if self.has_left and self.contest is None else now - self.heard_at
         for claim in sorted(self._others.values(), key=_preference):
@@ -377,11 +394,11 @@ class ComponentPeers:
     def _awaits_id(self, claim: Claim, now: float) -> bool:
         """Return whether the hardware id of the silent vehicle is still being requested from a further
         peer."""
-        mine = self._mine
-        is_over = self._is_over(claim, now) and not self._host.is_restarting
-        if mine is None or self.contest is not None or is_over:
+        home_claim = self._home_claim
+        is_over = self._is_over(claim, now) and not self._host.is_rebooting
+        if home_claim is None or self.contest is not None or is_over:
             return False
-        return self._hides_id(mine, claim) and self._in_turn(mine, claim) is PeerRelation.OPEN
+        return self._hides_id(home_claim, claim) and self._in_turn(home_claim, claim) is PeerRelation.OPEN
 
     @staticmethod
     def _hides_id(before: Claim, claim: Claim) -> bool:
@@ -390,20 +407,20 @@ class ComponentPeers:
 
     def _silence_before(self, claim: Claim) -> float:
         """Return the seconds of silence of the peer with the address after which this one gets it."""
-        if self.contest is not None or self._mine is None:
-            return self._timeout
+        if self.contest is not None or self._home_claim is None:
+            return self._heartbeat_timeout
         usual = self._host.presence.gap
-        if claim.kind.current != self._mine.kind.current:
+        if claim.kind.current != self._home_claim.kind.current:
             return usual
-        if self._host.is_restarting:
+        if self._host.is_rebooting:
             return COMMANDED_SILENCE
-        uids = {claim.uid.current, self._mine.uid.current}
+        uids = {claim.uid.current, self._home_claim.uid.current}
         has_started = claim.started_at >= self.heard_at - RESTART_SLACK
         return RESTART_SILENCE if len(uids) == 1 and has_started and claim.uid.current else usual
 
     def _swap(self, claim: Claim, now: float, *, is_proven: bool = False) -> None:
         """Give the address to a further peer."""
-        before = self._mine
+        before = self._home_claim
         assert before is not None, "it has the address"
         del self._others[claim.peer]
         if is_proven and not self.has_left:
@@ -417,10 +434,10 @@ class ComponentPeers:
         verdict = self._in_turn(before, claim)
         if verdict is PeerRelation.OPEN and self._hides_id(before, claim):
             verdict = PeerRelation.OTHER  # requested without success
-        self._host.peer_moved(claim, now, verdict)
+        self._host.home_changed(claim, now, verdict)
 
     def _settle_at(self, claim: Claim) -> None:
-        self.home, self._mine = claim.peer, claim
+        self.home, self._home_claim = claim.peer, claim
         self.has_left = False
         self.heard_at = claim.heard_at
         self.speaker = self.home if self.contest is None else NO_PEER
@@ -430,15 +447,15 @@ class ComponentPeers:
 
     def _ask(self, claim: Claim, now: float) -> None:
         """Request identity and boot time from a peer."""
-        claim.asked_at = now
+        claim.requested_at = now
         if claim.uid.current is None:
-            self._request(claim, AUTOPILOT_VERSION_ID, also_otherwise=claim.asks > 1)
+            self._request(claim, AUTOPILOT_VERSION_ID, also_otherwise=claim.requests > 1)
         self._request(claim, SYSTEM_TIME_ID)
 
     def _ask_again(self, claim: Claim, now: float) -> None:
         """Request the hardware id of the peer with the address, which has just sent two."""
-        if self._may_ask and now >= claim.asked_at + PEER_RECHECKS.later:
-            claim.asked_at = now
+        if self._may_ask and now >= claim.requested_at + PEER_RECHECKS.later:
+            claim.requested_at = now
             self._request(claim, AUTOPILOT_VERSION_ID)
 
     def _request(self, claim: Claim, message_id: int, *, also_otherwise: bool = False) -> None:

@@ -26,7 +26,7 @@ from paramclient.client.local import local
 from paramclient.protocol import wire
 from paramclient.protocol.requests.retry import REBOOT_COMMANDS_MAX
 from paramclient.protocol.system_id_change import OLD_ID_SILENCE_MIN
-from paramclient.protocol.vehicle.reboot import SAVING_TIME, UNOBSERVED_TIMEOUT
+from paramclient.protocol.vehicle.reboot_command import SAVING_TIME, UNOBSERVED_TIMEOUT
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle, Vehicle
 from tests.shell import FlakyLink, Tap, a_client, generic, outcome, residue, swiftly, tasks_beside
 from tests.simulation import is_so
@@ -404,7 +404,7 @@ async def test_cancelling_leaves_nothing(make: Make, after: float) -> None:
         assert call.cancelled() or call.done()
         assert residue(component) == []
         assert len(local(component).machine.commands) == 0
-        assert local(component).machine.restarts.current is None
+        assert local(component).machine.reboots.current is None
         assert tasks_beside() == tasks
         await asyncio.sleep(5.0)
         assert await component.reboot() is component

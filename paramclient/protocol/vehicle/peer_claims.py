@@ -74,7 +74,7 @@ class AlternatingValues(Generic[Value]):
         self._earlier: dict[Value, float] = {}  # other recent values, and when each was received last
 
     @property
-    def is_moving(self) -> bool:
+    def is_unsettled(self) -> bool:
         """Whether another value was received within the timeout, as of the last `settle`."""
         return bool(self._earlier)
 
@@ -119,26 +119,26 @@ class _BootTimes:
     """The boots that messages of one id imply, as far as they differ.
 
     Attributes:
-        turns: when the boot differed from that of the message before, in the last 15 s.
+        alternations_at: when the boot differed from that of the message before, in the last 15 s.
     """
 
-    __slots__ = ("_current", "turns")
+    __slots__ = ("_current", "alternations_at")
 
     def __init__(self) -> None:
         self._current: float | None = None
-        self.turns: list[float] = []
+        self.alternations_at: list[float] = []
 
     def add(self, started_at: float, now: float) -> None:
         if self._current is not None and abs(started_at - self._current) > BOOT_DIFFERENCE_MIN:
-            self.turns.append(now)
+            self.alternations_at.append(now)
         self._current = started_at
         self.settle(now)
 
     def settle(self, now: float) -> None:
-        self.turns = [at for at in self.turns if now - at < ALTERNATION_WINDOW]
+        self.alternations_at = [at for at in self.alternations_at if now - at < ALTERNATION_WINDOW]
 
     def age(self, seconds: float) -> None:
-        self.turns.clear()
+        self.alternations_at.clear()
         if self._current is not None:
             self._current -= seconds
 
@@ -151,7 +151,7 @@ class Claim:
         first_at, heard_at: when its first and last message were received.
         kind: autopilot and vehicle type of its heartbeats.
         uid: the hardware id of its AUTOPILOT_VERSION, "" where that has none.
-        asks, asked_at: the number of identity requests to it, and the time of the last.
+        requests, requested_at: the number of identity requests to it, and the time of the last.
         verdict: its relation to the peer with the address.
         heartbeat, version: its last ones, used when it becomes the peer with the address.
         version_at: when the version was received; infinity before.
@@ -160,13 +160,13 @@ class Claim:
     __slots__ = (
         "_clocks",
         "_starts",
-        "asked_at",
-        "asks",
         "first_at",
         "heard_at",
         "heartbeat",
         "kind",
         "peer",
+        "requested_at",
+        "requests",
         "uid",
         "verdict",
         "version",
@@ -180,8 +180,8 @@ class Claim:
         self.uid: AlternatingValues[str] = AlternatingValues()
         self._clocks: dict[int, _Clock] = {}
         self._starts: dict[int, _BootTimes] = {}
-        self.asks = 0
-        self.asked_at = -math.inf
+        self.requests = 0
+        self.requested_at = -math.inf
         self.verdict = PeerRelation.OPEN
         self.heartbeat: Heartbeat | None = None
         self.version: AutopilotVersion | None = None
@@ -195,7 +195,7 @@ class Claim:
     @property
     def has_two_starts(self) -> bool:
         """Whether the times since boot are those of several vehicles."""
-        return any(len(each.turns) >= ALTERNATIONS_MIN for each in self._starts.values())
+        return any(len(each.alternations_at) >= ALTERNATIONS_MIN for each in self._starts.values())
 
     def settle(self, now: float, timeout: float) -> None:
         """Drop values that were not received within the timeout."""
@@ -205,9 +205,9 @@ class Claim:
             each.settle(now)
 
     @property
-    def is_moving(self) -> bool:
+    def is_unsettled(self) -> bool:
         """Whether recent values may show that."""
-        return self.kind.is_moving or self.uid.is_moving
+        return self.kind.is_unsettled or self.uid.is_unsettled
 
     def take(self, message: Message, now: float, timeout: float) -> None:
         """Record what a message of this peer says about the vehicle."""
@@ -293,21 +293,21 @@ class Claim:
         return f"{words} from {peer_in_words(self.peer)}"
 
 
-def compare(mine: Claim, other: Claim, *, is_over: bool, may_ask: bool) -> tuple[PeerRelation, str]:
+def compare(home: Claim, other: Claim, *, is_over: bool, may_ask: bool) -> tuple[PeerRelation, str]:
     """Return whether two claims are of one vehicle, and their difference as text.
 
     Args:
-        mine, other: the claims.
+        home, other: the claims.
         is_over: whether all requests that could tell more were sent.
         may_ask: whether requests may be sent at all.
     """
-    kinds = mine.kind.current, other.kind.current
-    uids = mine.uid.current, other.uid.current
+    kinds = home.kind.current, other.kind.current
+    uids = home.uid.current, other.uid.current
     if None not in kinds and kinds[0] != kinds[1]:
         return PeerRelation.OTHER, "the autopilot or vehicle type"
     if None not in uids and uids[0] != uids[1]:
         return PeerRelation.OTHER, "the hardware id"
-    have_one_start = mine.has_one_start(other)
+    have_one_start = home.has_one_start(other)
     if have_one_start is False:
         return PeerRelation.OTHER, "the time since boot"
     uid = uids[0] if uids[0] == uids[1] else None
@@ -316,7 +316,7 @@ def compare(mine: Claim, other: Claim, *, is_over: bool, may_ask: bool) -> tuple
     if not is_over:
         return PeerRelation.OPEN, ""
     if kinds[0] == kinds[1] and uids[0] == uids[1]:
-        no_clock = not (mine.tells_clock or other.tells_clock)
+        no_clock = not (home.tells_clock or other.tells_clock)
         if have_one_start or (no_clock and not uid):
             return PeerRelation.SAME, ""
     if kinds[0] == kinds[1] and have_one_start and not may_ask:
@@ -324,26 +324,26 @@ def compare(mine: Claim, other: Claim, *, is_over: bool, may_ask: bool) -> tuple
     return PeerRelation.OTHER, "nothing that shows them to be one vehicle"
 
 
-def compare_in_turn(mine: Claim, other: Claim, *, may_ask: bool) -> PeerRelation:
+def compare_in_turn(home: Claim, other: Claim, *, may_ask: bool) -> PeerRelation:
     """Return whether a claim is of the vehicle that has sent under another one until it went silent.
 
     The vehicle may have rebooted since, so only the hardware id proves that. `OPEN` where there is none to
     compare: the other claim has not received it, or neither has a unique one.
 
     Args:
-        mine: the claim of the silent peer.
+        home: the claim of the silent peer.
         other: the claim.
         may_ask: whether requests may be sent at all.
     """
-    kinds = mine.kind.current, other.kind.current
+    kinds = home.kind.current, other.kind.current
     if None not in kinds and kinds[0] != kinds[1]:
         return PeerRelation.OTHER
-    if mine.uid.current == other.uid.current:
-        return PeerRelation.SAME if mine.has_own_uid else PeerRelation.OPEN
+    if home.uid.current == other.uid.current:
+        return PeerRelation.SAME if home.has_own_uid else PeerRelation.OPEN
     if other.uid.current is None:
-        is_heard = not may_ask and kinds[0] == kinds[1] and mine.has_one_start(other)
+        is_heard = not may_ask and kinds[0] == kinds[1] and home.has_one_start(other)
         return PeerRelation.SAME if is_heard else PeerRelation.OPEN
-    return PeerRelation.OTHER if mine.uid.current or other.uid.current else PeerRelation.OPEN
+    return PeerRelation.OTHER if home.uid.current or other.uid.current else PeerRelation.OPEN
 
 
 def _is_one_start(one: _Clock, another: _Clock) -> bool | None:

@@ -14,7 +14,7 @@ from paramclient.protocol.events import ComponentContested, ComponentReplaced, C
 from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.requests.retry import PEER_REQUESTS, PEER_REQUESTS_MAX
 from paramclient.protocol.station import Station
-from paramclient.protocol.vehicle import peers as room
+from paramclient.protocol.vehicle import address_contest as room
 from paramclient.protocol.vehicle.presence import LOST_AFTER
 from paramclient.protocol.wire import (
     MAV_AUTOPILOT_ARDUPILOTMEGA,
@@ -163,7 +163,7 @@ def test_two_autopilots_under_one_address_are_contested_at_once() -> None:
         lambda: net.machine.write("P", 1.0, net.now),
         lambda: net.machine.read("P", net.now),
         lambda: net.machine.begin_fetch(net.now),
-        lambda: net.machine.begin_restart(net.now),
+        lambda: net.machine.begin_reboot(net.now),
         lambda: net.machine.search(["P"], net.now),
         lambda: net.machine.check_present("a file", net.now),
     ):
@@ -443,7 +443,7 @@ def test_components_of_one_system_may_come_from_several_peers() -> None:
 
 
 def test_a_heartbeat_from_a_forged_address_brings_that_seven_requests_and_no_more() -> None:
-    station = Station(link="udpin:test", is_stream=False, upkeep=SyncSettings.chosen(None, "auto"))
+    station = Station(link="udpin:test", is_stream=False, sync_settings=SyncSettings.chosen(None, "auto"))
     station.receive(wire.encode(PX4, system=9, component=1, sequence=0), "victim", 0.0)
     framer, sent = Framer(wire.DECODED_IDS, stream=False), []
     for step in range(1200):
@@ -503,7 +503,7 @@ def test_further_peers_are_so_many_and_no_more() -> None:
 
 def test_where_nothing_is_sent_the_clock_shows_a_second_path() -> None:
     def listening(**other: object) -> Net:
-        station = Station(link="udpin:test", is_stream=False, upkeep=SyncSettings(listens_only=True))
+        station = Station(link="udpin:test", is_stream=False, sync_settings=SyncSettings(listens_only=True))
         net = Net(a=Speaker(), b=Speaker(start=0.4, **other), station=station)  # type: ignore[arg-type]
         for _ in range(20):
             for speaker in net.peers.values():
@@ -819,7 +819,7 @@ def test_a_restart_at_a_new_port_may_take_its_time_to_answer() -> None:
     net = Net(a=silent_after(3.0), b=after)
     net.run(2.0)
     hold(net, "P", "Q")
-    net.machine.begin_restart(net.now)
+    net.machine.begin_reboot(net.now)
     net.run(10.0)
     after.uid, after.booted_at = 1, 3.5
     net.run(6.0)

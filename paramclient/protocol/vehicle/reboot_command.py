@@ -44,7 +44,7 @@ class Reboots(Machine):
     """The reboot on command of one component: at most one at a time, shared by all callers.
 
     Args:
-        context, commands, who, presence, clock_requests: the component's.
+        context, commands, identification, presence, boot_time_requests: the component's.
         restarted: called when the component has rebooted and nothing else has detected it; calls `rebooted`.
 
     Attributes:
@@ -56,22 +56,22 @@ class Reboots(Machine):
         self,
         context: Context,
         commands: Commands,
-        who: Identification,
+        identification: Identification,
         presence: Presence,
-        clock_requests: BootTimeRequests,
+        boot_time_requests: BootTimeRequests,
         restarted: Callable[[float], None],
     ) -> None:
         self.current: Reboot | None = None
         self.saved_at = -math.inf
         self._context = context
         self._commands = commands
-        self._identification = who
+        self._identification = identification
         self._presence = presence
-        self._clock_requests = clock_requests
+        self._boot_time_requests = boot_time_requests
         self._restarted = restarted
 
     @property
-    def is_under_way(self) -> bool:
+    def is_in_progress(self) -> bool:
         """Whether a reboot was commanded and is awaited."""
         return self.current is not None and not self.current.done
 
@@ -90,19 +90,19 @@ class Reboots(Machine):
                 self._presence,
                 self.saved_at,
                 self._restarted,
-                self._clock_requests,
+                self._boot_time_requests,
                 returns=returns,
                 now=now,
             )
         self.current.waiters += 1
         return self.current
 
-    def end(self, restart: Reboot, now: float) -> None:
+    def end(self, reboot: Reboot, now: float) -> None:
         """Give a reboot back. The last holder ends it; whether the command takes effect is then unknown."""
-        restart.waiters -= 1
-        if not restart.waiters:
-            restart.stop(now)
-            if self.current is restart:
+        reboot.waiters -= 1
+        if not reboot.waiters:
+            reboot.stop(now)
+            if self.current is reboot:
                 self.current = None
 
     def write_ended(self, now: float) -> None:
@@ -154,10 +154,10 @@ class Reboot(Operation[None]):
     It has no time limit of its own.
 
     Args:
-        context, commands, who, presence: the component's.
+        context, commands, identification, presence: the component's.
         saved_at: when the vehicle has saved all written values.
         restarted: called when the component has rebooted and nothing else has detected it; calls `rebooted`.
-        clock_requests: the component's.
+        boot_time_requests: the component's.
         returns: whether it comes back under its address. Otherwise it ends with the acknowledgement, or with
             the silence.
         now: the time.
@@ -171,11 +171,11 @@ class Reboot(Operation[None]):
         self,
         context: Context,
         commands: Commands,
-        who: Identification,
+        identification: Identification,
         presence: Presence,
         saved_at: float,
         restarted: Callable[[float], None],
-        clock_requests: BootTimeRequests,
+        boot_time_requests: BootTimeRequests,
         *,
         returns: bool,
         now: float,
@@ -183,11 +183,11 @@ class Reboot(Operation[None]):
         super().__init__(now)
         self._target = context.target
         self._commands = commands
-        self._identification = who
+        self._identification = identification
         self._presence = presence
         self._saved_at = saved_at
         self._restarted = restarted
-        self._clock_requests = clock_requests
+        self._boot_time_requests = boot_time_requests
         self._returns = returns
         self.waiters = 0
         self._command: Command | None = None
@@ -217,7 +217,7 @@ class Reboot(Operation[None]):
         """Process a reboot that its clock or its heartbeat shows."""
         if self._command is None:
             return
-        self._clock_requests.stop_following()
+        self._boot_time_requests.stop_following()
         if not self._returns:
             self.finish(None, now)
         self._back_at = now
@@ -255,7 +255,7 @@ class Reboot(Operation[None]):
 
     def stop(self, now: float) -> None:
         """End the reboot for all callers. A sent command cannot be recalled."""
-        self._clock_requests.stop_following()
+        self._boot_time_requests.stop_following()
         if self._command is not None:
             self._commands.cancel(self._command, now)
 
@@ -271,15 +271,15 @@ class Reboot(Operation[None]):
         return math.inf if self.done else self._next_step()[0]
 
     def _next_step(self) -> tuple[float, Callable[[float], None]]:
-        command, presence, who = self._command, self._presence, self._identification
+        command, presence, identification = self._command, self._presence, self._identification
         if command is None:
-            return (self._saved_at if who.settled else math.inf), self._begin
+            return (self._saved_at if identification.settled else math.inf), self._begin
         if self._back_at is not None:
             if presence.is_booting:
                 return math.inf, self._ask
             if self._is_identified_since(self._back_at):
                 return -math.inf, self._compare
-            return (math.inf if who.is_asking else self._ask_at), self._ask
+            return (math.inf if identification.is_asking else self._ask_at), self._ask
         if self._clock_shows_it(command.request.sent_at):
             return -math.inf, self._restarted
         if self._heard_again_at is not None:
@@ -299,7 +299,7 @@ class Reboot(Operation[None]):
             MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, (1.0,), now, repeats=False
         )
         command.on_done.append(self._answered)
-        self._clock_requests.follow(now)
+        self._boot_time_requests.follow(now)
 
     def _answered(self) -> None:
         command = self._command
