@@ -41,6 +41,7 @@ from paramclient.protocol.params.reads import Key, Read, Reads
 from paramclient.protocol.params.sync import Sync, SyncSettings, SyncState
 from paramclient.protocol.params.sync_interval import SyncInterval
 from paramclient.protocol.params.table import NameQuota, Table
+from paramclient.protocol.params.upload import Uploads
 from paramclient.protocol.params.value_check import Rereads
 from paramclient.protocol.params.volatile_values import VolatileReads
 from paramclient.protocol.params.write_batch import BatchRules, WriteBatch, WriteBatches
@@ -163,6 +164,7 @@ class ComponentMachine:
         following: the list that another station has requested, while none of ours runs.
         sync: whether the table still matches the vehicle's.
         files: its files over MAVFTP.
+        uploads: its parameter file as a way to write many values.
         descriptions: the location of its metadata.
         name_searches: the searches for names that may not exist.
         commands: its commands.
@@ -226,6 +228,7 @@ class ComponentMachine:
         self.presence = Presence()
         self.peers = ComponentPeers(target, self, may_ask=context.may_send)
         self.files = FileTransfers(context)
+        self.uploads = Uploads(context, self.files, self.table)
         check_pace = SyncInterval(upkeep.interval, is_chosen=upkeep.without_hash)
         self.sync = Sync(
             context, self.reads, self.table, upkeep, check_pace, self.presence, self.files, host=self
@@ -455,6 +458,7 @@ class ComponentMachine:
                 self._vehicle_replaced(now)
             elif before not in (None, self.identification.firmware):
                 self.fetches.updated(now)
+                self.uploads.forget()
         elif isinstance(message, ParamError):
             addressee = (message.target_system, message.target_component)
             if message.param_index < 0 and not is_portable_name(message.param_id):
@@ -720,6 +724,7 @@ class ComponentMachine:
         *,
         settle: float = 0.0,
         force: bool = False,
+        filed: bool = False,
     ) -> Write:
         """Write one parameter, also on behalf of another user.
 
@@ -728,6 +733,7 @@ class ComponentMachine:
             now: the time.
             settle: seconds from the acknowledgement until the value is read once more.
             force: send NaN and infinity also to an autopilot that cannot store them.
+            filed: as in `Writes.set`.
 
         Raises:
             UsageError: the type is known and the value does not fit it, or the autopilot cannot store it.
@@ -740,7 +746,7 @@ class ComponentMachine:
         if known is not None and known.trust is not Trust.CACHED and self.may_be_written:
             encode_value(value, known.type, self.table.encoding)
         self.writes.check_finite(name, value, force=force)
-        write = self.writes.set(name, value, now, asker, settle=settle, force=force)
+        write = self.writes.set(name, value, now, asker, settle=settle, force=force, filed=filed)
         write.on_done.append(lambda: self._write_ended(write))
         return write
 
@@ -765,8 +771,12 @@ class ComponentMachine:
         """
         self.check_present(f"PARAM_SET to {self.system}/{self.component}", now)
 
-        def begin(name: str, value: Value, at: float) -> Write:
-            return self.write(name, value, at, asker, settle=settle, force=force)
+        def begin(name: str, value: Value, at: float, filed: bool) -> Write:
+            return self.write(name, value, at, asker, settle=settle, force=force, filed=filed)
+
+        def fileable(name: str) -> Param | None:
+            name = self.spelling(name)
+            return None if name in self.writes.queues else self.uploads.entry(name)
 
         number = self.identification.autopilot
         autopilot = "" if number is None else autopilot_name(number)
@@ -774,7 +784,18 @@ class ComponentMachine:
         def is_switch(name: str) -> bool:
             return is_group_switch(self.spelling(name), autopilot)
 
-        return self.write_batches.begin(pairs, BatchRules(begin, self.writes.cancel, is_switch), now)
+        rules = BatchRules(
+            begin=begin,
+            cancel=self.writes.cancel,
+            committed=self.writes.committed,
+            unfile=self.writes.unfile,
+            heard=self.receive_value,
+            is_switch=is_switch,
+            fileable=fileable,
+            may_commit=lambda: self.may_be_written,
+            uploads=self.uploads if settle == 0.0 and self.may_be_written else None,
+        )
+        return self.write_batches.begin(pairs, rules, now)
 
     def read_ext(self, key: Key, now: float) -> ExtRead:
         """Read one extended parameter; give it back with `ext.reads.release`.
@@ -1043,6 +1064,7 @@ class ComponentMachine:
         self._observer.replaced(self)
         self.sync.forget()
         self.fetches.forget()
+        self.uploads.forget()
         self.following.forget()
         self.ext.forget(now)
         self._checks.clear()

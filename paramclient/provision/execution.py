@@ -361,6 +361,8 @@ class ApplyRun:
             ParamClientError: not all values were tried.
         """
         self._is_verified = False
+        # ArduPilot may get all of them at once, as a file
+        in_flight = len(steps) if self._component.autopilot == "ardupilot" else WRITES_MAX
         by_name = {step.name: step for step in steps}
         before = frozenset(self.sent)
         ended = 0
@@ -368,10 +370,10 @@ class ApplyRun:
         def take(outcome: SetOutcome) -> None:
             nonlocal ended
             ended += 1
-            self.sent.update(step.name for step in steps[: ended + WRITES_MAX])
+            self.sent.update(step.name for step in steps[: ended + in_flight])
             self._take(by_name[outcome.name], outcome)
 
-        self.sent.update(step.name for step in steps[:WRITES_MAX])
+        self.sent.update(step.name for step in steps[:in_flight])
         try:
             done = await self._component.set_many(
                 [(step.name, step.value) for step in steps],

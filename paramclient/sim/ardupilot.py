@@ -235,11 +235,16 @@ class ArduPilotVehicle(Vehicle):
     def _count_in_list(self) -> int:
         return self._list_count
 
-    def _set_from_file(self, entry: Entry, param: PackedParam) -> None:
+    def _set_from_file(self, entry: Entry, param: PackedParam) -> float:
+        """Set a parameter from an uploaded file: 4.6 also sets read-only ones, newer versions do not."""
         value = from_bits(param.bits, param.type)
-        if entry.name in self._read_only or isinstance(value, bytes) or not math.isfinite(value):
-            return
-        self._hold(entry, param.bits if param.type == entry.type else _converted(value, entry.type))
+        is_protected = self._param_error and entry.name in self._read_only
+        if is_protected or isinstance(value, bytes) or not math.isfinite(value):
+            return _SAVE
+        bits = param.bits if param.type == entry.type else _converted(value, entry.type)
+        is_switched_on = entry.name in self._switches and entry.bits == 0 and bits != 0
+        self._hold(entry, bits)
+        return _SAVE + is_switched_on * _SWITCH_ON
 
     def _hold(self, entry: Entry, bits: int) -> None:
         if bits != entry.bits:
@@ -459,6 +464,10 @@ _INFO = 6
 _WARNING = 4
 _LOOP = 0.0058
 """Period of the main loop, which answers sets, in seconds."""
+_SAVE = 1e-5
+"""Seconds to set and save one parameter of an uploaded file."""
+_SWITCH_ON = 0.1
+"""Seconds that ArduPilot waits after an uploaded parameter has switched on a group."""
 _SLOT = 0.1
 """Period of the parameter task, which answers reads, in seconds."""
 _ROUNDING = 1e-6

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple, TypeAlias
 
 from paramclient.errors import FileErrorCode, PackError, UsageError
-from paramclient.model.values import crc32_px4
+from paramclient.model.values import ParamType, crc32_px4
 from paramclient.protocol.ftp import param_pck
 from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.ftp.param_pck import PackedParam
@@ -79,8 +80,13 @@ class FileServer:
       session are refused with InvalidSession; closing another session is acknowledged and closes nothing. The
       session ends after 3 s without any response; refusals count as responses.
     - param.pck is generated for every read. With ArduPilot, all reads of a session request the same size, and
-      the file size in the response to the open is an estimate, 12 bytes per parameter. An uploaded param.pck
-      sets parameters when it is closed.
+      the file size in the response to the open is an estimate, 12 bytes per parameter.
+    - An uploaded param.pck sets parameters when it is closed, also by a reset, or by another station's
+      request after 3 s of silence. ArduPilot acknowledges the closing whatever it does with the file: one
+      with another length than its header says, or another magic, is dropped; entries up to the first invalid
+      one are applied. The buffer grows to the header's length when the header is written, and is zero where
+      nothing was written. The acknowledgement waits for the parameters.
+    - The checksum of a param.pck is that of the file as it is read 64 bytes at a time.
     - A burst of ArduPilot sends a block whenever a third of the link is free again, to the end of the file.
     - PX4 has one session for each link, closes it after 11 s without a request, and a reset from any sender
       closes it. A burst starts up to 10 ms after its request, has blocks of 239 bytes independent of the
@@ -92,14 +98,14 @@ class FileServer:
 
     Args:
         params: returns all parameters for param.pck, in order; None if it cannot be generated.
-        apply: sets the parameters of an uploaded file.
+        apply: sets the parameters of an uploaded file, and returns the seconds that this takes.
         rate: bytes per second of a burst; single reads are three times as fast.
         is_px4: whether the server behaves like PX4, which assigns session numbers; else like ArduPilot,
             which uses the session number of the open request.
     """
 
     params: Callable[[], Sequence[PackedParam] | None]
-    apply: Callable[[Sequence[PackedParam]], None]
+    apply: Callable[[Sequence[PackedParam]], float]
     rate: float
     is_px4: bool = False
     files: dict[str, bytes] = field(default_factory=dict)
@@ -110,6 +116,8 @@ class FileServer:
     _answered_at: float = -math.inf
     _last: tuple[Address, Packet] | None = None
     _packed: tuple[object, bytes] | None = None
+    _busy_time: float = 0.0
+    _late: tuple[float, Packet, Address] | None = None
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.rate) and self.rate > 0.0):
@@ -124,7 +132,7 @@ class FileServer:
         """Close all sessions, as after switching off."""
         self._open.clear()
         self._waiting.clear()
-        self._burst = self._last = None
+        self._burst = self._last = self._late = None
         self._free_at = self._answered_at = -math.inf
 
     def receive(self, payload: bytes, sender: Address, now: float) -> None:
@@ -135,6 +143,8 @@ class FileServer:
 
     def next_deadline(self) -> float:
         """Return the time of the next work, or infinity."""
+        if self._late is not None:
+            return self._late[0]
         request_at = max(self._waiting[0][0], self._free_at) if self._waiting else math.inf
         if self._burst is None:
             return request_at
@@ -143,14 +153,23 @@ class FileServer:
     def work(self, now: float, most: int | None = None) -> list[tuple[Packet, Address]]:
         """Do the due work, limited to `most` responses; return the responses with their receivers."""
         out: list[tuple[Packet, Address]] = []
+        answer: Packet | None
         while (due := self.next_deadline()) <= now:
             if most is not None and len(out) >= most:
                 self._free_at = now
                 break
             burst = self._burst
-            if burst is None or (self.is_px4 and due < burst.at):
+            if self._late is not None:
+                _, answer, sender = self._late
+                self._late = None
+                self._free_at = due + _size(answer) / (3 * self.rate)
+            elif burst is None or (self.is_px4 and due < burst.at):
                 _, request, sender = self._waiting.popleft()
                 answer = self._answer(request, sender, due)
+                if answer is not None and self._busy_time > 0.0:
+                    self._late = (due + self._busy_time, answer, sender)
+                    self._busy_time = 0.0
+                    continue
                 if answer is not None:
                     self._free_at = due + _size(answer) / (3 * self.rate)
             else:
@@ -185,20 +204,24 @@ class FileServer:
                 return _packet(_Answer(Opcode.ACK), request, number, request.sequence + 1)
             if now - self._answered_at < IDLE_LIMIT:
                 return _packet(_no(FileErrorCode.INVALID_SESSION), request, number, request.sequence + 1)
-            self._terminate(*self._open)
+            (left_open,) = self._open
+            self._terminate(left_open, now)
         if self.is_px4 and self._open and now - self._open[0].used_at >= PX4_IDLE_LIMIT:
-            self._terminate(0)
+            self._terminate(0, now)
         match request.opcode:
             case Opcode.TERMINATE_SESSION:
-                done = self._terminate(number)
-            case Opcode.RESET_SESSIONS:
-                for each in list(self._open) if self.is_px4 else [number]:
-                    self._open.pop(each, None)
+                done = self._terminate(number, now)
+            case Opcode.RESET_SESSIONS if self.is_px4:
+                self._open.clear()
                 done = _Answer(Opcode.ACK)
+            case Opcode.RESET_SESSIONS:
+                done = self._terminate(number, now)
             case Opcode.OPEN_FILE_RO | Opcode.CREATE_FILE:
                 number, done = self._open_file(request, sender, now)
             case Opcode.READ_FILE:
                 done = self._read(number, request.offset, request.size, now)
+                if done.opcode is Opcode.NAK:
+                    done = done._replace(offset=0)
             case Opcode.WRITE_FILE:
                 done = self._write(number, request, now)
             case Opcode.BURST_READ_FILE:
@@ -209,8 +232,7 @@ class FileServer:
             case Opcode.LIST_DIRECTORY:
                 done = self._list(_text(request.data), request.offset)
             case Opcode.CALC_FILE_CRC32:
-                content = self.files.get(_text(request.data))
-                done = _NOT_FOUND if content is None else _number(crc32_px4(content))
+                done = self._checksum(_text(request.data))
             case _:
                 done = _no(FileErrorCode.UNKNOWN_COMMAND)
         return _packet(done, request, number, request.sequence + 1)
@@ -256,7 +278,7 @@ class FileServer:
             content = self.files[path]
             session.read = lambda offset, size: content[offset : offset + size]
             done = _number(len(content))
-        elif path.split("?")[0] == PARAM_FILE and (rows := self.params()) is not None:
+        elif _is_param_file(path) and (rows := self.params()) is not None:
             query = _query(path)
             if query is None or query["start"] >= len(rows):
                 return number, _no(FileErrorCode.FAIL_ERRNO, EINVAL)
@@ -292,28 +314,52 @@ class FileServer:
         session.used_at = now
         if session.written is None or request.offset > _LARGEST:
             return _no(FileErrorCode.FAIL)
+        magic, _, length = _UPLOAD_HEADER.unpack(request.data[: _UPLOAD_HEADER.size].ljust(6, b"\0"))
+        is_header = request.offset == 0 and len(request.data) >= _UPLOAD_HEADER.size
+        if is_header and magic == _MAGIC and _is_param_file(session.path) and not self.is_px4:
+            session.written += bytes(max(length - len(session.written), 0))
         if len(session.written) < request.offset:
             session.written += bytes(request.offset - len(session.written))
         session.written[request.offset : request.offset + len(request.data)] = request.data
         return _Answer(Opcode.ACK, offset=request.offset)
 
-    def _terminate(self, number: int) -> _Answer:
+    def _checksum(self, path: str) -> _Answer:
+        """Return the checksum of a file; ArduPilot reads a param.pck for it 64 bytes at a time."""
+        content = self.files.get(path)
+        if content is None and _is_param_file(path) and (rows := self.params()) is not None:
+            query = _query(path)
+            if query is None or query["start"] >= len(rows):
+                return _no(FileErrorCode.FAIL_ERRNO, EINVAL)
+            content = param_pck.encode(
+                _part(rows, query),
+                total=len(rows),
+                with_defaults=bool(query["withdefaults"]),
+                read_size=_CHECKSUM_READ,
+            )
+            self._busy_time = _CHECKSUM_TIME * len(content)
+        return _NOT_FOUND if content is None else _number(crc32_px4(content))
+
+    def _terminate(self, number: int, now: float) -> _Answer:
         session = self._open.pop(number, None)
         if session is None and self.is_px4:
             return _no(FileErrorCode.INVALID_SESSION)
-        if session is not None and session.written is not None:
-            if session.path != PARAM_FILE:
-                self.files[session.path] = bytes(session.written)
-                return _Answer(Opcode.ACK)
+        if session is None or session.written is None:
+            return _Answer(Opcode.ACK)
+        written = bytes(session.written)
+        if not _is_param_file(session.path):
+            self.files[session.path] = written
+        elif self.is_px4:
             try:
-                self.apply(param_pck.decode_upload(bytes(session.written)))
+                self.apply(param_pck.decode_upload(written))
             except PackError:
                 return _no(FileErrorCode.FAIL_ERRNO, EINVAL)
+        else:
+            self._busy_time = self.apply(_uploaded(written))
         return _Answer(Opcode.ACK)
 
     def _param_file(self, query: dict[str, int]) -> Callable[[int, int], bytes | None]:
         """Return a function that reads the current param.pck, always with the first read's size."""
-        start, count, with_defaults = query["start"], query["count"] or None, bool(query["withdefaults"])
+        start, count, with_defaults = query["start"], query["count"], bool(query["withdefaults"])
         first_size: int | None = None
 
         def read(offset: int, size: int) -> bytes | None:
@@ -325,9 +371,8 @@ class FileServer:
             aligned = DATA_SIZE_MAX if self.is_px4 else min(size, DATA_SIZE_MAX)
             key = (start, count, with_defaults, aligned, rows)
             if self._packed is None or self._packed[0] != key:
-                part = rows[start:] if count is None else rows[start : start + count]
                 content = param_pck.encode(
-                    part, total=len(rows), with_defaults=with_defaults, read_size=aligned
+                    _part(rows, query), total=len(rows), with_defaults=with_defaults, read_size=aligned
                 )
                 self._packed = (key, content)
             return self._packed[1][offset : offset + size]
@@ -367,6 +412,13 @@ _ESTIMATE = 12
 """Estimated bytes per parameter in param.pck."""
 _LARGEST = 0xFFFF
 """Largest offset of a write, in bytes."""
+_CHECKSUM_READ = 64
+"""Bytes that ArduPilot reads at a time for a checksum."""
+_CHECKSUM_TIME = 1e-6
+"""Seconds of a checksum for each byte of a generated file."""
+_MAGIC = 0x671B
+_UPLOAD_HEADER = struct.Struct("<HHH")
+_UPLOAD_TYPES = {1: ParamType.INT8, 2: ParamType.INT16, 3: ParamType.INT32, 4: ParamType.REAL32}
 
 
 def _no(code: FileErrorCode, errno: int = 0) -> _Answer:
@@ -398,6 +450,43 @@ def _size(packet: Packet) -> int:
 
 def _text(data: bytes) -> str:
     return data.split(b"\0", 1)[0].decode("latin-1")
+
+
+def _is_param_file(path: str) -> bool:
+    return path.split("?")[0] == PARAM_FILE
+
+
+def _part(rows: Sequence[PackedParam], query: dict[str, int]) -> Sequence[PackedParam]:
+    """Return the rows that a query asks for."""
+    start, count = query["start"], query["count"]
+    return rows[start : start + count] if count else rows[start:]
+
+
+def _uploaded(data: bytes) -> list[PackedParam]:
+    """Return the entries of an uploaded param.pck that ArduPilot applies: those before the first invalid one.
+
+    A file with another magic, or of another length than its header says, has none. Unlike `decode_upload`,
+    there is no padding, and names may repeat.
+    """
+    if len(data) < _UPLOAD_HEADER.size:
+        return []
+    magic, number, length = _UPLOAD_HEADER.unpack_from(data)
+    if magic != _MAGIC or length != len(data):
+        return []
+    rows: list[PackedParam] = []
+    at, name = _UPLOAD_HEADER.size, b""
+    for _ in range(number):
+        if at + 2 > len(data) or data[at] not in _UPLOAD_TYPES:
+            break
+        kind, shared, more = _UPLOAD_TYPES[data[at]], data[at + 1] & 0x0F, (data[at + 1] >> 4) + 1
+        end = at + 2 + more + kind.size
+        if shared + more > 16 or end > len(data):
+            break
+        name = name[:shared].ljust(shared, b"\0") + data[at + 2 : at + 2 + more]
+        bits = int.from_bytes(data[end - kind.size : end], "little")
+        rows.append(PackedParam(_text(name), kind, bits))
+        at = end
+    return rows
 
 
 def _query(path: str) -> dict[str, int] | None:

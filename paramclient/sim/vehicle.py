@@ -218,10 +218,11 @@ class Vehicle(Device):
     def _write(self, entry: Entry, bits: int) -> None:
         """Set another value, from any source, and start what follows from the change."""
 
-    def _set_from_file(self, entry: Entry, param: PackedParam) -> None:
-        """Set a parameter from an uploaded file."""
+    def _set_from_file(self, entry: Entry, param: PackedParam) -> float:
+        """Set a parameter from an uploaded file; return the seconds that this takes."""
         if param.type == entry.type:
             self._write(entry, param.bits)
+        return 0.0
 
     def _is_listed(self, entry: Entry) -> bool:
         return True
@@ -325,11 +326,13 @@ class Vehicle(Device):
         packed = [each for entry in self._listed if (each := entry.packed) is not None]
         return packed if len(packed) == len(self._listed) else None
 
-    def _apply_packed(self, params: Sequence[PackedParam]) -> None:
-        for param in params:
-            entry = self._find(param.name)
-            if entry is not None:
-                self._set_from_file(entry, param)
+    def _apply_packed(self, params: Sequence[PackedParam]) -> float:
+        """Set the parameters of an uploaded file; return the seconds that this takes."""
+        return sum(
+            self._set_from_file(entry, param)
+            for param in params
+            if (entry := self._find(param.name)) is not None
+        )
 
     def _take_system_id(self, entry: Entry | None) -> None:
         """Use the system id in a parameter, if the parameter exists and its value is a valid id."""

@@ -186,31 +186,102 @@ def upload(pilot: Pilot, data: bytes) -> Packet:
     return pilot.ask(Opcode.TERMINATE_SESSION)
 
 
-def test_an_uploaded_param_pck_sets_parameters_on_closing() -> None:
-    pilot = Pilot(ArduPilotVehicle(read_only=["RTL_SPEED"]))
-    rows = [
-        PackedParam("RTL_ALT", ParamType.REAL32, 0x449A4000),  # 1234, for an INT16 or an INT32
-        PackedParam("STAT_RESET", ParamType.INT32, 16777217),
-        PackedParam("RTL_SPEED", ParamType.INT16, 7),
-        PackedParam("COMPASS_DEC", ParamType.REAL32, 0x7FC00000),
-        PackedParam("EK2_ENABLE", ParamType.INT8, 1),
-        PackedParam("NOT_THERE", ParamType.INT8, 1),
-    ]
-    speed, declination = (pilot.vehicle.param(name).bits for name in ("RTL_SPEED", "COMPASS_DEC"))
-    assert upload(pilot, param_pck.encode_upload(rows)).opcode == Opcode.ACK
+UPLOADED = [
+    PackedParam("RTL_ALT", ParamType.REAL32, 0x449A4000),  # 1234, for an INT16 or an INT32
+    PackedParam("STAT_RESET", ParamType.INT32, 16777217),
+    PackedParam("RTL_SPEED", ParamType.INT16, 7),
+    PackedParam("COMPASS_DEC", ParamType.REAL32, 0x7FC00000),
+    PackedParam("NOT_THERE", ParamType.INT8, 1),
+    PackedParam("WPNAV_SPEED", ParamType.INT16, 321),
+]
+
+
+@pytest.mark.parametrize(("param_error", "speed"), [(False, 7), (True, 0)])
+def test_an_uploaded_param_pck_sets_parameters_on_closing(param_error: bool, speed: int) -> None:
+    """4.6 sets read-only parameters too; newer versions, those with PARAM_ERROR, do not."""
+    pilot = Pilot(ArduPilotVehicle(read_only=["RTL_SPEED"], param_error=param_error))
+    declination = pilot.vehicle.param("COMPASS_DEC").bits
+    assert upload(pilot, param_pck.encode_upload(UPLOADED)).opcode == Opcode.ACK
     assert pilot.vehicle.param("RTL_ALT").value == 1234
     assert pilot.vehicle.param("STAT_RESET").value == 16777217
-    assert pilot.vehicle.param("RTL_SPEED").bits == speed
+    assert pilot.vehicle.param("RTL_SPEED").value == speed
     assert pilot.vehicle.param("COMPASS_DEC").bits == declination
+    assert pilot.vehicle.param("WPNAV_SPEED").value == 321
+
+
+def test_an_upload_that_switches_on_a_group_is_acknowledged_late() -> None:
+    pilot = Pilot(ArduPilotVehicle())
+    data = param_pck.encode_upload([PackedParam("EK2_ENABLE", ParamType.INT8, 1)])
+    assert pilot.ask(Opcode.CREATE_FILE, PARAMS).opcode == Opcode.ACK
+    assert pilot.ask(Opcode.WRITE_FILE, data).opcode == Opcode.ACK
+    pilot.send(Packet(9, 3, Opcode.TERMINATE_SESSION))
+    pilot.send(Packet(11, 3, Opcode.LIST_DIRECTORY, b"nothing"))
+    assert pilot.listen(0.1) == []
+    assert [each.requested for each in pilot.listen(0.1)] == [Opcode.TERMINATE_SESSION, Opcode.LIST_DIRECTORY]
     assert len(pilot.vehicle.params) == 1434
 
 
-def test_an_invalid_param_pck_sets_nothing() -> None:
+@pytest.mark.parametrize("what", ["longer", "magic", "header only"])
+def test_a_param_pck_that_is_dropped_is_acknowledged_all_the_same(what: str) -> None:
     pilot = Pilot(ArduPilotVehicle())
     before = pilot.vehicle.values
     data = param_pck.encode_upload([PackedParam("RTL_ALT", ParamType.INT16, 5)])
-    assert refusal(upload(pilot, data[:-1])) == (FileErrorCode.FAIL_ERRNO, 22)
+    changed = {
+        "longer": data + b"x",
+        "magic": b"\x1c" + data[1:],
+        "header only": data[:5],
+    }[what]
+    assert upload(pilot, changed).opcode == Opcode.ACK
     assert pilot.vehicle.values == before
+
+
+def test_an_invalid_entry_ends_an_upload_and_the_earlier_ones_stay() -> None:
+    pilot = Pilot(ArduPilotVehicle())
+    data = bytearray(param_pck.encode_upload(UPLOADED))
+    data[data.index(b"RTL_SPEED") - 2 if b"RTL_SPEED" in data else data.index(b"SPEED") - 2] |= 0x10
+    assert upload(pilot, bytes(data)).opcode == Opcode.ACK
+    assert pilot.vehicle.param("RTL_ALT").value == 1234
+    assert pilot.vehicle.param("WPNAV_SPEED").value != 321
+
+
+def test_a_param_pck_in_parts_is_zero_where_nothing_was_written() -> None:
+    """Closed by another session after 3 s; without its header it is dropped."""
+    pilot = Pilot(ArduPilotVehicle())
+    data = param_pck.encode_upload(
+        [PackedParam("RTL_ALT", ParamType.INT32, 5), PackedParam("WPNAV_SPEED", ParamType.INT16, 0x0141)]
+    )
+    pilot.ask(Opcode.CREATE_FILE, PARAMS)
+    pilot.ask(Opcode.WRITE_FILE, data[6:], offset=6)
+    pilot.listen(3.3)
+    pilot.ask(Opcode.LIST_DIRECTORY, b"", session=4)
+    assert pilot.vehicle.param("RTL_ALT").value == 1500
+    pilot.ask(Opcode.CREATE_FILE, PARAMS)
+    pilot.ask(Opcode.WRITE_FILE, data[:-1])
+    pilot.listen(3.3)
+    pilot.ask(Opcode.LIST_DIRECTORY, b"", session=4)
+    assert (pilot.vehicle.param("RTL_ALT").value, pilot.vehicle.param("WPNAV_SPEED").value) == (5, 0x41)
+
+
+def test_a_reset_closes_an_upload() -> None:
+    pilot = Pilot(ArduPilotVehicle())
+    data = param_pck.encode_upload([PackedParam("RTL_ALT", ParamType.INT16, 5)])
+    pilot.ask(Opcode.CREATE_FILE, PARAMS + b"?start=5")
+    pilot.ask(Opcode.WRITE_FILE, data)
+    assert pilot.ask(Opcode.RESET_SESSIONS).opcode == Opcode.ACK
+    assert pilot.vehicle.param("RTL_ALT").value == 5
+
+
+def test_the_checksum_of_param_pck_is_that_of_reads_of_64_bytes() -> None:
+    pilot = Pilot(ArduPilotVehicle())
+    rows = packed(pilot.vehicle)
+    for query, part in ((b"", rows), (b"?start=5&count=300", rows[5:305])):
+        found = pilot.ask(Opcode.CALC_FILE_CRC32, PARAMS + query)
+        wanted = crc32_px4(param_pck.encode(part, total=len(rows), read_size=64))
+        assert int.from_bytes(found.data, "little") == wanted
+    assert refusal(pilot.ask(Opcode.CALC_FILE_CRC32, PARAMS + b"?start=1382")) == (
+        FileErrorCode.FAIL_ERRNO,
+        22,
+    )
 
 
 def test_directories_and_checksums() -> None:

@@ -45,6 +45,8 @@ class FtpChannel:
         target: system and component.
         retry: the component's policy, which decides when to repeat the requests.
         heard_at: when the server's last message to us was received.
+        byte_rate: bytes per second of the last file that was read in a burst, with the overhead of its
+            frames; 0 before.
     """
 
     def __init__(
@@ -55,6 +57,7 @@ class FtpChannel:
         self.target = context.target
         self.retry: RetryPolicy = context.retry
         self.heard_at = -math.inf
+        self.byte_rate = 0.0
         self._context = context
         self._send = context.send
         # The first number differs between runs of the program: a server repeats its last response to a
@@ -273,12 +276,15 @@ class FileTransferJob(Operation[Result]):
         session: int = 0,
         offset: int = 0,
         copies: int = 1,
+        is_slow: bool = False,
     ) -> None:
-        """Send a request and repeat it until its response, which is passed to `then`."""
+        """Send a request and repeat it until its response, which is passed to `then`.
+
+        With `is_slow`, the server works on it for a while, and the response tells nothing of the link.
+        """
         sequence = self._line.next_sequence()
         self._request = Packet(sequence, session, opcode, data, offset=offset)
         self._then = then
-        is_slow = opcode == Opcode.CALC_FILE_CRC32
         self._attempts = FileAttempts(self._line.retry, self._line, is_slow=is_slow)
         self._transmit(self._request, now, copies=copies)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -17,11 +17,14 @@ from paramclient.errors import (
     ValueNotApplied,
     VehicleError,
 )
-from paramclient.model.values import Value
+from paramclient.model.values import Param, Value
+from paramclient.protocol.ftp.param_pck import PackedParam
+from paramclient.protocol.params.upload import ParamUpload, UploadHooks, Uploads
 from paramclient.protocol.params.writes import SetResult, Write
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.requests.pacing import WriteWindow
+from paramclient.protocol.wire import ParamValue
 
 __all__ = [
     "UNANSWERED_WRITES_MAX",
@@ -141,14 +144,27 @@ class BatchRules:
     """What a batch needs of its component.
 
     Attributes:
-        begin: begins a write: name, value, time.
+        begin: begins a write: name, value, time, and whether it is filed (see `Writes.set`).
         cancel: cancels a write.
+        committed: records that the vehicle may take the parameter file with the value of a filed write.
+        unfile: continues a filed write with PARAM_SET.
+        heard: processes a PARAM_VALUE of the component.
         is_switch: whether other parameters depend on one with this name.
+        fileable: returns the parameter with this name if its value can be written with the parameter file;
+            None otherwise.
+        may_commit: whether it is still certain which vehicle receives a write.
+        uploads: the component's; None if the values are not to be written as a file.
     """
 
-    begin: Callable[[str, Value, float], Write]
+    begin: Callable[[str, Value, float, bool], Write]
     cancel: Callable[[Write, float], None]
+    committed: Callable[[Write, float], None]
+    unfile: Callable[[Write, float], None]
+    heard: Callable[[ParamValue, float], None]
     is_switch: Callable[[str], bool]
+    fileable: Callable[[str], Param | None]
+    may_commit: Callable[[], bool]
+    uploads: Uploads | None
 
 
 class WriteBatch(Operation[tuple[SetOutcome, ...]]):
@@ -170,7 +186,9 @@ class WriteBatch(Operation[tuple[SetOutcome, ...]]):
         self._outcomes: dict[int, SetOutcome] = {}
         self._open: dict[int, Write] = {}
         self._window = WriteWindow()
-        self._next = 0
+        self._waiting = deque(range(len(pairs)))  # numbers of the pairs that have not begun
+        self._upload: ParamUpload | None = None
+        self._unproven: deque[int] = deque()  # numbers of filed writes that go on with PARAM_SET
         self._barrier: int | None = None  # the open write that the next ones wait for
         self._unanswered = 0
 
@@ -181,33 +199,116 @@ class WriteBatch(Operation[tuple[SetOutcome, ...]]):
 
     def proceed(self, now: float) -> None:
         """Begin as many writes as may be in flight, and end when none is left."""
-        while self.failure is None and self._next < len(self._pairs) and self._may_begin():
-            number = self._next
-            self._next += 1
-            name, value = self._pairs[number]
-            try:
-                write = self._rules.begin(name, value, now)
-            except ParamClientError as error:
-                if is_refusal(error):
-                    self._record(number, SetStatus.REFUSED, error=error)
-                else:
-                    self.stop(error)
-                    self._record(number, SetStatus.NOT_TRIED, error=error)
+        while self._unproven and self._in_flight < self._window.limit:
+            self._rules.unfile(self._open[self._unproven.popleft()], now)
+        while self.failure is None and self._waiting and self._may_begin():
+            if not self._open and (filed := self._stage_for_file(now)):
+                self._begin_upload(filed, now)
                 continue
-            if self._rules.is_switch(name):
+            number = self._waiting.popleft()
+            if self._rules.is_switch(self._pairs[number][0]):
                 self._barrier = number
-            self._open[number] = write
-            if write.done:
-                self._take(number, write)
-            else:
-                write.on_acknowledged.append(self._acknowledged)
-                write.on_done.append(partial(self._ended, number, write))
-        if not self._open and (self.failure is not None or self._next == len(self._pairs)):
+            self._begin(number, now)
+        if not self._open and (self.failure is not None or not self._waiting):
             self._finish(now)
+
+    def _begin(self, number: int, now: float, *, filed: bool = False) -> None:
+        """Begin one write."""
+        name, value = self._pairs[number]
+        try:
+            write = self._rules.begin(name, value, now, filed)
+        except ParamClientError as error:
+            if self._barrier == number:
+                self._barrier = None
+            if is_refusal(error):
+                self._record(number, SetStatus.REFUSED, error=error)
+            else:
+                self.stop(error)
+                self._record(number, SetStatus.NOT_TRIED, error=error)
+            return
+        self._open[number] = write
+        if write.done:
+            self._take(number, write)
+        else:
+            write.on_acknowledged.append(self._acknowledged)
+            write.on_done.append(partial(self._ended, number, write))
+
+    # by one file
+
+    def _stage_for_file(self, now: float) -> list[int]:
+        """Return the pairs up to the next switch that are to be written as one file; none for PARAM_SET."""
+        uploads = self._rules.uploads
+        if uploads is None or not uploads.is_served(now):
+            return []
+        numbers: list[int] = []
+        params: list[Param] = []
+        names = set()
+        for number in self._waiting:
+            name = self._pairs[number][0]
+            if self._rules.is_switch(name):
+                break
+            param = self._rules.fileable(name)
+            if param is not None and param.name not in names:
+                numbers.append(number)
+                params.append(param)
+            elif param is not None:
+                break  # the values of one name follow each other
+            if param is not None:
+                names.add(param.name)
+        return numbers if uploads.is_quicker(params) else []
+
+    def _begin_upload(self, numbers: Sequence[int], now: float) -> None:
+        """Begin the writes of these pairs, and write their values as one file."""
+        filed = frozenset(numbers)
+        self._waiting = deque(number for number in self._waiting if number not in filed)
+        entries: dict[str, PackedParam] = {}
+        for number in numbers:
+            self._begin(number, now, filed=True)
+            write = self._open.get(number)
+            if write is not None and write.filed_as is not None:
+                entries[write.name] = write.filed_as
+        if not entries:
+            return
+        uploads = self._rules.uploads
+        assert uploads is not None
+        hooks = UploadHooks(self._commit, self._rules.heard)
+        upload = self._upload = uploads.begin(entries, hooks, now)
+        if upload.done:
+            self._upload_ended(upload)
+        else:
+            upload.on_done.append(partial(self._upload_ended, upload))
+
+    def _commit(self, now: float) -> bool:
+        """Record that the vehicle may take the file, if that is still the vehicle."""
+        if not self._rules.may_commit() or self.failure is not None:
+            return False
+        for write in self._open.values():
+            if write.is_filed:
+                self._rules.committed(write, now)
+        return True
+
+    def _upload_ended(self, upload: ParamUpload) -> None:
+        """Continue with PARAM_SET what the file has not proven."""
+        self._upload = None
+        self._unproven.extend(number for number, write in self._open.items() if write.is_filed)
+        self.proceed(upload.ended_at)
+
+    def _cancel_upload(self, now: float) -> None:
+        upload, self._upload = self._upload, None
+        self._unproven.clear()
+        if upload is not None:
+            upload.cancel(now)
+
+    # the end
 
     def stop(self, error: ParamClientError) -> None:
         """Begin no further write; the open ones end by themselves."""
         self.failure = self.failure or error
+
+    def interrupt(self, error: ParamClientError, now: float) -> None:
+        """Begin no further write and end an upload; `Writes` ends the open writes."""
+        self.stop(error)
+        self._cancel_upload(now)
 
     @property
     def open_names(self) -> list[str]:
@@ -218,13 +319,15 @@ class WriteBatch(Operation[tuple[SetOutcome, ...]]):
         """End at once: open writes are cancelled, and their outcome is unknown if anything was sent."""
         if self.done:
             return
+        self._cancel_upload(now)
         self.failure = self.failure or error
         self._cancel(now, lambda number, write: self._record_unanswered(number, write, error))
         self._finish(now)
 
     def discard(self, now: float) -> None:
         """Cancel the open writes: the caller was cancelled."""
-        self._next = len(self._pairs)
+        self._cancel_upload(now)
+        self._waiting.clear()
         self.on_outcome = _ignore
         self._cancel(now, lambda number, write: None)
 
@@ -240,10 +343,14 @@ class WriteBatch(Operation[tuple[SetOutcome, ...]]):
     def _may_begin(self) -> bool:
         if not self._open:
             return True
-        if self._barrier is not None or self._rules.is_switch(self._pairs[self._next][0]):
+        if self._barrier is not None or self._rules.is_switch(self._pairs[self._waiting[0]][0]):
             return False
-        in_flight = sum(write.acknowledged is None for write in self._open.values())
-        return in_flight < self._window.limit
+        return self._in_flight < self._window.limit
+
+    @property
+    def _in_flight(self) -> int:
+        """PARAM_SETs that are not acknowledged."""
+        return sum(write.acknowledged is None and not write.is_filed for write in self._open.values())
 
     def _acknowledged(self, now: float) -> None:
         """Begin further writes while the value of one is watched."""
@@ -251,10 +358,11 @@ class WriteBatch(Operation[tuple[SetOutcome, ...]]):
         self.proceed(now)
 
     def _ended(self, number: int, write: Write) -> None:
-        if write.result is not None and write.acknowledged is None:
+        if write.result is not None and write.acknowledged is None and not write.is_filed:
             self._window.acknowledged()
         self._take(number, write)
-        self.proceed(write.ended_at)
+        if self._upload is None or not write.is_filed:
+            self.proceed(write.ended_at)
 
     def _take(self, number: int, write: Write) -> None:
         """Record the outcome of a write that has ended."""
@@ -296,9 +404,9 @@ class WriteBatch(Operation[tuple[SetOutcome, ...]]):
         self.on_outcome()
 
     def _finish(self, now: float) -> None:
-        for number in range(self._next, len(self._pairs)):
+        for number in self._waiting:
             self._record(number, SetStatus.NOT_TRIED, error=self.failure)
-        self._next = len(self._pairs)
+        self._waiting.clear()
         self.finish(tuple(self._outcomes[number] for number in range(len(self._pairs))), now)
 
 
@@ -306,9 +414,11 @@ class WriteBatches(Machine):
     """The batches of writes to one component.
 
     As many writes are in flight as `WriteWindow` permits, in the order of the request: the writes to one name
-    follow each other, and a write that other parameters depend on is alone. A write that fails does not stop
-    the others, unless the component is lost, the link fails, or `UNANSWERED_WRITES_MAX` writes in a row get
-    no response.
+    follow each other, and a write that other parameters depend on is alone. Between two of these, many values
+    for ArduPilot are written as one file if that should be quicker (see `Uploads`). A value that the file
+    does not prove is then sent by PARAM_SET, whose outcome counts. A write that fails does not stop the
+    others, unless the component is lost, the link fails, or `UNANSWERED_WRITES_MAX` writes in a row get no
+    response.
 
     Args:
         target: system and component.
@@ -337,13 +447,13 @@ class WriteBatches(Machine):
         """Begin no further writes: the component is lost. `Writes` ends the open ones."""
         for batch in self._batches:
             what = f"PARAM_SET to {self._target[0]}/{self._target[1]} (lost)"
-            batch.stop(NoReply(what, attempts=0, waited=now - batch.begun_at))
+            batch.interrupt(NoReply(what, attempts=0, waited=now - batch.begun_at), now)
 
     def fail_all(self, error: Exception, now: float) -> None:
         """Begin no further writes. `Writes` ends the open ones with the error."""
         assert isinstance(error, ParamClientError)
         for batch in self._batches:
-            batch.stop(error)
+            batch.interrupt(error, now)
 
 
 def is_refusal(error: ParamClientError) -> bool:

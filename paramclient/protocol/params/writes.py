@@ -25,6 +25,7 @@ from paramclient.model.values import (
     format_value,
     type_name,
 )
+from paramclient.protocol.ftp.param_pck import PackedParam
 from paramclient.protocol.params.change_origin import by_us
 from paramclient.protocol.params.reads import Read, Reads
 from paramclient.protocol.params.small_changes import note_on_small_change
@@ -50,7 +51,7 @@ class SetResult:
         requested: the requested value.
         actual: the value that the vehicle reports.
         param: the parameter as it is now.
-        attempts: PARAM_SETs sent.
+        attempts: PARAM_SETs sent; a parameter file with the value counts as one.
         note: a further sentence: PX4 does not save a change as small as this one.
     """
 
@@ -80,6 +81,8 @@ class Write(Operation[SetResult]):
         request: its attempts.
         settle: seconds from the acknowledgement until the value is read once more.
         is_forced: whether a value that the vehicle cannot store is sent anyway.
+        is_filed: whether the value is written with the parameter file. Meanwhile no PARAM_SET is sent, and
+            only the requested value counts.
         acknowledged: the result so far, while the value is watched for `settle` seconds.
         on_acknowledged: called with the time when that begins.
     """
@@ -94,6 +97,7 @@ class Write(Operation[SetResult]):
         *,
         settle: float = 0.0,
         is_forced: bool = False,
+        is_filed: bool = False,
     ) -> None:
         super().__init__(begun_at)
         self.name = name
@@ -101,6 +105,7 @@ class Write(Operation[SetResult]):
         self.by = by_us(asker)
         self.settle = settle
         self.is_forced = is_forced
+        self.is_filed = is_filed
         self.acknowledged: SetResult | None = None
         self.on_acknowledged: list[Callable[[float], None]] = []
         self.request = WriteAttempts(policy)
@@ -114,8 +119,16 @@ class Write(Operation[SetResult]):
         self.was_retyped = False
 
     @property
+    def filed_as(self) -> PackedParam | None:
+        """The entry of a parameter file that sets what its PARAM_SET would set; None where it cannot."""
+        wanted = self.wanted
+        if not self.is_filed or wanted is None or not isinstance(wanted.type, ParamType):
+            return None
+        return PackedParam(wanted.name, wanted.type, wanted.bits)
+
+    @property
     def attempts(self) -> int:
-        """PARAM_SETs sent."""
+        """PARAM_SETs sent; a parameter file with the value counts as one."""
         return self.request.count
 
 
@@ -199,9 +212,17 @@ class Writes(Machine):
         *,
         settle: float = 0.0,
         force: bool = False,
+        filed: bool = False,
     ) -> Write:
-        """Begin a write, after the open ones to the same name."""
-        write = Write(name, value, self._policy, now, asker, settle=settle, is_forced=force)
+        """Begin a write, after the open ones to the same name.
+
+        With `filed`, which needs a live type and no open write to the name, nothing is sent: the caller
+        writes the value with the parameter file, and reports that with `committed` and with PARAM_VALUEs, or
+        gives it up with `unfile`.
+        """
+        write = Write(
+            *(name, value, self._policy, now, asker), settle=settle, is_forced=force, is_filed=filed
+        )
         self.asked += 1
         queue = self.queues.setdefault(name, deque())
         queue.append(write)
@@ -233,11 +254,23 @@ class Writes(Machine):
         else:
             queue.remove(write)
 
+    def committed(self, write: Write, now: float) -> None:
+        """Record that the vehicle may take the parameter file with the value of a filed write."""
+        write.request.sent(now)
+
+    def unfile(self, write: Write, now: float) -> None:
+        """Continue a filed write with PARAM_SET: the parameter file does not prove its value."""
+        write.is_filed = False
+        if write.attempts:
+            self._transmit(write, now)
+        else:
+            self._start(write, now)
+
     def proceed(self, now: float) -> None:
         """Begin the writes that waited for the permission."""
         self.is_held = False
         for queue in list(self.queues.values()):
-            if queue and not queue[0].attempts and queue[0].read is None:
+            if queue and not queue[0].attempts and queue[0].read is None and not queue[0].is_filed:
                 self._start(queue[0], now)
 
     def wants(self, message: ParamValue) -> bool:
@@ -255,7 +288,10 @@ class Writes(Machine):
             return
         value, bits = decode_value(message.raw, message.param_type, self._table.encoding)
         heard = Param(write.name, value, message.param_type, None, bits)
-        if message.param_type != write.number:
+        if write.is_filed:
+            if write.wanted is not None and write.wanted.same_value(heard):
+                self._succeed(write, now)
+        elif message.param_type != write.number:
             if write.was_retyped:
                 words = f"it is written as {type_name(write.number)} and reported as {type_name(heard.type)}"
                 self._fail(write, self._type_mismatch(write, words), now)
@@ -277,14 +313,14 @@ class Writes(Machine):
         If it has the requested value, the parameter is read at `until` to decide.
         """
         write = self._active(message.param_id)
-        if write is not None and write.read is None and self.wants(message):
+        if write is not None and write.read is None and not write.is_filed and self.wants(message):
             write.is_answered = True
             write.verify_at = min(write.verify_at, until)
 
     def refused(self, message: ParamError, now: float) -> bool:
         """Process a PARAM_ERROR and return whether it ended a write."""
         write = self._active(message.param_id) if message.param_index < 0 or message.param_id else None
-        if write is None:
+        if write is None or write.is_filed:
             return False
         self._fail(write, self._reads.error_of(message, write.name), now)
         return True
@@ -292,7 +328,7 @@ class Writes(Machine):
     def denied(self, name: str, now: float) -> None:
         """Process ArduPilot's STATUSTEXT that a write to this name was denied."""
         write = self._active(name)
-        if write is not None:
+        if write is not None and not write.is_filed:
             message = ParamError(0, 0, name, -1, ParamErrorCode.READ_ONLY)
             self._fail(write, self._reads.error_of(message, name), now)
 
@@ -364,14 +400,19 @@ class Writes(Machine):
 
     @staticmethod
     def _awaits_answer(write: Write) -> bool:
-        return write.attempts > 0 and write.acknowledged is None and write.read is None
+        is_sent = write.attempts > 0 and not write.is_filed
+        return is_sent and write.acknowledged is None and write.read is None
 
     def _start(self, write: Write, now: float) -> None:
         known = self._params.get(write.name)
         if not self._permission.may_be_written:
             self.is_held = True
             return
-        if known is not None and known.trust is not Trust.CACHED:
+        if write.is_filed:
+            assert known is not None
+            write.before, write.number = known, known.type
+            self._prepare(write, now)
+        elif known is not None and known.trust is not Trust.CACHED:
             self._begin(write, known, now)
         else:
             self._read(write, now)
@@ -390,25 +431,32 @@ class Writes(Machine):
             write.is_answered = False
             write.verify_at = math.inf
             return
+        raw = self._prepare(write, now)
+        if raw is None:
+            return
+        write.request.sent(now)
+        self.retries += write.attempts > 1
+        write.is_answered = False
+        write.verify_at = math.inf
+        self._send(ParamSetMessage(*self._target, write.name, raw, write.number))
+
+    def _prepare(self, write: Write, now: float) -> bytes | None:
+        """Set the value that proves the write, and return its 4 bytes; end the write if it cannot be sent."""
         encoding = self._table.encoding
         try:
             raw = encode_value(write.value, write.number, encoding)
         except UsageError as error:
             # something was sent before, and the vehicle has turned out to be a different one
             self._fail(write, self._type_mismatch(write, str(error)) if write.was_retyped else error, now)
-            return
+            return None
         value, bits = decode_value(raw, write.number, encoding)
         try:
             self.check_finite(write.name, value, force=write.is_forced)
         except UsageError as error:
             self._fail(write, error, now)
-            return
+            return None
         write.wanted = Param(write.name, value, write.number, None, bits)
-        write.request.sent(now)
-        self.retries += write.attempts > 1
-        write.is_answered = False
-        write.verify_at = math.inf
-        self._send(ParamSetMessage(*self._target, write.name, raw, write.number))
+        return raw
 
     def _read(self, write: Write, now: float) -> None:
         """Read the vehicle's value: before the first PARAM_SET for the type, later to decide."""

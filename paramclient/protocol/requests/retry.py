@@ -1065,7 +1065,7 @@ class FileAttempts(Attempts):
     def timeout(self) -> float:
         policy = self._policy
         if self._is_slow:
-            return policy.timeout
+            return policy.timeout * 2.0 ** min(max(self.count - 1, 0), BACKOFF_DOUBLINGS_MAX)
         timeout = policy.repeat_timeout(self.count)
         if self._server.heard_at == -math.inf and policy.round_trip.smoothed is not None:
             # the server may be busy with another station, whose burst nothing interrupts
