@@ -138,10 +138,12 @@ class FileChecksums(FileTransferJob[tuple[int | None, ...]]):
             self._transmit_flight(sequence, number, attempts, now)
 
     def _go_on(self, now: float) -> None:
-        while self._waiting and len(self._flights) < CHECKSUMS_IN_FLIGHT_MAX:
+        while self._waiting:
+            attempts = FileAttempts(self._line.retry, self._line, is_slow=True)
+            if len(self._flights) >= CHECKSUMS_IN_FLIGHT_MAX // attempts.copies:
+                break
             number = self._waiting.popleft()
             sequence = self._line.next_sequence()
-            attempts = FileAttempts(self._line.retry, self._line, is_slow=True)
             self._flights[sequence] = number, attempts
             self._transmit_flight(sequence, number, attempts, now)
         if not self._flights:
@@ -149,7 +151,8 @@ class FileChecksums(FileTransferJob[tuple[int | None, ...]]):
 
     def _transmit_flight(self, sequence: int, number: int, attempts: FileAttempts, now: float) -> None:
         attempts.sent(now)
-        self._line.send(Packet(sequence, 0, Opcode.CALC_FILE_CRC32, self._paths[number]))
+        for _ in range(attempts.copies):
+            self._line.send(Packet(sequence, 0, Opcode.CALC_FILE_CRC32, self._paths[number]))
 
 
 class FileTransfers(Machine):

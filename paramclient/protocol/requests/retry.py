@@ -1033,6 +1033,11 @@ UNHEARD_ATTEMPTS_MAX: Final = 16
 all of them are lost once in 700 times."""
 ATTEMPTS_WITHOUT_BACKOFF: Final = 2
 """Requests without backoff to a server that has not responded yet."""
+SLOW_ATTEMPTS_WITHOUT_BACKOFF: Final = 4
+"""The same of requests on which the server works for long: the first ones may only be lost."""
+SLOW_ATTEMPTS_MIN: Final = 9
+"""Attempts of such a request before it is given up, at least: with the backoff some seconds, in which a small
+board applies a file of parameters."""
 BACKOFF_DOUBLINGS_MAX: Final = 4
 """Doublings of the timeout after these."""
 
@@ -1065,7 +1070,8 @@ class FileAttempts(Attempts):
     def timeout(self) -> float:
         policy = self._policy
         if self._is_slow:
-            return policy.timeout * 2.0 ** min(max(self.count - 1, 0), BACKOFF_DOUBLINGS_MAX)
+            doublings = min(max(self.count - SLOW_ATTEMPTS_WITHOUT_BACKOFF, 0), BACKOFF_DOUBLINGS_MAX)
+            return policy.timeout * 2.0**doublings
         timeout = policy.repeat_timeout(self.count)
         if self._server.heard_at == -math.inf and policy.round_trip.smoothed is not None:
             # the server may be busy with another station, whose burst nothing interrupts
@@ -1102,6 +1108,8 @@ class FileAttempts(Attempts):
     def should_give_up(self, now: float) -> bool:
         is_unheard = self._server.heard_at == -math.inf  # the loss of requests is unknown
         if is_unheard and self.count < UNHEARD_ATTEMPTS_MAX and not self._policy.is_gone(now):
+            return False
+        if self._is_slow and self.count < SLOW_ATTEMPTS_MIN:
             return False
         return super().should_give_up(now)
 

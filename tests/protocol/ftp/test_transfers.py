@@ -1222,6 +1222,105 @@ def test_whatever_a_server_says_it_ends(junk: list[Packet], what: str) -> None:
     assert desk.transfers.is_idle
 
 
+class TestWritingAtOnce:
+    """A file of five blocks, written with its first block last."""
+
+    def begin(self, desk: Desk, *, may_commit: bool = True) -> Operation[None]:
+        job = desk.transfers.write_whole(
+            PARAMS, bytes(range(10)), desk.now, may_commit=lambda now: may_commit, write_size=2
+        )
+        desk.answer(desk.next(Opcode.CREATE_FILE))
+        return job
+
+    def test_four_blocks_are_in_flight_and_the_first_one_ends_the_file(self) -> None:
+        desk = Desk()
+        job = self.begin(desk)
+        blocks = desk.take()
+        assert [packet.offset for packet in blocks] == [2, 4, 6, 8]
+        assert {packet.opcode for packet in blocks} == {Opcode.WRITE_FILE}
+        for block in blocks[:3]:
+            desk.answer(block)
+            assert desk.take() == []
+        desk.answer(blocks[3])
+        first, end = desk.take()
+        assert (first.opcode, first.offset, first.data) == (Opcode.WRITE_FILE, 0, b"\0\1")
+        assert end.opcode == Opcode.TERMINATE_SESSION
+        desk.answer(first)
+        assert not desk.transfers.is_idle
+        desk.answer(end)
+        assert job.done
+        assert job.error is None
+
+    def test_a_block_that_a_later_one_has_overtaken_is_sent_again_at_once(self) -> None:
+        desk = Desk()
+        self.begin(desk)
+        _, second, *_ = desk.take()
+        desk.answer(second)
+        assert desk.next(Opcode.WRITE_FILE).offset == 2
+
+    def test_nothing_ends_the_file_while_a_block_is_missing(self) -> None:
+        desk = Desk()
+        self.begin(desk)
+        for block in desk.take()[1:]:
+            desk.answer(block)
+        desk.pass_time(0.5)
+        assert {packet.offset for packet in desk.take()} == {2}
+
+    def test_a_block_that_is_never_acknowledged_ends_the_write_without_its_beginning(self) -> None:
+        desk = Desk()
+        job = self.begin(desk)
+        sent: list[Packet] = []
+        while not job.done:
+            sent += desk.take()
+            desk.pass_time(1.0)
+        assert isinstance(job.error, NoReply)
+        assert 0 not in {packet.offset for packet in sent if packet.opcode == Opcode.WRITE_FILE}
+        assert desk.take()[-1].opcode == Opcode.TERMINATE_SESSION
+
+    def test_a_write_that_may_not_be_committed_is_closed_without_its_beginning(self) -> None:
+        desk = Desk()
+        job = self.begin(desk, may_commit=False)
+        for block in desk.take():
+            desk.answer(block)
+        desk.answer(desk.next(Opcode.TERMINATE_SESSION))
+        assert isinstance(job.error, UsageError)
+
+    def test_the_beginning_is_repeated_with_the_end_until_it_is_acknowledged(self) -> None:
+        desk = Desk()
+        job = self.begin(desk)
+        for block in desk.take():
+            desk.answer(block)
+        first, _ = desk.take()
+        desk.pass_time(1.1)
+        again = [packet.opcode for packet in desk.take()]
+        assert Opcode.WRITE_FILE in again
+        assert Opcode.TERMINATE_SESSION in again
+        desk.answer(first)
+        desk.pass_time(1.1)
+        later = desk.take()
+        assert {packet.opcode for packet in later} == {Opcode.TERMINATE_SESSION}
+        desk.answer(later[0])
+        assert job.error is None
+        assert job.done
+
+
+def test_checksums_are_requested_in_parallel() -> None:
+    desk = Desk()
+    job = desk.transfers.checksums(["a", "b", "c", "d", "e"], desk.now)
+    requests = desk.take()
+    assert [packet.data for packet in requests] == [b"a", b"b", b"c", b"d"]
+    desk.answer(requests[1], (7).to_bytes(4, "little"))
+    last = desk.next(Opcode.CALC_FILE_CRC32)
+    assert last.data == b"e"
+    for request in (last, requests[3], requests[0]):
+        desk.answer(request, (9).to_bytes(4, "little"))
+    assert not desk.transfers.is_idle
+    desk.answer(requests[2], code=FileErrorCode.FILE_NOT_FOUND)
+    assert job.result == (9, 7, None, 9, 9)
+    with pytest.raises(UsageError, match="no file"):
+        desk.transfers.checksums([], desk.now)
+
+
 # Whole transfers
 
 
