@@ -2,7 +2,7 @@
 
 `blocks`: received pieces of a file, and its gaps.
 `file_read`: the read of a file: one burst, and single reads of lost blocks.
-`file_write`: the write of a file: in order, or with its first block last.
+`file_write`: the write of a file: in order, or with its header last.
 `packets`: the payload of FILE_TRANSFER_PROTOCOL.
 `param_pck`: the packed parameter file.
 `passive`: files that other stations read.

@@ -1,4 +1,4 @@
-"""The write of a file: in order, or with its first block last, so that it counts as a whole."""
+"""The write of a file: in order, or with its header last, so that it counts as a whole."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from typing import Final, NamedTuple
 from paramclient.errors import FileErrorCode, UsageError
 from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, FRAME_OVERHEAD, Opcode, Packet
 from paramclient.protocol.ftp.transfer_job import SESSION_LOST, FileTransferJob, FtpChannel
-from paramclient.protocol.requests.retry import BlockRetries
+from paramclient.protocol.requests.retry import COMMIT_COPIES, BlockRetries
 
 __all__ = ["CommittedWrite", "FileWrite"]
 
+HEADER_SIZE: Final = 6
+"""Bytes at the beginning of a param.pck without which ArduPilot drops it: its header."""
 BLOCKS_IN_FLIGHT_MAX: Final = 4
 """Blocks in flight: ArduPilot queues 5 requests of all stations and drops further ones (GCS_FTP.cpp)."""
 
@@ -80,8 +82,8 @@ class _Flight(NamedTuple):
 class CommittedWrite(FileTransferJob[None]):
     """One write of a file of which the server takes all or nothing. See `FileTransfers.write_whole`.
 
-    All blocks but the first are written first, several at a time. When the server has acknowledged each, the
-    first block is sent together with the request to close the file: the commit. A write that ends before its
+    All but the header is written first, several blocks at a time. When the server has acknowledged each, the
+    header is sent together with the request to close the file: the commit. A write that ends before its
     commit changes nothing on board. ArduPilot keeps an uploaded param.pck in memory and parses it when it is
     closed, also when another station's request closes it after 3 s of silence; bytes that were not written
     are zero, and a file that begins with zeros is dropped. A hole behind the header would be parsed, and its
@@ -124,7 +126,7 @@ class CommittedWrite(FileTransferJob[None]):
 
     def _start_anew(self) -> None:
         """Reset all state: nothing is written."""
-        self._waiting = [*range(self._write_size, len(self._data), self._write_size)]
+        self._waiting = [*range(HEADER_SIZE, len(self._data), self._write_size)]
         self._waiting.reverse()  # the next one last
         self._flights: dict[int, _Flight] = {}  # by sequence number of the request
         self._lost: dict[int, int] = {}  # unanswered requests by offset
@@ -199,7 +201,7 @@ class CommittedWrite(FileTransferJob[None]):
         self._send_block(sequence, offset)
 
     def _send_block(self, sequence: int, offset: int) -> None:
-        piece = self._data[offset : offset + self._write_size]
+        piece = self._data[offset : offset + self._write_size] if offset else self._data[:HEADER_SIZE]
         self._line.send(Packet(sequence, self.session or 0, Opcode.WRITE_FILE, piece, offset=offset))
 
     def _due_at(self, flight: _Flight) -> float:
@@ -219,9 +221,9 @@ class CommittedWrite(FileTransferJob[None]):
             self._waiting.append(flight.offset)
 
     def _commit(self, now: float) -> None:
-        """Send the first block and the request to close, which the server serves in this order.
+        """Send the header and the request to close, which the server serves in this order.
 
-        If the first block is lost, the file is dropped, and closed with an acknowledgement all the same.
+        If the header is lost, the file is dropped, and closed with an acknowledgement all the same.
         """
         if not self._may_commit(now):
             self.fail(UsageError(f"{self.path} was not written: the vehicle may be another one"), now)
@@ -233,9 +235,9 @@ class CommittedWrite(FileTransferJob[None]):
         is_commit = request.opcode == Opcode.TERMINATE_SESSION and self.is_committed
         if is_commit and not self._is_beginning_written and not self.is_ended:
             sequence = self._line.next_sequence()
-            for _ in range(self._attempts.copies):
+            for _ in range(COMMIT_COPIES):
                 self._send_block(sequence, 0)
-        super()._transmit(request, now, copies=copies)
+        super()._transmit(request, now, copies=COMMIT_COPIES if is_commit else copies)
 
     def _taken(self, packet: Packet, now: float) -> None:
         is_closed = packet.opcode == Opcode.ACK or self._code(packet) in SESSION_LOST

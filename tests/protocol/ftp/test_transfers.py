@@ -1223,27 +1223,28 @@ def test_whatever_a_server_says_it_ends(junk: list[Packet], what: str) -> None:
 
 
 class TestWritingAtOnce:
-    """A file of five blocks, written with its first block last."""
+    """A file of a header and four blocks, written with its header last."""
 
     def begin(self, desk: Desk, *, may_commit: bool = True) -> Operation[None]:
         job = desk.transfers.write_whole(
-            PARAMS, bytes(range(10)), desk.now, may_commit=lambda now: may_commit, write_size=2
+            PARAMS, bytes(range(14)), desk.now, may_commit=lambda now: may_commit, write_size=2
         )
         desk.answer(desk.next(Opcode.CREATE_FILE))
         return job
 
-    def test_four_blocks_are_in_flight_and_the_first_one_ends_the_file(self) -> None:
+    def test_four_blocks_are_in_flight_and_the_header_ends_the_file(self) -> None:
         desk = Desk()
         job = self.begin(desk)
         blocks = desk.take()
-        assert [packet.offset for packet in blocks] == [2, 4, 6, 8]
+        assert [packet.offset for packet in blocks] == [6, 8, 10, 12]
         assert {packet.opcode for packet in blocks} == {Opcode.WRITE_FILE}
         for block in blocks[:3]:
             desk.answer(block)
             assert desk.take() == []
         desk.answer(blocks[3])
-        first, end = desk.take()
-        assert (first.opcode, first.offset, first.data) == (Opcode.WRITE_FILE, 0, b"\0\1")
+        first, again, end, _ = desk.take()
+        assert first == again
+        assert (first.opcode, first.offset, first.data) == (Opcode.WRITE_FILE, 0, bytes(range(6)))
         assert end.opcode == Opcode.TERMINATE_SESSION
         desk.answer(first)
         assert not desk.transfers.is_idle
@@ -1256,7 +1257,7 @@ class TestWritingAtOnce:
         self.begin(desk)
         _, second, *_ = desk.take()
         desk.answer(second)
-        assert desk.next(Opcode.WRITE_FILE).offset == 2
+        assert desk.next(Opcode.WRITE_FILE).offset == 6
 
     def test_nothing_ends_the_file_while_a_block_is_missing(self) -> None:
         desk = Desk()
@@ -1264,7 +1265,7 @@ class TestWritingAtOnce:
         for block in desk.take()[1:]:
             desk.answer(block)
         desk.pass_time(0.5)
-        assert {packet.offset for packet in desk.take()} == {2}
+        assert {packet.offset for packet in desk.take()} == {6}
 
     def test_a_block_that_is_never_acknowledged_ends_the_write_without_its_beginning(self) -> None:
         desk = Desk()
@@ -1290,7 +1291,7 @@ class TestWritingAtOnce:
         job = self.begin(desk)
         for block in desk.take():
             desk.answer(block)
-        first, _ = desk.take()
+        first, *_ = desk.take()
         desk.pass_time(1.1)
         again = [packet.opcode for packet in desk.take()]
         assert Opcode.WRITE_FILE in again
