@@ -46,6 +46,7 @@ __all__ = [
     "UploadedFile",
     "Timestamp",
     "Number",
+    "Pattern",
     "Patterns",
     "WantedParams",
     "FILE_NAME_LENGTH_MAX",
@@ -119,8 +120,10 @@ def _check_patterns(given: tuple[str, ...]) -> tuple[str, ...]:
 
 LimitedPatterns: Final = AfterValidator(_check_patterns)
 """Limits the number of patterns among names."""
+Pattern = Annotated[str, Field(min_length=1, max_length=64)]
+"""A name or a shell pattern. A long pattern with many unclosed brackets takes seconds to compile."""
 Patterns = Annotated[
-    tuple[Annotated[str, Field(min_length=1, max_length=64)], ...],
+    tuple[Pattern, ...],
     Field(max_length=REQUEST_NAMES_MAX, fail_fast=True),
     LimitedPatterns,
 ]

@@ -377,7 +377,7 @@ def served(monkeypatch: pytest.MonkeyPatch) -> Callable[[Endpoint], None]:
 
     def place(far_end: Endpoint) -> None:
         def client(url: str, **options: Any) -> ServedClient:
-            return ServedClient(SimLink(far_end, "sim:custom"))
+            return ServedClient(SimLink(far_end, "sim:custom"), cache=False)
 
         monkeypatch.setattr(cli_session, "ParamClient", client)
 

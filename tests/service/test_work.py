@@ -392,6 +392,16 @@ def test_a_document_in_yaml_takes_as_much_memory_as_its_values() -> None:
 
 
 @swiftly
+async def test_names_and_patterns_of_a_query_are_short() -> None:
+    async with service(GenericVehicle(table=TABLE)) as (_, browser):
+        await fetched(browser)
+        for path in ("params", "metadata"):
+            answer = await browser.get(f"{C}/{path}", params={"names": "[" * 65})
+            assert answer.status_code == 422, path
+        assert (await browser.get(f"{C}/params", params={"names": "[" * 64})).status_code == 200
+
+
+@swiftly
 async def test_what_takes_long_is_done_in_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     text = f"# {'long ' * 1_000}\n" + "".join(f"{name},{value}\n" for name, value in VALUES.items())
     calls = (
@@ -516,6 +526,7 @@ async def test_plans_have_a_quota_for_each_holder_and_for_all(monkeypatch: pytes
             for path in ("plan", "diff", "verify"):
                 told = problem(await browser.post(f"{C}/{path}", json=body), 429, "too-many")
                 assert told["most"] == LONG_REQUESTS_OF_HOLDER_MAX
+            problem(await browser.post("/api/v1/fetch", json={"timeout_s": 20}), 429, "too-many")
             dry = {**body, "dry_run": True}
             problem(await browser.post(f"{C}/apply", json=dry), 429, "too-many")
             problem(await browser.post("/api/v1/files", content=b"A 1\n", headers=A_FILE), 429, "too-many")

@@ -8,15 +8,12 @@ from typing import Final, NamedTuple
 from paramclient.errors import FileErrorCode, UsageError
 from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, FRAME_OVERHEAD, Opcode, Packet
 from paramclient.protocol.ftp.transfer_job import SESSION_LOST, FileTransferJob, FtpChannel
-from paramclient.protocol.requests.retry import BlockRetries
+from paramclient.protocol.requests.retry import COMMIT_COPIES, BlockRetries
 
 __all__ = ["CommittedWrite", "FileWrite"]
 
 HEADER_SIZE: Final = 6
 """Bytes at the beginning of a param.pck without which ArduPilot drops it: its header."""
-COMMIT_COPIES: Final = 2
-"""Requests of each kind that are sent at once at the end of such a file: they are short, and if all that
-write the header are lost, the whole file was in vain."""
 BLOCKS_IN_FLIGHT_MAX: Final = 4
 """Blocks in flight: ArduPilot queues 5 requests of all stations and drops further ones (GCS_FTP.cpp)."""
 

@@ -26,6 +26,7 @@ from paramclient.protocol.requests.round_trip import SAMPLE_WEIGHT, RoundTrip
 __all__ = [
     "BASELINE_DELAY",
     "CLOCK_FOLLOW_DELAY",
+    "COMMIT_COPIES",
     "COUNT_CHANGES_MAX",
     "EMPTY_LISTS_MAX",
     "FETCH_RESTARTS_MAX",
@@ -1033,8 +1034,11 @@ UNHEARD_ATTEMPTS_MAX: Final = 16
 all of them are lost once in 700 times."""
 UNHEARD_ATTEMPTS_WITHOUT_BACKOFF: Final = 2
 """Requests without backoff to a server that has not responded yet."""
+COMMIT_COPIES: Final = 2
+"""Requests of each kind that are sent at once at the end of an uploaded param.pck: they are short, and if all
+that write the header are lost, the whole file was in vain."""
 SLOW_ATTEMPTS_WITHOUT_BACKOFF: Final = 4
-"""The same of requests on which the server works for long: the first ones may only be lost."""
+"""Requests without backoff on which the server works for long: the first ones may only be lost."""
 SLOW_ATTEMPTS_MIN: Final = 9
 """Attempts of such a request before it is given up, at least: with the backoff some seconds, in which a small
 board applies a file of parameters."""

@@ -17,7 +17,7 @@ from paramclient.protocol.params.sampling import SAMPLE_SIZE
 from paramclient.service.hub import Hub
 from paramclient.service.jobs import Job
 from paramclient.service.problems import problem_of
-from paramclient.service.request_body import BodyRoute
+from paramclient.service.request_body import BodyRoute, long_request
 from paramclient.service.responses import JSON, document_response, encode_document
 from paramclient.service.route_context import (
     HubArgument,
@@ -85,7 +85,8 @@ async def fetch_all(
     request: Request, hub: HubArgument, body: FetchAllRequest, link: LinkName = None
 ) -> FetchedAllDoc:
     """Fetch the tables of all components, on all links in parallel."""
-    return await run_until_disconnect(request, lambda: _fetch_all(hub, body, link), *hub.followed)
+    with long_request(request):
+        return await run_until_disconnect(request, lambda: _fetch_all(hub, body, link), *hub.followed)
 
 
 @router.get("/jobs", response_model=JobsDoc)

@@ -12,7 +12,7 @@ from paramclient.metadata import Metadata, metadata_of, read_content
 from paramclient.model.patterns import NameChoice
 from paramclient.service.body_limits import METADATA_BYTES_MAX
 from paramclient.service.followed_component import FollowedComponent
-from paramclient.service.param_sources import FILE_NAME_LENGTH_MAX, PATTERNS_MAX
+from paramclient.service.param_sources import FILE_NAME_LENGTH_MAX, PATTERNS_MAX, Pattern
 from paramclient.service.problems import ServiceError
 from paramclient.service.request_body import BodyRoute, long_request
 from paramclient.service.responses import document_response
@@ -43,7 +43,7 @@ async def known_infos(
     hub: HubArgument,
     target: Target,
     names: Annotated[
-        list[str], Query(max_length=PATTERNS_MAX, description="Names or patterns such as MC_*.")
+        list[Pattern], Query(max_length=PATTERNS_MAX, description="Names or patterns such as MC_*.")
     ] = [],  # noqa: B006 - FastAPI copies it
 ) -> Response:
     """Return the known descriptions of the parameters of the component."""
@@ -56,7 +56,7 @@ async def known_infos(
         chosen = NameChoice(names)
         return InfosDoc.of(metadata, [name for name in known if not names or chosen.has(name)])
 
-    return await document_response(hub.run_in_thread, document)
+    return await document_response(hub.run_in_file_thread, document)
 
 
 @router.post("/metadata")

@@ -25,7 +25,7 @@ from paramclient.model.similar_names import did_you_mean, nearest_names
 from paramclient.model.values import Param, Value
 from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome, SetStatus
 from paramclient.service.followed_component import FollowedComponent
-from paramclient.service.param_sources import PATTERNS_MAX, REQUEST_VALUES_MAX
+from paramclient.service.param_sources import PATTERNS_MAX, REQUEST_VALUES_MAX, Pattern
 from paramclient.service.problems import problem_of
 from paramclient.service.request_body import BodyRoute
 from paramclient.service.responses import JSON
@@ -115,7 +115,7 @@ async def known_params(
     hub: HubArgument,
     target: Target,
     names: Annotated[
-        list[str], Query(max_length=PATTERNS_MAX, description="Names or patterns such as MC_*.")
+        list[Pattern], Query(max_length=PATTERNS_MAX, description="Names or patterns such as MC_*.")
     ] = [],  # noqa: B006 - FastAPI copies it
     changed: Annotated[
         bool, Query(description="Only parameters that differ from the firmware's default.")
@@ -125,7 +125,7 @@ async def known_params(
     """Return all known parameters, without traffic."""
     target.publish_changes()
     place, table = hub.feed.position, copy_params(target.component.params)
-    chosen = await hub.run_in_thread(lambda: _named(table, names)) if names else list(table)
+    chosen = await hub.run_in_file_thread(lambda: _named(table, names)) if names else list(table)
     head = f'{{"run":"{place.run}","seq":{place.seq},"params":{{'
     described = target.metadata if metadata else None
     if described is None:
