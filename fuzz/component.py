@@ -62,8 +62,9 @@ MOST_STEPS: Final = 60
 """Ticks at one time that count as an endless loop."""
 MOST_SENT: Final = 400
 """Frames that one step may send: a burst of reads, responses to the received frames, and repeats."""
-PATIENCE: Final = 900.0
-"""Seconds of final silence within which every request has ended."""
+PATIENCE: Final = 1_800.0
+"""Seconds of final silence within which every request has ended. A queue of six checksums alone takes
+1,060 s: each may have 9 attempts, on a link with timeouts of 3.5 s."""
 MOST_TICKS: Final = 6000
 """Deadlines within the final silence by which every request has ended."""
 

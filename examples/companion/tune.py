@@ -16,9 +16,12 @@ async def main(service: str, name: str, value: float) -> None:
         vehicle = await client.only_component(timeout=30)
         result = await vehicle.fetch_all()
         print(f"{result.received} parameters, {len(result.missing)} missing")
+        known = vehicle.params.get(name)
         changes = vehicle.changes()
         done = await vehicle.set(name, value)
         print(f"{done.status}: {name} = {done.actual!r}")
+        if known is not None and known.value == done.actual:
+            return  # the vehicle had the value already: nothing has changed
         async for change in changes:
             if change.name == name and change.new is not None:
                 print(f"all clients receive: {name} = {change.new.value!r}, by {change.by}")

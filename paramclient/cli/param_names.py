@@ -11,7 +11,7 @@ import anyio.to_thread
 from paramclient.cache import ParamCache
 from paramclient.cli.session import CommandSession
 from paramclient.client.component import Component
-from paramclient.errors import CacheError, ParamClientError, UnknownParameter
+from paramclient.errors import CacheError, ParamClientError, UnknownParameter, UsageError
 from paramclient.model.group_switches import is_group_switch
 from paramclient.model.identity import autopilot_name
 from paramclient.model.patterns import NameChoice, is_pattern
@@ -58,9 +58,15 @@ def check_given(given: Iterable[str]) -> list[str]:
     """Return names and patterns without repetitions.
 
     Raises:
-        UsageError: a name is not a valid param_id.
+        UsageError: a name is not a valid param_id, or a pattern has other than printable ASCII characters.
     """
-    return [text if is_pattern(text) else check_name(text) for text in dict.fromkeys(given)]
+    chosen = list(dict.fromkeys(given))
+    for text in chosen:
+        if not is_pattern(text):
+            check_name(text)
+        elif not (text.isascii() and text.isprintable()):
+            raise UsageError(f"pattern {text!r}: only printable ASCII characters are allowed")
+    return chosen
 
 
 def may_appear(text: str, component: Component) -> bool:

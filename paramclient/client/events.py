@@ -41,7 +41,8 @@ class Heard:
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """A component is lost: it has sent heartbeats before, and no message for 5 seconds.
+    """A component is lost: it has sent heartbeats before, and no message for the heartbeat timeout: 5 s,
+    longer for slow heartbeats and in high-latency mode.
 
     Attributes:
         component: the lost component.

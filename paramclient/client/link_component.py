@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 import weakref
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import TypeVar
@@ -223,7 +223,7 @@ class LinkComponent(LocalComponent):
         finally:
             machine.writes.cancel(write, anyio.current_time())
         if durable:
-            await self._write_durably(name)
+            await self._write_durably([name])
         return result
 
     async def set_many(
@@ -255,7 +255,7 @@ class LinkComponent(LocalComponent):
         failure = batch.failure
         if durable and (done := [outcome.name for outcome in outcomes if outcome.is_set]):
             try:
-                await self._write_durably(f"{len(done)} values")
+                await self._write_durably(done)
             except NotDurable as error:
                 failure = failure or error
                 outcomes = tuple(replace(each, error=error) if each.is_set else each for each in outcomes)
@@ -291,11 +291,11 @@ class LinkComponent(LocalComponent):
         report()
         return _outcome(batch)
 
-    async def _write_durably(self, what: str) -> None:
+    async def _write_durably(self, names: Sequence[str]) -> None:
         """Sync the values of the component to the disk.
 
         Args:
-            what: what the vehicle has accepted, for NotDurable.
+            names: names of the parameters whose values the vehicle has accepted, for NotDurable.
 
         Raises:
             NotDurable: the disk cannot be written.
@@ -304,7 +304,8 @@ class LinkComponent(LocalComponent):
             await self.client.cache_writer.write_durably(self.machine)
         except CacheError as error:
             address = f"{self.system}/{self.component}"
-            raise NotDurable(f"{address} has accepted {what}, but it is not on the disk: {error}") from error
+            what = f"{names[0]}, but it is" if len(names) == 1 else f"{len(names)} values, but they are"
+            raise NotDurable(f"{address} has accepted {what} not on the disk: {error}") from error
 
     async def fetch_all(
         self,

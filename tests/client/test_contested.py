@@ -185,7 +185,7 @@ def test_the_command_says_so_on_stderr(
     put(two())
     done = command("set", url, "SHARED_A", "5")
     assert done.code == 1
-    assert "contested" in done.out
+    assert "not tried" in done.out
     for peer in ("10.0.0.1:14550", "10.0.0.2:14550"):
         assert peer in done.err
 

@@ -179,7 +179,7 @@ def test_the_command_says_what_is_not_on_the_disk(
     assert command(*words, "--no-cache").code == 2
     with mock.patch.object(ParamCache, "sync", side_effect=CacheError("no room")):
         ended = command("set", put(vehicle), NAME, "6", "--durable", "--cache", tmp_path / "cache")
-    assert (ended.code, ended.rows[1]) == (5, [NAME, "6", "not-durable"])
+    assert (ended.code, ended.rows[1]) == (5, [NAME, "6", "6", "accepted"])
     assert "1/1 has accepted PARAM_01, but it is not on the disk" in ended.err
     file = tmp_path / "quad.parm"
     file.write_text(f"{NAME} 7\n")

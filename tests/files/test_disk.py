@@ -279,7 +279,7 @@ def test_a_list_has_a_header_that_names_the_vehicle(tmp_path: Path) -> None:
     write_file(path, ParamSet(PARAMS.params, 1, 3, who, 1_700_000_000.0, "link udpin:0.0.0.0:14550"))
     assert read_file(path).header == (
         "2 parameters of system/component 3/1, px4",
-        "of the vehicle uid:00ff, firmware 1.17.0, commit abc",
+        "of the vehicle uid:00ff, firmware 1.17.0-dev, commit abc",
         "as of 2023-11-14T22:13:20Z",
         "from link udpin:0.0.0.0:14550",
     )

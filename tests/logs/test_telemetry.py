@@ -473,11 +473,11 @@ def test_the_command_line_imports_logs(tmp_path: Path, capsys: pytest.CaptureFix
     empty = Log().beat().write(tmp_path / "empty.tlog")
     (tmp_path / "bad.tlog").write_bytes(b"nothing")
     files = [str(tmp_path / "bad.tlog"), str(empty), str(good)]
-    assert run(["import", *files, "--cache", str(cache), "--json"]) == 4
+    assert run(["import", *files, "--cache", str(cache), "--json"]) == 2
     told = capsys.readouterr()
     [table] = json.loads(told.out)["tables"]
     assert (table["file"], table["key"], table["params"], table["complete"]) == (str(good), KEY, 2, True)
-    assert "bad.tlog is not a telemetry log" in told.err
+    assert "bad.tlog: not imported: a text file, and no log" in told.err
     assert "empty.tlog has no parameters" in told.err
     assert run(["import", str(good), "--cache", str(cache)]) == 0
     assert "flight.tlog  1/1        generic         2  yes" in capsys.readouterr().out
