@@ -28,7 +28,7 @@ def bench(name: str, *arguments: str, code: int = 0) -> str:
         text=True,
         timeout=120,
     )
-    assert run.returncode == code, run.stderr
+    assert run.returncode == code, run.stdout + run.stderr
     return run.stdout
 
 
