@@ -224,7 +224,7 @@ class ComponentMachine:
         self.table = Table(self.identification.encoding, name_quota)
         self.reads = Reads(context, self.table, scheduler.list_admission.bandwidth)
         self.writes = Writes(context, self.reads, self.table, permission=self)
-        self.write_batches = WriteBatches(target)
+        self.write_batches = WriteBatches(target, "PARAM_SET")
         self.presence = Presence()
         self.peers = ComponentPeers(target, self, may_ask=context.may_send)
         self.files = FileTransfers(context)
@@ -802,7 +802,9 @@ class ComponentMachine:
             may_commit=lambda: self.may_be_written,
             uploads=self.uploads if settle == 0.0 and self.may_be_written else None,
         )
-        return self.write_batches.begin(pairs, rules, now)
+        batch = WriteBatch(pairs, rules, now)
+        self.write_batches.begin(batch, now)
+        return batch
 
     def read_ext(self, key: Key, now: float) -> ExtRead:
         """Read one extended parameter; give it back with `ext.reads.release`.

@@ -12,12 +12,12 @@ from paramclient.protocol.ext.change import ExtChange
 from paramclient.protocol.ext.fetch import ExtFetch, ExtFetches
 from paramclient.protocol.ext.reads import ExtRead, ExtReads
 from paramclient.protocol.ext.table import ExtTable
-from paramclient.protocol.ext.write_batch import ExtWriteBatches
 from paramclient.protocol.ext.writes import ExtWrite, ExtWrites
 from paramclient.protocol.params.change_origin import Authors
 from paramclient.protocol.params.reads import Key
 from paramclient.protocol.params.table import NameQuota
 from paramclient.protocol.params.value_check import READS_PAUSE, REREADS_MAX, ValueChecks
+from paramclient.protocol.params.write_batch import WriteBatches
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.pacing import LinkBandwidth
@@ -69,7 +69,7 @@ class ExtendedParams(Machine):
         self.table = ExtTable(room)
         self.reads = ExtReads(context, self.table, share)
         self.writes = ExtWrites(context, self.reads, self.table, host, self._store)
-        self.batches = ExtWriteBatches(context.target)
+        self.batches = WriteBatches(context.target, "PARAM_EXT_SET")
         self.fetches = ExtFetches(context, self.reads, self.table, self.report)
         self._authors = Authors()
         self._checks = ValueChecks()

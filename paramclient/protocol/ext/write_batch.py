@@ -11,11 +11,10 @@ from paramclient.errors import NoReply, ParamClientError
 from paramclient.model.ext_params import ExtValue
 from paramclient.protocol.ext.writes import ExtSetResult, ExtWrite
 from paramclient.protocol.params.write_batch import UNANSWERED_WRITES_MAX, SetStatus, is_refusal
-from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.requests.pacing import WriteWindow
 
-__all__ = ["ExtSetManyResult", "ExtSetOutcome", "ExtWriteBatch", "ExtWriteBatches"]
+__all__ = ["ExtSetManyResult", "ExtSetOutcome", "ExtWriteBatch"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +88,7 @@ class ExtSetManyResult:
 
 
 class ExtWriteBatch(Operation[tuple[ExtSetOutcome, ...]]):
-    """The writes of one `set_many`; see `ExtWriteBatches`.
+    """The writes of one `set_many`; see `params.write_batch.WriteBatches`.
 
     Attributes:
         ended: the outcomes so far, in the order in which they came.
@@ -152,6 +151,10 @@ class ExtWriteBatch(Operation[tuple[ExtSetOutcome, ...]]):
     def stop(self, error: ParamClientError) -> None:
         """Begin no further write; the open ones end by themselves."""
         self.failure = self.failure or error
+
+    def interrupt(self, error: ParamClientError, now: float) -> None:
+        """Begin no further write; `ExtWrites` ends the open ones."""
+        self.stop(error)
 
     def give_up(self, error: ParamClientError, now: float) -> None:
         """End at once: open writes are cancelled, and their outcome is unknown if anything was sent."""
@@ -227,47 +230,6 @@ class ExtWriteBatch(Operation[tuple[ExtSetOutcome, ...]]):
             self._record(number, SetStatus.NOT_TRIED, error=self.failure)
         self._next = len(self._pairs)
         self.finish(tuple(self._outcomes[number] for number in range(len(self._pairs))), now)
-
-
-class ExtWriteBatches(Machine):
-    """The batches of writes of extended parameters to one component.
-
-    As many writes are in flight as `WriteWindow` permits, in the order of the request. A write that fails
-    does not stop the others, unless the component is lost, the link fails, or `UNANSWERED_WRITES_MAX` writes
-    in a row get no response.
-
-    Args:
-        target: system and component.
-    """
-
-    def __init__(self, target: tuple[int, int]) -> None:
-        self._target = target
-        self._batches: set[ExtWriteBatch] = set()
-
-    def __len__(self) -> int:
-        return len(self._batches)
-
-    def begin(self, batch: ExtWriteBatch, now: float) -> None:
-        """Begin a batch. The caller ends it with `end`."""
-        self._batches.add(batch)
-        batch.proceed(now)
-
-    def end(self, batch: ExtWriteBatch, now: float) -> None:
-        """End a batch. The component may have the values whose writes are in flight."""
-        self._batches.discard(batch)
-        batch.discard(now)
-
-    def lose(self, now: float) -> None:
-        """Begin no further writes: the component is lost. `ExtWrites` ends the open ones."""
-        for batch in self._batches:
-            what = f"PARAM_EXT_SET to {self._target[0]}/{self._target[1]} (lost)"
-            batch.stop(NoReply(what, attempts=0, waited=now - batch.begun_at))
-
-    def fail_all(self, error: Exception, now: float) -> None:
-        """Begin no further writes. `ExtWrites` ends the open ones with the error."""
-        assert isinstance(error, ParamClientError)
-        for batch in self._batches:
-            batch.stop(error)
 
 
 def _ignore() -> None:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
-from typing import Final
+from typing import Final, Protocol
 
 from paramclient.errors import (
     ContestedAddress,
@@ -28,6 +28,7 @@ from paramclient.protocol.wire import ParamValue
 
 __all__ = [
     "UNANSWERED_WRITES_MAX",
+    "Batch",
     "BatchRules",
     "SetManyResult",
     "SetOutcome",
@@ -410,8 +411,25 @@ class WriteBatch(Operation[tuple[SetOutcome, ...]]):
         self.finish(tuple(self._outcomes[number] for number in range(len(self._pairs))), now)
 
 
+class Batch(Protocol):
+    """The part of a batch that `WriteBatches` needs."""
+
+    @property
+    def begun_at(self) -> float:
+        """Time at which it was begun."""
+
+    def proceed(self, now: float) -> None:
+        """Begin as many writes as may be in flight, and end when none is left."""
+
+    def interrupt(self, error: ParamClientError, now: float) -> None:
+        """Begin no further write; the open ones are ended by the machine of the writes."""
+
+    def discard(self, now: float) -> None:
+        """Cancel the open writes: the caller was cancelled."""
+
+
 class WriteBatches(Machine):
-    """The batches of writes to one component.
+    """The batches of writes to one component, of plain or of extended parameters.
 
     As many writes are in flight as `WriteWindow` permits, in the order of the request: the writes to one name
     follow each other, and a write that other parameters depend on is alone. Between two of these, many values
@@ -422,35 +440,35 @@ class WriteBatches(Machine):
 
     Args:
         target: system and component.
+        request: name of the message that writes one value.
     """
 
-    def __init__(self, target: tuple[int, int]) -> None:
+    def __init__(self, target: tuple[int, int], request: str) -> None:
         self._target = target
-        self._batches: set[WriteBatch] = set()
+        self._request = request
+        self._batches: set[Batch] = set()
 
     def __len__(self) -> int:
         return len(self._batches)
 
-    def begin(self, pairs: Sequence[tuple[str, Value]], rules: BatchRules, now: float) -> WriteBatch:
+    def begin(self, batch: Batch, now: float) -> None:
         """Begin a batch. The caller ends it with `end`."""
-        batch = WriteBatch(pairs, rules, now)
         self._batches.add(batch)
         batch.proceed(now)
-        return batch
 
-    def end(self, batch: WriteBatch, now: float) -> None:
-        """End a batch. The vehicle may have the values whose writes are in flight."""
+    def end(self, batch: Batch, now: float) -> None:
+        """End a batch. The component may have the values whose writes are in flight."""
         self._batches.discard(batch)
         batch.discard(now)
 
     def lose(self, now: float) -> None:
-        """Begin no further writes: the component is lost. `Writes` ends the open ones."""
+        """Begin no further writes: the component is lost. The machine of the writes ends the open ones."""
         for batch in self._batches:
-            what = f"PARAM_SET to {self._target[0]}/{self._target[1]} (lost)"
+            what = f"{self._request} to {self._target[0]}/{self._target[1]} (lost)"
             batch.interrupt(NoReply(what, attempts=0, waited=now - batch.begun_at), now)
 
     def fail_all(self, error: Exception, now: float) -> None:
-        """Begin no further writes. `Writes` ends the open ones with the error."""
+        """Begin no further writes. The machine of the writes ends the open ones with the error."""
         assert isinstance(error, ParamClientError)
         for batch in self._batches:
             batch.interrupt(error, now)
