@@ -1,6 +1,7 @@
 """The client over one link.
 
 - `arguments`: argument defaults and checks.
+- `batch_wait`: waiting for the end of a batch of writes.
 - `cache_writer`: writes parameter tables to the cache.
 - `client`: `ParamClient`, the public class.
 - `client_task`: the task that keeps a client open from `open` to `aclose`.

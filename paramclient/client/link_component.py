@@ -19,6 +19,7 @@ from paramclient.client.arguments import (
     check_settle,
     check_writes,
 )
+from paramclient.client.batch_wait import wait_for_batch
 from paramclient.client.component import Component
 from paramclient.client.link_extended_params import LinkExtParams
 from paramclient.client.local import LocalClient, LocalComponent
@@ -38,7 +39,7 @@ from paramclient.protocol.params.fetch_result import FetchResult, Progress, Samp
 from paramclient.protocol.params.passive import PASSIVE_TIMEOUT
 from paramclient.protocol.params.sampling import SAMPLE_SIZE
 from paramclient.protocol.params.sync import SyncState
-from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome, WriteBatch
+from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome
 from paramclient.protocol.params.writes import SetResult
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.station import Station
@@ -249,7 +250,8 @@ class LinkComponent(LocalComponent):
             pairs, began, check_author(asker), settle=check_settle(settle), force=force
         )
         try:
-            outcomes = await self._wait_for_batch(batch, timeout, progress)
+            self.wake()
+            outcomes = await wait_for_batch(batch, timeout, progress, self._unanswered_sets)
         finally:
             machine.write_batches.end(batch, anyio.current_time())
         failure = batch.failure
@@ -262,34 +264,9 @@ class LinkComponent(LocalComponent):
         elapsed = anyio.current_time() - began
         return SetManyResult(self.system, self.component, outcomes, failure, elapsed)
 
-    async def _wait_for_batch(
-        self, batch: WriteBatch, timeout: float | None, progress: Callable[[SetOutcome], None] | None
-    ) -> tuple[SetOutcome, ...]:
-        """Wait until a batch ends, or give it up at the timeout; report the outcomes as they arrive."""
-        reported = 0
-
-        def report() -> None:
-            nonlocal reported
-            for outcome in batch.ended[reported:]:
-                reported += 1
-                if progress is not None:
-                    progress(outcome)
-
-        self.wake()
-        with anyio.move_on_after(timeout):
-            while not batch.done:
-                news = anyio.Event()
-                batch.on_outcome = news.set
-                report()
-                await news.wait()
-        now = anyio.current_time()
-        if not batch.done:
-            open_names = batch.open_names
-            what = f"PARAM_SET {open_names[0]}" if len(open_names) == 1 else f"{len(open_names)} PARAM_SETs"
-            what += f" to {self.system}/{self.component}"
-            batch.give_up(NoReply(what, attempts=batch.attempts, waited=now - batch.begun_at), now)
-        report()
-        return _outcome(batch)
+    def _unanswered_sets(self, names: Sequence[str]) -> str:
+        what = f"PARAM_SET {names[0]}" if len(names) == 1 else f"{len(names)} PARAM_SETs"
+        return f"{what} to {self.system}/{self.component}"
 
     async def _write_durably(self, names: Sequence[str]) -> None:
         """Sync the values of the component to the disk.

@@ -10,13 +10,14 @@ from types import MappingProxyType
 import anyio
 
 from paramclient.client.arguments import PROGRESS_CALL_INTERVAL, check_asked_name, check_requested_name
+from paramclient.client.batch_wait import wait_for_batch
 from paramclient.client.extended_params import ExtChanges, ExtParams
 from paramclient.client.local import LocalComponent
 from paramclient.errors import CacheError, NoReply, ParamClientError
 from paramclient.model.ext_params import ExtParam, ExtSettable, check_ext_value
 from paramclient.protocol.ext.change import ExtChange
 from paramclient.protocol.ext.fetch import ExtFetch, ExtFetchResult
-from paramclient.protocol.ext.write_batch import ExtSetManyResult, ExtSetOutcome, ExtWriteBatch
+from paramclient.protocol.ext.write_batch import ExtSetManyResult, ExtSetOutcome
 from paramclient.protocol.ext.writes import ExtSetResult
 from paramclient.protocol.params.change_origin import check_author
 from paramclient.protocol.params.fetch_result import Policy, Progress
@@ -117,39 +118,17 @@ class LinkExtParams(ExtParams):
         began = anyio.current_time()
         batch = machine.write_many_ext(pairs, began, check_author(asker))
         try:
-            outcomes = await self._wait_for_batch(batch, timeout, progress)
+            self._component.wake()
+            outcomes = await wait_for_batch(
+                batch,
+                timeout,
+                progress,
+                lambda names: f"PARAM_EXT_SET {', '.join(names)} to {self._whose}",
+            )
         finally:
             machine.ext.batches.end(batch, anyio.current_time())
         elapsed = anyio.current_time() - began
         return ExtSetManyResult(machine.system, machine.component, outcomes, batch.failure, elapsed)
-
-    async def _wait_for_batch(
-        self, batch: ExtWriteBatch, timeout: float | None, progress: Callable[[ExtSetOutcome], None] | None
-    ) -> tuple[ExtSetOutcome, ...]:
-        """Wait until a batch ends, or give it up at the timeout; report the outcomes as they arrive."""
-        reported = 0
-
-        def report() -> None:
-            nonlocal reported
-            for outcome in batch.ended[reported:]:
-                reported += 1
-                if progress is not None:
-                    progress(outcome)
-
-        self._component.wake()
-        with anyio.move_on_after(timeout):
-            while not batch.done:
-                news = anyio.Event()
-                batch.on_outcome = news.set
-                report()
-                await news.wait()
-        now = anyio.current_time()
-        if not batch.done:
-            what = f"PARAM_EXT_SET {', '.join(batch.open_names)} to {self._whose}"
-            batch.give_up(NoReply(what, attempts=batch.attempts, waited=now - batch.begun_at), now)
-        report()
-        assert batch.result is not None
-        return batch.result
 
     async def fetch_all(
         self,
