@@ -466,7 +466,7 @@ def test_every_package_names_what_is_in_it(package: str) -> None:
 
 
 @EVERY_MODULE
-def test_what_a_module_offers_exists(module: str) -> None:
+def test_the_names_in_all_exist_once(module: str) -> None:
     """`__all__`, where there is one, is a plain list without repetitions, of names that the module binds."""
     offered = offers_of(module)
     bound = bound_names(source_of(module))

@@ -92,7 +92,7 @@ def run(*command: str | Path, cache: Path) -> str:
     return done.stdout
 
 
-def test_all_are_here() -> None:
+def test_every_example_is_tested() -> None:
     assert {path.stem for path in EXAMPLES.glob("*.py")} == set(PRINTED)
 
 

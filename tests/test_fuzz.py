@@ -30,7 +30,7 @@ def inputs(kind: str, name: str) -> list[Path]:
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_what_is_kept_finds_no_fault(name: str) -> None:
+def test_no_input_of_the_corpus_finds_a_fault(name: str) -> None:
     """The corpus, all of it in one test: each input takes a millisecond."""
     run = target(name)
     kept = inputs("corpus", name)
@@ -46,7 +46,7 @@ FOUND = [pytest.param(name, path, id=path.name) for name in TARGETS for path in 
 
 
 @pytest.mark.parametrize(("name", "path"), FOUND)
-def test_what_was_found_once_is_mended(name: str, path: Path) -> None:
+def test_inputs_that_once_found_a_fault_find_none_now(name: str, path: Path) -> None:
     target(name)(path.read_bytes())
 
 

@@ -82,7 +82,7 @@ EVERYWHERE = (
 SET_UPS = ("verify, 15 unknown names", "restore, the state before", "apply with a restart")
 
 
-def test_it_passes_on_a_simulated_px4(
+def test_the_live_checks_pass_on_a_simulated_px4(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     vehicle = px4()
@@ -107,7 +107,7 @@ def test_it_passes_on_a_simulated_px4(
     assert vehicle.values == before
 
 
-def test_it_passes_on_a_simulated_ardupilot(
+def test_the_live_checks_pass_on_a_simulated_ardupilot(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     vehicle = ardupilot()
@@ -154,7 +154,7 @@ async def set_and_be_interrupted(session: Session) -> Measured:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals reach no process there as they do elsewhere")
 @pytest.mark.parametrize("fails", [set_and_fail, set_and_be_interrupted])
-def test_it_puts_back_whatever_happens(
+def test_a_failed_live_check_restores_the_vehicle(
     fails: Callable[[Session], object], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     vehicle = px4()
@@ -200,7 +200,7 @@ def test_a_state_that_is_not_the_one_before_fails_and_stays_on_disk(
         (Air([px4(), ArduPilotVehicle(table=ARDUPILOT_TABLE, system=2)]), [], "2 vehicles on this link"),
     ],
 )
-def test_it_does_not_begin_where_it_should_not(
+def test_the_live_checks_refuse_to_begin(
     endpoint: Vehicle | Air, arguments: Sequence[str], words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     vehicles = endpoint.vehicles if isinstance(endpoint, Air) else (endpoint,)
@@ -248,7 +248,7 @@ def test_only_what_nothing_uses_is_chosen() -> None:
     assert choose("ardupilot", {}).names == ()
 
 
-def test_what_a_vehicle_changes_by_itself_is_no_difference(tmp_path: Path) -> None:
+def test_values_that_a_vehicle_changes_itself_are_no_difference(tmp_path: Path) -> None:
     def param(name: str, value: int) -> Param:
         return Param(name, value, ParamType.INT32, 0, value)
 

@@ -131,7 +131,7 @@ def test_the_changelog_knows_the_version() -> None:
     assert versions[:2] == ["Unreleased", paramclient.__version__]
 
 
-def test_what_an_installation_brings(metadata: Message) -> None:
+def test_the_dependencies_of_the_library_and_its_extras(metadata: Message) -> None:
     """The library alone brings nothing of the command's."""
     requirements = metadata.get_all("Requires-Dist", [])
     always = {re.split(r"[^\w-]", each)[0] for each in requirements if "extra ==" not in each}

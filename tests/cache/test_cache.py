@@ -174,7 +174,7 @@ def test_all_updates_of_a_call_are_written_or_none(path: Path) -> None:
 
 
 @pytest.mark.parametrize("at", [-1.0, float("nan"), float("inf"), 1e12])
-def test_what_is_no_time_is_refused(path: Path, at: float) -> None:
+def test_an_update_with_an_invalid_time_is_refused(path: Path, at: float) -> None:
     with ParamCache(path) as cache:
         for bad in (update(at=at), update(stored("A", 1, at=at)), update(table=TableState(synced_at=at))):
             with pytest.raises(UsageError):
@@ -398,7 +398,7 @@ def test_an_exact_key_is_preferred_to_the_beginning_of_another(path: Path) -> No
         ({"component": 7}, "component 7 is not in the cache"),
     ],
 )
-def test_what_is_not_there_or_not_clear_is_an_error_that_says_what_there_is(
+def test_an_unknown_or_ambiguous_vehicle_is_an_error_that_lists_the_vehicles(
     three: ParamCache, wanted: dict[str, Any], text: str
 ) -> None:
     with three as cache, pytest.raises((UnknownVehicle, AmbiguousVehicle), match=text) as caught:
@@ -498,7 +498,7 @@ def test_folder_and_file_are_for_the_user_alone(path: Path) -> None:
     assert path.parent.stat().st_mode & 0o777 == 0o700
 
 
-def test_it_stands_in_the_users_cache_folder_unless_told_otherwise(
+def test_the_default_path_is_in_the_users_cache_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -540,7 +540,7 @@ def test_an_older_observation_never_replaces_a_newer_one(path: Path) -> None:
         assert len(lines_of(one)) == 2, "it was told already"
 
 
-def test_what_was_observed_before_a_whole_table_leaves_it_whole(path: Path) -> None:
+def test_an_observation_older_than_a_whole_table_keeps_it_complete(path: Path) -> None:
     """And what was observed after a part of it stays."""
     with ParamCache(path) as one, ParamCache(path) as other:
         one.save(whole_table(2))
@@ -611,7 +611,7 @@ def test_a_name_that_was_found_missing_before_it_was_heard_is_not_gone(path: Pat
 
 
 @pytest.mark.parametrize("seen_before", [True, False])
-def test_what_is_observed_late_of_a_name_that_came_back_is_no_change_of_what_it_was_before(
+def test_a_late_observation_of_a_name_that_was_removed_and_added_is_no_change_of_its_earlier_value(
     path: Path, seen_before: bool
 ) -> None:
     with ParamCache(path) as one, ParamCache(path) as other:
@@ -850,7 +850,7 @@ def test_defaults_are_kept_beside_the_values(path: Path) -> None:
         assert not table.history(), "a default is no change of the value"
 
 
-def test_when_a_value_was_heard_last(path: Path) -> None:
+def test_the_time_of_the_last_observation_of_a_table(path: Path) -> None:
     with ParamCache(path) as cache:
 
         def heard_last(component: int) -> float:

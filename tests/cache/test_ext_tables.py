@@ -96,7 +96,7 @@ def test_values_of_every_type_come_back_in_the_next_session(path: Path) -> None:
         assert cache.load_ext("nothing", 100) is None
 
 
-def test_both_tables_of_a_component_are_apart(path: Path) -> None:
+def test_plain_and_extended_tables_of_a_component_are_separate(path: Path) -> None:
     with ParamCache(path) as cache:
         cache.save(update(stored("A", 1), stored("B", 2), component=100))
         cache.save_ext([learnt(A="text", C=3)])

@@ -112,7 +112,7 @@ def test_types_come_from_another_table_of_the_same_firmware(cache: ParamCache) -
         cache.add(file(typed=False, **THREE), replace(PX4, uid="0002ff", firmware=1, git_hash="b0"))
 
 
-def test_what_cannot_work_is_refused(cache: ParamCache) -> None:
+def test_files_without_types_or_with_invalid_values_are_refused(cache: ParamCache) -> None:
     cache.save(whole_table(3))
     with pytest.raises(UsageError, match=r"lacks them: NO_SUCH\. Fetch the vehicle"):
         cache.add(file(typed=False, **THREE, NO_SUCH=1), PX4.key)

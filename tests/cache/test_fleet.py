@@ -79,7 +79,7 @@ def test_vehicles_are_compared_with_each_other_by_what_most_of_them_have(cache: 
     assert not cache.fleet_diff(["B"]).differs
 
 
-def test_where_two_values_are_equally_common_neither_is_the_right_one(cache: ParamCache) -> None:
+def test_two_equally_common_values_are_both_listed_as_differing(cache: ParamCache) -> None:
     for number, identity in enumerate(VEHICLES[:4]):
         cache.save(update(stored("A", number % 2), identity=identity, table=DONE))
     [each] = cache.fleet_diff(["A"]).names

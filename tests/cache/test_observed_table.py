@@ -78,7 +78,7 @@ def test_a_table_gives_the_same_rows_in_every_way(
     ]
 
 
-def test_what_was_overwritten_comes_first_and_by_itself() -> None:
+def test_overwritten_values_come_before_the_present_ones() -> None:
     params = Params()
     params["A"] = Param("A", 2, ParamType.INT32, 0, 2)
     before = StoredParam(Param("A", 1, ParamType.INT32, 0, 1), AT, None, "us")

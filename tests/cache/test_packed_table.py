@@ -201,13 +201,13 @@ BITS_AT = TYPES_AT + 4 * 2
         (with_bytes(BITS_AT + 16, struct.pack("<d", 253402300800.0)), "a cell holds 253402300800.0"),
     ],
 )  # fmt: skip
-def test_what_pack_would_not_have_made_is_damage(blob: bytes, why: str) -> None:
+def test_bytes_that_pack_cannot_produce_are_damaged(blob: bytes, why: str) -> None:
     assert unpack(with_bytes(0, b"\1")) == EVERY
     with pytest.raises(Damaged, match=why):
         unpack(blob)
 
 
-def test_where_only_some_columns_are_read_these_are_looked_at() -> None:
+def test_a_read_of_some_columns_checks_these_columns() -> None:
     with pytest.raises(Damaged, match="a cell holds nan"):
         Packed(with_bytes(BITS_AT + 16, struct.pack("<d", math.nan))).heard_at([0, 1])
     with pytest.raises(Damaged, match="neither 0 nor 1"):
@@ -291,7 +291,7 @@ def test_the_fields_of_a_stored_parameter_are_its_columns_and_the_author() -> No
         {"A": EVERY["A"]._replace(default_bits=1 << 63)},
     ],
 )
-def test_what_cannot_be_kept_is_refused(rows: dict[str, StoredParam]) -> None:
+def test_rows_that_do_not_fit_the_format_are_refused(rows: dict[str, StoredParam]) -> None:
     with pytest.raises(UsageError, match="the table cannot be stored"):
         pack(rows)
 
@@ -304,7 +304,7 @@ def path(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     "item", [stored("\udcff", 1), stored("A", 1, 256), stored("A", 1, index=1 << 40)], ids=repr
 )
-def test_what_cannot_be_kept_is_refused_before_anything_is_written(path: Path, item: Any) -> None:
+def test_an_update_with_a_row_that_does_not_fit_writes_nothing(path: Path, item: Any) -> None:
     with ParamCache(path) as cache:
         cache.save(whole_table(3))
         with pytest.raises(UsageError, match="the table cannot be stored"):
@@ -316,7 +316,7 @@ def test_what_cannot_be_kept_is_refused_before_anything_is_written(path: Path, i
 # In the file
 
 
-def test_what_stands_beside_the_bytes_is_in_the_checksum() -> None:
+def test_the_checksum_covers_the_columns_beside_the_blob() -> None:
     size, heard_last, blob = packed_row(TABLE)
     assert (size, heard_last, blob) == (30, NOW + 29, pack(TABLE))
     right = row_checksum(size, heard_last, blob)

@@ -72,7 +72,7 @@ def test_a_snapshot_is_the_table_as_it_stood_whatever_becomes_of_it(path: Path) 
     )
 
 
-def test_what_a_caller_has_is_kept_beside_the_table(path: Path) -> None:
+def test_store_snapshot_stores_the_table_of_the_caller(path: Path) -> None:
     vehicle = {"A": WrittenParam("A", 9, ParamType.INT32, comment="words", line=3)}
     with ParamCache(path) as cache:
         cache.save(whole_table(3))
@@ -173,7 +173,7 @@ def test_snapshots_are_bounded_for_each_table_and_keep_their_numbers(
         assert cache.snapshot(PX4.key, 1, reason="").id == 11
 
 
-def test_what_is_not_there_is_an_error_that_creates_nothing(path: Path) -> None:
+def test_snapshots_of_an_unknown_vehicle_are_an_error_that_creates_nothing(path: Path) -> None:
     with ParamCache(path) as cache:
         for ask in (
             lambda: cache.snapshot(PX4.key, 1, reason=""),
@@ -273,7 +273,7 @@ def test_before_a_table_was_first_complete_nothing_is_claimed(path: Path) -> Non
         assert set(cache.state_at(PX4.key, 1, NOW + 9.0)) == {"A", "B", "C"}
 
 
-def test_where_history_was_dropped_it_says_how_far_it_reaches(
+def test_the_error_of_state_at_says_how_far_the_history_reaches(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tables, "HISTORY_ENTRIES_MAX", 3)
@@ -295,7 +295,7 @@ def test_where_history_was_dropped_it_says_how_far_it_reaches(
             cache.state_at(PX4.key, 1, NOW + 29.9)
 
 
-def test_what_is_noted_of_names_and_clocks_goes_with_the_history(
+def test_added_names_and_clock_rollbacks_are_trimmed_with_the_history(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A vehicle whose parameters come and go all the time cannot fill the disk."""
@@ -367,7 +367,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ParamCache]:
 
 @given(steps=STEPS, lines=st.sampled_from([2, 4, 1000]), backwards=st.booleans())
 @settings(max_examples=80, deadline=None)
-def test_what_is_claimed_of_any_moment_is_what_was_so(
+def test_state_at_agrees_with_a_model_that_keeps_every_state(
     shared: ParamCache, steps: list[Any], lines: int, backwards: bool
 ) -> None:
     """A model that keeps every state. Where the clock went through a moment twice, there are two of them."""

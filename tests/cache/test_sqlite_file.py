@@ -192,7 +192,7 @@ def whole_batches(path: Path) -> int:
     return number
 
 
-def test_whatever_was_written_survives_a_kill_at_any_moment(tmp_path: Path) -> None:
+def test_committed_batches_survive_a_kill_at_any_moment(tmp_path: Path) -> None:
     """A process that has imported everything forks a writer, which is killed; seventy times.
 
     Some die while they make the file, some while they write, some while they carry the log over into the
@@ -350,7 +350,7 @@ def test_a_file_that_another_program_set_aside_is_let_go(path: Path) -> None:
         assert len(values(kept)) == 3
 
 
-def test_what_was_written_into_a_file_that_just_went_is_written_again(path: Path) -> None:
+def test_a_write_into_a_file_that_was_moved_meanwhile_is_repeated(path: Path) -> None:
     store = Database(path)
     went: list[bool] = []
 
@@ -492,7 +492,7 @@ def sound_with(at: int, byte: int) -> Callable[[Path], None]:
         (sound_but("UPDATE vehicle SET first_seen = -1"), "a cell holds -1"),
     ],
 )  # fmt: skip
-def test_what_is_no_cache_is_set_aside_whole_and_a_fresh_one_begins(
+def test_a_damaged_cache_is_renamed_unchanged_and_a_new_one_is_created(
     path: Path, caplog: pytest.LogCaptureFixture, make: Callable[[Path], None], why: str
 ) -> None:
     make(path)
@@ -544,7 +544,7 @@ def test_another_programs_database_is_left_where_it_is(
         sound_but("PRAGMA application_id = 0; DROP TABLE history"),
     ],
 )  # fmt: skip
-def test_what_is_no_cache_is_an_error_and_left_as_it_is(
+def test_a_file_that_is_no_cache_is_an_error_and_is_not_changed(
     path: Path, caplog: pytest.LogCaptureFixture, make: Callable[[Path], None]
 ) -> None:
     make(path)
@@ -579,7 +579,7 @@ def crashed(path: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("text", ["notes", "[settings]\n" * 1000])
-def test_what_stands_beside_a_file_that_is_no_cache_is_left_as_it_is(path: Path, text: str) -> None:
+def test_companions_of_a_file_that_is_no_cache_are_not_changed(path: Path, text: str) -> None:
     """SQLite itself would delete these before it finds that the file is no database."""
     for suffix in ("", "-wal", "-shm", "-journal"):
         path.with_name(f"{path.name}{suffix}").write_text(f"{text} {suffix}")
@@ -1021,7 +1021,7 @@ def test_mistakes_of_the_program_are_not_taken_for_damage(path: Path) -> None:
     assert not set_aside(path)
 
 
-def test_what_another_program_has_just_set_aside_is_not_set_aside_again(
+def test_a_file_that_another_program_has_just_renamed_is_not_renamed_again(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path.write_bytes(sound_file())
@@ -1098,7 +1098,7 @@ def test_a_file_that_a_full_disk_left_without_tables_is_an_empty_cache(path: Pat
         assert not cache.notes
 
 
-def test_where_no_open_file_can_be_renamed_it_is_closed_before(
+def test_a_damaged_file_is_closed_before_it_is_renamed_on_windows(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As on Windows."""
@@ -1258,7 +1258,7 @@ def test_an_older_file_where_nothing_can_be_written_is_an_error(
         cache.vehicles()
 
 
-def test_what_is_not_a_regular_file_is_an_error_and_what_is_below_a_file_does_not_exist(
+def test_a_folder_as_cache_is_an_error_and_a_path_below_a_file_does_not_exist(
     tmp_path: Path,
 ) -> None:
     file = tmp_path / "file"

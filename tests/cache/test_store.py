@@ -328,7 +328,7 @@ def test_of_two_that_fetch_at_different_times_the_later_writer_makes_no_false_li
     assert lines == [(200, 17), (17, 18), (18, 19)]
 
 
-def test_whatever_two_programs_write_to_a_database_was_so(path: str, tmp_path: Path) -> None:
+def test_a_database_that_two_programs_write_to_agrees_with_a_model(path: str, tmp_path: Path) -> None:
     interleaved(
         lambda: (ParamCache(path, local=tmp_path / "a"), ParamCache(path, local=tmp_path / "b")), examples=15
     )
@@ -365,7 +365,7 @@ def test_a_reason_with_a_zero_in_it_does_no_harm(cache: ParamCache) -> None:
     assert cache.state_at(PX4.key, 1, made.id) == made.params
 
 
-def test_what_was_done_without_an_answer_is_told_all_the_same(
+def test_an_operation_whose_response_was_lost_returns_its_result(
     stations: tuple[ParamCache, ParamCache], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     a, b = stations
@@ -506,7 +506,7 @@ def link_of(cache: ParamCache) -> _Connection:
     return store._connection
 
 
-def test_what_only_the_database_can_keep_is_kept_there(
+def test_a_table_that_the_local_copy_cannot_store_is_in_the_database(
     cache: ParamCache, caplog: pytest.LogCaptureFixture
 ) -> None:
     cache.save(update(stored("A", 1, index=(1 << 31) - 1)))
@@ -522,7 +522,7 @@ def test_what_only_the_database_can_keep_is_kept_there(
     )
 
 
-def test_what_waited_when_a_program_died_goes_with_the_next_one(own_server: Server, tmp_path: Path) -> None:
+def test_writes_left_in_the_outbox_are_sent_by_the_next_program(own_server: Server, tmp_path: Path) -> None:
     with database_on(own_server.url) as url:
         dead = ParamCache(url, local=tmp_path / "a")
         dead.save(whole_table(3))
@@ -630,7 +630,7 @@ def test_a_transaction_takes_no_thread(server_url: str) -> None:
             database.close()
 
 
-def test_another_database_under_the_same_name_is_not_taken_for_the_one_before(
+def test_the_local_copy_is_made_anew_for_another_database_of_the_same_name(
     server_url: str, tmp_path: Path
 ) -> None:
     """A backup of some days ago, or another one's database: the local copy is made anew from it."""
@@ -653,7 +653,7 @@ def shown_in_copy(cache: ParamCache) -> Mapping[str, int]:
     return {name: row.bits for name, row in whole.rows.items()}
 
 
-def test_what_the_database_refuses_is_told_and_holds_nothing_up(
+def test_a_write_that_the_database_refuses_is_logged_and_delays_no_other(
     own_server: Server, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with database_on(own_server.url) as url, ParamCache(url, local=tmp_path / "a") as cache:
@@ -703,7 +703,7 @@ def make_read_only(url: str, is_so: bool) -> None:
         )
 
 
-def test_what_waits_for_a_vehicle_that_is_held_is_not_refused(
+def test_a_write_to_a_locked_vehicle_waits_and_is_not_refused(
     server_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr("paramclient.cache.postgres.LOCK_TIMEOUT", "50ms")
@@ -748,7 +748,7 @@ def no_room(*_: object) -> None:
     raise CacheError("no room")
 
 
-def test_what_others_tell_in_the_same_database_is_not_for_us(
+def test_notifications_of_other_programs_are_ignored(
     path: str, stations: tuple[ParamCache, ParamCache]
 ) -> None:
     a, b = stations
@@ -851,7 +851,7 @@ def test_a_copy_that_was_ended_goes_on(cache: ParamCache, tmp_path: Path) -> Non
         assert cache.history(PX4.key) == old.history(PX4.key)
 
 
-def test_what_two_caches_have_of_one_vehicle_is_joined(cache: ParamCache, tmp_path: Path) -> None:
+def test_copy_to_merges_the_tables_of_one_vehicle(cache: ParamCache, tmp_path: Path) -> None:
     with ParamCache(tmp_path / "old") as old:
         for each in (old, cache):
             each.save(whole_table(3))
@@ -919,7 +919,7 @@ def test_the_command_copies_and_reads_it(
 
 
 @swiftly
-async def test_what_another_station_hears_renews_what_is_only_cached_here(tmp_path: Path) -> None:
+async def test_values_of_another_station_update_cached_values(tmp_path: Path) -> None:
     """Told by a cache that is told by a database: see above."""
     vehicle = small_px4()
     cache = Told(tmp_path / "cache")

@@ -178,7 +178,7 @@ def test_apply_tells_what_it_cannot_do(command: Command, put: Put, tmp_path: Pat
     assert (wrong.code, "it has the parameters of component 100" in wrong.err) == (2, True)
 
 
-def test_they_are_shown_without_a_link(command: Command, put: Put) -> None:
+def test_cached_extended_parameters_are_shown_offline(command: Command, put: Put) -> None:
     url = put(Air.symmetric([PX4Vehicle(table={"A": 1}), small()]))
     assert command("fetch", url).code == 0
     assert command("fetch", url, *CAMERA).code == 0

@@ -131,7 +131,7 @@ def test_an_unknown_value_name_is_not_sent(command: Command, put: Any) -> None:
     assert not vehicle.requests["PARAM_SET"]
 
 
-def test_a_value_outside_of_the_range_is_sent_with_a_warning(command: Command, put: Any) -> None:
+def test_a_value_outside_of_the_range_is_sent_with_force(command: Command, put: Any) -> None:
     """The range of the metadata is advice; the vehicle decides."""
     vehicle = quad()
     done = command("set", put(vehicle), "MC_ROLL_P=40", "--metadata", "vehicle", "--no-cache")

@@ -379,7 +379,7 @@ async def test_calls_that_wait_end_with_the_client() -> None:
     assert endings == ["ClientClosed"] * 3
 
 
-async def test_what_the_body_raises_comes_out_as_it_is_and_what_was_learnt_is_kept(tmp_path: Path) -> None:
+async def test_an_exception_of_the_body_is_raised_unchanged_and_the_cache_is_written(tmp_path: Path) -> None:
     vehicle = small_px4(**QUICK)
     with pytest.raises(ZeroDivisionError), anyio.fail_after(TIMEOUT):  # noqa: PT012 - the body is what counts
         async with ParamClient(vehicle, cache=tmp_path / "cache") as client:

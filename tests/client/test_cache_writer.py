@@ -232,7 +232,7 @@ async def test_a_change_while_we_were_away_is_a_miss(path: Path) -> None:
 
 
 @swiftly
-async def test_what_the_vehicle_no_longer_has_goes_from_the_cache(path: Path) -> None:
+async def test_a_parameter_that_the_vehicle_no_longer_has_leaves_the_cache(path: Path) -> None:
     larger = PX4Vehicle(table=VALUES)
     await session(larger, path)
     smaller = PX4Vehicle(table=VALUES, not_in_use=["PARAM_04"])
@@ -515,7 +515,7 @@ async def test_a_change_of_ours_tells_who_asked_for_it(path: Path) -> None:
 
 
 @swiftly
-async def test_what_was_written_is_in_the_history_however_short_it_stood(path: Path) -> None:
+async def test_every_own_write_is_in_the_history_however_briefly_it_was_valid(path: Path) -> None:
     vehicle = small_px4()
     await session(vehicle, path)
     async with ParamClient(vehicle, cache=path) as client:
@@ -577,7 +577,7 @@ async def test_a_write_is_in_the_history_also_where_the_cache_knew_nothing_befor
 
 @pytest.mark.parametrize("asker", ["", "x" * 129, "a\nb", "Änne", "\x7f"])
 @swiftly
-async def test_who_asks_is_told_in_printable_ascii(path: Path, asker: str) -> None:
+async def test_an_asker_must_be_printable_ascii(path: Path, asker: str) -> None:
     vehicle = small_px4()
     async with ParamClient(vehicle, cache=path) as client:
         component = await client.component()
@@ -613,7 +613,7 @@ async def test_a_set_that_moves_the_count_leads_to_a_download_and_a_right_table(
 
 
 @swiftly
-async def test_what_another_station_changes_is_kept_with_its_name(path: Path) -> None:
+async def test_a_change_by_another_station_is_in_the_history_with_its_address(path: Path) -> None:
     vehicle = small_px4()
     radio = Radio(vehicle)
     async with ParamClient(radio, cache=path) as client:
@@ -663,7 +663,7 @@ async def test_closing_writes_what_is_new(path: Path) -> None:
 
 
 @swiftly
-async def test_what_goes_from_the_table_goes_from_the_cache(path: Path) -> None:
+async def test_a_parameter_removed_from_the_table_is_removed_from_the_cache(path: Path) -> None:
     await session(small_px4(), path)
     async with ParamClient(small_px4(), cache=path) as client:
         component = await client.component()
@@ -816,7 +816,7 @@ async def test_a_damaged_file_is_set_aside(path: Path, caplog: pytest.LogCapture
 
 
 @swiftly
-async def test_what_could_not_be_written_is_written_later(
+async def test_values_that_could_not_be_written_are_written_later(
     path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     class Moody(ParamCache):

@@ -88,7 +88,7 @@ async def changes_of(component: Component, count: int = 1) -> list[Change]:
 
 
 @swiftly
-async def test_what_the_body_raises_comes_out_as_it_is() -> None:
+async def test_an_exception_of_the_body_is_raised_unchanged() -> None:
     class Stop(BaseException):
         pass
 
@@ -702,7 +702,7 @@ async def test_a_vehicle_that_changes_the_type() -> None:
 
 
 @swiftly
-async def test_what_cannot_be_right_is_not_sent() -> None:
+async def test_invalid_values_and_names_are_not_sent() -> None:
     table: dict[str, Any] = {"SMALL": (ParamType.UINT8, 1), "WHOLE": 1}
     tap = Tap(GenericVehicle(table))
     async with a_client(tap) as client:
@@ -984,7 +984,7 @@ async def test_a_silent_component_holds_nobody_up(autopilot: int) -> None:
 
 
 @swiftly
-async def test_whoever_is_late_to_speak_is_fetched_too() -> None:
+async def test_fetch_all_includes_a_vehicle_that_is_heard_late() -> None:
     late = generic(system=2)
     late.reboot(1000.0, down=0.9)
     async with a_client(Air([generic(), late])) as client:
@@ -1067,7 +1067,7 @@ async def test_a_change_that_is_taken_back_is_none() -> None:
 
 
 @swiftly
-async def test_what_waits_is_bounded_by_the_table() -> None:
+async def test_queued_changes_of_one_parameter_are_merged() -> None:
     vehicle = small_px4()
     async with a_client(vehicle) as client:
         component = await client.component()
@@ -1099,7 +1099,7 @@ async def test_several_tasks_may_wait_for_the_changes_of_one_subscription() -> N
 
 
 @swiftly
-async def test_who_listens_late_or_once_more_is_told_of_what_changes_from_then_on() -> None:
+async def test_changes_begin_when_they_are_requested() -> None:
     async with a_client(small_px4()) as client:
         component = await client.component()
         await component.fetch_all()
@@ -1128,7 +1128,7 @@ async def test_changes_end_with_the_client_and_what_waits_comes_first() -> None:
 
 
 @swiftly
-async def test_nobody_is_told_who_has_gone() -> None:
+async def test_a_dropped_changes_object_is_no_listener_any_more() -> None:
     async with a_client(small_px4()) as client:
         component = await client.component()
         changes = component.changes()
@@ -1185,7 +1185,7 @@ async def test_calls_go_on_when_the_link_is_back(way: str) -> None:
 
 
 @swiftly
-async def test_what_waited_is_asked_for_at_once_when_the_link_is_back() -> None:
+async def test_waiting_reads_are_sent_at_once_when_the_link_is_back() -> None:
     link = FlakyLink(Air.symmetric([generic()], delay=0.5))
     async with a_client(link) as client:
         component = await client.component()
@@ -1574,7 +1574,7 @@ async def test_the_autopilots_are_the_vehicles_without_what_they_carry(way: str)
 
 @swiftly
 @pytest.mark.parametrize("index", [-1, 32_768, 1.5])
-async def test_what_is_no_index_is_refused_and_ends_nothing(index: Any) -> None:
+async def test_an_invalid_index_is_refused_and_later_reads_work(index: Any) -> None:
     async with a_client(generic()) as client:
         component = await client.component()
         with pytest.raises(UsageError, match=f"parameter index {index}: indices are 0 to 32767"):
@@ -1583,7 +1583,7 @@ async def test_what_is_no_index_is_refused_and_ends_nothing(index: Any) -> None:
 
 
 @swiftly
-async def test_what_a_fetch_can_accept() -> None:
+async def test_invalid_options_of_accept_and_sample_are_refused() -> None:
     async with a_client(generic()) as client:
         component = await client.component()
         with pytest.raises(UsageError, match='accept must be "verified" or "sampled", not \'all\''):

@@ -102,7 +102,7 @@ async def test_no_mixed_table_and_no_false_line_reaches_the_cache(
 
 
 @swiftly
-async def test_what_came_in_a_contest_through_one_peer_goes_nowhere(tmp_path: Path) -> None:
+async def test_values_received_in_a_contest_through_one_peer_are_not_cached(tmp_path: Path) -> None:
     """Both vehicles behind one radio, with values of both in the table before they are told apart."""
     path = tmp_path / "cache.sqlite3"
     link = PeersLink({"radio": px4(), "radio ": Late(ardupilot(), 6.0, 20.0)})

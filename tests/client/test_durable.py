@@ -61,7 +61,7 @@ def test_only_a_durable_write_waits_for_the_disk(tmp_path: Path) -> None:
     assert said[1].endswith("disk I/O error")
 
 
-def test_what_is_synchronised_is_whole_and_the_next_write_is_an_ordinary_one(tmp_path: Path) -> None:
+def test_sync_writes_everything_and_later_writes_are_not_synced(tmp_path: Path) -> None:
     path = tmp_path / "cache"
     with ParamCache(path) as cache:
         cache.sync()  # also where there is nothing yet

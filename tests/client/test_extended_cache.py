@@ -118,7 +118,7 @@ async def test_plain_and_extended_tables_of_one_system_are_kept_apart(tmp_path: 
 
 
 @swiftly
-async def test_what_could_not_be_written_is_written_later(
+async def test_values_that_could_not_be_written_are_written_later(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "cache"
@@ -142,7 +142,7 @@ async def test_what_could_not_be_written_is_written_later(
 
 
 @swiftly
-async def test_what_is_lost_is_told(
+async def test_values_that_were_never_written_are_logged_at_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def fail(*_: object) -> None:

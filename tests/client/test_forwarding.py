@@ -111,7 +111,7 @@ async def test_every_frame_of_the_vehicle_is_passed_on_and_none_of_ours() -> Non
 
 
 @swiftly
-async def test_what_the_program_asks_for_reaches_the_vehicle_and_its_answer_the_program() -> None:
+async def test_requests_of_the_program_reach_the_vehicle_and_responses_the_program() -> None:
     vehicle, program = Tap(generic()), Program()
     async with a_client(vehicle, forward=program) as client:
         component = await client.component()
@@ -145,7 +145,7 @@ async def test_a_key_is_never_passed_on() -> None:
 
 
 @swiftly
-async def test_what_the_program_sets_is_its_change() -> None:
+async def test_a_write_of_the_program_is_a_change_by_its_station() -> None:
     """Also where it has the ids that a client has."""
     program = Program()
     async with a_client(generic(), forward=program) as client:
@@ -206,7 +206,7 @@ async def test_a_program_that_floods_takes_turns_with_us(monkeypatch: pytest.Mon
 
 
 @swiftly
-async def test_where_nothing_may_be_sent_nothing_of_the_program_is() -> None:
+async def test_frames_of_the_program_are_not_sent_with_listen_only() -> None:
     vehicle, program = Tap(generic()), Program()
     async with a_client(vehicle, forward=program, listen_only=True) as client:
         await client.component()
@@ -245,7 +245,7 @@ async def test_frames_of_a_stream_are_passed_on_whole_also_after_it_dropped() ->
 
 
 @swiftly
-async def test_what_is_forwarded_is_in_the_log(tmp_path: Path) -> None:
+async def test_forwarded_frames_are_in_the_telemetry_log(tmp_path: Path) -> None:
     path = tmp_path / "flight.tlog"
     program = Program()
     async with a_client(generic(), forward=program, tlog=path) as client:

@@ -217,7 +217,7 @@ def test_changes_that_nobody_takes_are_so_many_and_no_more(monkeypatch: pytest.M
     assert [*changes._waiting] == ["C", "D", "E"]
 
 
-def test_what_is_remembered_of_changes_is_so_much_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_remembered_changes_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(authors_room, "RECENT_CHANGES_MAX", 3)
     authors = Authors()
     for at, name in enumerate("ABCDABCD"):
@@ -252,7 +252,7 @@ def test_a_value_that_flips_is_asked_for_only_so_often(monkeypatch: pytest.Monke
     assert len(session.machine.reads) == 2
 
 
-def test_so_many_texts_are_remembered_and_no_more() -> None:
+def test_remembered_texts_are_bounded() -> None:
     """Those that come again and again are one object each."""
     known_well = text_of(b"MC_ROLL_P")
     for number in range(2 * TEXTS_MAX):
@@ -292,7 +292,7 @@ def test_a_directory_has_so_many_entries_and_no_more(monkeypatch: pytest.MonkeyP
     assert len(session.outcome(job)) == 100
 
 
-def test_what_is_remembered_of_the_reads_of_a_file_is_so_much_and_no_more() -> None:
+def test_remembered_reads_of_a_file_are_bounded() -> None:
     session = Simulation(LiarVehicle("crumbs", system=1))
     job = session.meet().files.read("/crumbs", session.now)
     for number in range(2 * reading_room.LATE_READS_MAX):
@@ -364,7 +364,7 @@ MOST_GROWTH = 300_000
 """Bytes by which the memory may differ between two moments of one session, without anything that stays."""
 
 
-def test_all_lies_at_once_cost_no_more_than_so_much_memory() -> None:
+def test_memory_is_bounded_under_all_kinds_of_lies_at_once() -> None:
     """When all that has a bound has reached it, nothing grows any more."""
     names, components = 100, 10
     with (
@@ -411,7 +411,7 @@ def test_all_lies_at_once_cost_no_more_than_so_much_memory() -> None:
 
 @pytest.mark.parametrize(("lies", "kept"), [((), 3), (("restless identity",), 0)], ids=["slowly", "at once"])
 @swiftly
-async def test_one_that_is_another_vehicle_each_time_fills_no_cache(
+async def test_a_vehicle_that_changes_its_identity_each_time_fills_no_cache(
     lies: tuple[str, ...],
     kept: int,
     tmp_path: Path,

@@ -106,7 +106,7 @@ async def test_the_list_that_another_station_asks_for_fills_the_table() -> None:
 
 
 @swiftly
-async def test_what_others_set_is_told_with_its_author() -> None:
+async def test_a_write_of_another_station_is_a_change_with_its_author() -> None:
     channel = Channel(generic())
     async with listener(channel) as client:
         component = await client.component()
@@ -123,7 +123,7 @@ async def test_what_others_set_is_told_with_its_author() -> None:
 
 
 @swiftly
-async def test_what_would_have_to_be_sent_is_refused_at_once() -> None:
+async def test_calls_that_send_are_refused_at_once() -> None:
     channel = Channel(small_px4())
     async with listener(channel) as client:
         component = await client.component()
@@ -145,7 +145,7 @@ async def test_what_would_have_to_be_sent_is_refused_at_once() -> None:
     assert channel.heard == []
 
 
-def test_what_may_be_asked_cannot_be_said_where_nothing_is() -> None:
+def test_policy_and_watch_interval_are_refused_with_listen_only() -> None:
     for options in ({"policy": Policy.HASH_ONLY}, {"watch_interval": 5.0}):
         with pytest.raises(UsageError, match="the client only listens"):
             listener(small_px4(), **options)
@@ -154,7 +154,7 @@ def test_what_may_be_asked_cannot_be_said_where_nothing_is() -> None:
 
 @pytest.mark.parametrize("timeout", [None, 3.0])
 @swiftly
-async def test_nobody_asks(timeout: float | None) -> None:
+async def test_fetch_all_without_any_request_of_others_ends_with_no_reply(timeout: float | None) -> None:
     async with listener(Channel(generic())) as client:
         component = await client.component()
         for fetch_all in (component.fetch_all, client.fetch_all):
@@ -282,7 +282,7 @@ def test_a_table_is_whole_when_every_index_has_come_in_whatever_order() -> None:
     assert is_so(machine.sync.synced)
 
 
-def test_another_count_or_another_name_makes_everything_count_again() -> None:
+def test_another_count_or_name_discards_the_received_values() -> None:
     station = station_that_listens()
     machine = station.components[1, 1]
     tell(station, 4, 0, 1, 2)
@@ -300,7 +300,7 @@ def test_another_count_or_another_name_makes_everything_count_again() -> None:
     assert sorted(machine.table.params) == ["P0", "P1", "P3", "Q2"]
 
 
-def test_what_came_before_a_restart_does_not_count() -> None:
+def test_values_from_before_a_reboot_do_not_complete_the_table() -> None:
     station = station_that_listens()
     machine = station.components[1, 1]
     tell(station, 3, 0, 1)

@@ -62,7 +62,7 @@ async def test_each_step_is_told_in_one_line(caplog: pytest.LogCaptureFixture, t
 
 
 @swiftly
-async def test_what_is_not_answered_is_told(caplog: pytest.LogCaptureFixture) -> None:
+async def test_unanswered_requests_are_logged(caplog: pytest.LogCaptureFixture) -> None:
     vehicle = Tap(generic())
     with caplog.at_level(logging.DEBUG, WATCHED):
         async with a_client(vehicle) as client:
@@ -142,7 +142,7 @@ def test_the_command_tells_its_steps(capsys: pytest.CaptureFixture[str]) -> None
     assert logging.getLogger(WATCHED).level == level
 
 
-def test_what_comes_from_the_wire_is_printed_harmlessly(capsys: pytest.CaptureFixture[str]) -> None:
+def test_control_characters_are_not_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["get", "sim:px4", "BAD\x1b[31m", "-v", "--no-cache"]) == 2
     assert "\x1b" not in capsys.readouterr().err
 

@@ -188,7 +188,7 @@ async def test_a_thousand_parameters_to_the_last_bit(kind: str) -> None:
 
 
 @pytest.mark.asyncio
-async def test_what_it_says_of_itself() -> None:
+async def test_the_identity_of_the_mavsdk_server() -> None:
     async with connected("raw") as (client, _):
         component = await client.component()
         await component.fetch_all()
@@ -245,7 +245,7 @@ async def test_many_at_once() -> None:
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize("kind", ["raw", "udpin"])
-async def test_what_it_does_not_have_it_says_so(kind: str) -> None:
+async def test_the_mavsdk_server_answers_unknown_names_with_an_error(kind: str) -> None:
     async with connected(kind) as (client, _):
         component = await client.component()
         await component.get("INT_001")
@@ -364,7 +364,7 @@ async def test_extended_parameters_of_every_type_that_it_has(kind: ComponentType
 
 
 @pytest.mark.asyncio
-async def test_what_it_does_with_other_extended_writes() -> None:
+async def test_the_mavsdk_server_and_unusual_extended_writes() -> None:
     async with with_extended(ComponentType.CAMERA) as (client, server):
         component = await client.component(1, 100)
         ext = component.ext

@@ -49,7 +49,7 @@ def test_a_value_that_is_heard_again_has_the_later_moment() -> None:
     assert table.take_overwritten() == [], "it is no change"
 
 
-def test_what_was_overwritten_keeps_its_own_moments() -> None:
+def test_overwritten_values_keep_their_observation_times() -> None:
     table = Table()
     heard(table, 1, "vehicle", 1.0)
     heard(table, 2, "us", 2.0)
@@ -76,7 +76,7 @@ def test_a_change_that_is_heard_again_keeps_the_moment_of_the_change() -> None:
     assert (param.value, by, moment) == (2, "station 254/190", 2.0)
 
 
-def test_what_did_not_reach_the_cache_is_given_back_with_its_moments() -> None:
+def test_restored_unwritten_values_keep_their_observation_times() -> None:
     table = Table()
     heard(table, 1, "vehicle", 1.0)
     table.take_dirty()
@@ -91,7 +91,7 @@ def test_what_did_not_reach_the_cache_is_given_back_with_its_moments() -> None:
 
 
 @pytest.mark.parametrize("by", ["vehicle", "us"])
-def test_what_is_replaced_on_its_way_to_a_cache_that_does_not_take_it_is_kept(by: str) -> None:
+def test_a_value_replaced_during_a_failed_write_is_kept(by: str) -> None:
     table = Table()
     heard(table, 1, "vehicle", 1.0)
     table.take_dirty()
@@ -104,7 +104,7 @@ def test_what_is_replaced_on_its_way_to_a_cache_that_does_not_take_it_is_kept(by
     assert table.take_dirty() == {"A": by}
 
 
-def test_what_is_gone_was_found_missing_when_the_last_value_came() -> None:
+def test_a_removed_name_has_the_time_of_the_last_value_of_the_download() -> None:
     table = Table()
     heard(table, 1, "vehicle", 1.0)
     table.store_value(param_value("B", 1.0, index=0, count=1), "vehicle", 2.0)
@@ -124,7 +124,7 @@ def test_a_file_counts_from_when_it_was_asked_for() -> None:
         assert table.params.moments == {"A": 2.0}
 
 
-def test_what_is_cached_keeps_the_moment_at_which_it_was_observed() -> None:
+def test_cached_values_keep_their_observation_times() -> None:
     table = Table()
     param = Param("A", 1, ParamType.INT32, 0, 1)
     table.fill({"A": param}, moments={"A": -500.0})
@@ -373,7 +373,7 @@ def interleaved(caches: Callable[[], tuple[ParamCache, ParamCache]], examples: i
     )
 
 
-def test_what_went_before_anything_was_written_does_not_come_back(tmp_path: Path) -> None:
+def test_a_name_removed_before_the_first_write_does_not_return(tmp_path: Path) -> None:
     """Its first value had no index, and a later one had: the list without it overtakes both."""
     path = tmp_path / "cache"
     caches = staticmethod(lambda: (ParamCache(path), ParamCache(path)))
@@ -392,7 +392,7 @@ def test_what_went_before_anything_was_written_does_not_come_back(tmp_path: Path
     programs.teardown()
 
 
-def test_whatever_two_programs_write_to_a_file_was_so(tmp_path: Path) -> None:
+def test_a_file_that_two_programs_write_to_agrees_with_a_model(tmp_path: Path) -> None:
     path = tmp_path / "cache"
     interleaved(lambda: (ParamCache(path), ParamCache(path)), examples=100)
 
@@ -402,7 +402,7 @@ def test_whatever_two_programs_write_to_a_file_was_so(tmp_path: Path) -> None:
 
 @pytest.mark.asyncio
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux is asked when a datagram arrived")
-async def test_what_is_read_late_is_told_apart_by_when_it_arrived() -> None:
+async def test_datagrams_read_late_have_their_arrival_times() -> None:
     link = create_link("udpin:127.0.0.1:0")
     await link.open()
     with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as sender:
@@ -498,7 +498,7 @@ async def carried(link: Scripted) -> AsyncIterator[dict[bytes, float]]:
 
 
 @swiftly
-async def test_what_the_system_tells_of_the_arrival_counts() -> None:
+async def test_the_arrival_time_of_the_system_is_used() -> None:
     async with carried(link := Telling()) as came:
         link.arrive(b"0")
         await anyio.sleep(1.0)
@@ -514,7 +514,7 @@ async def test_what_the_system_tells_of_the_arrival_counts() -> None:
 
 
 @swiftly
-async def test_what_is_read_at_once_came_just_now() -> None:
+async def test_bytes_read_at_once_have_the_present_time() -> None:
     async with carried(link := Scripted()) as came:
         await anyio.sleep(5.0)
         link.arrive(b"1")
@@ -524,7 +524,7 @@ async def test_what_is_read_at_once_came_just_now() -> None:
 
 
 @swiftly
-async def test_what_was_read_late_is_no_newer_than_the_last_look() -> None:
+async def test_bytes_read_late_have_the_time_of_the_last_read() -> None:
     async with carried(link := Scripted()) as came:
         link.arrive(b"1")
         now = anyio.current_time()
@@ -546,7 +546,7 @@ async def test_what_was_read_late_is_no_newer_than_the_last_look() -> None:
 
 
 @swiftly
-async def test_what_came_before_this_computer_slept_is_as_old_as_that(
+async def test_datagrams_from_before_a_suspend_are_as_old_as_the_suspend(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     asleep = 0.0

@@ -91,7 +91,7 @@ async def test_a_vehicle_that_sends_telemetry_is_found_although_its_heartbeats_a
 
 
 @swiftly
-async def test_who_is_named_is_given_beside_others() -> None:
+async def test_a_named_system_is_returned_although_there_are_several() -> None:
     async with a_client(Air([px4(), copter(), px4(3)])) as client:
         assert address(await client.only_component(2)) == (2, 1)
         assert address(await client.only_component(3, 1)) == (3, 1)

@@ -74,7 +74,7 @@ def test_a_log_is_read_whatever_its_blocks(size: int, monkeypatch: pytest.Monkey
     assert [each.data for each in records(log_of(*frames))] == frames
 
 
-def test_what_is_no_record_is_stepped_over() -> None:
+def test_bytes_between_records_are_skipped() -> None:
     first, second, third = (frame(number) for number in range(3))
     torn = log_of(second)[:-5]
     found = records(log_of(first) + torn + b"\xfd" * 3 + log_of(second, third))
@@ -118,7 +118,7 @@ def test_a_record_that_the_end_cuts_off_is_left_out(missing: int) -> None:
     assert [each.data for each in records(whole[:-missing])] == [frame(1)]
 
 
-def test_what_is_no_log_has_no_records() -> None:
+def test_a_file_that_is_no_log_has_no_records() -> None:
     assert records(b"") == []
     assert records(bytes(range(256)) * 40) == []
     assert records(b"FRAME_CLASS 1\n" * 500) == []
@@ -128,7 +128,7 @@ def test_what_is_no_log_has_no_records() -> None:
 
 
 @swiftly
-async def test_everything_on_the_link_is_written_both_ways(tmp_path: Path) -> None:
+async def test_frames_of_both_directions_are_written(tmp_path: Path) -> None:
     vehicle = Tap(small_px4())
     path = tmp_path / "flight.tlog"
     before = time.time()

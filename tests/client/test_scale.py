@@ -62,7 +62,7 @@ def looks(monkeypatch: pytest.MonkeyPatch) -> Counter[int]:
     return looks
 
 
-def test_what_one_says_makes_nobody_look_at_the_others(looks: Counter[int]) -> None:
+def test_a_message_of_one_component_examines_no_other(looks: Counter[int]) -> None:
     station = Station(link="x", is_stream=False)
     for system in range(1, MANY + 1):
         hear(station, system, 0.0)
@@ -97,7 +97,7 @@ def test_a_deadline_is_kept_whoever_was_looked_at_meanwhile() -> None:
     assert sorted(set(asked)) == [(round(0.25 + system / 100, 3), system) for system in range(1, 11)]
 
 
-def test_what_was_asked_of_one_goes_out() -> None:
+def test_a_request_makes_its_component_due() -> None:
     station = Station(link="x", is_stream=False)
     hear(station, 1, 0.0)
     hear(station, 2, 0.0)
@@ -110,7 +110,7 @@ def test_what_was_asked_of_one_goes_out() -> None:
     assert station.next_deadline() == min(each.next_deadline() for each in station.components.values())
 
 
-def test_what_is_due_of_many_at_once_is_done_in_parts() -> None:
+def test_one_tick_handles_a_part_of_many_due_components() -> None:
     station = Station(link="x", is_stream=False)
     for system in range(1, MANY + 1):
         hear(station, system, 0.0)
@@ -186,7 +186,7 @@ def _raise(error: Exception, *_: object) -> None:
     raise error
 
 
-def test_who_was_forgotten_leaves_no_deadline_to_whoever_comes_in_its_place(
+def test_a_forgotten_component_leaves_no_deadline_to_its_successor(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """One that is lost makes room for another, and is asked for a parameter although it is gone."""
@@ -212,7 +212,7 @@ def test_who_was_forgotten_leaves_no_deadline_to_whoever_comes_in_its_place(
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.2])
-def test_it_makes_no_difference_who_is_looked_at(loss: float) -> None:
+def test_a_session_ends_the_same_whether_or_not_all_components_are_examined(loss: float) -> None:
     """A whole session of twelve, with and without looking at everyone."""
     ends = []
     for everyone in (True, False):
@@ -442,7 +442,7 @@ async def test_time_outs_wait_for_what_waits_for_its_turn() -> None:
 
 
 @swiftly
-async def test_what_comes_at_once_gives_way_to_other_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_many_datagrams_at_once_give_way_to_other_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each datagram takes a millisecond; so do others that are told of what has happened by then."""
 
     class Clock:
@@ -584,7 +584,7 @@ class Portions(ParamCache):
 
 
 @swiftly
-async def test_what_is_new_is_written_in_portions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_new_tables_are_written_in_portions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No transaction begins another table when it has enough: to gather one takes the loop's time."""
     monkeypatch.setattr(cache_writer, "TRANSACTION_PARAMS", 200)
     monkeypatch.setattr(cache_writer, "CACHE_FLUSH_INTERVAL", 1000.0)  # everything on closing
@@ -641,7 +641,7 @@ class Busy(Tap):
 
 
 @swiftly
-async def test_who_answers_no_sooner_than_others_is_waited_for() -> None:
+async def test_a_component_that_is_as_slow_as_another_is_waited_for() -> None:
     """Where another one took a while as well, an answer that is late says nothing."""
     vehicles = [Busy(small(1), 0.3, beats=True), Busy(small(2), 2.3, beats=True)]
     async with ParamClient(Air.symmetric(vehicles), cache=False) as client:
@@ -651,7 +651,7 @@ async def test_who_answers_no_sooner_than_others_is_waited_for() -> None:
 
 
 @swiftly
-async def test_who_is_not_heard_at_all_for_a_while_is_waited_for() -> None:
+async def test_a_component_without_heartbeats_is_waited_for_until_it_is_lost() -> None:
     """It owes its heartbeats as well, and is not lost."""
     vehicles: list[Endpoint] = [small(1), *(Busy(small(system), 3.5, beats=False) for system in (2, 3))]
     async with ParamClient(Air.symmetric(vehicles), cache=False) as client:

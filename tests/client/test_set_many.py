@@ -153,7 +153,7 @@ async def test_a_switch_of_a_group_is_a_barrier() -> None:
 
 @direct_only("counts the writes in flight")
 @swiftly
-async def test_so_many_writes_are_in_flight_as_the_vehicle_serves() -> None:
+async def test_as_many_writes_are_in_flight_as_the_vehicle_serves() -> None:
     tap = Tap(Air.symmetric([PX4Vehicle(table=MANY)], delay=0.2))
     async with a_client(tap) as client:
         component = await client.component()

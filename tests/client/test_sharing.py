@@ -100,7 +100,7 @@ def test_a_list_that_another_station_has_asked_for_is_followed(kind: str, later:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_where_much_is_lost_both_come_to_their_end(kind: str) -> None:
+def test_two_fetches_of_two_stations_complete_with_packet_loss(kind: str) -> None:
     world = Shared(KINDS[kind](), loss=0.1, delay=0.01)
     world.meet()
     began = world.now
@@ -113,7 +113,7 @@ def test_where_much_is_lost_both_come_to_their_end(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_another_station_asks_for_fills_our_table(kind: str) -> None:
+def test_values_requested_by_another_station_fill_the_table(kind: str) -> None:
     vehicle = KINDS[kind]()
     setting = SimParam("MC_ROLL_P" if kind == "px4" else "RTL_ALT", ParamType.REAL32, 7.5)
     world = Simulation(air=Air([vehicle], others=[OtherStation(list_every=4.0, sets=[(10.0, setting)])]))
@@ -124,7 +124,7 @@ def test_what_another_station_asks_for_fills_our_table(kind: str) -> None:
     assert not world.sent_of(ParamRequestList)
 
 
-def test_where_theirs_stops_in_the_middle_we_ask_for_the_rest() -> None:
+def test_a_fetch_reads_what_a_stopped_list_of_another_station_lacks() -> None:
     world = Shared(PX4Vehicle(list_stops_at=500))
     world.meet()
     message = wire.encode(ParamRequestList(1, 1), system=253, component=190, sequence=0)

@@ -156,7 +156,7 @@ def test_the_environment_names_a_key_in_one_of_three_ways(key_file: Path) -> Non
     assert "hunter2" not in str(caught.value)
 
 
-def test_what_cannot_be_is_refused_when_it_is_said() -> None:
+def test_invalid_signing_settings_are_refused_at_once() -> None:
     assert Signing(KEY, "signed-only").policy == SigningPolicy.SIGNED_ONLY
     with pytest.raises(
         UsageError, match="unknown signing policy 'none'; choose one of signed-only, unsigned-radios, accept"
@@ -189,7 +189,7 @@ def test_each_session_has_the_lowest_link_id_that_is_free(state: Path) -> None:
     wanted.release()
 
 
-def test_all_link_ids_in_use_is_said(state: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_key_without_a_free_link_id_is_an_error(state: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(signing_timestamps, "LINK_IDS", 2)
     files = [TimestampFile(state, KEY.fingerprint, None) for _ in range(3)]
     for file in files[:2]:
@@ -223,7 +223,7 @@ def test_another_process_keeps_its_link_id_until_it_ends(state: Path) -> None:
     file.release()
 
 
-def test_what_is_written_is_whole_private_and_no_key(state: Path) -> None:
+def test_the_timestamp_file_is_private_and_contains_no_key(state: Path) -> None:
     file = TimestampFile(state, KEY.fingerprint, 7)
     file.claim()
     file.write(NOW)
@@ -423,7 +423,7 @@ async def test_a_link_id_of_ones_own_is_taken_once() -> None:
 
 
 @swiftly
-async def test_whoever_is_not_heard_for_signatures_is_told_so() -> None:
+async def test_no_reply_says_that_frames_were_refused() -> None:
     async with a_client(signed_vehicle(), signing=OTHER_KEY) as client:
         with pytest.raises(NoReply, match=r"an autopilot \(frames were refused, [0-9]+ for: bad signature\)"):
             await client.component(timeout=3.0)
@@ -461,7 +461,7 @@ async def test_a_vehicle_of_mavlink_1_is_given_no_key() -> None:
 
 
 @swiftly
-async def test_where_all_is_accepted_old_vehicles_are_answered_unsigned() -> None:
+async def test_accept_all_answers_a_mavlink_1_vehicle_unsigned() -> None:
     vehicle = small_px4(mavlink_version=1)
     async with a_client(vehicle, signing=Signing(KEY, SigningPolicy.ACCEPT_ALL)) as client:
         component = await client.component()
@@ -764,7 +764,7 @@ def test_a_passphrase_is_typed_unseen_and_the_link_confirmed(terminal: Callable[
     assert b"Schl" not in setup.seen
 
 
-def test_whoever_is_not_sure_sends_nothing(terminal: Callable[..., Terminal]) -> None:
+def test_a_signing_set_up_that_is_not_confirmed_sends_nothing(terminal: Callable[..., Terminal]) -> None:
     refused = terminal("signing", "setup", "sim:px4", PARAMCLIENT_SIGNING_KEY=SECRET.hex())
     refused.until(b"[y/N] ")
     refused.type(b"\n")

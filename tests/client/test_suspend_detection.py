@@ -56,7 +56,7 @@ def trusts(component: Component) -> set[Trust]:
 
 
 @swiftly
-async def test_what_moved_meanwhile_is_found_and_nobody_is_lost(sleep: Sleep) -> None:
+async def test_a_change_during_a_suspend_is_found_and_no_component_is_lost(sleep: Sleep) -> None:
     tap = Tap(vehicle := small_px4())
     async with a_client(tap) as client:
         component = await client.component()
@@ -153,7 +153,7 @@ async def test_nor_does_one_that_is_asked_for_before_anybody_has_noticed(sleep: 
 
 
 @swiftly
-async def test_one_that_has_gone_is_lost_soon_and_without_a_storm(sleep: Sleep) -> None:
+async def test_a_vehicle_gone_during_a_suspend_is_lost_soon_with_few_requests(sleep: Sleep) -> None:
     tap = Tap(small_px4())
     async with a_client(tap) as client, asyncio.TaskGroup() as tasks:
         component = await client.component()
@@ -240,7 +240,7 @@ async def _error_of(component: Component, name: str, value: float | None = None)
 # The clocks
 
 
-def test_who_is_late_by_much_was_away() -> None:
+def test_a_long_delay_counts_as_a_suspend() -> None:
     clock = SuspendDetector()
     assert clock.unseen(100.0) is None, "nothing was expected"
     clock.expect(101.0)
@@ -258,7 +258,7 @@ def test_sleep_that_the_clock_leaves_out_is_told_once(monkeypatch: pytest.Monkey
     assert clock.unseen(1.0) is None
 
 
-def test_this_computer_is_awake() -> None:
+def test_time_asleep_is_finite_and_stands_still_while_awake() -> None:
     assert math.isfinite(before := time_asleep())
     assert time_asleep() - before < 1.0
 

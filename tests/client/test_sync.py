@@ -474,7 +474,7 @@ async def test_cache_only_where_nothing_is_cached(path: Path) -> None:
 
 
 @swiftly
-async def test_one_that_is_not_cached_keeps_the_others_not_back(path: Path) -> None:
+async def test_a_component_without_a_cached_table_does_not_delay_the_others(path: Path) -> None:
     vehicle = small_px4()
     await learn(vehicle, path)
     async with a_client(Air([vehicle, generic(component=100)]), cache=path, policy="cache-only") as client:
@@ -509,7 +509,7 @@ async def test_hash_only_asks_for_the_hash_alone(path: Path) -> None:
 
 @pytest.mark.parametrize("policy", [Policy.CACHE_ONLY, Policy.HASH_ONLY])
 @swiftly
-async def test_such_a_policy_and_refresh_exclude_each_other(policy: Policy) -> None:
+async def test_refresh_is_refused_with_a_policy_that_forbids_downloads(policy: Policy) -> None:
     tap = Tap(small_px4())
     async with a_client(tap, policy=policy) as client:
         component = await client.component()
@@ -582,7 +582,7 @@ async def test_a_slow_listener_misses_the_oldest_and_holds_no_more() -> None:
 
 
 @swiftly
-async def test_nobody_is_told_who_has_gone() -> None:
+async def test_a_dropped_events_object_is_unsubscribed() -> None:
     async with a_client(small_px4()) as client:
         await client.component()
         gone: weakref.ref[Events] = weakref.ref(client.events())

@@ -233,7 +233,7 @@ async def test_a_disk_that_is_full_for_a_while(path: Path, caplog: pytest.LogCap
     assert set_aside(path) == []
 
 
-def test_how_often_a_cache_found_another_file(path: Path) -> None:
+def test_replacements_counts_how_often_the_cache_file_was_replaced(path: Path) -> None:
     with ParamCache(path) as cache:
         assert cache.replacements == 0
         cache.save(of_another_vehicle())

@@ -80,7 +80,7 @@ def test_a_portable_name_has_1_to_16_characters() -> None:
 
 
 @pytest.mark.parametrize("name", UNUSABLE)
-def test_what_is_said_under_such_a_name_is_dropped_and_counted(name: str) -> None:
+def test_messages_with_unusable_names_are_dropped_and_counted(name: str) -> None:
     session = Simulation(
         vehicle := GenericVehicle({"A": (ParamType.REAL32, 1.0), "B": (ParamType.REAL32, 2.0)})
     )
@@ -151,7 +151,7 @@ def test_a_forged_value_blocks_no_export(command: Command, put: Put, tmp_path: P
         assert [*loads(path.read_bytes()).sets[0]] == ["A", "B"]
 
 
-def test_such_a_name_in_the_cache_blocks_no_export_and_goes_with_the_next_whole_table(
+def test_an_unusable_name_in_the_cache_blocks_no_export_and_leaves_with_the_next_fetch(
     command: Command, put: Put, tmp_path: Path
 ) -> None:
     path = tmp_path / "cache.sqlite3"

@@ -133,7 +133,7 @@ async def test_a_cache_that_cannot_be_read_is_no_unknown_state(path: Path) -> No
 
 @UNWRITABLE
 @swiftly
-async def test_what_is_written_late_has_the_times_of_the_observations_and_every_value(
+async def test_values_written_late_keep_their_observation_times_and_the_whole_history(
     unwritable: Holding, path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     vehicle = PX4Vehicle(table={NAME: 1.0, "PARAM_02": 2.0})

@@ -16,7 +16,7 @@ def threads() -> int:
     return sum(thread.name == NAME for thread in threading.enumerate())
 
 
-def test_it_closes_while_others_ask_for_more() -> None:
+def test_calls_made_while_the_worker_closes_are_completed() -> None:
     """Their calls are behind the last one of the closing, and are done and told all the same."""
     done: list[str] = []
     may_go_on = threading.Event()
@@ -41,7 +41,7 @@ def test_it_closes_while_others_ask_for_more() -> None:
     assert not threads()
 
 
-def test_what_is_asked_for_when_it_is_closed_is_done_too() -> None:
+def test_a_call_after_the_close_is_completed() -> None:
     async def main() -> None:
         worker = Worker(NAME)
         assert await worker.run(lambda: 1) == 1

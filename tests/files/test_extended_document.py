@@ -50,7 +50,7 @@ def every_kind() -> dict[str, ExtParam]:
 
 
 @pytest.mark.parametrize("ending", ["json", "yaml", "yml"])
-def test_what_is_written_comes_back(tmp_path: Path, ending: str) -> None:
+def test_a_written_file_reads_back_unchanged(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"camera.{ending}"
     params = every_kind()
     write_extended_file(path, ExtParamFile(params, 1, 100, 1_700_000_000.0, "link sim:camera"))
@@ -128,7 +128,7 @@ def test_the_two_kinds_of_files_are_told_apart(tmp_path: Path) -> None:
         (5, "expected value or hex, and type"),
     ],
 )
-def test_what_is_invalid_is_told(tmp_path: Path, fields: object, words: str) -> None:
+def test_an_invalid_file_is_an_error_with_its_path(tmp_path: Path, fields: object, words: str) -> None:
     path = tmp_path / "camera.json"
     path.write_text(json.dumps({"paramclient_extended": 1, "params": {"CAM": fields}}))
     with pytest.raises(FileError, match=words) as caught:

@@ -115,7 +115,7 @@ def test_values_that_do_not_fit(value: ExtValue, number: int, words: str) -> Non
         ("é" * 64, "é" * 64),
     ],
 )
-def test_what_a_caller_may_give(given_value: ExtSettable, value: ExtValue) -> None:
+def test_valid_extended_values_are_converted(given_value: ExtSettable, value: ExtValue) -> None:
     assert check_ext_value(given_value) == value
 
 
@@ -131,7 +131,7 @@ def test_what_a_caller_may_give(given_value: ExtSettable, value: ExtValue) -> No
         (decimal.Decimal("sNaN"), "number in the range of a float"),
     ],
 )
-def test_what_a_caller_may_not_give(value: ExtSettable, words: str) -> None:
+def test_invalid_extended_values_are_refused(value: ExtSettable, words: str) -> None:
     with pytest.raises(UsageError, match=words):
         check_ext_value(value)
 

@@ -61,7 +61,7 @@ def test_upper_and_lower_case_do_not_matter_in_a_selection() -> None:
     assert not choice.has("MC_ROLL_P")
 
 
-def test_what_fits_nothing_is_listed_with_suggestions() -> None:
+def test_unmatched_names_are_listed_with_suggestions() -> None:
     chosen, unmatched = NameChoice(["MC_ROLLP", "BAT*", "MC_YAW_P"]).choose(NAMES)
     assert chosen == {"MC_YAW_P"}
     assert unmatched == "MC_ROLLP (did you mean MC_ROLL_P?) or BAT*"

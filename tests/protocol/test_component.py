@@ -215,7 +215,7 @@ def test_values_are_read_again_when_the_encoding_becomes_known() -> None:
     assert desk.changes[-1].new == desk.machine.table.params["A"]
 
 
-def test_what_the_user_says_about_the_encoding_holds() -> None:
+def test_a_chosen_encoding_overrides_the_detected_one() -> None:
     desk = Desk(ARDUPILOT, encoding=Encoding.BYTEWISE)
     desk.hear("A", 5, ParamType.INT32)
     assert desk.machine.table.params["A"].value == 5
@@ -309,7 +309,7 @@ def test_a_count_that_moves_takes_the_table_out_of_step() -> None:
     assert desk.machine.table.count == 4
 
 
-def test_what_changes_twice_in_a_short_while_is_asked_for_once_more() -> None:
+def test_a_value_that_changes_twice_quickly_is_read_again() -> None:
     desk = Desk(ARDUPILOT)
     desk.hear("A", 1.0)
     desk.now += 2 * DOUBT_TIME
@@ -329,7 +329,7 @@ def test_what_changes_twice_in_a_short_while_is_asked_for_once_more() -> None:
     assert len(desk.machine.reads) == 0
 
 
-def test_what_changes_slowly_is_believed() -> None:
+def test_a_value_that_changes_slowly_is_not_read_again() -> None:
     desk = Desk()
     for number in range(5):
         desk.now += DOUBT_TIME + 0.1
@@ -338,7 +338,7 @@ def test_what_changes_slowly_is_believed() -> None:
     assert desk.reads() == []
 
 
-def test_what_we_change_twice_ourselves_is_believed() -> None:
+def test_own_quick_changes_are_not_read_again() -> None:
     desk = Desk(SOMETHING)
     desk.hear("A", 0.0)
     for value in (1.0, 2.0, 3.0):
@@ -624,7 +624,7 @@ def test_a_change_makes_an_announced_hash_old() -> None:
 # the cache
 
 
-def test_what_the_cache_knows_is_confirmed_by_a_hash_that_came_before() -> None:
+def test_a_hash_received_before_the_cache_was_read_confirms_it() -> None:
     desk = Desk()
     params = [known("A", 1, index=0), known("B", 2, index=1)]
     desk.hash(px4_hash(params), count=2)
@@ -645,7 +645,7 @@ def test_without_such_a_hash_it_stays_cached(announced: int | None) -> None:
     assert {param.trust for param in desk.machine.table.params.values()} == {Trust.CACHED}
 
 
-def test_what_was_heard_before_the_cache_was_read_stays() -> None:
+def test_values_received_before_the_cache_was_read_are_kept() -> None:
     desk = Desk()
     desk.hear("A", 9, ParamType.INT32, index=0, count=2)
     params = [known("A", 1, index=0), known("B", 2, index=1)]
@@ -730,7 +730,7 @@ def test_the_observer_is_called_when_the_identity_is_settled() -> None:
     assert desk.machine.identity.uid == "0000000000000007"
 
 
-def test_it_is_told_again_when_a_late_answer_gives_another_name() -> None:
+def test_a_late_hardware_id_is_announced_as_a_new_identity() -> None:
     desk = Desk(None)
     for _ in range(10):
         desk.receive(PX4)

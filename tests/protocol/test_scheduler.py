@@ -286,7 +286,7 @@ def test_without_room_no_more_run_than_before() -> None:
     assert sum(lane.is_running for lane in road.lanes[2:]) == 1
 
 
-def test_what_is_slower_has_no_room_either() -> None:
+def test_slower_lists_end_the_growth_of_parallel_lists() -> None:
     road = Road(8)
     while road.running < 2:
         road.run()
@@ -367,7 +367,7 @@ def test_a_slow_one_does_not_hold_up_the_others() -> None:
     assert road.now < 3.0
 
 
-def test_one_that_falls_quiet_beside_others_had_no_room() -> None:
+def test_a_list_that_stops_beside_others_ends_the_growth_of_parallel_lists() -> None:
     road = Road(8)
     road.until(4)
     road.end(road.lanes[3], is_cut=True)
@@ -375,7 +375,7 @@ def test_one_that_falls_quiet_beside_others_had_no_room() -> None:
     assert road.running == 3
 
 
-def test_one_that_falls_quiet_alone_tells_nothing() -> None:
+def test_a_list_that_stops_alone_changes_no_limit() -> None:
     road = Road(8)
     road.run(2)
     road.end(road.lanes[0], is_cut=True)
@@ -392,7 +392,7 @@ def test_a_turn_given_back_while_waiting_is_dropped() -> None:
     road.turns.release(road.lanes[1])  # it is no longer there; that does no harm
 
 
-def test_what_was_found_out_is_forgotten_when_no_list_came_for_long() -> None:
+def test_measurements_expire_without_a_list() -> None:
     road = Road(4)
     road.until(2, room=1.0)
     road.run(50, room=1.0)
@@ -537,7 +537,7 @@ def test_a_list_that_waits_for_its_turn_is_not_silent_and_gives_it_back() -> Non
     assert third.result.complete
 
 
-def test_what_others_have_asked_for_fills_the_table_of_one_that_waits() -> None:
+def test_a_list_for_another_station_fills_the_table_of_a_waiting_fetch() -> None:
     vehicles = [MAKES["ArduPilot"](1), MAKES["PX4"](2)]
     world = a_radio(vehicles)
     slow, waiting = begin_all(world, 2)

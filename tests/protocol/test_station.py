@@ -79,7 +79,7 @@ def test_our_heartbeat_comes_once_a_second() -> None:
     assert beats == [float(second) for second in range(10)]
 
 
-def test_what_our_heartbeat_says() -> None:
+def test_the_content_of_our_heartbeat() -> None:
     station = Station(link="x", is_stream=False, system=250, component=7)
     station.tick(0.0)
     [(message, version, peer)] = sent(station)
@@ -245,7 +245,7 @@ def test_bytes_that_mean_nothing() -> None:
     assert station.bytes_received > 9
 
 
-def test_what_is_of_interest() -> None:
+def test_receive_says_whether_a_datagram_had_a_message_of_interest() -> None:
     for is_stream in (False, True):
         station = a_station(is_stream=is_stream)
         telemetry = wire.build_frame(30, bytes(28), system=1, component=1, sequence=0)
@@ -256,7 +256,7 @@ def test_what_is_of_interest() -> None:
         assert station.receive(frame(PX4)[-1:], "peer", 0.0) is is_stream
 
 
-def test_what_is_waited_for() -> None:
+def test_is_waiting_while_a_response_is_expected() -> None:
     station = a_station()
     assert not station.is_waiting
     hear(station, PX4)
@@ -408,7 +408,7 @@ def test_a_whole_session_in_mavlink_1(make: type[PX4Vehicle] | type[ArduPilotVeh
 # other stations
 
 
-def test_what_another_station_sets() -> None:
+def test_a_param_set_of_another_station_is_attributed_to_its_targets() -> None:
     station = a_station()
     for component in (1, 2):
         hear(station, PX4, 1, component)

@@ -99,7 +99,7 @@ def test_a_program_that_has_listened_for_long_does_not_wait(listening: Listening
     assert listening.chosen(7.1) == (1, 1)
 
 
-def test_what_is_heard_after_the_choice_is_found_by_the_next_look(listening: Listening) -> None:
+def test_a_vehicle_heard_after_the_choice_is_found_by_the_next_check(listening: Listening) -> None:
     listening.hear(PX4, 5.0)
     assert listening.chosen(6.3) == (1, 1)
     listening.hear(PLANE, 6.4, system=2)
@@ -154,7 +154,7 @@ def test_a_vehicle_that_was_silent_for_a_moment_is_there(listening: Listening) -
 
 @pytest.mark.parametrize("heartbeat", [GIMBAL, GCS, MISLABELLED])
 @pytest.mark.parametrize(("system", "component"), [(1, 154), (2, 1), (9, 190)])
-def test_what_is_no_autopilot_is_no_vehicle(
+def test_components_that_are_no_autopilots_are_no_vehicles(
     listening: Listening, heartbeat: Heartbeat, system: int, component: int
 ) -> None:
     listening.hear(heartbeat, 4.9, system, component).hear(PX4, 5.0)

@@ -260,7 +260,7 @@ async def test_two_that_set_one_name_are_put_in_order_and_each_learns_what_happe
 
 
 @swiftly
-async def test_who_set_it_is_told_to_the_others() -> None:
+async def test_other_clients_receive_the_author_of_a_change() -> None:
     access = AccessSettings(tokens=tokens())
     async with a_hub(small_px4()) as hub:
         network = Network(create_app(hub, Settings(access=access)))
@@ -358,7 +358,7 @@ async def test_components_on_several_links() -> None:
 
 
 @swiftly
-async def test_what_is_not_given_over_a_service_is_refused_in_words() -> None:
+async def test_calls_that_a_service_lacks_raise_usage_errors() -> None:
     async with a_service(small_px4()) as network, a_program(network) as client:
         component = await client.component()
         refused: list[Callable[[], Any]] = [
@@ -632,7 +632,7 @@ def answering(status: int, body: bytes, kind: str = "text/html", **headers: str)
     ids=["page", "nothing", "elsewhere", "json", "problem", "number", "noise", "end", "proxy", "nobody"],
 )
 @swiftly
-async def test_what_is_no_service_is_told_from_one(app: ASGIApp | None, words: str) -> None:
+async def test_an_address_that_is_no_service_is_a_link_error(app: ASGIApp | None, words: str) -> None:
     with pytest.raises(LinkError, match=words) as caught:
         async with a_program(Network(app)):
             pass
@@ -640,7 +640,7 @@ async def test_what_is_no_service_is_told_from_one(app: ASGIApp | None, words: s
 
 
 @swiftly
-async def test_one_that_says_nothing_is_given_up() -> None:
+async def test_a_service_that_does_not_respond_is_given_up() -> None:
     async def silent(scope: Scope, receive: Receive, send: Send) -> None:
         while (await receive())["type"] != "http.disconnect":
             pass

@@ -208,7 +208,7 @@ REFUSED = {"error": "Refused", "detail": "x", "system": 1, "component": 1}
         ("/components", components(component(last_fetch=5)), "document of the service is not valid"),
     ],
 )
-async def test_it_ends_in_an_error_when_it_is_opened(
+async def test_opening_a_client_of_a_hostile_service_raises_link_error(
     path: str, sent: Sent, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(http, "HELLO_TIMEOUT", 0.3)
@@ -249,7 +249,7 @@ async def test_an_error_that_it_tells_of_is_one_of_ours(problem: object) -> None
 
 
 @pytest.mark.asyncio
-async def test_what_it_answers_in_between_ends_no_program() -> None:
+async def test_invalid_responses_to_background_loads_end_no_program() -> None:
     """Tables are loaded beside the program; whatever comes of that is told by the calls that need them."""
     refuse = [b"HTTP/1.1 401 No\r\nContent-Type: application/problem+json\r\nContent-Length: 2\r\n\r\n{}"]
     async with hostile({"/components/1/1/params": refuse}) as url, ParamClient(url) as client:
@@ -362,7 +362,7 @@ def test_encodings_that_are_asked_for_are_decoded(encoding: str) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "5", f"{RUN}-", f"{RUN}-x", f"{RUN}-{'9' * 5_000}", "x" * 90 + "-1"])
-def test_what_is_no_place(text: str) -> None:
+def test_an_invalid_stream_position_is_ignored(text: str) -> None:
     assert StreamPosition.read(text) is None
 
 

@@ -137,7 +137,7 @@ def test_a_token_is_given_or_stands_in_the_environment(monkeypatch: pytest.Monke
         ParamClient("sim:px4", token="given")
 
 
-def test_everything_public_is_answered_for() -> None:
+def test_the_remote_classes_define_every_public_name_of_the_local_ones() -> None:
     """What a client or a component offers either goes over the service or is refused in words."""
     for local, remote in ((ParamClient, ServiceClient), (RemoteComponent.__base__, RemoteComponent)):
         offered = {name for name in vars(local) if not name.startswith("_")} - IN_INTERFACE
@@ -173,7 +173,7 @@ def test_a_subclass_is_a_client_over_both(link: str) -> None:
     assert not client.components
 
 
-def test_what_only_a_client_with_a_link_has_is_refused_over_a_service() -> None:
+def test_local_client_refuses_a_client_of_a_service() -> None:
     assert local_client(ParamClient("sim:px4")).link.name == "sim:px4"
     with pytest.raises(UsageError, match="a service does not give"):
         local_client(ParamClient("http://h:1"))
@@ -214,7 +214,7 @@ def test_raw_bytes_stay_raw(kind: int, bits: int) -> None:
 
 
 @pytest.mark.parametrize("value", [0, -(2**63), 2**64, 2.0, -0.0, 1e300, math.inf, -math.inf, math.nan])
-def test_what_is_written_stays_a_whole_number_or_a_fraction(value: float) -> None:
+def test_sent_values_stay_integers_or_floats(value: float) -> None:
     sent = json.loads(json.dumps(value_as_sent(value), allow_nan=False))
     assert repr(parse_number(sent)) == repr(value)
 
@@ -316,7 +316,7 @@ def loaded(mirror: Mirror, seq: int, *params: Param) -> list[Change] | None:
     return mirror.load(seq, {each.name: each for each in params})
 
 
-def test_what_happened_before_a_snapshot_is_in_it_and_what_came_after_is_added() -> None:
+def test_events_before_a_loaded_table_are_dropped_and_later_ones_applied() -> None:
     mirror = Mirror()
     mirror.begin()
     for seq in (4, 5, 6):
@@ -343,7 +343,7 @@ def test_a_first_table_is_no_change_and_a_later_one_tells_what_is_different() ->
     assert list(mirror.params) == ["A", "B", "D"]
 
 
-def test_what_comes_and_goes_is_told_as_such() -> None:
+def test_added_and_removed_names_are_reported_as_such() -> None:
     mirror = Mirror()
     loaded(mirror, 1)
     assert type(mirror.take(2, Change("A", None, param(1)))) is Change, "the service receives the table"
@@ -386,7 +386,7 @@ def test_a_change_of_trust_alone_is_none() -> None:
 
 
 @pytest.mark.parametrize("how", [Mirror.doubt, Mirror.leave])
-def test_what_may_be_old_is_cached(how: Callable[[Mirror], None]) -> None:
+def test_values_that_may_be_stale_are_cached(how: Callable[[Mirror], None]) -> None:
     mirror = Mirror()
     loaded(mirror, 1, param(1))
     how(mirror)

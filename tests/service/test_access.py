@@ -433,7 +433,7 @@ async def test_a_token_says_who_asks_and_goes_no_further() -> None:
 
 
 @swiftly
-async def test_who_asks_is_never_longer_than_a_change_can_tell() -> None:
+async def test_an_asker_has_at_most_128_characters() -> None:
     text = f"{'n' * 32} write {ANNA}"
     door = Door(AccessSettings(tokens=Tokens.of_text(text)))
     address = "2001:0db8:85a3:1111:2222:8a2e:3370:7334"
@@ -444,7 +444,7 @@ async def test_who_asks_is_never_longer_than_a_change_can_tell() -> None:
 
 @pytest.mark.parametrize("given", ["Basic YTpi", "Bearer", "Bearer  ", "Token x", BEN])
 @swiftly
-async def test_what_is_no_token_is_nobodys(given: str) -> None:
+async def test_malformed_authorization_is_refused(given: str) -> None:
     door = Door(GUARDED)
     assert (await door.request(raw=[(b"authorization", given.encode())])).status == 401
     assert not door.seen
@@ -471,7 +471,7 @@ async def test_those_who_read_may_ask_for_everything(method: str, path: str) -> 
 
 @pytest.mark.parametrize(("method", "path"), WRITES)
 @swiftly
-async def test_what_may_change_something_is_for_those_who_may_write(method: str, path: str) -> None:
+async def test_changes_need_a_token_that_may_write(method: str, path: str) -> None:
     door = Door(GUARDED)
     assert (await door.request(method, path, token=BEN)).problem == "forbidden"
     assert not door.seen
@@ -556,7 +556,7 @@ async def test_no_session_begins_without_a_token(body: bytes | None, kind: str, 
 
 
 @swiftly
-async def test_where_no_token_is_needed_a_session_is_nothing() -> None:
+async def test_a_session_without_tokens_sets_no_cookie() -> None:
     answer = await Door().request("POST", SESSION_PATH, body=b'{"token": "any"}')
     assert json.loads(answer.body) == {"role": "write", "name": "local", "read_only": False}
     assert "set-cookie" not in answer.headers
@@ -643,7 +643,7 @@ async def test_a_proxy_that_is_trusted_says_who_asks(raw: list[tuple[str, str]],
 
 
 @swiftly
-async def test_what_others_say_of_themselves_counts_for_nothing() -> None:
+async def test_forwarded_headers_count_only_from_trusted_proxies() -> None:
     told = [(b"x-forwarded-for", b"198.51.100.7"), (b"forwarded", b"for=198.51.100.8")]
     door = Door(PROXY)
     assert (await door.request(token=ANNA, raw=told, client=("10.0.0.3", 1))).status == 200
@@ -707,7 +707,7 @@ def test_those_who_guess_are_remembered_in_bounds() -> None:
 
 @pytest.mark.parametrize("host", [HERE, "localhost", "LOCALHOST:1", "localhost.", "[::1]:8765", "127.9.9.9"])
 @swiftly
-async def test_this_machine_goes_by_its_names(host: str) -> None:
+async def test_loopback_host_names_are_accepted(host: str) -> None:
     for settings in (OPEN, GUARDED):
         assert (await Door(settings).request(host=host, token=ANNA)).status == 200
 

@@ -346,7 +346,7 @@ async def test_headers_that_mean_two_things_mean_none() -> None:
             assert data.count(b"HTTP/1.1 ") == 1
 
 
-async def test_what_is_no_http_is_told_so() -> None:
+async def test_bytes_that_are_no_http_get_status_400() -> None:
     async with served() as service:
         for data in (
             b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n",
@@ -429,7 +429,7 @@ async def test_a_deep_body_is_a_problem_and_no_more() -> None:
         assert (await service.ask()).status == 200
 
 
-async def test_whoever_asks_nothing_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_connections_without_a_request_are_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connections, "REQUEST_HEAD_TIMEOUT", 0.2)
     async with served() as service:
         for data in (b"", b"GET /health HT"):
@@ -555,7 +555,7 @@ async def test_a_listener_who_never_reads_is_left(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize("is_secure", [False, True])
-async def test_what_one_connection_sends_is_parsed_in_slices(
+async def test_data_of_one_connection_is_parsed_in_slices(
     is_secure: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slices: list[int] = []
@@ -636,7 +636,7 @@ async def test_a_websocket_message_that_is_none_closes_it_without_a_traceback(
 
 
 @pytest.mark.parametrize("is_secure", [False, True])
-async def test_whoever_reads_nothing_does_not_hold_up_the_end(
+async def test_clients_that_read_nothing_do_not_delay_the_end(
     is_secure: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Streams of events, WebSockets and downloads, each with more on its way than the systems hold."""

@@ -45,7 +45,7 @@ def died(running: RunningSetup) -> None:
     os.close(running._descriptor)
 
 
-def test_one_that_runs_or_has_ended_is_not_cut_off(notes: SetupNotes) -> None:
+def test_a_running_or_ended_set_up_is_not_cut_off(notes: SetupNotes) -> None:
     assert notes.cut_off() == []
     running = begun(notes)
     assert notes.cut_off(tells=True) == []
@@ -116,7 +116,7 @@ def test_a_file_that_is_no_note_tells_nothing(notes: SetupNotes, content: bytes)
     assert notes.cut_off(tells=True) == []
 
 
-def test_where_nothing_can_be_noted_nothing_begins(tmp_path: Path) -> None:
+def test_a_set_up_that_cannot_be_noted_does_not_begin(tmp_path: Path) -> None:
     (tmp_path / "cache.interrupted_setups").write_text("a file in its place")
     with pytest.raises(CacheError, match="the note of the set-up cannot be written to"):
         begun(SetupNotes(tmp_path / "cache.interrupted_setups"))
@@ -173,7 +173,7 @@ async def test_an_apply_that_the_end_of_the_service_cuts_off_is_told_at_the_next
 
 
 @swiftly
-async def test_one_that_somebody_ends_is_not_cut_off(tmp_path: Path) -> None:
+async def test_a_cancelled_set_up_is_not_cut_off(tmp_path: Path) -> None:
     async with serving(Quiet(px4()), place=tmp_path) as service:
         job = (await service.client.post(f"{HERE}/apply", json=BODY)).json()["id"]
         await service.job(job, lambda told: told["progress"] and told["progress"]["done"])

@@ -116,7 +116,7 @@ async def a_feed(**options: Any) -> AsyncIterator[EventFeed]:
 
 
 @swiftly
-async def test_whoever_listens_gets_everything_once_and_in_order() -> None:
+async def test_a_listener_receives_every_event_once_and_in_order() -> None:
     async with a_feed() as feed:
         publish(feed, 3)
         listener = feed.listen()
@@ -144,7 +144,7 @@ async def test_a_place_that_is_gone_or_never_was_is_not_gone_on_from() -> None:
 @pytest.mark.parametrize(
     "text", ["", "x", "-", "0123456789abcdef-", "0123456789abcdef-1x", "-1", "é-1", "1" * 99]
 )
-def test_what_is_no_place_is_none(text: str) -> None:
+def test_an_invalid_event_position_is_none(text: str) -> None:
     assert EventPosition.read(text) is None
 
 
@@ -228,7 +228,7 @@ async def test_an_event_that_was_sent_releases_what_it_was_written_from() -> Non
 
 
 @swiftly
-async def test_what_is_told_is_written_out_once_for_all() -> None:
+async def test_an_event_is_encoded_once_for_all_listeners() -> None:
     written = 0
 
     def write() -> str:
@@ -279,7 +279,7 @@ async def test_a_listener_hears_of_a_vehicle_its_values_and_its_fetch() -> None:
 
 
 @swiftly
-async def test_who_comes_back_misses_nothing_and_gets_nothing_twice() -> None:
+async def test_a_client_that_reconnects_misses_no_event_and_gets_none_twice() -> None:
     async with service(generic(burst=1, period=0.05)) as (hub, browser):
         await met(browser)
         whole: list[int] = []
@@ -333,7 +333,7 @@ async def test_a_stream_in_which_nothing_happens_says_that_it_lives() -> None:
 
 
 @swiftly
-async def test_what_is_not_wanted_moves_the_place_of_those_who_come_back() -> None:
+async def test_filtered_events_advance_the_position() -> None:
     async with service(generic()) as (hub, browser), listening(browser, types="link") as heard:
         await met(browser)
         await browser.post(f"{C}/fetch", json={})

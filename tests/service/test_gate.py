@@ -84,7 +84,7 @@ def test_a_proxy_that_is_trusted_is_many_clients() -> None:
     assert seats.take("127.0.0.1") is not None
 
 
-def test_whoever_says_least_loses_its_place_first() -> None:
+def test_the_least_active_connection_is_closed_first() -> None:
     seats = ConnectionSlots(4, is_local=lambda _: True)
     ended: list[str] = []
     for name, stage in (

@@ -84,7 +84,7 @@ async def test_the_document_of_the_api_has_the_body_of_everything_that_takes_one
 
 
 @swiftly
-async def test_what_no_vehicle_has_is_no_failure_of_the_cache(tmp_path: Path) -> None:
+async def test_a_name_that_no_vehicle_has_is_no_failure_of_the_cache(tmp_path: Path) -> None:
     async with service(small_px4(), cache=tmp_path / "cache.sqlite3", fetches=True) as (_, browser):
         told = await browser.post("/api/v1/fleet/diff", json={"names": ["PARAM_01"]})
         assert "holds no table" in problem(told, 404, "unknown-state")["detail"]

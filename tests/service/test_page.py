@@ -186,7 +186,7 @@ def test_nothing_comes_from_elsewhere() -> None:
 
 
 @needs_browser
-def test_all_parameters_at_once_of_which_those_in_sight_are_drawn(sight: Sight) -> None:
+def test_only_visible_rows_of_the_table_are_drawn(sight: Sight) -> None:
     expect(sight.page.get_by_role("heading", level=1)).to_have_text("PX4 1/1")
     expect(sight.page.locator("#badges")).to_have_text("up to date")
     expect(sight.page.locator("#count")).to_have_text("903 parameters")
@@ -224,7 +224,7 @@ def test_groups_hold_what_is_theirs(sight: Sight, bench: Bench) -> None:
 
 
 @needs_browser
-def test_what_is_changed_from_its_default(visit: Callable[..., Sight], bench: Bench) -> None:
+def test_changed_from_default_lists_the_changed_parameters(visit: Callable[..., Sight], bench: Bench) -> None:
     sight = visit(bench.url, "ArduPilot 2/1")
     sight.page.get_by_role("button", name="Changed from default").click()
     changed = bench.ask("GET", "/components/2/1/params?changed=true")["params"]
@@ -232,7 +232,7 @@ def test_what_is_changed_from_its_default(visit: Callable[..., Sight], bench: Be
 
 
 @needs_browser
-def test_all_that_is_known_of_one(sight: Sight) -> None:
+def test_the_details_of_a_parameter(sight: Sight) -> None:
     sight.find("MC_ROLL_P")
     sight.search.press("Enter")
     sight.grid.press("Space")
@@ -345,7 +345,7 @@ def test_changes_whose_response_is_lost_may_have_been_written(sight: Sight) -> N
 
 
 @needs_browser
-def test_what_is_no_value_cannot_be_staged_and_what_is_out_of_range_is_doubted(sight: Sight) -> None:
+def test_an_invalid_value_is_not_staged_and_one_out_of_range_has_a_warning(sight: Sight) -> None:
     editor = sight.open("MC_ROLL_P")
     field = editor.get_by_role("textbox")
     field.fill("twelve")
@@ -417,7 +417,7 @@ def test_an_armed_vehicle_wants_a_second_word(sight: Sight, bench: Bench) -> Non
 
 
 @needs_browser
-def test_what_others_change_is_marked_and_takes_no_focus_away(sight: Sight, bench: Bench) -> None:
+def test_a_change_by_another_client_is_marked_and_keeps_the_focus(sight: Sight, bench: Bench) -> None:
     editor = sight.open("MC_YAWRATE_P")
     field = editor.get_by_role("textbox")
     field.fill("0.3")
@@ -597,7 +597,7 @@ def test_the_table_is_saved_as_a_file(sight: Sight, bench: Bench) -> None:
 
 
 @needs_browser
-def test_everything_goes_by_keyboard(sight: Sight, bench: Bench) -> None:
+def test_the_page_is_usable_by_keyboard(sight: Sight, bench: Bench) -> None:
     keyboard = sight.page.keyboard
     keyboard.press("/")
     expect(sight.search).to_be_focused()
@@ -633,7 +633,7 @@ def test_everything_goes_by_keyboard(sight: Sight, bench: Bench) -> None:
 
 
 @needs_browser
-def test_who_listens_is_told_where_they_are(sight: Sight) -> None:
+def test_the_grid_has_accessible_names_and_positions(sight: Sight) -> None:
     sight.grid.focus()
     sight.grid.press("ArrowDown")
     active = sight.grid.get_attribute("aria-activedescendant")
@@ -748,7 +748,7 @@ def _keep_yesterdays(folder: Path) -> None:
 
 
 @needs_browser
-def test_nobody_is_led_to_another_vehicle_unasked(sight: Sight) -> None:
+def test_a_forgotten_vehicle_stays_in_view(sight: Sight) -> None:
     """One that the service forgets, as when its link fails, stays in view, and what was staged waits."""
     sight.stage("MC_ROLL_P", "7.5")
     sight.page.evaluate(

@@ -62,7 +62,7 @@ async def ended(process: asyncio.subprocess.Process) -> tuple[int, str]:
 
 
 @pytest.mark.asyncio
-async def test_it_waits_for_a_vehicle_and_ends_in_good_order(tmp_path: Path) -> None:
+async def test_serve_waits_for_a_vehicle_and_ends_cleanly(tmp_path: Path) -> None:
     """The link is not there yet when it begins. At the end listeners are let go, and callers answered."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -130,7 +130,7 @@ async def test_ctrl_c_ends_it_too_and_a_page_of_the_api_is_there() -> None:
         assert (code, err) == (0, "")
 
 
-def test_what_cannot_be_served_is_said_in_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_arguments_of_serve_are_reported_in_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:
     call = in_process(capsys)
     for words, what in (
         ((), "no link is given"),
@@ -172,11 +172,11 @@ def test_an_address_that_is_taken_is_a_link_that_fails(capsys: pytest.CaptureFix
         ("[::1]:80", "http://[::1]:80"),
     ],
 )
-def test_where_to_listen(text: str, url: str) -> None:
+def test_valid_listening_addresses(text: str, url: str) -> None:
     assert Listening.at(text).url == url
 
 
 @pytest.mark.parametrize("text", ["", "8765", ":8765", "a:", "a:x", "a:65536", "::1:80", "a:-1", "a:٣"])
-def test_where_nobody_can_listen(text: str) -> None:
+def test_invalid_listening_addresses_are_refused(text: str) -> None:
     with pytest.raises(UsageError):
         Listening.at(text)

@@ -28,7 +28,7 @@ from tests.shell import VALUES, FlakyLink, Tap, generic, settled, small_px4, swi
 
 
 @swiftly
-async def test_it_begins_without_a_vehicle_and_with_a_link_that_is_not_there() -> None:
+async def test_the_service_starts_without_a_vehicle_and_without_its_link() -> None:
     link = FlakyLink(generic())
     link.is_away = True
     async with service(link, fetches=True) as (_, browser):
@@ -53,7 +53,7 @@ async def test_it_begins_without_a_vehicle_and_with_a_link_that_is_not_there() -
 
 
 @swiftly
-async def test_who_asks_what_is_in_the_cache_of_a_service_that_ends_is_told_so(tmp_path: Path) -> None:
+async def test_requests_to_the_cache_of_a_closing_service_get_closing(tmp_path: Path) -> None:
     with ParamCache(tmp_path / "cache.sqlite3") as cache:
         async with Hub([small_px4()], cache=cache) as hub, a_browser(create_app(hub)) as browser:
             assert (await browser.get("/api/v1/vehicles")).status_code == 200
@@ -119,7 +119,7 @@ async def test_ids_that_two_links_carry_need_the_link_beside_them() -> None:
 
 
 @swiftly
-async def test_who_is_not_heard_in_time_is_a_problem_that_says_so() -> None:
+async def test_find_without_a_vehicle_is_a_no_reply_problem() -> None:
     async with service(SimLink(generic())) as (_, browser):
         told = problem(
             await browser.post("/api/v1/find", json={"system": 7, "timeout_s": 2}), 504, "no-reply"
@@ -161,7 +161,7 @@ async def test_a_vehicle_starts_again() -> None:
 
 
 @swiftly
-async def test_what_is_known_of_parameters_is_told_as_the_documents_have_it(tmp_path: Path) -> None:
+async def test_the_fast_encoding_of_parameters_equals_the_documents(tmp_path: Path) -> None:
     """The quick way of writing them says to the letter what the documents would."""
     async with service(SimLink(ArduPilotVehicle()), cache=tmp_path / "cache") as (hub, browser):
         await met(browser)
@@ -278,7 +278,7 @@ async def test_a_write_may_be_watched_or_forced() -> None:
 
 
 @swiftly
-async def test_what_a_call_has_changed_is_told_before_it_is_answered() -> None:
+async def test_events_of_a_call_precede_its_response() -> None:
     async with service(SimLink(small_px4())) as (hub, browser):
         await met(browser)
         before = hub.feed.listen()
@@ -299,7 +299,7 @@ async def test_what_a_call_has_changed_is_told_before_it_is_answered() -> None:
 
 
 @swiftly
-async def test_how_the_component_stands_after_a_call_is_told_before_it_is_answered() -> None:
+async def test_the_component_event_of_a_call_precedes_its_response() -> None:
     """Also where it was told a moment before, and would else wait for its turn."""
     async with service(SimLink(small_px4())) as (hub, browser):
         await met(browser)
@@ -514,7 +514,7 @@ async def test_at_the_end_whoever_waits_is_answered() -> None:
         ("GET", "/api/v1/events?system=x", None, 422, "invalid-request"),
     ],
 )
-def test_whatever_cannot_be_done_is_a_problem(
+def test_every_invalid_request_is_a_problem_document(
     method: str, path: str, body: str | None, status: int, kind: str
 ) -> None:
     @swiftly
@@ -527,7 +527,7 @@ def test_whatever_cannot_be_done_is_a_problem(
 
 
 @swiftly
-async def test_what_fails_inside_tells_nothing_of_the_inside(
+async def test_an_internal_error_reveals_no_details(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with service() as (hub, browser):

@@ -259,7 +259,7 @@ class Quiet(Tap):
 
 
 @swiftly
-async def test_what_was_written_before_it_was_ended_is_told(tmp_path: Path) -> None:
+async def test_a_cancelled_apply_reports_the_values_written_so_far(tmp_path: Path) -> None:
     """Values that were acknowledged and will not be read back are said to be unproven."""
     async with serving(Quiet(px4()), place=tmp_path) as service:
         body = {"wanted": {"values": dict.fromkeys(TUNE, 7.5)}, "wait": False}
@@ -282,7 +282,7 @@ async def test_the_service_ends_in_the_middle_of_a_set_up(tmp_path: Path) -> Non
 
 
 @swiftly
-async def test_what_cannot_be_is_said_before_anything_is_sent(tmp_path: Path) -> None:
+async def test_an_apply_that_cannot_succeed_is_refused_before_the_first_write(tmp_path: Path) -> None:
     on_board = px4(armed=True)
     async with serving(on_board, place=tmp_path) as service:
         armed = await service.post(f"{HERE}/apply", {"wanted": {"values": {"MODE": 4}}}, 409)
@@ -356,7 +356,7 @@ FAULTS: list[tuple[Any, str]] = [
 
 
 @swiftly
-async def test_what_cannot_be_meant_is_refused() -> None:
+async def test_invalid_bodies_of_plan_are_refused() -> None:
     async with serving(px4()) as service:
         for body, words in FAULTS:
             problem = await service.post(f"{HERE}/plan", body, 422)
@@ -599,7 +599,7 @@ async def test_history_comes_in_pages_without_a_loss(tmp_path: Path) -> None:
 
 @BOTH
 @swiftly
-async def test_what_is_kept_of_a_vehicle_is_the_same_with_and_without_it(
+async def test_cached_data_of_a_vehicle_is_the_same_with_and_without_its_link(
     vehicle: Callable[..., Vehicle], tmp_path: Path
 ) -> None:
     async with serving(vehicle(), place=tmp_path) as service:
@@ -691,7 +691,7 @@ async def test_a_file_describes_parameters_too(tmp_path: Path) -> None:
 
 
 @swiftly
-async def test_who_may_only_read_changes_nothing(tmp_path: Path) -> None:
+async def test_a_token_that_may_only_read_changes_nothing(tmp_path: Path) -> None:
     on_board = px4()
     async with Hub([on_board], cache=False) as hub:
         await until(lambda: hub.followed, pause=0.1)

@@ -37,7 +37,7 @@ def test_two_files_that_belong_together() -> None:
         (CERT, DATA / "tls_locked.key", "tls_locked.key: the private key is encrypted"),
     ],
 )
-def test_what_is_wrong_is_told_with_the_name_of_the_file(
+def test_an_invalid_certificate_or_key_is_reported_with_its_file(
     cert: Path | None, key: Path | None, words: str
 ) -> None:
     with pytest.raises(UsageError) as caught:

@@ -187,7 +187,7 @@ BODIES: list[tuple[str, bytes]] = [
 
 @pytest.mark.parametrize(("_", "body"), BODIES, ids=[name for name, _ in BODIES])
 @swiftly
-async def test_what_has_too_many_values_is_not_parsed(
+async def test_a_body_with_too_many_values_is_not_parsed(
     _: str, body: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async with service(GenericVehicle(table=TABLE)) as (_hub, browser):
@@ -223,7 +223,7 @@ async def test_a_file_with_too_many_values_is_not_read(name: str, data: bytes) -
 
 
 @swiftly
-async def test_nobody_wants_more_values_than_a_vehicle_has() -> None:
+async def test_a_request_with_more_values_than_a_vehicle_has_is_refused() -> None:
     unknown = {f"U{number}": number for number in range(60_000)}
     text = "".join(f"U{number} 1\n" for number in range(REQUEST_VALUES_MAX + 1))
     vehicle = Tap(GenericVehicle(table=TABLE))
@@ -244,7 +244,7 @@ async def test_nobody_wants_more_values_than_a_vehicle_has() -> None:
 
 
 @swiftly
-async def test_what_a_vehicle_has_is_within_all_limits() -> None:
+async def test_a_whole_table_is_within_all_limits() -> None:
     """The page sends a whole file in base64, with the names that were chosen; programs send values."""
     text = "".join(f"{name},{value + 1}\n" for name, value in LARGE.items())
     coded = {"file": {"name": "a.param", "base64": base64.b64encode(text.encode()).decode()}}
@@ -402,7 +402,7 @@ async def test_names_and_patterns_of_a_query_are_short() -> None:
 
 
 @swiftly
-async def test_what_takes_long_is_done_in_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_long_work_is_done_in_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     text = f"# {'long ' * 1_000}\n" + "".join(f"{name},{value}\n" for name, value in VALUES.items())
     calls = (
         *((json, "loads"), (setup_room, "compare"), (responses, "encode_document")),

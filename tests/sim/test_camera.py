@@ -44,7 +44,7 @@ def result(camera: Camera, request: ParamExtSet) -> tuple[int, int]:
     return answer.raw[0], answer.param_result
 
 
-def test_it_answers_reads_of_what_it_has() -> None:
+def test_the_camera_answers_reads_of_its_parameters() -> None:
     camera = Camera()
     by_name = ask(camera, ParamExtRequestRead(1, 100, "CAM_MODE"))
     assert by_name == [ParamExtValue("CAM_MODE", b"\1".ljust(128, b"\0"), UINT32, 16, 0)]
@@ -55,7 +55,7 @@ def test_it_answers_reads_of_what_it_has() -> None:
     assert camera.requests["PARAM_EXT_REQUEST_READ"] == 4
 
 
-def test_it_sends_its_list_in_bursts() -> None:
+def test_the_camera_sends_its_list_in_bursts() -> None:
     camera = Camera()
     assert len(ask(camera, ParamExtRequestList(1, 100), until=1.0)) == 5
     camera.tick(2.0)

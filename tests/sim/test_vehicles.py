@@ -1064,7 +1064,7 @@ class TestFaultyLink:
         assert 6.0 <= sum(runs) / len(runs) <= 10.0
         assert link.lost == sum(runs)
 
-    def test_everything_lost_in_bursts(self) -> None:
+    def test_a_link_that_loses_everything_in_bursts(self) -> None:
         assert pass_through(FaultyLink(loss=1.0, loss_burst=3.0)) == []
 
     def test_jitter_keeps_the_order(self) -> None:

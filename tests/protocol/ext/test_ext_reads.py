@@ -64,7 +64,7 @@ def test_a_fetch_on_a_link_that_loses_packets(table: dict[str, int], seed: int) 
     assert session.is_idle
 
 
-def test_what_little_a_list_lacks_is_read_by_index() -> None:
+def test_a_few_values_missing_from_a_list_are_read_by_index() -> None:
     camera = Camera(MANY)
     session = CameraSession(camera)
     lost: set[int | None] = {3, 150, 299}
@@ -207,7 +207,7 @@ def test_the_last_holder_cancels_a_fetch() -> None:
     assert len(session.params) == 300, "what still comes is taken"
 
 
-def test_what_is_gone_is_removed_by_a_complete_list() -> None:
+def test_a_complete_list_removes_parameters_that_are_gone() -> None:
     camera = Camera({"A": 1, "B": 2, "C": 3})
     session = CameraSession(camera)
     session.fetch_ext()

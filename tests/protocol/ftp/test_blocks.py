@@ -41,7 +41,7 @@ def test_a_gap_is_missing_until_it_is_filled() -> None:
     assert blocks.content == b"abcdefghijk"
 
 
-def test_what_was_there_first_stays() -> None:
+def test_the_first_bytes_received_for_an_offset_are_kept() -> None:
     blocks = Blocks()
     blocks.take(2, b"cd")
     assert not blocks.take(2, b"XX")

@@ -158,13 +158,13 @@ class TestTheFormat:
             (packed(entry("\xc4")), "has the name"),
         ],
     )
-    def test_what_is_none(self, data: bytes, words: str) -> None:
+    def test_a_file_that_is_no_param_pck_is_an_error(self, data: bytes, words: str) -> None:
         with pytest.raises(PackError, match=words) as caught:
             decode(data)
         assert 0 <= caught.value.offset <= len(data)
         assert str(caught.value).endswith(f"(byte {caught.value.offset})")
 
-    def test_what_is_longer_than_any_file_is_not_looked_at(self) -> None:
+    def test_a_file_above_the_size_limit_is_refused_unread(self) -> None:
         with pytest.raises(PackError, match="no packed parameter file has"):
             decode(packed(bytes(PACK_SIZE_MAX)))
 
@@ -201,7 +201,7 @@ class TestTheUpload:
         assert data == b"\x1b\x67\x02\x00" + struct.pack("<H", len(data)) + encode([A, B])[6:]
         assert decode_upload(data) == (A, B._replace(default=None))
 
-    def test_it_has_no_padding(self) -> None:
+    def test_an_upload_has_no_padding(self) -> None:
         entries = [each for each in decode(PLAIN).entries if each.type is not ParamType.INT8]
         data = encode_upload(entries)
         assert len(data) < len(encode(entries))
@@ -216,11 +216,11 @@ class TestTheUpload:
             (b"\x1b", "cut off in its header"),
         ],
     )
-    def test_what_is_none(self, data: bytes, words: str) -> None:
+    def test_an_upload_that_is_no_param_pck_is_an_error(self, data: bytes, words: str) -> None:
         with pytest.raises(PackError, match=words):
             decode_upload(data)
 
-    def test_one_that_its_header_cannot_count(self) -> None:
+    def test_an_upload_above_the_size_of_the_header_is_refused(self) -> None:
         rows = [PackedParam(f"{number:016d}"[::-1], ParamType.INT32, 0) for number in range(4000)]
         with pytest.raises(UsageError, match="65535"):
             encode_upload(rows)
@@ -242,7 +242,7 @@ tables = st.lists(entries(), max_size=40, unique_by=lambda each: each.name)
 
 @busy
 @given(tables, st.integers(1, 239), st.booleans(), st.integers(0, 5))
-def test_what_is_encoded_is_decoded(
+def test_an_encoded_file_decodes_to_the_same_entries(
     rows: list[PackedParam], read_size: int, with_defaults: bool, more: int
 ) -> None:
     data = encode(rows, total=len(rows) + more, with_defaults=with_defaults, read_size=read_size)
@@ -252,7 +252,7 @@ def test_what_is_encoded_is_decoded(
 
 @busy
 @given(tables)
-def test_what_is_encoded_to_be_written_is_decoded(rows: list[PackedParam]) -> None:
+def test_an_encoded_upload_decodes_to_the_same_entries(rows: list[PackedParam]) -> None:
     assert decode_upload(encode_upload(rows)) == tuple(each._replace(default=None) for each in rows)
 
 

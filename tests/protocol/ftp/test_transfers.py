@@ -641,7 +641,7 @@ class TestRefusals:
         assert BUSY_TIMEOUT <= desk.now - began <= BUSY_TIMEOUT + 2 * SESSION_IDLE_TIME
         assert desk.transfers.is_idle
 
-    def test_whatever_the_server_says_lets_that_session_live_on(self) -> None:
+    def test_each_reply_of_the_server_extends_the_wait_for_the_end_of_a_session(self) -> None:
         desk = Desk()
         desk.transfers.read("a", desk.now)
         request = desk.opening()
@@ -684,7 +684,7 @@ class TestSilence:
         assert ATTEMPTS_MIN <= read.error.attempts <= ATTEMPTS_MAX
         assert desk.transfers.is_idle
 
-    def test_who_fell_silent_is_told_once_to_close(self) -> None:
+    def test_a_silent_server_gets_one_last_request_to_close(self) -> None:
         desk = Desk()
         desk.transfers.read("a", desk.now)
         desk.pass_time()
@@ -821,7 +821,7 @@ class TestTurns:
         assert third.result == 0x04030201
         assert desk.transfers.is_idle
 
-    def test_what_is_asked_for_at_the_end_of_another_waits_for_its_turn(self) -> None:
+    def test_a_transfer_begun_when_another_ends_waits_for_the_close(self) -> None:
         desk = Desk()
         read, burst = desk.opened("a")
         read.on_done.append(lambda: more.append(desk.transfers.read("b", desk.now)))
@@ -831,7 +831,7 @@ class TestTurns:
         assert desk.first(Opcode.OPEN_FILE_RO).data == b"b"
         assert not more[0].done
 
-    def test_one_that_waits_is_dropped_without_a_word(self) -> None:
+    def test_a_released_transfer_that_waits_sends_nothing(self) -> None:
         desk = Desk()
         desk.opened("a")
         waiting = desk.transfers.read("b", desk.now)
@@ -839,7 +839,7 @@ class TestTurns:
         desk.transfers.release(waiting, desk.now)
         assert desk.take() == []
 
-    def test_one_that_is_under_way_is_closed(self) -> None:
+    def test_a_released_transfer_in_progress_is_closed(self) -> None:
         desk = Desk()
         read, burst = desk.opened("a")
         desk.transfers.release(read, desk.now)
@@ -883,7 +883,7 @@ class TestTurns:
         assert desk.transfers.is_idle
         assert not read.done
 
-    def test_one_that_is_done_needs_nothing_more(self) -> None:
+    def test_a_release_of_an_ended_transfer_sends_nothing(self) -> None:
         desk = Desk()
         read, burst = desk.opened("a")
         desk.answer(burst, code=FileErrorCode.EOF)
@@ -952,7 +952,7 @@ class TestHaste:
         desk.closed(first.session)
         assert read.result == b""
 
-    def test_when_the_answer_to_the_open_got_lost_all_is_begun_anew_behind_the_burst(self) -> None:
+    def test_a_lost_response_to_the_open_restarts_the_read_after_the_burst(self) -> None:
         """The file of the burst is unknown: a failed open has no response either."""
         desk = self.known_link()
         read = desk.transfers.read("a", desk.now)
@@ -989,7 +989,7 @@ class TestHaste:
             desk.answer(burst, b"x" * 239)
         assert opened == 2 + REOPENS_MAX
 
-    def test_one_that_got_lost_is_asked_for_soon(self) -> None:
+    def test_a_lost_burst_is_detected_by_a_read_behind_it(self) -> None:
         desk = self.known_link()
         desk.transfers.read("a", desk.now)
         first, _, _ = desk.take()
@@ -1100,7 +1100,7 @@ class TestWriting:
         assert write.done
         assert write.error is None
 
-    def test_what_stays_unanswered_is_sent_again_with_its_number(self) -> None:
+    def test_an_unanswered_request_is_repeated_with_its_sequence_number(self) -> None:
         desk = Desk()
         desk.transfers.write("a", b"abc", desk.now)
         desk.answer(desk.next(Opcode.CREATE_FILE), session=9)
@@ -1201,7 +1201,7 @@ packets = st.builds(
 
 @settings(max_examples=200, deadline=None)
 @given(st.lists(packets, max_size=60), st.sampled_from(("read", "list", "checksum", "write")))
-def test_whatever_a_server_says_it_ends(junk: list[Packet], what: str) -> None:
+def test_a_transfer_ends_whatever_packets_the_server_sends(junk: list[Packet], what: str) -> None:
     """Each number is counted from one of the last requests, so that much of this is taken for an answer."""
     desk = Desk()
     job: Operation[Any] = (

@@ -59,7 +59,7 @@ def test_the_table_holds_what_the_vehicle_means_by_the_name(
 
 
 @EVERY_KIND
-def test_what_the_name_does_not_mean_is_passed_over(kind: Callable[..., Vehicle]) -> None:
+def test_values_of_the_other_parameter_with_the_name_are_ignored(kind: Callable[..., Vehicle]) -> None:
     vehicle = kind(table=ROWS, repeated_names=True)
     world = Simulation(air=Air([vehicle], others=[OtherStation(list_every=7.0)]))
     assert world.fetch(limit=5.0).complete
@@ -190,7 +190,7 @@ def test_the_note_names_a_few() -> None:
 
 
 @pytest.mark.asyncio
-async def test_the_others_can_be_read_by_their_index() -> None:
+async def test_a_duplicate_name_is_read_by_index() -> None:
     async with ParamClient(GenericVehicle(ROWS, repeated_names=True), cache=False) as client:
         vehicle = await client.component()
         await vehicle.fetch_all()

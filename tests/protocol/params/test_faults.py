@@ -105,7 +105,7 @@ class TestDeadIndices:
         ],
         ids=["three", "the first", "the last", "the first two and the last"],
     )
-    def test_they_are_named(
+    def test_dead_indices_are_listed_as_missing(
         self, kind: Make, dead: tuple[int, ...], within: float, within_lossy: float, loss: float
     ) -> None:
         indices = sorted(index % len(kind().listed) for index in dead)
@@ -123,7 +123,7 @@ class TestDeadIndices:
         # of ArduPilot, which answers 50 reads a second, 16 to 74 s, by where the losses fall
         check(world, vehicle, world.fetch(limit=90.0), *range(100, 136))
 
-    def test_what_the_cache_knows_of_them_stays(self, loss: float) -> None:
+    def test_cached_values_of_dead_indices_are_kept(self, loss: float) -> None:
         world = world_of(px4(), loss=loss)
         world.fetch()
         memory = world.memory()
@@ -170,7 +170,7 @@ class TestAnotherStation:
     @pytest.mark.parametrize(
         ("every", "within"), [(0.5, 30.0), (0.1, 60.0)], ids=["twice a second", "ten times a second"]
     )
-    def test_it_starts_the_list_again_and_again(
+    def test_a_fetch_completes_while_another_station_restarts_the_list(
         self, kind: Make, every: float, within: float, loss: float
     ) -> None:
         vehicle = kind()
@@ -342,7 +342,7 @@ class TestAReboot:
         assert any(isinstance(event, ComponentRebooted) for event in world.events)
 
     @BOTH_AUTOPILOTS
-    def test_that_says_that_it_boots(self, kind: Make, loss: float) -> None:
+    def test_a_reboot_during_a_fetch_with_a_long_boot(self, kind: Make, loss: float) -> None:
         """ArduPilot ignores the list meanwhile and answers reads, 33 a second."""
         vehicle = kind(boot_time=5.0)
         vehicle.when_listed(150, lambda: vehicle.reboot(down=1.0))

@@ -283,7 +283,7 @@ def test_the_vehicle_may_keep_silent_on_the_hash_that_it_once_had() -> None:
     assert values_of(result) == vehicle.values
 
 
-def test_what_the_vehicle_no_longer_has_leaves_the_table() -> None:
+def test_a_parameter_that_the_vehicle_no_longer_lists_leaves_the_table() -> None:
     memory = memory_of_cache([*SMALL, SimParam("GONE", ParamType.INT32, 1)])
     memory["params"] = {**memory["params"], "UNLISTED": known("UNLISTED", 1, index=None)}
     world = Simulation(PX4Vehicle(table=SMALL))
@@ -390,7 +390,7 @@ def test_a_group_that_comes_during_the_download() -> None:
     assert values_of(result) == vehicle.values
 
 
-def test_another_station_asks_for_the_list_meanwhile() -> None:
+def test_a_fetch_completes_when_another_station_requests_the_list() -> None:
     vehicle = PX4Vehicle()
     world = Simulation(vehicle)
     fetch = world.meet().begin_fetch(world.now)
@@ -458,7 +458,7 @@ ODD = [SimParam(row.name, row.type, row.value, row.volatile or row.name in ("P03
 """A firmware that leaves out a little more than usual."""
 
 
-def test_what_changes_under_an_unchanged_hash_is_found_to_be_volatile() -> None:
+def test_a_value_that_changes_under_an_equal_hash_is_volatile() -> None:
     vehicle = PX4Vehicle(table=ODD)
     world = Simulation(vehicle)
     world.fetch()
@@ -477,7 +477,7 @@ def test_what_changes_under_an_unchanged_hash_is_found_to_be_volatile() -> None:
     assert world.fetch().notes == ()
 
 
-def test_what_changes_with_the_hash_is_not_found_to_be_volatile() -> None:
+def test_a_value_that_changes_with_the_hash_is_not_volatile() -> None:
     vehicle = PX4Vehicle(table=ODD)
     world = Simulation(air=Air.symmetric([vehicle], delay=0.05))
     world.fetch()
@@ -557,7 +557,7 @@ def test_a_write_that_brings_parameters_into_use() -> None:
 # what does not come
 
 
-def test_what_never_comes_is_named_and_the_table_is_not_complete() -> None:
+def test_indices_that_are_never_received_are_missing() -> None:
     vehicle = PX4Vehicle(table=SMALL)
     deaf_to(vehicle, ["P03", "P17"])
     world = Simulation(vehicle)
@@ -583,7 +583,7 @@ def test_with_something_missing_no_hash_is_waited_for() -> None:
     assert fetch.result.missing
 
 
-def test_what_does_not_come_stays_as_the_cache_knows_it() -> None:
+def test_a_value_that_is_not_received_keeps_its_cached_value() -> None:
     vehicle = PX4Vehicle(table=SMALL)
     deaf_to(vehicle, ["P03"])
     vehicle.set_param("P20", 1234)
@@ -700,7 +700,7 @@ def test_a_refresh_joins_a_download_and_turns_a_question_for_the_hash_into_one()
     assert world.outcome(fetch).source == "stream"
 
 
-def test_what_has_come_so_far() -> None:
+def test_progress_and_partial_result_of_a_list_download() -> None:
     world = Simulation(PX4Vehicle())
     fetch = world.meet().begin_fetch(world.now)
     assert fetch.progress(world.now).received == 0

@@ -166,7 +166,7 @@ def test_an_open_that_stays_unanswered_brings_the_list_beside_it() -> None:
     assert result.elapsed < FILE_OPEN_TIMEOUT + 1.5
 
 
-def test_where_nothing_is_answered_at_all_the_list_is_asked_for_later() -> None:
+def test_the_list_is_requested_later_if_nothing_is_answered() -> None:
     uplink = Uplink(ardupilot())
     uplink.loses = LosesFirst(1000, FileTransfer, CommandLong)
     session = Simulation(air=Air.symmetric([uplink], delay=0.05))
@@ -211,7 +211,7 @@ def test_a_late_version_that_says_that_no_file_will_come_lets_the_list_begin() -
     assert version_at <= times_of(session, ParamRequestList)[0] < version_at + 0.01
 
 
-def test_what_the_list_has_brought_whole_is_not_waited_for_as_a_file() -> None:
+def test_a_complete_list_ends_the_fetch_without_the_file() -> None:
     vehicle = ardupilot()
     uplink = Uplink(vehicle)
     session = Simulation(air=Air.symmetric([uplink], delay=0.05))

@@ -257,7 +257,7 @@ def odd_files() -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("kind", list(odd_files()))
-def test_what_is_no_table_is_read_again_and_then_listed(kind: str) -> None:
+def test_an_invalid_file_is_read_twice_and_then_the_list_follows(kind: str) -> None:
     server = Server(vehicle := ArduPilotVehicle(live_period=0))
     vehicle.files[FULL_PATH] = odd_files()[kind]
     session = Simulation(server)
@@ -270,7 +270,7 @@ def test_what_is_no_table_is_read_again_and_then_listed(kind: str) -> None:
     assert (again.source, again.notes, len(server.opened)) == ("stream", (), 2)
 
 
-def test_what_is_no_table_once_is_read_again() -> None:
+def test_a_file_that_is_invalid_once_is_read_again() -> None:
     server = Server(vehicle := ArduPilotVehicle(live_period=0))
     vehicle.files[FULL_PATH] = odd_files()["cut off"]
     session = Simulation(server)
@@ -359,7 +359,7 @@ def test_a_server_that_is_busy_is_asked_again_next_time() -> None:
     assert session.fetch().source == "ftp"
 
 
-def test_another_vehicle_does_not_inherit_that_there_is_no_file() -> None:
+def test_another_vehicle_is_asked_for_the_file_again() -> None:
     vehicle = ArduPilotVehicle(live_period=0)
     assert vehicle._ftp is not None
     vehicle._ftp.params = lambda: None
@@ -375,7 +375,7 @@ def test_another_vehicle_does_not_inherit_that_there_is_no_file() -> None:
     assert remembered(session) is True
 
 
-def test_another_firmware_is_asked_again_and_has_other_defaults() -> None:
+def test_another_firmware_is_asked_for_the_file_again_and_has_new_defaults() -> None:
     vehicle = ArduPilotVehicle(live_period=0)
     session = Simulation(vehicle)
     session.fetch()
@@ -410,7 +410,7 @@ def test_a_reboot_in_the_middle_begins_anew() -> None:
     assert not vehicle.open_files
 
 
-def test_what_came_before_an_absence_is_read_again() -> None:
+def test_blocks_received_before_an_outage_are_read_again() -> None:
     server = Server(vehicle := ArduPilotVehicle(live_period=0))
     session = Simulation(server)
     fetch = in_the_middle(session)
@@ -504,7 +504,7 @@ def test_a_refresh_while_the_hash_is_awaited_gets_the_received_file() -> None:
     assert server.opened == [FULL_PATH]
 
 
-def test_what_is_said_while_it_comes() -> None:
+def test_progress_and_partial_result_of_a_file_download() -> None:
     session = Simulation(ArduPilotVehicle(live_period=0))
     fetch = begin(session)
     assert fetch.progress(session.now).total is None

@@ -192,7 +192,7 @@ def test_a_component_that_is_not_heard_either_is_given_up_sooner() -> None:
     assert desk.now < LIST_TIMEOUT + 5.0
 
 
-def test_another_pass_is_asked_for_twice_at_once_on_a_link_that_loses() -> None:
+def test_another_pass_is_requested_twice_on_a_lossy_link() -> None:
     desk = Desk()
     for _ in range(100):
         desk.retry.timed_out(1)
@@ -227,7 +227,7 @@ def test_the_first_answer_tells_the_round_trip() -> None:
 @pytest.mark.parametrize(
     ("index", "count"), [(NO_INDEX, 100), (5, NO_INDEX), (NO_INDEX, NO_INDEX), (100, 100), (5, 0), (65534, 9)]
 )
-def test_what_cannot_be_counts_as_nothing(index: int, count: int) -> None:
+def test_values_with_an_impossible_index_or_count_are_ignored(index: int, count: int) -> None:
     desk = Desk()
     desk.hear(index, count=count)
     assert is_so(desk.download.count is None)
@@ -280,7 +280,7 @@ def test_ardupilot_is_asked_for_as_many_values_as_its_list_brings_over_a_radio()
     assert desk.reads.pace.rate == pytest.approx(40.0, rel=0.01)
 
 
-def test_what_comes_in_another_order_is_not_asked_for() -> None:
+def test_reordered_values_are_not_requested() -> None:
     desk = Desk()
     desk.stream([0, 2, 1, 4, 5, 3])
     desk.stream(range(6, 100))
@@ -297,7 +297,7 @@ def test_duplicates_are_counted_and_nothing_else() -> None:
     assert desk.take() == ["list"]
 
 
-def test_what_is_missing_at_the_end_is_asked_for_when_it_falls_quiet() -> None:
+def test_values_missing_at_the_end_are_read_after_a_pause() -> None:
     desk = Desk()
     desk.stream(range(90))
     assert desk.take() == ["list"]
@@ -346,7 +346,7 @@ def test_an_index_that_is_refused_is_named() -> None:
     assert desk.download.missing == (7,)
 
 
-def test_what_was_given_up_may_still_come() -> None:
+def test_an_index_that_was_given_up_may_still_be_received() -> None:
     desk = Desk()
     desk.stream([*range(7), 8, 9, 10])
     desk.reads.refused(ParamError(255, 190, "", 7, 1), desk.now)
@@ -436,7 +436,7 @@ def test_lost_is_what_had_to_be_asked_for_each_index_once() -> None:
     assert (desk.download.lost, desk.download.missing) == (12, ())
 
 
-def test_what_another_pass_brings_was_lost() -> None:
+def test_values_requested_by_another_pass_count_as_lost() -> None:
     desk = Desk()
     desk.stream(range(30), count=1000)
     desk.pass_time(0.6)
@@ -444,7 +444,7 @@ def test_what_another_pass_brings_was_lost() -> None:
     assert desk.download.lost == 970
 
 
-def test_what_was_lost_under_another_count_does_not_count() -> None:
+def test_losses_under_another_count_are_forgotten() -> None:
     desk = Desk()
     desk.stream([0, *range(5, 20)])
     assert is_so(desk.download.lost == 4)
@@ -685,7 +685,7 @@ def test_reads_that_wait_for_their_answers_hold_another_pass_up() -> None:
         assert ("list" in desk.take()) is sends_again, len(passed_over)
 
 
-def test_what_is_asked_for_already_is_not_asked_for_again_by_the_next_pass() -> None:
+def test_an_index_whose_read_is_open_is_not_read_again_by_the_next_pass() -> None:
     desk = Desk()
     desk.stream([*range(10), *range(12, 40)], count=1000)
     assert desk.take() == ["list", 10, 11]

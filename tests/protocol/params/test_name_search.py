@@ -73,7 +73,7 @@ class Desk:
         self.searches.tick(self.now)
 
 
-def test_what_is_silent_is_requested_again_with_each_control_and_then_unknown() -> None:
+def test_a_silent_name_is_requested_with_each_control_and_then_unknown() -> None:
     desk = Desk()
     search = desk.searches.begin(["A", "B", "C"], 0.0)
     controls = set()
@@ -205,7 +205,7 @@ def test_searches_are_done_one_after_the_other_and_can_be_cancelled() -> None:
     assert desk.searches.begin([], 0.0).done
 
 
-def test_it_ends_with_the_component_and_with_the_link() -> None:
+def test_a_search_ends_when_the_component_is_lost_or_the_link_fails() -> None:
     desk = Desk()
     lost = desk.searches.begin(["A"], 0.0)
     desk.searches.lose(3.0)

@@ -392,7 +392,7 @@ def lines_of(tmp_path: Path, key: str) -> str:
         return repr(cache.history(key))
 
 
-def test_what_was_heard_while_the_file_came_is_newer(tmp_path: Path) -> None:
+def test_a_value_received_during_the_file_read_is_newer(tmp_path: Path) -> None:
     log = FileLog().beat().open().burst(FILE, range(2), is_ended=False)
     log.value(NAMES[1], 77, count=COUNT).burst(FILE, range(2, BLOCKS)).close().wait(1.0).beat()
     [told] = imported(log, tmp_path)
@@ -508,7 +508,7 @@ def test_of_what_cannot_be_trusted_nothing_is_taken(log: FileLog, note: str, tmp
         FileLog().beat().open(),
     ],
 )
-def test_what_is_no_read_of_the_parameter_file_says_nothing(log: FileLog, tmp_path: Path) -> None:
+def test_reads_of_other_files_are_ignored(log: FileLog, tmp_path: Path) -> None:
     assert imported(log.wait(1.0).beat(), tmp_path) == []
 
 

@@ -198,7 +198,7 @@ def test_a_read_of_a_fetch_becomes_urgent_when_a_caller_joins() -> None:
     assert desk.take() == [25, BURST]
 
 
-def test_what_is_released_before_its_turn_is_not_sent() -> None:
+def test_a_read_released_while_it_waits_is_not_sent() -> None:
     desk = Desk()
     reads = [desk.ask(index) for index in range(BURST + 5)]
     for read in reads[:-1]:
@@ -388,7 +388,7 @@ def test_where_much_is_silent_the_controls_tell_how_good_the_link_is() -> None:
     assert 9 < read.attempts < 15  # five answered controls of five are no proof of a link that loses nothing
 
 
-def test_what_a_list_may_have_brought_is_no_answered_control() -> None:
+def test_a_value_that_a_list_may_have_sent_answers_no_control_read() -> None:
     desk = Desk()
     desk.measure()
     desk.reads.list_runs_again = True
@@ -661,7 +661,7 @@ def test_reads_that_are_given_up_at_once_keep_to_the_pace() -> None:
     assert len(desk.take()) <= 12
 
 
-def test_what_is_read_in_the_background_keeps_to_the_pace() -> None:
+def test_background_reads_keep_to_the_pace() -> None:
     desk = Desk()
     for number in range(100):
         desk.ask(f"P{number}", urgent=False)

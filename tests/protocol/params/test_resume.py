@@ -131,7 +131,7 @@ def test_a_list_that_was_expected_and_has_broken_off_is_not_the_vehicles_end() -
 
 
 @both
-def test_what_came_after_all_needs_only_to_be_asked_whether_it_is_still_so(kind: str) -> None:
+def test_a_table_completed_after_a_cancelled_fetch_is_only_verified(kind: str) -> None:
     vehicle = MAKES[kind]()
     world = Simulation(vehicle)
     machine = world.meet()
@@ -163,7 +163,7 @@ def test_a_refresh_that_joins_begins_anew() -> None:
 
 
 @both
-def test_what_is_dead_is_named_as_ever(kind: str) -> None:
+def test_a_resumed_fetch_lists_dead_indices_as_missing(kind: str) -> None:
     vehicle = MAKES[kind]()
     world = cancelled(vehicle, 180)
     serve = vehicle._by_index
@@ -259,7 +259,7 @@ def test_with_a_hash_the_whole_is_proven_and_counts_as_verified() -> None:
     assert world.machine.table.params["COM_FLIGHT_UUID"].value == 8
 
 
-def test_what_changed_since_leads_to_the_list() -> None:
+def test_a_change_since_the_interruption_leads_to_a_new_list() -> None:
     vehicle = MAKES["PX4"]()
     world = cancelled(vehicle, 150)
     memory = world.memory()

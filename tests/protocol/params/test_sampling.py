@@ -93,7 +93,7 @@ def test_a_sample_of_everything_is_everything() -> None:
     ],
     ids=["value", "type", "name", "more", "fewer"],
 )
-def test_what_does_not_agree_leads_to_the_whole_table(vehicle: GenericVehicle, why: str) -> None:
+def test_a_sample_that_differs_leads_to_a_download(vehicle: GenericVehicle, why: str) -> None:
     session = Simulation(vehicle)
     result = session.outcome(sampled(session, size=200))
     assert (result.source, result.complete, result.sampled) == ("stream", True, False)
@@ -103,7 +103,7 @@ def test_what_does_not_agree_leads_to_the_whole_table(vehicle: GenericVehicle, w
     assert session.machine.state == "synced"
 
 
-def test_it_ends_at_the_first_that_differs() -> None:
+def test_a_sample_ends_at_the_first_difference() -> None:
     session = Simulation(generic(PARAM_000=99))
     fetch = sampled(session, size=200)
     session.until(lambda: len(session.sent_of(ParamRequestList)) > 0)
@@ -213,7 +213,7 @@ def test_the_confidence_is_a_chance_that_rises(data: st.DataObject) -> None:
     assert math.isclose(sample.confidence(1), size / count, rel_tol=1e-9)
 
 
-def test_what_the_usual_sample_shows() -> None:
+def test_the_confidence_of_the_default_sample() -> None:
     sample = Sample(SAMPLE_SIZE, 1400)
     assert sample.confidence(140) > 0.95
     assert sample.confidence(1) < 0.03
@@ -275,7 +275,7 @@ async def test_a_cached_table_that_is_not_whole_is_not_sampled(tmp_path: Path) -
 
 
 @swiftly
-async def test_what_cannot_be_asked_for() -> None:
+async def test_invalid_sampling_options_are_refused() -> None:
     async with ParamClient(ArduPilotVehicle(), cache=False) as client:
         component = await client.component()
         with pytest.raises(UsageError, match="accept"):

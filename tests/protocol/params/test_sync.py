@@ -150,7 +150,7 @@ def test_an_update_that_was_lost_is_found_within_one_interval() -> None:
     assert trusts(world.machine) == {Trust.LIVE}
 
 
-def test_what_moved_is_told_before_it_is_said_that_all_agrees() -> None:
+def test_changes_are_reported_before_the_table_is_in_sync() -> None:
     world, vehicle = fetched()
     world.unheard(vehicle, P07=700)
     states: list[SyncState] = []
@@ -374,7 +374,7 @@ def test_a_gap_counts_whatever_is_heard_first_after_it() -> None:
     assert len(world.hashes()) == 1
 
 
-def test_what_a_heartbeat_leaves_between_two_of_them_is_no_gap() -> None:
+def test_the_usual_interval_of_heartbeats_is_no_gap() -> None:
     world, _ = fetched()
     world.away(1.9)
     world.run(1.0)
@@ -433,7 +433,7 @@ class Rare(Tap):
         return kept
 
 
-def test_one_that_beats_every_ten_seconds_is_not_flapping() -> None:
+def test_a_component_with_a_slow_heartbeat_is_not_lost_again_and_again() -> None:
     world = World(air=Air([Rare(PX4Vehicle(table=TABLE))]))
     world.run(0.5)
     world.fetch()
@@ -449,7 +449,7 @@ class Heartless(Tap):
         return [each for each in super().data_to_send() if each[7] not in (0, 2)]
 
 
-def test_one_that_never_sends_heartbeats_is_never_lost() -> None:
+def test_a_component_without_heartbeats_is_never_lost() -> None:
     heartless = Heartless(GenericVehicle(table=PLAIN))
     world = World(air=Air([heartless]))
     world.station.receive(
@@ -463,7 +463,7 @@ def test_one_that_never_sends_heartbeats_is_never_lost() -> None:
     assert world.machine.state != "lost"
 
 
-def test_what_lies_between_the_answers_of_one_without_heartbeats_is_no_gap() -> None:
+def test_silence_of_a_component_without_heartbeats_is_no_gap() -> None:
     world = World(air=Air([Heartless(PX4Vehicle(table=TABLE))]))
     world.station.receive(
         wire.encode(wire.ParamValue("P00", bytes(4), 6, 42, 65535), system=1, component=1, sequence=0),
@@ -487,7 +487,7 @@ def test_what_lies_between_the_answers_of_one_without_heartbeats_is_no_gap() -> 
     assert state(world) is SyncState.SYNCED
 
 
-def test_one_that_beats_rarely_is_found_again_in_high_latency_mode() -> None:
+def test_a_component_with_a_slow_heartbeat_is_found_again_in_high_latency_mode() -> None:
     world = World(air=Air([]))
 
     def hear(message: wire.Message, at: float) -> None:
@@ -532,7 +532,7 @@ def test_after_five_seconds_without_a_word_it_is_lost() -> None:
     assert not world.sent_of(CommandLong)
 
 
-def test_what_is_pending_ends_with_the_loss_and_what_is_new_at_once() -> None:
+def test_waiting_calls_end_with_the_loss_and_new_calls_at_once() -> None:
     world, _ = fetched()
     machine = world.machine
     world.tap.is_mute = True
@@ -1072,7 +1072,7 @@ def test_no_list_goes_to_all_components_at_once(policy: Policy) -> None:
     world.station.check_refresh(False)
 
 
-def test_what_a_users_choice_means() -> None:
+def test_sync_settings_of_interval_and_policy() -> None:
     assert SyncSettings.chosen(None, "auto") == SyncSettings(WATCH_INTERVAL)
     assert SyncSettings.chosen(5, Policy.AUTO) == SyncSettings(5, without_hash=True)
     assert SyncSettings.chosen(0, "hash-only") == SyncSettings(

@@ -277,7 +277,7 @@ def test_the_hash_is_asked_for_so_early_that_a_fetch_ends_within_the_interval() 
 
 
 @pytest.mark.parametrize("after", [0.01, 0.5, 1.2])
-def test_what_changes_in_or_after_a_check_by_file_is_right_one_interval_later(after: float) -> None:
+def test_a_change_during_or_after_a_file_check_is_corrected_within_one_interval(after: float) -> None:
     world, vehicle = watched(ArduPilotVehicle(table=PLAIN, ftp_rate=500.0))
     last = world.machine.fetches.last
     assert last is not None
@@ -293,7 +293,7 @@ def test_what_changes_in_or_after_a_check_by_file_is_right_one_interval_later(af
     assert wrong(world, vehicle) == 0
 
 
-def test_what_px4_changes_after_its_hash_was_asked_for_is_right_one_interval_later() -> None:
+def test_a_change_of_px4_after_a_hash_check_is_corrected_within_one_interval() -> None:
     vehicle = PX4Vehicle(clamp_delay=None)
     world = World(vehicle)
     elapsed = world.fetch().elapsed
@@ -325,7 +325,7 @@ def wrong(world: World, vehicle: PX4Vehicle | ArduPilotVehicle) -> int:
 
 
 @pytest.mark.parametrize("pause", [0.0002, 0.001, 0.002, 0.005])
-def test_what_another_station_sets_at_full_speed_is_right_soon_after(pause: float) -> None:
+def test_values_set_by_another_station_at_full_speed_are_corrected_after_the_last_one(pause: float) -> None:
     """On a link of its own: ours is told of a part only."""
     world, vehicle = quad()
     rows = [row for row in px4_table() if row.type is ParamType.REAL32 and not row.volatile]

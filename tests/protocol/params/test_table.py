@@ -25,7 +25,7 @@ def test_a_first_value() -> None:
     assert table.take_dirty() == {}
 
 
-def test_what_turns_out_to_be_volatile_or_not_is_news() -> None:
+def test_names_whose_volatility_changes_are_dirty() -> None:
     table = Table()
     for index, name in enumerate("ABC"):
         table.store_value(param_value(name, 1.5, index=index), "vehicle")
@@ -187,7 +187,7 @@ def test_a_hash_that_may_leave_out_anything_verifies_nothing() -> None:
     assert table.unhashed() == {"A", "B"}
 
 
-def test_what_the_vehicle_no_longer_has_is_taken_out() -> None:
+def test_remove_deletes_names_and_returns_the_changes() -> None:
     table = Table()
     table.store_value(param_value("A", 9.0, index=0), "vehicle")
     table.store_value(param_value("B", 9.0, index=1), "vehicle")
@@ -231,7 +231,7 @@ def test_a_hash_that_cannot_be_computed_ends_with_the_first_change() -> None:
     assert table.hash is None
 
 
-def test_what_is_not_covered_does_not_move_it() -> None:
+def test_a_volatile_value_does_not_change_the_hash() -> None:
     table = hashed(proven=True)
     before = table.hash
     table.store_value(param_value("V", 2.0, index=2), "vehicle")
@@ -253,7 +253,7 @@ def test_without_confirmation_there_is_no_hash() -> None:
     assert table.hash is None
 
 
-def test_it_is_computed_again_on_request() -> None:
+def test_rehash_computes_the_hash_again() -> None:
     table = hashed(proven=True)
     right = table.hash
     table.confirm(0x12345678, frozenset("V"), proven=True)
@@ -310,7 +310,7 @@ def test_a_message_that_says_what_was_written_rounds_nothing() -> None:
 
 
 @pytest.mark.parametrize("first", list(Encoding))
-def test_what_a_file_says_is_the_same_in_every_encoding(first: Encoding) -> None:
+def test_file_entries_are_independent_of_the_encoding(first: Encoding) -> None:
     second = Encoding.C_CAST if first is Encoding.BYTEWISE else Encoding.BYTEWISE
     table = Table(first)
     table.store_file_entry("A", ParamType.INT32, BIG, 0, 7, is_older=False)
@@ -349,7 +349,7 @@ def test_a_byte_wise_integer_is_what_the_message_says() -> None:
     assert table.params["A"].value == BIG - 1
 
 
-def test_what_was_heard_while_the_file_came_counts_and_not_the_file() -> None:
+def test_a_value_received_during_the_file_download_wins() -> None:
     table = Table(Encoding.C_CAST)
     table.store_value(
         param_value("A", 5, index=65535, kind=ParamType.INT32, encoding=Encoding.C_CAST), "vehicle"
@@ -399,7 +399,7 @@ def rows_of(table: Table) -> dict[str, int | None]:
     return {f"{item.name} {item.type}": item.default_bits for item in heard}
 
 
-def test_what_was_overwritten_keeps_the_default_of_its_own_type() -> None:
+def test_an_overwritten_value_keeps_the_default_of_its_type() -> None:
     table = Table()
     table.store_value(param_value("A", 5, index=0, kind=ParamType.INT8), "us")
     change = table.store_file_entry("A", ParamType.REAL32, HALF, 0, HALF, is_older=False)
@@ -427,7 +427,7 @@ def test_an_older_file_tells_no_default_of_another_type() -> None:
     assert (table.params["A"].value, table.params["A"].default) == (5, 7)
 
 
-def test_what_another_station_has_heard_in_another_type_has_no_default() -> None:
+def test_a_renewed_value_of_another_type_has_no_default() -> None:
     table = Table()
     table.fill({"A": replace(known("A", 5), default=7)})
     [change] = table.renew({"A": known("A", 0.5)})

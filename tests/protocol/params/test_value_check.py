@@ -255,7 +255,7 @@ def test_a_restart_makes_the_old_values_possible_again() -> None:
     assert desk.value == 1.0
 
 
-def test_what_is_remembered_is_bounded() -> None:
+def test_remembered_replaced_values_are_bounded() -> None:
     checks = ValueChecks()
     for number in range(REPLACED_MAX + 10):
         name = f"P{number}"

@@ -36,7 +36,7 @@ SMALL = 0.5 + 2.0**-24
         (held(1, ParamType.INT32), held(1.0), ""),
     ],
 )
-def test_what_becomes_of_a_change(before: Param, after: Param, note: str) -> None:
+def test_the_note_on_a_change_that_px4_does_not_save(before: Param, after: Param, note: str) -> None:
     said = note_on_small_change(before, after)
     assert note in said
     assert bool(said) is bool(note)

@@ -148,7 +148,7 @@ def test_a_cached_type_is_not_enough_but_a_verified_one_is() -> None:
 
 
 @pytest.mark.parametrize("is_known", [True, False])
-def test_what_has_to_wait_says_so_until_it_is_begun(is_known: bool) -> None:
+def test_held_writes_are_reported_until_they_begin(is_known: bool) -> None:
     """A component with a permission again handles its held writes, however short the interruption."""
     desk = Desk()
     if is_known:
@@ -361,7 +361,7 @@ def test_another_stations_value_is_not_taken_for_an_adjustment() -> None:
     assert write.result.status == "accepted"
 
 
-def test_what_a_read_alone_shows_is_no_adjustment() -> None:
+def test_another_value_from_a_read_alone_is_no_adjustment() -> None:
     desk = Desk()
     desk.knows("A", 1.0)
     write = desk.set("A", 3.0)
@@ -663,7 +663,7 @@ def test_when_the_link_is_back_writes_are_sent_again() -> None:
     assert write.attempts == 1
 
 
-def test_what_no_longer_fits_when_the_link_is_back_fails_without_harm() -> None:
+def test_a_write_that_no_longer_fits_after_an_outage_fails_alone() -> None:
     desk = Desk(Encoding.C_CAST)
     desk.knows("A", 0, INT32)
     desk.knows("B", 0, INT32)
@@ -747,7 +747,7 @@ def test_a_watched_value_is_read_once_more_and_then_the_write_ends() -> None:
     assert len(desk.writes) == len(desk.reads) == 0
 
 
-def test_what_the_vehicle_makes_of_a_watched_value_is_an_adjustment() -> None:
+def test_a_change_by_the_vehicle_while_a_value_is_watched_is_an_adjustment() -> None:
     desk = Desk()
     desk.knows("A", 1.0)
     write = desk.writes.set("A", 80.0, desk.now, settle=1.2)

@@ -8,7 +8,7 @@ from paramclient.errors import NoReply
 from paramclient.protocol.requests.operation import Operation
 
 
-def test_it_ends_with_a_result() -> None:
+def test_an_operation_ends_with_a_result() -> None:
     operation = Operation[int](1.0)
     told: list[str] = []
     operation.on_done += [lambda: told.append("first"), lambda: told.append("second")]

@@ -46,7 +46,7 @@ def serve(pace: Pace, seconds: float, delay: float, *, rate: float = 1e9, since:
     return now
 
 
-def test_it_begins_with_what_the_slowest_autopilot_serves() -> None:
+def test_the_first_rate_is_that_of_the_slowest_autopilot() -> None:
     pace = Pace(RoundTrip())
     assert burst(pace, 5.0) == BURST_MIN
     assert pace.next_at() == pytest.approx(5.0 + 1 / FIRST_RATE)
@@ -54,7 +54,7 @@ def test_it_begins_with_what_the_slowest_autopilot_serves() -> None:
     assert pace.may_send(pace.next_at())
 
 
-def test_what_next_at_promises_holds_to_the_last_bit() -> None:
+def test_a_request_may_be_sent_at_next_at_exactly() -> None:
     pace = Pace(RoundTrip())
     now = 1234.567
     for _ in range(10_000):
@@ -72,13 +72,13 @@ def test_a_reserve_is_kept() -> None:
     assert pace.next_at(1.5) == pytest.approx(0.5 / FIRST_RATE)
 
 
-def test_it_speeds_up_as_long_as_answers_keep_up() -> None:
+def test_the_rate_rises_while_responses_keep_up() -> None:
     pace = Pace(RoundTrip())
     serve(pace, 3.0, 0.02)
     assert pace.rate == RATE_MAX
 
 
-def test_it_stays_near_what_is_served() -> None:
+def test_the_rate_stays_near_the_served_rate() -> None:
     pace = Pace(RoundTrip())
     end = serve(pace, 3.0, 0.02, rate=120.0)
     assert FIRST_RATE <= pace.rate < 400.0
@@ -87,7 +87,7 @@ def test_it_stays_near_what_is_served() -> None:
 
 
 @pytest.mark.parametrize("silent", [0, 64])
-def test_one_that_serves_batches_is_never_asked_faster_than_it_serves(silent: int) -> None:
+def test_the_rate_never_exceeds_that_of_a_vehicle_that_serves_batches(silent: int) -> None:
     policy = RetryPolicy()
     for number in range(100):
         if number < silent:
@@ -142,7 +142,7 @@ def test_an_answer_to_what_was_asked_for_twice_tells_no_delay() -> None:
     assert pace.rate >= FIRST_RATE
 
 
-def test_it_leaves_most_of_the_link_to_others() -> None:
+def test_the_rate_is_a_share_of_the_list_rate() -> None:
     pace = Pace(RoundTrip())
     pace.stream_seen(0.1)
     assert pace.rate == pytest.approx(37 * 10 * UPSTREAM_SHARE / 16)
@@ -168,7 +168,7 @@ def test_something_may_always_be_asked_even_on_the_slowest_link(gap: float) -> N
     assert now < 5 / RATE_MIN + 1.0
 
 
-def test_what_the_component_drops_does_not_pass_for_a_bad_link() -> None:
+def test_requests_dropped_by_the_component_do_not_count_as_packet_loss() -> None:
     policy = RetryPolicy()
     pace = Pace(policy.round_trip)
     pace.stream_seen(0.0001)  # the list lost nothing

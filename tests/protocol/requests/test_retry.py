@@ -54,7 +54,7 @@ def test_a_steady_link_is_not_asked_sooner_than_a_vehicle_answers() -> None:
     assert 0.3 < steady.timeout < 0.35
 
 
-def test_what_was_asked_for_twice_is_no_sample() -> None:
+def test_a_response_to_a_repeated_request_is_no_sample() -> None:
     policy = measured(0.2)
     policy.answered(0.0, 3.0, 2)
     assert policy.round_trip.smoothed == pytest.approx(0.2)

@@ -92,7 +92,7 @@ def test_names_and_words_come_from_the_dialect() -> None:
 
 
 @pytest.mark.parametrize("stream", [True, False])
-def test_what_is_no_good_frame_is_told_apart(stream: bool) -> None:
+def test_damaged_unknown_and_signed_frames_and_other_bytes_are_distinguished(stream: bool) -> None:
     data = b"noise" + frame(sequence=1) + damaged(2) + unknown(3) + b"\xfd\xfe" + signed(4) + unknown(5)
     seen, sniffer = sniffed([data], stream=stream)
     assert [(each.sequence, each.is_known, each.is_signed) for each in seen] == [
@@ -110,7 +110,7 @@ def test_a_header_that_claims_too_much_hides_nothing() -> None:
     assert (sniffer.damaged, sniffer.other_bytes) == (0, 4)
 
 
-def test_what_is_kept_of_a_stream_in_which_nothing_is_proven_is_bounded() -> None:
+def test_unproven_bytes_of_a_stream_are_bounded() -> None:
     sniffer = Sniffer(stream=True)
     count = 0
     for _ in range(2000):
@@ -138,7 +138,7 @@ pieces = st.lists(
 
 
 @given(pieces, st.data())
-def test_it_sees_the_frames_that_the_framer_finds_and_accounts_for_every_byte(
+def test_the_sniffer_finds_the_frames_of_the_framer_and_counts_every_byte(
     parts: list[bytes], data: st.DataObject
 ) -> None:
     whole = b"".join(parts)
@@ -191,20 +191,20 @@ def test_a_long_gap_is_counted_exactly(start: int, gaps: list[tuple[int, int]]) 
 
 
 @given(st.integers(0, 255), st.lists(st.integers(1, 3), min_size=1, max_size=600))
-def test_what_comes_twice_is_no_loss(start: int, copies: list[int]) -> None:
+def test_repeated_frames_are_no_loss(start: int, copies: list[int]) -> None:
     check = check_of(start + offset for offset, count in enumerate(copies) for _ in range(count))
     assert (check.lost, check.repeated, check.late) == (0, sum(copies) - len(copies), 0)
 
 
 @given(st.integers(0, 255), st.lists(st.integers(0, CERTAIN_GAP - 1), min_size=1, max_size=600))
-def test_what_comes_a_little_late_is_no_loss(start: int, delays: list[int]) -> None:
+def test_slightly_reordered_frames_are_no_loss(start: int, delays: list[int]) -> None:
     order = sorted(range(1, len(delays) + 1), key=lambda each: (each + delays[each - 1], each))
     check = check_of([start, *(start + each for each in order)])
     behind = sum(each < max(order[:place], default=0) for place, each in enumerate(order))
     assert (check.lost, check.repeated, check.late) == (0, 0, behind)
 
 
-def test_what_comes_too_late_for_that_is_not_counted_twice() -> None:
+def test_frames_beyond_the_reorder_depth_are_counted_once_as_lost() -> None:
     check = check_of([*range(50), *range(51, 51 + REORDER_DEPTH), 50])
     assert (check.lost, check.late) == (0, 1)
     check = check_of([*range(50), *range(51, 52 + REORDER_DEPTH), 50, *range(52 + REORDER_DEPTH, 200)])
@@ -233,18 +233,18 @@ def test_after_a_silence_a_jump_tells_of_nothing(before: int, first: int, after:
     assert check.lost <= CERTAIN_GAP
 
 
-def test_what_comes_late_and_twice_is_both() -> None:
+def test_a_frame_may_be_late_and_repeated() -> None:
     check = check_of([0, 2, 1, 1])
     assert (check.lost, check.late, check.repeated) == (0, 1, 1)
 
 
-def test_what_was_not_lost_between_two_numberings_cannot_come_late() -> None:
+def test_a_number_between_two_numberings_is_not_late() -> None:
     check = check_of([0, 40, 1, 39])
     assert (check.lost, check.late, check.repeated) == (0, 0, 1)
     assert check_of([0, 40, 39, 1]).lost == 0
 
 
-def test_what_came_before_several_gaps_is_forgotten() -> None:
+def test_a_numbering_is_forgotten_after_several_gaps() -> None:
     check = check_of(
         [*range(6), *range(50, 56), *range(100, 261), 263, 264]
     )  # 261 is 5, the end of the first
@@ -339,7 +339,7 @@ def test_rates_and_loss_are_recent() -> None:
     assert component.age == pytest.approx(2 * RATE_WINDOW + 0.02)
 
 
-def test_what_comes_twice_does_not_hide_what_is_lost() -> None:
+def test_repeated_frames_do_not_hide_losses() -> None:
     traffic = Traffic(is_stream=False)
     for number in range(100):
         for _ in range(3):
@@ -420,7 +420,7 @@ def test_a_stream_is_followed_for_each_peer_and_its_end_counts() -> None:
     assert (report.frames, report.damaged, report.other_bytes) == (3, 1, 7)
 
 
-def test_what_others_can_stretch_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_counted_components_messages_and_peers_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("COUNTED_COMPONENTS_MAX", "COUNTED_MESSAGES_MAX", "COUNTED_PEERS_MAX"):
         monkeypatch.setattr(room, name, 3)
     traffic = Traffic(is_stream=True)
@@ -464,7 +464,7 @@ def test_a_link_that_comes_back_begins_anew() -> None:
 
 
 @pytest.mark.parametrize("loss", [0.05, 0.3])
-def test_what_it_counts_as_lost_is_what_the_link_has_lost(loss: float) -> None:
+def test_counted_losses_agree_with_the_faulty_link(loss: float) -> None:
     faulty = FaultyLink(loss=loss, duplicate=0.05, seed=1)
     air = Air([PX4Vehicle(telemetry=50)], downlink=faulty)
     simulation = Simulation(air=air, station=Station(link="x", is_stream=False, counts_traffic=True))

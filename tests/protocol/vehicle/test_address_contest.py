@@ -252,7 +252,7 @@ def test_requests_go_to_the_peer_that_gives_the_hardware_id() -> None:
     assert net.kinds() == ["Contested"]
 
 
-def test_it_ends_when_one_was_silent_for_the_heartbeat_timeout() -> None:
+def test_a_contest_ends_when_one_vehicle_was_silent_for_the_heartbeat_timeout() -> None:
     net = Net(a=Speaker(PX4, uid=1), b=silent_after(4.0, uid=2, start=0.5))
     net.run(0.4)
     net.machine.read("P", net.now)
@@ -575,7 +575,7 @@ def hold(net: Net, *names: str) -> None:
     net.run(STEP)
 
 
-def test_one_that_gives_its_id_first_takes_nothing_over() -> None:
+def test_a_second_vehicle_that_gives_its_id_first_takes_nothing_over() -> None:
     """Two of one kind: the id of the first and one of its values were lost, and the table is gone on with."""
     net = Net(a=Speaker(uid=None), b=Speaker(uid=9, start=0.6, value=9.0))
     net.run(0.4)
@@ -622,7 +622,7 @@ def test_nothing_is_taken_from_one_that_does_not_show_to_be_the_vehicle_that_is_
     assert not net.station.is_doubted(net.machine)
 
 
-def test_one_that_stays_and_gives_no_id_is_another_vehicle() -> None:
+def test_a_peer_that_replaces_a_silent_one_without_an_id_is_another_vehicle() -> None:
     net = Net(a=silent_after(3.0), b=Speaker(uid=None, booted_at=None, start=3.5, value=99.0))
     net.run(2.0)
     hold(net, "P", "Q")
@@ -707,7 +707,7 @@ def test_a_component_that_no_longer_identifies_itself_is_not_written_to() -> Non
     assert len([each for each in speaker.heard if isinstance(each, ParamSetMessage)]) == 1
 
 
-def test_another_kind_through_one_peer_is_identified() -> None:
+def test_another_vehicle_type_through_one_peer_is_identified() -> None:
     """As where another vehicle was plugged in within the heartbeat timeout."""
     port = Speaker(PX4, end=3.0)
     net = Net(port=port)
@@ -720,7 +720,7 @@ def test_another_kind_through_one_peer_is_identified() -> None:
     assert dict(net.machine.table.params) == {}
 
 
-def test_another_kind_that_gives_no_id_is_not_written_to() -> None:
+def test_another_vehicle_type_without_an_id_is_not_written_to() -> None:
     port = Speaker(PX4)
     net = Net(port=port)
     net.run(2.5)
@@ -738,7 +738,7 @@ def test_another_kind_that_gives_no_id_is_not_written_to() -> None:
 
 
 @pytest.mark.parametrize("first", [None, 0])
-def test_one_that_gives_an_id_after_one_without_is_another(first: int | None) -> None:
+def test_a_vehicle_with_an_id_after_one_without_is_another_vehicle(first: int | None) -> None:
     port = Speaker(uid=first, end=6.0)
     net = Net(port=port)
     net.run(5.0)
@@ -780,7 +780,7 @@ def test_two_of_one_kind_behind_one_radio_are_told_apart_by_their_clocks() -> No
     assert net.kinds() == ["Contested", "Uncontested"]
 
 
-def test_what_comes_late_after_a_restart_is_no_second_vehicle() -> None:
+def test_late_clocks_after_a_restart_are_no_second_vehicle() -> None:
     radio = Speaker()
     net = Net(radio=radio)
     net.run(5.0)

@@ -142,7 +142,7 @@ def test_after_the_command_to_restart_it_is_asked_until_it_is_back() -> None:
     assert desk.run(60.0) == []
 
 
-def test_another_message_that_is_requested_goes_first() -> None:
+def test_a_clock_request_waits_for_another_message_request() -> None:
     desk = Requests()
     desk.context.is_requesting_message = True
     desk.requests.want(desk.now)
@@ -242,7 +242,7 @@ def test_numbers_that_begin_anew_have_the_clock_requested() -> None:
     assert desk.reboots == 1
 
 
-def test_another_state_has_the_clock_requested() -> None:
+def test_a_changed_mav_state_leads_to_a_clock_request() -> None:
     """As ArduCopter says ACTIVE for two seconds after a start, and PX4 UNINIT."""
     desk = Desk()
     desk.run_heard(100.0)
@@ -321,7 +321,7 @@ def test_numbers_prove_nothing_while_a_clock_goes_on() -> None:
 # values that are measured at each start
 
 
-def test_what_is_measured_at_a_start_is_read_again() -> None:
+def test_values_measured_at_each_start_are_read_again_after_a_reboot() -> None:
     desk = Desk()
     measured = {"INS_GYR1_CALTEMP", "BARO1_GND_PRESS", "ARSPD_OFFSET", "RC1_DZ"}
     for name in (*sorted(measured), "ATC_RAT_RLL_P", "INS_TCAL1_TMIN"):

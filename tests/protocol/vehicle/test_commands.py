@@ -82,7 +82,7 @@ def test_a_result_that_is_not_known_keeps_its_number() -> None:
     assert command.error.reason == "result 99"
 
 
-def test_what_is_not_answered_is_sent_again_and_counted() -> None:
+def test_an_unanswered_command_is_repeated_with_a_confirmation_count() -> None:
     desk = Desk()
     command = desk.commands.begin(NUMBER, (), 0.0)
     timeout = desk.retry.timeout
@@ -167,7 +167,7 @@ def test_those_of_one_number_wait_for_each_other() -> None:
 
 
 @pytest.mark.parametrize("is_first", [True, False])
-def test_one_that_is_cancelled_leaves_nothing(is_first: bool) -> None:
+def test_a_cancelled_command_leaves_nothing_behind(is_first: bool) -> None:
     desk = Desk()
     commands = [desk.commands.begin(NUMBER, (each,), 0.0) for each in (1.0, 2.0)]
     gone, stays = commands if is_first else reversed(commands)
@@ -180,7 +180,7 @@ def test_one_that_is_cancelled_leaves_nothing(is_first: bool) -> None:
     assert len(desk.commands) == 0
 
 
-def test_one_that_does_not_repeat_is_sent_by_others() -> None:
+def test_a_command_without_automatic_repeats_is_repeated_by_its_caller() -> None:
     desk = Desk()
     command = desk.commands.begin(NUMBER, (), 0.0, repeats=False)
     assert desk.commands.next_deadline() == math.inf
@@ -199,7 +199,7 @@ def test_a_link_that_is_back_brings_it_at_once() -> None:
 
 
 @pytest.mark.parametrize("is_lost", [True, False])
-def test_what_can_have_no_answer_any_more_ends(is_lost: bool) -> None:
+def test_commands_end_when_the_component_is_lost_or_the_link_fails(is_lost: bool) -> None:
     desk = Desk()
     commands: list[Command] = [desk.commands.begin(number, (), 0.0) for number in (NUMBER, NUMBER, OTHER)]
     error = LinkError("gone", link="udp")

@@ -160,7 +160,7 @@ def test_before_a_heartbeat_it_is_no_autopilot() -> None:
 # asking
 
 
-def test_it_is_asked_for_its_version_once() -> None:
+def test_autopilot_version_is_requested_once() -> None:
     desk = Desk()
     desk.beat(PX4, 1.0)
     [message] = desk.sent
@@ -181,7 +181,7 @@ def test_it_is_asked_for_its_version_once() -> None:
     assert (identity.autopilot, identity.vehicle_type) == (MAV_AUTOPILOT_PX4, 2)
 
 
-def test_both_ways_to_ask_are_tried_in_turn_and_then_it_is_let_be() -> None:
+def test_both_version_requests_alternate_until_the_component_is_given_up() -> None:
     desk = Desk()
     desk.beat(CAMERA)
     assert desk.next_deadline() == FIRST_TIMEOUT
@@ -318,7 +318,7 @@ def test_an_answer_that_never_comes_again_leaves_what_is_known() -> None:
     assert desk.who.settled
 
 
-def test_one_that_was_away_is_asked_for_five_seconds_and_not_more_than_once_a_second_in_the_end() -> None:
+def test_a_component_that_returns_is_asked_for_five_seconds_at_most_once_a_second_in_the_end() -> None:
     desk = settled(7)
     for _ in range(50):
         desk.retry.answered(0.0, 0.02, 1)  # a quick link, on which five tries take half a second

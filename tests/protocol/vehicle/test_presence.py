@@ -48,7 +48,7 @@ def test_the_first_word_has_no_silence_before_it() -> None:
     assert presence.heard(9.5) == 2.5
 
 
-def test_what_never_sent_a_heartbeat_is_never_lost() -> None:
+def test_a_component_without_heartbeats_is_never_lost() -> None:
     presence = Presence()
     presence.heard(1.0)
     assert not presence.has_beaten
@@ -74,7 +74,7 @@ def test_usual_heartbeats_change_nothing(interval: float) -> None:
     assert 2.5 <= presence.gap <= 4.0
 
 
-def test_one_that_beats_rarely_is_given_three_of_its_own_intervals() -> None:
+def test_the_heartbeat_timeout_is_three_intervals_of_a_slow_heartbeat() -> None:
     presence = beating(0.0, 10.0)
     assert presence.heartbeat_timeout == 30.0
     assert presence.gap == 25.0, "no gap after each of its heartbeats"
@@ -107,7 +107,7 @@ def test_high_latency_needs_more_patience_until_the_next_heartbeat() -> None:
     assert presence.lost_at() == 30.0 + LOST_AFTER
 
 
-def test_one_that_is_first_heard_in_high_latency_can_be_lost_too() -> None:
+def test_a_component_first_received_in_high_latency_mode_can_be_lost() -> None:
     presence = Presence()
     presence.heard(2.0)
     presence.high_latency()
@@ -134,7 +134,7 @@ def test_each_reboot_counts_once() -> None:
     assert reboots(clock) == [5.0, 20.0]
 
 
-def test_what_comes_in_the_wrong_order_or_twice_is_no_reboot() -> None:
+def test_reordered_and_repeated_clocks_are_no_reboot() -> None:
     assert reboots([(0.0, 50_000), (0.1, 49_000), (0.2, 51_000), (0.2, 51_000), (1.0, 50_000)]) == []
     soon = int(1000 * REORDERING_TIME) + 100
     assert reboots([(0.0, soon), (0.1, 200), (1.0, soon + 1_000)]) == [], "soon after it was switched on"
@@ -169,7 +169,7 @@ def test_a_heartbeat_that_says_it_boots_is_a_reboot() -> None:
     assert states((0.0, ACTIVE), (5.0, BOOT), (7.0, ACTIVE), (20.0, BOOT)) == [5.0, 20.0]
 
 
-def test_one_that_is_met_while_it_boots_has_not_started_again() -> None:
+def test_a_component_first_received_while_it_boots_has_not_rebooted() -> None:
     assert states((0.0, BOOT), (1.0, BOOT), (2.0, ACTIVE)) == []
 
 

@@ -151,7 +151,7 @@ async def test_it_comes_back(make: Make, uptime: float, down: float, ack: bool) 
 
 @MAKES
 @swiftly
-async def test_it_is_not_back_while_it_boots(make: Make) -> None:
+async def test_reboot_waits_until_the_vehicle_has_booted(make: Make) -> None:
     vehicle = make(boot_time=7.0)
     starts = counted(vehicle)
     async with a_client(vehicle) as client:
@@ -250,7 +250,7 @@ async def test_a_silence_alone_is_no_restart() -> None:
 
 
 @swiftly
-async def test_what_was_written_is_saved_first() -> None:
+async def test_a_reboot_waits_until_px4_has_saved_the_last_write() -> None:
     tap = Tap(px4())
     async with a_client(tap) as client:
         component = await known(client)
@@ -349,7 +349,7 @@ async def test_another_vehicle_is_told(before: Make, after: Make, ack: bool) -> 
 
 
 @swiftly
-async def test_another_one_is_told_as_soon_as_it_says_so() -> None:
+async def test_another_hardware_id_after_the_reboot_raises_at_once() -> None:
     place = Exchanged(generic(uid=1, reboot_down=math.inf))
     async with a_client(place) as client:
         component = await known(client)
@@ -360,7 +360,7 @@ async def test_another_one_is_told_as_soon_as_it_says_so() -> None:
 
 
 @swiftly
-async def test_another_kind_is_told_though_its_first_heartbeat_is_lost() -> None:
+async def test_another_vehicle_type_after_the_reboot_raises_despite_a_lost_heartbeat() -> None:
     class Beatless(Tap):
         def data_to_send(self) -> list[bytes]:
             sent = super().data_to_send()
@@ -471,7 +471,7 @@ async def test_there_and_back_again(uid: int | None, ack: bool) -> None:
 
 
 @swiftly
-async def test_one_that_does_not_take_the_new_id() -> None:
+async def test_a_vehicle_that_keeps_its_old_system_id_is_no_reply() -> None:
     vehicle = px4()
     async with a_client(vehicle) as client:
         component = await known(client)
@@ -568,7 +568,7 @@ async def test_without_a_hardware_id_the_silence_of_the_old_one_tells() -> None:
 
 
 @swiftly
-async def test_another_vehicle_has_the_id_already() -> None:
+async def test_successor_raises_if_another_vehicle_has_the_new_id() -> None:
     air = Air.symmetric([generic(), generic(system=9)])
     async with a_client(air) as client:
         component = await client.component(system=1)

@@ -114,7 +114,7 @@ def test_a_key_comes_as_hexadecimal_digits_base64_or_a_passphrase() -> None:
     "text",
     ["", "secret", "z" * 64, SECRET.hex()[:-1], SECRET.hex() + "0", "!" * 44, "é" * 64, "ab " * 21 + "c"],
 )
-def test_what_is_no_key_is_refused_and_not_repeated(text: str) -> None:
+def test_an_invalid_key_is_refused_without_printing_it(text: str) -> None:
     with pytest.raises(UsageError, match="64 hexadecimal digits") as caught:
         SigningKey.from_text(text)
     assert not text or text not in str(caught.value)
@@ -186,7 +186,7 @@ def test_pymavlink_takes_what_we_sign_and_we_what_it_signs(
     assert theirs.signing.badsig_count == 0
 
 
-def test_what_pymavlink_refuses_we_refuse() -> None:
+def test_frames_are_refused_as_by_pymavlink() -> None:
     """Frame after frame, good and bad: the judgement is the same."""
     good = signed_frame(timestamp=NOW + 10)
     frames = [
@@ -350,7 +350,7 @@ def test_in_a_stream_a_cut_off_signature_is_waited_for() -> None:
 @pytest.mark.parametrize("version", [1, 2])
 @pytest.mark.parametrize("number", [109, 166, 0, 22])
 @pytest.mark.parametrize("policy", SigningPolicy)
-def test_what_the_policies_take_without_a_signature(policy: SigningPolicy, number: int, version: int) -> None:
+def test_unsigned_frames_that_each_policy_accepts(policy: SigningPolicy, number: int, version: int) -> None:
     frame = wire.build_frame(number, b"\1" * 9, system=51, component=68, sequence=0, version=version)
     verifier = a_verifier(policy)
     is_radio = number in (109, 166) and policy is SigningPolicy.UNSIGNED_RADIOS
@@ -508,7 +508,7 @@ def test_a_vehicle_that_has_lost_its_time_is_heard_again() -> None:
     assert simulation.station.verifier.report().refused.keys() == {Refusal.REPLAYED}
 
 
-def test_what_is_recorded_and_sent_again_changes_nothing() -> None:
+def test_replayed_frames_change_nothing() -> None:
     vehicle = ArduPilotVehicle(table=VALUES, ftp=False, signing_key=KEY)
     simulation = Simulation(vehicle, station=a_station())
     simulation.fetch()

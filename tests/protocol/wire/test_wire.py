@@ -273,7 +273,7 @@ def test_a_mavlink_1_frame_is_pymavlinks_without_extension_fields(ours: Message,
         assert decode(one_frame(frame)) == ours
 
 
-def test_what_mavlink_1_leaves_out_reads_as_zero() -> None:
+def test_fields_missing_in_mavlink_1_are_zero() -> None:
     frame = encode(CommandAck(512, 3, 255, 190), system=1, component=1, sequence=0, version=1)
     assert decode(one_frame(frame)) == CommandAck(512, 3, 0, 0)
     version = AutopilotVersion(16, uid=5, uid2=b"eighteen bytes uid")
@@ -789,7 +789,7 @@ def test_in_datagrams_every_whole_frame_is_found(mixes: list[list[Piece]]) -> No
 
 
 @pytest.mark.parametrize("number", sorted(BOOT_CLOCK_OFFSETS))
-def test_where_the_time_since_boot_stands(number: int) -> None:
+def test_the_position_of_time_boot_ms_in_each_message(number: int) -> None:
     """pymavlink packs each message that has it; in the payload its trailing zeros are cut off."""
     kind = dialect.mavlink_map[number]
     for boot_ms in (0xA1B2C3D4, 0x00000017):
