@@ -39,7 +39,10 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import common
 
+from paramclient.cache import ParamCache, StoredParam, TableState, TableUpdate
 from paramclient.links import create_link, serve_endpoint
+from paramclient.model.identity import Identity
+from paramclient.model.values import Param, ParamType
 from paramclient.sim import GenericVehicle
 
 ROOT: Final = Path(__file__).parent.parent
@@ -505,6 +508,54 @@ async def many_components(rows: list[Row], quick: bool) -> None:
             beating.cancel()
 
 
+async def large_fleet(rows: list[Row], quick: bool) -> None:
+    """Clause 7: comparisons of many vehicles in the cache, whose values all differ."""
+    vehicles, names = (50, 20) if quick else (999, 160)
+    folder = Path(tempfile.mkdtemp())
+    place = folder / "fleet.sqlite3"
+    everything = [f"P{number:03}" for number in range(names)]
+    too_many = [f"P{number:03}*" for number in range(64)]
+    posts: list[tuple[str, dict[str, Any], int]] = [
+        (f"{names} names", {"names": everything}, 200),
+        (f"{names} wanted values", {"values": dict.fromkeys(everything, -1)}, 200),
+        ("more than the maximum, by pattern", {"names": ["*", *too_many[1:]]}, 200 if quick else 413),
+    ]
+    try:
+        fill_fleet(place, vehicles, names + 50)
+        words = ("sim:px4", "--cache", str(place), "--no-fetch")
+        async with serving(rows, *words, folder=folder) as service:
+            for what, body, expected in posts:
+                service.attack = f"{vehicles:,} vehicles: fleet/diff of {what}"
+                with service.watched(late=LATE):
+                    status, answer = await service.ask(
+                        "POST", "/api/v1/fleet/diff", as_json(body), token(READER)
+                    )
+                    assert status == expected, answer[:500]
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def fill_fleet(place: Path, vehicles: int, names: int) -> None:
+    """Write a cache with the tables of many vehicles; each value is of one vehicle alone, and has changed."""
+    at = time.time() - 1_000
+    with ParamCache(place) as cache:
+        for vehicle in range(vehicles):
+            identity = Identity(1 + vehicle % 250, "a", f"{vehicle:036x}", 12, 2, 17_891_392, "a70a5583")
+            for add in (0, 1_000_000):
+                params = [
+                    StoredParam(Param(f"P{number:03}", value, ParamType.INT32, number, value), at + add / 1e6)
+                    for number in range(names)
+                    for value in (add + vehicle * names + number,)
+                ]
+                state = TableState(1, names, complete=True, volatile_known=True, synced_at=at)
+                cache.save(
+                    TableUpdate(
+                        identity=identity, component=1, autopilot=12, at=at + add / 1e6, table=state,
+                        params=params, replace=True,
+                    )
+                )  # fmt: skip
+
+
 async def beat(port: int, count: int) -> None:
     """Send the heartbeats of many components to a UDP port, each once a second; until cancelled."""
     frames = []
@@ -562,6 +613,35 @@ def push(one: socket.socket, data: bytes, seconds: float) -> None:
             time.sleep(0.005)
         except OSError:
             return
+
+
+async def waiting(service: Service, quick: bool) -> None:
+    """Clause 7: requests of a reader that wait, each resumed by what another client receives."""
+    for path in ("/api/v1/find", f"{C}/fetch"):
+        status, answer = await service.ask("POST", path, b'{"timeout_s": 60}', token(READER))
+        assert status == 200, answer
+    count = 100 if quick else 460
+    absent = {"system": 77, "timeout_s": 60}
+    for what, path, body in (
+        ("find", "/api/v1/find", as_json(absent)),
+        ("find with only", "/api/v1/find", as_json(absent, only=True)),
+        ("successor", f"{C}/successor", as_json(absent)),
+        ("read", f"{C}/params/NO_SUCH_NAME/read", b'{"timeout_s": 60}'),
+    ):
+        service.attack = f"{count} waiting requests: {what}"
+        lines = [f"POST {path} HTTP/1.1", f"Host: 127.0.0.1:{service.port}", token(READER)]
+        lines += ["Content-Type: application/json", f"Content-Length: {len(body)}", "", ""]
+        data = "\r\n".join(lines).encode() + body
+        with service.watched(late=None if quick else LATE), connections(service, 0, HERE) as held:
+            for _ in range(count):
+                one = socket.create_connection((HERE, service.port))
+                held.append(one)
+                one.sendall(data)
+            await asyncio.sleep(0.5)
+            status, answer = await service.ask(
+                "POST", f"{C}/fetch", b'{"refresh": true, "timeout_s": 60}', token(WRITER)
+            )
+            service.note("a fetch of another token fails", 0, status != 200, "times")
 
 
 async def parsing(service: Service, quick: bool) -> None:
@@ -816,7 +896,9 @@ async def attack(quick: bool, only: str) -> list[Row]:
         "requests": lambda: on_service(requests, *sim),
         "large table": lambda: large_table(rows, quick),
         "many components": lambda: many_components(rows, quick),
+        "large fleet": lambda: large_fleet(rows, quick),
         "slices": lambda: on_service(slices, *sim),
+        "waiting": lambda: on_service(waiting, *sim),
         "parsing": lambda: on_service(parsing, *sim),
         "guesses": lambda: on_service(guesses, *bare, "--trusted-proxy", ELSEWHERE),
         "origins": lambda: on_service(

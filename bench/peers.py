@@ -235,9 +235,7 @@ class LiveField:
             self.journal.begin(component, listed)
             self.kind = f"real {TITLES.get(component.autopilot, component.autopilot)}"
             self.vehicle = firmware(component.identity)
-        self.values = {
-            name: float(param.value) for name, param in listed.items() if not isinstance(param.value, bytes)
-        }
+        self.values = {name: float(param.value) for name, param in listed.items() if not param.is_raw}
 
 
 def main() -> None:

@@ -13,7 +13,7 @@ from unittest import mock
 
 from fuzz.draw import Draw
 from paramclient.errors import ContestedAddress, NoReply, ParamClientError, UsageError
-from paramclient.model.values import Encoding, Param, Trust, Value, known_type
+from paramclient.model.values import Encoding, Param, Trust, WireValue, known_type
 from paramclient.protocol import station, wire
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.ftp import FileRead
@@ -55,7 +55,7 @@ COMPONENTS: Final = (1, 1, 100, 190)
 COUNTS: Final = (8, 8, 8, 9, 3, 0, 1, 65534, 65535)
 KINDS: Final = (9, 6, 1, 4, 5, 2, 3, 7, 8, 10, 0, 255)
 AUTOPILOTS: Final = (12, 3, 0, 8)
-VALUES: Final[tuple[Value, ...]] = (0.0, 1, -1.5, 300, 1e39, math.nan, b"\1\2\3\4", -0.0)
+VALUES: Final[tuple[WireValue, ...]] = (0.0, 1, -1.5, 300, 1e39, math.nan, b"\1\2\3\4", -0.0)
 PAUSES: Final = (0.0, 0.001, 0.02, 0.1, 0.3, 1.0, 2.5, 5.1, 20.0, 70.0, 3600.0)
 MOST_OPERATIONS: Final = 12
 MOST_STEPS: Final = 60
@@ -396,7 +396,7 @@ class _Session:
         machine = self.machine()
         if machine is not None:
             name = self.name(machine.system)
-            value: Value = self.draw.one_of(VALUES)
+            value: WireValue = self.draw.one_of(VALUES)
             with suppress(NoReply, UsageError):
                 self.keep(machine, machine.write(name, value, self.now))
 

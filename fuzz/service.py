@@ -11,13 +11,14 @@ import json
 import logging
 import selectors
 from collections.abc import AsyncIterator
+from contextlib import suppress
 from copy import deepcopy
 from typing import Any, Final
 
 import httpx
 
 from fuzz.draw import Draw
-from paramclient.errors import ParamClientError
+from paramclient.errors import ParamClientError, UsageError
 from paramclient.remote import RemoteClient
 
 __all__ = ["LONGEST", "run"]
@@ -61,6 +62,35 @@ COMPONENT: Final = {
     "round_trip_s": 0.01,
     "fetch": None,
     "last_fetch": {"source": "ftp", "elapsed_s": 1.0},
+    "extended": {"is_spoken": True, "is_expected": True, "is_complete": True, "count": 1, "params": 1},
+}
+EXT_PARAM: Final = {
+    "name": "A",
+    "value": "text",
+    "type": "CUSTOM",
+    "index": 0,
+    "hex": "74657874",
+    "trust": "live",
+    "heard_at": 1.0,
+}
+EXT_RESULT: Final = {
+    "link": "a",
+    "system": 1,
+    "component": 1,
+    "source": "stream",
+    "count": 1,
+    "received": 1,
+    "missing": [],
+    "elapsed_s": 0.0,
+    "notes": [],
+}
+EXT_SET: Final = {
+    "name": "A",
+    "status": "accepted",
+    "requested": "text",
+    "actual": "text",
+    "attempts": 1,
+    "param": EXT_PARAM,
 }
 PARAM: Final = {
     "name": "A",
@@ -114,6 +144,10 @@ ANSWERS: Final[dict[str, Any]] = {
     "POST /components/1/1/fetch": RESULT,
     "POST /components/1/1/read": PARAM,
     "PATCH /components/1/1/params": {"results": {"A": SET}},
+    "GET /components/1/1/extended/params": {"run": RUN, "seq": 0, "params": {"A": EXT_PARAM}},
+    "POST /components/1/1/extended/fetch": EXT_RESULT,
+    "POST /components/1/1/extended/read": EXT_PARAM,
+    "PATCH /components/1/1/extended/params": {"results": {"A": EXT_SET}},
     "POST /fetch": {"results": [RESULT], "silent": [SILENT]},
 }
 ABOUT: Final = {"run": RUN, "at": 1.0, "link": "a", "system": 1, "component": 1}
@@ -138,8 +172,11 @@ EVENTS: Final[tuple[dict[str, Any], ...]] = (
     },
     {**ABOUT, "seq": 8, "type": "params"},
     {**ABOUT, "seq": 9, "type": "link", "state": "open"},
-    {**ABOUT, "seq": 10, "type": "gap", "missed": 3},
-    {**ABOUT, "seq": 11, "type": "component", "why": "forgotten", "component_doc": COMPONENT},
+    {**ABOUT, "seq": 10, "type": "extended_change", "name": "A", "old": None, "new": EXT_PARAM, "by": "us"},
+    {**ABOUT, "seq": 11, "type": "extended_progress", **PROGRESS},
+    {**ABOUT, "seq": 12, "type": "extended_params"},
+    {**ABOUT, "seq": 13, "type": "gap", "missed": 3},
+    {**ABOUT, "seq": 14, "type": "component", "why": "forgotten", "component_doc": COMPONENT},
 )
 ODD: Final[tuple[Any, ...]] = (
     *(None, True, False, 0, -1, 1, 255, 256, 1 << 64, 0.5, float("inf"), float("nan"), "", "A", "0x7f", "zz"),
@@ -194,6 +231,9 @@ async def _use(client: RemoteClient) -> None:
         lambda: vehicle.get("A", timeout=5),
         lambda: vehicle.set("A", 3.0, timeout=5),
         lambda: client.fetch_all(timeout=5),
+        lambda: vehicle.ext.fetch_all(timeout=5),
+        lambda: vehicle.ext.get("A", timeout=5),
+        lambda: vehicle.ext.set("A", "text", timeout=5),
     ):
         try:
             await call()
@@ -204,6 +244,9 @@ async def _use(client: RemoteClient) -> None:
         for name in (*names, "silence", "round_trip", "is_autopilot"):
             getattr(component, name)
         repr((component, dict(component.params)))
+        with suppress(UsageError):  # the service looks like one of an earlier version
+            ext = component.ext
+            repr((ext, dict(ext.params), ext.is_spoken, ext.is_expected))
     repr((client, client.stats, client.autopilots))
 
 

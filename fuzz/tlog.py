@@ -112,7 +112,8 @@ def _check_import(kept: ParamCache, tables: Sequence[ImportedTable], records: Se
             for encoding in Encoding
         }
         for name, param in table.params.items():
-            assert (name, param.type, bits_of(param.value, param.type)) in words
+            kind = param.type_number
+            assert (name, kind, bits_of(param.settable, kind)) in words
         assert set(table.heard_at.values()) <= times
         lines = list(kept.history(summary.key))
         told.append(repr((summary, sorted(table.params.items()), sorted(table.heard_at.items()), lines)))

@@ -479,6 +479,12 @@ class NoReply(ParamClientError, TimeoutError):
         self.waited = waited
         self.hint = hint
 
+    def with_hint(self, hint: str) -> NoReply:
+        """Return the error with a hint; the error itself if it has one already, or there is none to add."""
+        if self.hint or not hint:
+            return self
+        return NoReply(self.awaited, attempts=self.attempts, waited=self.waited, hint=hint)
+
 
 class LinkError(ParamClientError, OSError):
     """The link failed. `__cause__` is the operating system's error, if there is one.

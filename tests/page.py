@@ -6,7 +6,7 @@ import json
 import shutil
 import threading
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,7 +17,7 @@ import anyio.from_thread
 
 from paramclient import ParamCache, ParamClient
 from paramclient.links import SimLink
-from paramclient.model.values import ParamType, Value
+from paramclient.model.values import ParamType, WireValue
 from paramclient.service import Hub, Listening, Settings, serve
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, Vehicle
 from paramclient.sim.param_table import Entry
@@ -31,7 +31,7 @@ BROWSER_OPTIONS = [
     *("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
 ]
-HOSTILE: dict[str, Value | tuple[ParamType, Value]] = {
+HOSTILE: dict[str, WireValue | tuple[ParamType, WireValue]] = {
     "<b>BOLD</b>": 1.0,
     "<iframe/>": (ParamType.INT32, 2),
     "'\"></script>": (ParamType.INT32, 3),
@@ -100,12 +100,19 @@ class Bench:
 
 
 @contextmanager
-def at_work(folder: Path, settings: Settings | None = None, *, port: int = 0) -> Iterator[Bench]:
+def at_work(
+    folder: Path,
+    settings: Settings | None = None,
+    *,
+    port: int = 0,
+    more: Mapping[str, SimVehicle[Any]] | None = None,
+) -> Iterator[Bench]:
     """A service over both autopilots and one with names that nobody should have, its cache in this folder."""
     links: dict[str, SimVehicle[Any]] = {
         "px4": SimVehicle(PX4Vehicle(metadata=True, param_error=True)),
         "ardupilot": SimVehicle(Limited()),
         "odd": SimVehicle(PX4Vehicle(system=3, table=HOSTILE, metadata=True)),
+        **(more or {}),
     }
     url = ""
     listens = threading.Event()

@@ -38,7 +38,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
-from paramclient.model.values import Value
+from paramclient.model.values import WireValue
 from paramclient.protocol import wire
 from paramclient.protocol.ftp.packets import Opcode, Packet
 from paramclient.sim import Vehicle
@@ -120,7 +120,7 @@ def replay(
     name: str,
     *,
     phase: float = 0.0,
-    on_board: Iterable[tuple[float, str, Value]] = (),
+    on_board: Iterable[tuple[float, str, WireValue]] = (),
 ) -> Messages:
     """Send the vehicle the ground station's frames of a log; return its messages that `wire` decodes.
 
@@ -129,7 +129,7 @@ def replay(
             are due. The vehicle has then been on for a second.
         on_board: changes on board: time, parameter, and new value.
     """
-    inputs: list[tuple[float, bytes | tuple[str, Value]]] = [
+    inputs: list[tuple[float, bytes | tuple[str, WireValue]]] = [
         *((record.time, record.data) for record in from_ground(name)),
         *((time, (param, value)) for time, param, value in on_board),
         (read(name)[-1].time + 0.05, b""),

@@ -109,7 +109,10 @@ class _LeapingSelector(selectors.DefaultSelector):
         if ready or timeout == 0:
             return ready
         if loop.threads:  # one of them will wake the loop
-            return super().select(PATIENCE)
+            ready = super().select(PATIENCE)
+            if not ready:
+                raise RuntimeError(f"a thread was at work for {PATIENCE} s; the clock stood still meanwhile")
+            return ready
         if loop.has_told_the_patient():
             return []
         if timeout is None:

@@ -8,7 +8,7 @@ from functools import partial
 from typing import TypedDict, TypeVar
 
 from paramclient.errors import ParamClientError
-from paramclient.model.values import Encoding, Param, ParamType, Trust, Value, encode_value
+from paramclient.model.values import Encoding, Param, ParamType, Trust, WireValue, encode_value
 from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import Event
@@ -36,7 +36,7 @@ Result = TypeVar("Result")
 
 def param_value(
     name: str,
-    value: Value = 0.0,
+    value: WireValue = 0.0,
     *,
     index: int = NO_INDEX,
     count: int = 10,
@@ -206,7 +206,7 @@ class Simulation:
         message = self.outcome(machine.read(key, self.now), limit)
         return machine.table.params[message.param_id]
 
-    def set(self, name: str, value: Value, limit: float = 120.0) -> SetResult:
+    def set(self, name: str, value: WireValue, limit: float = 120.0) -> SetResult:
         """Write one parameter of 1/1."""
         return self.outcome(self.meet().write(name, value, self.now), limit)
 

@@ -33,7 +33,11 @@ def bench(name: str, *arguments: str, code: int = 0) -> str:
 
 
 @pytest.mark.parametrize(
-    "group", ["handshakes over", "requests", "slices", "parsing", "guesses", "origins", "stuck", "hostile"]
+    "group",
+    [
+        *("handshakes over", "requests", "large fleet", "slices", "waiting", "parsing", "guesses", "origins"),
+        *("stuck", "hostile"),
+    ],
 )
 def test_attacks_are_held(group: str) -> None:
     """The quick ones, with time for a machine that does other things besides."""

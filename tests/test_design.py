@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from graphlib import TopologicalSorter
+from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -57,6 +58,7 @@ MAY_IMPORT = {
     "files": {"errors", "model", "protocol.ftp.param_pck"},
     "client": SHELL | {"remote", "sim"},
     "remote": SHELL | {"documents"},
+    "sync": SHELL | {"sim"},
     "metadata": SHELL,
     "provision.apply_rules": {"errors", "model"},
     "provision.planning": {"errors", "model", "provision.apply_rules"},
@@ -235,6 +237,13 @@ SAME_NAME_CONSTANTS = {"MIGRATIONS": "the schema of each store"}
 
 SAME_NAME_CLASSES = {
     "ParamInfo": "the metadata of a parameter, and what a plan needs of it (a Protocol)",
+    **dict.fromkeys(
+        [
+            *("ParamClient", "Component", "ExtParams", "Ftp", "Events", "Changes", "ExtChanges"),
+            *("Heard", "Lost", "Found", "Rebooted", "Resynced", "Contested", "Uncontested"),
+        ],
+        "asynchronous, and blocking",
+    ),
 }
 """Classes of one name, and the reason."""
 
@@ -480,10 +489,13 @@ def test_the_package_offers_what_it_imports_and_nothing_else() -> None:
     assert "__version__" in offered
     imported = {
         alias.asname or alias.name
-        for node in source.body
-        if isinstance(node, ast.ImportFrom) and node.module != "__future__"
+        for block in source.body
+        if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING"
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
         for alias in node.names
     }
+    assert len(imported) > 100
     assert imported <= set(offered)
 
     import paramclient
@@ -502,9 +514,10 @@ def offers_of(module: str) -> list[str]:
 
 
 def bound_names(source: ast.Module) -> set[str]:
-    """The names that a module binds at its top."""
+    """The names that a module binds at its top, also for types only."""
     names: set[str] = set()
-    for node in source.body:
+    blocks = [node.body for node in source.body if isinstance(node, ast.If)]
+    for node in [*source.body, *chain.from_iterable(blocks)]:
         match node:
             case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
                 names.add(node.name)
@@ -532,8 +545,9 @@ def test_importing_the_package_loads_nothing_that_only_some_need() -> None:
     unwanted += ["paramclient.sim", "paramclient.testing", "paramclient.cli", "paramclient.provision"]
     unwanted += ["paramclient.documents", "paramclient.service", "fastapi", "starlette", "uvicorn", "httpx"]
     unwanted += ["filelock", "prometheus_client", "httpx_sse"]
-    unwanted += ["paramclient.remote"]
-    program = f"import sys, paramclient; print([name for name in {unwanted!r} if name in sys.modules])"
+    unwanted += ["paramclient.remote", "paramclient.sync"]
+    loaded = f"[name for name in {unwanted!r} if name in sys.modules]"
+    program = f"import sys; from paramclient import *; print({loaded})"
     run = subprocess.run(
         [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True, timeout=60
     )

@@ -157,6 +157,36 @@ def test_the_check_of_parameter_files_finds_what_does_not_fit(tmp_path: Path) ->
     assert "not on this vehicle (did you mean RTL_ALT" in second
 
 
+@pytest.mark.parametrize("source", ["git+https://git.example/paramclient@1.0", ""])
+def test_the_check_of_parameter_files_installs_from_the_source_that_the_user_has_set(
+    source: str, tmp_path: Path
+) -> None:
+    text = (EXAMPLES / "check-parameters.yml").read_text(encoding="utf-8")
+    [step] = [
+        step
+        for step in yaml.safe_load(text)["jobs"]["check"]["steps"]
+        if "pip install" in step.get("run", "")
+    ]
+    assert step["env"] == {"PARAMCLIENT_SOURCE": "${{ vars.PARAMCLIENT_SOURCE }}"}
+    pip = tmp_path / "pip"
+    pip.write_text('#!/bin/sh\nprintf "%s\\n" "$@"\n')
+    pip.chmod(0o755)
+    done = subprocess.run(
+        ["bash", "-e", "-c", step["run"]],
+        env=os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}", "PARAMCLIENT_SOURCE": source},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        encoding="utf-8",
+        timeout=60,
+        check=False,
+    )
+    if source:
+        assert done.stdout.splitlines() == ["install", f"paramclient[cli] @ {source}"]
+    else:
+        assert done.returncode != 0
+        assert "PARAMCLIENT_SOURCE: Set this variable" in done.stderr
+
+
 def test_the_parameter_files_are_what_the_check_looks_at() -> None:
     """Laid out as the workflow expects them, and each is read."""
     files = [path for path in (EXAMPLES / "parameters").rglob("*") if path.is_file()]

@@ -14,7 +14,7 @@ import anyio.from_thread
 import anyio.lowlevel
 import pytest
 
-from paramclient.model.values import Param, ParamType, Value
+from paramclient.model.values import Param, ParamType, WireValue
 from paramclient.protocol import wire
 from paramclient.protocol.ftp.packets import Opcode, Packet
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, Vehicle
@@ -26,7 +26,7 @@ from tests.live.journal import Journal
 from tests.live.relay import Conditions, RealVehicle
 from tests.live.session import Check, Measured, Session
 
-CHANNELS: dict[str, Value] = {
+CHANNELS: dict[str, WireValue] = {
     f"RC{channel}_{what}": value
     for channel in range(1, 17)
     for what, value in {"DZ": 0.0, "TRIM": 1500.0, "MIN": 1000.0, "MAX": 2000.0}.items()
@@ -42,7 +42,7 @@ ARDUPILOT_TABLE = {
     "RC16_OPTION": (ParamType.INT16, 300),
     "RC15_OPTION": (ParamType.INT16, 0),
 }
-GROUP: dict[str, dict[str, Value | tuple[ParamType, Value]]]
+GROUP: dict[str, dict[str, WireValue | tuple[ParamType, WireValue]]]
 GROUP = {"GRIP_ENABLE": {"GRIP_GRAB": (ParamType.INT16, 1900), "GRIP_REGRAB": 1.5}}
 
 

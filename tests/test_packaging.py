@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import re
 import subprocess
@@ -145,3 +146,32 @@ def test_the_dependencies_of_the_library_and_its_extras(metadata: Message) -> No
 
 def test_the_readme_is_the_description(metadata: Message) -> None:
     assert metadata.get_payload() == (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def test_the_package_imports_its_modules_at_the_first_use_of_a_name() -> None:
+    """The names for type checkers are those that it finds at run time, and `import` alone loads none."""
+    tree = ast.parse(Path(paramclient.__file__).read_text(encoding="utf-8"))
+    typed = {
+        alias.name: node.module
+        for block in tree.body
+        if isinstance(block, ast.If)
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    (homes,) = (
+        ast.literal_eval(node.value)
+        for node in tree.body
+        if isinstance(node, ast.AnnAssign) and ast.unparse(node.target) == "_HOMES" and node.value
+    )
+    assert {name: module for module, names in homes.items() for name in names} == typed
+    assert {*typed, "__version__"} == set(paramclient.__all__)
+    for name in paramclient.__all__:
+        assert getattr(paramclient, name) is not None
+    with pytest.raises(AttributeError, match="nothing"):
+        _ = paramclient.nothing  # type: ignore[attr-defined]
+    code = "import sys, paramclient; print(sorted(name for name in sys.modules if 'paramclient.' in name))"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, encoding="utf-8", check=True, timeout=60
+    )
+    assert done.stdout == "['paramclient.version']\n"

@@ -1,10 +1,10 @@
 #!/bin/sh
-# A shell script on the companion computer: is the battery set up as this vehicle needs it? If not, it is set.
+# A shell script on the companion computer: sets a parameter, such as the number of battery cells, unless it has the value.
 #
-#     sh check.sh http://127.0.0.1:8765 BAT1_N_CELLS 6
+#     sh examples/companion/check.sh http://127.0.0.1:8765 BAT1_N_CELLS 6
 #
-# It needs curl. The token, where the service wants one, stands in the environment variable PARAMCLIENT_TOKEN; curl
-# gets it by a pipe, as anybody may read the arguments of a process.
+# It needs curl. If the service requires a token, it is in the environment variable PARAMCLIENT_TOKEN. curl receives it
+# through a pipe, because every user can read the arguments of a process.
 set -eu
 
 service=${1:-http://127.0.0.1:8765}
@@ -23,7 +23,7 @@ value_of() {
     sed 's/.*"value":\([^,}]*\).*/\1/'
 }
 
-# the service begins to listen before it has heard the vehicle
+# the service listens before it has received the vehicle
 until ask "$service/api/v1/components/1/1" > /dev/null 2>&1; do
     sleep 0.2
 done

@@ -1,6 +1,6 @@
 """A program on the companion computer. It uses the vehicle over the service like over its own link.
 
-    python tune.py http://127.0.0.1:8765 MC_ROLL_P 6.5
+    python examples/companion/tune.py http://127.0.0.1:8765 MC_ROLL_P 6.5
 
 If the service requires a token, it is in the environment variable PARAMCLIENT_TOKEN.
 """

@@ -8,9 +8,10 @@
 - `fleet`: comparison of parameters across vehicles.
 - `interface`: `Store`, the interface of a file and of a shared database.
 - `lock`: lock on a folder or file.
-- `lookup`: vehicles by system id, hardware id or key.
+- `lookup`: vehicles by system id, address, nickname, kind, hardware id or key.
 - `merge`: merge of earlier observations, such as those of logs.
 - `postgres_schema`: schema of the PostgreSQL database.
+- `nicknames`: nicknames of vehicles.
 - `observed_table`: parameters of a live table as observations.
 - `operations`: write operations.
 - `outbox`: local copy of a shared database, with the writes that it has not received yet.

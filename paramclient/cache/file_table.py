@@ -11,9 +11,9 @@ from paramclient.cache.param_columns import StoredParam
 from paramclient.cache.records import CachedSummary, TableState, TableUpdate
 from paramclient.cache.transaction import Transaction
 from paramclient.errors import UsageError
-from paramclient.model.hash_exclusions import hash_of, usual_volatile
 from paramclient.model.identity import Identity, version_difference
 from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.px4_hash import hash_bits, usual_volatile
 from paramclient.model.values import (
     Param,
     Trust,
@@ -137,14 +137,14 @@ class FileTable:
             )
         elif not reference.complete:
             notes.append(
-                "no complete table of this vehicle or firmware is in the cache: whether the file has every "
-                "parameter shows at the first contact"
+                "the cache has no complete table of this vehicle or firmware, so it is not known whether the "
+                "file has every parameter; the next fetch checks this"
             )
         volatile = self._volatile(typed, reference)
         placed = self._placed(typed, reference) if not missing else typed
         crc = None
         if not missing and self._autopilot(kept) == _PX4:
-            crc = hash_of({name: each.bits for name, each in placed.items()}, leave_out=volatile)
+            crc = hash_bits({name: each.bits for name, each in placed.items()}, leave_out=volatile)
         else:
             notes.append("the next fetch downloads the table and replaces these values")
         state = TableState(
@@ -198,7 +198,9 @@ class FileTable:
             UsageError: as `update`.
         """
         unknown = [
-            name for name, each in self.params.items() if each.type is None and name not in reference.rows
+            name
+            for name, each in self.params.items()
+            if each.type_number is None and name not in reference.rows
         ]
         if unknown:
             where = (
@@ -215,14 +217,14 @@ class FileTable:
         name = check_name(written.name)
         if not is_portable_name(name):
             raise UsageError(f"parameter name {name!r}: no parameter file can hold it")
-        kind = known_type(reference.rows[name].type) if written.type is None else written.type
+        kind = known_type(reference.rows[name].type) if written.type_number is None else written.type_number
         bits = written.bits_as(kind)  # its error names value and type
         default = None
         if written.default is not None:
             with suppress(UsageError):
                 default = from_bits(bits_of(written.default, kind), kind)
-        is_raw = isinstance(written.value, bytes)
-        return Param(name, from_bits(bits, kind, is_raw=is_raw), kind, None, bits, Trust.CACHED, default)
+        value = from_bits(bits, kind, is_raw=written.is_raw)
+        return Param(name, value, kind, None, bits, Trust.CACHED, default)
 
     def _placed(self, typed: Mapping[str, Param], reference: _Reference) -> dict[str, Param]:
         """Return the parameters with the indices of the reference, else of PX4's order, which is sorted."""

@@ -7,6 +7,7 @@ transaction runs inside the transaction of its caller.
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -150,8 +151,8 @@ def spread(
     same: dict[tuple[int, bool, int], tuple[Param, list[Holder]]] = {}
     for value, holders in values.items():
         param = read_param(name, *value)
-        bits = 0 if same_bits(param.type, param.bits, 0) else param.bits  # -0 equals 0
-        same.setdefault((param.type, param.is_raw, bits), (param, []))[1].extend(holders)
+        bits = 0 if same_bits(param.type_number, param.bits, 0) else param.bits  # -0 equals 0
+        same.setdefault((param.type_number, param.is_raw, bits), (param, []))[1].extend(holders)
     groups = sorted(same.values(), key=lambda group: (-len(group[1]), group[0].bits))
     is_clear = len(groups) < 2 or len(groups[0][1]) > len(groups[1][1])
     shared = tuple(
@@ -192,16 +193,21 @@ def fleet_diff(
     return FleetDiff(component, tuple(owners.values()), tuple(_dated(transaction, owners, names)))
 
 
-def names_like(transaction: Transaction, component: int, pattern: str) -> list[str]:
-    """Return the names of all vehicles that match a shell pattern, in alphabetical order.
+def names_like(transaction: Transaction, component: int, patterns: Iterable[str]) -> dict[str, list[str]]:
+    """Return by shell pattern the matching names of all vehicles, in alphabetical order.
 
-    A text without pattern characters is returned unchanged, whether any vehicle has it or not.
+    A text without pattern characters has itself as its only name, whether any vehicle has it or not.
     """
-    start = pattern[: next((at for at, sign in enumerate(pattern) if sign in "*?["), len(pattern))]
-    if start == pattern:
-        return [pattern]
-    names = transaction.names_between(component, start, f"{start}\U0010ffff")
-    return sorted(name for name in names if fnmatchcase(name, pattern))
+    starts = {each: re.split(r"[*?\[]", each, maxsplit=1)[0] for each in patterns}
+    sought = [start for each, start in starts.items() if start != each]
+    names: list[str] = []
+    if sought:
+        end = max(f"{start}\U0010ffff" for start in sought)
+        names = sorted(transaction.names_between(component, min(sought), end))
+    return {
+        each: [each] if start == each else [name for name in names if fnmatchcase(name, each)]
+        for each, start in starts.items()
+    }
 
 
 def _dated(

@@ -1,24 +1,31 @@
-"""Vehicles in the cache by name: system id, hardware id or key.
+"""Vehicles in the cache by name: system id, address, nickname, kind, hardware id or key.
 
 The only place that decides which vehicle a name means. In this order:
 
 1. A key, as `Identity.key` has it.
-2. One to three decimal digits: a system id, and nothing else.
-3. `uid:` and at least six hexadecimal digits: the beginning of a hardware id. `/` and a system id may follow
+2. One to three decimal digits: a system id, and nothing else. With `/` and a component id: an address.
+3. A nickname.
+4. `px4` or `ardupilot`: the only vehicle with this autopilot.
+5. `uid:` and at least six hexadecimal digits: the beginning of a hardware id. `/` and a system id may follow
    for a hardware id that many vehicles share.
-4. Four or more hexadecimal digits: a hardware id in full, also when all of its digits are decimal.
+6. Four or more hexadecimal digits: a hardware id in full, also when all of its digits are decimal.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Final
 
 from paramclient.cache.records import CachedVehicle
 from paramclient.errors import AmbiguousVehicle, UnknownVehicle
+from paramclient.model.identity import autopilot_name
 
-__all__ = ["find_vehicle", "is_vehicle_name"]
+__all__ = ["KINDS", "address_of", "find_vehicle", "is_vehicle_name"]
+
+KINDS: Final = ("px4", "ardupilot")
+"""Autopilots that name a vehicle where only one has them."""
 
 PREFIX_DIGITS_MIN: Final = 6
 """Hexadecimal digits that the beginning of a hardware id has at least: fewer fit by accident, as those of a
@@ -28,12 +35,22 @@ VEHICLES_LISTED_MAX: Final = 50
 
 _SYSTEM_ID: Final = re.compile(r"[0-9]{1,3}")
 _UID: Final = re.compile(r"(?P<prefix>uid:)?(?P<digits>[0-9a-f]+)(/(?P<system>[0-9]{1,3}))?", re.IGNORECASE)
-_NAME: Final = re.compile(r"uid:.*|system:.*|[0-9]+|[0-9a-f]{4,}(/[0-9]*)?", re.IGNORECASE)
+_ADDRESS: Final = re.compile(r"([0-9]{1,3})/([0-9]{1,3})")
+_NAME: Final = re.compile(
+    rf"uid:.*|system:.*|[0-9]+|{_ADDRESS.pattern}|[0-9a-f]{{4,}}(/[0-9]*)?|{'|'.join(KINDS)}", re.IGNORECASE
+)
+_NO_NICKNAMES: Final[Mapping[str, str]] = MappingProxyType({})
 
 
 def is_vehicle_name(text: str) -> bool:
     """Return whether a text can only be the name of a vehicle. The cache need not have that vehicle."""
     return _NAME.fullmatch(text) is not None
+
+
+def address_of(text: str) -> tuple[int, int] | None:
+    """Return the system and component id of an address such as `4/1`; None for another name."""
+    found = _ADDRESS.fullmatch(text)
+    return None if found is None else (int(found[1]), int(found[2]))
 
 
 def find_vehicle(
@@ -43,21 +60,23 @@ def find_vehicle(
     place: str,
     system: int | None = None,
     component: int | None = None,
+    nicknames: Mapping[str, str] = _NO_NICKNAMES,
 ) -> CachedVehicle:
     """Return the only vehicle of the cache that fits.
 
     Args:
         kept: the vehicles in the cache.
-        name: a system id, a hardware id or a key, see above; None for any.
+        name: one of the names above; None for any.
         place: the cache, for messages.
         system: only a vehicle with this system id.
         component: only a vehicle of which the table of this component is kept.
+        nicknames: keys of vehicles by nickname.
 
     Raises:
         UnknownVehicle: none fits, or the name can be no vehicle's.
         AmbiguousVehicle: several fit.
     """
-    named, problem = (kept, None) if name is None else _named(kept, name)
+    named, problem = (kept, None) if name is None else _named(kept, name, nicknames)
     fits = [
         known
         for known in named
@@ -81,7 +100,9 @@ def find_vehicle(
     )
 
 
-def _named(kept: Sequence[CachedVehicle], name: str) -> tuple[Sequence[CachedVehicle], str | None]:
+def _named(
+    kept: Sequence[CachedVehicle], name: str, nicknames: Mapping[str, str]
+) -> tuple[Sequence[CachedVehicle], str | None]:
     """Return the vehicles that a name fits, and why it fits none where the name itself is the reason."""
     if same := [known for known in kept if known.key == name]:
         return same, None
@@ -89,6 +110,17 @@ def _named(kept: Sequence[CachedVehicle], name: str) -> tuple[Sequence[CachedVeh
         is_valid = 1 <= int(name) <= 255
         problem = f"no vehicle has system id {int(name)}" if is_valid else "system ids are 1 to 255"
         return [known for known in kept if known.identity.system == int(name)], problem
+    if (address := address_of(name)) is not None:
+        fits = [known for known in kept if known.identity.system == address[0]]
+        problem = f"no vehicle has system id {address[0]} and a table of component {address[1]}"
+        return [known for known in fits if address[1] in known.components], problem
+    key = next((each for nickname, each in nicknames.items() if nickname.lower() == name.lower()), None)
+    if key is not None:
+        problem = f"{name} is the nickname of {key}, which it does not hold"
+        return [known for known in kept if known.key == key], problem
+    if name.lower() in KINDS:
+        fits = [known for known in kept if autopilot_name(known.identity.autopilot) == name.lower()]
+        return fits, f"no vehicle has the autopilot {name.lower()}"
     uid = _UID.fullmatch(name)
     if uid is None:
         if name.lower().startswith("uid:"):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import Any, Final
 
 from paramclient.cache.param_columns import BY_VEHICLE, StoredParam
 from paramclient.cache.records import CachedSummary, CachedVehicle, TableUpdate
 from paramclient.cache.tables import HISTORY_ENTRIES_MAX, apply_update, check_times, hashed, save
-from paramclient.cache.transaction import Line, Transaction
+from paramclient.cache.transaction import HistoryLine, Transaction
 
 __all__ = ["merge"]
 
@@ -54,7 +54,7 @@ class _TableMerge:
     owner: int | None = None
     goes_on: bool = False
     overtaken: dict[str, StoredParam] = field(default_factory=dict)
-    lines: list[Line] = field(default_factory=list)
+    lines: list[HistoryLine] = field(default_factory=list)
 
     def take(self, update: TableUpdate) -> None:
         """Merge one update."""
@@ -83,9 +83,9 @@ class _TableMerge:
         kept = self.transaction.table(self.owner)
         for item in found:
             new = kept.get(item.name)
-            if new is None or item.same_value(new) or self._lines(item.name, item.heard_at, new.heard_at):
+            if new is None or item.same_value(new) or self._values(item.name, item.heard_at, new.heard_at):
                 continue
-            self.lines.append((new.heard_at, item.name, BY_VEHICLE, *item.value, *new.value))
+            self.lines.append(HistoryLine.of(new.heard_at, item.name, BY_VEHICLE, item.value, new.value))
 
     def finish(self) -> None:
         """Insert the new history lines by time, and trim the history."""
@@ -93,14 +93,14 @@ class _TableMerge:
         if not self.lines:
             return
         assert self.owner is not None
-        lines: list[tuple[int | None, Line]] = list(self.transaction.lines(self.owner))
+        lines: list[tuple[int | None, HistoryLine]] = list(self.transaction.lines(self.owner))
         for new in self.lines:
-            later = (place for place, (_, line) in enumerate(lines) if line[0] > new[0])
+            later = (place for place, (_, line) in enumerate(lines) if line.at > new.at)
             lines.insert(next(later, len(lines)), (None, new))
         dropped, lines = lines[:-HISTORY_ENTRIES_MAX], lines[-HISTORY_ENTRIES_MAX:]
         self.transaction.replace_lines(self.owner, lines)
         if dropped:
-            self.transaction.raise_known_since(self.owner, max(line[0] for _, line in dropped))
+            self.transaction.raise_known_since(self.owner, max(line.at for _, line in dropped))
 
     def _save(self, update: TableUpdate, vehicle: CachedVehicle | None) -> None:
         if vehicle is not None and vehicle.last_seen > update.at:
@@ -144,15 +144,15 @@ class _TableMerge:
         self.transaction.record_added_names(self.owner, added)
         self.lines += changes
 
-    def _line(self, old: StoredParam, new: StoredParam) -> Iterator[Line]:
+    def _line(self, old: StoredParam, new: StoredParam) -> Iterator[HistoryLine]:
         """Yield the history line of a change between two observations, unless it exists."""
         if old.same_value(new):
             return
-        around = self._lines(new.name, new.heard_at - SAME_CHANGE_MAX, new.heard_at + SAME_CHANGE_MAX)
+        around = self._values(new.name, new.heard_at - SAME_CHANGE_MAX, new.heard_at + SAME_CHANGE_MAX)
         if new.value not in around:
-            yield (new.heard_at, new.name, new.by, *old.value, *new.value)
+            yield HistoryLine.of(new.heard_at, new.name, new.by, old.value, new.value)
 
-    def _lines(self, name: str, after: float, until: float) -> list[Line]:
+    def _values(self, name: str, after: float, until: float) -> list[tuple[Any, ...]]:
         """Return the new values of a parameter in a period, from its history lines."""
         assert self.owner is not None
         return self.transaction.values_between(self.owner, name, after, until)

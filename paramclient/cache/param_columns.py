@@ -17,7 +17,16 @@ from typing import Any, Final, NamedTuple
 
 from paramclient.cache.cells import MASK_64, Damaged, cells, signed
 from paramclient.model.params import CACHED, COMPACT_NO_INDEX, Params, iter_unpack_fields, pack_fields
-from paramclient.model.values import Param, ParamType, Trust, Value, bits_of, from_bits, known_type, same_bits
+from paramclient.model.values import (
+    Param,
+    ParamType,
+    Trust,
+    WireValue,
+    bits_of,
+    from_bits,
+    known_type,
+    same_bits,
+)
 
 __all__ = [
     "BY_VEHICLE",
@@ -125,7 +134,7 @@ class StoredParam(_Fields):
     def __new__(
         cls, param: Param, heard_at: float, volatile: bool | None = None, by: str = BY_VEHICLE
     ) -> StoredParam:
-        number = int(param.type)
+        number = int(param.type_number)
         return _new(
             cls,
             (
@@ -341,7 +350,7 @@ def read_param(
     return Param(name, value, known_type(number), index, bits & MASK_64, Trust.CACHED, default)
 
 
-def _value(number: int, bits: int, is_raw: bool) -> Value:
+def _value(number: int, bits: int, is_raw: bool) -> WireValue:
     bits &= MASK_64
     try:
         return from_bits(bits, number, is_raw=is_raw)

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 
 from paramclient.cache import tables
 from paramclient.cache.cells import time_cell
@@ -33,7 +34,7 @@ from paramclient.cache.tables import (
     write_lines,
     write_state,
 )
-from paramclient.cache.transaction import Line, NumberedLine, Transaction
+from paramclient.cache.transaction import HistoryLine, NumberedLine, Transaction
 
 __all__ = ["TableHistory", "reconcile"]
 
@@ -63,7 +64,7 @@ class TableHistory:
         new_added_names: new or earlier times from the inserted observations.
     """
 
-    lines: list[tuple[int | None, Line]]
+    lines: list[tuple[int | None, HistoryLine]]
     known_since: float | None = None
     added: Mapping[str, float] = field(default_factory=dict)
     new_added_names: dict[str, float] = field(default_factory=dict)
@@ -79,54 +80,56 @@ class TableHistory:
             ahead: new value of its last line before `lines`; None if there is none.
         """
         name, at, by = seen.name, seen.heard_at, seen.by
-        place = next((n for n, (_, line) in enumerate(self.lines) if line[1] == name and line[0] > at), None)
+        place = next(
+            (n for n, (_, line) in enumerate(self.lines) if line.name == name and line.at > at), None
+        )
         for _, line in self.lines[:place]:
-            if line[1] == name:
-                ahead = line[6:]
+            if line.name == name:
+                ahead = line.new
         is_known = ahead is not None
         has_come_back = ahead is not None and ahead[0] is None  # with this value, or an older one
         if place is None:
             if kept is None or seen.same_value(kept):
                 return
             if has_come_back:
-                self._insert((kept.heard_at, name, BY_VEHICLE, *seen.value, *kept.value))
+                self._insert(HistoryLine.of(kept.heard_at, name, BY_VEHICLE, seen.value, kept.value))
                 return
             since = self._added_at(name, self.known_since)
             is_new = since is None or at < since
             if is_known or not is_new:
-                self._insert((at, name, by, *kept.value, *seen.value))
+                self._insert(HistoryLine.of(at, name, by, kept.value, seen.value))
             else:
                 self.new_added_names[name] = at
-            self._insert((kept.heard_at, name, BY_VEHICLE, *seen.value, *kept.value))
+            self._insert(HistoryLine.of(kept.heard_at, name, BY_VEHICLE, seen.value, kept.value))
             return
-        number, (later, _, later_by, *values) = self.lines[place]
-        old, new = tuple(values[:3]), tuple(values[3:])
+        number, line = self.lines[place]
+        later, old, new = line.at, line.old, line.new
         if seen.has_value(old) or has_come_back:  # the time at which it became `old` is not known
             return
         added_at = self._added_at(name)
         if added_at is not None and at < added_at <= later and not is_known:  # it was `old` at `added_at`
             self.new_added_names[name] = at
-            self._insert((added_at, name, BY_VEHICLE, *seen.value, *old), before=place)
+            self._insert(HistoryLine.of(added_at, name, BY_VEHICLE, seen.value, old), before=place)
             return
         if seen.has_value(new):
             if later - at > SAME_CHANGE_MAX:  # the change was earlier than recorded
                 del self.lines[place]
-                self._insert((at, name, by, *old, *new))
+                self._insert(HistoryLine.of(at, name, by, old, new))
             return
-        self.lines[place] = (number, (later, name, later_by, *seen.value, *new))
-        self._insert((at, name, by, *old, *seen.value))
+        self.lines[place] = (number, HistoryLine.of(later, name, line.by, seen.value, new))
+        self._insert(HistoryLine.of(at, name, by, old, seen.value))
 
     def _added_at(self, name: str, default: float | None = None) -> float | None:
         """Return the recorded time before which a name is unknown; a new record is the earlier one."""
         return self.new_added_names.get(name, self.added.get(name, default))
 
-    def add(self, line: Line) -> None:
+    def add(self, line: HistoryLine) -> None:
         """Insert a line by its time."""
         self._insert(line)
 
-    def _insert(self, line: Line, *, before: int | None = None) -> None:
+    def _insert(self, line: HistoryLine, *, before: int | None = None) -> None:
         """Insert a line by its time, but at most at position `before`."""
-        place = next((n for n, (_, each) in enumerate(self.lines) if each[0] > line[0]), len(self.lines))
+        place = next((n for n, (_, each) in enumerate(self.lines) if each.at > line.at), len(self.lines))
         self.lines.insert(place if before is None else min(place, before), (None, line))
 
 
@@ -243,7 +246,7 @@ def _first_changes(
     owner: int,
     before: Mapping[str, StoredParam],
     added: Mapping[str, float],
-    lines: Sequence[Line],
+    lines: Sequence[HistoryLine],
 ) -> list[tuple[str, float]]:
     """Return the observation times of first-table values that change now, as their rows lose these times.
 
@@ -258,7 +261,7 @@ def _first_changes(
     until = math.inf if known_since is None else known_since
     first = {
         name: before[name].heard_at if name in before else added.get(name, math.inf)
-        for name in {line[1] for line in lines}
+        for name in {line.name for line in lines}
     }
     changed = {name for name, at in first.items() if at < until}
     if changed:
@@ -310,20 +313,20 @@ def _write_past(
     transaction: Transaction,
     owner: int,
     older: Sequence[StoredParam],
-    lines: Sequence[Line],
+    lines: Sequence[HistoryLine],
     seen: _Seen,
 ) -> None:
     """Insert lines and overtaken observations into the history, by time."""
-    times = [item.heard_at for item in older] + [line[0] for line in lines]
+    times = [item.heard_at for item in older] + [line.at for line in lines]
     if not times:
         return
     since = min(times)
     if not older and not since < transaction.last_line_at(owner) <= seen.horizon:
-        write_lines(transaction, owner, sorted(lines, key=_time_of))
+        write_lines(transaction, owner, sorted(lines, key=attrgetter("at")))
         return
     _, _, known_since = transaction.component_row(owner)
     kept: list[NumberedLine] = transaction.lines_from(owner, since)
-    ahead = max((place for place, (_, line) in enumerate(kept, 1) if line[0] > seen.horizon), default=0)
+    ahead = max((place for place, (_, line) in enumerate(kept, 1) if line.at > seen.horizon), default=0)
     kept = kept[ahead:]
     past = TableHistory(list(kept), known_since, transaction.first_times(owner))
     for item in older:
@@ -350,7 +353,3 @@ def _respectful(update: TableUpdate, table: CachedSummary) -> TableState | None:
         return state
     has_heard_less = state.count == table.count or (state.count is None and not update.params)
     return None if has_heard_less else state
-
-
-def _time_of(line: Line) -> float:
-    return float(line[0])

@@ -27,7 +27,7 @@ from paramclient.cache.transaction import Transaction
 from paramclient.errors import NotInCache
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import Value, is_portable_name, known_type
+from paramclient.model.values import WireValue, is_portable_name, known_type
 
 __all__ = [
     "CLOCK_SLACK",
@@ -180,8 +180,7 @@ _Taken = tuple[int, int, int] | None
 def _first_events_after(transaction: Transaction, owner: int, when: float) -> dict[str, _Taken]:
     """Return, by name, the value before the first event after a given time."""
     events: list[tuple[int, int, str, _Taken]] = [
-        (line, 0, name, (old_type, old_bits, old_is_raw))
-        for line, (_, name, _, old_type, old_bits, old_is_raw, *_) in transaction.lines(owner, when)
+        (number, 0, line.name, line.old) for number, line in transaction.lines(owner, when)
     ]
     for line, name in transaction.added_names_after(owner, when):
         events.append((line, 1, name, None))  # after the last line at that time
@@ -228,8 +227,8 @@ def _unpacked(blob: bytes) -> tuple[Identity, dict[str, WrittenParam]]:
 
 def written_cells(param: WrittenParam) -> tuple[str, int | None, int | str | None, int | str | None]:
     """Return a parameter's name, type, value and default in JSON types."""
-    number = None if param.type is None else int(param.type)
-    return param.name, number, _cell(param.value), _cell(param.default)
+    number = None if param.type_number is None else int(param.type_number)
+    return param.name, number, _cell(param.settable), _cell(param.default)
 
 
 def read_written(cells: Sequence[Any]) -> WrittenParam:
@@ -241,7 +240,7 @@ def read_written(cells: Sequence[Any]) -> WrittenParam:
     return WrittenParam(str(name), written, kind, _written(default))
 
 
-def _cell(value: Value | None) -> int | str | None:
+def _cell(value: WireValue | None) -> int | str | None:
     """Encode a value without loss: a float by its 8 bytes, or by 4 bytes if a float32 is exact."""
     if value is None or isinstance(value, int):
         return value
@@ -256,7 +255,7 @@ def _cell(value: Value | None) -> int | str | None:
     return f"f{narrow.hex()}" if is_whole else f"d{wide.hex()}"
 
 
-def _written(cell: Any) -> Value | None:
+def _written(cell: Any) -> WireValue | None:
     if cell is None or isinstance(cell, int):
         return cell
     kind, data = cell[0], bytes.fromhex(cell[1:])

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Sized
+from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -19,6 +20,7 @@ from paramclient.cache.file_table import AddedTable, FileTable
 from paramclient.cache.fleet import FleetDiff
 from paramclient.cache.interface import Store
 from paramclient.cache.lookup import find_vehicle
+from paramclient.cache.nicknames import Nicknames
 from paramclient.cache.operations import Merge, Remove, Save, SaveExt, StoreSnapshot
 from paramclient.cache.records import (
     CacheChange,
@@ -333,12 +335,45 @@ class ParamCache:
         """Return all vehicles, the last seen first."""
         return self._store.read(lambda transaction: transaction.vehicles())
 
+    @property
+    def nicknames(self) -> Mapping[str, str]:
+        """The keys of vehicles by nickname: those of this computer, in a file beside `path`.
+
+        Raises:
+            CacheError: the file cannot be read.
+        """
+        return Nicknames.beside(self.path).load()
+
+    def set_nickname(self, vehicle: str, nickname: str | None) -> str:
+        """Give a vehicle a nickname, by which every call and the command line then know it.
+
+        Args:
+            vehicle: the vehicle, as in `components`.
+            nickname: 1 to 32 letters, digits, `_` and `-`, in place of the previous one; None for none.
+
+        Returns:
+            The key of the vehicle.
+
+        Raises:
+            UsageError: the nickname is not valid, or is that of another vehicle.
+            UnknownVehicle, AmbiguousVehicle: as `components`.
+            CacheError: the nicknames cannot be written.
+        """
+        key = self.components(vehicle)[0].key
+        names = Nicknames.beside(self.path)
+        if nickname is None:
+            names.remove(key)
+        else:
+            names.set(key, nickname)
+        return key
+
     def components(self, vehicle: str | None = None) -> list[CachedSummary]:
         """Return all tables without parameters, ordered as `vehicles()`, then by component id.
 
         Args:
-            vehicle: only this vehicle: its system id (`"4"`), `uid:` with at least 6 digits of its hardware
-                id, its full hardware id, or its key.
+            vehicle: only this vehicle: its system id (`"4"`), its address (`"4/1"`), its nickname, `px4` or
+                `ardupilot` if only one has that autopilot, `uid:` with at least 6 digits of its hardware id,
+                its full hardware id, or its key.
 
         Raises:
             UnknownVehicle: no vehicle in the cache has this name.
@@ -525,18 +560,53 @@ class ParamCache:
         number = component or (written and written.component) or 1
 
         def work(transaction: Transaction) -> FleetDiff:
-            chosen = {name: fleet.names_like(transaction, number, name) for name in names}
+            chosen = fleet.names_like(transaction, number, names)
             plain: dict[str, None] = dict.fromkeys(each for like in chosen.values() for each in like)
             found = fleet.fleet_diff(transaction, number, plain if written is None else written)
-            if not found.vehicles:
-                raise NotInCache(f"the cache {self.place} holds no table of component {number}")
-            held = {each.name for each in found.names if each.values}
-            for name, like in chosen.items():
-                if held.isdisjoint(like):
-                    raise NotInCache(f"no vehicle in the cache {self.place} has a parameter {name}")
+            self._check_fleet(
+                number, found.vehicles, chosen, {each.name for each in found.names if each.values}
+            )
             return found
 
         return self._store.read(work)
+
+    def fleet_names(self, names: Iterable[str], *, component: int) -> tuple[int, list[str]]:
+        """Return what `fleet_diff` would compare, without a comparison.
+
+        Args:
+            names: names and shell patterns.
+            component: component id.
+
+        Returns:
+            The number of vehicles, and the parameter names.
+
+        Raises:
+            CacheError: no vehicle has a table of the component, or none has a parameter of such a name.
+        """
+        given = tuple(names)
+
+        def work(transaction: Transaction) -> tuple[int, list[str]]:
+            vehicles = transaction.tables_of(component)
+            chosen = fleet.names_like(transaction, component, given)
+            compared = dict.fromkeys(each for like in chosen.values() for each in like)
+            self._check_fleet(component, vehicles, chosen, compared.keys())
+            return len(vehicles), list(compared)
+
+        return self._store.read(work)
+
+    def _check_fleet(
+        self, component: int, vehicles: Sized, chosen: Mapping[str, Iterable[str]], held: AbstractSet[str]
+    ) -> None:
+        """Check that there are vehicles, and that each pattern has a name in `held`.
+
+        Raises:
+            NotInCache: the reason.
+        """
+        if not vehicles:
+            raise NotInCache(f"the cache {self.place} holds no table of component {component}")
+        for name, like in chosen.items():
+            if held.isdisjoint(like):
+                raise NotInCache(f"no vehicle in the cache {self.place} has a parameter {name}")
 
     def subscribe(self, told: Callable[[CacheChange], None]) -> Callable[[], None]:
         """Call a function after each write of another station to a table of the database.
@@ -642,7 +712,12 @@ class ParamCache:
     ) -> str:
         """Return the key of the only vehicle that matches; see `paramclient.cache.lookup`."""
         return find_vehicle(
-            transaction.vehicles(), vehicle, place=self.place, system=system, component=component
+            transaction.vehicles(),
+            vehicle,
+            place=self.place,
+            system=system,
+            component=component,
+            nicknames={} if vehicle is None else self.nicknames,
         ).key
 
 

@@ -16,7 +16,7 @@ from paramclient.cache.cells import are_times, time_cell
 from paramclient.cache.observed_table import HeardParams
 from paramclient.cache.param_columns import BY_VEHICLE, StoredParam
 from paramclient.cache.records import CachedComponent, HistoryEntry, TableState, TableUpdate
-from paramclient.cache.transaction import Line, Transaction
+from paramclient.cache.transaction import NO_VALUE, HistoryLine, Transaction
 from paramclient.model.identity import Identity
 
 __all__ = [
@@ -88,7 +88,7 @@ def forget_other_firmware(transaction: Transaction, identity: Identity) -> None:
 
 def apply_update(
     update: TableUpdate, before: Mapping[str, StoredParam], stays: Collection[str] = ()
-) -> tuple[Mapping[str, StoredParam], list[Line], Iterable[tuple[str, float]]]:
+) -> tuple[Mapping[str, StoredParam], list[HistoryLine], Iterable[tuple[str, float]]]:
     """Return the rows after an update, its history lines, and the new names with their times.
 
     Args:
@@ -104,8 +104,8 @@ def apply_update(
     added: list[tuple[str, float]] = []
     observations = list(update.params)
     heard = {item.name for item in observations}
-    lines: list[Line] = [
-        (update.removal_time(name), name, BY_VEHICLE, *after.pop(name).value, None, None, None)
+    lines: list[HistoryLine] = [
+        HistoryLine.of(update.removal_time(name), name, BY_VEHICLE, after.pop(name).value, NO_VALUE)
         for name in dict.fromkeys(before if update.replace else update.removed)
         if name in before and name not in heard and name not in stays
     ]
@@ -116,7 +116,7 @@ def apply_update(
         if old is None:
             added.append((name, item.heard_at))
         elif not old.same_value(item):
-            lines.append((item.heard_at, name, item.by, *old.value, *item.value))
+            lines.append(HistoryLine.of(item.heard_at, name, item.by, old.value, item.value))
     return after, lines, added
 
 
@@ -144,7 +144,7 @@ def hashed(rows: Mapping[str, StoredParam]) -> dict[str, tuple[int, int, int]]:
     return {name: row.hashed for name, row in rows.items() if row.hashed is not None}
 
 
-def write_lines(transaction: Transaction, owner: int, lines: Sequence[Line]) -> None:
+def write_lines(transaction: Transaction, owner: int, lines: Sequence[HistoryLine]) -> None:
     """Append history lines, and delete the oldest beyond `HISTORY_ENTRIES_MAX`."""
     if not lines:
         return

@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final, TypeAlias
+from typing import Any, ClassVar, Final, NamedTuple, TypeAlias
 
 from paramclient.cache.cells import Damaged, cells, identity_cells, read_identity, time_cell
 from paramclient.cache.ext_records import (
@@ -25,11 +25,57 @@ from paramclient.cache.records import CachedSummary, CachedVehicle, HistoryEntry
 from paramclient.model.ext_params import ExtParam
 from paramclient.model.values import Trust
 
-__all__ = ["ExtState", "Line", "NumberedLine", "Transaction"]
+__all__ = ["NO_VALUE", "ExtState", "HistoryLine", "LineValue", "NumberedLine", "Transaction"]
 
-Line: TypeAlias = tuple[Any, ...]
-"""A history line: at, name, by; type, bits, is_raw of the old value, and of the new one, or three None."""
-NumberedLine: TypeAlias = tuple[int, Line]
+LineValue: TypeAlias = tuple[int, int, int] | tuple[None, None, None]
+"""Type, bits and is_raw of a value, as in `StoredParam.value`; or `NO_VALUE`."""
+NO_VALUE: Final = (None, None, None)
+"""The new value of a parameter that was removed."""
+
+
+class HistoryLine(NamedTuple):
+    """A line of history as it is stored: columns of the table `history`.
+
+    To add a column: add a field here and its letter to `_LINE_CELLS`, and add the column to the table in
+    `sqlite_schema` and `postgres_schema`, with a new version of each. Users see a line as a `HistoryEntry`,
+    which `_entry` creates. Lines of extended parameters are `ExtLine` in `ext_records`.
+
+    Attributes:
+        at: unix seconds at which the new value was received.
+        name: param_id.
+        by: author of the change.
+        old_type, old_bits, old_is_raw: the previous value.
+        new_type, new_bits, new_is_raw: the new value; None if the parameter was removed.
+    """
+
+    at: float
+    name: str
+    by: str
+    old_type: int
+    old_bits: int
+    old_is_raw: int
+    new_type: int | None
+    new_bits: int | None
+    new_is_raw: int | None
+
+    @classmethod
+    def of(cls, at: float, name: str, by: str, old: tuple[int, int, int], new: LineValue) -> HistoryLine:
+        """Return the line of a change from one value to another, or to `NO_VALUE`."""
+        return cls(at, name, by, *old, *new)
+
+    @property
+    def old(self) -> tuple[int, int, int]:
+        """The previous value: type, bits and is_raw."""
+        return self[3:6]
+
+    @property
+    def new(self) -> LineValue:
+        """The new value, or `NO_VALUE`."""
+        values: LineValue = self[6:9]  # type: ignore[assignment]  # all three are None, or none is
+        return values
+
+
+NumberedLine: TypeAlias = tuple[int, HistoryLine]
 """A history line with its number."""
 
 # Columns of a vehicle, in the order of `identity_cells`.
@@ -37,7 +83,9 @@ _IDENTITY: Final = (
     "system, link, uid, autopilot, vehicle_type, firmware, git_hash,"
     " board, vendor_id, product_id, capabilities"
 )
-_LINE: Final = "at, name, by, old_type, old_bits, old_is_raw, new_type, new_bits, new_is_raw"
+_LINE: Final = ", ".join(HistoryLine._fields)
+_LINE_CELLS: Final = "fssiiiIII"  # the types of these columns, see `cells`
+_LINE_MARKS: Final = ", ".join("?" * len(HistoryLine._fields))
 _SUMMARY: Final = "s.id, vehicle, component, at, reason, size, s.hash, s.complete"
 
 
@@ -224,7 +272,7 @@ class Transaction(ABC):
         """Return the history of a vehicle, newest last."""
         end = "" if limit is None or limit < 0 else f" LIMIT {int(limit)}"
         rows = self._all(
-            "SELECT at, component, name, by, old_type, old_bits, old_is_raw, new_type, new_bits, new_is_raw"
+            f"SELECT component, {_LINE}"
             " FROM history h JOIN component c ON c.id = owner"
             " WHERE vehicle = ? AND component = coalesce(?, component) AND name = coalesce(?, name)"
             f" AND at >= coalesce(?, at) ORDER BY h.id DESC{end}",
@@ -243,10 +291,10 @@ class Transaction(ABC):
         where = " AND id >= (SELECT min(id) FROM history WHERE owner = ? AND at > ?)"
         return self._lines(where, (owner, owner, since))
 
-    def add_lines(self, owner: int, lines: Sequence[Line]) -> None:
+    def add_lines(self, owner: int, lines: Sequence[HistoryLine]) -> None:
         """Append history lines in this order."""
         self._many(
-            f"INSERT INTO history (owner, {_LINE}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            f"INSERT INTO history (owner, {_LINE}) VALUES (?, {_LINE_MARKS})",
             [(owner, *line) for line in lines],
         )
 
@@ -262,7 +310,9 @@ class Transaction(ABC):
         self._do("DELETE FROM history WHERE owner = ? AND id <= ?", (owner, last))
         return float(at)
 
-    def replace_lines(self, owner: int, lines: Sequence[tuple[int | None, Line]], *, start: int = 0) -> None:
+    def replace_lines(
+        self, owner: int, lines: Sequence[tuple[int | None, HistoryLine]], *, start: int = 0
+    ) -> None:
         """Replace the history lines of a table, in this order, with new numbers.
 
         Args:
@@ -377,7 +427,7 @@ class Transaction(ABC):
         return [(since, until) for since, until in (cells(row, "ff") for row in found)]
 
     def put_past(
-        self, owner: int, lines: Sequence[Line], clock_rollbacks: Iterable[tuple[float, float]]
+        self, owner: int, lines: Sequence[HistoryLine], clock_rollbacks: Iterable[tuple[float, float]]
     ) -> Sequence[int]:
         """Replace history and clock_rollbacks of a table. Return the numbers of the lines."""
         for table in ("history", "birth", "setback"):
@@ -628,18 +678,19 @@ class Transaction(ABC):
     def _insert(self, sql: str, values: Sequence[object]) -> int:
         """Insert a row into a table with an `id`, and return the id."""
 
-    def _put_lines(self, owner: int, lines: Sequence[Line], start: int = 0) -> Sequence[int]:
+    def _put_lines(self, owner: int, lines: Sequence[HistoryLine], start: int = 0) -> Sequence[int]:
         numbers = self._numbers(len(lines))  # above the deleted ones, so that added refer to either clearly
         self._do("DELETE FROM history WHERE owner = ? AND id >= ?", (owner, start))
         self._many(
-            f"INSERT INTO history (id, owner, {_LINE}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            f"INSERT INTO history (id, owner, {_LINE}) VALUES (?, ?, {_LINE_MARKS})",
             [(number, owner, *line) for number, line in zip(numbers, lines, strict=True)],
         )
         return numbers
 
     def _lines(self, where: str, values: Sequence[object]) -> list[NumberedLine]:
         found = self._all(f"SELECT id, {_LINE} FROM history WHERE owner = ?{where} ORDER BY id", values)
-        return [(number, tuple(line)) for number, *line in (cells(row, "ifssiiiIII") for row in found)]
+        rows = (cells(row, f"i{_LINE_CELLS}") for row in found)
+        return [(number, HistoryLine._make(line)) for number, *line in rows]
 
     @abstractmethod
     def _numbers(self, count: int) -> Sequence[int]:
@@ -671,15 +722,15 @@ def _summary(row: Sequence[object]) -> tuple[int, CachedSummary]:
 
 
 def _entry(row: Sequence[object]) -> HistoryEntry:
-    at, component, name, by, *values = cells(row, "fissiiiIII")
-    old, new = values[:3], values[3:]
+    component, *values = cells(row, f"i{_LINE_CELLS}")
+    line = HistoryLine._make(values)
     return HistoryEntry(
-        at=at,
+        at=line.at,
         component=component,
-        name=name,
-        old=read_param(name, *old),
-        new=None if None in new else read_param(name, *new),
-        by=by,
+        name=line.name,
+        old=read_param(line.name, *line.old),
+        new=None if None in line.new else read_param(line.name, *line.new),
+        by=line.by,
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
 from paramclient.cache.ext_tables import ExtDump, put_ext, take_ext
@@ -13,7 +14,7 @@ from paramclient.cache.param_columns import StoredParam
 from paramclient.cache.records import CachedSummary, CachedVehicle, TableState, TableUpdate
 from paramclient.cache.snapshots import SNAPSHOTS
 from paramclient.cache.tables import HISTORY_ENTRIES_MAX, hashed, write_state
-from paramclient.cache.transaction import Line, Transaction
+from paramclient.cache.transaction import NO_VALUE, HistoryLine, Transaction
 from paramclient.errors import CacheError, UsageError
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ class TableDump:
     table: CachedSummary
     known_since: float | None
     rows: Mapping[str, StoredParam]
-    lines: tuple[Line, ...]
+    lines: tuple[HistoryLine, ...]
     added_names: tuple[tuple[str, float, int], ...]
     clock_rollbacks: tuple[tuple[float, float], ...]
     shots: Mapping[int, StoredSnapshot]
@@ -85,8 +86,8 @@ class TableDump:
                 mine is not None and mine.heard_at < row.heard_at
             ):
                 return f"parameter {name}"
-        gone = self.lines[0][0] if len(self.lines) >= HISTORY_ENTRIES_MAX else 0.0
-        if any(line[0] >= gone for line in set(other.lines) - set(self.lines)):
+        gone = self.lines[0].at if len(self.lines) >= HISTORY_ENTRIES_MAX else 0.0
+        if any(line.at >= gone for line in set(other.lines) - set(self.lines)):
             return "a line of history"
         shots = {shot.crc for shot in self.shots.values()}
         if len(shots) < SNAPSHOTS and any(shot.crc not in shots for shot in other.shots.values()):
@@ -97,7 +98,7 @@ class TableDump:
 
     def was_removed(self, name: str) -> bool:
         """Return whether a history line removes a parameter."""
-        return any(line[1] == name and line[6] is None for line in self.lines)
+        return any(line.name == name and line.new == NO_VALUE for line in self.lines)
 
 
 @dataclass(frozen=True)
@@ -283,7 +284,7 @@ def _joined(there: TableDump, new: TableDump) -> TableDump:
             rows[name] = row
     rows = {name: row for name, row in rows.items() if name in later.rows or not later.was_removed(name)}
     table = later.table if hashed(rows) == hashed(later.rows) else replace(later.table, hash=None)
-    lines = sorted(dict.fromkeys((*there.lines, *new.lines)), key=lambda line: float(line[0]))
+    lines = sorted(dict.fromkeys((*there.lines, *new.lines)), key=attrgetter("at"))
     ext = there.ext or new.ext
     if there.ext is not None and new.ext is not None:
         ext = there.ext.joined(new.ext)

@@ -1,19 +1,32 @@
 """The command line: parses arguments, calls the client, and prints tables or JSON.
 
 - `app`: all subcommands, the main function, signals and errors.
-- Subcommands: `parameters` (fetch, get, watch), `set_command` (set), `offline` (show, cache), `logs`
-  (import), `apply` (apply, verify, restore), `save`, `diff`, `history`, `search` (search, info), `fleet`,
-  `link`, `check`, `ports`, `signing`, `serve`, `token` and `simulate` (sim).
+- Subcommands: `parameters` (fetch, get, watch), `set_command` (set), `reset_command` (reset), `offline`
+  (show, cache), `logs` (import), `apply` (apply, verify, restore), `save`, `diff`, `history`, `search`
+  (search, info), `fleet`, `link`, `check`, `ports`, `signing`, `serve`, `token` and `simulate` (sim).
+- `metadata_files`: metadata (add, list, remove).
+- `completion`, `completion_table`, `completion_install`: shell completion.
 - `param_names`: names and patterns of parameters, and suggestions.
-- `extended`: extended parameters in these subcommands.
+- `extended`: extended parameters in these subcommands. `watch_lines`: the lines of watch.
+- `every_vehicle`: --all of fetch, get and set.
+- `vehicle_name`: the vehicle that --vehicle names.
 - `sources`, `targets`: the parameters and the vehicles that an argument names. `time_arguments`: times.
 - `session`, `options`: an open link with its vehicle; options that several subcommands share.
+- `waiting`: what a command waits for, on a terminal.
 - `output`, `param_rows`, `results`, `metadata`, `exit_codes`: tables, JSON, metadata and exit codes.
+- `write_outcomes`, `confirmation`: writes with their outcomes, and the question before them.
 - `signals`: SIGINT and SIGTERM.
 """
 
 from __future__ import annotations
 
-from paramclient.cli.app import run
+from collections.abc import Sequence
 
 __all__ = ["run"]
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run the command line, see `app.run`. The libraries that it needs are imported only now."""
+    from paramclient.cli import app
+
+    return app.run(arguments)

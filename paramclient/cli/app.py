@@ -18,7 +18,7 @@ from paramclient.cli.signals import on_end_signal
 from paramclient.errors import ParamClientError
 from paramclient.version import __version__
 
-__all__ = ["run"]
+__all__ = ["command_line", "run"]
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -58,9 +58,14 @@ def run(arguments: Sequence[str]) -> int:
     return code or ExitCode.DONE
 
 
+def command_line() -> App:
+    """Return the command line, of which a subcommand is imported when it is looked up."""
+    return _app
+
+
 def _shows_help(arguments: Sequence[str]) -> bool:
     """Return whether help is printed: with --help, and without a subcommand."""
-    is_group = len(arguments) == 1 and arguments[0] in ("cache", "fleet", "signing")
+    is_group = len(arguments) == 1 and arguments[0] in ("cache", "fleet", "metadata", "signing")
     return not arguments or is_group or any(word in _app.help_flags for word in arguments)
 
 
@@ -153,6 +158,7 @@ _cache: Final = App(
         "cache history 1 MC_ROLL_P",
         "cache add 1 quad.params",
         "cache path",
+        "cache name 1 tractor",
         "cache remove 1",
         "cache copy field.sqlite3 postgresql://me@office/fleet",
     ),
@@ -166,6 +172,16 @@ _signing: Final = App(
         "signing disable udpin:0.0.0.0:14550 --signing-key vehicle.key",
     ),
 )
+_metadata: Final = App(
+    name="metadata",
+    help="Add, list or remove metadata files, which describe parameters. Needs no link.",
+    help_epilogue=_examples(
+        "metadata add apm.pdef.xml",
+        "metadata add apm.pdef.xml --firmware 4.6",
+        "metadata list",
+        "metadata remove copter --firmware 4.6",
+    ),
+)
 _fleet: Final = App(
     name="fleet",
     help="Compare the vehicles in the cache. Needs no link.",
@@ -173,7 +189,9 @@ _fleet: Final = App(
 )
 
 
-def _add(group: App, function: str, *examples: str, arguments: str | None = None) -> None:
+def _add(
+    group: App, function: str, *examples: str, arguments: str | None = None, name: str | None = None
+) -> None:
     """Add a subcommand, named like its function without the group and a trailing underscore.
 
     The function is named and not imported: a subcommand loads only its own modules, which halves the time
@@ -184,8 +202,9 @@ def _add(group: App, function: str, *examples: str, arguments: str | None = None
         function: module of `paramclient.cli`, and function.
         examples: arguments of the examples in the help.
         arguments: the arguments in the usage line, if they are not the function's names.
+        name: the name of the subcommand, if it is not that of the function.
     """
-    name = function.partition(":")[2].removesuffix("_").removeprefix(f"{group.name[0]}_")
+    name = name or function.partition(":")[2].removesuffix("_").removeprefix(f"{group.name[0]}_")
     words = name if group is _app else f"{group.name[0]} {name}"
     group.command(
         f"paramclient.cli.{function}",
@@ -217,6 +236,13 @@ _add(
     "udpin:0.0.0.0:14550 MC_ROLL_P 6.5 MC_PITCH_P 6.5",
     "udpin:0.0.0.0:14550 FLTMODE1=Loiter --metadata apm.pdef.xml",
     arguments="URL NAME VALUE|NAME=VALUE [NAME VALUE|NAME=VALUE...]",
+)
+_add(
+    _app,
+    "reset_command:reset",
+    "udpin:0.0.0.0:14550 MC_ROLL_P 'MC_PITCH*'",
+    "udpin:0.0.0.0:14550 --changed --dry-run",
+    arguments="URL NAME [NAME...]|--all|--changed",
 )
 _add(
     _app,
@@ -303,6 +329,7 @@ _add(
 )
 _add(_app, "token:token", "anna --file tokens", "wall-display --file tokens --read")
 _app.command(_cache)
+_app.command(_metadata)
 _add(_app, "ports:ports", "", "--json")
 _add(
     _app,
@@ -311,8 +338,18 @@ _add(
     "ardupilot --link udpin:127.0.0.1:0",
 )
 _app.command(_signing)
+_add(
+    _app,
+    "completion_install:install",
+    *("", "zsh"),
+    arguments="[SHELL]",
+    name="--install-completion",
+)
 _add(_signing, "signing:setup")
 _add(_signing, "signing:disable")
+_add(_metadata, "metadata_files:metadata_add")
+_add(_metadata, "metadata_files:metadata_list")
+_add(_metadata, "metadata_files:metadata_remove")
 _add(_cache, "offline:cache_list")
 _add(_cache, "history:history", arguments="VEHICLE [NAME...]")
 _add(
@@ -322,6 +359,7 @@ _add(
     arguments="VEHICLE FILE",
 )
 _add(_cache, "offline:cache_path")
+_add(_cache, "offline:cache_name", "4 tractor", "tractor --remove", arguments="VEHICLE [NICKNAME]")
 _add(_cache, "offline:cache_remove")
 _add(_cache, "offline:cache_copy")
 _add(

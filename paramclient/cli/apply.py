@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -16,6 +15,7 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from paramclient.cache import ParamCache
+from paramclient.cli.confirmation import can_confirm, confirm
 from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.extended import apply_extended, is_extended_source, verify_extended
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_session
@@ -36,6 +36,7 @@ from paramclient.cli.results import (
     show_verified,
     verified_doc,
 )
+from paramclient.cli.session import receiver_in_words
 from paramclient.cli.sources import is_file, open_file, read_rules
 from paramclient.cli.targets import (
     Address,
@@ -107,8 +108,8 @@ async def apply(
 
     The state before is stored in the cache, for `restore`. On a terminal, the changes are shown and must be
     confirmed. Exit code 0: the vehicle has all values of the file. Exit code 1: some values differ. After an
-    interruption, run the same command again to continue. If several vehicles are heard, --system must choose
-    one, or --all all of them.
+    interruption, run the same command again to continue. If several vehicles are received, --system must
+    choose one, or --all all of them.
 
     Args:
         url: The link, such as udpin:0.0.0.0:14550, or sim:ardupilot for a simulated vehicle.
@@ -136,12 +137,12 @@ async def apply(
         yes: Do not ask for confirmation.
     """
     if is_extended_source(file):
-        if include or reboot or backup or over or all_vehicles or renames or metadata or durable:
+        if include or reboot or backup or over or all_vehicles or renames or metadata:
             raise UsageError(
                 f"{file} has extended parameters; --include, --reboot, --backup, --overlay, --all, "
-                "--renames, --metadata and --durable are for plain ones"
+                "--renames and --metadata are for plain ones"
             )
-        return await apply_extended(url, file, options, dry_run=dry_run, yes=yes)
+        return await apply_extended(url, file, options, dry_run=dry_run, yes=yes, durable=durable)
     check_pattern("--overlay", over, all_vehicles=all_vehicles)
     check_pattern("--backup", backup, all_vehicles=all_vehicles)
     chosen = from_file(metadata)
@@ -164,7 +165,8 @@ async def apply(
         if dry_run:
             code = show.planned(*await plans(), reboot=reboot, skip_invalid=skip_invalid)
             return max(code, _armed(found, allow_armed=allow_armed))
-        if not yes and _can_confirm(options) and not await _confirm(*await plans(), reboot=reboot, full=full):
+        found.announce_write()
+        if not yes and can_confirm(options) and not await _confirm(*await plans(), reboot=reboot, full=full):
             return ExitCode.INCOMPLETE
         if options.no_cache and backup is None and not url.startswith("sim:"):
             say("the state before is not stored: --no-cache is given, and --backup is not")
@@ -262,6 +264,9 @@ async def restore(
     Parameters that the state does not have are not changed. On a terminal, the changes are shown and must be
     confirmed. The exit codes are those of apply.
 
+    A time without a time zone is in the time zone of this computer, in which times are printed too, marked
+    with it: 2026-11-20T14:00:00.000+01:00. A time in UTC ends with Z: 2026-11-20T13:00Z.
+
     Args:
         url: The link.
         when: A time, such as '2h ago' or '2026-11-20 14:00'; the number of a snapshot, from `history VEHICLE
@@ -292,7 +297,8 @@ async def restore(
         if dry_run:
             code = show.planned(*await plans(), reboot=reboot, skip_invalid=True)
             return max(code, _armed(found, allow_armed=allow_armed))
-        if not yes and _can_confirm(options) and not await _confirm(*await plans(), reboot=reboot, full=full):
+        found.announce_write()
+        if not yes and can_confirm(options) and not await _confirm(*await plans(), reboot=reboot, full=full):
             return ExitCode.INCOMPLETE
         with show.progress_until_interrupted(f"restoring {_title(found)}") as progress:
             result = await restore_to(
@@ -388,11 +394,6 @@ def _armed(found: Targets, *, allow_armed: bool) -> ExitCode:
     return ExitCode.INCOMPLETE if armed else ExitCode.DONE
 
 
-def _can_confirm(options: LinkOptions) -> bool:
-    """Return whether a user at a terminal can confirm the changes."""
-    return not options.json and sys.stdin.isatty() and sys.stderr.isatty()
-
-
 async def _confirm(
     plans: Mapping[NamedVehicle, Plan],
     errors: Mapping[NamedVehicle, ParamClientError],
@@ -406,10 +407,7 @@ async def _confirm(
     if not any(plan.steps or (reboot and plan.awaiting_reboot) for plan in plans.values()):
         return True
     show_planned(plans, reboot=reboot, full=full)
-    sys.stderr.write("go on? [y/N] ")
-    sys.stderr.flush()
-    await anyio.wait_readable(sys.stdin)  # Ctrl-C could not end a thread that reads
-    return sys.stdin.readline().strip().lower() in ("y", "yes")
+    return await confirm("go on?")
 
 
 def _title(found: Targets) -> str:
@@ -425,7 +423,9 @@ class _Output:
 
     def __init__(self, found: Targets, *, as_json: bool, is_fleet: bool, full: bool) -> None:
         self._vehicles = {
-            (each.system, each.component): NamedVehicle(each.system, each.component, describe(each))
+            (each.system, each.component): NamedVehicle(
+                each.system, each.component, describe(each), receiver_in_words(each)
+            )
             for each in found.vehicles
         }
         self._as_json = as_json

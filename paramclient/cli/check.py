@@ -22,7 +22,8 @@ from paramclient.cli.output import (
     printable,
     say,
 )
-from paramclient.cli.session import VEHICLE_TIMEOUT, Deadline, listen
+from paramclient.cli.session import VEHICLE_TIMEOUT, Deadline, listen, wait_for_vehicle
+from paramclient.cli.vehicle_name import VehicleName, check_uid
 from paramclient.diagnosis import Finding, Severity, VehicleReport, check_vehicle, findings_of
 from paramclient.errors import UsageError
 from paramclient.model.identity import version_text
@@ -47,6 +48,7 @@ async def check(
     url: str,
     /,
     *,
+    vehicle: str | None = None,
     system: Id = None,
     component: Id = None,
     timeout: Seconds = None,
@@ -60,23 +62,29 @@ async def check(
 
     Args:
         url: The link, such as udpin:0.0.0.0:14550, tcp:HOST:PORT or sim:px4.
-        system: The system to measure, 1 to 255. Default: the first one heard.
+        vehicle: The vehicle to measure: 4 or 4/1, px4 or ardupilot, or a nickname, hardware id or key of the
+            cache. Instead of --system.
+        system: The system to measure, 1 to 255. Default: the first one received.
         component: The component to measure, 1 to 255. Default: the autopilot.
         timeout: Timeout for the whole measurement in seconds. Default: 60.
         report: Also write the result to this new file, to attach it to an issue.
     """
     if report is not None:
         _check_is_new(report)
+    named = VehicleName.chosen(vehicle, system, component)
     deadline = Deadline(CHECK_TIMEOUT if timeout is None else timeout)
     async with listen(url, options) as client:
         if client.listens_only:
             raise UsageError(f"{client.link.name} is a log: check needs a link to a vehicle")
         heartbeat_timeout = VEHICLE_TIMEOUT if timeout is None else deadline.left()
-        vehicle = await client.component(system, component, timeout=heartbeat_timeout)
+        found = await wait_for_vehicle(
+            client, named.system, named.component, kind=named.kind, timeout=heartbeat_timeout
+        )
+        await check_uid(found, named.uid)
         left = deadline.left()
         assert left is not None
         measured = await check_vehicle(
-            client, vehicle, timeout=left, progress=_show_progress if sys.stderr.isatty() else None
+            client, found, timeout=left, progress=_show_progress if sys.stderr.isatty() else None
         )
     findings = findings_of(measured)
     if options.json or report is not None:

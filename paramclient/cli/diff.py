@@ -13,7 +13,7 @@ from paramclient.cli.metadata import MetadataChoice, from_file, known_of_sets, m
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import Coloured, print_document, print_table, printable, say
 from paramclient.cli.param_rows import described, value_text
-from paramclient.cli.sources import read_rules, resolve_all
+from paramclient.cli.sources import is_file, read_rules, resolve_all
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.comparison import Comparison, Difference, Moved, Standing, compare, defaults_of
@@ -54,7 +54,8 @@ async def diff(
         right: A file, a vehicle in the cache, or a link, like LEFT.
         base: A third source, or "defaults" for the firmware's defaults, to see which side differs from it.
         only: Compare only this name or pattern, such as "MC_*". May be given several times.
-        partial: Leave out parameters that only the right side has.
+        partial: Leave out parameters that only the right side has; if the right side is a file and the left
+            one is not, those that only the left side has.
         everything: Also print parameters that do not differ.
         renames: A YAML file of names that firmware versions have changed. A parameter that only one side has
             is compared with that of its other name.
@@ -69,9 +70,13 @@ async def diff(
     rules = read_rules(renames)
     third_source = [] if base is None or base == DEFAULTS else [base]
     first, second, *third = await resolve_all([left, right, *third_source], options)
+    is_right_partial = partial and is_file(right) and not is_file(left)
+    if is_right_partial:
+        named = second if rules is None else rules.apply_to(second, first)
+        first = replace(first, params={name: first[name] for name in first if name in named})
     known = first if rules is None else rules.apply_to(first, second)
     before = _defaults(known, second) if base == DEFAULTS else next(iter(third), None)
-    if partial:
+    if partial and not is_right_partial:
         second = replace(second, params={name: second[name] for name in second if name in known})
     outcome = compare(first, second, base=before, names=only or None, renames=rules)
     sides = _Sides(first, second, before, options, chosen)
@@ -153,7 +158,7 @@ def _shown(param: WrittenParam | None, metadata: Metadata | None) -> str | None:
     """Return a value with its meaning, if known: `5 (Loiter)`."""
     if param is None:
         return None
-    meaning = meaning_of(metadata, param.name, param.value)
+    meaning = meaning_of(metadata, param.name, param.settable)
     return f"{value_text(param)} ({meaning})" if meaning else value_text(param)
 
 
@@ -169,7 +174,7 @@ def _word(entry: Difference) -> str:
     """Return the comparison of an entry in words."""
     more = []
     if entry.renamed is not None:
-        is_converted = entry.left is not None and entry.renamed.value != entry.left.value
+        is_converted = entry.left is not None and entry.renamed.settable != entry.left.settable
         value = f", where left is {value_text(entry.renamed)}" if is_converted else ""
         more.append(f"{entry.renamed.name} on the right{value}")
     if entry.types_differ:
@@ -180,7 +185,7 @@ def _word(entry: Difference) -> str:
 
 
 def _type(param: WrittenParam | None) -> str:
-    return "" if param is None or param.type is None else type_name(param.type)
+    return "" if param is None or param.type_number is None else type_name(param.type_number)
 
 
 def _summary(outcome: Comparison) -> list[str]:

@@ -1,10 +1,10 @@
-"""Extended parameters in the subcommands fetch, get, set, show, save, diff and apply."""
+"""Extended parameters in the subcommands fetch, get, set, watch, show, save, diff and apply."""
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -12,12 +12,14 @@ import anyio
 import anyio.to_thread
 
 from paramclient.cache import CachedExtTable, ParamCache
+from paramclient.cli.confirmation import can_confirm, confirm
 from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.options import CacheOptions, LinkOptions
 from paramclient.cli.output import print_document, print_table, printable, progress_bar, report, say
 from paramclient.cli.session import CommandSession, connect
 from paramclient.cli.sources import check_link, is_file, names_vehicle, tables_in
-from paramclient.errors import FileError, NoReply, NotInCache, UnknownParameter, UsageError
+from paramclient.cli.watch_lines import HEX, ext_value_text, print_changes_and_events
+from paramclient.errors import CacheError, FileError, NoReply, NotInCache, UnknownParameter, UsageError
 from paramclient.files import FileForm
 from paramclient.files.extended_document import (
     ExtParamFile,
@@ -32,9 +34,9 @@ from paramclient.model.ext_params import (
     check_ext_value,
     encode_ext_value,
     ext_type_name,
-    format_ext_value,
 )
 from paramclient.model.notation import time_text
+from paramclient.model.patterns import NameChoice, is_pattern
 from paramclient.model.values import check_name
 from paramclient.model.wording import counted, first_of
 from paramclient.protocol.ext.write_batch import ExtSetOutcome
@@ -56,13 +58,12 @@ __all__ = [
     "show_extended",
     "text_pairs",
     "verify_extended",
+    "watch_extended",
 ]
 
 PROBE_TIMEOUT: Final = 2.0
 """Seconds in which a component of a kind that usually has extended parameters must send one, before its plain
 ones are used: four attempts, where nothing is known of the link."""
-HEX: Final = "hex:"
-"""The prefix of a value that is given as bytes in hexadecimal."""
 NAMES_SHOWN_MAX: Final = 20
 """Names that a message lists; it gives the number of further ones."""
 
@@ -141,6 +142,23 @@ async def fetch_extended(session: CommandSession) -> ExitCode:
 
 async def get_extended(session: CommandSession, names: Sequence[str]) -> ExitCode:
     """Read and print single extended parameters."""
+    found, errors = await _read_all(session, names)
+    params = [found[name] for name in names if name in found]
+    if session.options.json:
+        from paramclient.documents.extended_output import ExtParamsOutputDoc  # only here: loads pydantic
+
+        print_document(ExtParamsOutputDoc.of(params))
+    elif params:
+        print_table(_COLUMNS, map(_cells, params), right="index")
+    for error in errors:
+        report(str(error))
+    return max((code_of(error) for error in errors), default=ExitCode.DONE)
+
+
+async def _read_all(
+    session: CommandSession, names: Sequence[str]
+) -> tuple[dict[str, ExtParam], list[NoReply | UnknownParameter]]:
+    """Read several extended parameters concurrently; return them by name, and the errors."""
     found: dict[str, ExtParam] = {}
     errors: list[NoReply | UnknownParameter] = []
 
@@ -153,16 +171,7 @@ async def get_extended(session: CommandSession, names: Sequence[str]) -> ExitCod
     async with anyio.create_task_group() as tasks:
         for name in names:
             tasks.start_soon(read, name)
-    params = [found[name] for name in names if name in found]
-    if session.options.json:
-        from paramclient.documents.extended_output import ExtParamsOutputDoc  # only here: loads pydantic
-
-        print_document(ExtParamsOutputDoc.of(params))
-    elif params:
-        print_table(_COLUMNS, map(_cells, params), right="index")
-    for error in errors:
-        report(str(error))
-    return max((code_of(error) for error in errors), default=ExitCode.DONE)
+    return found, errors
 
 
 def text_pairs(words: Sequence[str]) -> list[tuple[str, str]]:
@@ -184,14 +193,17 @@ def text_pairs(words: Sequence[str]) -> list[tuple[str, str]]:
     return pairs
 
 
-async def set_extended(session: CommandSession, pairs: Sequence[tuple[str, str]]) -> ExitCode:
+async def set_extended(
+    session: CommandSession, pairs: Sequence[tuple[str, str]], *, durable: bool = False
+) -> ExitCode:
     """Write extended parameters, and print the outcomes."""
     await session.check_only()
+    await session.announce_write()
     values: list[tuple[str, ExtValue]] = []
     for name, text in pairs:
         known = await session.component.ext.get(name, timeout=session.deadline.left())
         values.append((name, value_of(name, text, known.type)))
-    result = await session.component.ext.set_many(values, timeout=session.deadline.left())
+    result = await session.component.ext.set_many(values, timeout=session.deadline.left(), durable=durable)
     _print_outcomes(session, result.outcomes)
     return _code_of_outcomes(result.outcomes)
 
@@ -217,6 +229,29 @@ def value_of(name: str, text: str, number: int) -> ExtValue:
     except UsageError as error:
         raise UsageError(f"{name}: {error}") from None
     return value
+
+
+async def watch_extended(session: CommandSession, wanted: Sequence[str]) -> ExitCode:
+    """Print changes of extended parameters until the timeout of the options."""
+    ext = session.component.ext
+    changes, events = ext.changes(), session.client.events()
+    known: set[str] | None = None
+    if not session.client.listens_only:
+        if not wanted or any(map(is_pattern, wanted)):
+            with suppress(CacheError):  # with an empty cache, all received parameters are new
+                await ext.fetch_all(timeout=session.deadline.left())
+        _, errors = await _read_all(session, [name for name in wanted if not is_pattern(name)])
+        if errors:
+            for error in errors:
+                report(str(error))
+            return max(map(code_of, errors))
+        known = set(ext.params)
+    watched = ", ".join(wanted) if wanted else counted(len(ext.params), "extended parameter")
+    say(printable(f"watching {watched} of {session.label}"))
+    with anyio.move_on_after(session.deadline.left()):
+        choice = NameChoice(wanted) if wanted else None
+        await print_changes_and_events(session, changes, events, known, choice)
+    return ExitCode.DONE
 
 
 # show, save, diff
@@ -267,7 +302,9 @@ async def diff_extended(
 ) -> ExitCode:
     """Compare the extended parameters of two sources."""
     first, second = await _source(left, options), await _source(right, options)
-    names = list(first.params) if partial else list(dict.fromkeys((*first.params, *second.params)))
+    names = list(dict.fromkeys((*first.params, *second.params)))
+    if partial:
+        names = list(second.params if is_file(right) and not is_file(left) else first.params)
     pairs = [(name, first.params.get(name), second.params.get(name)) for name in names]
     entries = [(name, one, two, _standing(one, two)) for name, one, two in pairs]
     different = [entry for entry in entries if entry[3] != "same"]
@@ -289,7 +326,9 @@ async def diff_extended(
 # apply
 
 
-async def apply_extended(url: str, file: str, options: LinkOptions, *, dry_run: bool, yes: bool) -> ExitCode:
+async def apply_extended(
+    url: str, file: str, options: LinkOptions, *, dry_run: bool, yes: bool, durable: bool = False
+) -> ExitCode:
     """Write the differing values of a file of extended parameters, and verify them by another download."""
     content = read_extended_file(file)
     async with connect(url, options, only=True) as session:
@@ -298,16 +337,14 @@ async def apply_extended(url: str, file: str, options: LinkOptions, *, dry_run: 
         if dry_run or not changes:
             _print_plan(session, changes, now, is_dry=dry_run)
             return ExitCode.INCOMPLETE if faulty or changes else ExitCode.DONE
-        if not (yes or options.json) and sys.stdin.isatty() and sys.stderr.isatty():
+        if not yes and can_confirm(options):
             _print_plan(session, changes, now, is_dry=True)
-            sys.stderr.write("go on? [y/N] ")
-            sys.stderr.flush()
-            await anyio.wait_readable(sys.stdin)  # Ctrl-C could not end a thread that reads
-            if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+            if not await confirm("go on?"):
                 return ExitCode.INCOMPLETE
         await session.check_only()
+        await session.announce_write()
         values = {name: param.value for name, param in changes.items()}
-        result = await component.ext.set_many(values, timeout=session.deadline.left())
+        result = await component.ext.set_many(values, timeout=session.deadline.left(), durable=durable)
         after = await component.ext.fetch_all(timeout=session.deadline.left())
         _print_outcomes(session, result.outcomes)
         code = _code_of_outcomes(result.outcomes)
@@ -367,7 +404,7 @@ def history_extended(
 async def is_extended_link(text: str, options: LinkOptions) -> bool:
     """Return whether an argument names a link, and the component that the options name speaks the extended
     protocol."""
-    is_link = not (is_file(text) or names_vehicle(text))
+    is_link = not (is_file(text) or names_vehicle(text, options.cache))
     if not is_link or options.listen_only or not may_be_extended(options, extended=False, plain=False):
         return False
     check_link(text)
@@ -382,7 +419,7 @@ _COLUMNS: Final = ("name", "value", "type", "index")
 
 
 def _has_extended_calls(session: CommandSession) -> bool:
-    """Return whether the component is on a link of this process: a service has no extended parameters."""
+    """Return whether extended parameters can be used: a service of an earlier version does not serve them."""
     try:
         return session.component.ext is not None
     except UsageError:
@@ -394,11 +431,7 @@ def _cells(param: ExtParam) -> tuple[object, ...]:
 
 
 def _text(param: ExtParam | None) -> str | None:
-    return None if param is None else _value_text(param.value, param.type)
-
-
-def _value_text(value: ExtValue, number: int) -> str:
-    return f"{HEX}{value.hex()}" if isinstance(value, bytes) else format_ext_value(value, number)
+    return None if param is None else ext_value_text(param.value, param.type)
 
 
 def _by_index(params: Iterable[ExtParam]) -> list[ExtParam]:
@@ -438,7 +471,7 @@ async def _source(text: str, options: LinkOptions) -> ExtParamFile:
     """
     if is_file(text):
         return read_extended_file(text)
-    if names_vehicle(text):
+    if names_vehicle(text, options.cache):
         if options.place is False:
             raise UsageError(f"{text!r} is a vehicle in the cache, which --no-cache excludes")
         table = _cached(text, options.component, CacheOptions(cache=options.cache))
@@ -516,7 +549,7 @@ def _print_outcomes(session: CommandSession, outcomes: Sequence[ExtSetOutcome]) 
         rows = (
             (
                 each.name,
-                _value_text(each.requested, ExtParamType.REAL64),
+                ext_value_text(each.requested, ExtParamType.REAL64),
                 None if each.result is None else _text(each.result.param),
                 each.status.value,
             )

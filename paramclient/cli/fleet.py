@@ -108,8 +108,10 @@ def _vehicle_text(vehicle: FleetVehicle) -> str:
 
 
 def _written(wanted: WrittenParam) -> str:
-    return format_value(wanted.value, ParamType.REAL32 if wanted.type is None else wanted.type)
+    return format_value(
+        wanted.settable, ParamType.REAL32 if wanted.type_number is None else wanted.type_number
+    )
 
 
 def _value(param: Param) -> str:
-    return format_value(param.value, param.type)
+    return format_value(param.settable, param.type_number)

@@ -149,4 +149,4 @@ def _reason(each: SnapshotSummary) -> str:
 
 
 def _value(param: Param) -> str:
-    return format_value(param.value, param.type)
+    return format_value(param.settable, param.type_number)

@@ -110,7 +110,7 @@ async def _show(client: ParamClient, seconds: float | None) -> TrafficReport:
             if report.frames:
                 draw(_COLUMNS, _rows(client, report), _lines(client, report))
             else:
-                draw(_COLUMNS, (), ["", f"nothing heard yet: {_pace(client, report)}"])
+                draw(_COLUMNS, (), ["", f"nothing received yet: {_pace(client, report)}"])
             left = deadline.left(REFRESH_INTERVAL)
             if not left:
                 return report

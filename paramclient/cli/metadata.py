@@ -14,12 +14,12 @@ from cyclopts import Parameter
 from paramclient.cache import CachedComponent, ParamCache
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import print_line, printable, say
-from paramclient.cli.session import CommandSession
+from paramclient.cli.session import FIRMWARE_POLL_INTERVAL, FIRMWARE_TIMEOUT, CommandSession
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata, MetadataStore, ParamInfo, metadata_of, read_metadata
 from paramclient.metadata.info import number_of
 from paramclient.model.paramset import ParamSet
-from paramclient.model.values import Param, Value, check_name, format_value
+from paramclient.model.values import Param, WireValue, check_name, format_value
 
 __all__ = [
     "DESCRIBED_COLUMNS",
@@ -44,10 +44,6 @@ MetadataChoice: TypeAlias = Annotated[str | None, Parameter(name="--metadata")]
 
 VEHICLE: Final = "vehicle"
 """The value of --metadata that downloads the metadata from the vehicle."""
-FIRMWARE_TIMEOUT: Final = 0.5
-"""Seconds to wait for the firmware version of the vehicle, if metadata of any firmware is stored."""
-FIRMWARE_POLL_INTERVAL: Final = 0.01
-"""Seconds between two checks whether the firmware version is known."""
 ANNOUNCED_SIZE_MIN: Final = 5_000
 """Bytes from which the download of a metadata file is announced: the first, general file is smaller."""
 
@@ -79,11 +75,24 @@ async def known_of_session(
     if choice == VEHICLE or must:
         progress = _DownloadNotice(session.label)
         found = await metadata_of(component, timeout=session.deadline.left(), progress=progress)
+        if found is None and choice != VEHICLE:
+            found = await _stored(session, added_only=True)
         if found is None:
             raise UsageError(
-                f"{session.label} does not describe its parameters; --metadata takes a file that does"
+                f"{session.label} does not describe its parameters; --metadata takes a file that does, and "
+                "`paramclient metadata add` remembers one"
             )
         return found
+    return await _stored(session)
+
+
+async def _stored(session: CommandSession, *, added_only: bool = False) -> Metadata | None:
+    """Return the stored or added metadata of the vehicle's firmware, without any request; or None.
+
+    With `added_only`, what a vehicle has provided earlier is left out: the firmware may have been built from
+    other sources since, and only the vehicle can confirm it.
+    """
+    component = session.component
     cache = session.client.cache
     store = None if cache is None else MetadataStore.beside(cache.path)
     if store is None or not store.has_notes:
@@ -91,7 +100,8 @@ async def known_of_session(
     with anyio.move_on_after(session.deadline.left(FIRMWARE_TIMEOUT)):
         while not component.identity.git_hash:  # noqa: ASYNC110 - no event
             await anyio.sleep(FIRMWARE_POLL_INTERVAL)
-    return await anyio.to_thread.run_sync(store.known, component.identity, component.component)
+    find = store.added.find if added_only else store.known
+    return await anyio.to_thread.run_sync(find, component.identity, component.component)
 
 
 class _DownloadNotice:
@@ -191,10 +201,10 @@ DESCRIBED_COLUMNS: Final = ("meaning", "units")
 
 def described_cells(metadata: Metadata, param: Param) -> tuple[str, str]:
     """Return the cells of `DESCRIBED_COLUMNS` for a parameter."""
-    return meaning_of(metadata, param.name, param.value), units_of(metadata, param.name)
+    return meaning_of(metadata, param.name, param.settable), units_of(metadata, param.name)
 
 
-def meaning_of(metadata: Metadata | None, name: str, value: Value) -> str:
+def meaning_of(metadata: Metadata | None, name: str, value: WireValue) -> str:
     """Return the meaning of a value in a word, or ""."""
     info = info_of(metadata, name)
     return ("" if info is None else info.text(value)) or ""

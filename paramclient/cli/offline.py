@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -48,7 +48,16 @@ from paramclient.provision.vehicle_params import NO_DEFAULTS, left_out_note
 if TYPE_CHECKING:
     from paramclient.documents.cached import CachedTableDoc
 
-__all__ = ["cache_add", "cache_copy", "cache_list", "cache_path", "cache_remove", "show", "tables_of"]
+__all__ = [
+    "cache_add",
+    "cache_copy",
+    "cache_list",
+    "cache_name",
+    "cache_path",
+    "cache_remove",
+    "show",
+    "tables_of",
+]
 
 _DEFAULTS: Final = CacheOptions()
 
@@ -90,6 +99,7 @@ def show(
     is_log = vehicle is not None and vehicle.lower().startswith("replay:")
     with _open(options) if not is_log or vehicle is None else cache_of_log(vehicle) as cache:
         summaries = tables_in(cache, None if is_log else vehicle, component)
+        nicknames = _names_by_key(cache)
         is_list = vehicle is None and len(summaries) > 1 and not options.json
         tables = [] if is_list else _load(cache, summaries)
         _check_known(cache, wanted, [name for table in tables for name in table.params])
@@ -99,7 +109,7 @@ def show(
 
         print_document(CachedTablesDoc(components=[view.document() for view in views]))
     elif is_list:
-        _print_summaries(summaries)
+        _print_summaries(summaries, nicknames)
         say("paramclient show VEHICLE prints the table of one vehicle, by its system id or its key")
     elif not summaries:
         say(f"the cache {printable(cache.place)} is empty")
@@ -112,16 +122,16 @@ def show(
 
 
 def cache_list(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
-    """List the tables in the cache, most recently heard vehicles first."""
+    """List the tables in the cache, most recently received vehicles first."""
     with _open(options) as cache:
-        summaries = cache.components()
+        summaries, names = cache.components(), _names_by_key(cache)
     if options.json:
         from paramclient.documents.cached import CachedListDoc, CachedSummaryDoc  # only here: loads pydantic
 
-        components = [CachedSummaryDoc.of(each) for each in summaries]
+        components = [CachedSummaryDoc.of(each, names.get(each.key)) for each in summaries]
         print_document(CachedListDoc(path=cache.place, components=components))
     elif summaries:
-        _print_summaries(summaries)
+        _print_summaries(summaries, names)
     else:
         say(f"the cache {printable(cache.place)} is empty")
     return ExitCode.DONE
@@ -198,6 +208,37 @@ def cache_remove(vehicle: str, /, *, component: Id = None, options: CacheOptions
         print_document(RemovedDoc(key=key, removed=removed))
     else:
         print_line(f"removed {counted(removed, 'table')} of {key}")
+    return ExitCode.DONE
+
+
+def cache_name(
+    vehicle: str,
+    nickname: str | None = None,
+    /,
+    *,
+    remove: bool = False,
+    options: CacheOptions = _DEFAULTS,
+) -> ExitCode:
+    """Give a vehicle a nickname, by which every subcommand then knows it, on links with --vehicle.
+
+    Nicknames are in a file beside the cache, on this computer only.
+
+    Args:
+        vehicle: Its system id, its address as 4/1, its present nickname, its hardware id in full, uid: and at
+            least 6 digits of it, or its key.
+        nickname: 1 to 32 letters, digits, _ and -, beginning with a letter; in place of the previous one.
+        remove: Remove its nickname.
+    """
+    if (nickname is None) is not remove:
+        raise UsageError("cache name takes a nickname, or --remove")
+    with _open(options) as cache:
+        key = cache.set_nickname(vehicle, nickname)
+    if options.json:
+        from paramclient.documents.cached import NicknameDoc  # only here: loads pydantic
+
+        print_document(NicknameDoc(key=key, nickname=nickname))
+    else:
+        print_line(f"{key} has no nickname now" if nickname is None else f"{nickname} is {key}")
     return ExitCode.DONE
 
 
@@ -319,9 +360,16 @@ class _View:
         return CachedTableDoc.of(self.table, self.params, self.metadata, whole=bool(self.names))
 
 
-def _print_summaries(summaries: Sequence[CachedSummary]) -> None:
+def _names_by_key(cache: ParamCache) -> dict[str, str]:
+    """Return the nicknames of vehicles by key."""
+    return {key: nickname for nickname, key in cache.nicknames.items()}
+
+
+def _print_summaries(summaries: Sequence[CachedSummary], names: Mapping[str, str]) -> None:
+    """Print a line for each table; with the nickname if any vehicle has one."""
     rows = (
         (
+            *([names.get(each.key)] if names else []),
             f"{each.system}/{each.component}",
             autopilot_name(each.autopilot),
             each.size,
@@ -331,7 +379,11 @@ def _print_summaries(summaries: Sequence[CachedSummary]) -> None:
         )
         for each in summaries
     )
-    print_table(["component", "autopilot", "params", "hash", "synced", "key"], rows, right="params")
+    print_table(
+        [*(["name"] if names else []), "component", "autopilot", "params", "hash", "synced", "key"],
+        rows,
+        right="params",
+    )
 
 
 def _synced(table: CachedSummary) -> str | None:
@@ -349,7 +401,7 @@ def _print_table(view: _View) -> None:
     rows = (
         (
             *(param.name, _value(param), *([default_text(param)] if changed else [])),
-            *(type_name(param.type), param.index, local_time(table.heard_at[param.name])),
+            *(type_name(param.type_number), param.index, local_time(table.heard_at[param.name])),
             *(() if metadata is None else described_cells(metadata, param)),
         )
         for param in params
@@ -375,4 +427,4 @@ def _print_table(view: _View) -> None:
 
 
 def _value(param: Param) -> str:
-    return format_value(param.value, param.type)
+    return format_value(param.settable, param.type_number)

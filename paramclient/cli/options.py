@@ -7,11 +7,12 @@ import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, TypeAlias
+from typing import Annotated, ClassVar, Final, TypeAlias, TypedDict
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
+from paramclient.cli.vehicle_name import VehicleName
 from paramclient.client.signing import Signing, key_from_environment, read_key
 from paramclient.errors import UsageError
 from paramclient.model.values import Encoding
@@ -19,8 +20,20 @@ from paramclient.protocol.wire import SigningKey, SigningPolicy
 
 __all__ = ["CacheOptions", "Id", "KeyOptions", "LinkOptions", "Seconds", "SigningOptions", "TrafficOptions"]
 
+SOURCE_SYSTEM: Final = 255
+"""The usual system id of ground stations, and the default of `ParamClient`."""
+SOURCE_COMPONENT: Final = 190
+"""MAV_COMP_ID_MISSIONPLANNER, the usual component id of ground stations, and the default of `ParamClient`."""
+
 Id: TypeAlias = Annotated[int | None, Parameter(validator=Number(gte=1, lte=255))]
 """A system or component id."""
+
+
+class SourceIds(TypedDict):
+    """Own ids, as arguments of a client."""
+
+    system: int
+    component: int
 
 
 def _check_seconds(_: object, seconds: float | None) -> None:
@@ -47,13 +60,19 @@ class CacheOptions:
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class KeyOptions:
-    """The signing key, of subcommands that open a link."""
+    """The signing key and this computer's own ids, of subcommands that open a link."""
 
     signing_key: Path | None = None
     """A file with the key for signed messages. Default: the key that the environment names, if any."""
 
     signing_passphrase: bool = False
     """Ask for a passphrase, and derive the key from it."""
+
+    source_system: Id = None
+    """System id of this computer on the link, 1 to 255. Default: 255."""
+
+    source_component: Id = None
+    """Component id of this computer on the link, 1 to 255. Default: 190."""
 
     _typed: ClassVar[SigningKey | None] = None  # a class variable, because each field would be an option
 
@@ -62,6 +81,14 @@ class KeyOptions:
             if self.signing_key is not None:
                 raise UsageError("--signing-key and --signing-passphrase exclude each other")
             object.__setattr__(self, "_typed", _typed_passphrase())
+
+    @property
+    def source(self) -> SourceIds:
+        """The arguments `system` and `component` of `ParamClient`."""
+        return {
+            "system": SOURCE_SYSTEM if self.source_system is None else self.source_system,
+            "component": SOURCE_COMPONENT if self.source_component is None else self.source_component,
+        }
 
     @property
     def key(self) -> SigningKey | None:
@@ -114,8 +141,12 @@ class TrafficOptions(SigningOptions):
 class LinkOptions(TrafficOptions):
     """Options of subcommands that communicate with a vehicle."""
 
+    vehicle: str | None = None
+    """The vehicle: 4 or 4/1 (system and component id), px4 or ardupilot if only one has that autopilot, or a
+    nickname, hardware id or key of the cache. Instead of --system."""
+
     system: Id = None
-    """System id of the vehicle, 1 to 255. Default: the first one heard; for writes, the only one heard."""
+    """System id of the vehicle, 1 to 255. Default: the first one received; for writes, the only one."""
 
     component: Id = None
     """Component id, 1 to 255. Default: the autopilot."""
@@ -143,6 +174,18 @@ class LinkOptions(TrafficOptions):
 
     forward: str | None = None
     """Share the vehicle's link with one other program over this link, such as udpout:127.0.0.1:14551."""
+
+    named: ClassVar[VehicleName] = VehicleName()  # a class variable, because each field would be an option
+
+    def __post_init__(self) -> None:
+        KeyOptions.__post_init__(self)  # a class with slots has no super() without arguments
+        if self.vehicle is not None:
+            named = VehicleName.chosen(
+                self.vehicle, self.system, self.component, cache=self.cache, uses_cache=not self.no_cache
+            )
+            object.__setattr__(self, "named", named)
+            object.__setattr__(self, "system", named.system)
+            object.__setattr__(self, "component", named.component)
 
     @property
     def place(self) -> str | bool:

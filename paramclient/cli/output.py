@@ -7,12 +7,15 @@ unchanged: JSON escapes all characters outside ASCII, and all other output is `p
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from typing import TYPE_CHECKING, Final
+
+import anyio
 
 from paramclient.model.values import Param, format_value
 from paramclient.protocol.params.fetch_result import Progress
@@ -25,6 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Coloured",
+    "StatusLine",
     "by_index",
     "default_text",
     "live_view",
@@ -42,6 +46,10 @@ __all__ = [
 WIDTH_UNLIMITED: Final = 10_000
 """Width in columns of an output that is not a terminal, so that nothing is wrapped or cut."""
 
+NOTICE_DELAY: Final = 0.5
+"""Seconds after which a terminal shows what is awaited: most responses arrive earlier."""
+ERASE: Final = "\r\x1b[K"
+"""Moves the cursor of a terminal to the start of the line, and erases the line."""
 GAP: Final = 2
 """Blanks between two columns of a table, and before the second and later lines of a row."""
 SENTENCE_WIDTH_MIN: Final = 20
@@ -77,7 +85,7 @@ def milliseconds(seconds: float) -> str:
 
 def default_text(param: Param) -> str | None:
     """Return the firmware's default as text, or None if it is not known."""
-    return None if param.default is None else format_value(param.default, param.type)
+    return None if param.default is None else format_value(param.default, param.type_number)
 
 
 def local_time(at: float) -> str:
@@ -161,9 +169,41 @@ def say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
+class StatusLine:
+    """A line on stderr, which must be a terminal, that is drawn again and again and erased at the end."""
+
+    def __init__(self) -> None:
+        self._is_drawn = self._has_ended = False
+
+    def draw(self, text: str, seconds: float, more: str = "") -> None:
+        """Draw a text, the seconds so far and a sentence, as much as fits on one line.
+
+        Nothing is drawn in the first `NOTICE_DELAY` seconds, and after `end`.
+        """
+        if seconds < NOTICE_DELAY or self._has_ended:
+            return
+        whole = printable(f"{text} ({int(seconds)} s). {more}".rstrip())
+        columns = shutil.get_terminal_size().columns - 1
+        self._write(whole[:columns])
+        self._is_drawn = True
+
+    def end(self) -> None:
+        """Erase the line, and draw no other."""
+        if self._is_drawn and not self._has_ended:
+            self._write("")
+        self._has_ended = True
+
+    def _write(self, text: str) -> None:
+        sys.stderr.write(f"{ERASE}{text}")
+        sys.stderr.flush()
+
+
 @contextmanager
 def progress_bar(title: str) -> Iterator[Callable[[Progress], None] | None]:
-    """Yield a function that draws the progress of a fetch; None if stderr is not a terminal."""
+    """Yield a function that draws the progress of a fetch; None if stderr is not a terminal.
+
+    Before the first response, the function says that it is awaited. Needs a running event loop.
+    """
     if not sys.stderr.isatty():
         yield None
         return
@@ -173,10 +213,15 @@ def progress_bar(title: str) -> Iterator[Callable[[Progress], None] | None]:
 
 def _bar(title: str, stack: ExitStack) -> Callable[[Progress], None]:
     update: Callable[[Progress], None] | None = None
+    line, began = StatusLine(), anyio.current_time()
+    stack.callback(line.end)
 
     def draw(state: Progress) -> None:
         nonlocal update
+        if update is None and not state.received:
+            line.draw(f"{title}: waiting for the first response", anyio.current_time() - began)
         if update is None and state.received:  # nothing is drawn for a fetch that needs no download
+            line.end()
             update = _start_bar(title, stack)
         if update is not None:
             update(state)

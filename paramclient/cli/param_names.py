@@ -72,7 +72,7 @@ def check_given(given: Iterable[str]) -> list[str]:
 def may_appear(text: str, component: Component) -> bool:
     """Return whether a name or pattern is of a group that a parameter of the vehicle shows, and hides now."""
     return any(
-        not param.value
+        not param.settable
         and is_group_switch(name, component.autopilot)
         and text.upper().startswith(f"{name.rpartition('_')[0]}_")
         for name, param in dict(component.params).items()

@@ -11,7 +11,7 @@ from paramclient.files.param_file import address
 from paramclient.model.comparison import non_defaults
 from paramclient.model.identity import autopilot_name
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType, Value, format_value, type_name
+from paramclient.model.values import ParamType, WireValue, format_value, type_name
 from paramclient.model.wording import counted
 from paramclient.provision.vehicle_params import NO_DEFAULTS
 
@@ -53,7 +53,7 @@ def described(params: ParamSet) -> str:
 
 def value_text(param: WrittenParam) -> str:
     """Return a parameter's value as text."""
-    return _text(param.value, param)
+    return _text(param.settable, param)
 
 
 _COLUMNS: Final = ("name", "value", "default", "type", "comment")
@@ -67,7 +67,7 @@ def _print_set(params: ParamSet, *, changed: bool) -> None:
             param.name,
             value_text(param),
             None if param.default is None else _text(param.default, param),
-            None if param.type is None else type_name(param.type),
+            None if param.type_number is None else type_name(param.type_number),
             param.comment or None,
         )
         for param in params.values()
@@ -85,5 +85,5 @@ def _print_set(params: ParamSet, *, changed: bool) -> None:
     say(printable(f"{described(params)}{', those that differ from their default' if changed else ''}"))
 
 
-def _text(value: Value, param: WrittenParam) -> str:
-    return format_value(value, ParamType.REAL32 if param.type is None else param.type)
+def _text(value: WireValue, param: WrittenParam) -> str:
+    return format_value(value, ParamType.REAL32 if param.type_number is None else param.type_number)

@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
-import asyncio
 import shlex
-from collections.abc import AsyncGenerator, Iterable, Sequence
-from contextlib import aclosing, suppress
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import anyio
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
+from paramclient.cli.every_vehicle import (
+    Done,
+    address_text,
+    check_all,
+    every_vehicle,
+    failed_documents,
+    report_failures,
+    run_on_all,
+)
 from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.extended import (
     check_choice,
     fetch_extended,
     get_extended,
     is_extended_session,
+    watch_extended,
 )
 from paramclient.cli.metadata import (
     DESCRIBED_COLUMNS,
@@ -31,10 +40,8 @@ from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import (
     by_index,
     default_text,
-    local_time,
     milliseconds,
     print_document,
-    print_line,
     print_table,
     printable,
     progress_bar,
@@ -43,40 +50,30 @@ from paramclient.cli.output import (
 )
 from paramclient.cli.param_names import ChosenNames, check_given, may_appear, suggest
 from paramclient.cli.session import CommandSession, connect
-from paramclient.client.events import (
-    Contested,
-    Event,
-    Events,
-    Found,
-    Heard,
-    Lost,
-    Rebooted,
-    Resynced,
-    Uncontested,
-)
-from paramclient.client.subscription import Changes
+from paramclient.cli.waiting import while_waiting
+from paramclient.cli.watch_lines import print_changes_and_events
 from paramclient.errors import CacheError, NoReply, ParamClientError, UsageError
+from paramclient.metadata import Metadata
 from paramclient.model.notation import hash_text
 from paramclient.model.patterns import NameChoice, is_pattern
 from paramclient.model.values import Param, Trust, format_value, type_name
 from paramclient.model.wording import first_of
-from paramclient.protocol.params.change import Added, Change, Removed
-from paramclient.protocol.params.fetch_result import FetchResult, Policy
+from paramclient.protocol.params.fetch_result import FetchResult, Policy, Progress
 from paramclient.protocol.params.sampling import SAMPLE_SIZE, Sample
 
 if TYPE_CHECKING:
     from paramclient.documents.command_output import FetchOutputDoc
-    from paramclient.documents.document import Document
 
 __all__ = ["fetch", "get", "watch"]
 
 REFRESH_TIMEOUT: Final = 10.0
 """Seconds to wait for the values that the vehicle's hash does not cover, without --timeout."""
+AWAITED_NAMES_MAX: Final = 3
+"""Parameters that the line about awaited values names."""
 INDICES_SHOWN_MAX: Final = 20
 """Missing indices that a message names, so that it stays readable; it gives the number of further ones."""
 
 _DEFAULTS: Final = LinkOptions()
-_ComponentEvent: TypeAlias = Lost | Found | Rebooted | Resynced | Contested | Uncontested
 """Events that watch prints."""
 
 
@@ -92,6 +89,7 @@ async def fetch(
     policy: Policy = Policy.AUTO,
     extended: bool = False,
     plain: bool = False,
+    all_: Annotated[bool, Parameter(name="--all")] = False,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
     """Fetch all parameters. Uses the cache if the vehicle's hash matches, otherwise downloads.
@@ -111,6 +109,7 @@ async def fetch(
         extended: Use the extended parameters (PARAM_EXT_*) of the component, as of a camera. Without it, a
             camera, gimbal or other payload is asked whether it has them.
         plain: Use the plain parameters, also of a component that has extended ones.
+        all_: Fetch from every vehicle that is heard in 3 s.
     """
     if names:
         given = shlex.quote(names[0])
@@ -121,15 +120,19 @@ async def fetch(
     check_choice(extended=extended, plain=plain)
     if sample is not None and accept != "sampled":
         raise UsageError("--sample needs --accept sampled")
+    fetching = _Fetching(refresh, accept, sample or SAMPLE_SIZE, policy)
+    if all_:
+        check_all(options, extended=extended)
+        async with every_vehicle(url, options, policy=policy) as sessions:
+            fleet = await run_on_all(sessions, fetching.fetch)
+        return _show_fleet(fleet, only, options, changed=changed)
     async with connect(url, options, policy=policy) as session:
         if await is_extended_session(session, extended=extended, plain=plain or changed):
             if accept != "verified":
                 raise UsageError("--accept is for plain parameters; add --plain")
             return await fetch_extended(session)
-        result = await _fetch_all(session, refresh=refresh, accept=accept, sample=sample or SAMPLE_SIZE)
-        with suppress(NoReply):
-            await session.component.refreshed(timeout=session.deadline.left(REFRESH_TIMEOUT))
-        fetched = _Fetched.of(session, result, policy)
+        with progress_bar(f"fetching {session.label}") as progress:
+            fetched = await fetching.fetch(session, progress)
     has_defaults = any(param.default is not None for param in fetched.params)
     if only:
         chosen, unmatched = NameChoice(only).choose({param.name for param in fetched.params})
@@ -138,10 +141,8 @@ async def fetch(
         fetched = replace(fetched, params=[param for param in fetched.params if param.name in chosen])
     if changed:
         fetched = replace(fetched, params=[param for param in fetched.params if param.is_changed])
-    for note in result.notes:
+    for note in fetched.notes:
         report(note)
-    if result.sample is not None:
-        report(_confidence(result.sample))
     if options.json:
         print_document(fetched.document())
     else:
@@ -158,11 +159,7 @@ async def fetch(
         report(NO_DEFAULTS)
         return ExitCode.INCOMPLETE
     if fetched.missing:
-        number = "was" if len(fetched.missing) == 1 else "were"
-        report(
-            f"incomplete: {_index_text(fetched.missing)} of {session.label} {number} not received; run the "
-            "command again to request what is missing"
-        )
+        report(fetched.incomplete)
         return ExitCode.INCOMPLETE
     return ExitCode.DONE
 
@@ -175,6 +172,7 @@ async def get(
     metadata: MetadataChoice = None,
     extended: bool = False,
     plain: bool = False,
+    all_: Annotated[bool, Parameter(name="--all")] = False,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
     """Read parameters from the vehicle.
@@ -188,16 +186,22 @@ async def get(
         extended: Use the extended parameters (PARAM_EXT_*) of the component, as of a camera. Without it, a
             camera, gimbal or other payload is asked whether it has them.
         plain: Use the plain parameters, also of a component that has extended ones.
+        all_: Read from every vehicle that is heard in 3 s.
     """
     check_choice(extended=extended, plain=plain)
     described = from_file(metadata)
     wanted = check_given((name, *names))
+    if all_:
+        check_all(options, extended=extended)
+        async with every_vehicle(url, options) as sessions:
+            read = await run_on_all(
+                sessions, lambda each: _read(each, wanted, described, metadata, draws=False)
+            )
+        return _show_read(read, options)
     async with connect(url, options) as session:
         if await is_extended_session(session, extended=extended, plain=plain):
             return await get_extended(session, wanted)
-        params, errors = await _get_chosen(session, wanted)
-        if described is None:
-            described = await known_of_session(session, metadata)
+        params, errors, described = await _read(session, wanted, described, metadata)
     if options.json:
         from paramclient.documents.param import ReadOutputDoc  # only here: loads pydantic
 
@@ -211,7 +215,13 @@ async def get(
 
 
 async def watch(
-    url: str, /, *names: str, policy: Policy = Policy.AUTO, options: LinkOptions = _DEFAULTS
+    url: str,
+    /,
+    *names: str,
+    policy: Policy = Policy.AUTO,
+    extended: bool = False,
+    plain: bool = False,
+    options: LinkOptions = _DEFAULTS,
 ) -> int:
     """Print changes of values by any source, as they happen, until Ctrl-C or --timeout.
 
@@ -224,9 +234,15 @@ async def watch(
         names: The parameters to watch, or patterns such as "MC_*". Default: all.
         policy: Requests that may be sent besides those for NAMES: all that are needed, only for the hash, or
             none.
+        extended: Watch the extended parameters (PARAM_EXT_*) of the component, as of a camera. Without it, a
+            component that usually has them is asked for its first one.
+        plain: Watch the plain parameters, also of a component that has extended ones.
     """
+    check_choice(extended=extended, plain=plain)
     wanted = check_given(names)
     async with connect(url, options, policy=policy, is_live=True) as session:
+        if await is_extended_session(session, extended=extended, plain=plain):
+            return await watch_extended(session, wanted)
         changes, events = session.component.changes(), session.client.events()
         listens = session.client.listens_only
         has_pattern = any(map(is_pattern, wanted))
@@ -244,14 +260,8 @@ async def watch(
                 tasks.start_soon(_follow_groups, session)
             with anyio.move_on_after(session.deadline.left()):
                 try:
-                    await _print_changes_and_events(
-                        session,
-                        changes,
-                        events,
-                        known,
-                        NameChoice(wanted) if wanted else None,
-                        as_lines_of_json=options.json,
-                    )
+                    choice = NameChoice(wanted) if wanted else None
+                    await print_changes_and_events(session, changes, events, known, choice)
                 except Exception as error:  # raised here, the task group would wrap it in a group
                     failure = error
             tasks.cancel_scope.cancel()
@@ -261,6 +271,31 @@ async def watch(
 
 
 # fetch
+
+
+@dataclass(frozen=True, slots=True)
+class _Fetching:
+    """How parameters are fetched."""
+
+    refresh: bool
+    accept: Literal["verified", "sampled"]
+    sample: int
+    policy: Policy
+
+    async def fetch(
+        self, session: CommandSession, progress: Callable[[Progress], None] | None = None
+    ) -> _Fetched:
+        """Fetch the table of a vehicle, and the values that its hash does not cover."""
+        result = await session.component.fetch_all(
+            refresh=self.refresh,
+            accept=self.accept,
+            sample=self.sample,
+            timeout=session.deadline.left(),
+            progress=progress,
+        )
+        with suppress(NoReply):
+            await session.component.refreshed(timeout=session.deadline.left(REFRESH_TIMEOUT))
+        return _Fetched.of(session, result, self.policy)
 
 
 @dataclass(frozen=True, slots=True)
@@ -306,6 +341,21 @@ class _Fetched:
         return self.result.count - len(self.missing)
 
     @property
+    def notes(self) -> list[str]:
+        """Remarks for the user."""
+        sample = self.result.sample
+        return [*self.result.notes, *([] if sample is None else [_confidence(sample)])]
+
+    @property
+    def incomplete(self) -> str:
+        """The line about missing parameters."""
+        number = "was" if len(self.missing) == 1 else "were"
+        return (
+            f"incomplete: {_index_text(self.missing)} of {self.session.label} {number} not received; run the "
+            "command again to request what is missing"
+        )
+
+    @property
     def summary(self) -> str:
         """The line about the fetch: parameters, source, seconds, losses, bytes, hash."""
         result = self.result
@@ -334,17 +384,57 @@ class _Fetched:
         )
 
 
-async def _fetch_all(
-    session: CommandSession, *, refresh: bool = False, accept: str = "verified", sample: int = SAMPLE_SIZE
-) -> FetchResult:
-    with progress_bar(f"fetching {session.label}") as progress:
-        return await session.component.fetch_all(
-            refresh=refresh,
-            accept=accept,
-            sample=sample,
-            timeout=session.deadline.left(),
-            progress=progress,
+def _show_fleet(
+    fleet: Sequence[Done[CommandSession, _Fetched]],
+    only: Sequence[str],
+    options: LinkOptions,
+    *,
+    changed: bool,
+) -> int:
+    """Print the tables of several vehicles, and what failed; return the exit code."""
+    found = [each.result for each in fleet if each.result is not None]
+    has_defaults = any(param.default is not None for each in found for param in each.params)
+    if only:
+        chosen, unmatched = NameChoice(only).choose({param.name for each in found for param in each.params})
+        if unmatched and found:
+            raise UsageError(f"no parameter of any vehicle is called {unmatched}")
+        found = [replace(each, params=[p for p in each.params if p.name in chosen]) for each in found]
+    if changed:
+        found = [replace(each, params=[param for param in each.params if param.is_changed]) for each in found]
+    for each in found:
+        for note in each.notes:
+            report(f"{each.session.label}: {note}")
+    if options.json:
+        from paramclient.documents.command_output import FleetFetchDoc  # only here: loads pydantic
+
+        documents = [each.document() for each in found]
+        print_document(FleetFetchDoc(vehicles=documents, errors=failed_documents(fleet)))
+    else:
+        rows = (
+            (address_text(each.session), *_cells(param), param.trust, *([default_text(param)] * changed))
+            for each in found
+            for param in each.params
         )
+        columns = ["vehicle", *_COLUMNS, "trust", *(["default"] * changed)]
+        print_table(columns, rows, right="value index default")
+        for each in found:
+            say(printable(each.summary))
+    code = report_failures(fleet)
+    for each in found:
+        if each.missing:
+            report(each.incomplete)
+            code = max(code, ExitCode.INCOMPLETE)
+    if changed and not has_defaults:
+        from paramclient.provision.vehicle_params import NO_DEFAULTS  # only here: loads provision
+
+        report(NO_DEFAULTS)
+        code = max(code, ExitCode.INCOMPLETE)
+    return code
+
+
+async def _fetch_all(session: CommandSession, *, draws: bool = True) -> FetchResult:
+    with progress_bar(f"fetching {session.label}") if draws else nullcontext() as progress:
+        return await session.component.fetch_all(timeout=session.deadline.left(), progress=progress)
 
 
 def _confidence(sample: Sample) -> str:
@@ -370,11 +460,63 @@ _COLUMNS: Final = ("name", "value", "type", "index")
 
 
 def _cells(param: Param) -> tuple[object, ...]:
-    return param.name, format_value(param.value, param.type), type_name(param.type), param.index
+    return (
+        param.name,
+        format_value(param.settable, param.type_number),
+        type_name(param.type_number),
+        param.index,
+    )
+
+
+async def _read(
+    session: CommandSession,
+    wanted: Sequence[str],
+    described: Metadata | None,
+    choice: MetadataChoice,
+    *,
+    draws: bool = True,
+) -> tuple[list[Param], dict[str, ParamClientError], Metadata | None]:
+    """Read the chosen parameters of a vehicle; return them, the errors by name, and the metadata."""
+    params, errors = await _get_chosen(session, wanted, draws=draws)
+    if described is None:
+        described = await known_of_session(session, choice)
+    return params, errors, described
+
+
+def _show_read(
+    read: Sequence[Done[CommandSession, tuple[list[Param], dict[str, ParamClientError], Metadata | None]]],
+    options: LinkOptions,
+) -> int:
+    """Print the parameters of several vehicles, and what failed; return the exit code."""
+    found = [(each.vehicle, *each.result) for each in read if each.result is not None]
+    if options.json:
+        from paramclient.documents.command_output import FleetReadDoc  # only here: loads pydantic
+
+        vehicles = ((s.component, params, errors, known) for s, params, errors, known in found)
+        print_document(FleetReadDoc.of(vehicles, failed_documents(read)))
+    else:
+        is_described = any(described is not None for *_, described in found)
+        no_meaning = ("", "") if is_described else ()
+        rows = (
+            (
+                *(address_text(session), *_cells(param)),
+                *(no_meaning if described is None else described_cells(described, param)),
+            )
+            for session, params, _, described in found
+            for param in params
+        )
+        columns = ["vehicle", *_COLUMNS, *(DESCRIBED_COLUMNS if is_described else ())]
+        print_table(columns, rows, right="value index")
+    code = report_failures(read)
+    for session, _, errors, _ in found:
+        for error in errors.values():
+            report(f"{session.label}: {error}")
+            code = max(code, code_of(error))
+    return code
 
 
 async def _get_chosen(
-    session: CommandSession, wanted: Sequence[str]
+    session: CommandSession, wanted: Sequence[str], *, draws: bool = True
 ) -> tuple[list[Param], dict[str, ParamClientError]]:
     """Read the parameters that names and patterns choose; return them, and the errors by name.
 
@@ -383,14 +525,16 @@ async def _get_chosen(
     component = session.component
     has_pattern = any(map(is_pattern, wanted))
     if has_pattern:
-        await _fetch_all(session)
+        await _fetch_all(session, draws=draws)
         with suppress(NoReply):
             await component.refreshed(timeout=session.deadline.left(REFRESH_TIMEOUT))
     chosen = ChosenNames.of(component, wanted)
     held = {name: component.params[name] for name in chosen.names if has_pattern and name in component.params}
     fresh = {name: param for name, param in held.items() if param.trust is not Trust.CACHED}
     asked = [name for name in chosen.names if name not in fresh]
-    read, errors = await _get_all(session, asked)
+    read, errors = await while_waiting(
+        lambda _: _get_all(session, asked), f"{first_of(asked, AWAITED_NAMES_MAX)} of {session.label}"
+    )
     answered = [name for name in asked if name not in errors]
     found = fresh | dict(zip(answered, read, strict=True))
     return (
@@ -451,104 +595,3 @@ async def _follow_groups(session: CommandSession) -> None:
     """Fetch the table, so that parameters which come and go are noticed. Values were read already."""
     with suppress(ParamClientError):  # the events and the end of the changes tell
         await session.component.fetch_all()
-
-
-async def _print_changes_and_events(
-    session: CommandSession,
-    changes: Changes,
-    events: Events,
-    known: set[str] | None,
-    wanted: NameChoice | None,
-    *,
-    as_lines_of_json: bool,
-) -> None:
-    """Print changes and events of the component until cancelled.
-
-    Args:
-        session: the session.
-        changes: the changes of the component.
-        events: the events of the client.
-        known: names of the table at the start. The first value of any other parameter is not a change. None:
-            the first value of every parameter is not a change.
-        wanted: the names to watch; None for all.
-        as_lines_of_json: print JSON instead of text.
-    """
-    async with aclosing(_merged(changes, events)) as news:
-        async for each in news:
-            if isinstance(each, Change):
-                is_first = each.old is None and not isinstance(each, Added)
-                if is_first and (known is None or each.name in known):
-                    known = known and known - {each.name}
-                    continue
-                if wanted is not None and not wanted.has(each.name):
-                    continue
-                text = _change_text(each)
-            elif isinstance(each, Heard) or each.component is not session.component:
-                continue
-            else:
-                text = _event_text(each)
-            at = session.now
-            if as_lines_of_json:
-                print_document(_line(each, at))
-            else:
-                print_line(f"{local_time(at)}  {text}")
-
-
-async def _merged(changes: Changes, events: Events) -> AsyncGenerator[Change | Event]:
-    """Yield changes and events in the order of their arrival."""
-    waiting: dict[asyncio.Future[Change | Event], Changes | Events] = {}
-
-    def wait(feed: Changes | Events) -> None:
-        waiting[asyncio.ensure_future(anext(feed))] = feed
-
-    try:
-        wait(changes)
-        wait(events)
-        while waiting:
-            done, _ = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
-            for each in [each for each in waiting if each in done]:
-                feed = waiting.pop(each)
-                if not isinstance(each.exception(), StopAsyncIteration):  # else a log has ended
-                    wait(feed)
-                    yield each.result()
-    finally:
-        for each in waiting:
-            if not each.cancel():
-                each.exception()  # both end with the link; one error is reported
-
-
-def _line(news: Change | _ComponentEvent, at: float) -> Document:
-    """Return the JSON document of a change or an event."""
-    from paramclient.documents.command_output import ChangeLineDoc, EventLineDoc  # only here: loads pydantic
-
-    return ChangeLineDoc.of(news, at) if isinstance(news, Change) else EventLineDoc.of(news, at)
-
-
-def _change_text(change: Change) -> str:
-    old, new = (
-        "none" if param is None else format_value(param.value, param.type)
-        for param in (change.old, change.new)
-    )
-    if isinstance(change, Added):
-        return f"{change.name}  added: {new}  ({change.by})"
-    if isinstance(change, Removed):
-        return f"{change.name}  removed, was {old}  ({change.by})"
-    return f"{change.name}  {old} -> {new}  ({change.by})"
-
-
-def _event_text(event: _ComponentEvent) -> str:
-    match event:
-        case Lost():
-            text = f"lost: not heard for {event.silence:.1f} s"
-        case Found():
-            text = f"found after {event.silence:.1f} s"
-        case Rebooted():
-            text = "rebooted"
-        case Contested():
-            text = f"contested: {'; '.join(event.contest.claimants)}"
-        case Uncontested():
-            text = "no longer contested"
-        case Resynced():
-            count = len(event.changed)
-            text = f"resynced: {count or 'no'} {'value' if count == 1 else 'values'} had changed"
-    return f"{event.component.system}/{event.component.component} {text}"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.output import Coloured, print_table, printable, report, say
 from paramclient.model.notation import typed
-from paramclient.model.values import Value, format_value
+from paramclient.model.values import WireValue, format_value
 from paramclient.model.wording import counted, first_of
 from paramclient.provision import (
     MISSING,
@@ -51,11 +51,13 @@ class NamedVehicle:
         system: its system id at the start of the command.
         component: its component id.
         label: its address and autopilot, `1/1 px4`.
+        receiver: its address, kind and firmware, `1/1 PX4 quadrotor, firmware 1.16.0`.
     """
 
     system: int
     component: int
     label: str
+    receiver: str
 
 
 Cells: TypeAlias = list[object]
@@ -75,7 +77,9 @@ def show_applied(results: Mapping[NamedVehicle, ApplyResult], *, full: bool) -> 
         },
     )
     for vehicle, result in results.items():
-        say(printable(f"{vehicle.label}: {_counted(result.counts, ApplyStatus)} in {result.elapsed:.1f} s"))
+        say(
+            printable(f"{vehicle.receiver}: {_counted(result.counts, ApplyStatus)} in {result.elapsed:.1f} s")
+        )
         if (result.system, result.component) != (vehicle.system, vehicle.component):
             say(f"{vehicle.system}/{vehicle.component} is {result.system}/{result.component} now")
         if result.reboot_required:
@@ -123,7 +127,7 @@ def _applied_cells(row: ApplyRow) -> Cells:
     return [
         row.name,
         _text(row.before, row),
-        _text(row.target.value, row),
+        _text(row.target.settable, row),
         _text(row.actual, row),
         Coloured(row.status, _STYLES[row.status]),
         _why(row),
@@ -142,7 +146,11 @@ def show_planned(plans: Mapping[NamedVehicle, Plan], *, reboot: bool, full: bool
         right="stage",
     )
     for vehicle, plan in plans.items():
-        say(printable(f"{vehicle.label}: {_counted(plan.counts, PlanStatus, _PLAN_WORDS)}; nothing was sent"))
+        say(
+            printable(
+                f"{vehicle.receiver}: {_counted(plan.counts, PlanStatus, _PLAN_WORDS)}; nothing was sent"
+            )
+        )
         if plan.reboot_for and not reboot:
             names = first_of(plan.reboot_for, RESULT_NAMES_MAX)
             say(printable(f"{vehicle.label}: would take effect after a reboot: {names}"))
@@ -186,7 +194,7 @@ def _planned_cells(row: PlanRow) -> Cells:
     return [
         row.name,
         _text(row.before, row),
-        _text(row.target.value, row),
+        _text(row.target.settable, row),
         Coloured(row.status, _PLAN_STYLES[row.status]),
         _why(row),
     ]
@@ -233,7 +241,7 @@ def _verified_cells(row: PlanRow) -> Cells:
     standing = row.standing
     return [
         row.name,
-        _text(row.target.value, row),
+        _text(row.target.settable, row),
         _text(row.before, row),
         Coloured(standing, _STANDING_STYLES[standing]),
         f"{row.rename_note} {_like(row)}".strip() if standing == "missing" else _why(row),
@@ -291,7 +299,7 @@ def _say_firmware(plans: Mapping[NamedVehicle, Plan]) -> None:
             say(printable(f"{vehicle.label}: {plan.firmware_note}"))
 
 
-def _text(value: Value | None, row: ApplyRow | PlanRow) -> str | None:
+def _text(value: WireValue | None, row: ApplyRow | PlanRow) -> str | None:
     return None if value is None else format_value(*typed(value, row.type))
 
 

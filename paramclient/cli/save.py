@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Final, Literal, TypeAlias
 
@@ -18,6 +19,7 @@ from paramclient.cli.options import CacheOptions, LinkOptions
 from paramclient.cli.output import print_document, printable, progress_bar, report, say
 from paramclient.cli.session import CommandSession, connect
 from paramclient.cli.sources import check_link, choose, collect_confirmed, is_file, names_vehicle, open_file
+from paramclient.cli.targets import find_vehicles
 from paramclient.client.component import Component
 from paramclient.errors import UsageError
 from paramclient.files import FileForm, write_file
@@ -63,7 +65,9 @@ async def save(
         form: The file format, if the ending does not determine it.
         changed: Write only parameters that differ from the firmware's defaults.
         only: Write only this name or pattern, such as "MC_*". May be given several times.
-        all_: Write all components of the vehicle, if the file format can hold several.
+        all_: Write all components of every vehicle that is heard in 3 s, or of the one with --system. A file
+            with {system} or {uid} in its name becomes a file for each vehicle; otherwise the file format must
+            be able to hold several components.
         refresh: Download all parameters even if the cache is up to date.
         extended: Use extended parameters (PARAM_EXT_*), as of a camera.
     """
@@ -79,7 +83,7 @@ async def save(
         if refresh:
             raise UsageError(f"--refresh needs a link; {where!r} is a file")
         sets, faults = _from_file(where, options, all_=all_, changed=changed)
-    elif names_vehicle(where):
+    elif names_vehicle(where, options.cache):
         if refresh:
             raise UsageError(f"--refresh needs a link; {where!r} is a vehicle in the cache")
         sets, faults = _from_cache(where, options, all_=all_, changed=changed)
@@ -89,9 +93,11 @@ async def save(
     for fault in faults:
         report(fault)
     sets = _chosen(sets, only) if only else sets
+    files = _by_file(str(file), sets) if all_ else {file: sets}
     if sets:
-        await anyio.to_thread.run_sync(lambda: write_file(file, sets, form=written))
-        _show(file, written, sets, as_json=options.json)
+        for path, each in files.items():
+            await anyio.to_thread.run_sync(partial(write_file, path, each, form=written))
+        _show(files, written, as_json=options.json)
     else:
         report(f"nothing was written to {file}")
     return ExitCode.INCOMPLETE if faults or not sets else ExitCode.DONE
@@ -131,7 +137,9 @@ async def _fetch(
                 refresh=refresh, timeout=deadline.left(), progress=progress
             )
         return [(session.component, result)], []
-    client, system = session.client, session.component.system
+    client, system = session.client, session.options.system
+    if system is None:
+        await find_vehicles(client, None, None, deadline)
     everything = await client.fetch_all(system, refresh=refresh, timeout=deadline.left())
     fetched = [(client.components[each], everything.results[each]) for each in sorted(everything.results)]
     silent = [f"{each[0]}/{each[1]}: {everything.silent[each]}" for each in sorted(everything.silent)]
@@ -203,11 +211,31 @@ def _add(sets: list[ParamSet], whole: ParamSet, *, changed: bool) -> Sequence[st
     return []
 
 
-def _show(file: Path, form: FileForm, sets: Sequence[ParamSet], *, as_json: bool) -> None:
-    if as_json:
-        from paramclient.documents.command_output import SavedDoc  # only here: loads pydantic
+def _by_file(pattern: str, sets: Sequence[ParamSet]) -> dict[Path, list[ParamSet]]:
+    """Return the sets of each file: those of a vehicle share one if the name has a placeholder.
 
-        print_document(SavedDoc.of(str(file), form, sets))
+    Raises:
+        UsageError: the name has {uid}, and a set is of a vehicle that reports no hardware id.
+    """
+    files: dict[Path, list[ParamSet]] = {}
+    for each in sets:
+        name = pattern.replace("{system}", str(each.system))
+        if "{uid}" in name:
+            uid = None if each.identity is None else each.identity.uid
+            if uid is None:
+                raise UsageError(f"{address(each)} does not report a hardware id, which {pattern} needs")
+            name = name.replace("{uid}", uid)
+        files.setdefault(Path(name), []).append(each)
+    return files
+
+
+def _show(files: Mapping[Path, Sequence[ParamSet]], form: FileForm, *, as_json: bool) -> None:
+    if as_json:
+        from paramclient.documents.command_output import SavedDoc, SavedFilesDoc  # only here: loads pydantic
+
+        documents = [SavedDoc.of(str(file), form, sets) for file, sets in files.items()]
+        print_document(documents[0] if len(documents) == 1 else SavedFilesDoc(files=documents))
         return
-    held = ", ".join(f"{counted(len(each), 'parameter')} of {address(each)}" for each in sets)
-    say(printable(f"{held} written to {file} ({form})"))
+    for file, sets in files.items():
+        held = ", ".join(f"{counted(len(each), 'parameter')} of {address(each)}" for each in sets)
+        say(printable(f"{held} written to {file} ({form})"))

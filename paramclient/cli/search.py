@@ -155,7 +155,7 @@ class _Known:
         param = tables[0].params[name] if len(tables) == 1 else None
         return (
             name,
-            None if param is None else format_value(param.value, param.type),
+            None if param is None else format_value(param.settable, param.type_number),
             ", ".join(f"{each.system}/{each.component}" for each in tables),
             None if described is None else described.short_description,
         )
@@ -176,14 +176,14 @@ def _lines_of(
 ) -> Iterator[str]:
     """Yield the lines about the value of one vehicle."""
     param = table.params[name]
-    meaning = "" if described is None else described.text(param.value) or ""
+    meaning = "" if described is None else described.text(param.settable) or ""
     yield f"{table.system}/{table.component} {autopilot_name(table.autopilot)} ({table.key})"
-    value = format_value(param.value, param.type)
-    yield f"  value: {value}{f' ({meaning})' if meaning else ''}, {type_name(param.type)}"
+    value = format_value(param.settable, param.type_number)
+    yield f"  value: {value}{f' ({meaning})' if meaning else ''}, {type_name(param.type_number)}"
     if param.default is not None:
-        yield f"  default of the firmware: {format_value(param.default, param.type)}"
+        yield f"  default of the firmware: {format_value(param.default, param.type_number)}"
     yield f"  heard: {local_time(table.heard_at[name])}"
     for entry in changes:
-        new = "removed" if entry.new is None else format_value(entry.new.value, entry.new.type)
-        old = format_value(entry.old.value, entry.old.type)
+        new = "removed" if entry.new is None else format_value(entry.new.settable, entry.new.type_number)
+        old = format_value(entry.old.settable, entry.old.type_number)
         yield f"  changed: {local_time(entry.at)}  {old} -> {new}  ({entry.by})"

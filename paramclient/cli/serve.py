@@ -13,7 +13,7 @@ import anyio
 from cyclopts import Parameter
 
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.options import Id, SigningOptions
+from paramclient.cli.options import SigningOptions
 from paramclient.cli.output import print_line
 from paramclient.cli.signals import on_end_signal
 from paramclient.errors import UsageError
@@ -42,8 +42,6 @@ async def serve(
     host: tuple[str, ...] = (),
     allow_origin: tuple[str, ...] = (),
     trusted_proxy: tuple[str, ...] = (),
-    system_id: Id = None,
-    component_id: Id = None,
     tls_cert: Path | None = None,
     tls_key: Path | None = None,
     verbose: Annotated[bool, Parameter(name=("--verbose", "-v"))] = False,
@@ -59,7 +57,7 @@ async def serve(
         listen: Address to listen on, HOST:PORT; with port 0, the system chooses the port.
         cache: The cache file, or the postgresql:// URL of a shared cache. Default: the user's own cache.
         no_cache: Neither read nor write a cache.
-        fetch: Fetch the parameters of all vehicles that are heard.
+        fetch: Fetch the parameters of all vehicles that are received.
         listen_only: Send nothing to vehicles; receive the parameters that other stations on the links
             request.
         token_file: A file with access tokens, see `paramclient token`. Without it, and without
@@ -72,8 +70,6 @@ async def serve(
             https://station.example; may be given several times. Without tokens, such a page can only read.
         trusted_proxy: Address or network, such as 10.0.0.0/8, of a reverse proxy whose header X-Forwarded-For
             or Forwarded names the client; may be given several times.
-        system_id: System id of the service on the links. Default: 255.
-        component_id: Component id of the service on the links. Default: 190.
         tls_cert: A certificate file (PEM), to serve over TLS.
         tls_key: The key file of the certificate (PEM).
         verbose: Log each step on stderr.
@@ -93,9 +89,8 @@ async def serve(
         fetches=fetch,
         listen_only=listen_only,
         signing=options.signing,
-        system=255 if system_id is None else system_id,
-        component=190 if component_id is None else component_id,
         traffic=True,
+        **options.source,
     )
     listening = service.Listening.at(listen, tls_cert=tls_cert, tls_key=tls_key)
     access = service.AccessSettings(

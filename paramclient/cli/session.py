@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 from typing import Final
@@ -11,20 +11,41 @@ from typing import Final
 import anyio
 
 from paramclient.cli.options import LinkOptions, TrafficOptions
-from paramclient.client.client import ParamClient
+from paramclient.cli.output import printable, say
+from paramclient.cli.vehicle_name import check_kind, check_uid, wait_for_kind
+from paramclient.cli.waiting import while_waiting
+from paramclient.client.arguments import address_in_words
+from paramclient.client.client import ParamClient, implementation_of
 from paramclient.client.component import Component
-from paramclient.errors import AmbiguousVehicle, UsageError
+from paramclient.client.link_client import LinkClient
+from paramclient.errors import AmbiguousVehicle, NoReply, UsageError
 from paramclient.links import LinkKind, ReplayLink, parse_link
 from paramclient.links.names import names_service
+from paramclient.model.identity import version_text
 from paramclient.protocol.params.fetch_result import Policy
+from paramclient.protocol.silence import silence_of_link
+from paramclient.protocol.vehicle.kinds import kind_in_words
 
-__all__ = ["Deadline", "CommandSession", "connect", "listen"]
+__all__ = [
+    "Deadline",
+    "CommandSession",
+    "connect",
+    "listen",
+    "receiver_in_words",
+    "wait_for_firmware",
+    "wait_for_vehicle",
+]
 
 VEHICLE_TIMEOUT: Final = 10.0
 """Seconds to wait for the first heartbeat of a vehicle, without --timeout."""
 RECHECK_TIMEOUT: Final = 2.5
 """Seconds to check that the vehicle is still the only one: no wait is needed unless the vehicle or the link
 was lost in between."""
+
+FIRMWARE_TIMEOUT: Final = 0.5
+"""Seconds to wait for the firmware version of the vehicle, to name it to the user or to find its metadata."""
+FIRMWARE_POLL_INTERVAL: Final = 0.01
+"""Seconds between two checks whether the firmware version is known."""
 
 
 class Deadline:
@@ -67,6 +88,17 @@ class CommandSession:
         component = self.component
         return f"{component.system}/{component.component} {component.autopilot}"
 
+    @property
+    def receiver(self) -> str:
+        """The component with its kind and firmware, for a subcommand that writes; see `receiver_in_words`."""
+        return receiver_in_words(self.component)
+
+    async def announce_write(self) -> None:
+        """Print a line on stderr that says to which vehicle the subcommand writes, unless it prints JSON."""
+        if not self.options.json:
+            await wait_for_firmware([self.component], self.deadline)
+            say(printable(f"writing to {self.receiver} on {self.client.link.name}"))
+
     async def check_only(self) -> None:
         """Check that the component is still the only one that matches the options.
 
@@ -78,6 +110,12 @@ class CommandSession:
             LinkError: the link failed.
         """
         options, component = self.options, self.component
+        kind = options.named.kind
+        if kind is not None and (check_kind(self.client, kind) or component) is component:
+            await self.client.only_component(
+                component.system, component.component, timeout=self.deadline.left(RECHECK_TIMEOUT)
+            )
+            return
         found = await self.client.only_component(
             options.system,
             options.component,
@@ -92,6 +130,21 @@ class CommandSession:
                 vehicles=(self.label, heard),
                 choose_by=_difference(found, component),
             )
+
+
+async def wait_for_firmware(vehicles: Sequence[Component], deadline: Deadline) -> None:
+    """Wait until the firmware versions of vehicles are known, for at most `FIRMWARE_TIMEOUT`."""
+    with anyio.move_on_after(deadline.left(FIRMWARE_TIMEOUT)):
+        while not all(each.identity.firmware for each in vehicles):  # noqa: ASYNC110 - no event
+            await anyio.sleep(FIRMWARE_POLL_INTERVAL)
+
+
+def receiver_in_words(component: Component) -> str:
+    """Return address, kind and firmware of a component: `1/1 PX4 quadrotor, firmware 1.16.0`."""
+    identity = component.identity
+    kind = kind_in_words(identity.autopilot, identity.vehicle_type)
+    firmware = f", firmware {version_text(identity.firmware)}" if identity.firmware else ""
+    return f"{component.system}/{component.component} {kind}".rstrip() + firmware
 
 
 @asynccontextmanager
@@ -131,11 +184,57 @@ async def connect(
         tlog=options.tlog,
         signing=options.signing,
         split_peers=options.split_peers,
+        **options.source,
     ) as client:
         timeout = VEHICLE_TIMEOUT if options.timeout is None else deadline.left()
-        find = client.only_component if only else client.component
-        component = await find(options.system, options.component, peer=options.peer, timeout=timeout)
+        component = await wait_for_vehicle(
+            client,
+            options.system,
+            options.component,
+            kind=options.named.kind,
+            peer=options.peer,
+            timeout=timeout,
+            only=only,
+        )
+        await check_uid(component, options.named.uid)
         yield CommandSession(client, component, deadline, options)
+
+
+async def wait_for_vehicle(
+    client: ParamClient,
+    system: int | None,
+    component: int | None,
+    *,
+    kind: str | None = None,
+    peer: str | None = None,
+    timeout: float | None,
+    only: bool = False,
+) -> Component:
+    """Wait for a component; meanwhile, say on a terminal what is awaited and what was received.
+
+    Args:
+        client: an open client.
+        system, component, peer, timeout: as in `ParamClient.component`.
+        kind: wait for the only vehicle with this autopilot instead.
+        only: as in `connect`.
+
+    Raises:
+        ParamClientError: as from `ParamClient.component` and `ParamClient.only_component`.
+    """
+    find = client.only_component if only else client.component
+    awaited = address_in_words(system, component, peer) if kind is None else f"a vehicle with {kind}"
+
+    async def look(_: Callable[[], None]) -> Component:
+        if kind is None:
+            return await find(system, component, peer=peer, timeout=timeout)
+        began = anyio.current_time()
+        found = await wait_for_kind(client, kind, timeout)
+        if found is None:
+            waited = anyio.current_time() - began
+            raise NoReply(awaited, attempts=0, waited=waited, hint=_received(client))
+        return found
+
+    return await while_waiting(look, f"{awaited} on {client.link.name}", lambda: _received(client))
 
 
 def listen(url: str, options: TrafficOptions, *, listen_only: bool = False) -> ParamClient:
@@ -156,7 +255,16 @@ def listen(url: str, options: TrafficOptions, *, listen_only: bool = False) -> P
         signing=options.signing,
         listen_only=listen_only,
         tlog=options.tlog,
+        **options.source,
     )
+
+
+def _received(client: ParamClient) -> str:
+    """Return what was received on the link so far; "" over a service."""
+    implementation = implementation_of(client)
+    if not isinstance(implementation, LinkClient):
+        return ""
+    return silence_of_link(implementation.station, client.link.name)
 
 
 def _difference(found: Component, chosen: Component) -> str:

@@ -1,17 +1,19 @@
-"""The subcommand set: values from the arguments, one outcome for each, and what an interruption leaves."""
+"""The subcommand set: values from the arguments, one outcome for each."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Final
 
 import anyio
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from paramclient.cli.exit_codes import ExitCode, code_of
+from paramclient.cli.confirmation import can_ask, confirm
+from paramclient.cli.every_vehicle import address_text, check_all, every_vehicle, run_on_all
+from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.extended import (
     check_choice,
     is_extended_session,
@@ -24,38 +26,33 @@ from paramclient.cli.metadata import (
     from_file,
     info_of,
     known_of_session,
-    needs_reboot,
     parse_pairs,
     problems,
     resolved,
 )
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import (
-    Coloured,
-    print_document,
-    print_table,
-    printable,
-    progress_bar,
-    report,
-    say,
-)
-from paramclient.cli.param_names import suggest
+from paramclient.cli.output import print_document, print_table, printable, report, say
 from paramclient.cli.session import CommandSession, connect
+from paramclient.cli.write_outcomes import (
+    OUTCOME_COLUMNS,
+    counted_outcomes,
+    outcome_cells,
+    outcomes_code,
+    report_outcomes,
+    summary,
+    type_of,
+    write_all,
+)
 from paramclient.client.arguments import SETTLE_MAX
-from paramclient.errors import ParamClientError, UnknownParameter, UsageError
+from paramclient.errors import ParamClientError, UsageError
 from paramclient.metadata import Metadata
-from paramclient.model.values import ParamType, Value, format_value
-from paramclient.model.wording import counted, first_of
-from paramclient.protocol.params.fetch_result import Progress
-from paramclient.protocol.params.write_batch import SetOutcome, SetStatus
+from paramclient.model.values import ParamType, format_value
+from paramclient.protocol.params.write_batch import SetOutcome
 
 if TYPE_CHECKING:
     from paramclient.documents.command_output import WritesOutputDoc
 
 __all__ = ["set_"]
-
-WRITE_NAMES_MAX: Final = 10
-"""Parameters that a line names, so that it stays short; it gives the number of further ones."""
 
 _DEFAULTS: Final = LinkOptions()
 
@@ -70,6 +67,7 @@ async def set_(
     metadata: MetadataChoice = None,
     extended: bool = False,
     plain: bool = False,
+    all_: Annotated[bool, Parameter(name="--all")] = False,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
     """Write parameters in the order given, and verify each by the value that the vehicle reports.
@@ -79,20 +77,27 @@ async def set_(
     metadata describes the parameter: it is downloaded from the vehicle unless --metadata names a file. Many
     writes are in flight at a time; values of one name, and switches such as *_ENABLE, are written one after
     the other. A refused value does not stop the others. If several vehicles are heard, --system must choose
-    one.
+    one, or --all all of them. A value outside of the range in the metadata, and a fraction for a parameter
+    that is an integer, is written only after a question, and without a terminal only with --force.
 
     Args:
         url: The link.
         pairs: A parameter and its value, or NAME=VALUE. May be given several times.
         settle: Seconds for which each value is watched until it is read again. 1.2 shows values that PX4's
             modules clamp.
-        force: Send NaN and infinity also to PX4, which cannot save them and may stop, and to ArduPilot.
+        force: Do not ask about values outside of the range, and fractions for integers, which ArduPilot cuts
+            off. Send NaN and infinity also to PX4, which cannot save them and may stop, and to
+            ArduPilot.
         durable: End only when all values and their history are on the disk and survive a power loss.
         metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
         extended: Use the extended parameters (PARAM_EXT_*) of the component, as of a camera. Without it, a
             camera, gimbal or other payload is asked whether it has them.
         plain: Use the plain parameters, also of a component that has extended ones.
+        all_: Write to every vehicle that is heard in 3 s.
     """
+    if all_:
+        check_all(options, extended=extended)
+        plain = True
     check_choice(extended=extended, plain=plain)
     described = from_file(metadata)
     wanted: list[tuple[str, int | float | str]] = []
@@ -103,115 +108,116 @@ async def set_(
         wanted = parse_pairs(pairs)
         if described is not None:
             wanted = [*resolved(wanted, described)]
+    if all_:
+        async with every_vehicle(url, options) as sessions:
+            jobs = [await _prepare(each, wanted, described, metadata) for each in sessions]
+            await _check_values(jobs, force=force)
+            for each in sessions:
+                await each.announce_write()
+            done = await run_on_all(
+                jobs, lambda job: _write(job, settle=settle, force=force, durable=durable, draws=False)
+            )
+        return _show_fleet(jobs, [each.result or () for each in done], options)
     async with connect(url, options, only=True) as session:
         if texts:
             if await is_extended_session(session, extended=extended, plain=plain):
-                if settle or force or durable or metadata is not None:
-                    raise UsageError("--settle, --force, --durable and --metadata are for plain parameters")
-                return await set_extended(session, texts)
+                if settle or force or metadata is not None:
+                    raise UsageError("--settle, --force and --metadata are for plain parameters")
+                return await set_extended(session, texts, durable=durable)
             wanted = parse_pairs(pairs)
-        if described is None:
-            has_names = any(isinstance(value, str) for _, value in wanted)
-            described = await known_of_session(session, metadata, must=has_names)
-        writes = resolved(wanted, described)
-        for problem in problems(writes, described):
-            report(problem)
+        job = await _prepare(session, wanted, described, metadata)
+        described = job.described
+        await _check_values([job], force=force)
         await session.check_only()
+        await session.announce_write()
         began = anyio.current_time()
-        outcomes = await _write(session, writes, described, settle=settle, force=force, durable=durable)
-        outcomes = await _with_suggestions(session, outcomes)
-        client = session.client
-        summary = (
-            f"{_counted(outcomes)} on {session.label} in {anyio.current_time() - began:.2f} s, "
-            f"{client.bytes_received:,} bytes received, {client.bytes_sent:,} sent"
-        )
+        outcomes = await _write(job, settle=settle, force=force, durable=durable)
+        line = summary(session, outcomes, anyio.current_time() - began)
     _print(session, outcomes, described)
     if not options.json:
-        say(summary)
-    late = {
-        each.name: None
-        for each in outcomes
-        if each.is_set and each.error is None and needs_reboot(each.name, described)
-    }
-    if late:
-        say(printable(f"takes effect after a reboot: {', '.join(late)}"))
-    _report_all(outcomes)
-    return max(ExitCode.DONE if each.error is None else code_of(each.error) for each in outcomes)
+        say(line)
+    report_outcomes(outcomes, described)
+    return outcomes_code(outcomes)
+
+
+@dataclass(frozen=True, slots=True)
+class _Job:
+    """The values for one vehicle, and its metadata."""
+
+    session: CommandSession
+    writes: Sequence[tuple[str, int | float]]
+    described: Metadata | None
+
+
+async def _prepare(
+    session: CommandSession,
+    wanted: Sequence[tuple[str, int | float | str]],
+    described: Metadata | None,
+    choice: MetadataChoice,
+) -> _Job:
+    """Return the values for a vehicle, names of values replaced by the numbers in its metadata."""
+    if described is None:
+        has_names = any(isinstance(value, str) for _, value in wanted)
+        described = await known_of_session(session, choice, must=has_names)
+    return _Job(session, resolved(wanted, described), described)
+
+
+async def _check_values(jobs: Sequence[_Job], *, force: bool) -> None:
+    """Report values that are probably wrong; go on if the user confirms them, or with `force`.
+
+    Raises:
+        UsageError: the user does not, or cannot be asked. Nothing was written.
+    """
+    found = [problem for job in jobs for problem in problems(job.writes, job.described)]
+    for job in jobs:
+        found += await _fractions(job)
+    for problem in dict.fromkeys(found):
+        report(problem)
+    if not found or force:
+        return
+    if not can_ask():
+        raise UsageError("nothing was written; --force writes these values all the same")
+    if not await confirm("Write these values all the same?"):
+        raise UsageError("nothing was written")
+
+
+async def _fractions(job: _Job) -> list[str]:
+    """Return sentences on fractions for parameters that are integers, by metadata or the vehicle's type."""
+    found = []
+    for name, value in job.writes:
+        if not isinstance(value, float) or not math.isfinite(value) or value.is_integer():
+            continue
+        info, component = info_of(job.described, name), job.session.component
+        kind = None if info is None else info.type
+        if info is not None and info.bits:
+            kind = ParamType.INT32
+        if kind is None or not kind.is_integer:
+            try:
+                known = component.params.get(name) or await component.get(
+                    name, timeout=job.session.deadline.left()
+                )
+            except ParamClientError:
+                continue  # the write will fail for the same reason, and say so
+            kind = known.type
+        if kind.is_integer:
+            found.append(f"{name}: {format_value(value)} is not a whole number, and {name} is an integer")
+    return found
 
 
 async def _write(
-    session: CommandSession,
-    writes: Sequence[tuple[str, int | float]],
-    described: Metadata | None,
-    *,
-    settle: float,
-    force: bool,
-    durable: bool,
+    job: _Job, *, settle: float, force: bool, durable: bool, draws: bool = True
 ) -> Sequence[SetOutcome]:
     """Write the values; return one outcome for each, also if nothing could be written."""
-    with _progress_until_interrupted(session, writes, described) as progress:
-        try:
-            done = await session.component.set_many(
-                writes,
-                progress=progress,
-                timeout=session.deadline.left(),
-                settle=settle,
-                force=force,
-                durable=durable,
-            )
-        except ParamClientError as error:  # raised only if nothing was written
-            return [SetOutcome(name, value, SetStatus.NOT_TRIED, error=error) for name, value in writes]
-    return done.outcomes
-
-
-async def _with_suggestions(session: CommandSession, outcomes: Sequence[SetOutcome]) -> Sequence[SetOutcome]:
-    """Return the outcomes with suggestions for names that the vehicle does not have."""
-    errors = {each.name: each.error for each in outcomes if isinstance(each.error, UnknownParameter)}
-    better = await suggest(session, {**errors})
-    return [
-        replace(each, error=better[each.name]) if isinstance(each.error, UnknownParameter) else each
-        for each in outcomes
-    ]
-
-
-@contextmanager
-def _progress_until_interrupted(
-    session: CommandSession, writes: Sequence[tuple[str, int | float]], described: Metadata | None
-) -> Iterator[Callable[[SetOutcome], None]]:
-    """Yield a function that draws the progress; on cancellation, print the outcomes so far."""
-    arrived: list[SetOutcome] = []
-    began = anyio.current_time()
-    try:
-        with progress_bar(f"setting {session.label}") as draw:
-
-            def update(outcome: SetOutcome) -> None:
-                arrived.append(outcome)
-                if draw is not None:
-                    rate = len(arrived) / max(anyio.current_time() - began, 0.001)
-                    draw(Progress(len(arrived), len(writes), rate, (len(writes) - len(arrived)) / rate))
-
-            yield update
-    except anyio.get_cancelled_exc_class():
-        outcomes = _in_order(writes, arrived)
-        _print(session, outcomes, described)
-        open_count = sum(each.status is SetStatus.UNKNOWN for each in outcomes)
-        say(
-            f"interrupted: the outcome of {counted(open_count, 'value')} is not known, and the vehicle may "
-            "have them; run it again to continue"
-        )
-        raise
-
-
-def _in_order(writes: Sequence[tuple[str, int | float]], arrived: Sequence[SetOutcome]) -> list[SetOutcome]:
-    """Return one outcome for each value in the order of the request; *unknown* for those without one."""
-    left = [*arrived]
-    outcomes = []
-    for name, value in writes:
-        found = next((each for each in left if each.name == name), None)  # those of one name are in order
-        if found is not None:
-            left.remove(found)
-        outcomes.append(found or SetOutcome(name, value, SetStatus.UNKNOWN))
-    return outcomes
+    return await write_all(
+        job.session,
+        job.writes,
+        lambda so_far: _print(job.session, so_far, job.described),
+        verb="setting",
+        settle=settle,
+        force=force,
+        durable=durable,
+        draws=draws,
+    )
 
 
 def _print(session: CommandSession, outcomes: Sequence[SetOutcome], described: Metadata | None) -> None:
@@ -220,8 +226,8 @@ def _print(session: CommandSession, outcomes: Sequence[SetOutcome], described: M
         print_document(_document(session, outcomes, described))
         return
     print_table(
-        ["name", "requested", "actual", "status"],
-        (_cells(session, outcome) for outcome in outcomes),
+        OUTCOME_COLUMNS,
+        (outcome_cells(session, outcome) for outcome in outcomes),
         right="requested actual",
     )
 
@@ -230,71 +236,49 @@ def _document(
     session: CommandSession, outcomes: Sequence[SetOutcome], described: Metadata | None
 ) -> WritesOutputDoc:
     from paramclient.documents.command_output import (  # only here: loads pydantic
+        ReceiverDoc,
         WriteOutputDoc,
         WritesOutputDoc,
     )
 
     return WritesOutputDoc(
+        vehicle=ReceiverDoc.of(session.component),
         results=[
-            WriteOutputDoc.of(each, _type_of(session, each), info_of(described, each.name))
+            WriteOutputDoc.of(each, type_of(session, each), info_of(described, each.name))
             for each in outcomes
+        ],
+    )
+
+
+def _show_fleet(jobs: Sequence[_Job], done: Sequence[Sequence[SetOutcome]], options: LinkOptions) -> int:
+    """Print the outcomes of several vehicles; return the exit code."""
+    pairs = list(zip(jobs, done, strict=True))
+    if options.json:
+        from paramclient.documents.command_output import (  # only here: loads pydantic
+            FleetWritesDoc,
+            VehicleWritesDoc,
+        )
+
+        documents = [
+            VehicleWritesDoc(
+                system=job.session.component.system,
+                component=job.session.component.component,
+                results=_document(job.session, outcomes, job.described).results,
+            )
+            for job, outcomes in pairs
         ]
-    )
-
-
-def _cells(session: CommandSession, outcome: SetOutcome) -> tuple[object, ...]:
-    return (
-        outcome.name,
-        _text(outcome.requested, ParamType.REAL64),
-        _text(outcome.actual, _type_of(session, outcome)),
-        Coloured(outcome.status, _STYLES[outcome.status]),
-    )
-
-
-def _text(value: Value | None, kind: ParamType | int) -> str | None:
-    return None if value is None else format_value(value, kind)
-
-
-def _type_of(session: CommandSession, outcome: SetOutcome) -> ParamType | int:
-    """Return the vehicle's type of a parameter; REAL32 if it is not known."""
-    if outcome.result is not None:
-        return outcome.result.param.type
-    known = session.component.params.get(outcome.name)
-    return ParamType.REAL32 if known is None else known.type
-
-
-def _report_all(outcomes: Sequence[SetOutcome]) -> None:
-    """Print the remarks and the errors: one line for all values without a response, and for one cause."""
-    errors: dict[object, list[SetOutcome]] = {}
-    for each in outcomes:
-        if each.result is not None and each.result.note:
-            say(printable(f"{each.name}: {each.result.note}"))
-        if each.error is not None:
-            is_open = each.status in (SetStatus.UNKNOWN, SetStatus.NOT_TRIED)
-            cause = (each.status, type(each.error)) if is_open else str(each.error)
-            errors.setdefault(cause, []).append(each)
-    for group in errors.values():
-        names = first_of(list(dict.fromkeys(each.name for each in group)), WRITE_NAMES_MAX)
-        report(f"{names}: {group[0].error}")
-
-
-def _counted(outcomes: Sequence[SetOutcome]) -> str:
-    """Return the numbers of outcomes in words: `2 of 4 set, 1 refused, 1 not tried`."""
-    done = sum(each.is_set for each in outcomes)
-    failed = {
-        status: sum(each.status is status for each in outcomes)
-        for status in SetStatus
-        if status not in (SetStatus.ACCEPTED, SetStatus.ADJUSTED)
-    }
-    others = [f"{count} {status}" for status, count in failed.items() if count]
-    return ", ".join([f"{done} of {len(outcomes)} set", *others])
-
-
-_STYLES: Final = {
-    SetStatus.ACCEPTED: "green",
-    SetStatus.ADJUSTED: "yellow",
-    SetStatus.REFUSED: "red",
-    SetStatus.UNKNOWN: "bold red",
-    SetStatus.NOT_TRIED: "dim",
-}
-"""Styles of rich for each outcome."""
+        print_document(FleetWritesDoc(vehicles=documents))
+    else:
+        rows = (
+            (address_text(job.session), *outcome_cells(job.session, outcome))
+            for job, outcomes in pairs
+            for outcome in outcomes
+        )
+        print_table(["vehicle", *OUTCOME_COLUMNS], rows, right="requested actual")
+        for job, outcomes in pairs:
+            say(printable(f"{counted_outcomes(outcomes)} on {job.session.receiver}"))
+    code: int = ExitCode.DONE
+    for job, outcomes in pairs:
+        report_outcomes(outcomes, job.described, vehicle=f"{job.session.label}: ")
+        code = max(code, outcomes_code(outcomes))
+    return code

@@ -14,7 +14,8 @@ from cyclopts import Parameter
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import Id, KeyOptions, Seconds
 from paramclient.cli.output import print_document, print_line, printable
-from paramclient.cli.session import VEHICLE_TIMEOUT, Deadline
+from paramclient.cli.session import VEHICLE_TIMEOUT, Deadline, wait_for_vehicle
+from paramclient.cli.vehicle_name import VehicleName, check_uid
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
 from paramclient.client.signing import Signing, read_key
@@ -36,8 +37,12 @@ class SigningTarget(KeyOptions):
     link_is_safe: bool = False
     """Confirm that no other person or program can listen on this link: a USB cable, a wire. Default: ask."""
 
+    vehicle: str | None = None
+    """The vehicle: 4 or 4/1, px4 or ardupilot, or a nickname, hardware id or key of the cache. Instead of
+    --system."""
+
     system: Id = None
-    """System id of the vehicle, 1 to 255. Default: the only one heard."""
+    """System id of the vehicle, 1 to 255. Default: the only one received."""
 
     component: Id = None
     """Component id of the vehicle, 1 to 255. Default: the autopilot."""
@@ -115,7 +120,7 @@ async def _setup(url: str, options: SigningTarget, key: SigningKey, present: Sig
     link = create_link(url)
     address = await _send(link, options, deadline, key, present)
     signing = Signing(key, SigningPolicy.ACCEPT_ALL)
-    async with ParamClient(link, cache=False, signing=signing) as client:
+    async with ParamClient(link, cache=False, signing=signing, **options.source) as client:
         vehicle = await _read_value(client, address, deadline, "does not answer requests signed with the key")
         report = client.signing_report()
         if report is None or address not in {(each.system, each.component) for each in report.streams}:
@@ -128,7 +133,7 @@ async def _disable(url: str, options: SigningTarget, key: SigningKey | None) -> 
     deadline = Deadline(options.timeout)
     link = create_link(url)
     address = await _send(link, options, deadline, None, key)
-    async with ParamClient(link, cache=False, traffic=True) as client:
+    async with ParamClient(link, cache=False, traffic=True, **options.source) as client:
         vehicle = await _read_value(client, address, deadline, "does not answer unsigned requests")
         before = _count_signed(client, address)
         await _read_value(client, address, deadline, "does not answer unsigned requests")
@@ -147,9 +152,13 @@ async def _send(
 ) -> tuple[int, int]:
     """Send SETUP_SIGNING, signed with the vehicle's present key if known; return the vehicle's address."""
     signing = None if present is None else Signing(present, SigningPolicy.ACCEPT_ALL)
-    async with ParamClient(link, cache=False, signing=signing) as client:
+    async with ParamClient(link, cache=False, signing=signing, **options.source) as client:
         timeout = VEHICLE_TIMEOUT if options.timeout is None else deadline.left()
-        vehicle = await client.only_component(options.system, options.component, timeout=timeout)
+        named = VehicleName.chosen(options.vehicle, options.system, options.component)
+        vehicle = await wait_for_vehicle(
+            client, named.system, named.component, kind=named.kind, timeout=timeout, only=True
+        )
+        await check_uid(vehicle, named.uid)
         await vehicle.setup_signing(key, link_is_safe=True)
         return vehicle.system, vehicle.component
 

@@ -20,7 +20,7 @@ from typing import Final
 import anyio
 
 from paramclient.cache import CachedSummary, ParamCache
-from paramclient.cache.lookup import is_vehicle_name
+from paramclient.cache.lookup import address_of, is_vehicle_name
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import progress_bar, report
 from paramclient.cli.session import Deadline, connect
@@ -96,7 +96,7 @@ async def resolve_all(texts: Sequence[str], options: LinkOptions, *, only: bool 
     for text in dict.fromkeys(texts):
         if is_file(text):
             found[text] = _from_file(text, options)
-        elif names_vehicle(text):
+        elif names_vehicle(text, options.cache):
             found[text] = _from_cache(text, options)
         else:
             check_link(text)
@@ -126,9 +126,19 @@ def is_file(text: str) -> bool:
     return False
 
 
-def names_vehicle(text: str) -> bool:
-    """Return whether an argument has the form of a name of a vehicle in the cache."""
-    return text.startswith(_CACHED) or is_vehicle_name(text)
+def names_vehicle(text: str, cache: str | None = None) -> bool:
+    """Return whether an argument has the form of a name of a vehicle in the cache, or is a nickname.
+
+    Args:
+        text: the argument.
+        cache: the option --cache.
+    """
+    if text.startswith(_CACHED) or is_vehicle_name(text):
+        return True
+    if not text.replace("_", "").replace("-", "").isalnum():  # no nickname, but a link or a file
+        return False
+    with ParamCache(cache) as opened:
+        return text.lower() in map(str.lower, opened.nicknames)
 
 
 def check_link(text: str) -> None:
@@ -213,6 +223,10 @@ def tables_in(cache: ParamCache, vehicle: str | None, component: int | None) -> 
     if name == "":
         raise UsageError("a vehicle in the cache needs a name: its system id, its hardware id, or its key")
     known = cache.components(name)
+    address = None if name is None else address_of(name)
+    if address is not None and component not in (None, address[1]):
+        raise UsageError(f"{name} names component {address[1]}, and --component names {component}")
+    component = component if address is None else address[1]
     chosen = [each for each in known if component in (None, each.component)]
     if not chosen and (known or vehicle is not None):
         held = [f"{each.system}/{each.component} ({each.key})" for each in known]

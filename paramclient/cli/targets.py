@@ -11,7 +11,15 @@ from typing import Final, TypeAlias
 import anyio
 
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.session import VEHICLE_TIMEOUT, CommandSession, Deadline, connect
+from paramclient.cli.output import printable, say
+from paramclient.cli.session import (
+    VEHICLE_TIMEOUT,
+    CommandSession,
+    Deadline,
+    connect,
+    receiver_in_words,
+    wait_for_firmware,
+)
 from paramclient.cli.sources import choose, is_file, open_file, resolve
 from paramclient.client.client import ParamClient, implementation_of
 from paramclient.client.component import Component
@@ -29,6 +37,7 @@ __all__ = [
     "check_pattern",
     "describe",
     "fill_pattern",
+    "find_vehicles",
     "targets",
 ]
 
@@ -67,6 +76,12 @@ class Targets:
         """The deadline of the command."""
         return self.session.deadline
 
+    def announce_write(self) -> None:
+        """Print a line on stderr for each vehicle to which the subcommand writes, unless it prints JSON."""
+        if not self.session.options.json:
+            for each in self.vehicles:
+                say(printable(f"writing to {receiver_in_words(each)} on {self.client.link.name}"))
+
     async def check_only(self) -> None:
         """See `CommandSession.check_only`; does nothing with --all, which names every vehicle."""
         if not self.all_vehicles:
@@ -92,8 +107,10 @@ async def targets(
         NoReply: no vehicle was heard, or fewer than expected.
         LinkError: the link cannot be opened, or failed.
     """
-    if all_vehicles and options.system is not None:
-        raise UsageError("--all and --system exclude each other")
+    if all_vehicles and (options.system is not None or options.vehicle is not None):
+        raise UsageError(
+            f"--all and {'--system' if options.vehicle is None else '--vehicle'} exclude each other"
+        )
     if all_vehicles and options.split_peers:
         raise UsageError(
             "--all and --split-peers exclude each other: files and results are identified by system id"
@@ -103,7 +120,9 @@ async def targets(
     async with connect(url, options, only=only and not all_vehicles) as session:
         vehicles = [session.component]
         if all_vehicles:
-            vehicles = await _find_vehicles(session.client, options.component, expect, session.deadline)
+            vehicles = await find_vehicles(session.client, options.component, expect, session.deadline)
+        if only:
+            await wait_for_firmware(vehicles, session.deadline)
         yield Targets(session, vehicles, all_vehicles)
 
 
@@ -204,9 +223,21 @@ def describe(vehicle: Component) -> str:
     return f"{vehicle.system}/{vehicle.component} {vehicle.autopilot}"
 
 
-async def _find_vehicles(
+async def find_vehicles(
     client: ParamClient, component: int | None, expect: int | None, deadline: Deadline
 ) -> list[Component]:
+    """Return the vehicles on a link, by system id: those heard in 3 s, or as many as are expected.
+
+    Args:
+        client: the client.
+        component: their component id; None for autopilots.
+        expect: the number of vehicles to wait for, at most 10 s; or None.
+        deadline: the deadline of the command.
+
+    Raises:
+        NoReply: fewer than expected were heard.
+        LinkError: the link failed.
+    """
     timeout = deadline.left(FLEET_LISTENING_TIME if expect is None else VEHICLE_TIMEOUT)
     with anyio.move_on_after(timeout):
         while expect is None or len(_vehicles(client, component)) < expect:
@@ -215,7 +246,7 @@ async def _find_vehicles(
     found = _vehicles(client, component)
     if expect is not None and len(found) < expect:
         heard = ", ".join(map(describe, found)) or "none"
-        raise NoReply(f"{expect} vehicles (heard: {heard})", attempts=0, waited=timeout or 0.0)
+        raise NoReply(f"{expect} vehicles (received: {heard})", attempts=0, waited=timeout or 0.0)
     return found
 
 

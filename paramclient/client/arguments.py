@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Final
 
 from paramclient.errors import UsageError
-from paramclient.model.values import Settable, Value, check_name, check_value, is_portable_name
+from paramclient.model.values import Settable, WireValue, check_name, check_value, is_portable_name
 from paramclient.protocol.wire import HASH_CHECK, PARAMETERS_MAX
 
 __all__ = [
@@ -19,7 +19,6 @@ __all__ = [
     "check_asked_name",
     "check_settle",
     "check_writes",
-    "silence_in_words",
 ]
 
 COMPONENT_TIMEOUT: Final = 10.0
@@ -28,18 +27,6 @@ PROGRESS_CALL_INTERVAL: Final = 0.1
 """Seconds between two calls of a progress callback."""
 SETTLE_MAX: Final = 60.0
 """Maximum `settle` in seconds: further writes to the same name wait for it."""
-
-LISTED_MAX: Final = 5
-"""Components that a message lists."""
-
-_CAUSES: Final = {
-    "udpin": " Is the vehicle sending to this port?",
-    "udpout": " Is the vehicle listening at this address?",
-    "tcp": " Does the vehicle send MAVLink on this port?",
-    "tcpin": " Has the vehicle connected to this port?",
-    "serial": " Check the cable and the baud rate.",
-}
-"""Likely causes of a silent link, by the first part of its name."""
 
 
 def check_requested_name(name: str | int) -> None:
@@ -69,7 +56,9 @@ def check_asked_name(name: str) -> str:
     return name
 
 
-def check_writes(values: Mapping[str, Settable] | Iterable[tuple[str, Settable]]) -> list[tuple[str, Value]]:
+def check_writes(
+    values: Mapping[str, Settable] | Iterable[tuple[str, Settable]],
+) -> list[tuple[str, WireValue]]:
     """Check names and values to write, and return them as pairs.
 
     Raises:
@@ -113,22 +102,3 @@ def address_in_words(system: int | None, component: int | None, peer: str | None
     if component is None:
         return f"an autopilot{at}" if system is None else f"an autopilot with system id {system}{at}"
     return f"component {'*' if system is None else system}/{component}{at}"
-
-
-def silence_in_words(link: str, components: Iterable[tuple[int, int]], bytes_received: int) -> str:
-    """Return what was received on a link instead of the awaited component, with the likely cause.
-
-    Args:
-        link: name of the link.
-        components: system and component ids of the received components.
-        bytes_received: number of bytes received on the link.
-    """
-    received = [f"{system}/{component}" for system, component in sorted(set(components))]
-    if received:
-        more = f" and {len(received) - LISTED_MAX} more" if len(received) > LISTED_MAX else ""
-        return f"Received on {link} so far: {', '.join(received[:LISTED_MAX])}{more}."
-    cause = _CAUSES.get(link.partition(":")[0], "")
-    if bytes_received:
-        cause = cause if link.startswith("serial:") else ""
-        return f"{bytes_received:,} bytes were received on {link}, but no valid MAVLink frame.{cause}"
-    return f"Nothing was received on {link}.{cause}"

@@ -276,10 +276,13 @@ class ParamClient:
     ) -> Component:
         """Return the component with this address, after its first message.
 
-        Without arguments, this is the first autopilot; with only a system, the autopilot of that system; with
-        only a component, the first component with that id. With several vehicles, the first one is arbitrary:
-        programs that write use `only_component`. On return, a cached table is in `params`, unless the vehicle
-        does not report its identity.
+        Without arguments, this is the autopilot whose heartbeat was received first; with only a system, the
+        autopilot of that system; with only a component, the first component with that id. On a link with
+        several vehicles, the first one may be another one at the next start, and the call reports nothing
+        about the others. Use it in programs that only read, or that know that there is one vehicle. Programs
+        that write use `only_component`, which refuses to choose.
+
+        On return, a cached table is in `params`, unless the vehicle does not report its identity.
 
         Args:
             system: system id.

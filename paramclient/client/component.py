@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
+from typing import Literal
 
 import anyio
 
 from paramclient.client.extended_params import ExtParams
-from paramclient.client.reset import ResetChoice, ResetResult
+from paramclient.client.reset import ResetChoice, ResetResult, read_unconfirmed
 from paramclient.client.subscription import Changes
 from paramclient.errors import UsageError
 from paramclient.model.identity import Identity
 from paramclient.model.params import ParamMap
-from paramclient.model.values import Encoding, Param, Settable, Trust, Value
+from paramclient.model.values import Encoding, Param, Settable, WireValue
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.params.fetch_result import FetchResult, Progress
 from paramclient.protocol.params.sampling import SAMPLE_SIZE
@@ -74,7 +75,7 @@ class Component(ABC):
         """The extended parameters of the component (PARAM_EXT_*), with their own calls.
 
         Raises:
-            UsageError: the client is one over a service, which does not serve them.
+            UsageError: the client is one over a service of an earlier version, which does not serve them.
         """
 
     @property
@@ -182,8 +183,8 @@ class Component(ABC):
             value: a number; or the 4 bytes of the message for a value that is not expressible as a number.
             timeout: as in `get`.
             settle: seconds, 0 to 60, for which the value is watched after its acknowledgement; then it is
-                read again, and the result has the final value. 1.2 is enough for PX4, whose modules clamp
-                values within a second. Without it, such a change only appears in `changes`.
+                read again, and the result has the final value. 1.2 is enough for PX4, whose modules change
+                values up to 1.1 s later. Without it, such a change only appears in `changes`.
             force: send NaN and infinity also to PX4, which cannot save them and may stop, and to ArduPilot,
                 which ignores them.
             durable: return only after the value and its history entry are synced to the disk, safe from power
@@ -258,7 +259,7 @@ class Component(ABC):
     async def reset(
         self,
         *names: str,
-        defaults: Mapping[str, Value] | None = None,
+        defaults: Mapping[str, WireValue] | None = None,
         progress: Callable[[SetOutcome], None] | None = None,
         timeout: float | None = None,
         settle: float = 0.0,
@@ -295,14 +296,9 @@ class Component(ABC):
             return None if timeout is None else max(deadline - anyio.current_time(), 0.0)
 
         await self.fetch_all(timeout=timeout)
-        present = []
-        for name in dict.fromkeys(names):
-            param = self.params.get(name)
-            if param is None or param.trust is Trust.CACHED:
-                await self.get(name, timeout=left())
-                param = self.params[name]
-            present.append(param)
-        choice = ResetChoice.of(present, {} if defaults is None else defaults)
+        choice = ResetChoice.of(
+            await read_unconfirmed(self.params, self.get, names, timeout=left()), defaults or {}
+        )
         written = await self.set_many(
             choice.values, progress=progress, timeout=left(), settle=settle, durable=durable, asker=asker
         )
@@ -313,7 +309,7 @@ class Component(ABC):
         self,
         *,
         refresh: bool = False,
-        accept: str = "verified",
+        accept: Literal["verified", "sampled"] = "verified",
         sample: int = SAMPLE_SIZE,
         seed: int | None = None,
         timeout: float | None = None,

@@ -34,7 +34,7 @@ class ExtChanges(Subscription[ExtChange]):
         """Add a change, or merge it with the queued change of the same parameter."""
         earlier = self._waiting.pop(item.name, None)
         if earlier is not None:
-            item = ExtChange(item.name, earlier.old, item.new, item.by)
+            item = ExtChange(item.name, earlier.old, item.new, item.by, earlier.is_added)
             old, new = item.old, item.new
             if (old is None and new is None) or (old is not None and new is not None and old.same_value(new)):
                 return
@@ -110,6 +110,7 @@ class ExtParams(ABC):
         value: ExtSettable,
         *,
         timeout: float | None = None,
+        durable: bool = False,
         asker: str | None = None,
     ) -> ExtSetResult:
         """Write one parameter with PARAM_EXT_SET, and return when the component has acknowledged the value.
@@ -122,7 +123,7 @@ class ExtParams(ABC):
             name: param_id.
             value: a number for a numeric type; text, or bytes, of up to 128 bytes for CUSTOM.
             timeout: seconds; None: no limit besides the number of unanswered attempts.
-            asker: as in `Component.set`.
+            durable, asker: as in `Component.set`.
 
         Returns:
             Accepted, or adjusted: the component stored another value.
@@ -137,6 +138,8 @@ class ExtParams(ABC):
             NoReply: the component did not respond. It is unknown whether it has the value.
             ContestedAddress: several vehicles use its address.
             LinkError: the link failed, or the client was closed.
+            CacheError: `durable`, and the cache cannot store the value. Nothing was written.
+            NotDurable: `durable`, and the component has the value, but the disk does not.
         """
 
     @abstractmethod
@@ -146,6 +149,7 @@ class ExtParams(ABC):
         *,
         progress: Callable[[ExtSetOutcome], None] | None = None,
         timeout: float | None = None,
+        durable: bool = False,
         asker: str | None = None,
     ) -> ExtSetManyResult:
         """Write many parameters in one call, each as `set` does.
@@ -158,7 +162,7 @@ class ExtParams(ABC):
             values: values by name, or pairs of name and value; a name may occur in several pairs.
             progress: called with each outcome in the order of their arrival, from this task.
             timeout: seconds for the whole call; None: no limit besides the number of attempts.
-            asker: as in `Component.set`.
+            durable, asker: as in `Component.set_many`.
 
         Returns:
             One outcome for each value, in the order given: accepted, adjusted, refused, unknown or not tried.
@@ -169,6 +173,7 @@ class ExtParams(ABC):
             NoReply: the component is lost already. Nothing was written.
             ContestedAddress: several vehicles use its address. Nothing was written.
             LinkError: the link had failed already, or the client was closed.
+            CacheError: `durable`, and the cache cannot store values. Nothing was written.
         """
 
     @abstractmethod

@@ -6,7 +6,7 @@ import math
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
 import anyio
 import anyio.lowlevel
@@ -18,6 +18,7 @@ from paramclient.errors import CacheError, ContestedAddress, NoReply
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_result import FetchResult, Progress
+from paramclient.protocol.silence import silence_of_component, silence_of_link
 from paramclient.protocol.station import Address, Peer, Station
 
 __all__ = ["FleetFetch", "FetchedAll"]
@@ -33,6 +34,10 @@ STARTED_FETCHES_MAX: Final = 32
 """Fetches started in one iteration of the event loop: 32 take 2 ms."""
 ENDED_FETCHES_MAX: Final = 64
 """Fetches ended, or results collected, in one iteration of the event loop: 64 take 3 ms."""
+
+
+Failure: TypeAlias = NoReply | CacheError | ContestedAddress
+"""The error of one component."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,7 +221,7 @@ class FleetFetch:
             LinkError: the link failed, or the client was closed.
         """
         results: dict[Address, FetchResult] = {}
-        silent: dict[Address, NoReply | CacheError | ContestedAddress] = {}
+        silent: dict[Address, Failure] = {}
         for number, (address, fetch) in enumerate(self._fetches.items(), 1):
             if not number % ENDED_FETCHES_MAX:
                 await anyio.lowlevel.checkpoint()
@@ -226,7 +231,7 @@ class FleetFetch:
                 results[address] = fetch.result or fetch.partial(now, TIMEOUT_NOTE)
             except (NoReply, CacheError, ContestedAddress) as error:
                 # a traceback refers to this call, and thus to the error: a cycle
-                silent[address] = error.with_traceback(None)
+                silent[address] = self._explained(error.with_traceback(None), address, now)
         for address, component in self._components.items():
             is_wanted = self._system in (None, address[0])
             contest = component.machine.peers.contest
@@ -242,8 +247,18 @@ class FleetFetch:
                     raise failure
                 attempts = max(attempts, failure.attempts)
             whose = "any component" if self._system is None else f"any component of system {self._system}"
-            raise NoReply(f"the parameters of {whose}", attempts=attempts, waited=waited)
+            hint = silence_of_link(self._station, self._station.link)
+            raise NoReply(f"the parameters of {whose}", attempts=attempts, waited=waited, hint=hint)
         return FetchedAll(results, silent)
+
+    def _explained(self, error: Failure, address: Address, now: float) -> Failure:
+        """Return an error; a NoReply with what was received instead."""
+        machine = self._station.components.get(address)
+        if not isinstance(error, NoReply) or machine is None:
+            return error
+        fetch = self._fetches.get(address)
+        since = -math.inf if fetch is None else fetch.begun_at
+        return error.with_hint(silence_of_component(self._station, machine, since, now))
 
     async def _end(self, wake: Callable[[], None]) -> None:
         """Release all fetches, the last ones first: those without a turn must not get one that ends."""

@@ -15,7 +15,7 @@ import anyio
 import anyio.abc
 
 from paramclient.cache import ParamCache
-from paramclient.client.arguments import COMPONENT_TIMEOUT, address_in_words, silence_in_words
+from paramclient.client.arguments import COMPONENT_TIMEOUT, address_in_words
 from paramclient.client.cache_writer import CacheWriter, choose_cache
 from paramclient.client.component import Component
 from paramclient.client.events import Events, public_event
@@ -52,6 +52,7 @@ from paramclient.protocol.events import (
 )
 from paramclient.protocol.params.fetch_result import Policy, Progress
 from paramclient.protocol.params.sync import SyncSettings
+from paramclient.protocol.silence import silence_of_link
 from paramclient.protocol.station import Station
 from paramclient.protocol.stats.traffic import TrafficReport
 from paramclient.protocol.system_id_change import SEARCH_INTERVAL, SystemIdSearch
@@ -266,7 +267,7 @@ class LinkClient(LocalClient):
                 for scope in (*self._outlasting, tasks.cancel_scope):
                     scope.cancel()
             try:
-                # not public_event of the caller's exception: it would come out wrapped in a group
+                # without the caller's exception, which the task group would wrap in an ExceptionGroup
                 await tasks.__aexit__(None, None, None)
             finally:
                 await self._release()
@@ -366,8 +367,7 @@ class LinkClient(LocalClient):
     def _not_received(self, wanted: str, began: float) -> NoReply:
         """Return the error of a component that was not received, with what was received instead."""
         refused = refused_in_words(self.signing_report())
-        addresses = [(machine.system, machine.component) for machine in self.station.components.values()]
-        hint = "" if refused else silence_in_words(self._link.name, addresses, self.station.bytes_received)
+        hint = "" if refused else silence_of_link(self.station, self._link.name)
         waited = anyio.current_time() - began
         return NoReply(f"{wanted}{refused}", attempts=0, waited=waited, hint=hint)
 

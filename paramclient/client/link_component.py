@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import random
 import weakref
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import TypeVar
+from functools import wraps
+from typing import Any, Concatenate, Literal, ParamSpec, TypeVar
 
 import anyio
 
@@ -42,6 +43,7 @@ from paramclient.protocol.params.sync import SyncState
 from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome
 from paramclient.protocol.params.writes import SetResult
 from paramclient.protocol.requests.operation import Operation
+from paramclient.protocol.silence import silence_of_component
 from paramclient.protocol.station import Station
 from paramclient.protocol.vehicle.address_contest import Contest
 from paramclient.protocol.wire import (
@@ -54,6 +56,7 @@ from paramclient.protocol.wire import (
 __all__ = ["LinkComponent", "fetch_timeout"]
 
 Result = TypeVar("Result")
+Call = ParamSpec("Call")
 
 REBOOT_TIMEOUT = 60.0
 """Default timeout in seconds for a vehicle to reboot and report its identity: small autopilot boards take up
@@ -68,6 +71,22 @@ SETUP_SIGNING_INTERVAL = 0.1
 """Seconds after each SETUP_SIGNING message."""
 TIMEOUT_NOTE = "The fetch ended at its timeout."
 """Note of a partial result that a timeout ended."""
+
+
+def _explains_silence(
+    method: Callable[Concatenate[LinkComponent, Call], Awaitable[Result]],
+) -> Callable[Concatenate[LinkComponent, Call], Coroutine[Any, Any, Result]]:
+    """Add to a NoReply of a method what was received on the link meanwhile."""
+
+    @wraps(method)
+    async def call(component: LinkComponent, /, *arguments: Call.args, **options: Call.kwargs) -> Result:
+        began = anyio.current_time()
+        try:
+            return await method(component, *arguments, **options)
+        except NoReply as error:
+            raise _Explanations(component, began).explained(error) from None
+
+    return call
 
 
 class LinkComponent(LocalComponent):
@@ -177,6 +196,7 @@ class LinkComponent(LocalComponent):
         whose = f"{self.system}/{self.component} {self.autopilot}"
         return f"<Component {whose} {self.state} {len(self.params)}{of} params{origin}>"
 
+    @_explains_silence
     async def get(self, name: str | int, *, timeout: float | None = None) -> Param:
         """See `Component.get`."""
         check_requested_name(name)
@@ -192,6 +212,7 @@ class LinkComponent(LocalComponent):
             return _param_of(message, machine.table.encoding)
         return known
 
+    @_explains_silence
     async def set(
         self,
         name: str,
@@ -209,7 +230,7 @@ class LinkComponent(LocalComponent):
         self.client.check_open()
         machine.check_uncontested()
         if durable:
-            await self._wait_until_kept()
+            await self.wait_until_kept()
         write = machine.write(
             name,
             checked,
@@ -224,9 +245,10 @@ class LinkComponent(LocalComponent):
         finally:
             machine.writes.cancel(write, anyio.current_time())
         if durable:
-            await self._write_durably([name])
+            await self.write_durably([name])
         return result
 
+    @_explains_silence
     async def set_many(
         self,
         values: Mapping[str, Settable] | Iterable[tuple[str, Settable]],
@@ -244,20 +266,26 @@ class LinkComponent(LocalComponent):
         self.client.check_open()
         machine.check_uncontested()
         if durable:
-            await self._wait_until_kept()
+            await self.wait_until_kept()
         began = anyio.current_time()
+        explain = _Explanations(self, began)
+
+        def tell(outcome: SetOutcome) -> None:
+            if progress is not None:
+                progress(explain.outcome(outcome))
+
         batch = machine.write_many(
             pairs, began, check_author(asker), settle=check_settle(settle), force=force
         )
         try:
             self.wake()
-            outcomes = await wait_for_batch(batch, timeout, progress, self._unanswered_sets)
+            outcomes = await wait_for_batch(batch, timeout, tell, self._unanswered_sets)
         finally:
             machine.write_batches.end(batch, anyio.current_time())
-        failure = batch.failure
+        failure, outcomes = explain.error(batch.failure), tuple(map(explain.outcome, outcomes))
         if durable and (done := [outcome.name for outcome in outcomes if outcome.is_set]):
             try:
-                await self._write_durably(done)
+                await self.write_durably(done)
             except NotDurable as error:
                 failure = failure or error
                 outcomes = tuple(replace(each, error=error) if each.is_set else each for each in outcomes)
@@ -268,27 +296,12 @@ class LinkComponent(LocalComponent):
         what = f"PARAM_SET {names[0]}" if len(names) == 1 else f"{len(names)} PARAM_SETs"
         return f"{what} to {self.system}/{self.component}"
 
-    async def _write_durably(self, names: Sequence[str]) -> None:
-        """Sync the values of the component to the disk.
-
-        Args:
-            names: names of the parameters whose values the vehicle has accepted, for NotDurable.
-
-        Raises:
-            NotDurable: the disk cannot be written.
-        """
-        try:
-            await self.client.cache_writer.write_durably(self.machine)
-        except CacheError as error:
-            address = f"{self.system}/{self.component}"
-            what = f"{names[0]}, but it is" if len(names) == 1 else f"{len(names)} values, but they are"
-            raise NotDurable(f"{address} has accepted {what} not on the disk: {error}") from error
-
+    @_explains_silence
     async def fetch_all(
         self,
         *,
         refresh: bool = False,
-        accept: str = "verified",
+        accept: Literal["verified", "sampled"] = "verified",
         sample: int = SAMPLE_SIZE,
         seed: int | None = None,
         timeout: float | None = None,
@@ -341,6 +354,7 @@ class LinkComponent(LocalComponent):
             self.client.wake()
             await anyio.sleep(SETUP_SIGNING_INTERVAL)
 
+    @_explains_silence
     async def reboot(self, *, system: int | None = None, timeout: float | None = None) -> Component:
         """See `Component.reboot`."""
         self.client.check_open()
@@ -390,13 +404,8 @@ class LinkComponent(LocalComponent):
                     await self._cache_is_read.wait()
                 self.client.check_open()
 
-    async def _wait_until_kept(self) -> None:
-        """Wait until the values of the component are written to the cache, for at most 6.5 s.
-
-        Raises:
-            UsageError: the client has no cache.
-            CacheError: the values cannot be written, or the timeout is over.
-        """
+    async def wait_until_kept(self) -> None:
+        """See `LocalComponent.wait_until_kept`."""
         writer = self.client.cache_writer
         if self.client.cache is None:
             raise UsageError("durable needs a cache, and the client has none; open it with a cache")
@@ -405,6 +414,15 @@ class LinkComponent(LocalComponent):
         self.client.check_open()
         if (why := writer.obstacle(self.machine)) is not None:
             raise CacheError(f"nothing was set: {why}, so it could not be written to the disk")
+
+    async def write_durably(self, names: Sequence[str]) -> None:
+        """See `LocalComponent.write_durably`."""
+        try:
+            await self.client.cache_writer.write_durably(self.machine)
+        except CacheError as error:
+            address = f"{self.system}/{self.component}"
+            what = f"{names[0]}, but it is" if len(names) == 1 else f"{len(names)} values, but they are"
+            raise NotDurable(f"{address} has accepted {what} not on the disk: {error}") from error
 
     async def wait_until_files_closed(self) -> None:
         """See `LocalComponent.wait_until_files_closed`."""
@@ -453,6 +471,7 @@ class LinkComponent(LocalComponent):
 
     # waiting
 
+    @_explains_silence
     async def wait(
         self,
         operation: Operation[Result],
@@ -480,6 +499,7 @@ class LinkComponent(LocalComponent):
             raise NoReply(awaited, attempts=attempts, waited=anyio.current_time() - began)
         return _outcome(operation)
 
+    @_explains_silence
     async def wait_for_fetch(
         self, fetch: Fetch, deadline: float | None, progress: Callable[[Progress], None] | None
     ) -> FetchResult:
@@ -503,6 +523,40 @@ class LinkComponent(LocalComponent):
             with suppress(ValueError):
                 fetch.on_done.remove(ended.set)
         return _outcome(fetch)
+
+
+class _Explanations:
+    """Adds to errors of requests without a response what was received on the link meanwhile.
+
+    Outcomes with one error keep one error.
+
+    Args:
+        component: the component.
+        since: when the first request was sent.
+    """
+
+    def __init__(self, component: LinkComponent, since: float) -> None:
+        self._component = component
+        self._since = since
+        self._done: dict[int, tuple[NoReply, NoReply]] = {}
+
+    def explained(self, error: NoReply) -> NoReply:
+        """Return the error with a hint."""
+        if id(error) not in self._done:
+            component = self._component
+            station, now = component.client.station, anyio.current_time()
+            hint = silence_of_component(station, component.machine, self._since, now)
+            self._done[id(error)] = (error, error.with_hint(hint))
+        return self._done[id(error)][1]
+
+    def error(self, error: ParamClientError | None) -> ParamClientError | None:
+        """Return an error, with a hint if it is a NoReply."""
+        return self.explained(error) if isinstance(error, NoReply) else error
+
+    def outcome(self, outcome: SetOutcome) -> SetOutcome:
+        """Return an outcome with its error explained."""
+        error = self.error(outcome.error)
+        return outcome if error is outcome.error else replace(outcome, error=error)
 
 
 def fetch_timeout(station: Station, timeout: float | None) -> float | None:

@@ -5,15 +5,16 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from types import MappingProxyType
 
 import anyio
 
 from paramclient.client.arguments import PROGRESS_CALL_INTERVAL, check_asked_name, check_requested_name
 from paramclient.client.batch_wait import wait_for_batch
-from paramclient.client.extended_params import ExtChanges, ExtParams
-from paramclient.client.local import LocalComponent
-from paramclient.errors import CacheError, NoReply, ParamClientError
+from paramclient.client.extended_params import ExtChanges
+from paramclient.client.local import LocalComponent, LocalExtParams
+from paramclient.errors import CacheError, NoReply, NotDurable, ParamClientError
 from paramclient.model.ext_params import ExtParam, ExtSettable, check_ext_value
 from paramclient.protocol.ext.change import ExtChange
 from paramclient.protocol.ext.fetch import ExtFetch, ExtFetchResult
@@ -28,7 +29,7 @@ EXT_TIMEOUT_NOTE = "The fetch of extended parameters ended at its timeout."
 """Note of a partial result that a timeout ended."""
 
 
-class LinkExtParams(ExtParams):
+class LinkExtParams(LocalExtParams):
     """The extended parameters of a component on a link of this process. See `ExtParams` for the calls.
 
     Args:
@@ -88,6 +89,7 @@ class LinkExtParams(ExtParams):
         value: ExtSettable,
         *,
         timeout: float | None = None,
+        durable: bool = False,
         asker: str | None = None,
     ) -> ExtSetResult:
         """See `ExtParams.set`."""
@@ -95,12 +97,18 @@ class LinkExtParams(ExtParams):
         check_asked_name(name)
         checked = check_ext_value(value)
         self._component.client.check_open()
+        machine.check_uncontested()
+        if durable:
+            await self._component.wait_until_kept()
         write = machine.write_ext(name, checked, anyio.current_time(), check_author(asker))
         what = f"PARAM_EXT_SET {name} to {self._whose}"
         try:
-            return await self._component.wait(write, timeout, lambda: (what, write.attempts))
+            result = await self._component.wait(write, timeout, lambda: (what, write.attempts))
         finally:
             machine.ext.writes.cancel(write, anyio.current_time())
+        if durable:
+            await self._component.write_durably([name])
+        return result
 
     async def set_many(
         self,
@@ -108,6 +116,7 @@ class LinkExtParams(ExtParams):
         *,
         progress: Callable[[ExtSetOutcome], None] | None = None,
         timeout: float | None = None,
+        durable: bool = False,
         asker: str | None = None,
     ) -> ExtSetManyResult:
         """See `ExtParams.set_many`."""
@@ -115,6 +124,9 @@ class LinkExtParams(ExtParams):
         pairs = [(check_asked_name(name), check_ext_value(value)) for name, value in given]
         machine = self._machine
         self._component.client.check_open()
+        machine.check_uncontested()
+        if durable:
+            await self._component.wait_until_kept()
         began = anyio.current_time()
         batch = machine.write_many_ext(pairs, began, check_author(asker))
         try:
@@ -127,8 +139,15 @@ class LinkExtParams(ExtParams):
             )
         finally:
             machine.ext.batches.end(batch, anyio.current_time())
+        failure = batch.failure
+        if durable and (done := [outcome.name for outcome in outcomes if outcome.is_set]):
+            try:
+                await self._component.write_durably(done)
+            except NotDurable as error:
+                failure = failure or error
+                outcomes = tuple(replace(each, error=error) if each.is_set else each for each in outcomes)
         elapsed = anyio.current_time() - began
-        return ExtSetManyResult(machine.system, machine.component, outcomes, batch.failure, elapsed)
+        return ExtSetManyResult(machine.system, machine.component, outcomes, failure, elapsed)
 
     async def fetch_all(
         self,
@@ -153,12 +172,19 @@ class LinkExtParams(ExtParams):
 
     def changes(self) -> ExtChanges:
         """See `ExtParams.changes`."""
-        changes = ExtChanges()
+        self.listen(changes := ExtChanges())
+        return changes
+
+    def listen(self, changes: ExtChanges) -> None:
+        """See `LocalExtParams.listen`."""
         self._subscriptions.add(changes)
         client = self._component.client
         if client.is_over:
             changes.end(client.link_task.ended)
-        return changes
+
+    def ignore(self, changes: ExtChanges) -> None:
+        """See `LocalExtParams.ignore`."""
+        self._subscriptions.discard(changes)
 
     # called by the component
 

@@ -1,4 +1,4 @@
-"""LocalClient and LocalComponent: internal interface of a client and a component on a link of this process.
+"""LocalClient, LocalComponent and LocalExtParams: internal interface of clients on a link of this process.
 
 `local` returns it for a component, `paramclient.client.client.local_client` for a client. The service,
 provision, metadata, diagnosis, MAVFTP and the fetch of several components use only these names. They are not
@@ -8,13 +8,14 @@ part of `Component` and `ParamClient`. A component over a service has none of th
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol, TypeVar
 
 from paramclient.cache import ParamCache
 from paramclient.client.cache_writer import CacheWriter
 from paramclient.client.component import Component
 from paramclient.client.events import Events
+from paramclient.client.extended_params import ExtChanges, ExtParams
 from paramclient.client.link_task import LinkTask
 from paramclient.client.subscription import Changes
 from paramclient.errors import UsageError
@@ -27,7 +28,7 @@ from paramclient.protocol.params.fetch_result import FetchResult, Progress
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.station import Station
 
-__all__ = ["LocalClient", "LocalComponent", "local", "not_given"]
+__all__ = ["LocalClient", "LocalComponent", "LocalExtParams", "local", "not_given"]
 
 Result = TypeVar("Result")
 
@@ -81,6 +82,18 @@ class LocalClient(Protocol):
         """Push all further events to this stream while it is referenced. Ends it if none can come."""
 
 
+class LocalExtParams(ExtParams):
+    """The extended parameters of a component on a link of this process."""
+
+    @abstractmethod
+    def listen(self, changes: ExtChanges) -> None:
+        """Push all further changes to this stream while it is referenced. Ends it if none can come."""
+
+    @abstractmethod
+    def ignore(self, changes: ExtChanges) -> None:
+        """Push no further changes to this stream."""
+
+
 class LocalComponent(Component):
     """A component on a link of this process.
 
@@ -91,6 +104,11 @@ class LocalComponent(Component):
 
     machine: ComponentMachine
     client: LocalClient
+
+    @property
+    @abstractmethod
+    def ext(self) -> LocalExtParams:
+        """See `Component.ext`."""
 
     @property
     @abstractmethod
@@ -111,6 +129,26 @@ class LocalComponent(Component):
 
         Raises:
             LinkError: the link failed, or the client was closed.
+        """
+
+    @abstractmethod
+    async def wait_until_kept(self) -> None:
+        """Wait until the values of the component are written to the cache, for at most 6.5 s.
+
+        Raises:
+            UsageError: the client has no cache.
+            CacheError: the values cannot be written, or the timeout is over.
+        """
+
+    @abstractmethod
+    async def write_durably(self, names: Sequence[str]) -> None:
+        """Sync the values of the component, plain and extended, to the disk.
+
+        Args:
+            names: names of the parameters whose values the vehicle has accepted, for NotDurable.
+
+        Raises:
+            NotDurable: the disk cannot be written.
         """
 
     @abstractmethod

@@ -4,12 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Protocol
+
+import anyio
 
 from paramclient.errors import UsageError
-from paramclient.model.values import Param, Value, bits_of, same_bits
+from paramclient.model.values import Param, Trust, WireValue, bits_of, same_bits
 from paramclient.protocol.params.write_batch import SetManyResult
 
-__all__ = ["ResetChoice", "ResetResult"]
+__all__ = ["ResetChoice", "ResetResult", "read_unconfirmed"]
+
+
+class Reader(Protocol):
+    """`Component.get`."""
+
+    async def __call__(self, name: str, *, timeout: float | None = None) -> Param:
+        """Read one parameter from the vehicle."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,12 +32,12 @@ class ResetChoice:
         without_default: names of parameters without a known default.
     """
 
-    values: Mapping[str, Value]
+    values: Mapping[str, WireValue]
     unchanged: tuple[str, ...]
     without_default: tuple[str, ...]
 
     @classmethod
-    def of(cls, params: Iterable[Param], defaults: Mapping[str, Value]) -> ResetChoice:
+    def of(cls, params: Iterable[Param], defaults: Mapping[str, WireValue]) -> ResetChoice:
         """Choose the values to write.
 
         Args:
@@ -35,7 +45,7 @@ class ResetChoice:
             defaults: defaults of parameters whose default the vehicle has not given; the vehicle's own
                 default has priority.
         """
-        values: dict[str, Value] = {}
+        values: dict[str, WireValue] = {}
         unchanged, unknown = [], []
         for param in params:
             default = defaults.get(param.name) if param.default is None else param.default
@@ -75,9 +85,36 @@ class ResetResult:
         )
 
 
-def _has_value(param: Param, value: Value) -> bool:
+async def read_unconfirmed(
+    table: Mapping[str, Param], read: Reader, names: Iterable[str], *, timeout: float | None = None
+) -> list[Param]:
+    """Return parameters of a fetched table in the order of the names; read those that are only cached.
+
+    Args:
+        table: `Component.params`.
+        read: `Component.get` of the same component.
+        names: param_ids; of equal ones the first counts.
+        timeout: seconds for all reads; None for no limit besides the number of attempts.
+
+    Raises:
+        UnknownParameter: the vehicle has no parameter with one of the names.
+        ParamClientError: as from `Component.get`.
+    """
+    until = None if timeout is None else anyio.current_time() + timeout
+    params = []
+    for name in dict.fromkeys(names):
+        param = table.get(name)
+        if param is None or param.trust is Trust.CACHED:
+            left = None if until is None else max(until - anyio.current_time(), 0.0)
+            await read(name, timeout=left)
+            param = table[name]
+        params.append(param)
+    return params
+
+
+def _has_value(param: Param, value: WireValue) -> bool:
     """Return whether a parameter has this value, as far as its type can represent the value."""
     try:
-        return same_bits(param.type, param.bits, bits_of(value, param.type))
+        return same_bits(param.type_number, param.bits, bits_of(value, param.type_number))
     except UsageError:  # not in the range of the type; the write reports it
         return False

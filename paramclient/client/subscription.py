@@ -68,11 +68,10 @@ class Changes(Subscription[Change]):
         """Add a change, or merge it with the queued change of the same parameter."""
         earlier = self._waiting.pop(item.name, None)
         if earlier is not None:
-            is_added = isinstance(earlier, Added)
-            item = Change.between(item.name, earlier.old, item.new, item.by, is_added=is_added)
-            old, new = item.old, item.new
+            old, new = earlier.old, item.new
             if (old is None and new is None) or (old is not None and new is not None and old.same_value(new)):
                 return
+            item = Change.between(item.name, old, new, item.by, is_added=isinstance(earlier, Added))
         self._waiting[item.name] = item
         if len(self._waiting) > QUEUED_CHANGES_MAX:
             del self._waiting[next(iter(self._waiting))]

@@ -164,10 +164,12 @@ def _about_vehicle(report: VehicleReport) -> Iterator[Finding]:
             "be taken for this one.",
         )
     elif report.identity.uid is None or report.identity.uid in SHARED_UIDS:
-        is_shared = report.identity.uid is not None
-        uid = "the hardware id that all simulated ones have" if is_shared else "no hardware id"
         yield Finding(
-            Severity.NOTE, f"The vehicle has {uid}: the cache identifies it by system id and link instead."
+            Severity.NOTE,
+            "The vehicle has no hardware id: the cache identifies it by system id and link."
+            if report.identity.uid is None
+            else "The vehicle has the hardware id that all simulated PX4 vehicles have: the cache identifies "
+            "it by hardware id and system id.",
         )
     if report.encoding_reason.startswith("the standard's"):
         yield Finding(

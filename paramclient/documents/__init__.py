@@ -9,6 +9,7 @@ Each document is built by its `of(…)` from an object of the library.
 - `diff`, `fleet`: comparisons of two sets and of many vehicles.
 - `cached`, `history`: tables, changes and snapshots in the cache.
 - `traffic`, `check`: traffic of a link; the diagnosis of a vehicle.
+- `extended_param`, `extended_results`: one extended parameter; results of fetches and writes.
 - `extended_output`: extended parameters, as subcommands print them.
 - `command_output`: results and events of single subcommands.
 

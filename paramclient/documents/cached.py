@@ -20,6 +20,7 @@ __all__ = [
     "AddedDoc",
     "CachedListDoc",
     "CachedSummaryDoc",
+    "NicknameDoc",
     "CachedTableDoc",
     "CachedTablesDoc",
     "CopiedDoc",
@@ -49,10 +50,11 @@ class CachedSummaryDoc(Document):
     synced_at: str | None
     updated_at: str | None
     source: Maybe[str] = None
+    nickname: Maybe[str] = None
 
     @classmethod
-    def of(cls, summary: CachedSummary) -> CachedSummaryDoc:
-        """Return the document of a `CachedSummary`."""
+    def of(cls, summary: CachedSummary, nickname: str | None = None) -> CachedSummaryDoc:
+        """Return the document of a `CachedSummary` of a vehicle with this nickname, or None."""
         return cls(
             key=summary.key,
             system=summary.system,
@@ -66,7 +68,15 @@ class CachedSummaryDoc(Document):
             synced_at=time_or_none(summary.synced_at),
             updated_at=time_or_none(summary.updated_at),
             source=summary.source,
+            nickname=nickname,
         )
+
+
+class NicknameDoc(Document):
+    """The nickname of a vehicle in the cache; null if it was removed."""
+
+    key: str
+    nickname: str | None
 
 
 class CachedListDoc(Document):

@@ -2,47 +2,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from paramclient.client.events import Contested, Found, Lost, Resynced
 from paramclient.documents.component import ContestDoc
 from paramclient.documents.document import Document, Maybe, Scalar
-from paramclient.documents.param import ParamDoc
-from paramclient.model.identity import autopilot_name
-from paramclient.model.notation import hash_text, rounded, time_text, value_json
+from paramclient.documents.param import ParamDoc, ReadOutputDoc
+from paramclient.documents.setup import FailedVehicleDoc
+from paramclient.model.identity import autopilot_name, version_text
+from paramclient.model.notation import hash_text, rounded, time_text, typed, value_json
 from paramclient.model.values import ParamType
 from paramclient.protocol.params.change import Added, Change, Removed
+from paramclient.protocol.vehicle.kinds import kind_in_words
 
 if TYPE_CHECKING:
     from paramclient.client.component import Component
     from paramclient.client.events import Rebooted, Uncontested
+    from paramclient.errors import ParamClientError
     from paramclient.links.ports import SerialPort
     from paramclient.logs.imported_table import ImportedTable
-    from paramclient.metadata import ParamInfo
+    from paramclient.metadata import AddedMetadata, Metadata, ParamInfo
     from paramclient.model.paramset import ParamSet
-    from paramclient.model.values import Param
+    from paramclient.model.values import Param, WireValue
     from paramclient.protocol.params.fetch_result import FetchResult
     from paramclient.protocol.params.sampling import Sample
     from paramclient.protocol.params.write_batch import SetOutcome
 
 __all__ = [
+    "AddedMetadataDoc",
+    "AddedMetadataListDoc",
     "ChangeLineDoc",
     "ContestedLineDoc",
     "EventLineDoc",
     "FetchOutputDoc",
+    "FleetFetchDoc",
+    "FleetReadDoc",
+    "FleetWritesDoc",
     "ImportDoc",
     "ImportedDoc",
     "PortDoc",
     "PortsDoc",
+    "ReceiverDoc",
+    "RemovedMetadataDoc",
+    "ResetOutputDoc",
+    "ResetPlanDoc",
+    "ResetValueDoc",
     "ResyncedLineDoc",
     "SavedDoc",
+    "SavedFilesDoc",
     "SavedSetDoc",
     "WriteOutputDoc",
     "WritesOutputDoc",
     "SigningOutputDoc",
     "SilenceLineDoc",
     "TrustedSampleDoc",
+    "VehicleReadDoc",
+    "VehicleWritesDoc",
 ]
 
 ASSUMED_CHANGES: Final = (1, 10, 100)
@@ -162,7 +178,7 @@ class WriteOutputDoc(Document):
             kind: the vehicle's type of the parameter.
             info: the metadata of the parameter, or None.
         """
-        actual, error, result = outcome.actual, outcome.error, outcome.result
+        actual, error, result = outcome.reported, outcome.error, outcome.result
         return cls(
             name=outcome.name,
             requested=value_json(outcome.requested, ParamType.REAL64),
@@ -176,10 +192,128 @@ class WriteOutputDoc(Document):
         )
 
 
-class WritesOutputDoc(Document):
-    """The outcomes of several writes, in their order."""
+class ReceiverDoc(Document):
+    """The vehicle that a subcommand writes to; `kind` is in words, and `firmware` null if it is not known."""
 
+    system: int
+    component: int
+    autopilot: str
+    kind: str
+    firmware: str | None
+    uid: str | None
+
+    @classmethod
+    def of(cls, component: Component) -> ReceiverDoc:
+        """Return the document of a component."""
+        identity = component.identity
+        return cls(
+            system=component.system,
+            component=component.component,
+            autopilot=component.autopilot,
+            kind=kind_in_words(identity.autopilot, identity.vehicle_type),
+            firmware=version_text(identity.firmware) if identity.firmware else None,
+            uid=identity.uid,
+        )
+
+
+class WritesOutputDoc(Document):
+    """The outcomes of several writes to a vehicle, in their order."""
+
+    vehicle: ReceiverDoc
     results: list[WriteOutputDoc]
+
+
+class ResetOutputDoc(Document):
+    """The outcomes of a reset to the firmware's defaults, and the names that were not written."""
+
+    vehicle: ReceiverDoc
+    results: list[WriteOutputDoc]
+    unchanged: list[str]
+    without_default: list[str]
+
+
+class ResetValueDoc(Document):
+    """A default that a reset would write; `source` is `vehicle` or `metadata`."""
+
+    name: str
+    value: Scalar
+    default: Scalar
+    source: str
+
+    @classmethod
+    def of(cls, param: Param, default: WireValue, source: str) -> ResetValueDoc:
+        """Return the document of a parameter and its default."""
+        return cls(
+            name=param.name,
+            value=value_json(param.settable, param.type_number),
+            default=value_json(*typed(default, param.type_number)),
+            source=source,
+        )
+
+
+class ResetPlanDoc(Document):
+    """The values that a reset to the firmware's defaults would write; see `ResetChoice`."""
+
+    vehicle: ReceiverDoc
+    dry_run: bool = True
+    values: list[ResetValueDoc]
+    unchanged: list[str]
+    without_default: list[str]
+
+
+class FleetFetchDoc(Document):
+    """The fetches of every vehicle on a link, and the errors of vehicles."""
+
+    vehicles: list[FetchOutputDoc]
+    errors: list[FailedVehicleDoc]
+
+
+class VehicleReadDoc(Document):
+    """Requested parameters of one of several vehicles; see `ReadOutputDoc`."""
+
+    system: int
+    component: int
+    params: dict[str, ParamDoc]
+    errors: Maybe[dict[str, str]] = None
+
+
+class FleetReadDoc(Document):
+    """Requested parameters of every vehicle on a link, and the errors of vehicles."""
+
+    vehicles: list[VehicleReadDoc]
+    errors: list[FailedVehicleDoc]
+
+    @classmethod
+    def of(
+        cls,
+        read: Iterable[tuple[Component, Iterable[Param], Mapping[str, ParamClientError], Metadata | None]],
+        errors: list[FailedVehicleDoc],
+    ) -> FleetReadDoc:
+        """Return the document of vehicles, each with its parameters, the errors by name and its metadata."""
+        vehicles = [
+            VehicleReadDoc(
+                system=component.system,
+                component=component.component,
+                params=(document := ReadOutputDoc.of(params, metadata, failed)).params,
+                errors=document.errors,
+            )
+            for component, params, failed, metadata in read
+        ]
+        return cls(vehicles=vehicles, errors=errors)
+
+
+class VehicleWritesDoc(Document):
+    """The outcomes of the writes to one of several vehicles."""
+
+    system: int
+    component: int
+    results: list[WriteOutputDoc]
+
+
+class FleetWritesDoc(Document):
+    """The outcomes of writes to every vehicle on a link."""
+
+    vehicles: list[VehicleWritesDoc]
 
 
 class ChangeLineDoc(Document):
@@ -196,7 +330,7 @@ class ChangeLineDoc(Document):
     def of(cls, change: Change, at: float) -> ChangeLineDoc:
         """Return the document of a change that was received `at` this unix time in seconds."""
         old, new = (
-            None if param is None else value_json(param.value, param.type)
+            None if param is None else value_json(param.settable, param.type_number)
             for param in (change.old, change.new)
         )
         kind: Literal["changed", "added", "removed"] = "changed"
@@ -284,6 +418,38 @@ class SavedDoc(Document):
         """Return the document of a file: its path, its format, and the sets in it."""
         held = [SavedSetDoc(system=each.system, component=each.component, params=len(each)) for each in sets]
         return cls(path=path, form=form, components=held)
+
+
+class SavedFilesDoc(Document):
+    """The files that were written for several vehicles."""
+
+    files: list[SavedDoc]
+
+
+class AddedMetadataDoc(Document):
+    """A metadata file that was added; `firmware` is null for every version."""
+
+    vehicle: str
+    firmware: str | None
+    descriptions: int
+
+    @classmethod
+    def of(cls, added: AddedMetadata, count: int) -> AddedMetadataDoc:
+        """Return the document of an added file with this number of descriptions."""
+        return cls(vehicle=added.kind, firmware=added.firmware, descriptions=count)
+
+
+class AddedMetadataListDoc(Document):
+    """The metadata files that were added."""
+
+    metadata: list[AddedMetadataDoc]
+
+
+class RemovedMetadataDoc(Document):
+    """A metadata file that was removed."""
+
+    vehicle: str
+    firmware: str | None
 
 
 class ImportedDoc(Document):

@@ -9,11 +9,20 @@ from paramclient.model.notation import hash_text, rounded
 
 if TYPE_CHECKING:
     from paramclient.client.component import Component
+    from paramclient.client.extended_params import ExtParams
     from paramclient.model.identity import Identity
     from paramclient.protocol.params.fetch_result import FetchResult, Progress
     from paramclient.protocol.vehicle.address_contest import Contest
 
-__all__ = ["ComponentDoc", "ComponentsDoc", "ContestDoc", "IdentityDoc", "LastFetchDoc", "ProgressDoc"]
+__all__ = [
+    "ComponentDoc",
+    "ComponentsDoc",
+    "ContestDoc",
+    "ExtendedStateDoc",
+    "IdentityDoc",
+    "LastFetchDoc",
+    "ProgressDoc",
+]
 
 
 class IdentityDoc(Document):
@@ -75,12 +84,34 @@ class ContestDoc(Document):
         return cls(claimants=list(contest.claimants), difference=contest.difference)
 
 
+class ExtendedStateDoc(Document):
+    """The state of the extended parameters of a component; see `ExtParams`. `params` is their number."""
+
+    is_spoken: bool
+    is_expected: bool
+    is_complete: bool
+    count: int | None
+    params: int
+
+    @classmethod
+    def of(cls, ext: ExtParams) -> ExtendedStateDoc:
+        """Return the document of the present state."""
+        return cls(
+            is_spoken=ext.is_spoken,
+            is_expected=ext.is_expected,
+            is_complete=ext.is_complete,
+            count=ext.count,
+            params=len(ext.params),
+        )
+
+
 class ComponentDoc(Document):
     """One component on one link.
 
     `key` is the cache key of its table, null until the vehicle is identified. `peer` is the source address of
     its messages. `params` is the number of known parameters, `count` the number that the component announces,
     `fetch` the progress of a running fetch. `contest` names the vehicles if several use the address.
+    `extended` is the state of the extended parameters.
     """
 
     link: str
@@ -106,6 +137,7 @@ class ComponentDoc(Document):
     round_trip_s: float | None
     fetch: ProgressDoc | None
     last_fetch: LastFetchDoc | None
+    extended: ExtendedStateDoc
 
     @classmethod
     def of(
@@ -156,6 +188,7 @@ class ComponentDoc(Document):
             last_fetch=None
             if last is None
             else LastFetchDoc(source=last.source, elapsed_s=round(last.elapsed, 4)),
+            extended=ExtendedStateDoc.of(component.ext),
         )
 
 

@@ -2,54 +2,34 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from paramclient.documents.document import Document, Maybe, Scalar
-from paramclient.model.ext_params import ExtParam, ExtParamType, ExtValue, ext_type_name
+from paramclient.documents.extended_param import ExtParamDoc, ext_value_json
+from paramclient.model.ext_params import ExtParam, ExtParamType
 from paramclient.model.notation import time_text
-from paramclient.model.values import shortest_float
 
 if TYPE_CHECKING:
     from paramclient.cache import ExtHistoryEntry
     from paramclient.files import FileForm
     from paramclient.files.extended_document import ExtParamFile
+    from paramclient.protocol.ext.change import ExtChange
     from paramclient.protocol.ext.fetch import ExtFetchResult
     from paramclient.protocol.ext.write_batch import ExtSetOutcome
 
 __all__ = [
     "ExtChangeDoc",
+    "ExtChangeLineDoc",
     "ExtDiffDoc",
     "ExtDifferenceDoc",
     "ExtFetchOutputDoc",
     "ExtHistoryDoc",
-    "ExtParamDoc",
     "ExtParamsOutputDoc",
     "ExtSavedDoc",
     "ExtWriteDoc",
     "ExtWritesOutputDoc",
 ]
-
-
-class ExtParamDoc(Document):
-    """One extended parameter; its name is the key of the document.
-
-    `value` is null for bytes that are no text; `hex` has the bytes of every value.
-    """
-
-    value: Scalar | None
-    type: str
-    index: int | None
-    hex: str
-
-    @classmethod
-    def of(cls, param: ExtParam) -> ExtParamDoc:
-        """Return the document of a parameter, without its name."""
-        kind = ext_type_name(param.type)
-        return cls(
-            value=ext_value_json(param.value, param.type), type=kind, index=param.index, hex=param.raw.hex()
-        )
 
 
 class ExtParamsOutputDoc(Document):
@@ -167,6 +147,29 @@ class ExtChangeDoc(Document):
     by: str
 
 
+class ExtChangeLineDoc(Document):
+    """One line of `watch`: a changed value, or an added or removed extended parameter."""
+
+    time: str
+    name: str
+    old: ExtParamDoc | None
+    new: ExtParamDoc | None
+    by: str
+    kind: Literal["changed", "added", "removed"]
+
+    @classmethod
+    def of(cls, change: ExtChange, at: float) -> ExtChangeLineDoc:
+        """Return the document of a change that was received `at` this unix time in seconds."""
+        return cls(
+            time=time_text(at),
+            name=change.name,
+            old=None if change.old is None else ExtParamDoc.of(change.old),
+            new=None if change.new is None else ExtParamDoc.of(change.new),
+            by=change.by,
+            kind="removed" if change.new is None else "added" if change.is_added else "changed",
+        )
+
+
 class ExtHistoryDoc(Document):
     """Changes of extended parameters, the newest last."""
 
@@ -207,14 +210,3 @@ class ExtSavedDoc(Document):
         return cls(
             file=file, format=form.value, system=content.system, component=content.component, count=count
         )
-
-
-def ext_value_json(value: ExtValue, number: int) -> Scalar | None:
-    """Return a value in strict JSON: NaN and infinities as text; None for bytes."""
-    if isinstance(value, bytes):
-        return None
-    if not isinstance(value, float):
-        return value
-    if math.isfinite(value):
-        return shortest_float(value) if number == ExtParamType.REAL32 else value
-    return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"

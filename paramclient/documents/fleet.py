@@ -46,8 +46,8 @@ class FleetValueDoc(Document):
     def of(cls, value: FleetValue) -> FleetValueDoc:
         """Return the document of a `FleetValue`."""
         return cls(
-            value=value_json(value.param.value, value.param.type),
-            type=type_name(value.param.type),
+            value=value_json(value.param.settable, value.param.type_number),
+            type=type_name(value.param.type_number),
             bits=bits_text(value.param),
             agrees=value.agrees,
             vehicles=[HolderDoc.of(holder) for holder in value.holders],
@@ -71,7 +71,9 @@ class NameSpreadDoc(Document):
         return cls(
             name=each.name,
             different=each.differs,
-            wanted=None if wanted is None else value_json(wanted.value, wanted.type or ParamType.REAL32),
+            wanted=None
+            if wanted is None
+            else value_json(wanted.settable, wanted.type_number or ParamType.REAL32),
             values=[FleetValueDoc.of(value) for value in each.values],
             lacking=[HolderDoc.of(holder) for holder in each.lacking],
             unknown=[HolderDoc.of(holder) for holder in each.unknown],

@@ -57,12 +57,12 @@ class HistoryEntryDoc(Document):
             time=time_text(entry.at),
             component=entry.component,
             name=entry.name,
-            old=value_json(old.value, old.type),
-            new=None if new is None else value_json(new.value, new.type),
+            old=value_json(old.settable, old.type_number),
+            new=None if new is None else value_json(new.settable, new.type_number),
             by=entry.by,
             at=entry.at if exact else None,
-            old_exact=ExactDoc(type=type_name(old.type), bits=bits_text(old)) if exact else None,
-            new_exact=ExactDoc(type=type_name(new.type), bits=bits_text(new))
+            old_exact=ExactDoc(type=type_name(old.type_number), bits=bits_text(old)) if exact else None,
+            new_exact=ExactDoc(type=type_name(new.type_number), bits=bits_text(new))
             if exact and new is not None
             else None,
         )

@@ -22,7 +22,7 @@ class JobDoc(Document):
     """
 
     id: str
-    kind: Literal["fetch", "apply", "restore"]
+    kind: Literal["fetch", "extended-fetch", "apply", "restore"]
     link: str
     system: int
     component: int

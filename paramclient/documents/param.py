@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from paramclient.documents.document import Document, Maybe, Scalar
 from paramclient.model.notation import bits_text, bits_written, parse_value, value_json, value_written
-from paramclient.model.values import Param, ParamType, Trust, format_value, from_bits, type_name
+from paramclient.model.values import (
+    TYPES_BY_NAME,
+    Param,
+    ParamType,
+    Trust,
+    format_value,
+    from_bits,
+    type_name,
+)
 
 if TYPE_CHECKING:
     from paramclient.errors import ParamClientError
@@ -16,7 +24,6 @@ if TYPE_CHECKING:
 
 __all__ = ["DescribedDoc", "ReadOutputDoc", "InfoDoc", "InfosDoc", "ParamDoc", "WrittenParamDoc"]
 
-_TYPES: Final = dict(ParamType.__members__)
 """The types by name."""
 
 
@@ -124,7 +131,7 @@ class ParamDoc(Document):
         Raises:
             ArithmeticError, LookupError, TypeError, ValueError: a member is not valid.
         """
-        known = _TYPES.get(self.type)
+        known = TYPES_BY_NAME.get(self.type)
         kind = int(self.type.removeprefix("TYPE_")) if known is None else known
         bits = int(self.bits, 16)
         is_raw = isinstance(self.value, str) and self.value.startswith("0x")
@@ -157,8 +164,8 @@ class WrittenParamDoc(Document):
     def of(cls, param: WrittenParam) -> WrittenParamDoc:
         """Return the document of a `WrittenParam`, without its line number."""
         return cls(
-            value=value_written(param.value, param),
-            type=None if param.type is None else type_name(param.type),
+            value=value_written(param.settable, param),
+            type=None if param.type_number is None else type_name(param.type_number),
             bits=bits_written(param),
             default=None if param.default is None else value_written(param.default, param),
             comment=param.comment or None,
@@ -168,7 +175,7 @@ class WrittenParamDoc(Document):
     def compared(cls, param: WrittenParam, metadata: Metadata | None = None) -> WrittenParamDoc:
         """Return the document of a parameter of one side of a comparison, with the metadata of that side."""
         info = None if metadata is None else metadata.find(param.name)
-        text = None if info is None else info.text(param.value) or None
+        text = None if info is None else info.text(param.settable) or None
         return cls.of(param).model_copy(update={"default": None, "comment": None, "text": text})
 
 
@@ -220,15 +227,15 @@ class DescribedDoc(Document):
 def _members(param: Param, info: ParamInfo | None, *, whole: bool) -> dict[str, Any]:
     """Return the members of every `ParamDoc`."""
     members: dict[str, Any] = {
-        "value": value_json(param.value, param.type),
-        "type": type_name(param.type),
+        "value": value_json(param.settable, param.type_number),
+        "type": type_name(param.type_number),
         "index": param.index,
         "bits": bits_text(param),
     }
     if param.default is not None:
-        members["default"] = value_json(param.default, param.type)
+        members["default"] = value_json(param.default, param.type_number)
     if info is not None:
-        members |= {"text": info.text(param.value) or None, "units": info.units or None}
+        members |= {"text": info.text(param.settable) or None, "units": info.units or None}
         if whole:
             members["metadata"] = InfoDoc.of(info)
     return members

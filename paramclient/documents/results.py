@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from paramclient.documents.document import Document, Maybe, Scalar
 from paramclient.documents.param import ParamDoc
@@ -100,7 +100,7 @@ class SetResultDoc(Document):
     """The result of a write: accepted, or adjusted by the vehicle; see `SetResult`."""
 
     name: str
-    status: str
+    status: Literal["accepted", "adjusted"]
     requested: Scalar
     actual: Scalar
     attempts: int
@@ -111,12 +111,12 @@ class SetResultDoc(Document):
     def of(cls, result: SetResult) -> SetResultDoc:
         """Return the document of a `SetResult`."""
         requested = result.requested
-        kind = ParamType.REAL64 if isinstance(requested, float) else result.param.type
+        kind = ParamType.REAL64 if isinstance(requested, float) else result.param.type_number
         return cls(
             name=result.name,
             status=result.status,
             requested=value_json(requested, kind),
-            actual=value_json(result.actual, result.param.type),
+            actual=value_json(result.param.settable, result.param.type_number),
             attempts=result.attempts,
             param=ParamDoc.kept(result.param),
             note=result.note or None,

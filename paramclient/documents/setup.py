@@ -10,7 +10,7 @@ from pydantic import Field
 from paramclient.documents.document import Document, Maybe, Scalar
 from paramclient.model.identity import version_text
 from paramclient.model.notation import typed, value_json
-from paramclient.model.values import Value, type_name
+from paramclient.model.values import WireValue, type_name
 from paramclient.provision.planning import PlanStatus, RowComparison
 from paramclient.provision.results import ApplyStatus
 
@@ -340,7 +340,7 @@ def _members(row: ApplyRow | PlanRow) -> dict[str, Any]:
     return {
         "type": None if row.type is None else type_name(row.type),
         "before": _value(row.before, row),
-        "wanted": value_json(*typed(row.target.value, row.type)),
+        "wanted": value_json(*typed(row.target.settable, row.type)),
         "category": row.category,
         "reason": row.reason,
         "nearest": list(row.nearest),
@@ -348,5 +348,5 @@ def _members(row: ApplyRow | PlanRow) -> dict[str, Any]:
     }
 
 
-def _value(value: Value | None, row: ApplyRow | PlanRow) -> Scalar | None:
+def _value(value: WireValue | None, row: ApplyRow | PlanRow) -> Scalar | None:
     return None if value is None else value_json(*typed(value, row.type))

@@ -6,14 +6,16 @@ import os
 import secrets
 import stat
 import sys
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
 from paramclient.errors import FileError
-from paramclient.files.formats import LARGEST_FILE, Content, dumps, loads
+from paramclient.files.formats import LARGEST_FILE, dumps, loads
 from paramclient.files.includes import Includes
 from paramclient.files.param_file import FileForm, ParamFile, format_of_name, parse_format
+from paramclient.model.paramset import ParamSet
 
 __all__ = ["read_bytes", "read_file", "replace_file", "write_file"]
 
@@ -65,7 +67,10 @@ def read_bytes(source: str) -> bytes:
 
 
 def write_file(
-    path: str | os.PathLike[str], content: Content, *, form: FileForm | str | None = None
+    path: str | os.PathLike[str],
+    content: ParamFile | ParamSet | Iterable[ParamSet],
+    *,
+    form: FileForm | str | None = None,
 ) -> FileForm:
     """Write a parameter file, and replace an existing one atomically. Blocks until the file is on disk.
 

@@ -23,7 +23,7 @@ from paramclient.errors import FileError, UsageError
 from paramclient.files.param_file import FileForm, ParamFile
 from paramclient.files.text import excerpt, is_plain, time_of
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType, Value, format_value, shortest_float, type_name
+from paramclient.model.values import ParamType, WireValue, format_value, shortest_float, type_name
 
 __all__ = [
     "is_document",
@@ -256,21 +256,21 @@ def _set_fields(params: ParamSet) -> dict[str, Any]:
 
 def _fields(param: WrittenParam) -> dict[str, Any]:
     """Return the fields of a parameter."""
-    fields: dict[str, Any] = {"value": _scalar(param.value, param.type)}
-    if param.type is not None:
-        is_wide = isinstance(param.type, ParamType) and param.type.size == 8
-        fields["type"] = type_name(param.type)
-        fields["bits"] = f"{param.bits_as(param.type):0{16 if is_wide else 8}x}"
+    fields: dict[str, Any] = {"value": _scalar(param.settable, param.type_number)}
+    if param.type_number is not None:
+        is_wide = param.type is not None and param.type.size == 8
+        fields["type"] = type_name(param.type_number)
+        fields["bits"] = f"{param.bits_as(param.type_number):0{16 if is_wide else 8}x}"
     elif isinstance(param.value, float) and not is_plain(param.value):
         raise UsageError(f"{param.name} is a NaN with payload bits, and has no type for them")
     if param.default is not None:
-        fields["default"] = _scalar(param.default, param.type)
+        fields["default"] = _scalar(param.default, param.type_number)
     if param.comment:
         fields["comment"] = _encodable(param.comment)
     return fields
 
 
-def _scalar(value: Value, kind: ParamType | int | None) -> int | float | str:
+def _scalar(value: WireValue, kind: ParamType | int | None) -> int | float | str:
     if isinstance(value, bytes):
         return format_value(value)
     if isinstance(value, int) or math.isfinite(value):

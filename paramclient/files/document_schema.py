@@ -16,7 +16,7 @@ from paramclient.files.param_file import TooManyParams
 from paramclient.files.text import PROBLEMS_MAX, as_type
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType, Value, check_name, from_bits, known_type
+from paramclient.model.values import TYPES_BY_NAME, ParamType, WireValue, check_name, from_bits, known_type
 
 __all__ = ["InvalidDocument", "Place", "parse"]
 
@@ -225,16 +225,16 @@ class _Document(_Model):
 
 
 def _kind(text: str) -> ParamType | int:
-    if text in ParamType.__members__:
-        return ParamType[text]
+    if text in TYPES_BY_NAME:
+        return TYPES_BY_NAME[text]
     if match := _type_number(text):
         number = int(match[1])
         if number <= 255 and not isinstance(known_type(number), ParamType):
             return number
-    raise UsageError(f"unknown type {text!r}; the types are {', '.join(ParamType.__members__)}")
+    raise UsageError(f"unknown type {text!r}; the types are {', '.join(TYPES_BY_NAME)}")
 
 
-def _value(written: int | float | str) -> Value:
+def _value(written: int | float | str) -> WireValue:
     if not isinstance(written, str):
         return written
     if written in _WORDS:
@@ -244,7 +244,7 @@ def _value(written: int | float | str) -> Value:
     raise UsageError(f"{_NUMBER_EXPECTED}, found {written!r}")
 
 
-def _with_bits(value: Value, kind: ParamType | int | None, text: str) -> Value:
+def _with_bits(value: WireValue, kind: ParamType | int | None, text: str) -> WireValue:
     """Return the value of the bits, if it agrees with the given value; else raise UsageError."""
     if kind is None:
         raise UsageError("bits need a type")

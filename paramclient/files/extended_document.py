@@ -33,6 +33,7 @@ from paramclient.model.ext_params import (
     check_ext_value,
     encode_ext_value,
     ext_type_name,
+    ext_type_number,
 )
 from paramclient.model.values import Trust, is_portable_name, shortest_float
 
@@ -46,7 +47,6 @@ EXT_FORMS: Final = (FileForm.JSON, FileForm.YAML)
 """The formats that can hold extended parameters."""
 
 _marked: Final = re.compile(rb"""\A\s*(?:---\s*)?\{?\s*["']?paramclient_extended["']?\s*:""").match
-_type_number: Final = re.compile(r"EXT_TYPE_([0-9]{1,3})").fullmatch
 _WORDS: Final = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 
 
@@ -219,10 +219,7 @@ def _param(name: str, fields: object) -> ExtParam:
 
 
 def _number_of(name: str, told: object) -> int:
-    if isinstance(told, str):
-        if told in ExtParamType.__members__:
-            return ExtParamType[told]
-        other = _type_number(told)
-        if other is not None and int(other[1]) < 256:
-            return int(other[1])
-    raise ValueError(f"{name}: {told!r:.40} is no type of an extended parameter")
+    try:
+        return ext_type_number(told if isinstance(told, str) else repr(told))
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None

@@ -31,7 +31,7 @@ from paramclient.files.text import (
     value_text,
 )
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType, Value, check_name
+from paramclient.model.values import ParamType, WireValue, check_name
 
 __all__ = ["is_pair", "is_qgc_row", "read_pairs", "read_qgc", "write_pairs", "write_qgc"]
 
@@ -324,13 +324,13 @@ def _qgc_line(params: ParamSet, param: WrittenParam) -> str:
         raise UsageError(
             "this format needs the system id of each parameter, and the set has none: give it one"
         )
-    if not isinstance(param.type, ParamType):
+    if not isinstance(param.type_number, ParamType):
         raise UsageError(f"{param.name} has no type that MAVLink defines, and this format needs one")
     component = AUTOPILOT if params.component is None else params.component
     text = value_text(param)
     if isinstance(param.value, float) and not math.isfinite(param.value):
         text = text.lower().removesuffix("inity")  # Qt's notation
-    return f"{params.system}\t{component}\t{_pair_name(param)}\t{text}\t{int(param.type)}"
+    return f"{params.system}\t{component}\t{_pair_name(param)}\t{text}\t{int(param.type_number)}"
 
 
 def _address(text: str) -> int:
@@ -347,7 +347,7 @@ def _type(text: str) -> ParamType:
     return ParamType(number)
 
 
-def _fitting(value: int | float, kind: ParamType) -> Value:
+def _fitting(value: int | float, kind: ParamType) -> WireValue:
     try:
         return as_type(value, kind)
     except UsageError as error:

@@ -1,4 +1,13 @@
-"""ParamFile, the content of a parameter file, and FileForm, the supported formats."""
+"""ParamFile, the content of a parameter file, and FileForm, the supported formats.
+
+`formats` detects the format of a file, and calls its parser:
+
+- `line_formats`: QGC, PARM and MISSION_PLANNER, with the `@include` lines of `includes`.
+- `param_pck`: PCK.
+- `script`: PX4_SCRIPT.
+- `document_format`: JSON and YAML. `extended_document` parses files of extended parameters.
+- `paramclient.logs.onboard`: on-board logs (`LogForm`).
+"""
 
 from __future__ import annotations
 

@@ -60,12 +60,12 @@ def write_packed(params: ParamSet) -> bytes:
 
 
 def _entry(param: WrittenParam, *, with_defaults: bool) -> param_pck.PackedParam:
-    kind = param.type
+    kind = param.type_number
     if not isinstance(kind, ParamType) or kind not in param_pck.PACKABLE:
         known = ", ".join(each.name for each in sorted(param_pck.PACKABLE))
         has = "no type" if kind is None else f"the type {type_name(kind)}"
         raise UsageError(f"{param.name} has {has}, and a packed file holds {known}")
-    if isinstance(param.value, bytes):
+    if param.is_raw:
         raise UsageError(f"{param.name} is not a number; json and yaml can keep it")
     bits = param.bits_as(kind)
     default = None

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 from paramclient.errors import FileError, UsageError
 from paramclient.files.param_file import TooManyParams
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType, Value, bits_of, format_value, from_bits, type_name
+from paramclient.model.values import ParamType, WireValue, bits_of, format_value, from_bits, type_name
 
 __all__ = [
     "COMMENT_START",
@@ -259,7 +259,7 @@ def parse_number(text: str) -> int | float | None:
     return None
 
 
-def as_type(value: Value, kind: ParamType | int) -> Value:
+def as_type(value: WireValue, kind: ParamType | int) -> WireValue:
     """Return the value in a parameter's type: a float32 for REAL32, an int for 6.0 as INT32.
 
     Raises:
@@ -274,7 +274,7 @@ def value_text(param: WrittenParam) -> str:
     Raises:
         UsageError: no text expresses the value: raw bytes, or a NaN with payload bits.
     """
-    value = param.value
+    value = param.settable
     if isinstance(value, bytes):
         raw = format_value(value)
         raise UsageError(f"{param.name} is {raw}, which is not a number; json and yaml can keep it")
@@ -282,7 +282,7 @@ def value_text(param: WrittenParam) -> str:
         if not is_plain(value):
             raise UsageError(f"{param.name} is a NaN with payload bits; json and yaml can keep them")
         return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
-    return format_value(value, ParamType.REAL64 if param.type is None else param.type)
+    return format_value(value, ParamType.REAL64 if param.type_number is None else param.type_number)
 
 
 def time_of(at: float, digits: str = "auto") -> str:
@@ -317,14 +317,14 @@ def _split(text: str) -> Iterator[str]:
 
 
 def _value_and_type(param: WrittenParam) -> str:
-    kind = "" if param.type is None else f" ({type_name(param.type)})"
-    return format_value(param.value, ParamType.REAL64) + kind
+    kind = "" if param.type_number is None else f" ({type_name(param.type_number)})"
+    return format_value(param.settable, ParamType.REAL64) + kind
 
 
 def _same(a: WrittenParam, b: WrittenParam) -> bool:
     """Return whether two values are equal as written: 1 and 1.0 are, −0.0 and 0.0 are not."""
-    if a.type != b.type or isinstance(a.value, bytes) or isinstance(b.value, bytes):
-        return a.type == b.type and a.value == b.value
+    if a.type_number != b.type_number or a.is_raw or b.is_raw:
+        return a.type_number == b.type_number and a.settable == b.settable
     if math.isnan(a.value) or math.isnan(b.value):
         return math.isnan(a.value) and math.isnan(b.value)
     return a.value == b.value and math.copysign(1, a.value) == math.copysign(1, b.value)

@@ -7,20 +7,22 @@ the port before it returns, and no transport, task or thread outlives it.
 
 from __future__ import annotations
 
-import errno
 import socket
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Hashable
 from contextlib import suppress
+from functools import partial
 from typing import Any, Final, NoReturn, Protocol, TypeAlias, runtime_checkable
 
 import anyio
 
 from paramclient.errors import LinkError
 from paramclient.links.names import LinkSpec
+from paramclient.links.own_thread import run_in_own_thread
+from paramclient.links.refusals import host_refusal, is_port_in_use, port_in_use, socket_refusal
 
-__all__ = ["Address", "Link", "Peer", "SocketLink", "claim", "close_socket", "reason"]
+__all__ = ["Address", "Link", "Peer", "SocketLink", "claim", "close_socket"]
 
 Peer: TypeAlias = Hashable
 """The sender of data: an address on UDP, a connection on TCP, a constant on links with one remote end."""
@@ -83,9 +85,12 @@ class SocketLink(ABC):
 
     Attributes:
         name: the canonical name.
+        is_stream: see `Link.is_stream`.
         address: the local host and port while the link is open, else None. With port 0, shows the port that
             the operating system chose.
     """
+
+    is_stream: bool
 
     def __init__(self, spec: LinkSpec) -> None:
         self.name = spec.name
@@ -116,12 +121,19 @@ class SocketLink(ABC):
             if opening == self._openings:
                 self._discard()
             if isinstance(error, OSError) and not isinstance(error, LinkError):
-                raise self._error(self._refusal(error)) from error
+                raise self._error(await self._refusal(error)) from error
             raise
 
     async def close(self) -> None:
         """See `Link.close`."""
         self._discard()
+
+    async def _refusal(self, error: OSError) -> str:
+        """Return why the link cannot be opened."""
+        if is_port_in_use(error):
+            find = partial(port_in_use, self._port, is_tcp=self.is_stream)
+            return await run_in_own_thread(find)
+        return socket_refusal(error, self._host, self._port, self._target)
 
     @abstractmethod
     async def _open(self, opening: int) -> None:
@@ -175,17 +187,6 @@ class SocketLink(ABC):
     def _error(self, problem: str) -> LinkError:
         return LinkError(f"{self.name}: {problem}", link=self.name)
 
-    def _refusal(self, error: OSError) -> str:
-        if isinstance(error, TimeoutError):
-            return f"no response from {self._target}"
-        if isinstance(error, ConnectionRefusedError):
-            return f"connection refused by {self._target}"
-        if error.errno == errno.EADDRINUSE or (sys.platform == "win32" and error.errno == errno.EACCES):
-            return f"port {self._port} is in use by another program"
-        if error.errno == errno.EADDRNOTAVAIL:
-            return f"{self._host} is not an address of this computer"
-        return f"cannot open: {reason(error)}"
-
     async def _resolve(self, kind: socket.SocketKind) -> list[tuple[socket.AddressFamily, Address]]:
         """Return the addresses of the host, IPv4 first, because most MAVLink programs listen on IPv4."""
         try:
@@ -195,7 +196,7 @@ class SocketLink(ABC):
         try:
             return _addresses(await anyio.getaddrinfo(self._host, self._port, type=kind))
         except socket.gaierror as error:
-            raise self._error(f"host {self._host} not found: {reason(error)}") from error
+            raise self._error(host_refusal(self._host, error)) from error
 
 
 def claim(sock: socket.socket) -> None:
@@ -211,11 +212,6 @@ def close_socket(sock: socket.socket) -> None:
     """Close a socket; tasks that wait for it get ClosedResourceError."""
     anyio.notify_closing(sock)
     sock.close()
-
-
-def reason(error: OSError) -> str:
-    """Return the operating system's text for an error, without its number."""
-    return error.strerror or str(error)
 
 
 _NUMERIC = socket.AI_NUMERICHOST | socket.AI_NUMERICSERV

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Final
 
+from paramclient.errors import UsageError
 from paramclient.links.names import DEFAULT_BAUD, LinkKind, LinkSpec
-from paramclient.links.serial import need_serialx
 
-__all__ = ["SerialPort", "list_ports"]
+__all__ = ["SerialPort", "list_ports", "need_serialx"]
 
 AUTOPILOT_VENDORS: Final = {
     0x26AC: "Pixhawk",  # 3D Robotics, and after it PX4's own boards
@@ -119,6 +120,12 @@ def list_ports() -> list[SerialPort]:
         for each in serialx.list_serial_ports()
     ]
     return sorted(found, key=_order)
+
+
+def need_serialx(what: str) -> None:
+    """Raise UsageError with the command that installs the extra, if serialx is missing."""
+    if find_spec("serialx") is None:
+        raise UsageError(f"{what} needs serialx: pip install 'paramclient[serial]'")
 
 
 def _order(port: SerialPort) -> tuple[bool, bool, list[tuple[str, int]]]:

@@ -9,8 +9,9 @@ import anyio
 import anyio.lowlevel
 
 from paramclient.errors import LinkError
-from paramclient.links.link import Peer, reason
+from paramclient.links.link import Peer
 from paramclient.links.names import LinkSpec
+from paramclient.links.refusals import reason
 from paramclient.links.tlog import Record, open_log, read_records
 
 __all__ = ["LOG_PEER", "ReplayLink"]

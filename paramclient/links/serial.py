@@ -8,19 +8,17 @@ such descriptors: there serialx's own transport moves the bytes, which only asyn
 An open port is exclusive: two programs on one port would each receive a part of the bytes. DTR and RTS are
 raised on opening, and lowered when the last program closes the port. Linux and pyserial do the same, and with
 pyserial also pymavlink and MAVProxy, so a board is not reset more often than by those programs.
+
+A port that fails or is unplugged raises LinkError here. `paramclient.client.link_task` opens it again.
 """
 
 from __future__ import annotations
 
 import errno
 import os
-import stat
 import sys
-import threading
-from collections.abc import Callable
 from contextlib import suppress
-from importlib.util import find_spec
-from pathlib import Path
+from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn, Protocol, TypeVar
 
 import anyio
@@ -28,8 +26,11 @@ import anyio.from_thread
 import anyio.lowlevel
 
 from paramclient.errors import LinkError, UsageError
-from paramclient.links.link import OPEN_TIMEOUT, Peer, reason
+from paramclient.links.link import OPEN_TIMEOUT, Peer
 from paramclient.links.names import LinkSpec
+from paramclient.links.own_thread import run_in_own_thread
+from paramclient.links.ports import need_serialx
+from paramclient.links.refusals import device_refusal, reason
 
 if sys.platform != "win32":
     import fcntl
@@ -38,7 +39,7 @@ if sys.platform != "win32":
 if TYPE_CHECKING:
     import serialx
 
-__all__ = ["SerialDevice", "SerialLink", "need_serialx"]
+__all__ = ["SerialDevice", "SerialLink"]
 
 T = TypeVar("T")
 
@@ -112,12 +113,18 @@ class SerialLink:
                 port = await _open_port(self.device, self.baud)
         except OSError as error:
             self._check(opening)
-            raise self._error(_refusal(self.device, self.baud, error)) from error
+            raise self._error(await self._refusal(error)) from error
         if opening != self._openings:
             await port.close()
         self._check(opening)
         self._port = port
         self._peer = self._peer._replace(number=self._peer.number + 1)
+
+    async def _refusal(self, error: OSError) -> str:
+        """Return why the port cannot be opened."""
+        if isinstance(error, TimeoutError):
+            return f"{self.device} did not open within {OPEN_TIMEOUT:g} s"
+        return await run_in_own_thread(partial(device_refusal, self.device, self.baud, error))
 
     async def receive(self) -> list[tuple[Peer, bytes]]:
         """See `Link.receive`: one chunk of up to `READ_SIZE` bytes."""
@@ -182,12 +189,6 @@ class SerialLink:
         return LinkError(f"{self.name}: {problem}", link=self.name)
 
 
-def need_serialx(what: str) -> None:
-    """Raise UsageError with the command that installs the extra, if serialx is missing."""
-    if find_spec("serialx") is None:
-        raise UsageError(f"{what} needs serialx: pip install 'paramclient[serial]'")
-
-
 class _Port(Protocol):
     """An open port."""
 
@@ -222,7 +223,9 @@ if sys.platform != "win32":
         @classmethod
         async def opened(cls, device: str, baud: int) -> _Descriptor:
             """Open a port in a thread. A port that opens after cancellation is closed again."""
-            return await _in_thread(lambda: cls._open(device, baud), undo=cls._release, grace=CLOSE_TIMEOUT)
+            return await run_in_own_thread(
+                lambda: cls._open(device, baud), undo=cls._release, grace=CLOSE_TIMEOUT
+            )
 
         async def read(self) -> bytes:
             with suppress(anyio.ClosedResourceError):
@@ -244,7 +247,7 @@ if sys.platform != "win32":
         async def close(self) -> None:
             anyio.notify_closing(self._file)
             with anyio.move_on_after(CLOSE_TIMEOUT, shield=True):
-                await _in_thread(self._release, undo=_nothing, grace=0)
+                await run_in_own_thread(self._release)
 
         @classmethod
         def _open(cls, device: str, baud: int) -> _Descriptor:
@@ -271,83 +274,3 @@ if sys.platform != "win32":
                 fcntl.ioctl(self._file, termios.TIOCNXCL)  # a pseudo-terminal would stay exclusive
             with suppress(OSError):
                 self._serial.close()
-
-
-async def _in_thread(work: Callable[[], T], *, undo: Callable[[T], object], grace: float) -> T:
-    """Run a function in a thread of its own, and return its result.
-
-    On cancellation, a result is undone, even if it comes later; cancellation waits at most `grace` seconds.
-    """
-    ended = anyio.Event()
-    token = anyio.lowlevel.current_token()
-    lock = threading.Lock()
-    is_wanted = True
-    results: list[T] = []
-    failures: list[BaseException] = []
-
-    def run() -> None:
-        try:
-            result = work()
-            with lock:
-                results.append(result)
-                if is_wanted:
-                    return
-            undo(result)
-        except BaseException as error:
-            failures.append(error)
-        finally:
-            with suppress(anyio.RunFinishedError):
-                anyio.from_thread.run_sync(ended.set, token=token)
-
-    thread = threading.Thread(target=run, name="paramclient serial", daemon=True)
-    thread.start()
-    try:
-        await ended.wait()
-    except BaseException:
-        with lock:
-            is_wanted = False
-            finished_before_cancel = bool(results)
-        with anyio.move_on_after(grace, shield=True):
-            await ended.wait()
-            thread.join()
-        if finished_before_cancel:
-            undo(results[0])
-        raise
-    thread.join()
-    if failures:
-        raise failures[0]
-    return results[0]
-
-
-def _nothing(_: None) -> None:
-    return
-
-
-def _refusal(device: str, baud: int, error: OSError) -> str:
-    """Return why a port cannot be opened, and what to do about it."""
-    if isinstance(error, TimeoutError):
-        return f"{device} did not open within {OPEN_TIMEOUT:g} s"
-    if error.errno in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
-        return f"{device} does not exist; 'paramclient ports' lists the serial ports"
-    if error.errno == errno.EBUSY or (sys.platform == "win32" and error.errno == errno.EACCES):
-        return f"{device} is in use by another program"
-    if error.errno in (errno.EACCES, errno.EPERM):
-        return f"no permission to open {device}{_group_hint(device)}"
-    if error.errno in (errno.ENOTTY, errno.EISDIR):
-        return f"{device} is not a serial port"
-    if error.errno == errno.EINVAL:
-        return f"{device} cannot be set to {baud} baud"
-    return f"cannot open {device}: {reason(error)}"
-
-
-def _group_hint(device: str) -> str:
-    """Return a hint on joining the port's group, if the user is not in it; else ""."""
-    if sys.platform == "linux":
-        import grp  # imported here: POSIX only
-
-        with suppress(OSError, KeyError):
-            info = Path(device).stat()
-            group = grp.getgrgid(info.st_gid).gr_name
-            if info.st_mode & stat.S_IWGRP and info.st_gid not in (0, *os.getgroups()):
-                return f", which needs the group {group}: sudo usermod -aG {group} $USER, then log in again"
-    return ""

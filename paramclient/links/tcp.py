@@ -13,8 +13,9 @@ from typing import Final, NamedTuple
 import anyio
 import anyio.lowlevel
 
-from paramclient.links.link import OPEN_TIMEOUT, Address, Peer, SocketLink, claim, close_socket, reason
+from paramclient.links.link import OPEN_TIMEOUT, Address, Peer, SocketLink, claim, close_socket
 from paramclient.links.names import LinkSpec
+from paramclient.links.refusals import reason
 
 __all__ = ["TcpConnection", "TcpIn", "TcpOut"]
 

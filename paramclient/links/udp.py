@@ -40,8 +40,9 @@ import anyio.lowlevel
 
 from paramclient.errors import LinkError
 from paramclient.links.clock_offset import seconds_ahead
-from paramclient.links.link import OPEN_TIMEOUT, Address, Peer, SocketLink, claim, reason
+from paramclient.links.link import OPEN_TIMEOUT, Address, Peer, SocketLink, claim
 from paramclient.links.names import LinkSpec
+from paramclient.links.refusals import reason
 from paramclient.protocol.wire import HEARTBEAT_ID, Framer
 
 __all__ = ["UdpIn", "UdpOut"]

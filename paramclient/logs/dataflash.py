@@ -20,7 +20,7 @@ from paramclient.files.param_file import LogForm
 from paramclient.logs.logged_params import LoggedChange, OnboardLog, log_link
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import WrittenParam
-from paramclient.model.values import Value, check_name, shortest_float
+from paramclient.model.values import WireValue, check_name, shortest_float
 from paramclient.protocol.wire import MAV_AUTOPILOT_ARDUPILOTMEGA
 
 __all__ = ["read_dataflash"]
@@ -115,7 +115,7 @@ class _Messages:
     def __init__(self) -> None:
         self.initial: dict[str, WrittenParam] = {}
         self._changes: list[LoggedChange] = []
-        self._values: dict[str, Value] = {}  # the latest, by name
+        self._values: dict[str, WireValue] = {}  # the latest, by name
         self._began: float | None = None
         self._last = 0.0  # time of the last PARM of the initial run
         self._ended = 0.0
@@ -135,7 +135,7 @@ class _Messages:
 
     def finish(self, path: str, boot_time: float | None) -> OnboardLog:
         ids = (self.initial.get(name) for name in SYSTEM_ID_NAMES)
-        system = next((int(each.value) for each in ids if each is not None and _is_id(each.value)), 0)
+        system = next((int(each.settable) for each in ids if each is not None and _is_id(each.settable)), 0)
         refused = self._refused
         notes = (f"{refused} PARM messages are damaged and left out",) if refused else ()
         return OnboardLog(
@@ -198,10 +198,10 @@ class _Messages:
             self._uid = b"".join(words).ljust(UID_SIZE, b"\0").hex()
 
 
-def _number(value: float) -> Value:
+def _number(value: float) -> WireValue:
     """Return a float32 as the number that a person would write."""
     return int(value) if value.is_integer() else shortest_float(value)
 
 
-def _is_id(value: Value) -> bool:
+def _is_id(value: WireValue) -> bool:
     return isinstance(value, int) and 0 < value < 256

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from paramclient.files.param_file import AUTOPILOT, LogForm
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import Value
+from paramclient.model.values import WireValue
 
 __all__ = ["LoggedChange", "OnboardLog", "log_link"]
 
@@ -26,7 +26,7 @@ class LoggedChange:
 
     time: float
     name: str
-    value: Value
+    value: WireValue
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +67,7 @@ class OnboardLog:
             params[change.name] = (
                 WrittenParam(change.name, change.value)
                 if known is None
-                else replace(known, value=change.value)
+                else WrittenParam(change.name, change.value, known.type_number, known.default, known.comment)
             )
         return self._set(params, self.ended)
 

@@ -6,7 +6,6 @@ import os
 from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import replace
 from functools import partial
 
 import anyio.to_thread
@@ -62,11 +61,12 @@ def _store(log: OnboardLog, cache: ParamCache) -> ImportedTable:
     for change in log.changes:
         first = log.initial.get(change.name, WrittenParam(change.name, change.value))
         at = log.boot_time + change.time
-        param = _param(replace(first, value=change.value), types)
+        changed = WrittenParam(change.name, change.value, first.type_number, first.default)
+        param = _param(changed, types)
         updates.append(update(at=at, params=[StoredParam(param, at)]))
     cache.merge(updates)
     notes = log.notes
-    if untyped := sum(param.type is None and name not in types for name, param in log.initial.items()):
+    if untyped := sum(param.type_number is None and name not in types for name, param in log.initial.items()):
         notes += (f"the log has no types: {untyped} parameters that no cached table has are REAL32",)
     return ImportedTable(
         identity.key,
@@ -82,7 +82,7 @@ def _store(log: OnboardLog, cache: ParamCache) -> ImportedTable:
 
 def _types(log: OnboardLog, cache: ParamCache) -> Mapping[str, ParamType | int]:
     """Return types by name: those of the vehicle's cached table, else the most frequent ones."""
-    if all(param.type is not None for param in log.initial.values()):
+    if all(param.type_number is not None for param in log.initial.values()):
         return {}
     own: dict[str, ParamType | int] = {}
     others: dict[str, Counter[ParamType | int]] = {}
@@ -93,15 +93,15 @@ def _types(log: OnboardLog, cache: ParamCache) -> Mapping[str, ParamType | int]:
         if table is None:  # another process may have removed it
             continue
         if summary.key == log.identity.key and summary.component == AUTOPILOT:
-            own = {name: param.type for name, param in table.params.items()}
+            own = {name: param.type_number for name, param in table.params.items()}
         for name, param in table.params.items():
-            others.setdefault(name, Counter())[param.type] += 1
+            others.setdefault(name, Counter())[param.type_number] += 1
     return {name: types.most_common(1)[0][0] for name, types in others.items()} | own
 
 
 def _param(written: WrittenParam, types: Mapping[str, ParamType | int]) -> Param:
     """Return a logged value as a parameter; as a REAL32 if its type is unknown or cannot hold it."""
-    kind = types.get(written.name, ParamType.REAL32) if written.type is None else written.type
+    kind = types.get(written.name, ParamType.REAL32) if written.type_number is None else written.type_number
     try:
         bits = written.bits_as(kind)
     except UsageError:

@@ -3,14 +3,26 @@
 The metadata is optional. It comes from a file (`read_metadata`) or from the vehicle (`metadata_of`).
 
 - `info`, `metadata_cache`, `download`: the metadata of a firmware, cached files, downloads.
+- `added_files`: files that the user has added for a vehicle type and firmware version.
 - `formats`, `ardupilot`, `px4`: detection of the format, and one module for each format.
 """
 
 from __future__ import annotations
 
+from paramclient.metadata.added_files import AddedFiles, AddedMetadata, VehicleKind
 from paramclient.metadata.download import metadata_of
 from paramclient.metadata.formats import read_content, read_metadata
 from paramclient.metadata.info import Metadata, ParamInfo
 from paramclient.metadata.metadata_cache import MetadataStore
 
-__all__ = ["Metadata", "MetadataStore", "ParamInfo", "metadata_of", "read_content", "read_metadata"]
+__all__ = [
+    "AddedFiles",
+    "AddedMetadata",
+    "Metadata",
+    "MetadataStore",
+    "ParamInfo",
+    "VehicleKind",
+    "metadata_of",
+    "read_content",
+    "read_metadata",
+]

@@ -16,6 +16,9 @@ PACKED_SIZE_MAX: Final = 4 << 20
 """Bytes of a packed file, or of a file from a vehicle; PX4's has about 0.1 million."""
 CONTENT_SIZE_MAX: Final = 16 << 20
 """Bytes of a file, and of an unpacked one; those of ArduPilot and PX4 have 2 to 5 million."""
+SEPARATORS_MAX: Final = 400_000
+"""Commas and opening brackets of a JSON file, which bound its values: 40 MB of memory. A file of 65,535
+parameters with five members has as many; PX4's has about 30,000."""
 UNPACKING_MEMORY_MAX: Final = 96 << 20
 """Bytes of memory for unpacking. PX4 packs with a dictionary of 64 million, `xz -9`."""
 
@@ -74,8 +77,10 @@ def json_of(content: bytes, *, source: str) -> dict[str, object]:
     """Parse a JSON object.
 
     Raises:
-        MetadataError: the text is not a JSON object.
+        MetadataError: the text is not a JSON object, or has too many values.
     """
+    if sum(map(content.count, (b",", b"[", b"{"))) > SEPARATORS_MAX:
+        raise MetadataError(f"{source}: has more than {SEPARATORS_MAX:,} values", source=source)
     from pydantic_core import from_json  # imported here: takes time to load
 
     try:

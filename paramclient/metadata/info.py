@@ -14,7 +14,7 @@ from types import MappingProxyType
 from typing import Final, TypeVar
 
 from paramclient.errors import UsageError
-from paramclient.model.values import ParamType, Value, format_value, shortest_float
+from paramclient.model.values import ParamType, WireValue, format_value, shortest_float
 from paramclient.model.wording import counted
 
 __all__ = ["Metadata", "ParamInfo", "number_of"]
@@ -68,7 +68,7 @@ class ParamInfo:
     category: str = ""
     group: str = ""
 
-    def text(self, value: Value) -> str | None:
+    def text(self, value: WireValue) -> str | None:
         """Return the name of a value: `Loiter`, or for a mask `GPS|Baro`. None without a name.
 
         Bits without a name, or with a number as name, are appended as one hexadecimal number. `parse`
@@ -109,7 +109,7 @@ class ParamInfo:
             raise UsageError(f"{self.name}: {text!r} is not a number{self._suggestion(text)}")
         return value
 
-    def problem(self, value: Value) -> str | None:
+    def problem(self, value: WireValue) -> str | None:
         """Return why a value is invalid: it is outside the range. None for a valid value.
 
         Fractions are compared as float32, the precision of vehicles.

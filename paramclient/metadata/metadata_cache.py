@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Final
 
 from paramclient.errors import MetadataError
+from paramclient.metadata.added_files import AddedFiles
 from paramclient.metadata.formats import PACKED_SIZE_MAX, read_content, unpacked
 from paramclient.metadata.info import Metadata
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet
-from paramclient.model.values import crc32_px4
+from paramclient.model.px4_hash import crc32_px4
 
 __all__ = ["MetadataStore", "has_checksum"]
 
@@ -50,12 +51,18 @@ class MetadataStore:
         return f"<MetadataStore {self.folder}>"
 
     @property
+    def added(self) -> AddedFiles:
+        """The metadata files that the user has added."""
+        return AddedFiles(self.folder / "added")
+
+    @property
     def has_notes(self) -> bool:
-        """Whether metadata of any firmware is cached."""
+        """Whether metadata of any firmware is cached or was added."""
         try:
-            return any(path.suffix == _NOTES for path in self.folder.iterdir())
+            is_cached = any(path.suffix == _NOTES for path in self.folder.iterdir())
         except OSError:
             return False
+        return is_cached or any(True for _ in self.added)
 
     def get(self, crc: int) -> bytes | None:
         """Return a file as stored on board, or None if it is not cached."""
@@ -82,7 +89,14 @@ class MetadataStore:
             self._write(path, f"{crc:08x}\n".encode("ascii"))
 
     def known(self, identity: Identity, component: int) -> Metadata | None:
-        """Return the cached metadata of a firmware with this version, commit and board, or None."""
+        """Return the metadata of a firmware, or None.
+
+        The cached metadata of a firmware with this version, commit and board, which the vehicle has provided;
+        otherwise a file that was added for its vehicle type and version.
+        """
+        return self._cached(identity, component) or self.added.find(identity, component)
+
+    def _cached(self, identity: Identity, component: int) -> Metadata | None:
         path = self._note(identity, component)
         noted = None if path is None else self._read(path)
         if path is None or noted is None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from types import MappingProxyType
-from typing import Annotated, Final, NotRequired, TypeVar
+from typing import Annotated, Any, Final, NotRequired, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, with_config
 from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
@@ -101,7 +101,7 @@ class _Parameter(_Strict):
 
 class _Parameters(_Strict):
     version: int = Field(ge=1)
-    parameters: list[_Parameter] = Field(max_length=PARAMS_MAX)
+    parameters: list[Any] = Field(max_length=PARAMS_MAX)
 
 
 class MetadataFile(_Strict):
@@ -133,7 +133,11 @@ def read_parameters(document: object, *, source: str) -> Metadata:
         MetadataError: the document does not follow the schema.
     """
     read = _read(_Parameters, document, source)
-    return Metadata.of((each.info() for each in read.parameters), source=source)
+    # one by one: pydantic lets no other thread run while it validates all in one call
+    described = (
+        _read(_Parameter, each, source, ("parameters", number)) for number, each in enumerate(read.parameters)
+    )
+    return Metadata.of((each.info() for each in described), source=source)
 
 
 def read_general(document: object, *, source: str) -> tuple[MetadataFile, ...]:
@@ -150,18 +154,23 @@ def whole(number: int | float) -> int | float:
     return int(number) if isinstance(number, float) and number.is_integer() else number
 
 
-def error_text(error: ValidationError) -> str:
-    """Return the first problem as text, to be appended to the file's name."""
+def error_text(error: ValidationError, within: tuple[int | str, ...] = ()) -> str:
+    """Return the first problem as text, to be appended to the file's name.
+
+    Args:
+        error: the error.
+        within: place of the validated part in the file.
+    """
     first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-    place = "".join(f"[{each}]" if isinstance(each, int) else f".{each}" for each in first["loc"])
+    place = "".join(f"[{each}]" if isinstance(each, int) else f".{each}" for each in (*within, *first["loc"]))
     return f"{', ' if place else ''}{place.lstrip('.')}: {first['msg']}"
 
 
-def _read(model: type[Model], document: object, source: str) -> Model:
+def _read(model: type[Model], document: object, source: str, within: tuple[int | str, ...] = ()) -> Model:
     try:
         return model.model_validate(document)
     except ValidationError as error:
-        raise MetadataError(f"{source}{error_text(error)}", source=source) from None
+        raise MetadataError(f"{source}{error_text(error, within)}", source=source) from None
 
 
 def _finite(number: float | None) -> int | float | None:

@@ -6,7 +6,7 @@ words.
 - `ext_params`: extended parameters, with text and 64-bit values.
 - `comparison`, `patterns`, `notation`: comparison of sets, selection of names, JSON notation.
 - `group_switches`: parameters that others depend on.
-- `hash_exclusions`: the parameters that PX4 excludes from its hash.
+- `px4_hash`: PX4's hash of its parameters, and the ones that it excludes.
 - `renames`: names that firmware versions have changed, and the conversion of their values.
 - `similar_names`: names that are similar to a mistyped one.
 - `wording`: counts and lists of names in messages.

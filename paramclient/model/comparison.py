@@ -14,7 +14,7 @@ from paramclient.errors import UsageError
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.patterns import NameChoice
 from paramclient.model.renames import Renames
-from paramclient.model.values import ParamType, Value, bits_of, from_bits, same_bits
+from paramclient.model.values import ParamType, WireValue, bits_of, from_bits, same_bits
 
 __all__ = [
     "Comparison",
@@ -88,8 +88,8 @@ class Difference:
         return (
             left is not None
             and self.right is not None
-            and None not in (left.type, self.right.type)
-            and left.type != self.right.type
+            and None not in (left.type_number, self.right.type_number)
+            and left.type_number != self.right.type_number
         )
 
     @property
@@ -100,6 +100,8 @@ class Difference:
         may be equal on board. Only a packed parameter file holds the exact value.
         """
         if self.standing is not Standing.DIFFERENT or self._left is None or self.right is None:
+            return False
+        if self._left.is_raw or self.right.is_raw:
             return False
         left, right = self._left.value, self.right.value
         if not (isinstance(left, int) and isinstance(right, int)):
@@ -197,7 +199,8 @@ def non_defaults(params: ParamSet) -> ParamSet:
     differing = {
         name: param
         for name, param in params.items()
-        if param.default is not None and not same_value(param, replace(param, value=param.default))
+        if param.default is not None
+        and not same_value(param, WrittenParam(name, param.default, param.type_number))
     }
     return replace(params, params=differing)
 
@@ -212,8 +215,9 @@ def same_value(left: WrittenParam, right: WrittenParam) -> bool:
 
     Symmetric but not transitive: 16777217 equals 16777217.0, and 16777217.0 equals 16777216.
     """
-    if isinstance(left.value, bytes) or isinstance(right.value, bytes):
-        return left.value == right.value and (None in (left.type, right.type) or left.type == right.type)
+    if left.is_raw or right.is_raw:
+        types = left.type_number, right.type_number
+        return left.settable == right.settable and (None in types or types[0] == types[1])
     if left.value == right.value:  # equal in every type, and the common case: skips the slower comparison
         return True
     kind = _common_type(left, right)
@@ -236,7 +240,7 @@ def defaults_of(*sets: ParamSet) -> ParamSet:
     for each in sets:
         for name, param in each.items():
             if param.default is not None:
-                default = WrittenParam(name, param.default, param.type)
+                default = WrittenParam(name, param.default, param.type_number)
                 if not same_value(known.setdefault(name, default), default):
                     disputed.add(name)
     kept = {name: param for name, param in known.items() if name not in disputed}
@@ -300,7 +304,7 @@ def _moved(
 
 def _common_type(left: WrittenParam, right: WrittenParam) -> ParamType | int | None:
     """Return the type in which to compare two values, or None to compare them as numbers."""
-    kinds = {param.type for param in (left, right) if param.type is not None}
+    kinds = {param.type_number for param in (left, right) if param.type_number is not None}
     if ParamType.REAL32 in kinds:
         return ParamType.REAL32
     if kinds:
@@ -308,7 +312,7 @@ def _common_type(left: WrittenParam, right: WrittenParam) -> ParamType | int | N
     return None if isinstance(left.value, int) and isinstance(right.value, int) else ParamType.REAL32
 
 
-def _bits(value: Value, number: ParamType | int) -> int | None:
+def _bits(value: WireValue, number: ParamType | int) -> int | None:
     """Return the bits of a value in a type, or None if the value does not fit."""
     try:
         return bits_of(value, number)

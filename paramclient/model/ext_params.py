@@ -6,6 +6,7 @@ They are apart from `Param`, so that the values of plain parameters stay numbers
 from __future__ import annotations
 
 import math
+import re
 import struct
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
@@ -24,6 +25,7 @@ __all__ = [
     "decode_ext_value",
     "encode_ext_value",
     "ext_type_name",
+    "ext_type_number",
     "format_ext_value",
 ]
 
@@ -124,6 +126,23 @@ def own_bytes(data: bytes, number: int) -> bytes:
 def ext_type_name(number: ExtParamType | int) -> str:
     """Return the name of a type, `INT32`, `CUSTOM`, …, or `EXT_TYPE_77` for an unknown type."""
     return ExtParamType(number).name if number in _TYPES else f"EXT_TYPE_{number}"
+
+
+_unknown_type: Final = re.compile(r"EXT_TYPE_([0-9]{1,3})").fullmatch
+
+
+def ext_type_number(name: str) -> int:
+    """Return the number of a type by its name, the inverse of `ext_type_name`.
+
+    Raises:
+        ValueError: there is no such type.
+    """
+    if name in ExtParamType.__members__:
+        return ExtParamType[name]
+    found = _unknown_type(name)
+    if found is None or int(found[1]) > 255:
+        raise ValueError(f"{name!r:.40} is no type of an extended parameter")
+    return int(found[1])
 
 
 def decode_ext_value(data: bytes, number: int) -> ExtValue:

@@ -9,7 +9,7 @@ from typing import Final, TypeAlias
 
 from paramclient.errors import UsageError
 from paramclient.model.paramset import WrittenParam
-from paramclient.model.values import Param, ParamType, Value, format_value, shortest_float
+from paramclient.model.values import Param, ParamType, WireValue, format_value, shortest_float
 
 __all__ = [
     "Scalar",
@@ -32,7 +32,7 @@ _WORDS: Final = {"NaN": float("nan"), "Infinity": float("inf"), "-Infinity": flo
 _FLOAT32: Final = struct.Struct("<f")
 
 
-def value_json(value: Value, number: ParamType | int) -> Scalar:
+def value_json(value: WireValue, number: ParamType | int) -> Scalar:
     """Return a value in strict JSON: NaN and infinities as text, raw bytes as hexadecimal text.
 
     A REAL32 becomes the shortest number that rounds to the same float32.
@@ -46,7 +46,7 @@ def value_json(value: Value, number: ParamType | int) -> Scalar:
     return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
 
 
-def parse_number(told: object) -> Value:
+def parse_number(told: object) -> WireValue:
     """Return the value of a JSON number; NaN and infinities are text, raw bytes text of the form `0x…`.
 
     Raises:
@@ -59,7 +59,7 @@ def parse_number(told: object) -> Value:
     return told
 
 
-def parse_value(told: object, number: ParamType | int) -> Value:
+def parse_value(told: object, number: ParamType | int) -> WireValue:
     """Return the value of a result of `value_json`, which may also be 2 for 2.0.
 
     Raises:
@@ -73,12 +73,12 @@ def parse_value(told: object, number: ParamType | int) -> Value:
     return float(value) if number == ParamType.REAL64 and isinstance(value, int) else value
 
 
-def value_written(value: Value, param: WrittenParam) -> Scalar:
+def value_written(value: WireValue, param: WrittenParam) -> Scalar:
     """Return a written value in strict JSON; without a type, as the number that was written."""
-    return value_json(value, ParamType.REAL64 if param.type is None else param.type)
+    return value_json(value, ParamType.REAL64 if param.type_number is None else param.type_number)
 
 
-def typed(value: Value, number: ParamType | int | None) -> tuple[Value, ParamType | int]:
+def typed(value: WireValue, number: ParamType | int | None) -> tuple[WireValue, ParamType | int]:
     """Return a written value and the type in which to show it.
 
     A whole number for a REAL32 or REAL64 becomes a float. A value without a type is shown as a REAL32.
@@ -90,15 +90,15 @@ def typed(value: Value, number: ParamType | int | None) -> tuple[Value, ParamTyp
 
 def bits_text(param: Param) -> str:
     """Return `Param.bits` as hexadecimal digits: 16 for types of 8 bytes, else 8."""
-    return _digits(param.bits, param.type)
+    return _digits(param.bits, param.type_number)
 
 
 def bits_written(param: WrittenParam) -> str | None:
     """Return a written value's bits as hexadecimal digits; None without a type or beyond its range."""
-    if param.type is None:
+    if param.type_number is None:
         return None
     try:
-        return _digits(param.bits_as(param.type), param.type)
+        return _digits(param.bits_as(param.type_number), param.type_number)
     except UsageError:
         return None
 

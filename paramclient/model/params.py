@@ -13,7 +13,7 @@ from collections.abc import ItemsView, Iterable, Iterator, Mapping, MutableMappi
 from typing import Final, TypeAlias, TypeVar, overload
 
 from paramclient.model.similar_names import unknown_name
-from paramclient.model.values import Param, Trust, Value, from_bits, known_type, same_bits
+from paramclient.model.values import Param, Trust, WireValue, from_bits, known_type, same_bits
 from paramclient.model.wording import counted
 
 __all__ = [
@@ -83,11 +83,11 @@ class Params(MutableMapping[str, Param]):
     def __init__(
         self,
         held: dict[str, CompactParam] | None = None,
-        defaults: dict[str, Value] | None = None,
+        defaults: dict[str, WireValue] | None = None,
         moments: dict[str, float] | None = None,
     ) -> None:
         self.held: dict[str, CompactParam] = {} if held is None else held
-        self.defaults: dict[str, Value] = {} if defaults is None else defaults
+        self.defaults: dict[str, WireValue] = {} if defaults is None else defaults
         self.moments: dict[str, float] = {} if moments is None else moments
 
     def __getitem__(self, name: str) -> Param:
@@ -178,7 +178,7 @@ def copy_params(params: Mapping[str, Param]) -> Mapping[str, Param]:
 def compact_param(param: Param) -> CompactParam:
     """Return a parameter in compact form."""
     index = COMPACT_NO_INDEX if param.index is None else param.index
-    return pack_fields(param.bits, param.type, isinstance(param.value, bytes), number_of(param.trust), index)
+    return pack_fields(param.bits, param.type_number, param.is_raw, number_of(param.trust), index)
 
 
 def number_of(trust: Trust) -> int:
@@ -186,7 +186,7 @@ def number_of(trust: Trust) -> int:
     return _NUMBERS[trust]
 
 
-def param_of(name: str, held: CompactParam, default: Value | None = None) -> Param:
+def param_of(name: str, held: CompactParam, default: WireValue | None = None) -> Param:
     """Return the `Param` of a compact parameter."""
     bits, number, is_raw, trust, place = unpack_fields(held)
     value = from_bits(bits, number, is_raw=is_raw)

@@ -10,38 +10,82 @@ from paramclient.errors import UsageError
 from paramclient.model.identity import Identity
 from paramclient.model.patterns import NameChoice
 from paramclient.model.similar_names import unknown_name
-from paramclient.model.values import Param, ParamType, Value, bits_of, format_value, same_bits
+from paramclient.model.values import (
+    WIRE_SIZE,
+    Param,
+    ParamType,
+    Value,
+    WireValue,
+    bits_of,
+    format_value,
+    known_type,
+    same_bits,
+)
 from paramclient.model.wording import counted
 
 __all__ = ["ParamSet", "WrittenParam"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, init=False)
 class WrittenParam:
     """One parameter of a set.
 
     Attributes:
         name: param_id.
-        value: int for a written whole number, else float; the four raw bytes for a value that is not a
-            number. A number without a type is kept as written: only the vehicle's own type shows
-            which float32 it becomes (see `bits_as`).
-        type: param_type, or None if the source has no types.
-        default: the firmware's default, or None if the source does not contain it.
+        value: int for a written whole number, else float. A number without a type is kept as written: only
+            the vehicle's own type shows which float32 it becomes (see `bits_as`). Where `is_raw`, the
+            unsigned number of the four raw bytes, little-endian.
+        type: `ParamType`, UNKNOWN for a type that MAVLink does not define; None if the source has no types.
+        default: the firmware's default, or None if the source does not contain it as a number.
         comment: the comment in the file, without the comment character; "" for none.
         line: the line in the source file, from 1; None for other sources. Takes no part in equality.
+        is_raw: whether the source has the four raw bytes instead of a number of the type (see
+            `Param.is_raw`). Write such a value elsewhere as `settable`, not as `value`.
+        type_number: the number of the type, also of an unknown one; None if the source has no types.
+
+    Args:
+        value: as the attribute, or the four raw bytes.
+        type: as the attribute, or the number of an unknown type.
     """
 
     name: str
     value: Value
-    type: ParamType | int | None = None
-    default: Value | None = None
-    comment: str = ""
-    line: int | None = field(default=None, compare=False)
+    type: ParamType | None
+    default: Value | None
+    comment: str
+    line: int | None = field(compare=False)
+    is_raw: bool
+    type_number: int | None
+
+    def __init__(
+        self,
+        name: str,
+        value: WireValue,
+        type: ParamType | int | None = None,  # noqa: A002 - the name of the field
+        default: WireValue | None = None,
+        comment: str = "",
+        line: int | None = None,
+        is_raw: bool = False,
+        type_number: int | None = None,
+    ) -> None:
+        if isinstance(value, bytes):
+            value, is_raw = int.from_bytes(value, "little"), True
+        number = None if type is None else known_type(type or type_number or 0)
+        kind = number if number is None or isinstance(number, ParamType) else ParamType.UNKNOWN
+        default = None if isinstance(default, bytes) else default
+        given = (name, value, kind, default, comment, line, is_raw, number)
+        for attribute, each in zip(self.__slots__, given, strict=True):
+            object.__setattr__(self, attribute, each)
+
+    @property
+    def settable(self) -> WireValue:
+        """The value as `set` takes it: the number, or the four raw bytes where `is_raw`."""
+        return int(self.value).to_bytes(WIRE_SIZE, "little") if self.is_raw else self.value
 
     @classmethod
     def of(cls, param: Param) -> WrittenParam:
         """Return the value, type and default of a table's parameter, without index and trust."""
-        return cls(param.name, param.value, param.type, param.default)
+        return cls(param.name, param.settable, param.type_number, param.default)
 
     def bits_as(self, number: ParamType | int) -> int:
         """Return the bits (see `Param.bits`) of a parameter of this type with this value.
@@ -49,9 +93,8 @@ class WrittenParam:
         Raises:
             UsageError: the value does not fit the type.
         """
-        if isinstance(self.value, bytes):
-            return int.from_bytes(self.value, "little")  # four bytes, also if the type has fewer
-        return bits_of(self.value, number)
+        # four bytes of a raw value also if the type has fewer
+        return int(self.value) if self.is_raw else bits_of(self.value, number)
 
     def is_held_by(self, param: Param) -> bool:
         """Return whether a vehicle's parameter has this value, compared in the vehicle's type.
@@ -59,17 +102,17 @@ class WrittenParam:
         −0 equals 0, NaN equals only the same NaN, and a float is rounded to float32 first. False if the
         value does not fit the type. Raw bytes equal only the same raw bytes, as their number is unknown.
         """
-        if isinstance(self.value, bytes) or param.is_raw:
-            return self.value == param.value
+        if self.is_raw or param.is_raw:
+            return self.settable == param.settable
         try:
-            bits = self.bits_as(param.type)
+            bits = self.bits_as(param.type_number)
         except UsageError:
             return False
-        return same_bits(param.type, bits, param.bits)
+        return same_bits(param.type_number, bits, param.bits)
 
     def __str__(self) -> str:
-        kind = ParamType.REAL32 if self.type is None else self.type
-        return f"{self.name} = {format_value(self.value, kind)}"
+        kind = ParamType.REAL32 if self.type_number is None else self.type_number
+        return f"{self.name} = {format_value(self.settable, kind)}"
 
 
 T = TypeVar("T")

@@ -6,12 +6,16 @@ import math
 from collections.abc import Container, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from typing import Final
 
 from paramclient.errors import FileError, UsageError
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType, Value, check_name, shortest_float
+from paramclient.model.values import ParamType, WireValue, check_name, shortest_float
 
 __all__ = ["Rename", "Renames"]
+
+PARAM_NAMES_MAX: Final = 16
+"""Maximum number of names of one parameter. Each conversion multiplies the factors between two of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +50,8 @@ class Renames:
 
     Raises:
         FileError: an entry has an invalid name, or a factor that is 0 or not finite; a name has two new names
-            or two old ones; or the entries return to a name. `line` is that of the entry.
+            or two old ones; the entries return to a name; or a parameter has more than 16 names. `line` is
+            that of the entry.
     """
 
     def __init__(self, entries: Iterable[Rename] = (), source: str = "") -> None:
@@ -127,8 +132,8 @@ class Renames:
         if ratio == 1:
             return replace(param, name=other)
         try:
-            value = _multiplied(param.value, param.type, ratio)
-            default = None if param.default is None else _multiplied(param.default, param.type, ratio)
+            value = _multiplied(param.settable, param.type_number, ratio)
+            default = None if param.default is None else _multiplied(param.default, param.type_number, ratio)
         except UsageError as error:
             raise UsageError(f"{param.name} cannot become {other}: {error}") from None
         return replace(param, name=other, value=value, type=None, default=default)
@@ -178,6 +183,8 @@ class Renames:
         chain = [entry.new, *(each.new for each in self._walk(entry.new, newer=True))]
         if entry.old in chain:
             raise error(f"the renames return to {entry.old}: {' to '.join([entry.old, *chain])}")
+        if len(chain) + 1 + sum(1 for _ in self._walk(entry.old, newer=False)) > PARAM_NAMES_MAX:
+            raise error(f"{entry.old} is one of more than {PARAM_NAMES_MAX} names of one parameter")
         self._newer[entry.old] = self._older[entry.new] = entry
 
     def _walk(self, name: str, *, newer: bool) -> Iterator[Rename]:
@@ -199,7 +206,7 @@ class Renames:
             yield entry.old, ratio
 
 
-def _multiplied(value: Value, kind: ParamType | int | None, ratio: Fraction) -> int | float:
+def _multiplied(value: WireValue, kind: ParamType | int | None, ratio: Fraction) -> int | float:
     """Return the product, as an int if it is a whole number.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Parameter types, the two wire encodings, float32 comparison, and the PX4 hash.
+"""Parameter types, the two wire encodings, and float32 comparison.
 
 A PARAM_VALUE has four bytes for the value, whatever its type. Two encodings are in use (MAVLink guide,
 "Parameter Protocol"). *Byte-wise*, the standard, copies the value's own bytes into the field. *C-cast*,
@@ -11,8 +11,6 @@ from __future__ import annotations
 import math
 import re
 import struct
-import zlib
-from collections.abc import Iterable
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum, StrEnum
 from functools import lru_cache
@@ -21,37 +19,42 @@ from typing import Final, SupportsFloat, SupportsIndex, TypeAlias
 from paramclient.errors import UsageError
 
 __all__ = [
+    "WIRE_SIZE",
     "Encoding",
+    "TYPES_BY_NAME",
     "Param",
     "ParamType",
     "Settable",
     "Trust",
     "Value",
+    "WireValue",
     "as_sent",
     "bits_of",
     "check_name",
     "check_value",
-    "crc32_px4",
     "decode_value",
     "encode_value",
     "format_value",
     "from_bits",
-    "hash_chunk",
     "is_portable_name",
     "known_type",
-    "px4_hash",
     "same_bits",
     "shortest_float",
     "type_name",
 ]
 
-Value: TypeAlias = int | float | bytes
-"""A parameter's value. `bytes` only where the four wire bytes cannot be decoded as a number of the type: a
-64-bit type in the byte-wise encoding, an unknown type, a C-cast float that the integer type cannot hold."""
+Value: TypeAlias = int | float
+"""The value of a parameter as a number."""
+
+WireValue: TypeAlias = int | float | bytes
+"""A value to write: a number, or the four bytes of the message where they cannot be decoded as a number of
+the type (see `Param.is_raw`)."""
 
 Settable: TypeAlias = SupportsIndex | SupportsFloat | bytes
 """A value that can be set: a number, also of another library, or the four wire bytes."""
 
+WIRE_SIZE: Final = 4
+"""Bytes of the value in PARAM_VALUE and PARAM_SET, of any type."""
 NAME_LENGTH = 16
 """Bytes in param_id. Shorter names end with a NUL, names of 16 bytes have none."""
 PORTABLE_NAMES_CACHED: Final = 4096
@@ -62,6 +65,8 @@ _portable: Final = re.compile(r"(?=[^A-Za-z]*[A-Za-z])(?![@/])(?:(?![#,;=])[!-~]
 class ParamType(IntEnum):
     """MAV_PARAM_TYPE."""
 
+    UNKNOWN = 0
+    """A type that MAVLink does not define; `Param.type_number` has its number."""
     UINT8 = 1
     INT8 = 2
     UINT16 = 3
@@ -75,12 +80,12 @@ class ParamType(IntEnum):
 
     @property
     def size(self) -> int:
-        """Size of a value of this type, in bytes."""
-        return _LAYOUT[self].size
+        """Size of a value of this type, in bytes; 4, the size in the message, for UNKNOWN."""
+        return _LAYOUT[self].size if self else WIRE_SIZE
 
     @property
     def is_integer(self) -> bool:
-        return self < ParamType.REAL32
+        return ParamType.UNKNOWN < self < ParamType.REAL32
 
     @property
     def bounds(self) -> tuple[int, int]:
@@ -117,49 +122,67 @@ class Param:
 
     Attributes:
         name: param_id, 1 to 16 characters.
-        value: int for integer types, float for REAL32 and REAL64, and the four wire bytes where they cannot
-            be decoded as the type (see `Value`). A REAL32 is the exact float32 value as a Python float.
-        type: a `ParamType`, or the number of a type that MAVLink does not define.
+        value: int for integer types, float for REAL32 and REAL64. A REAL32 is the exact float32 value as a
+            Python float. Where `is_raw`, the unsigned number of the four wire bytes, little-endian.
+        type: MAV_PARAM_TYPE; `ParamType.UNKNOWN` for a type that MAVLink does not define.
         index: the component's index of the parameter, or None while unknown (PX4 gives none to parameters
             not in use, ArduPilot none in responses by name).
         bits: the value's own bytes in its type, as a little-endian unsigned number. Two values are
             equal if `same_bits` returns true for them; `value` does not take part in equality.
         trust: how the value was confirmed.
         default: the firmware's default, or None where the vehicle has not given it (only a packed
-            parameter file does). `default` does not take part in equality.
+            parameter file does) or it is no number of the type. `default` does not take part in equality.
+        is_raw: whether the wire bytes cannot be decoded as a number of the type: an unknown type, a 64-bit
+            type in the byte-wise encoding, a C-cast float that the integer type cannot hold. Write such a
+            value elsewhere as `settable`, not as `value`.
+        type_number: the number of the type, also of an unknown one.
+
+    Args:
+        value: as the attribute, or the four wire bytes, which make the parameter raw.
+        type: as the attribute, or the number of an unknown type.
     """
 
     name: str
     value: Value = field(compare=False)
-    type: ParamType | int
+    type: ParamType
     index: int | None
     bits: int
     trust: Trust = Trust.LIVE
     default: Value | None = field(default=None, compare=False)
+    is_raw: bool = False
+    type_number: int = 0
 
     def __init__(
         self,
         name: str,
-        value: Value,
+        value: WireValue,
         type: ParamType | int,  # noqa: A002 - the name of the field
         index: int | None,
         bits: int,
         trust: Trust = Trust.LIVE,
-        default: Value | None = None,
+        default: WireValue | None = None,
+        is_raw: bool = False,
+        type_number: int = 0,
     ) -> None:
         # The generated __init__ takes twice as long, and every PARAM_VALUE makes a Param.
+        if isinstance(value, bytes):
+            value, is_raw = int.from_bytes(value, "little"), True
+        number = known_type(type or type_number)
+        is_known = isinstance(number, ParamType)
         _set_name(self, name)
         _set_value(self, value)
-        _set_type(self, type)
+        _set_type(self, number if is_known else _UNKNOWN)
         _set_index(self, index)
         _set_bits(self, bits)
         _set_trust(self, trust)
-        _set_default(self, default)
+        _set_default(self, None if isinstance(default, bytes) else default)
+        _set_is_raw(self, is_raw or not is_known)
+        _set_type_number(self, number)
 
     @property
-    def is_raw(self) -> bool:
-        """Whether `value` is the undecoded wire bytes."""
-        return isinstance(self.value, bytes)
+    def settable(self) -> WireValue:
+        """The value as `set` takes it to write it to another vehicle: the four wire bytes where `is_raw`."""
+        return self.bits.to_bytes(WIRE_SIZE, "little") if self.is_raw else self.value
 
     @property
     def is_changed(self) -> bool | None:
@@ -167,7 +190,9 @@ class Param:
         if self.default is None:
             return None
         # NaN is not equal to NaN, and a default can be NaN.
-        return self.value != self.default and not (self.value != self.value and self.default != self.default)
+        return self.is_raw or not (
+            self.value == self.default or (self.value != self.value and self.default != self.default)
+        )
 
     def with_trust(self, trust: Trust) -> Param:
         """Return this parameter with another trust."""
@@ -176,18 +201,20 @@ class Param:
     def same_value(self, other: Param) -> bool:
         """Return whether both have the same value in the same type (−0 equals 0, NaN is compared by bits)."""
         return (
-            self.type == other.type
+            self.type_number == other.type_number
             and self.is_raw == other.is_raw
-            and same_bits(self.type, self.bits, other.bits)
+            and same_bits(self.type_number, self.bits, other.bits)
         )
 
     def __str__(self) -> str:
-        return f"{self.name} = {format_value(self.value, self.type)}"
+        return f"{self.name} = {format_value(self.settable, self.type_number)}"
 
 
-_set_name, _set_value, _set_type, _set_index, _set_bits, _set_trust, _set_default = (
+_UNKNOWN: Final = ParamType.UNKNOWN
+_set_name, _set_value, _set_type, _set_index, _set_bits, *_set_rest = (
     vars(Param)[each.name].__set__ for each in fields(Param)
 )
+_set_trust, _set_default, _set_is_raw, _set_type_number = _set_rest
 
 # Constants for `decode_value`, which runs for every received value: enumeration members are slower than
 # numbers.
@@ -197,6 +224,8 @@ _BYTEWISE = Encoding.BYTEWISE
 _LAYOUTS = {int(kind): layout for kind, layout in _LAYOUT.items()}
 _FITTING = {number: (1 << 8 * each.size) - 1 for number, each in _LAYOUTS.items() if each.size <= 4}
 _BOUNDS = {int(kind): kind.bounds for kind in ParamType if kind.is_integer}
+TYPES_BY_NAME: Final = {kind.name: kind for kind in ParamType if kind}
+"""The types that MAVLink defines, by name."""
 
 
 def known_type(number: int) -> ParamType | int:
@@ -204,12 +233,12 @@ def known_type(number: int) -> ParamType | int:
     return _TYPES[number] if number < len(_TYPES) else number
 
 
-_TYPES: tuple[ParamType | int, ...] = (0, *ParamType)
+_TYPES: tuple[ParamType | int, ...] = (0, *TYPES_BY_NAME.values())
 
 
 def type_name(number: ParamType | int) -> str:
     """Return the name of a type, `INT32`, `REAL32`, …, or `TYPE_77` for an unknown type."""
-    return number.name if isinstance(number, ParamType) else f"TYPE_{number}"
+    return ParamType(number).name if 1 <= number <= ParamType.REAL64 else f"TYPE_{number}"
 
 
 def check_name(name: str) -> str:
@@ -236,7 +265,7 @@ def is_portable_name(name: str) -> bool:
     return _portable(name) is not None
 
 
-def check_value(value: Settable) -> Value:
+def check_value(value: Settable) -> WireValue:
     """Convert a caller's value to an int, a float or four raw bytes; else raise UsageError.
 
     Numbers of other libraries (numpy's, Decimal) are converted with `__index__` or `__float__`. Text is
@@ -258,7 +287,7 @@ def check_value(value: Settable) -> Value:
     raise UsageError(f"a parameter value is a number, not {type(value).__name__}")
 
 
-def decode_value(raw: bytes, number: int, encoding: Encoding) -> tuple[Value, int]:
+def decode_value(raw: bytes, number: int, encoding: Encoding) -> tuple[WireValue, int]:
     """Decode the four wire bytes of a value.
 
     Args:
@@ -293,7 +322,7 @@ def bits_of_wire(raw: bytes, number: int, encoding: Encoding) -> tuple[int, bool
     return bits, True
 
 
-def encode_value(value: Value, number: int, encoding: Encoding) -> bytes:
+def encode_value(value: WireValue, number: int, encoding: Encoding) -> bytes:
     """Encode a value in the four wire bytes.
 
     Raises:
@@ -346,7 +375,7 @@ def as_sent(bits: int, number: int, encoding: Encoding) -> bytes:
     return (bits & 0xFFFFFFFF).to_bytes(4, "little")
 
 
-def from_bits(bits: int, number: int, *, is_raw: bool = False) -> Value:
+def from_bits(bits: int, number: int, *, is_raw: bool = False) -> WireValue:
     """Return the value with these bits: the inverse of `Param.bits`, for values kept on disk.
 
     Args:
@@ -361,7 +390,7 @@ def from_bits(bits: int, number: int, *, is_raw: bool = False) -> Value:
     return value
 
 
-def bits_of(value: Value, number: int) -> int:
+def bits_of(value: WireValue, number: int) -> int:
     """Return the value's own bytes in its type, as a little-endian unsigned number.
 
     Raises:
@@ -396,7 +425,7 @@ def same_bits(number: int, a: int, b: int) -> bool:
     return number == ParamType.REAL64 and a | b == 0x8000000000000000
 
 
-def format_value(value: Value, number: int = ParamType.REAL32) -> str:
+def format_value(value: WireValue, number: int = ParamType.REAL32) -> str:
     """Return the shortest text that parses to the same value: floats as float32, raw bytes as hexadecimal."""
     if isinstance(value, bytes):
         return f"0x{int.from_bytes(value, 'little'):08x}"
@@ -425,28 +454,6 @@ _FLOAT32_END = 2.0**128 - 2.0**103
 """Upper bound: smaller floats round to a finite float32."""
 _FLOAT32_NORMAL = 2.0**-126
 """Smallest normal float32: from here on, all decimals of up to 6 digits are different floats."""
-
-
-def crc32_px4(data: bytes, crc: int = 0) -> int:
-    """Return PX4's CRC-32: polynomial 0xEDB88320, reflected, start 0, no final xor (crc.c, `crc32part`)."""
-    return zlib.crc32(data, crc ^ 0xFFFFFFFF) ^ 0xFFFFFFFF
-
-
-def px4_hash(params: Iterable[Param], *, leave_out: Iterable[str] = ()) -> int:
-    """Return the value of PX4's `_HASH_CHECK` for a table.
-
-    Args:
-        params: the parameters in use, in any order; PX4's types have 4 bytes each.
-        leave_out: names of volatile parameters, which PX4 excludes from the hash.
-    """
-    without = frozenset(leave_out)
-    kept = sorted((param for param in params if param.name not in without), key=lambda param: param.name)
-    return crc32_px4(b"".join(map(hash_chunk, kept)))
-
-
-def hash_chunk(param: Param) -> bytes:
-    """Return the bytes that PX4 hashes for a parameter: the name without NUL, and the 4 value bytes."""
-    return param.name.encode("latin-1") + (param.bits & 0xFFFFFFFF).to_bytes(4, "little")
 
 
 def _to_float32(value: int | float, kind: ParamType) -> bytes:

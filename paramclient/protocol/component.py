@@ -17,7 +17,7 @@ from paramclient.model.values import (
     Param,
     ParamType,
     Trust,
-    Value,
+    WireValue,
     as_sent,
     encode_value,
     is_portable_name,
@@ -725,7 +725,7 @@ class ComponentMachine:
     def write(
         self,
         name: str,
-        value: Value,
+        value: WireValue,
         now: float,
         asker: str | None = None,
         *,
@@ -751,7 +751,7 @@ class ComponentMachine:
         name = self.spelling(name)
         known = self.table.params.get(name)
         if known is not None and known.trust is not Trust.CACHED and self.may_be_written:
-            encode_value(value, known.type, self.table.encoding)
+            encode_value(value, known.type_number, self.table.encoding)
         self.writes.check_finite(name, value, force=force)
         write = self.writes.set(name, value, now, asker, settle=settle, force=force, filed=filed)
         write.on_done.append(lambda: self._write_ended(write))
@@ -759,7 +759,7 @@ class ComponentMachine:
 
     def write_many(
         self,
-        pairs: Sequence[tuple[str, Value]],
+        pairs: Sequence[tuple[str, WireValue]],
         now: float,
         asker: str | None = None,
         *,
@@ -778,7 +778,7 @@ class ComponentMachine:
         """
         self.check_present(f"PARAM_SET to {self.system}/{self.component}", now)
 
-        def begin(name: str, value: Value, at: float, filed: bool) -> Write:
+        def begin(name: str, value: WireValue, at: float, filed: bool) -> Write:
             return self.write(name, value, at, asker, settle=settle, force=force, filed=filed)
 
         def fileable(name: str) -> Param | None:

@@ -74,6 +74,8 @@ REMOVAL_SEARCH_INTERVAL: Final = 0.5
 """Seconds between two searches for a component to forget, where there was none: each looks at all."""
 STREAM_PEERS_MAX: Final = 256
 """Stream peers with an incomplete frame."""
+SENDERS_MAX: Final = 32
+"""Senders that are remembered while no autopilot has been received, to name them to the user."""
 EARLY_REQUESTS_MAX: Final = 32
 """Requests for parameter files that are kept for components that are not known yet: a log may begin with the
 read of one."""
@@ -108,6 +110,8 @@ class Station:
 
     Attributes:
         components: every known component, by (system, component); with `split_peers` by `PeerAddress`.
+        senders: the senders of all frames before the first autopilot, at most `SENDERS_MAX`; empty if the
+            client only listens or has a signing key.
         bytes_received, bytes_sent, frames_sent: on this link, by this station.
         traffic: the counts, or None without `counts_traffic`.
         policy: the requests that may be sent to bring tables up to date.
@@ -141,6 +145,7 @@ class Station:
         self.listening_since = -math.inf
         self.own_address: Address = NO_ADDRESS if self.listens_only else (system, component)
         self.components: dict[Address, ComponentMachine] = {}
+        self.senders: set[Address] = set()
         self.bytes_received = 0
         self.bytes_sent = self.frames_sent = 0
         self._trace = trace
@@ -499,6 +504,8 @@ class Station:
             return False
         for frame in Framer(stream=False).receive(data):
             address = (frame.system, frame.component)
+            if len(self.senders) < SENDERS_MAX:
+                self.senders.add(address)
             is_autopilot = frame.component == AUTOPILOT_COMPONENT and frame.system != 0
             known = self.components.get(self._key(*address, peer))
             if is_autopilot and address != self.own_address and not (known and known.presence.has_beaten):

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from paramclient.provision.apply_restore import apply, restore
 from paramclient.provision.apply_rules import CATEGORIES
-from paramclient.provision.fleet import apply_all, verify_all
+from paramclient.provision.fleet import Wanted, apply_all, verify_all
 from paramclient.provision.inspection import prepare, verify
 from paramclient.provision.planning import (
     MISSING,
@@ -35,24 +35,27 @@ from paramclient.provision.results import (
     FleetApplied,
     FleetVerified,
 )
+from paramclient.provision.runner import Runner
 
 __all__ = [
-    "CATEGORIES",
-    "MISSING",
-    "WRONG",
     "ApplyProgress",
     "ApplyResult",
     "ApplyRow",
     "ApplyStatus",
+    "CATEGORIES",
     "FleetApplied",
     "FleetVerified",
+    "MISSING",
     "ParamInfo",
     "Plan",
     "PlanRow",
     "PlanStatus",
     "RowComparison",
+    "Runner",
     "Stage",
     "Step",
+    "WRONG",
+    "Wanted",
     "apply",
     "apply_all",
     "overlay",

@@ -27,7 +27,7 @@ from paramclient.errors import (
 from paramclient.model.identity import SHARED_UIDS, Identity
 from paramclient.model.paramset import ParamSet
 from paramclient.model.renames import Renames
-from paramclient.model.values import Value
+from paramclient.model.values import WireValue
 from paramclient.protocol.params.change_origin import check_author
 from paramclient.protocol.params.write_batch import SetOutcome, SetStatus
 from paramclient.protocol.requests.pacing import WRITES_MAX
@@ -64,8 +64,8 @@ another parameter may have changed it."""
 DEFAULT_SYSTEM_ID: Final = 1
 """The system id of a PX4 after SYS_AUTOCONFIG: its start script does not keep MAV_SYS_ID."""
 VERIFY_DELAY: Final = 1.2
-"""Seconds between the last write and the read that verifies it: modules of PX4 clamp values up to 815 ms
-after the acknowledgement, and set other parameters up to 1 s after it (measured)."""
+"""Seconds between the last write and the read that verifies it: modules of PX4 clamp the value, or set other
+parameters, up to 1.1 s after the acknowledgement (measured)."""
 ARMED_STATE_TIMEOUT: Final = 3.0
 """Seconds to wait for a heartbeat with the armed flag: heartbeats come once a second, and some are lost."""
 SYSTEM_CHANGE_TIMEOUT: Final = 10.0
@@ -401,9 +401,9 @@ class ApplyRun:
             if self._is_action(step.name) and self._rules.resets(step.name):
                 self._next_system_id = DEFAULT_SYSTEM_ID
             if done.adjusted:
-                self._record(step, ApplyStatus.ADJUSTED, done.actual, "the vehicle changed the value")
+                self._record(step, ApplyStatus.ADJUSTED, done.param.settable, "the vehicle changed the value")
             else:
-                self._report("writing", self._make_row(step, ApplyStatus.SET, done.actual, done.note))
+                self._report("writing", self._make_row(step, ApplyStatus.SET, done.param.settable, done.note))
         elif outcome.status is SetStatus.REFUSED:
             is_read_only = isinstance(error, Refused) and error.code == ParamErrorCode.READ_ONLY
             if is_read_only and self._options.skips_read_only:
@@ -587,7 +587,7 @@ class ApplyRun:
             self._reboot_for[step.name] = None
 
     def _record(
-        self, step: Step, status: ApplyStatus, actual: Value | None, reason: str, category: str = ""
+        self, step: Step, status: ApplyStatus, actual: WireValue | None, reason: str, category: str = ""
     ) -> None:
         """Record an outcome that only the verification may still change, and report it."""
         row = self._make_row(step, status, actual, reason, category)
@@ -595,15 +595,15 @@ class ApplyRun:
         self._report("writing", row)
 
     def _make_row(
-        self, step: Step, status: ApplyStatus, actual: Value | None, reason: str = "", category: str = ""
+        self, step: Step, status: ApplyStatus, actual: WireValue | None, reason: str = "", category: str = ""
     ) -> ApplyRow:
         renamed = None if step.name == step.wanted.name else self.plan.rows[step.wanted.name].renamed
         before = self._before(step.name)
         return ApplyRow(step.wanted, status, before, actual, step.type, category, reason, (), renamed)
 
-    def _before(self, name: str) -> Value | None:
+    def _before(self, name: str) -> WireValue | None:
         held = None if self._first is None else self._first.table.get(name)
-        return None if held is None else held.value
+        return None if held is None else held.settable
 
     def _report(self, phase: str, row: ApplyRow | None = None) -> None:
         if self._options.progress is not None:

@@ -38,6 +38,8 @@ __all__ = [
     "with_other_names",
 ]
 
+READS_IN_PROGRESS_MAX: Final = 64
+"""Reads by name that are in progress at once, each in a task. The component itself sends fewer at a time."""
 SETUP_IDENTITY_TIMEOUT: Final = 10.0
 """Seconds to wait for the identity of a vehicle. The identification usually ends sooner, after a few
 requests."""
@@ -324,22 +326,24 @@ async def _read_names(
     found, unknown = search.result()
     failed: list[NoReply | LinkError] = []
 
-    async def read_one(name: str) -> None:
-        try:
-            found[name] = await component.get(name)
-        except (VehicleError, UsageError):  # the vehicle cannot have an invalid name either
-            unknown.add(name)
-        except (NoReply, LinkError) as error:
-            if isinstance(error, NoReply) and name in given_up:
+    left = (name for name in names if name not in found and name not in unknown)
+
+    async def read() -> None:
+        for name in left:
+            try:
+                found[name] = await component.get(name)
+            except (VehicleError, UsageError):  # the vehicle cannot have an invalid name either
                 unknown.add(name)
-                return
-            failed.append(error)
-            reading.cancel_scope.cancel()
+            except (NoReply, LinkError) as error:
+                if isinstance(error, NoReply) and name in given_up:
+                    unknown.add(name)
+                    continue
+                failed.append(error)
+                reading.cancel_scope.cancel()
 
     async with anyio.create_task_group() as reading:
-        for name in names:
-            if name not in found and name not in unknown:
-                reading.start_soon(read_one, name)
+        for _ in range(min(READS_IN_PROGRESS_MAX, len(names))):
+            reading.start_soon(read)
     if failed:
         raise failed[0]
     return found, frozenset(unknown)
@@ -412,7 +416,7 @@ def _probably_hidden(component: Component, wanted: ParamSet) -> frozenset[str]:
     if component.autopilot != "ardupilot" or not local(component).machine.fetches.may_use_file():
         return frozenset()
     rules = rules_for("ardupilot")
-    switches = {name for name, each in wanted.items() if rules.reveals(name) and each.value != 0}
+    switches = {name for name, each in wanted.items() if rules.reveals(name) and each.settable != 0}
     groups = tuple(f"{name.rpartition('_')[0]}_" for name in switches)
     names = [name for name in wanted if name.startswith(groups) and name not in switches]
     unheard = frozenset(name for name in names if name not in component.params)
@@ -429,7 +433,9 @@ def _in_no_hidden_group(table: Mapping[str, Param], wanted: Iterable[str]) -> fr
         table: the whole list.
         wanted: the wanted names.
     """
-    switches = [name for name, param in table.items() if param.type is ParamType.INT8 and param.value == 0]
+    switches = [
+        name for name, param in table.items() if param.type_number is ParamType.INT8 and param.settable == 0
+    ]
     hidden = {start for name in switches for start in _starts(name)}
     return frozenset(name for name in wanted if name not in table and hidden.isdisjoint(_starts(name)))
 

@@ -19,7 +19,7 @@ from paramclient.model.values import (
     Encoding,
     Param,
     ParamType,
-    Value,
+    WireValue,
     bits_of,
     encode_value,
     format_value,
@@ -126,7 +126,7 @@ class PlanRow:
 
     wanted: WrittenParam
     status: PlanStatus
-    before: Value | None = None
+    before: WireValue | None = None
     type: ParamType | int | None = None
     category: str = ""
     reason: str = ""
@@ -152,7 +152,7 @@ class PlanRow:
     @property
     def differs(self) -> bool:
         """Whether the vehicle has another value than the wanted one, or no such parameter."""
-        return self.before is None or not _is_same(self.target.value, self.before, self.type)
+        return self.before is None or not _is_same(self.target.settable, self.before, self.type)
 
     @property
     def standing(self) -> RowComparison:
@@ -170,7 +170,7 @@ class PlanRow:
 
     def __str__(self) -> str:
         kind = ParamType.REAL32 if self.type is None else self.type
-        wanted = format_value(self.target.value, kind)
+        wanted = format_value(self.target.settable, kind)
         name = self.name if self.renamed is None else f"{self.name} (here {self.renamed.name})"
         if self.status is PlanStatus.UNCHANGED:
             return f"{name} = {wanted}"
@@ -194,9 +194,9 @@ class Step:
     """
 
     name: str
-    value: Value
+    value: WireValue
     type: ParamType | int
-    before: Value
+    before: WireValue
     needs_reboot: bool
     wanted: WrittenParam
 
@@ -444,8 +444,8 @@ class _Planner:
         target = wanted if renamed is None else renamed
         name = target.name
         held: Param | WrittenParam | None = self._current.get(name)
-        before = None if held is None else held.value
-        kind = target.type if held is None or held.type is None else held.type
+        before = None if held is None else held.settable
+        kind = target.type_number if held is None or held.type_number is None else held.type_number
         note = self._renames.missing_note(wanted.name) if before is None else ""
 
         def verdict(status: PlanStatus, category: str = "", reason: str = "") -> PlanRow:
@@ -460,14 +460,14 @@ class _Planner:
                 return verdict(PlanStatus.SKIPPED, rule.category, f"left out: it {rule.reason}")
         if before is None:
             return verdict(PlanStatus.LATER, MISSING)
-        if _is_same(target.value, before, kind):
+        if _is_same(target.settable, before, kind):
             return verdict(PlanStatus.UNCHANGED)
         info = self._info.get(name)
         if info is not None and info.is_read_only and not includes(READ_ONLY):
             return verdict(PlanStatus.SKIPPED, READ_ONLY, "left out: it can only be read")
-        wrong = self._find_fault(name, target.value, kind, info)
-        if wrong is None and isinstance(target.value, bytes) and not isinstance(before, bytes):
-            wrong = WRONG, f"{format_value(target.value)} are raw bytes, and the vehicle has a number"
+        wrong = self._find_fault(name, target.settable, kind, info)
+        if wrong is None and target.is_raw and not isinstance(before, bytes):
+            wrong = WRONG, f"{format_value(target.settable)} are raw bytes, and the vehicle has a number"
         if wrong is None or (wrong[0] == OUT_OF_RANGE and includes(OUT_OF_RANGE)):
             return verdict(PlanStatus.SET)
         category, reason = wrong
@@ -542,7 +542,7 @@ class _Planner:
         return settled
 
     def _find_fault(
-        self, name: str, value: Value, kind: ParamType | int | None, info: ParamInfo | None
+        self, name: str, value: WireValue, kind: ParamType | int | None, info: ParamInfo | None
     ) -> tuple[str, str] | None:
         """Return why a value is invalid, as category and sentence, or None."""
         if self._rules.is_system_id(name) and (isinstance(value, bytes) or not 1 <= value <= 255):
@@ -573,13 +573,13 @@ class _Planner:
     def _step(self, row: PlanRow) -> Step:
         assert row.before is not None, "only parameters that the vehicle has are set"
         kind = ParamType.REAL32 if row.type is None else row.type
-        name, value = row.target.name, row.target.value
+        name, value = row.target.name, row.target.settable
         return Step(name, value, kind, row.before, self._needs_reboot(name), row.wanted)
 
-    def _value_to_be(self, name: str) -> Value | None:
+    def _value_to_be(self, name: str) -> WireValue | None:
         """Return the wanted value of a parameter, or else its present value."""
         param: Param | WrittenParam | None = self._targets.get(name) or self._current.get(name)
-        return None if param is None else param.value
+        return None if param is None else param.settable
 
     def _needs_reboot(self, name: str) -> bool:
         info = self._info.get(name)
@@ -595,7 +595,7 @@ def _pop_matching(steps: list[Step], fits: Callable[[Step], bool]) -> list[Step]
     return taken
 
 
-def _is_same(wanted: Value, held: Value, kind: ParamType | int | None) -> bool:
+def _is_same(wanted: WireValue, held: WireValue, kind: ParamType | int | None) -> bool:
     """Return whether two values are equal in the vehicle's type; as float32 if the type is unknown."""
     if isinstance(wanted, bytes) or isinstance(held, bytes):
         return wanted == held

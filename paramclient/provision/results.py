@@ -9,7 +9,7 @@ from enum import StrEnum
 
 from paramclient.errors import ParamClientError
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType, Value, format_value
+from paramclient.model.values import ParamType, WireValue, format_value
 from paramclient.provision.apply_rules import CATEGORIES, OUT_OF_RANGE
 from paramclient.provision.planning import Plan
 
@@ -52,8 +52,8 @@ class ApplyRow:
 
     wanted: WrittenParam
     status: ApplyStatus
-    before: Value | None = None
-    actual: Value | None = None
+    before: WireValue | None = None
+    actual: WireValue | None = None
     type: ParamType | int | None = None
     category: str = ""
     reason: str = ""
@@ -86,7 +86,7 @@ class ApplyRow:
 
     def __str__(self) -> str:
         kind = ParamType.REAL32 if self.type is None else self.type
-        value = self.target.value if self.actual is None else self.actual
+        value = self.target.settable if self.actual is None else self.actual
         name = self.name if self.renamed is None else f"{self.name} (here {self.renamed.name})"
         why = f": {self.reason}" if self.reason else ""
         like = f" (did you mean {', '.join(self.nearest)}?)" if self.nearest else ""

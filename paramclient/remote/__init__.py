@@ -10,12 +10,15 @@ sends calls as HTTP requests. Errors are the exceptions that the client of the s
 - `decoding`: JSON documents of a service as records.
 - `http`: HTTP requests and the event stream.
 - `link`: `ServiceLink`, the link object of such a client.
-- `mirror`: copy of one table.
+- `mirror`: copies of one table, plain or extended.
 - `mirrored_component`: state and table of one component.
 - `problems`: problem documents as exceptions.
+- `remote_extended_params`: `RemoteExtParams`, the implementation of `ExtParams`.
 - `roster`: all components of a service.
+- `service`: interface of a service for its components.
 - `service_address`: address and token of a service.
 - `service_client`: `ServiceClient`, the implementation of `ParamClient`.
+- `write_parts`: writes of many values in several requests.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, Final, Protocol
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Final, Literal
 
 import anyio
 
@@ -18,10 +18,10 @@ from paramclient.client.component import Component
 from paramclient.client.extended_params import ExtParams
 from paramclient.client.local import not_given
 from paramclient.client.subscription import Changes
-from paramclient.errors import LinkError, NoReply, ParamClientError
+from paramclient.errors import NoReply, ParamClientError
 from paramclient.model.identity import Identity
 from paramclient.model.params import ParamMap
-from paramclient.model.values import Encoding, Param, Settable, Value, check_value
+from paramclient.model.values import Encoding, Param, Settable, WireValue, check_value
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.params.fetch_result import FetchResult, Progress
 from paramclient.protocol.params.sampling import SAMPLE_SIZE
@@ -30,7 +30,7 @@ from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome, S
 from paramclient.protocol.params.writes import SetResult
 from paramclient.protocol.vehicle.address_contest import Contest
 from paramclient.protocol.wire import PARAMETERS_MAX, SigningKey
-from paramclient.remote.connection import Connection, run_with_progress
+from paramclient.remote.connection import run_with_progress
 from paramclient.remote.decoding import (
     Document,
     decode_errors,
@@ -44,49 +44,15 @@ from paramclient.remote.decoding import (
 from paramclient.remote.http import ServiceResponse
 from paramclient.remote.mirrored_component import MirroredComponent
 from paramclient.remote.problems import error_of
+from paramclient.remote.remote_extended_params import RemoteExtParams
+from paramclient.remote.service import Service
+from paramclient.remote.write_parts import requests_of, write_in_parts
 
-__all__ = ["RemoteComponent", "Service", "mirrored_of"]
+__all__ = ["RemoteComponent", "mirrored_of"]
 
 VALUES_PER_REQUEST_MAX: Final = 1000
 """Values in one request: a service accepts 10,000, and a lost response leaves the outcome of all of them
 unknown."""
-
-
-class Service(Protocol):
-    """Interface of a service for its components.
-
-    Attributes:
-        name: address of the service.
-        connection: connection to the service.
-    """
-
-    name: str
-    connection: Connection
-
-    async def ask(
-        self,
-        mirrored: MirroredComponent,
-        what: str,
-        body: Mapping[str, Any],
-        timeout: float | None,
-        awaited: str,
-        *,
-        method: str = "POST",
-        is_write: bool = False,
-    ) -> ServiceResponse:
-        """Request something about a component, and wait until its effect is in the mirror.
-
-        Args:
-            mirrored: the component.
-            what: the last part of the path.
-            body, timeout, awaited, method, is_write: as in `Connection.ask`.
-
-        Raises:
-            ParamClientError: as from `Connection.ask`.
-        """
-
-    async def component_of_response(self, answer: ServiceResponse) -> Component:
-        """Return the component of a response, with its table."""
 
 
 class RemoteComponent(Component):
@@ -101,8 +67,10 @@ class RemoteComponent(Component):
         self.params = ParamMap(mirrored.mirror.params)
         self._service = service
         self._mirrored = mirrored
+        self._ext = RemoteExtParams(service, mirrored)
 
     # state
+
     @property
     def autopilot(self) -> str:
         """See `Component.autopilot`."""
@@ -130,8 +98,14 @@ class RemoteComponent(Component):
 
     @property
     def ext(self) -> ExtParams:
-        """Raise UsageError: the service does not serve extended parameters."""
-        raise not_given("extended parameters")
+        """See `Component.ext`.
+
+        Raises:
+            UsageError: the service is one of an earlier version, which does not serve them.
+        """
+        if not self._mirrored.has_extended:
+            raise not_given("extended parameters, as its version is too old")
+        return self._ext
 
     @property
     def count(self) -> int | None:
@@ -286,35 +260,34 @@ class RemoteComponent(Component):
             options["force"] = True
         if durable:
             options["durable"] = True
+        self._service.connection.check_open()
         if self.state == "lost":
             what = f"PARAM_SET to {self.system}/{self.component} (lost)"
             raise NoReply(what, attempts=0, waited=self.silence)
         began = anyio.current_time()
-        outcomes: list[SetOutcome] = []
-        failure: ParamClientError | None = None
-        for part in _requests_of(pairs):
-            if failure is not None:
-                done = [SetOutcome(*pair, SetStatus.NOT_TRIED, error=failure) for pair in part]
-            else:
-                left = None if timeout is None else began + timeout - anyio.current_time()
-                try:
-                    done, failure = await self._set_part(part, options, left)
-                except ParamClientError as error:
-                    is_open = isinstance(error, (NoReply, LinkError))  # the service may have written them
-                    if not is_open and not outcomes:
-                        raise
-                    failure = error
-                    status = SetStatus.UNKNOWN if is_open else SetStatus.NOT_TRIED
-                    done = [SetOutcome(*pair, status, error=error) for pair in part]
-            for outcome in done:
-                outcomes.append(outcome)
-                if progress is not None:
-                    progress(outcome)
+
+        async def write(
+            part: Sequence[tuple[str, WireValue]], left: float | None
+        ) -> tuple[list[SetOutcome], ParamClientError | None]:
+            return await self._set_part(part, options, left)
+
+        def not_written(
+            name: str, value: WireValue, status: SetStatus, error: ParamClientError
+        ) -> SetOutcome:
+            return SetOutcome(name, value, status, error=error)
+
+        outcomes, failure = await write_in_parts(
+            requests_of(pairs, VALUES_PER_REQUEST_MAX),
+            write,
+            not_written,
+            timeout=timeout,
+            progress=progress,
+        )
         elapsed = anyio.current_time() - began
-        return SetManyResult(self.system, self.component, tuple(outcomes), failure, elapsed)
+        return SetManyResult(self.system, self.component, outcomes, failure, elapsed)
 
     async def _set_part(
-        self, pairs: Sequence[tuple[str, Value]], options: Mapping[str, Any], timeout: float | None
+        self, pairs: Sequence[tuple[str, WireValue]], options: Mapping[str, Any], timeout: float | None
     ) -> tuple[list[SetOutcome], ParamClientError | None]:
         """Write values with different names in one request."""
         answer = await self._service.ask(
@@ -341,7 +314,7 @@ class RemoteComponent(Component):
         self,
         *,
         refresh: bool = False,
-        accept: str = "verified",
+        accept: Literal["verified", "sampled"] = "verified",
         sample: int = SAMPLE_SIZE,
         seed: int | None = None,
         timeout: float | None = None,
@@ -349,7 +322,8 @@ class RemoteComponent(Component):
     ) -> FetchResult:
         """See `Component.fetch_all`. Concurrent fetches of several programs share one download."""
         began = anyio.current_time()
-        before = self._mirrored.progress_count
+        told = self._mirrored.progress
+        before = told.count
         check_accepted(accept, sample)
         body: dict[str, Any] = {"refresh": refresh, "accept": accept, "sample": min(sample, PARAMETERS_MAX)}
         if seed is not None:
@@ -357,13 +331,13 @@ class RemoteComponent(Component):
 
         def tell() -> None:
             assert progress is not None
-            progress(self._mirrored.progress_since(before))
+            progress(told.since(before))
 
         async def fetch() -> ServiceResponse:
             awaited = f"the parameters of {self.system}/{self.component}"
             answer = await self._service.ask(self._mirrored, "fetch", body, timeout, awaited)
             with decode_errors(self._service.name):
-                self._mirrored.end_progress(answer.document["received"], answer.document["count"])
+                told.end(answer.document["received"], answer.document["count"])
             return answer
 
         answer = await run_with_progress(fetch, None if progress is None else tell)
@@ -397,18 +371,6 @@ class RemoteComponent(Component):
         if (ended := self._service.connection.ended) is not None:
             changes.end(ended)
         return changes
-
-
-def _requests_of(pairs: Iterable[tuple[str, Value]]) -> Iterator[list[tuple[str, Value]]]:
-    """Divide pairs, in order, into requests that have each name once."""
-    part: dict[str, Value] = {}
-    for name, value in pairs:
-        if name in part or len(part) == VALUES_PER_REQUEST_MAX:
-            yield list(part.items())
-            part = {}
-        part[name] = value
-    if part:
-        yield list(part.items())
 
 
 def mirrored_of(component: Component) -> MirroredComponent:

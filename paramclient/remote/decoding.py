@@ -10,11 +10,15 @@ from types import NoneType
 from typing import Any, Final
 
 from paramclient.client.stats import ClientStats
+from paramclient.documents.extended_param import ExtParamDoc
 from paramclient.documents.param import ParamDoc
 from paramclient.errors import LinkError, ParamClientError
+from paramclient.model.ext_params import ExtParam, ExtValue
 from paramclient.model.identity import Identity
-from paramclient.model.notation import parse_value
-from paramclient.model.values import Param, Value
+from paramclient.model.values import Param, WireValue
+from paramclient.protocol.ext.fetch import ExtFetchResult
+from paramclient.protocol.ext.write_batch import ExtSetOutcome
+from paramclient.protocol.ext.writes import ExtSetResult
 from paramclient.protocol.params.fetch_result import FetchResult, Progress
 from paramclient.protocol.params.sampling import Sample
 from paramclient.protocol.params.write_batch import SetOutcome, SetStatus
@@ -24,6 +28,12 @@ from paramclient.remote.problems import error_of
 __all__ = [
     "Document",
     "check_kind",
+    "ext_fetch_result_of",
+    "ext_param_of",
+    "ext_params_of",
+    "ext_set_outcome_of",
+    "ext_set_result_of",
+    "ext_value_as_sent",
     "fetch_result_of",
     "hash_of",
     "identity_of",
@@ -61,7 +71,7 @@ def decode_errors(name: str) -> Iterator[None]:
         raise LinkError(f"{name}: a document of the service is not valid: {error!r}", link=name) from error
 
 
-def value_as_sent(value: Value) -> object:
+def value_as_sent(value: WireValue) -> object:
     """Return the JSON form of a value for a write, without loss."""
     if isinstance(value, bytes):
         return {"raw": value.hex()}
@@ -82,6 +92,25 @@ def param_of(document: Document, name: str | None = None) -> Param:
     check_kind(name, str)
     assert name is not None
     return found.param(name)
+
+
+def ext_param_of(document: Document, name: str | None = None) -> ExtParam:
+    """Return the extended parameter of a document.
+
+    Args:
+        document: the document.
+        name: param_id; None if it is in the document.
+    """
+    found = ExtParamDoc.model_validate(document)
+    name = found.name if name is None else name
+    check_kind(name, str)
+    assert name is not None
+    return found.param(name)
+
+
+def ext_params_of(documents: Mapping[str, Document]) -> dict[str, ExtParam]:
+    """Return a whole table of extended parameters, in the order of the service."""
+    return {name: ext_param_of(document, name) for name, document in documents.items()}
 
 
 def params_of(documents: Mapping[str, Document]) -> dict[str, Param]:
@@ -150,21 +179,20 @@ def fetch_result_of(document: Document, params: Mapping[str, Param], elapsed: fl
     )
 
 
-def set_result_of(document: Document, requested: Value) -> SetResult:
+def set_result_of(document: Document, requested: WireValue) -> SetResult:
     """Return the result of a write."""
     param = param_of(document["param"])
     return SetResult(
         document["name"],
         document["status"],
         requested,
-        parse_value(document["actual"], param.type),
         param,
         document["attempts"],
         document.get("note", ""),
     )
 
 
-def set_outcome_of(document: Document, name: str, requested: Value, link: str) -> SetOutcome:
+def set_outcome_of(document: Document, name: str, requested: WireValue, link: str) -> SetOutcome:
     """Return the outcome of one of several writes."""
     problem = document.get("problem")
     if problem is None:
@@ -172,6 +200,61 @@ def set_outcome_of(document: Document, name: str, requested: Value, link: str) -
         return SetOutcome(name, requested, SetStatus(result.status), result)
     error = error_of(problem, status=problem["status"], link=link)
     return SetOutcome(name, requested, SetStatus(document["status"]), error=error)
+
+
+def ext_value_as_sent(value: ExtValue) -> object:
+    """Return the JSON form of an extended value for a write, without loss.
+
+    The words of NaN and infinities would be taken as numbers by a service if the parameter is one.
+    """
+    if isinstance(value, bytes):
+        return {"hex": value.hex()}
+    if isinstance(value, str):
+        return {"hex": value.encode().hex()} if value in ("NaN", "Infinity", "-Infinity") else value
+    sent = value_as_sent(value)
+    return {"number": sent} if isinstance(sent, str) else sent
+
+
+def ext_fetch_result_of(document: Document, params: Mapping[str, ExtParam], elapsed: float) -> ExtFetchResult:
+    """Return the result of a fetch of extended parameters.
+
+    Args:
+        document: the result without parameters.
+        params: the current parameters.
+        elapsed: seconds from the call to its end.
+    """
+    count = document["count"]
+    check_kind(count, int, NoneType)
+    return ExtFetchResult(
+        system=document["system"],
+        component=document["component"],
+        params=dict(params),
+        count=count,
+        missing=tuple(document["missing"]),
+        source=document["source"],
+        elapsed=elapsed,
+        notes=tuple(document["notes"]),
+    )
+
+
+def ext_set_result_of(document: Document, requested: ExtValue) -> ExtSetResult:
+    """Return the result of a write of an extended parameter."""
+    param = ext_param_of(document["param"])
+    SetStatus(document["status"])
+    check_kind(document["attempts"], int)
+    return ExtSetResult(
+        str(document["name"]), document["status"], requested, param.value, param, document["attempts"]
+    )
+
+
+def ext_set_outcome_of(document: Document, name: str, requested: ExtValue, link: str) -> ExtSetOutcome:
+    """Return the outcome of one of several writes of extended parameters."""
+    problem = document.get("problem")
+    if problem is None:
+        result = ext_set_result_of(document, requested)
+        return ExtSetOutcome(name, requested, SetStatus(result.status), result)
+    error = error_of(problem, status=problem["status"], link=link)
+    return ExtSetOutcome(name, requested, SetStatus(document["status"]), error=error)
 
 
 def stats_of(documents: list[Document]) -> ClientStats:

@@ -41,8 +41,9 @@ HELLO_TIMEOUT: Final = 10.0
 """Timeout in seconds for the first event of a stream, which the service sends immediately."""
 PLACE_LENGTH_MAX: Final = 64
 """Maximum number of characters of an event position: a run has 16 digits, a number at most 18."""
-PARALLEL_REQUESTS_MAX: Final = 200
-"""Maximum number of requests in flight; further ones wait."""
+PARALLEL_REQUESTS_MAX: Final = 64
+"""Maximum number of requests in flight, the event stream included; further ones wait. A service refuses more
+than 64 waiting requests of one holder."""
 KEEPALIVE_OPTIONS: Final = {"TCP_KEEPIDLE": 5, "TCP_KEEPINTVL": 2, "TCP_KEEPCNT": 3}
 """TCP keepalive, in seconds and probes: it detects a lost network while a response takes minutes."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from types import NoneType
 from typing import Final, TypeAlias
@@ -12,15 +12,25 @@ import anyio
 
 from paramclient.client.component import Component
 from paramclient.client.events import Event, Found, Heard, Lost
+from paramclient.client.extended_params import ExtChanges
 from paramclient.client.subscription import Changes
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.model.values import Encoding
+from paramclient.protocol.ext.change import ExtChange
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.fetch_result import Progress
 from paramclient.protocol.params.sync import SyncState
 from paramclient.protocol.wire import MAV_TYPE_GCS
-from paramclient.remote.decoding import Document, check_kind, hash_of, identity_of, param_of, progress_of
-from paramclient.remote.mirror import Mirror
+from paramclient.remote.decoding import (
+    Document,
+    check_kind,
+    ext_param_of,
+    hash_of,
+    identity_of,
+    param_of,
+    progress_of,
+)
+from paramclient.remote.mirror import ExtMirror, Mirror
 
 __all__ = ["Key", "MirroredComponent", "key_of"]
 
@@ -46,9 +56,10 @@ class MirroredComponent:
         told_at: time of the last received state, by the clock of the event loop.
         identity: the identity in the document.
         mirror: its table.
+        ext_mirror: the table of its extended parameters.
         is_gone: whether the service does not know the component now.
         seq: number of the last event included in the document; -1 before any.
-        progress_count: number of received progress reports.
+        progress, ext_progress: the progress of its fetches, plain and extended.
     """
 
     def __init__(
@@ -60,12 +71,14 @@ class MirroredComponent:
     ) -> None:
         self.key = key_of(document)
         self.mirror = Mirror()
+        self.ext_mirror = ExtMirror()
         self.is_gone = False
-        self.progress_count = 0
+        self.progress = FetchProgress()
+        self.ext_progress = FetchProgress()
         self.seq = seq
         self._publish_event = publish
-        self._progress = NO_PROGRESS
         self._subscriptions: weakref.WeakSet[Changes] = weakref.WeakSet()
+        self._ext_subscriptions: weakref.WeakSet[ExtChanges] = weakref.WeakSet()
         self._held: list[Event] = []
         self._is_announced = False
         self._read(document)
@@ -92,6 +105,16 @@ class MirroredComponent:
         return "lost" if self.is_gone else str(self.document["state"])
 
     @property
+    def has_extended(self) -> bool:
+        """Whether the service serves extended parameters: one of an earlier version does not."""
+        return self.document.get("extended") is not None
+
+    @property
+    def is_loaded(self) -> bool:
+        """Whether the copies of both tables match the service up to the last received event."""
+        return self.mirror.is_loaded and (self.ext_mirror.is_loaded or not self.has_extended)
+
+    @property
     def silence(self) -> float:
         """Seconds since its last message to the service, by the last report of the service."""
         return float(self.document["silence_s"]) + anyio.current_time() - self.told_at
@@ -100,9 +123,9 @@ class MirroredComponent:
         """Push all further changes to this stream while it is referenced."""
         self._subscriptions.add(changes)
 
-    def progress_since(self, count: int) -> Progress:
-        """Return the last progress after this number of reports; no progress if there is none."""
-        return self._progress if self.progress_count > count else NO_PROGRESS
+    def listen_ext(self, changes: ExtChanges) -> None:
+        """Push all further changes of extended parameters to this stream while it is referenced."""
+        self._ext_subscriptions.add(changes)
 
     def take_document(self, document: Document, seq: int) -> None:
         """Process its state after an event, unless a later one is known."""
@@ -126,26 +149,26 @@ class MirroredComponent:
             is_added=event.get("kind") == "added",
         )
         if (made := self.mirror.take(event["seq"], change)) is not None:
-            self._publish(made)
+            self.publish([made])
 
-    def take_progress(self, event: Document) -> None:
-        """Process a progress report of a fetch."""
-        told = progress_of(event)
-        if event.get("done"):  # a completed fetch has no rate
-            told = replace(told, rate=self._progress.rate)
-        self._progress = told
-        self.progress_count += 1
-
-    def end_progress(self, received: int, count: int) -> None:
-        """Record the end of a fetch. A short fetch may have had no report."""
-        self._progress = Progress(received, count, self._progress.rate, 0.0)
-        self.progress_count += 1
+    def take_ext_change(self, event: Document, asker: str) -> None:
+        """Process a change of an extended parameter; the arguments are those of `take_change`."""
+        old, new, by = event["old"], event["new"], str(event["by"])
+        change = ExtChange(
+            str(event["name"]),
+            None if old is None else ext_param_of(old, event["name"]),
+            None if new is None else ext_param_of(new, event["name"]),
+            "us" if asker and by == f"us for {asker}" else by,
+            event.get("kind") == "added",
+        )
+        if (made := self.ext_mirror.take(event["seq"], change)) is not None:
+            self.publish_ext([made])
 
     def announce(self, event: Event) -> None:
         """Publish an event as soon as the table includes its effect."""
         self._held.append(event)
-        if self.mirror.is_loaded:
-            self.table_was_loaded([])
+        if self.is_loaded:
+            self.tables_were_loaded()
 
     def announce_first(self) -> None:
         """Publish the event Heard, once."""
@@ -153,20 +176,35 @@ class MirroredComponent:
             self._is_announced = True
             self.announce(Heard(self.component))
 
-    def table_was_loaded(self, changes: list[Change]) -> None:
-        """Publish the changes of a loaded table, and the events that have waited for it."""
+    def publish(self, changes: Iterable[Change]) -> None:
+        """Push changes to all streams."""
         for change in changes:
-            self._publish(change)
+            for stream in list(self._subscriptions):
+                stream.push(change)
+
+    def publish_ext(self, changes: Iterable[ExtChange]) -> None:
+        """Push changes of extended parameters to all streams."""
+        for change in changes:
+            for stream in list(self._ext_subscriptions):
+                stream.push(change)
+
+    def tables_were_loaded(self) -> None:
+        """Publish the events that have waited for the tables."""
         held, self._held = self._held, []
         for event in held:
             self._publish_event(event)
 
+    def doubt(self) -> None:
+        """Mark the copies of both tables as stale."""
+        self.mirror.doubt()
+        self.ext_mirror.doubt()
+
     def leave(self) -> None:
         """Mark the component as lost: the service no longer knows it."""
-        self.mirror.doubt()
+        self.doubt()
         if self.state != "lost":
             self._held.append(Lost(self.component, self.silence))
-        self.table_was_loaded([])
+        self.tables_were_loaded()
         self.is_gone = True
 
     def mark_found(self, document: Document, seq: int) -> None:
@@ -187,10 +225,8 @@ class MirroredComponent:
         """End all streams of changes with this error."""
         for changes in list(self._subscriptions):
             changes.end(error)
-
-    def _publish(self, change: Change) -> None:
-        for changes in list(self._subscriptions):
-            changes.push(change)
+        for ext_changes in list(self._ext_subscriptions):
+            ext_changes.end(error)
 
     def _read(self, document: Document) -> None:
         _check(document)
@@ -218,6 +254,40 @@ def _check(document: Document) -> None:
     if last is not None:
         check_kind(last["source"], str)
         check_kind(last["elapsed_s"], int, float)
+    extended = document.get("extended")
+    if extended is not None:
+        check_kind(extended["count"], int, NoneType)
+        check_kind(extended["is_spoken"], bool)
+        check_kind(extended["is_expected"], bool)
+
+
+class FetchProgress:
+    """The progress of the fetches of one table, as the service reports it.
+
+    Attributes:
+        count: number of received reports.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._last = NO_PROGRESS
+
+    def since(self, count: int) -> Progress:
+        """Return the last progress after this number of reports; no progress if there is none."""
+        return self._last if self.count > count else NO_PROGRESS
+
+    def take(self, event: Document) -> None:
+        """Process a report."""
+        told = progress_of(event)
+        if event.get("done"):  # a completed fetch has no rate
+            told = replace(told, rate=self._last.rate)
+        self._last = told
+        self.count += 1
+
+    def end(self, received: int, count: int | None) -> None:
+        """Record the end of a fetch. A short fetch may have had no report."""
+        self._last = Progress(received, count, self._last.rate, 0.0)
+        self.count += 1
 
 
 NO_PROGRESS: Final = Progress(0, None, 0.0, None)

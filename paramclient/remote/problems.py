@@ -11,6 +11,7 @@ from paramclient.errors import (
     CacheError,
     CommandRefused,
     ContestedAddress,
+    ExtSetRefused,
     FileError,
     InvalidParameters,
     LinkError,
@@ -19,14 +20,17 @@ from paramclient.errors import (
     NotInCache,
     ParamClientError,
     Refused,
+    SetFailed,
     TypeMismatch,
     UnknownParameter,
     UnknownVehicle,
     UsageError,
     ValueNotApplied,
+    ValueUnsupported,
     VehicleArmed,
 )
 from paramclient.model.notation import parse_number
+from paramclient.model.values import WireValue
 
 __all__ = ["NotHeard", "error_of"]
 
@@ -98,8 +102,25 @@ def _not_applied(detail: str, problem: Problem) -> ValueNotApplied:
         system=int(problem["system"]),
         component=int(problem["component"]),
         name=str(problem["name"]),
-        requested=parse_number(problem["requested"]),
-        actual=parse_number(problem["actual"]),
+        requested=_value(problem["requested"]),
+        actual=_value(problem["actual"]),
+    )
+
+
+def _value(told: object) -> WireValue | str:
+    """Return the value of a parameter in a problem: a number, text or bytes."""
+    if not isinstance(told, Mapping):
+        return parse_number(told)
+    return str(told["text"]) if "text" in told else bytes.fromhex(told["hex"])
+
+
+def _ext_refused(kind: type[ExtSetRefused]) -> Callable[[str, Problem], ExtSetRefused]:
+    return lambda detail, problem: kind(
+        detail,
+        system=int(problem["system"]),
+        component=int(problem["component"]),
+        code=int(problem["code"]),
+        name=str(problem["name"]),
     )
 
 
@@ -136,6 +157,9 @@ _MAKERS: Final[dict[str, Callable[[str, Problem], ParamClientError]]] = {
     "VehicleArmed": lambda detail, problem: VehicleArmed(detail, **_whom(problem)),
     "Refused": lambda detail, problem: Refused(detail, code=int(problem["code"]), **_whom(problem)),
     "CommandRefused": _command_refused,
+    "ExtSetRefused": _ext_refused(ExtSetRefused),
+    "ValueUnsupported": _ext_refused(ValueUnsupported),
+    "SetFailed": _ext_refused(SetFailed),
     "ValueNotApplied": _not_applied,
     "AnotherVehicle": _another,
     "NoReply": _no_reply,

@@ -15,7 +15,7 @@ from paramclient.client.events import Contested, Event, Events, Found, Lost, Reb
 from paramclient.errors import LinkError, NoReply, ParamClientError
 from paramclient.remote.component import RemoteComponent
 from paramclient.remote.connection import Connection
-from paramclient.remote.decoding import Document, decode_errors, hash_of, params_of
+from paramclient.remote.decoding import Document, decode_errors, ext_params_of, hash_of, params_of
 from paramclient.remote.http import Requests, ServiceResponse, ServiceUnreachable, StreamPosition
 from paramclient.remote.mirrored_component import Key, MirroredComponent, key_of
 from paramclient.remote.problems import NotHeard
@@ -88,22 +88,32 @@ class ServiceComponents:
             case "change":
                 mirrored.take_change(event, self.asker)
             case "params":
-                self._doubt(mirrored)
+                mirrored.mirror.doubt()
+                self._stale[mirrored.key] = mirrored
             case "resynced":
                 told = tuple(event["changed"])
                 mirrored.announce(Resynced(mirrored.component, told, hash_of(event["hash"])))
             case "progress":
-                mirrored.take_progress(event)
+                mirrored.progress.take(event)
+            case "extended_change":
+                mirrored.take_ext_change(event, self.asker)
+            case "extended_params":
+                mirrored.ext_mirror.doubt()
+                self._stale[mirrored.key] = mirrored
+            case "extended_progress":
+                mirrored.ext_progress.take(event)
 
     def leave(self) -> None:
         """See `EventSink`."""
         for mirrored in self.components.values():
             mirrored.mirror.leave()
+            mirrored.ext_mirror.leave()
 
     def resume(self) -> None:
         """See `EventSink`."""
         for mirrored in self.components.values():
             mirrored.mirror.resume()
+            mirrored.ext_mirror.resume()
 
     def begin_anew(self) -> None:
         """See `EventSink`."""
@@ -111,6 +121,7 @@ class ServiceComponents:
         for mirrored in self.components.values():
             mirrored.seq = -1  # another run of the service has new event numbers
             mirrored.mirror.resume()
+            mirrored.ext_mirror.resume()
             self._doubt(mirrored)
 
     def _take_component(self, event: Document, known: MirroredComponent | None) -> None:
@@ -174,7 +185,7 @@ class ServiceComponents:
         return mirrored
 
     def _doubt(self, mirrored: MirroredComponent) -> None:
-        mirrored.mirror.doubt()
+        mirrored.doubt()
         self._stale[mirrored.key] = mirrored
 
     def _forget(self, mirrored: MirroredComponent) -> None:
@@ -218,7 +229,7 @@ class ServiceComponents:
                     or connection.place.run != place.run
                     or connection.place.seq >= place.seq
                 )
-                if has_come and mirrored.mirror.is_loaded:
+                if has_come and mirrored.is_loaded:
                     return
                 if mirrored.key in self._stale:  # load this table next
                     self._stale = {mirrored.key: mirrored, **self._stale}
@@ -332,18 +343,26 @@ class ServiceComponents:
                     self._forget(mirrored)
 
     async def _load(self, mirrored: MirroredComponent) -> None:
-        """Load the table of a component."""
-        mirrored.mirror.begin()
+        """Load the stale tables of a component."""
         try:
-            answer = await self._snapshot(f"{mirrored.path}/params", mirrored.link_name)
+            if not mirrored.mirror.is_loaded:
+                mirrored.mirror.begin()
+                answer = await self._snapshot(f"{mirrored.path}/params", mirrored.link_name)
+                with decode_errors(self.name):
+                    changes = mirrored.mirror.load(answer["seq"], params_of(answer["params"]))
+                mirrored.publish(changes or ())
+            if mirrored.has_extended and not mirrored.ext_mirror.is_loaded:
+                mirrored.ext_mirror.begin()
+                answer = await self._snapshot(f"{mirrored.path}/extended/params", mirrored.link_name)
+                with decode_errors(self.name):
+                    ext_changes = mirrored.ext_mirror.load(answer["seq"], ext_params_of(answer["params"]))
+                mirrored.publish_ext(ext_changes or ())
         except NoReply:
             self._forget(mirrored)
             return
-        with decode_errors(self.name):
-            changes = mirrored.mirror.load(answer["seq"], params_of(answer["params"]))
-        if changes is not None:
+        if mirrored.is_loaded:
             self._stale.pop(mirrored.key, None)
-            mirrored.table_was_loaded(changes)
+            mirrored.tables_were_loaded()
             self.connection.tell()
 
     async def _snapshot(self, path: str, link: str | None) -> Document:

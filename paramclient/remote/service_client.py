@@ -290,12 +290,12 @@ class ServiceClient:
     ) -> FetchedAll:
         """See `ParamClient.fetch_all`. If two links have equal ids, the result has one of them."""
         began = anyio.current_time()
-        before = {key: each.progress_count for key, each in self._roster.components.items()}
+        before = {key: each.progress.count for key, each in self._roster.components.items()}
 
         def tell() -> None:
             told = self._roster.components.items()
             assert progress is not None
-            progress({key[1:]: each.progress_since(before.get(key, 0)) for key, each in told})
+            progress({key[1:]: each.progress.since(before.get(key, 0)) for key, each in told})
 
         async def fetch() -> ServiceResponse:
             whose = "any component" if system is None else f"any component of system {system}"
@@ -315,7 +315,7 @@ class ServiceClient:
                 mirrored = self._roster.components.get(key)
                 await self._roster.until_current(mirrored, answer.place)
                 if mirrored is not None:
-                    mirrored.end_progress(received, count)
+                    mirrored.progress.end(received, count)
             await self._look_at_links()
             return answer
 

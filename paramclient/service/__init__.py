@@ -3,8 +3,9 @@
 Needs the extra `service`.
 
 - `app`, `server`, `routes`: the application, the server, the routes.
-- `hub`, `link`, `followed_component`, `event_feed`, `jobs`: links and cache, one link, one component,
-  events, jobs.
+- `hub`, `link`, `followed_component`, `followed_extended`: links and cache, one link, one component, its
+  extended parameters.
+- `event_feed`, `jobs`: events, jobs.
 - `access`, `request`, `tokens`, `client_address`, `tls`: access checks of every request.
 - `acceptor`, `connection_slots`, `connections`: connections before TLS, their number, their limits.
 - `quota`, `body_limits`, `body_memory`, `log_limit`: limits of requests in progress, request bodies and log

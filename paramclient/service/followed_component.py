@@ -18,6 +18,7 @@ from paramclient.errors import NoReply, ParamClientError
 from paramclient.model.params import as_params, compact_param
 from paramclient.model.values import Param, Trust
 from paramclient.protocol.params.change import Added, Change
+from paramclient.service.followed_extended import FollowedExtended
 
 if TYPE_CHECKING:
     from paramclient.metadata import Metadata
@@ -54,6 +55,7 @@ class FollowedComponent:
         component: the component of the library.
         link: its link.
         metadata: descriptions of its parameters, or None.
+        extended: its extended parameters.
     """
 
     def __init__(self, component: Component, link: FollowedLink, feed: EventFeed) -> None:
@@ -69,6 +71,7 @@ class FollowedComponent:
         self._last_fetch: object = None
         self._forwarder = _ChangeForwarder(self)
         self.component.listen(self._forwarder)
+        self.extended = FollowedExtended(self.component, self.publish)
 
     def __repr__(self) -> str:
         return f"<FollowedComponent {self.component!r} on {self.link.name}>"
@@ -148,6 +151,7 @@ class FollowedComponent:
     def publish_changes(self) -> None:
         """Publish changes that caused no event yet, so that a response follows the events of its changes."""
         self._publish_value_changes()
+        self.extended.publish_changes()
         self.publish_state_changes()
 
     def publish_state_changes(self) -> None:
@@ -163,6 +167,7 @@ class FollowedComponent:
             known, count = len(self.component.params), self.component.count
             ended = ProgressDoc(received=known, total=count, rate=0.0, seconds_left=0.0)
             self.publish("progress", {**ended.as_json(), "done": True})
+        self.extended.publish_progress()
         state_key = self._state_key()
         if state_key != self._published_state:
             why = (
@@ -175,6 +180,7 @@ class FollowedComponent:
     def close(self) -> None:
         """Stop following the component."""
         self.component.ignore(self._forwarder)
+        self.extended.close()
 
     def handle_change(self, change: Change) -> None:
         """Handle a change of a value."""
@@ -250,6 +256,7 @@ class FollowedComponent:
     def _state_key(self) -> tuple[object, ...]:
         """Return the state whose changes are published; the identity is the first item."""
         component = self.component
+        ext = component.ext
         return (
             (self.key, component.identity),
             component.autopilot,
@@ -261,6 +268,7 @@ class FollowedComponent:
             component.is_armed,
             component.machine.fetches.last,
             self.link.state,
+            (ext.is_spoken, ext.is_expected, ext.is_complete, ext.count),
         )
 
 

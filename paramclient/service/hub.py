@@ -17,24 +17,32 @@ import anyio.abc
 import anyio.lowlevel
 
 from paramclient.cache import SetupNotes
-from paramclient.client.arguments import address_in_words, silence_in_words
+from paramclient.client.arguments import address_in_words
 from paramclient.client.cache_writer import choose_cache
 from paramclient.client.client import ParamClient, local_client
 from paramclient.client.worker_thread import Worker
 from paramclient.documents.component import ProgressDoc
+from paramclient.documents.extended_results import ExtFetchResultDoc
 from paramclient.documents.job import progress_text
 from paramclient.documents.results import FetchResultDoc
 from paramclient.errors import NoReply, ParamClientError, UsageError
 from paramclient.links import Link, create_link
 from paramclient.metadata.metadata_cache import MetadataStore
 from paramclient.model.notation import time_text
+from paramclient.protocol.silence import silence_of_link
 from paramclient.protocol.vehicle_selection import LOOK_TIME, VehicleChoice
 from paramclient.service.event_feed import EventFeed
 from paramclient.service.followed_component import FollowedComponent
 from paramclient.service.jobs import Job, Jobs
 from paramclient.service.link import ServiceLink
 from paramclient.service.problems import ServiceError
-from paramclient.service.quota import LONG_REQUESTS_MAX, LONG_REQUESTS_OF_HOLDER_MAX, Quota
+from paramclient.service.quota import (
+    LONG_REQUESTS_MAX,
+    LONG_REQUESTS_OF_HOLDER_MAX,
+    WAITING_REQUESTS_MAX,
+    WAITING_REQUESTS_OF_HOLDER_MAX,
+    Quota,
+)
 
 if TYPE_CHECKING:
     from paramclient.cache import CutOff, ParamCache, RunningSetup
@@ -45,7 +53,8 @@ __all__ = ["Hub"]
 SERVICE_AUTHOR: Final = "service"
 """Author of fetches that the service starts itself."""
 FILE_WORK_TIMEOUT: Final = 1.0
-"""Timeout in seconds for running work of the file thread at shutdown. Queued work is dropped."""
+"""Timeout in seconds for running work of the threads for files and responses at shutdown. Queued work is
+dropped."""
 
 Result = TypeVar("Result")
 
@@ -71,6 +80,9 @@ class Hub:
         jobs: fetches and set-ups.
         links: the links, by name.
         long_requests: quota of long requests.
+        waiting_requests: quotas of requests that wait for a vehicle, the cache or a comparison, by whether
+            the client may write: no number of readers can keep a writer out.
+        fleet_comparisons: limits the fleet comparisons in the thread of the cache to one.
 
     Raises:
         UsageError: a link or option is invalid, or two links have one name.
@@ -94,9 +106,20 @@ class Hub:
         self._options = options
         self._worker = Worker("paramclient service")
         self._reader = Worker("paramclient files")
+        self._encoder = Worker("paramclient responses")
         self.long_requests = Quota(
             "long requests", most=LONG_REQUESTS_MAX, most_of_holder=LONG_REQUESTS_OF_HOLDER_MAX
         )
+        self.waiting_requests = {
+            may_write: Quota(
+                "waiting requests",
+                most=WAITING_REQUESTS_MAX,
+                most_of_holder=WAITING_REQUESTS_OF_HOLDER_MAX,
+                leaves_room=True,
+            )
+            for may_write in (False, True)
+        }
+        self.fleet_comparisons = anyio.Semaphore(1)
         self._closing = anyio.Event()
         self._setups = None if self.cache is None else SetupNotes.beside(self.cache.path)
         self._tasks: anyio.abc.TaskGroup | None = None
@@ -143,6 +166,7 @@ class Hub:
         self.feed.end()
         self._closing.set()
         self._reader.drop(_closing)
+        self._encoder.drop(_closing)
         try:
             link_tasks.cancel_scope.cancel()
             await link_tasks.__aexit__(None, None, None)
@@ -154,6 +178,7 @@ class Hub:
             with anyio.CancelScope(shield=True):
                 await self._worker.close(close)
                 await self._reader.abandon(_closing, FILE_WORK_TIMEOUT)
+                await self._encoder.abandon(_closing, FILE_WORK_TIMEOUT)
 
     async def run_in_thread(self, work: Callable[[], Result]) -> Result:
         """Run blocking work in a thread, such as an access to the cache. It is not interrupted by
@@ -197,6 +222,15 @@ class Hub:
         """
         self._check_open()
         return await self._reader.run(work)
+
+    async def encode_in_thread(self, work: Callable[[], Result]) -> Result:
+        """Encode a response in a thread of its own, which neither a locked cache nor a comparison delays.
+
+        Raises:
+            ServiceError: the service ends.
+        """
+        self._check_open()
+        return await self._encoder.run(work)
 
     def find_component(self, system: int, component: int, link: str | None = None) -> FollowedComponent:
         """Return the component with this address.
@@ -244,6 +278,19 @@ class Hub:
             ServiceError: too many jobs are running, of this holder or in total.
         """
         return self.jobs.start("fetch", followed, partial(_fetch, options), asked_by, holder)
+
+    def start_extended_fetch(
+        self, followed: FollowedComponent, asked_by: str, holder: str = "", *, timeout: float | None = None
+    ) -> Job:
+        """Start a job that downloads a component's extended parameters; see `ExtParams.fetch_all`.
+
+        Simultaneous jobs share one download. Cancelling one does not affect the others.
+
+        Raises:
+            ServiceError: too many jobs are running, of this holder or in total.
+        """
+        work = partial(_fetch_extended, timeout)
+        return self.jobs.start("extended-fetch", followed, work, asked_by, holder)
 
     async def wait_for_component(
         self, system: int | None, component: int | None, link: str | None, timeout: float | None
@@ -428,19 +475,22 @@ async def _fetch(options: dict[str, Any], job: Job) -> FetchResultDoc:
     return FetchResultDoc.of(result, link=job.followed.link.name)
 
 
+async def _fetch_extended(timeout: float | None, job: Job) -> ExtFetchResultDoc:
+    def note(progress: Any) -> None:
+        job.progress = ProgressDoc.of(progress)
+
+    result = await job.followed.extended.ext.fetch_all(timeout=timeout, progress=note)
+    return ExtFetchResultDoc.of(result, link=job.followed.link.name)
+
+
 def _is_log(link: object) -> bool:
     return isinstance(link, str) and link.lower().startswith("replay:")
 
 
 def _silence_of(links: Iterable[ServiceLink]) -> str:
     """Return in sentences what was received on links instead of an awaited component."""
-    sentences = []
-    for each in links:
-        if each.client is not None:
-            station = local_client(each.client).station
-            heard = [(machine.system, machine.component) for machine in station.components.values()]
-            sentences.append(silence_in_words(each.name, heard, station.bytes_received))
-    return " ".join(sentences)
+    clients = [(each.name, local_client(each.client)) for each in links if each.client is not None]
+    return " ".join(silence_of_link(client.station, name) for name, client in clients)
 
 
 def _closing() -> ServiceError:

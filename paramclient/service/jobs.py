@@ -22,9 +22,11 @@ if TYPE_CHECKING:
     from paramclient.service.event_feed import EventFeed
     from paramclient.service.followed_component import FollowedComponent
 
-__all__ = ["Job", "Jobs", "Kind", "Work"]
+__all__ = ["FETCHES", "Job", "Jobs", "Kind", "Work"]
 
-Kind = Literal["fetch", "apply", "restore"]
+Kind = Literal["fetch", "extended-fetch", "apply", "restore"]
+FETCHES: Final[tuple[Kind, ...]] = ("fetch", "extended-fetch")
+"""Jobs that change nothing on a vehicle."""
 State = Literal["running", "done", "failed", "cancelled"]
 
 RUNNING_JOBS_MAX: Final = 256
@@ -46,7 +48,7 @@ class Job:
 
     Attributes:
         id: random id.
-        kind: fetch, apply or restore.
+        kind: fetch, extended-fetch, apply or restore.
         followed: its component.
         asked_by: author who started it.
         holder: holder of its quota; "" for the service.
@@ -175,7 +177,7 @@ class Jobs:
         """Start a job.
 
         Args:
-            kind: fetch, apply or restore.
+            kind: fetch, extended-fetch, apply or restore.
             followed: its component.
             work: the work of the job.
             asked_by: author who starts it.

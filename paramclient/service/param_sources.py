@@ -14,7 +14,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from paramclient.client.client import local_client
 from paramclient.documents.document import Body, InParts
 from paramclient.errors import NotInCache, UnknownVehicle, UsageError
-from paramclient.files import FileForm, ParamFile, loads
+from paramclient.files import FileForm, ParamFile, loads, loads_renames
 from paramclient.files.param_file import TooManyParams
 from paramclient.files.param_pck import is_packed
 from paramclient.model.params import copy_params
@@ -37,6 +37,7 @@ from paramclient.service.route_context import Bits, ValueInput, parse_value, res
 
 if TYPE_CHECKING:
     from paramclient.cache import CachedComponent, ParamCache
+    from paramclient.model.renames import Renames
     from paramclient.service.followed_component import FollowedComponent
     from paramclient.service.hub import Hub
 
@@ -44,6 +45,7 @@ __all__ = [
     "OtherComponent",
     "LimitedPatterns",
     "UploadedFile",
+    "UploadedRenames",
     "Timestamp",
     "Number",
     "Pattern",
@@ -58,6 +60,7 @@ __all__ = [
     "read_cache",
     "current_set",
     "read_file",
+    "read_renames",
     "load_cached_state",
     "parse_upload",
     "resolve_source",
@@ -164,6 +167,36 @@ class UploadedFile(Body):
             except (binascii.Error, ValueError) as error:
                 raise UsageError(f"{self.name or 'the file'} is not valid base64: {error}") from None
         return parse_upload(data, self.name, self.form)
+
+
+class UploadedRenames(Body):
+    """A file of names that firmware versions have changed, as text in YAML or JSON; see `Renames`."""
+
+    name: Annotated[str, Field(max_length=FILE_NAME_LENGTH_MAX)] = ""
+    text: str
+
+    def read(self) -> Renames:
+        """Parse the file. Blocks for up to seconds.
+
+        Raises:
+            FileError: the file is invalid.
+            ServiceError: the file exceeds a limit.
+        """
+        data = self.text.encode("utf-8", "surrogatepass")
+        check_size(len(data), PARAM_FILE_BYTES_MAX)
+        check_separators(data)
+        check_line_lengths(data)
+        return loads_renames(data, source=self.name)
+
+
+async def read_renames(hub: Hub, given: UploadedRenames | None) -> Renames | None:
+    """Parse a file of changed names in the file thread. None without a file.
+
+    Raises:
+        FileError: the file is invalid.
+        ServiceError: the file exceeds a limit.
+    """
+    return None if given is None else await hub.run_in_file_thread(given.read)
 
 
 class OtherComponent(Body):

@@ -35,6 +35,7 @@ from paramclient.errors import (
     UnknownParameter,
     UnknownVehicle,
     UsageError,
+    ValueNotApplied,
     VehicleError,
 )
 
@@ -77,6 +78,8 @@ def problem_of(error: Exception) -> Problem:
     if isinstance(error, ParamClientError):
         status, kind = next(found for known, found in _KINDS.items() if isinstance(error, known))
         members = {name: _json(value) for name, value in vars(error).items() if not name.startswith("_")}
+        if isinstance(error, ValueNotApplied):
+            members |= {"requested": _value_json(error.requested), "actual": _value_json(error.actual)}
         named = {"error": type(error).__name__, **{k: v for k, v in members.items() if k not in _TAKEN}}
         return _problem(status, kind or _hyphened(type(error).__name__), str(error), named)
     return _problem(500, "internal", "Internal error of the service. Its log has the details.", {})
@@ -162,8 +165,7 @@ def _problem(status: int, kind: str, detail: str, members: Mapping[str, Any]) ->
 
 
 def _json(value: Any) -> Any:
-    """Return an attribute of an exception as JSON: numbers and texts unchanged, types by name, bytes as
-    hexadecimal digits."""
+    """Return an attribute of an exception as JSON: numbers and texts unchanged, types by name."""
     match value:
         case None | bool() | str():
             return value
@@ -171,14 +173,23 @@ def _json(value: Any) -> Any:
             return int(value)
         case float():
             return value if math.isfinite(value) else "NaN" if value != value else _infinity(value)
-        case bytes():
-            return f"0x{int.from_bytes(value, 'little'):08x}"
         case Mapping():
             return {str(key): _json(each) for key, each in value.items()}
         case Iterable():
             return [_json(each) for each in value]
         case _:
             return str(value)
+
+
+def _value_json(value: int | float | str | bytes) -> Any:
+    """Return the value of a parameter as JSON that distinguishes numbers, text and bytes."""
+    match value:
+        case str():
+            return {"text": value}
+        case bytes():
+            return {"hex": value.hex()}
+        case _:
+            return _json(value)
 
 
 def _infinity(value: float) -> str:

@@ -17,6 +17,8 @@ __all__ = [
     "LARGE_POSTS_OF_HOLDER_MAX",
     "LONG_REQUESTS_MAX",
     "LONG_REQUESTS_OF_HOLDER_MAX",
+    "WAITING_REQUESTS_MAX",
+    "WAITING_REQUESTS_OF_HOLDER_MAX",
     "Quota",
 ]
 
@@ -35,6 +37,14 @@ created at once."""
 LARGE_POSTS_OF_HOLDER_MAX: Final = 16
 """Maximum number of large responses to POST for one holder. Further requests wait."""
 
+WAITING_REQUESTS_MAX: Final = 128
+"""Maximum number of requests in progress that wait for a vehicle, the cache or a comparison: each may be
+resumed by one event, such as a datagram. Requests of clients that may write are counted apart from those of
+clients that may only read."""
+WAITING_REQUESTS_OF_HOLDER_MAX: Final = 64
+"""Maximum number of waiting requests of one holder. It is lower while others have many: no holder gets more
+slots than remain free."""
+
 
 class Quota:
     """Counts requests in progress, per holder and in total.
@@ -43,10 +53,13 @@ class Quota:
         what: name of the counted requests in error messages, in the plural.
         most: maximum of all holders together.
         most_of_holder: maximum of one holder.
+        leaves_room: whether `hold` gives a holder no more slots than remain free, so that several holders
+            together cannot occupy all.
     """
 
-    def __init__(self, what: str, *, most: int, most_of_holder: int) -> None:
+    def __init__(self, what: str, *, most: int, most_of_holder: int, leaves_room: bool = False) -> None:
         self._what = what
+        self._leaves_room = leaves_room
         self._most = most
         self._most_of_holder = most_of_holder
         self._slots = anyio.Semaphore(most)
@@ -64,7 +77,11 @@ class Quota:
             ServiceError: 429, the holder has no free slot, or all slots are occupied.
         """
         with self._slots_of(holder) as own:
-            self._take(own, f"{self._most_of_holder} {self._what} of yours", self._most_of_holder)
+            most = self._most_of_holder
+            held = most - own.value
+            if self._leaves_room and held and held >= self._slots.value:
+                raise self._too_many(f"{held} {self._what} of yours", held)
+            self._take(own, f"{most} {self._what} of yours", most)
             try:
                 self._take(self._slots, f"{self._most} {self._what}", self._most)
                 try:
@@ -92,14 +109,17 @@ class Quota:
             if not own.users:
                 del self._holders[holder]
 
-    @staticmethod
-    def _take(slots: anyio.Semaphore, occupied: str, most: int) -> None:
+    @classmethod
+    def _take(cls, slots: anyio.Semaphore, occupied: str, most: int) -> None:
         try:
             slots.acquire_nowait()
         except anyio.WouldBlock:
-            raise ServiceError(
-                429, "too-many", f"{occupied} are already in progress. Try again later.", most=most
-            ) from None
+            raise cls._too_many(occupied, most) from None
+
+    @staticmethod
+    def _too_many(occupied: str, most: int) -> ServiceError:
+        what = f"{occupied} are already in progress. Try again later."
+        return ServiceError(429, "too-many", what, most=most)
 
 
 class _HolderSlots:

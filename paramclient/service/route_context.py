@@ -14,7 +14,7 @@ from pydantic import Field, StrictFloat, StrictInt
 from paramclient.documents.document import Body
 from paramclient.errors import UsageError
 from paramclient.metadata.info import number_of
-from paramclient.model.values import Param, ParamType, Value, from_bits, type_name
+from paramclient.model.values import Param, WireValue, from_bits, type_name
 from paramclient.service import access
 from paramclient.service.followed_component import FollowedComponent
 from paramclient.service.hub import Hub
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Bits",
+    "Finite",
     "LinkName",
     "Raw",
     "Seconds",
@@ -109,15 +110,20 @@ async def run_until_disconnect(
         request: a request whose body is received.
         work: the work.
         about: components that it may change.
+
+    Raises:
+        ServiceError: 429, too many requests wait, of this holder or in total; the work is not started.
     """
     outcome: Result | Exception = ServiceError(499, "gone", "The client has disconnected.")
-    async with anyio.create_task_group() as tasks:
-        tasks.start_soon(_cancel_on_disconnect, request, tasks.cancel_scope)
-        try:
-            outcome = await work()
-        except Exception as error:  # the task group would wrap it
-            outcome = error
-        tasks.cancel_scope.cancel()
+    hub = await hub_of(request)
+    with hub.waiting_requests[access.may_write(request)].hold(holder_of(request)):
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(_cancel_on_disconnect, request, tasks.cancel_scope)
+            try:
+                outcome = await work()
+            except Exception as error:  # the task group would wrap it
+                outcome = error
+            tasks.cancel_scope.cancel()
     for number, followed in enumerate(about, 1):
         followed.publish_changes()
         if not number % COMPONENTS_PER_TURN:
@@ -150,7 +156,7 @@ ValueInput = Annotated[
 
 async def resolve_value(
     followed: FollowedComponent, name: str, given: int | float | str | Bits | Raw
-) -> Value:
+) -> WireValue:
     """Return the value of a request.
 
     Raises:
@@ -165,7 +171,7 @@ async def resolve_value(
     return _of_bits(int(given.bits, 16), known)
 
 
-def parse_value(metadata: Metadata | None, name: str, given: int | float | str | Raw) -> Value:
+def parse_value(metadata: Metadata | None, name: str, given: int | float | str | Raw) -> WireValue:
     """Return a value that is not given by bits, which would need the vehicle's type.
 
     Raises:
@@ -186,16 +192,15 @@ def parse_value(metadata: Metadata | None, name: str, given: int | float | str |
     return info.parse(given)
 
 
-def _of_bits(bits: int, known: Param) -> Value:
+def _of_bits(bits: int, known: Param) -> WireValue:
     """Return the value with these bits in the type of a parameter.
 
     Raises:
         UsageError: the bits do not fit the type.
     """
-    size = known.type.size if isinstance(known.type, ParamType) else 4
-    if bits >> (32 if known.is_raw else 8 * size):
-        raise UsageError(f"{known.name}: {bits:x} has more bits than {type_name(known.type)}")
-    return from_bits(bits, known.type, is_raw=known.is_raw)
+    if bits >> (32 if known.is_raw else 8 * known.type.size):
+        raise UsageError(f"{known.name}: {bits:x} has more bits than {type_name(known.type_number)}")
+    return from_bits(bits, known.type_number, is_raw=known.is_raw)
 
 
 async def _cancel_on_disconnect(request: Request, scope: anyio.CancelScope) -> None:

@@ -26,20 +26,24 @@ The vehicles behave as measured on real ones, with the real timing. The docstrin
 
 from __future__ import annotations
 
-from paramclient.sim.air import Air, Endpoint, FaultyLink
+from paramclient.sim.air import Air, Endpoint, Faults, FaultyLink
 from paramclient.sim.ardupilot import ArduPilotVehicle
-from paramclient.sim.camera import Camera, camera_table
+from paramclient.sim.camera import Camera, ExtEntries, camera_table
+from paramclient.sim.device import DeviceOptions
 from paramclient.sim.generic import GenericVehicle
 from paramclient.sim.other import OtherStation
 from paramclient.sim.param_table import SimParam, Table, ardupilot_table, px4_table
 from paramclient.sim.px4 import PX4Vehicle
-from paramclient.sim.vehicle import Vehicle
+from paramclient.sim.vehicle import Vehicle, VehicleOptions
 
 __all__ = [
     "Air",
     "ArduPilotVehicle",
     "Camera",
+    "DeviceOptions",
     "Endpoint",
+    "ExtEntries",
+    "Faults",
     "FaultyLink",
     "GenericVehicle",
     "OtherStation",
@@ -47,6 +51,7 @@ __all__ = [
     "SimParam",
     "Table",
     "Vehicle",
+    "VehicleOptions",
     "ardupilot_table",
     "camera_table",
     "px4_table",

@@ -8,7 +8,7 @@ import struct
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Iterable, Mapping
-from typing import Unpack
+from typing import Literal, Unpack
 
 from paramclient.errors import ParamErrorCode, UsageError
 from paramclient.model.values import Encoding, ParamType, bits_of, from_bits
@@ -93,7 +93,7 @@ class ArduPilotVehicle(Vehicle):
     def __init__(
         self,
         *,
-        kind: str = "copter",
+        kind: Literal["copter", "plane", "rover"] = "copter",
         system: int = 1,
         component: int = 1,
         uid2: bytes | None = None,

@@ -158,6 +158,16 @@ class Camera(BytewiseVehicle):
         """
         self._store(name, encode_ext_value(value, self.ext_param(name).type))
 
+    def add_ext_param(self, name: str, entry: ExtValue | tuple[ExtParamType | int, ExtValue]) -> None:
+        """Add an extended parameter behind the others; an entry is one of `ExtEntries`.
+
+        Raises:
+            UsageError: the name or the value is invalid, or the camera has the parameter already.
+        """
+        if check_name(name) in self._ext:
+            raise UsageError(f"this camera has an extended parameter {name!r} already")
+        self._ext[name] = _param(name, entry, len(self._ext))
+
     def remove_ext_param(self, name: str) -> None:
         """Remove an extended parameter; the indices of later ones move.
 

@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple, TypeAlias
 
 from paramclient.errors import FileErrorCode, PackError, UsageError
-from paramclient.model.values import ParamType, crc32_px4
+from paramclient.model.px4_hash import crc32_px4
+from paramclient.model.values import ParamType
 from paramclient.protocol.ftp import param_pck
 from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.ftp.param_pck import PackedParam

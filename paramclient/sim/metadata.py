@@ -8,7 +8,8 @@ import math
 from functools import cache
 from typing import Any, Final
 
-from paramclient.model.values import ParamType, crc32_px4
+from paramclient.model.px4_hash import crc32_px4
+from paramclient.model.values import TYPES_BY_NAME, ParamType
 from paramclient.sim.param_table import SimParam
 
 __all__ = ["GENERAL_FILE", "METADATA_FILE", "metadata_files"]
@@ -61,7 +62,7 @@ def _bits(*names: str) -> list[dict[str, Any]]:
 
 _TYPES: Final[dict[int, str]] = {
     kind: "Float" if kind is ParamType.REAL32 else kind.name.capitalize()
-    for kind in ParamType
+    for kind in TYPES_BY_NAME.values()
     if kind.size <= 4
 }
 _KNOWN: Final[dict[str, dict[str, Any]]] = {

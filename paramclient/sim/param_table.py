@@ -15,7 +15,7 @@ from paramclient.model.values import (
     Encoding,
     Param,
     ParamType,
-    Value,
+    WireValue,
     bits_of,
     check_name,
     check_value,
@@ -57,7 +57,7 @@ class SimParam:
 
     name: str
     type: ParamType | int
-    value: Value = field(compare=False)
+    value: WireValue = field(compare=False)
     volatile: bool = False
     default: float | None = None
     bits: int = field(init=False)
@@ -68,7 +68,7 @@ class SimParam:
         object.__setattr__(self, "bits", bits_of(self.value, self.type))
 
 
-Table: TypeAlias = Iterable[SimParam] | Mapping[str, Value | tuple[ParamType | int, Value]]
+Table: TypeAlias = Iterable[SimParam] | Mapping[str, WireValue | tuple[ParamType | int, WireValue]]
 """A table: `SimParam`s, or a mapping from names to values, where an int becomes an INT32, a float a REAL32,
 and `(type, value)` gives another type."""
 
@@ -101,7 +101,7 @@ class Entry:
         self.store(row.bits)
 
     @property
-    def value(self) -> Value:
+    def value(self) -> WireValue:
         return from_bits(self.bits, self.type)
 
     @property
@@ -181,7 +181,7 @@ def ek2_group() -> tuple[SimParam, ...]:
     return tuple(map(_plain, _read("ardupilot_ek2.csv")))
 
 
-def _row(name: str, entry: Value | tuple[ParamType | int, Value]) -> SimParam:
+def _row(name: str, entry: WireValue | tuple[ParamType | int, WireValue]) -> SimParam:
     if isinstance(entry, tuple):
         return SimParam(name, *entry)
     value = check_value(entry)

@@ -8,7 +8,8 @@ from collections.abc import Iterable, Mapping
 from typing import Final, Unpack
 
 from paramclient.errors import ParamErrorCode, UsageError
-from paramclient.model.values import Encoding, ParamType, Value, bits_of, crc32_px4, from_bits, px4_hash
+from paramclient.model.px4_hash import crc32_px4, hash_params
+from paramclient.model.values import Encoding, ParamType, WireValue, bits_of, from_bits
 from paramclient.protocol import wire
 from paramclient.sim.ftp import FileServer
 from paramclient.sim.generic import BytewiseVehicle
@@ -203,7 +204,7 @@ class PX4Vehicle(BytewiseVehicle):
         if not self._hash_check or (switch is not None and switch.bits == 0):
             return None
         if self._hash is None:
-            self._hash = px4_hash(entry.param for entry in self._listed if not entry.volatile)
+            self._hash = hash_params(entry.param for entry in self._listed if not entry.volatile)
         return self._hash
 
     def use(self, *names: str) -> None:
@@ -215,7 +216,7 @@ class PX4Vehicle(BytewiseVehicle):
         self._unused.difference_update([self._entry(name).name for name in names])
         self._relist()
 
-    def load(self, values: Mapping[str, Value]) -> None:
+    def load(self, values: Mapping[str, WireValue]) -> None:
         """Change values as `param load`, `param reset` and `param set-default` do: nothing is sent.
 
         Raises:

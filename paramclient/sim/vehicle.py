@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Unpack
 
 from paramclient.errors import ParamErrorCode, UsageError
-from paramclient.model.values import Encoding, Param, Value, bits_of
+from paramclient.model.values import Encoding, Param, WireValue, bits_of
 from paramclient.protocol import wire
 from paramclient.protocol.ftp.param_pck import PackedParam
 from paramclient.sim.device import Device, DeviceOptions
@@ -157,9 +157,9 @@ class Vehicle(Device):
         return found
 
     @property
-    def values(self) -> dict[str, Value]:
+    def values(self) -> dict[str, WireValue]:
         """The listed values by name, like `params`."""
-        return {name: param.value for name, param in self.params.items()}
+        return {name: param.settable for name, param in self.params.items()}
 
     def when_listed(self, count: int, do: Callable[[], object]) -> None:
         """Call a function once, when a list has sent this many values since its start.
@@ -191,7 +191,7 @@ class Vehicle(Device):
         """The paths of the files that are open in a MAVFTP session."""
         return [] if self._ftp is None else self._ftp.open_files
 
-    def set_param(self, name: str, value: Value) -> None:
+    def set_param(self, name: str, value: WireValue) -> None:
         """Change a value as if on board or by another station; announced as this kind of vehicle does.
 
         Raises:

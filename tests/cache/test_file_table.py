@@ -12,7 +12,7 @@ import pytest
 from paramclient import ParamCache, ParamType, Trust, UnknownVehicle, UsageError
 from paramclient.cache import TableState
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import px4_hash
+from paramclient.model.px4_hash import hash_params
 from tests.caches import NOW, PX4, stored, update, values, whole_table
 
 OTHER = replace(PX4, uid="0002000000003331383300012345679999ff", system=2)
@@ -48,7 +48,7 @@ def test_a_file_becomes_the_table_and_is_marked(cache: ParamCache) -> None:
     assert (table.source, table.complete, table.count, table.synced_at) == ("quad.params", True, 3, None)
     assert {param.trust for param in table.params.values()} == {Trust.CACHED}
     assert table.heard_at["PARAM_2"] == NOW + 60
-    assert table.hash == added.hash == px4_hash(table.params.values())
+    assert table.hash == added.hash == hash_params(table.params.values())
     assert [param.index for param in table.params.values()] == [0, 1, 2]
     assert [each.source for each in cache.components()] == ["quad.params"]
     lines = cache.history(PX4.key)
@@ -98,7 +98,7 @@ def test_types_and_volatile_names_come_from_the_previous_table(cache: ParamCache
         ParamType.REAL32,
         ParamType.INT32,
     ]
-    assert table.hash == px4_hash(table.params.values(), leave_out=["PARAM_2"])
+    assert table.hash == hash_params(table.params.values(), leave_out=["PARAM_2"])
     assert table.volatile == {"PARAM_2"}
 
 
@@ -107,7 +107,7 @@ def test_types_come_from_another_table_of_the_same_firmware(cache: ParamCache) -
     added = cache.add(file(typed=False, **THREE), PX4)
     assert added.complete
     assert values(cache) == THREE
-    assert cache.component(PX4.key).hash == px4_hash(cache.component(PX4.key).params.values())
+    assert cache.component(PX4.key).hash == hash_params(cache.component(PX4.key).params.values())
     with pytest.raises(UsageError, match=r"quad.params does not tell the types .* no cached table of its"):
         cache.add(file(typed=False, **THREE), replace(PX4, uid="0002ff", firmware=1, git_hash="b0"))
 

@@ -115,7 +115,9 @@ def test_a_zero_has_no_sign_here_and_a_nan_is_itself(cache: ParamCache) -> None:
     assert not cache.fleet_diff(wanted(Z=-0.0)).differs
 
 
-def test_who_lacks_a_parameter_stands_out_and_who_was_not_heard_to_the_end_may(cache: ParamCache) -> None:
+def test_a_vehicle_without_the_parameter_is_lacking_and_one_with_an_incomplete_table_is_unknown(
+    cache: ParamCache,
+) -> None:
     cache.save(update(stored("A", 1), identity=VEHICLES[0], table=DONE))
     cache.save(update(stored("B", 1), identity=VEHICLES[1], table=DONE))
     cache.save(update(stored("B", 1), identity=VEHICLES[2]))

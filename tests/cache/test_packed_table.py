@@ -359,9 +359,7 @@ def test_a_table_can_become_empty_and_have_parameters_again(path: Path) -> None:
         assert not cache.notes
 
 
-def test_where_names_stand_is_remembered_of_a_few_firmwares(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_name_positions_are_cached_for_a_few_firmwares(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sqlite, "_NAME_SETS_MAX", 2)
     with ParamCache(path) as cache:
         for number in range(5):

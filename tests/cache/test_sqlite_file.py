@@ -278,9 +278,7 @@ def test_several_programs_write_at_once(path: Path, begin: bytes | None) -> None
     assert sum("damaged" in text for text in said) == len(set_aside(path))
 
 
-def test_who_writes_holds_the_file_before_he_reads_what_is_there(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_writer_locks_the_file_before_it_reads(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path.write_bytes(sound_file())
     monkeypatch.setattr(sqlite_file, "LOCK_WAIT_MAX", 0.05)
     ours, theirs = Database(path), Database(path)

@@ -34,7 +34,7 @@ from paramclient.cache.operations import Save
 from paramclient.cache.outbox import LocalCopy, packed, unpacked
 from paramclient.cache.postgres import PostgresDatabase, PostgresTransaction, Unavailable
 from paramclient.cache.shared import SharedStore, _Connection
-from paramclient.cache.transaction import Line, Transaction
+from paramclient.cache.transaction import HistoryLine, Transaction
 from paramclient.cache.transfer import take_whole
 from paramclient.errors import CacheError, UsageError
 from paramclient.model.values import Param, ParamType
@@ -53,24 +53,23 @@ OF_A_FILE = {
     # what is said of a file, of its folder, or with SQLite's own words
     "test_a_cache_that_is_thrown_away_closes_its_file",
     "test_folder_and_file_are_for_the_user_alone",
-    "test_it_stands_in_the_users_cache_folder_unless_told_otherwise",
+    "test_the_default_path_is_in_the_users_cache_folder",
     "test_to_import_it_takes_no_other_library",
     "test_to_save_nothing_creates_nothing",
     "test_without_a_file_there_is_nothing_and_to_look_creates_nothing",
-    "test_what_is_not_there_is_an_error_that_creates_nothing",
+    "test_snapshots_of_an_unknown_vehicle_are_an_error_that_creates_nothing",
     "test_damage_that_is_met_is_told_as_everywhere",
     "test_a_snapshot_that_is_damaged_is_an_error_and_costs_nothing_else",
-    "test_what_is_noted_of_names_and_clocks_goes_with_the_history",
+    "test_added_names_and_clock_rollbacks_are_trimmed_with_the_history",
     "test_a_snapshot_that_was_made_survives_a_kill_at_any_moment",
     "test_two_programs_set_down_the_same_table_at_once",
     "test_a_full_disk_is_an_error_and_keeps_the_snapshots_there_are",
-    "test_a_file_of_an_earlier_version_knows_its_states_from_now_on",
     # a time that lies before another one is another station's, not a clock that was set back
     "test_a_time_that_the_clock_went_through_twice_is_refused",
     "test_two_programs_that_write_a_moment_apart_are_no_clock_set_back",
     "test_a_clock_that_was_set_back_is_told_from_a_program_that_is_late",
     # they have fixtures of their own
-    "test_what_is_claimed_of_any_moment_is_what_was_so",
+    "test_state_at_agrees_with_a_model_that_keeps_every_state",
     "test_every_value_comes_back_to_the_last_bit",
     # damage of a file, and what needs no store
     "test_damage_is_noticed",
@@ -92,6 +91,11 @@ globals().update(
 )
 globals().update(asked_of(test_ext_tables))
 three = test_cache.three
+
+
+def test_the_tests_that_are_left_out_exist() -> None:
+    rooms = (test_cache, test_file_table, test_fleet, test_snapshots, test_ext_tables)
+    assert {name for room in rooms for name in vars(room)} >= OF_A_FILE
 
 
 @pytest.fixture(scope="session")
@@ -334,7 +338,7 @@ def test_a_database_that_two_programs_write_to_agrees_with_a_model(path: str, tm
     )
 
 
-def kept_of(updates: Iterable[TableUpdate]) -> tuple[Mapping[str, StoredParam], Sequence[Line]]:
+def kept_of(updates: Iterable[TableUpdate]) -> tuple[Mapping[str, StoredParam], Sequence[HistoryLine]]:
     """What becomes of a whole table by these."""
     with TemporaryDirectory() as folder:
         copy = LocalCopy(Path(folder) / "copy")
@@ -950,7 +954,9 @@ async def test_values_of_another_station_update_cached_values(tmp_path: Path) ->
 
 
 @swiftly
-async def test_what_another_station_hears_is_told_at_once_while_nothing_is_heard_here(tmp_path: Path) -> None:
+async def test_values_of_another_station_are_announced_while_the_vehicle_is_silent_here(
+    tmp_path: Path,
+) -> None:
     """The vehicle has flown out of reach of this station: nothing on the link brings the news to light."""
     vehicle = Tap(small_px4())
     cache = Told(tmp_path / "cache")

@@ -342,20 +342,28 @@ def test_get_prints_errors_and_received_values(command: Command) -> None:
 
 
 def test_set_prints_the_value_that_the_vehicle_reports(command: Command) -> None:
-    done = command("set", "sim:ardupilot", "RTL_ALT", 1234.7, "RTL_ALT", 99, "--json", "--no-cache")
+    done = command(
+        "set", "sim:ardupilot", "RTL_ALT", 1234.7, "RTL_ALT", 99, "--json", "--no-cache", "--force"
+    )
     assert done.code == 0
+    vehicle = done.json["vehicle"]
+    assert (vehicle["system"], vehicle["component"], vehicle["kind"]) == (1, 1, "ArduPilot quadrotor")
     assert done.json == {
+        "vehicle": vehicle,
         "results": [
             {"name": "RTL_ALT", "requested": 1234.7, "actual": 1234, "status": "adjusted"},
             {"name": "RTL_ALT", "requested": 99, "actual": 99, "status": "accepted"},
-        ]
+        ],
     }
-    table = command("set", "sim:ardupilot", "RTL_ALT", 1234.7, "--no-cache")
+    table = command("set", "sim:ardupilot", "RTL_ALT", 1234.7, "--no-cache", "--force")
     assert table.words == [
         ["name", "requested", "actual", "status"],
         ["RTL_ALT", "1234.7", "1234", "adjusted"],
     ]
-    assert table.err.startswith("1 of 1 set on 1/1 ardupilot in ")
+    doubt, announced, line = table.err.splitlines()
+    assert doubt == "paramclient: RTL_ALT: 1234.7 is not a whole number, and RTL_ALT is an integer"
+    assert announced == "writing to 1/1 ArduPilot quadrotor, firmware 4.6.0-dev on sim:ardupilot"
+    assert line.startswith("1 of 1 set on 1/1 ArduPilot quadrotor, firmware 4.6.0-dev in ")
 
 
 def test_nan_can_be_forced(command: Command) -> None:
@@ -743,7 +751,7 @@ async def test_watch_prints_events_of_the_vehicle(
     lines = printed.out.splitlines()
     if not as_json:
         told = [line.partition("Z  ")[2] for line in lines]
-        assert told[0] == "1/1 lost: not heard for 5.0 s"
+        assert told[0] == "1/1 lost: nothing received for 5.0 s"
         assert re.fullmatch(r"1/1 found after \d\d?\.\d s", told[1])
         assert told[2:] == [
             "1/1 rebooted",
@@ -926,7 +934,7 @@ def test_link_is_live_on_a_terminal() -> None:
     assert "1/1 standby: " in last
     waiting = on_terminal("link", "udpin:127.0.0.1:0", "--seconds", 0.5)
     assert waiting.code == 3
-    assert "nothing heard yet: udpin:127.0.0.1:0" in waiting.out
+    assert "nothing received yet: udpin:127.0.0.1:0" in waiting.out
     one = on_terminal("link", "sim:px4", "--seconds", 1, "--json")
     assert strict(one.out)["components"][0]["system"] == 1
 

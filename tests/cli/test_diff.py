@@ -23,7 +23,7 @@ from paramclient.cli import run
 from paramclient.cli import session as cli_session
 from paramclient.links import SimLink
 from paramclient.model.identity import Identity
-from paramclient.model.values import Param, Value, bits_of, from_bits
+from paramclient.model.values import Param, WireValue, bits_of, from_bits
 from paramclient.sim import GenericVehicle, PX4Vehicle, SimParam, Vehicle
 from paramclient.sim.param_table import Entry
 from tests.caches import NOW, PX4, update
@@ -39,7 +39,7 @@ FIRST = replace(PX4, system=1, uid="aa00000000000001")
 SECOND = replace(PX4, system=2, uid="bb00000000000002")
 THIRD = replace(PX4, system=3, uid="cc00000000000003")
 
-Content = dict[str, tuple[Value, int] | tuple[Value, int, Value]]
+Content = dict[str, tuple[WireValue, int] | tuple[WireValue, int, WireValue]]
 
 
 @pytest.fixture

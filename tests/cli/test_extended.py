@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from paramclient.sim import Air, Camera, GenericVehicle, PX4Vehicle
-from tests.commands import Command, Put, behind, in_process, leaping
+from paramclient import CacheError, ParamCache, ParamClient
+from paramclient.cli import session as cli_session
+from paramclient.links import SimLink
+from paramclient.sim import Air, Camera, Endpoint, GenericVehicle, PX4Vehicle
+from tests.commands import Command, Put, behind, in_process, leaping, strict
+from tests.shell import PeersLink
+from tests.ways import ServedClient
 
 URL = "udpin:0.0.0.0:14550"
+SERVICE = "http://127.0.0.1:8765"
 CAMERA = ("--component", 100)
 
 
@@ -26,12 +33,31 @@ def put(monkeypatch: pytest.MonkeyPatch) -> Put:
     return behind(monkeypatch, URL)
 
 
+@pytest.fixture(params=[URL, SERVICE])
+def reach(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Put:
+    """Connect to simulated vehicles over a link of this process, and over a service."""
+    url: str = request.param
+    if url == URL:
+        return behind(monkeypatch, url)
+
+    def place(far_end: Endpoint | SimLink | PeersLink) -> str:
+        def client(url: str, **options: Any) -> ParamClient:
+            assert url == SERVICE
+            link = far_end if isinstance(far_end, SimLink | PeersLink) else SimLink(far_end, URL)
+            return ServedClient(link, **options)
+
+        monkeypatch.setattr(cli_session, "ParamClient", client)
+        return url
+
+    return place
+
+
 def small() -> Camera:
     return Camera({"CAM_MODE": 1, "CAM_NAME": "Front", "CAM_KEY": b"\xff\0\xfe", "CAM_EV": 0.5})
 
 
-def test_fetch_finds_them(command: Command, put: Put) -> None:
-    url = put(small())
+def test_fetch_finds_them(command: Command, reach: Put) -> None:
+    url = reach(small())
     done = command("fetch", url, *CAMERA)
     assert done.code == 0
     assert done.rows == [
@@ -48,16 +74,16 @@ def test_fetch_finds_them(command: Command, put: Put) -> None:
     assert document["extended"]["CAM_NAME"]["value"] == "Front"
 
 
-def test_a_component_with_plain_parameters_alone_is_found_too(command: Command, put: Put) -> None:
-    url = put(GenericVehicle({"A": 1, "B": 2.5}, component=100))
+def test_a_component_with_plain_parameters_alone_is_found_too(command: Command, reach: Put) -> None:
+    url = reach(GenericVehicle({"A": 1, "B": 2.5}, component=100))
     done = command("fetch", url, *CAMERA)
     assert (done.code, [row[0] for row in done.words[1:]]) == (0, ["A", "B"])
     assert command("set", url, *CAMERA, "A", 5).code == 0
     assert command("get", url, *CAMERA, "A").words[1][:2] == ["A", "5"]
 
 
-def test_plain_ones_of_a_component_that_has_both(command: Command, put: Put) -> None:
-    url = put(Camera({"A": "text"}, plain={"A": 7}))
+def test_plain_ones_of_a_component_that_has_both(command: Command, reach: Put) -> None:
+    url = reach(Camera({"A": "text"}, plain={"A": 7}))
     assert command("get", url, "A", *CAMERA).words[1][:2] == ["A", "text"]
     assert command("get", url, "A", *CAMERA, "--plain").words[1][:2] == ["A", "7"]
     assert command("fetch", url, *CAMERA, "--plain").words[1][:2] == ["A", "7"]
@@ -74,9 +100,9 @@ def test_a_kind_that_cannot_be_told_needs_the_option(command: Command, put: Put)
     assert command("get", url, "A", "--component", 191, "--extended").words[1][:2] == ["A", "text"]
 
 
-def test_get_and_set(command: Command, put: Put) -> None:
+def test_get_and_set(command: Command, reach: Put) -> None:
     camera = small()
-    url = put(camera)
+    url = reach(camera)
     done = command(
         "set", url, *CAMERA, "CAM_NAME", "-Rear-", "CAM_MODE=0x10", "CAM_KEY", "hex:00ff", "CAM_EV", 1
     )
@@ -96,8 +122,8 @@ def test_get_and_set(command: Command, put: Put) -> None:
     )
 
 
-def test_refusals_have_a_status_and_an_exit_code(command: Command, put: Put) -> None:
-    url = put(Camera({"A": 1, "B": 2, "C": 3}, supported={"A": [1]}, failing=["B"], limits={"C": (0, 5)}))
+def test_refusals_have_a_status_and_an_exit_code(command: Command, reach: Put) -> None:
+    url = reach(Camera({"A": 1, "B": 2, "C": 3}, supported={"A": [1]}, failing=["B"], limits={"C": (0, 5)}))
     done = command("set", url, *CAMERA, "A", 2, "B", 5, "C", 9)
     assert done.code == 1
     assert done.rows[1:] == [["A", "2", "refused"], ["B", "5", "refused"], ["C", "9", "5", "adjusted"]]
@@ -109,15 +135,17 @@ def test_refusals_have_a_status_and_an_exit_code(command: Command, put: Put) -> 
         (("A", "hex:0g"), "is not a value of type INT32"),
         (("A", 2**40), "does not fit INT32"),
         (("A",), "A: there is no value"),
-        (("A", 1, "--durable"), "--durable and --metadata are for plain parameters"),
+        (("A", 1, "--settle", 1), "--settle, --force and --metadata are for plain parameters"),
     ):
-        failed = command("set", url, *CAMERA, *words)
+        failed = command(
+            "set", reach(Camera({"A": 1})), *CAMERA, *words
+        )  # its clock begins with the command's
         assert (failed.code, why in failed.err) == (2, True), failed.err
 
 
-def test_files_and_comparisons(command: Command, put: Put, tmp_path: Path) -> None:
+def test_files_and_comparisons(command: Command, reach: Put, tmp_path: Path) -> None:
     camera = small()
-    url = put(camera)
+    url = reach(camera)
     for ending in ("json", "yaml"):
         file = tmp_path / f"camera.{ending}"
         saved = command("save", url, file, *CAMERA, "--extended")
@@ -140,9 +168,9 @@ def test_files_and_comparisons(command: Command, put: Put, tmp_path: Path) -> No
     assert command("diff", file, url, *CAMERA, "--only", "CAM_*").code == 2
 
 
-def test_apply_writes_what_differs_and_reads_it_back(command: Command, put: Put, tmp_path: Path) -> None:
+def test_apply_writes_what_differs_and_reads_it_back(command: Command, reach: Put, tmp_path: Path) -> None:
     camera = small()
-    url = put(camera)
+    url = reach(camera)
     file = tmp_path / "camera.yaml"
     assert command("save", url, file, *CAMERA, "--extended").code == 0
     camera.set_ext_param("CAM_NAME", "Rear")
@@ -162,10 +190,10 @@ def test_apply_writes_what_differs_and_reads_it_back(command: Command, put: Put,
     assert command("apply", url, file, *CAMERA, "--reboot").code == 2
 
 
-def test_apply_tells_what_it_cannot_do(command: Command, put: Put, tmp_path: Path) -> None:
+def test_apply_tells_what_it_cannot_do(command: Command, reach: Put, tmp_path: Path) -> None:
     file = tmp_path / "camera.yaml"
-    assert command("save", put(small()), file, *CAMERA, "--extended").code == 0
-    url = put(Camera({"CAM_MODE": 2, "CAM_NAME": 5}, supported={"CAM_MODE": [2]}))
+    assert command("save", reach(small()), file, *CAMERA, "--extended").code == 0
+    url = reach(Camera({"CAM_MODE": 2, "CAM_NAME": 5}, supported={"CAM_MODE": [2]}))
     done = command("apply", url, file, *CAMERA)
     assert done.code == 1
     for words in (
@@ -174,7 +202,7 @@ def test_apply_tells_what_it_cannot_do(command: Command, put: Put, tmp_path: Pat
         "CAM_MODE: 1/100 no autopilot has 2, and the file 1",
     ):
         assert words in done.err
-    wrong = command("apply", put(Camera(component=101)), file, "--component", 101)
+    wrong = command("apply", reach(Camera(component=101)), file, "--component", 101)
     assert (wrong.code, "it has the parameters of component 100" in wrong.err) == (2, True)
 
 
@@ -195,15 +223,15 @@ def test_cached_extended_parameters_are_shown_offline(command: Command, put: Put
     assert command("diff", 1, url, "--extended", *CAMERA).code == 0
 
 
-def test_a_component_without_them_is_told(command: Command, put: Put) -> None:
-    url = put(PX4Vehicle(table={"A": 1}))
+def test_a_component_without_them_is_told(command: Command, reach: Put) -> None:
+    url = reach(PX4Vehicle(table={"A": 1}))
     done = command("fetch", url, "--extended")
     assert (done.code, "no reply: extended parameters of 1/1" in done.err) == (3, True)
 
 
-def test_verify_compares_with_a_file(command: Command, put: Put, tmp_path: Path) -> None:
+def test_verify_compares_with_a_file(command: Command, reach: Put, tmp_path: Path) -> None:
     camera = small()
-    url = put(camera)
+    url = reach(camera)
     file = tmp_path / "camera.json"
     assert command("save", url, file, *CAMERA).code == 0, "found without the option"
     same = command("verify", url, file, *CAMERA)
@@ -221,8 +249,8 @@ def test_verify_compares_with_a_file(command: Command, put: Put, tmp_path: Path)
     assert not camera.requests["PARAM_EXT_SET"]
 
 
-def test_save_finds_plain_ones_of_such_a_component(command: Command, put: Put, tmp_path: Path) -> None:
-    url = put(GenericVehicle({"A": 1}, component=100))
+def test_save_finds_plain_ones_of_such_a_component(command: Command, reach: Put, tmp_path: Path) -> None:
+    url = reach(GenericVehicle({"A": 1}, component=100))
     file = tmp_path / "camera.yaml"
     assert command("save", url, file, *CAMERA).code == 0
     assert "paramclient: 1" in file.read_text()
@@ -241,3 +269,77 @@ def test_the_history_of_extended_parameters(command: Command, put: Put) -> None:
     assert [(each["name"], each["new"]["hex"]) for each in document["history"]] == [("CAM_KEY", "01")]
     assert command("history", 1, "--extended", "--snapshots").code == 2
     assert command("history", 1).rows[1:] == []
+
+
+class Changing(Camera):
+    """A camera that sets one of its parameters itself after 5 s, removes another, and tells of the first."""
+
+    def tick(self, now: float) -> None:
+        super().tick(now)
+        self.began = min(now, getattr(self, "began", now))
+        if now > self.began + 5 and self.ext_values["CAM_NAME"] == "Front":
+            self.set_ext_param("CAM_NAME", "Rear")
+            self.set_ext_param("CAM_KEY", b"\xff")
+            for name in ("CAM_NAME", "CAM_KEY"):
+                self._send_ext(self.ext_param(name))
+
+
+def changing() -> Camera:
+    return Changing({"CAM_MODE": 1, "CAM_NAME": "Front", "CAM_KEY": b"\xff\0\xfe"})
+
+
+def test_watch_prints_changes(command: Command, reach: Put) -> None:
+    watched = command("watch", reach(changing()), *CAMERA, "--timeout", 10)
+    assert (watched.code, watched.err) == (0, "watching 3 extended parameters of 1/100 no autopilot\n")
+    assert [line.split("  ", 1)[1] for line in watched.out.splitlines()] == [
+        "CAM_NAME  Front -> Rear  (vehicle)",
+        "CAM_KEY  hex:ff00fe -> hex:ff  (vehicle)",
+    ]
+
+
+def test_watch_prints_lines_of_json(command: Command, reach: Put) -> None:
+    watched = command("watch", reach(changing()), "CAM_K*", *CAMERA, "--timeout", 10, "--json")
+    (line,) = (strict(line) for line in watched.out.splitlines())
+    assert line.pop("time")
+    assert line == {
+        "name": "CAM_KEY",
+        "old": {"value": None, "type": "CUSTOM", "index": 2, "hex": "ff00fe"},
+        "new": {"value": None, "type": "CUSTOM", "index": 2, "hex": "ff"},
+        "by": "vehicle",
+        "kind": "changed",
+    }
+
+
+def test_watch_checks_its_names(command: Command, reach: Put) -> None:
+    url = reach(changing())
+    unknown = command("watch", url, "NO_SUCH", *CAMERA, "--extended", "--timeout", 10)
+    assert (unknown.code, unknown.out, "NO_SUCH" in unknown.err) == (1, "", True)
+    one = command("watch", url, "CAM_MODE", *CAMERA, "--timeout", 10)
+    assert (one.code, one.out, one.err) == (0, "", "watching CAM_MODE of 1/100 no autopilot\n")
+    assert command("watch", url, *CAMERA, "--extended", "--plain").code == 2
+
+
+def test_watch_of_the_plain_ones(command: Command, reach: Put) -> None:
+    url = reach(Camera({"A": "text"}, plain={"A": 7}))
+    watched = command("watch", url, *CAMERA, "--plain", "--timeout", 3)
+    assert (watched.code, watched.err) == (0, "watching 1 parameters of 1/100 no autopilot\n")
+
+
+def test_a_durable_set(command: Command, put: Put, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    url = put(small())
+    assert command("set", url, *CAMERA, "CAM_NAME", "Rear", "--durable").code == 0
+    assert command("show", 1, "CAM_NAME", "--extended").rows[1:] == [["CAM_NAME", "Rear", "CUSTOM", "1"]]
+    monkeypatch.setattr(ParamCache, "sync", lambda self: failing())
+    failed = command("set", put(small()), *CAMERA, "CAM_NAME", "Top", "--durable")
+    assert "has accepted CAM_NAME, but it is not on the disk" in failed.err
+    assert failed.code == 5
+    file = tmp_path / "camera.yaml"
+    file.write_text("paramclient_extended: 1\nparams:\n  CAM_NAME: {value: Top, type: CUSTOM}\n")
+    applied = command("apply", put(small()), file, *CAMERA, "--durable", "--yes")
+    assert (applied.code, "it is not on the disk" in applied.err) == (5, True)
+    assert command("apply", put(small()), file, *CAMERA, "--yes").code == 0
+    assert command("set", put(small()), *CAMERA, "CAM_NAME", "Top", "--durable", "--no-cache").code == 2
+
+
+def failing() -> None:
+    raise CacheError("no room")

@@ -134,7 +134,10 @@ def test_an_unknown_value_name_is_not_sent(command: Command, put: Any) -> None:
 def test_a_value_outside_of_the_range_is_sent_with_force(command: Command, put: Any) -> None:
     """The range of the metadata is advice; the vehicle decides."""
     vehicle = quad()
-    done = command("set", put(vehicle), "MC_ROLL_P=40", "--metadata", "vehicle", "--no-cache")
+    words = ("set", put(vehicle), "MC_ROLL_P=40", "--metadata", "vehicle", "--no-cache")
+    assert command(*words).code == 2
+    assert not vehicle.requests["PARAM_SET"]
+    done = command(*words, "--force")
     assert done.code == 0
     assert "paramclient: MC_ROLL_P: 40 is above the maximum of 12 1/s\n" in done.err
     assert vehicle.values["MC_ROLL_P"] == 40

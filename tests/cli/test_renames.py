@@ -11,11 +11,11 @@ import pytest
 
 from paramclient import ParamSet, ParamType, WrittenParam, write_file
 from paramclient.model.identity import Identity
-from paramclient.model.values import Value
+from paramclient.model.values import WireValue
 from paramclient.sim import ArduPilotVehicle, Endpoint
 from tests.commands import Command, Put, behind, in_process, leaping
 
-TABLE: dict[str, Value | tuple[ParamType, Value]] = {
+TABLE: dict[str, WireValue | tuple[ParamType, WireValue]] = {
     "WP_SPD": 10.0,
     "RTL_ALT_M": (ParamType.INT16, 15),
     "OTHER": 1.0,
@@ -53,7 +53,7 @@ def file(text: str = FILE, name: str = "quad.param") -> str:
     return name
 
 
-def older_file(**values: Value) -> str:
+def older_file(**values: WireValue) -> str:
     """Write a file of ArduPilot 4.5.7."""
     identity = Identity(1, "udp", autopilot=3, firmware=0x040507FF)
     params = {name: WrittenParam(name, value) for name, value in values.items()}

@@ -66,7 +66,10 @@ def test_many_pairs_are_in_flight_at_a_time(command: Command, put: Put, kind: An
     done = command("set", put(Air.symmetric([vehicle], delay=0.1)), *PAIRS)
     assert done.code == 0
     assert set(vehicle.values.values()) == {7}
-    found = re.match(r"60 of 60 set on 1/1 \w+ in (\d+\.\d+) s, ", done.err)
+    receiver = rf"1/1 {'PX4' if kind is PX4Vehicle else 'ArduPilot'} quadrotor, firmware [\d.]+\S*"
+    found = re.match(
+        rf"writing to {receiver} on sim:custom\n60 of 60 set on {receiver} in (\d+\.\d+) s, ", done.err
+    )
     assert found
     assert float(found[1]) < 3.0
     assert [row[0] for row in done.rows[1:]] == NAMES
@@ -77,7 +80,7 @@ def test_every_value_has_an_outcome_of_its_own(command: Command, put: Put) -> No
         table={"A": 1.0, "COUNT": 3, "FIXED": 2.0}, read_only=["FIXED"], live=(), ftp=False, param_error=True
     )
     words = ["A", 5, "NO_SUCH", 1, "COUNT", 7.6, "FIXED", 9, "A", 6]
-    done = command("set", put(vehicle), *words)
+    done = command("set", put(vehicle), *words, "--force")
     assert done.code == 1
     assert [[row[0], row[-1]] for row in done.rows[1:]] == [
         ["A", "accepted"],
@@ -86,7 +89,10 @@ def test_every_value_has_an_outcome_of_its_own(command: Command, put: Put) -> No
         ["FIXED", "refused"],
         ["A", "accepted"],
     ]
-    assert done.err.startswith("3 of 5 set, 2 refused on 1/1 ardupilot in ")
+    doubt, announced, line, *_ = done.err.splitlines()
+    assert doubt == "paramclient: COUNT: 7.6 is not a whole number, and COUNT is an integer"
+    assert announced == "writing to 1/1 ArduPilot quadrotor, firmware 4.6.0-dev on sim:custom"
+    assert line.startswith("3 of 5 set, 2 refused on 1/1 ArduPilot quadrotor, firmware 4.6.0-dev in ")
     assert "NO_SUCH: " in done.err
     assert "FIXED: " in done.err
     assert vehicle.values["A"] == 6
@@ -140,7 +146,7 @@ def test_over_a_service_all_pairs_are_one_request(
     assert done.code == 0, done.err
     assert set(vehicle.values.values()) == {7}
     assert len(client) == 1
-    found = re.match(r"60 of 60 set on 1/1 px4 in (\d+\.\d+) s, ", done.err)
+    found = re.search(r"\n60 of 60 set on 1/1 PX4 quadrotor, firmware [\d.]+\S* in (\d+\.\d+) s, ", done.err)
     assert found
     assert float(found[1]) < 3.0
 

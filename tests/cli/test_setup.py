@@ -15,12 +15,12 @@ from typing import Any
 import pytest
 
 from paramclient import ParamCache, ParamType, read_file
-from paramclient.model.values import Value
+from paramclient.model.values import WireValue
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle
 from paramclient.sim.param_table import Entry
 from tests.commands import Command, Put, behind, in_process, leaping
 
-TABLE: dict[str, Value | tuple[ParamType, Value]] = {
+TABLE: dict[str, WireValue | tuple[ParamType, WireValue]] = {
     "RTL_ALT": 1500,
     "WPNAV_SPEED": 500.0,
     "WPNAV_ACCEL": 100.0,
@@ -28,7 +28,7 @@ TABLE: dict[str, Value | tuple[ParamType, Value]] = {
     "EK2_ENABLE": (ParamType.INT8, 0),
     "BARO1_GND_PRESS": 94500.0,
 }
-GROUP: dict[str, Value | tuple[ParamType, Value]] = {"EK2_GPS_TYPE": (ParamType.INT8, 0)}
+GROUP: dict[str, WireValue | tuple[ParamType, WireValue]] = {"EK2_GPS_TYPE": (ParamType.INT8, 0)}
 FILE = """\
 RTL_ALT,2500
 WPNAV_SPEED,750.5
@@ -93,7 +93,10 @@ def test_apply_sets_and_verifies_values_that_differ(
         ["WPNAV_SPEED", "500.0", "750.5", "750.5", "set"],
         ["COMPASS_OFS_X", "5.0", "12.5", "5.0", "skipped", left_out],
     ]
-    assert re.fullmatch(r"1/1 ardupilot: 2 set, 1 unchanged, 1 skipped in \d\.\d s\n", outcome.err)
+    announced, line = outcome.err.splitlines()
+    assert announced == "writing to 1/1 ArduPilot quadrotor, firmware 4.6.0-dev on udpin:0.0.0.0:14550"
+    receiver = "1/1 ArduPilot quadrotor, firmware 4.6.0-dev"
+    assert re.fullmatch(rf"{receiver}: 2 set, 1 unchanged, 1 skipped in \d\.\d s", line)
     assert vehicle.values["RTL_ALT"] == 2500
     assert vehicle.values["COMPASS_OFS_X"] == 5.0
     again = command("apply", put(vehicle), file())
@@ -325,6 +328,12 @@ def test_a_warning_is_printed_if_the_state_before_is_not_stored(
 # restore
 
 
+def test_the_help_of_restore_names_the_time_zone(command: Command) -> None:
+    told = " ".join(command("restore", "--help", "--no-cache").out.split())
+    assert "A time without a time zone is in the time zone of this computer" in told
+    assert "A time in UTC ends with Z: 2026-11-20T13:00Z" in told
+
+
 def test_restore_reverts_the_last_apply(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
 ) -> None:
@@ -470,9 +479,10 @@ def test_all_vehicles_are_set_concurrently(
     ]
     assert [vehicle.values["WPNAV_SPEED"] for vehicle in vehicles] == [100.0, 200.0, 300.0]
     assert [vehicle.values["RTL_ALT"] for vehicle in vehicles] == [2500, 2500, 2500]
-    assert [line.split(":")[0] for line in outcome.err.splitlines()] == [
-        f"{system}/1 ardupilot" for system in (1, 2, 3)
-    ]
+    receivers = [f"{system}/1 ArduPilot quadrotor, firmware 4.6.0-dev" for system in (1, 2, 3)]
+    lines = outcome.err.splitlines()
+    assert lines[:3] == [f"writing to {each} on udpin:0.0.0.0:14550" for each in receivers]
+    assert [line.split(":")[0] for line in lines[3:]] == receivers
     assert sorted(path.name for path in tmp_path.glob("?.yaml")) == ["1.yaml", "2.yaml", "3.yaml"]
     assert command("verify", put(air), file(), "--all", "--overlay", over).code == 0
     outcome = command("verify", put(air), file(), "--all")
@@ -496,7 +506,7 @@ def test_a_failed_vehicle_does_not_stop_the_others(
     vehicles[2].reboot(down=float("inf"))
     outcome = command("verify", put(air), file(), "--all", "--expect", 3, "--timeout", 30)
     assert outcome.code == 3
-    assert "3 vehicles (heard: 1/1 ardupilot, 2/1 ardupilot)" in outcome.err
+    assert "3 vehicles (received: 1/1 ardupilot, 2/1 ardupilot)" in outcome.err
 
 
 def test_file_names_for_all_vehicles_need_a_placeholder(

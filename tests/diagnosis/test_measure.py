@@ -368,8 +368,16 @@ def test_nothing_unusual() -> None:
         ({"link": {"radio_free": 10}}, Severity.SLOW, "transmit buffer is 90 % full"),
         ({"link": {"signed": 12}}, Severity.NOTE, "has signed 12 frames"),
         ({"has_version": False}, Severity.PROBLEM, "did not answer the request for AUTOPILOT_VERSION"),
-        ({"identity": {"uid": None}}, Severity.NOTE, "has no hardware id"),
-        ({"identity": {"uid": "4954414c44494e4f"}}, Severity.NOTE, "all simulated ones have"),
+        (
+            {"identity": {"uid": None}},
+            Severity.NOTE,
+            "no hardware id: the cache identifies it by system id and link",
+        ),
+        (
+            {"identity": {"uid": "4954414c44494e4f"}},
+            Severity.NOTE,
+            "the cache identifies it by hardware id and system id",
+        ),
         ({"encoding_reason": "the standard's encoding, …"}, Severity.PROBLEM, "bytewise is assumed"),
         ({"is_armed": True}, Severity.NOTE, "is armed"),
         ({"reads": {"single": None}}, Severity.PROBLEM, "No PARAM_REQUEST_READ was answered"),

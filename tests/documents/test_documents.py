@@ -36,7 +36,7 @@ from paramclient.metadata import Metadata, ParamInfo
 from paramclient.model.comparison import compare, defaults_of
 from paramclient.model.notation import bits_written, typed, value_json
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import Param, ParamType, Trust, Value, bits_of
+from paramclient.model.values import Param, ParamType, Trust, WireValue, bits_of
 from paramclient.provision import ApplyResult, ApplyRow, ApplyStatus, plan
 from tests.caches import PX4
 from tests.commands import strict
@@ -46,7 +46,7 @@ ROOT = Path(__file__).parents[2]
 THIRD = struct.unpack("<f", struct.pack("<f", 1 / 3))[0]
 
 
-def param(name: str, value: Value, kind: ParamType | int = ParamType.REAL32, **more: object) -> Param:
+def param(name: str, value: WireValue, kind: ParamType | int = ParamType.REAL32, **more: object) -> Param:
     bits = int.from_bytes(value, "little") if isinstance(value, bytes) else bits_of(value, kind)
     return Param(name, value, kind, None, bits, **more)  # type: ignore[arg-type]  # the further members
 
@@ -69,7 +69,7 @@ def param(name: str, value: Value, kind: ParamType | int = ParamType.REAL32, **m
         (b"\x01\x02\x03\x04", 99, "0x04030201"),
     ],
 )
-def test_values_are_exact(value: Value, kind: ParamType | int, shown: object) -> None:
+def test_values_are_exact(value: WireValue, kind: ParamType | int, shown: object) -> None:
     member = value_json(value, kind)
     assert (type(member), repr(member)) == (type(shown), repr(shown))
     document = ParamDoc.of(param("P", value, kind))

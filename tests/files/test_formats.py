@@ -17,7 +17,7 @@ from pymavlink.mavparm import MAVParmDict
 from paramclient import FileError, FileForm, Identity, Param, ParamFile, ParamSet, ParamType, WrittenParam
 from paramclient.errors import UsageError
 from paramclient.files import dumps, line_formats, loads
-from paramclient.model.values import Encoding, Value, bits_of, decode_value, from_bits
+from paramclient.model.values import Encoding, WireValue, bits_of, decode_value, from_bits
 
 DATA = Path(__file__).parents[1] / "data"
 TABLES = Path(__file__).parents[2] / "paramclient/sim/tables"
@@ -32,7 +32,7 @@ def params_of(*params: WrittenParam, system: int | None = 1, component: int | No
     return ParamSet({param.name: param for param in params}, component, system)
 
 
-def numbered(values: list[Value], kind: ParamType) -> ParamSet:
+def numbered(values: list[WireValue], kind: ParamType) -> ParamSet:
     return params_of(*(WrittenParam(f"P{at}", value, kind) for at, value in enumerate(values)))
 
 
@@ -60,7 +60,7 @@ def failed(data: bytes | str, **options: object) -> FileError:
 @given(written=st.lists(finite_bits, min_size=1, max_size=60))
 @settings(max_examples=25, deadline=None)
 def test_finite_floats_round_trip(form: FileForm, written: list[int]) -> None:
-    floats: list[Value] = [from_bits(each, ParamType.REAL32) for each in written]
+    floats: list[WireValue] = [from_bits(each, ParamType.REAL32) for each in written]
     assert bits(back(numbered(floats, ParamType.REAL32), form), ParamType.REAL32) == written
 
 
@@ -75,7 +75,7 @@ def test_integers_round_trip(form: FileForm, kind: ParamType, data: st.DataObjec
         return
     low, high = kind.bounds
     whole: list[int] = data.draw(st.lists(st.integers(low, high), max_size=40))
-    values: list[Value] = [low, high, *whole]
+    values: list[WireValue] = [low, high, *whole]
     read = back(numbered(values, kind), form)
     assert [param.value for param in read.values()] == values
     assert all(type(param.value) is int for param in read.values())
@@ -84,7 +84,7 @@ def test_integers_round_trip(form: FileForm, kind: ParamType, data: st.DataObjec
 @pytest.mark.parametrize("form", [FileForm.PARM, *TYPED])
 @given(values=st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1, max_size=20))
 @settings(max_examples=20, deadline=None)
-def test_doubles_round_trip(form: FileForm, values: list[Value]) -> None:
+def test_doubles_round_trip(form: FileForm, values: list[WireValue]) -> None:
     expected = bits(numbered(values, ParamType.REAL64), ParamType.REAL64)
     assert bits(back(numbered(values, ParamType.REAL64), form), ParamType.REAL64) == expected
 
@@ -145,7 +145,9 @@ def test_a_document_keeps_raw_bytes_and_nan_payloads(form: FileForm) -> None:
     ("value", "kind"),
     [(b"\x01\0\0\0", ParamType.INT32), (from_bits(0x7FC12345, ParamType.REAL32), ParamType.REAL32)],
 )
-def test_other_formats_reject_raw_bytes_and_payloads(form: FileForm, value: Value, kind: ParamType) -> None:
+def test_other_formats_reject_raw_bytes_and_payloads(
+    form: FileForm, value: WireValue, kind: ParamType
+) -> None:
     if form is FileForm.PCK and kind is ParamType.REAL32:
         assert bits(back(numbered([value], kind), form), kind) == [0x7FC12345]
         return

@@ -10,7 +10,7 @@ import pytest
 import serialx
 
 from paramclient.cli import run
-from paramclient.links import SerialPort, create_link, list_ports
+from paramclient.links import SerialPort, create_link, list_ports, refusals
 
 BY_ID = "/dev/serial/by-id/usb-Hex_ProfiCNC_CubeOrange_2E0045-if00"
 
@@ -155,9 +155,13 @@ def test_without_the_extra_the_command_names_it(
     assert err.count("\n") == 1
 
 
-def test_a_missing_port_is_exit_code_4(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_port_is_exit_code_4(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    present = [SerialPort("/dev/ttyACM1", vendor_id=0x26AC, product_id=0x11), SerialPort("/dev/ttyS0")]
+    monkeypatch.setattr(refusals, "list_ports", lambda: present)
     assert run(["fetch", "/dev/nowhere,115200", "--no-cache"]) == 4
     assert capsys.readouterr().err == (
-        "paramclient: serial:/dev/nowhere:115200: /dev/nowhere does not exist; "
-        "'paramclient ports' lists the serial ports\n"
+        "paramclient: serial:/dev/nowhere:115200: /dev/nowhere does not exist. "
+        "The serial ports are /dev/ttyACM1 (Pixhawk), /dev/ttyS0\n"
     )

@@ -7,6 +7,7 @@ import errno
 import fcntl
 import grp
 import os
+import pwd
 import stat
 import struct
 import subprocess
@@ -27,7 +28,7 @@ import serialx
 from paramclient import ParamClient
 from paramclient.client import link_task
 from paramclient.errors import LinkError, UsageError
-from paramclient.links import Link, Peer, create_link, serial
+from paramclient.links import Link, Peer, create_link, refusals, serial
 from paramclient.links.transport import UNREAD_BYTES_MAX, Transport
 from paramclient.protocol import wire
 from tests.cable import TIMEOUT, Cable
@@ -35,6 +36,7 @@ from tests.shell import a_client, bits, generic, small_px4, until
 
 HEARTBEAT = wire.encode(wire.Heartbeat(6, 8), system=255, component=190, sequence=0)
 RATE = 40_000.0
+NO_PORTS = "This computer has no serial ports: is the device plugged in and switched on?"
 """Bytes per second in each direction. With 57600 baud (5,760 bytes per second), tests would take seconds."""
 
 TIOCGEXCL = 0x80045440  # Linux, asm-generic/ioctls.h; termios has no name for it
@@ -153,6 +155,7 @@ async def test_unplugged_permanently(cable: Cable, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(link_task, "LINK_TIMEOUT", 0.2)
     monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MIN", 0.05)
     monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MAX", 0.1)
+    monkeypatch.setattr(refusals, "list_ports", list)
     vehicle = generic(stream=True)
     async with (
         asyncio.timeout(TIMEOUT),
@@ -163,7 +166,7 @@ async def test_unplugged_permanently(cable: Cable, monkeypatch: pytest.MonkeyPat
         component = await client.component()
         cable.pull_out()
         with pytest.raises(
-            LinkError, match=f"{cable.device} does not exist; 'paramclient ports' lists"
+            LinkError, match=f"{cable.device} does not exist. This computer has no serial ports"
         ) as caught:
             await component.get("PARAM_01")
         assert isinstance(caught.value.__cause__, FileNotFoundError)
@@ -313,7 +316,7 @@ async def test_an_open_port_is_exclusive_and_closing_frees_it(cable: Cable) -> N
     async with opened(cable) as link:
         assert is_exclusive()
         error = await refusal(create_link(cable.link))
-        assert str(error) == f"{cable.link}: {cable.device} is in use by another program"
+        assert str(error) == f"{cable.link}: {cable.device} is in use by this program itself, on another link"
         await link.send(HEARTBEAT, None)
         assert cable.recv(100) == HEARTBEAT
     assert not is_exclusive()
@@ -325,11 +328,11 @@ async def test_an_open_port_is_exclusive_and_closing_frees_it(cable: Cable) -> N
 @pytest.mark.parametrize(
     ("code", "text"),
     [
-        (errno.ENOENT, "/dev/ttyACM0 does not exist; 'paramclient ports' lists the serial ports"),
-        (errno.ENODEV, "/dev/ttyACM0 does not exist; 'paramclient ports' lists the serial ports"),
-        (errno.EBUSY, "/dev/ttyACM0 is in use by another program"),
+        (errno.ENOENT, f"/dev/ttyACM0 does not exist. {NO_PORTS}"),
+        (errno.ENODEV, f"/dev/ttyACM0 does not exist. {NO_PORTS}"),
+        (errno.EBUSY, "/dev/ttyACM0 is in use by another program. Close that program"),
         (errno.EPERM, "no permission to open /dev/ttyACM0"),
-        (errno.ENOTTY, "/dev/ttyACM0 is not a serial port"),
+        (errno.ENOTTY, f"/dev/ttyACM0 is not a serial port. {NO_PORTS}"),
         (errno.EINVAL, "/dev/ttyACM0 cannot be set to 57600 baud"),
         (errno.EIO, "cannot open /dev/ttyACM0: Input/output error"),
     ],
@@ -339,7 +342,8 @@ async def test_errors_of_opening_a_port(code: int, text: str, monkeypatch: pytes
         raise OSError(code, os.strerror(code))
 
     monkeypatch.setattr(serialx.Serial, "open", refuse)
-    monkeypatch.setattr(serial, "_group_hint", lambda _: "")
+    monkeypatch.setattr(refusals, "_group_hint", lambda _: "")
+    monkeypatch.setattr(refusals, "list_ports", list)
     error = await refusal(create_link("/dev/ttyACM0"))
     assert str(error) == f"serial:/dev/ttyACM0:57600: {text}"
     assert isinstance(error.__cause__, OSError)
@@ -347,25 +351,42 @@ async def test_errors_of_opening_a_port(code: int, text: str, monkeypatch: pytes
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize("name", ["", "file", "missing"])
-async def test_files_that_are_not_ports(tmp_path: Path, name: str) -> None:
+async def test_files_that_are_not_ports(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(refusals, "list_ports", list)
     (tmp_path / "file").touch()
     path = tmp_path / name
-    expected = f"{path} does not exist;" if name == "missing" else f"{path} is not a serial port"
-    assert expected in str(await refusal(create_link(f"serial:{path}")))
+    expected = f"{path} does not exist." if name == "missing" else f"{path} is not a serial port."
+    assert f"{expected} {NO_PORTS}" in str(await refusal(create_link(f"serial:{path}")))
+
+
+JOIN = ", which needs the group dialout: sudo usermod -aG dialout $USER, then log in again"
 
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize(
-    ("mode", "is_member", "says_who"), [(0o660, False, True), (0o600, False, False), (0o660, True, False)]
+    ("mode", "groups", "members", "hint"),
+    [
+        (0o660, [100], [], JOIN),
+        (
+            0o660,
+            [100],
+            [pwd.getpwuid(os.getuid()).pw_name],
+            ", which needs the group dialout. The user is in it since the last login: log out and in again",
+        ),
+        (0o600, [100], [], ": only its owner may open it. A udev rule can give it to a group"),
+        (0o660, [20], [], ""),
+    ],
+    ids=["not a member", "a member since the last login", "no group", "a member"],
 )
 async def test_without_permission_the_error_names_the_group(
-    mode: int, is_member: bool, says_who: bool, monkeypatch: pytest.MonkeyPatch
+    mode: int, groups: list[int], members: list[str], hint: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(_: object) -> None:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
     class Group:
         gr_name = "dialout"
+        gr_mem = members
 
     info = os.stat_result((stat.S_IFCHR | mode, 1, 1, 1, 0, 20, 0, 0, 0, 0))
     monkeypatch.setattr(serialx.Serial, "open", refuse)
@@ -373,11 +394,24 @@ async def test_without_permission_the_error_names_the_group(
     with monkeypatch.context() as patch:
         patch.setattr(Path, "stat", lambda _: info)
         patch.setattr(grp, "getgrgid", {20: Group}.__getitem__)
-        patch.setattr(os, "getgroups", lambda: [20] if is_member else [100])
+        patch.setattr(os, "getgroups", lambda: groups)
         error = await refusal(link)
-    who = ", which needs the group dialout: sudo usermod -aG dialout $USER, then log in again"
-    expected = f"no permission to open /dev/ttyUSB0{who if says_who else ''}"
-    assert str(error) == f"serial:/dev/ttyUSB0:57600: {expected}"
+    assert str(error) == f"serial:/dev/ttyUSB0:57600: no permission to open /dev/ttyUSB0{hint}"
+
+
+@pytest.mark.parametrize(
+    ("system", "command"),
+    [
+        ("darwin", "sudo dseditgroup -o edit -a $USER -t user dialout"),
+        ("freebsd14", "sudo pw groupmod dialout -m $USER"),
+        ("linux", "sudo usermod -aG dialout $USER"),
+    ],
+)
+def test_each_system_has_its_command_to_join_a_group(
+    system: str, command: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "platform", system)
+    assert refusals._join("dialout") == command
 
 
 @pytest.mark.asyncio
@@ -438,7 +472,7 @@ async def test_opening_a_stalled_driver_times_out(cable: Cable, monkeypatch: pyt
     stuck.may_go_on.set()
     assert await anyio.to_thread.run_sync(stuck.is_closed.wait, TIMEOUT)
     monkeypatch.undo()
-    await until(lambda: "paramclient serial" not in {thread.name for thread in threading.enumerate()})
+    await until(lambda: "paramclient link" not in {thread.name for thread in threading.enumerate()})
     async with opened(cable):
         pass
 
@@ -467,7 +501,7 @@ async def test_closing_a_stalled_driver_times_out(cable: Cable, monkeypatch: pyt
         await link.close()
         assert stuck.is_in_it.is_set()
         stuck.may_go_on.set()
-        await until(lambda: "paramclient serial" not in {thread.name for thread in threading.enumerate()})
+        await until(lambda: "paramclient link" not in {thread.name for thread in threading.enumerate()})
 
 
 @pytest.mark.asyncio
@@ -527,4 +561,5 @@ def test_serialx_is_loaded_on_the_first_open() -> None:
         "assert 'serialx' in sys.modules\n"
     )
     run = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True)
-    assert run.stdout == "serial:/dev/null:57600: /dev/null is not a serial port\n"
+    assert run.stdout.startswith("serial:/dev/null:57600: /dev/null is not a serial port. ")
+    assert run.stdout.count("\n") == 1

@@ -655,7 +655,7 @@ async def set_small(session: Session) -> Measured:
         param = await vehicle.get(name)
         wanted = from_bits(param.bits + 1, ParamType.REAL32)
         assert not isinstance(wanted, bytes)
-        assert not isinstance(param.value, bytes)
+        assert not param.is_raw
         if not abs(wanted - param.value) <= CHANGE_MIN:
             raise Skip(f"{name} is {param.value!r}, too large for such a change")
         done = await session.journal.set(vehicle, name, wanted)

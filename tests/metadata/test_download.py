@@ -20,7 +20,7 @@ from paramclient.client.local import local
 from paramclient.errors import MetadataError
 from paramclient.metadata import Metadata, MetadataStore, download, metadata_cache, metadata_of
 from paramclient.model.identity import Identity
-from paramclient.model.values import crc32_px4
+from paramclient.model.px4_hash import crc32_px4
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import EventMaker
 from paramclient.protocol.requests.context import Context

@@ -13,7 +13,7 @@ from paramclient.errors import UsageError
 from paramclient.model.comparison import Comparison, Moved, Standing, compare, defaults_of, same_value
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.renames import Rename, Renames
-from paramclient.model.values import Encoding, Param, ParamType, Value, bits_of, decode_value, from_bits
+from paramclient.model.values import Encoding, Param, ParamType, WireValue, bits_of, decode_value, from_bits
 
 INT32, REAL32, REAL64 = ParamType.INT32, ParamType.REAL32, ParamType.REAL64
 NAN, OTHER_NAN = from_bits(0x7FC00000, REAL32), from_bits(0x7FC00001, REAL32)
@@ -36,11 +36,11 @@ STANDING_MIRRORED = {Standing.ONLY_LEFT: Standing.ONLY_RIGHT, Standing.ONLY_RIGH
 MOVED_MIRRORED = {Moved.LEFT: Moved.RIGHT, Moved.RIGHT: Moved.LEFT}
 
 
-def written(value: Value, number: int | None = None) -> WrittenParam:
+def written(value: WireValue, number: int | None = None) -> WrittenParam:
     return WrittenParam("P", value, number)
 
 
-def of(**values: Value) -> ParamSet:
+def of(**values: WireValue) -> ParamSet:
     return ParamSet({name: WrittenParam(name, value) for name, value in values.items()})
 
 
@@ -98,7 +98,9 @@ def test_same_value_is_symmetric(left: WrittenParam, right: WrittenParam) -> Non
 
 
 @given(VALUES, st.integers(0, 2**32 - 1), st.sampled_from([*ParamType, 77]), st.sampled_from(Encoding))
-def test_is_held_by_agrees_with_same_value(value: Value, raw: int, number: int, encoding: Encoding) -> None:
+def test_is_held_by_agrees_with_same_value(
+    value: WireValue, raw: int, number: int, encoding: Encoding
+) -> None:
     """`WrittenParam.is_held_by` and `same_value` agree for values without a type or with the vehicle's."""
     held, bits = decode_value(raw.to_bytes(4, "little"), number, encoding)
     assume(number != REAL32 or bits == bits_of(held, number))  # Python has no signalling NaN for these bits
@@ -112,8 +114,8 @@ def test_is_held_by_agrees_with_same_value(value: Value, raw: int, number: int, 
         agree(value, Param("P", from_bits(bits, number), number, 0, bits))
 
 
-def agree(value: Value, param: Param) -> None:
-    for number in (None, param.type):
+def agree(value: WireValue, param: Param) -> None:
+    for number in (None, param.type_number):
         ours = WrittenParam("P", value, number)
         assert same_value(ours, WrittenParam.of(param)) == ours.is_held_by(param)
 

@@ -23,16 +23,14 @@ from paramclient.model.ext_params import (
     ext_type_name,
     format_ext_value,
 )
-from paramclient.model.values import ParamType, Trust
+from paramclient.model.values import TYPES_BY_NAME, Trust
 
 KINDS = ExtParamType
 NAN = struct.pack("<f", math.nan)
 
 
 def test_the_numeric_types_have_the_numbers_of_plain_ones() -> None:
-    assert {kind.name: int(kind) for kind in ParamType} == {
-        kind.name: int(kind) for kind in ExtParamType if kind is not ExtParamType.CUSTOM
-    }
+    assert {kind.name: int(kind) for kind in ExtParamType if kind is not ExtParamType.CUSTOM} == TYPES_BY_NAME
 
 
 @pytest.mark.parametrize(

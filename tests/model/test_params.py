@@ -90,8 +90,8 @@ def test_the_compact_form_loses_nothing(
     params["NAME"] = param
     found = params["NAME"]
     assert (found, found.default) == (param, default)
-    assert repr(found.value) == repr(value)
-    assert type(found.type) is type(param.type)
+    assert repr(found.settable) == repr(value)
+    assert (found.type, found.type_number, found.is_raw) == (param.type, number, param.is_raw)
     assert list(params.values()) == [param]
     assert list(params.items()) == [("NAME", param)]
     assert params == {"NAME": param}

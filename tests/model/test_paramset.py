@@ -8,10 +8,10 @@ import pytest
 
 from paramclient.errors import UsageError
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import Encoding, Param, ParamType, Value, bits_of, decode_value
+from paramclient.model.values import Encoding, Param, ParamType, WireValue, bits_of, decode_value
 
 
-def held(value: Value, number: int, name: str = "P") -> Param:
+def held(value: WireValue, number: int, name: str = "P") -> Param:
     return Param(name, value, number, 0, bits_of(value, number))
 
 
@@ -30,7 +30,7 @@ def held(value: Value, number: int, name: str = "P") -> Param:
     ],
 )
 def test_a_written_value_is_compared_in_the_vehicles_type(
-    written: Value, value: Value, number: int, same: bool
+    written: WireValue, value: WireValue, number: int, same: bool
 ) -> None:
     assert WrittenParam("P", written).is_held_by(held(value, number)) is same
 

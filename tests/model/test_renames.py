@@ -10,17 +10,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from paramclient import FileError, ParamSet, ParamType, Rename, Renames, UsageError, WrittenParam
-from paramclient.model.values import Value
+from paramclient.model.values import WireValue
 
 CHAIN = Renames([Rename("A", "B", 0.01), Rename("B", "C", 10)], "names.yaml")
 CENTIMETRES = Renames([Rename("OLD", "NEW", 0.01)])
 
 
-def written(values: Mapping[str, Value]) -> ParamSet:
+def written(values: Mapping[str, WireValue]) -> ParamSet:
     return ParamSet({name: WrittenParam(name, value) for name, value in values.items()}, source="a file")
 
 
-def values(params: Mapping[str, WrittenParam]) -> dict[str, tuple[str, Value]]:
+def values(params: Mapping[str, WrittenParam]) -> dict[str, tuple[str, WireValue]]:
     return {name: (param.name, param.value) for name, param in params.items()}
 
 
@@ -46,7 +46,7 @@ def test_a_chain_of_renames_is_followed_with_the_product_of_its_factors() -> Non
 @pytest.mark.parametrize(
     ("wanted", "held"), [({"OLD": 1, "NEW": 2}, {"NEW"}), ({"NEW": 2, "OLD": 1}, {"OLD"})]
 )
-def test_two_names_that_would_become_one_are_an_error(wanted: dict[str, Value], held: set[str]) -> None:
+def test_two_names_that_would_become_one_are_an_error(wanted: dict[str, WireValue], held: set[str]) -> None:
     (name,) = held
     with pytest.raises(UsageError, match=rf"of a file are both {name} by the renames; remove one of the two"):
         CENTIMETRES.renamed(written(wanted), held)
@@ -128,6 +128,11 @@ def test_there_and_back_is_the_same_float32(value: int | float, factor: float) -
         ([("A", "B", math.nan)], "the factor of A is nan;"),
         ([("A", "B", -math.inf)], "the factor of A is -inf;"),
         ([("A", "B", True)], "the factor of A is not a number: True"),
+        ([(f"A{n}", f"A{n + 1}") for n in range(16)], "A15 is one of more than 16 names of one parameter"),
+        (
+            [("A7", "A8"), *((f"A{n}", f"A{n + 1}") for n in (*range(7), *range(8, 16)))],
+            "A15 is one of more than 16 names",
+        ),
     ],
 )
 def test_rules_that_contradict_each_other_are_refused(entries: list[tuple[str, str]], message: str) -> None:

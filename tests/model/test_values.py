@@ -1,11 +1,10 @@
-"""Values: both encodings, names, text, and the PX4 hash."""
+"""Values: both encodings, names and text."""
 
 from __future__ import annotations
 
 import math
-import random
 import struct
-from dataclasses import FrozenInstanceError
+from dataclasses import FrozenInstanceError, replace
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 from fractions import Fraction
 from types import SimpleNamespace
@@ -18,29 +17,29 @@ from pymavlink.dialects.v20 import all as dialect
 from pymavlink.mavparm import MAVParmDict
 
 from paramclient.errors import UsageError
+from paramclient.model.comparison import same_value
+from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import (
     Encoding,
     Param,
     ParamType,
     Trust,
-    Value,
+    WireValue,
     bits_of,
     check_name,
     check_value,
-    crc32_px4,
     decode_value,
     encode_value,
     format_value,
     from_bits,
-    hash_chunk,
     known_type,
-    px4_hash,
     same_bits,
     shortest_float,
     type_name,
 )
 
 BYTEWISE, C_CAST = Encoding.BYTEWISE, Encoding.C_CAST
+KNOWN = [kind for kind in ParamType if kind is not ParamType.UNKNOWN]
 INTEGERS = [kind for kind in ParamType if kind.is_integer]
 SMALL = [kind for kind in INTEGERS if kind.size <= 4]
 WIDE = [ParamType.UINT64, ParamType.INT64, ParamType.REAL64]
@@ -76,7 +75,7 @@ def as_float32(value: float) -> float:
     return number
 
 
-def param(bits: int = 0x3F800000, value: Value = 1.0, kind: int = ParamType.REAL32, **more: Any) -> Param:
+def param(bits: int = 0x3F800000, value: WireValue = 1.0, kind: int = ParamType.REAL32, **more: Any) -> Param:
     return Param(**{"name": "P", "value": value, "type": kind, "index": 0, "bits": bits, **more})
 
 
@@ -84,15 +83,15 @@ def param(bits: int = 0x3F800000, value: Value = 1.0, kind: int = ParamType.REAL
 
 
 def test_types_have_mavlinks_numbers_and_names() -> None:
-    for kind in ParamType:
+    for kind in KNOWN:
         assert getattr(dialect, f"MAV_PARAM_TYPE_{kind.name}") == kind
         assert known_type(int(kind)) is kind
         assert type_name(kind) == kind.name
-    assert len(ParamType) == dialect.MAV_PARAM_TYPE_ENUM_END - 1
+    assert len(KNOWN) == dialect.MAV_PARAM_TYPE_ENUM_END - 1
 
 
 def test_sizes_and_bounds() -> None:
-    assert [kind.size for kind in ParamType] == [1, 1, 2, 2, 4, 4, 8, 8, 4, 8]
+    assert [kind.size for kind in KNOWN] == [1, 1, 2, 2, 4, 4, 8, 8, 4, 8]
     assert [kind.bounds for kind in INTEGERS] == [
         (0, 255),
         (-128, 127),
@@ -110,6 +109,39 @@ def test_an_unknown_type_keeps_its_number(number: int) -> None:
     assert known_type(number) == number
     assert not isinstance(known_type(number), ParamType)
     assert type_name(number) == f"TYPE_{number}"
+
+
+@pytest.mark.parametrize("number", UNDEFINED)
+def test_a_param_of_an_unknown_type_has_a_number_and_is_raw(number: int) -> None:
+    param = Param("X", b"\x01\x02\x03\x84", number, None, 0x84030201)
+    assert (param.type, param.type_number) == (ParamType.UNKNOWN, number)
+    assert (param.value, param.is_raw, param.settable) == (0x84030201, True, b"\x01\x02\x03\x84")
+    assert str(param) == "X = 0x84030201"
+    assert param == Param("X", 0x84030201, number, None, 0x84030201)
+    assert param != Param("X", b"\x01\x02\x03\x84", 200, None, 0x84030201)
+
+
+def test_copies_of_a_param_keep_its_type_and_whether_it_is_raw() -> None:
+    unknown = Param("X", b"abcd", 77, None, 0x64636261)
+    misfit = Param("Y", b"\0\0\x80\x7f", ParamType.INT32, None, 0x7F800000)
+    for param in (unknown, misfit):
+        assert (copy := param.with_trust(Trust.CACHED)) == replace(param, trust=Trust.CACHED) != param
+        assert (copy.type_number, copy.value, copy.settable, copy.is_raw) == (
+            *(param.type_number, param.value, param.settable),
+            True,
+        )
+    assert (misfit.type, misfit.value) == (ParamType.INT32, 0x7F800000)
+    assert replace(unknown, type=ParamType.INT32).type_number == ParamType.INT32
+    assert not misfit.same_value(Param("Y", 0x7F800000, ParamType.INT32, None, 0x7F800000))
+
+
+def test_the_number_of_a_raw_value_is_written_nowhere_as_a_number() -> None:
+    raw = WrittenParam.of(Param("X", b"\0\0\x80\x7f", ParamType.INT32, None, 0x7F800000))
+    assert (raw.value, raw.is_raw, raw.settable) == (0x7F800000, True, b"\0\0\x80\x7f")
+    assert str(raw) == "X = 0x7f800000"
+    assert not raw.is_held_by(Param("X", 0x7F800000, ParamType.INT32, None, 0x7F800000))
+    assert not same_value(raw, WrittenParam("X", 0x7F800000, ParamType.INT32))
+    assert replace(raw, comment="c") == WrittenParam("X", b"\0\0\x80\x7f", ParamType.INT32, comment="c")
 
 
 # Byte-wise
@@ -412,7 +444,7 @@ class Indexable:
         (b"\x01\x02\x03\x04", b"\x01\x02\x03\x04"),
     ],
 )
-def test_check_value_accepts_numbers_of_other_libraries(given_value: Any, value: Value) -> None:
+def test_check_value_accepts_numbers_of_other_libraries(given_value: Any, value: WireValue) -> None:
     checked = check_value(given_value)
     assert checked == value
     assert type(checked) is type(value)
@@ -492,7 +524,7 @@ def test_same_bits_of_real64_zeros() -> None:
     assert not same_bits(ParamType.REAL32, 0, 1 << 63)
 
 
-@pytest.mark.parametrize("number", [*ParamType])
+@pytest.mark.parametrize("number", KNOWN)
 def test_bits_of_rejects_a_number_beyond_the_type(number: ParamType) -> None:
     with pytest.raises(UsageError, match=number.name):
         bits_of(10**400, number)
@@ -562,7 +594,7 @@ def test_format_value_at_powers_of_two_and_subnormals() -> None:
         (b"\x01\x00\x80\x7f", ParamType.INT64, "0x7f800001"),
     ],
 )
-def test_format_value(value: Value, kind: ParamType, text: str) -> None:
+def test_format_value(value: WireValue, kind: ParamType, text: str) -> None:
     assert format_value(value, kind) == text
 
 
@@ -570,57 +602,3 @@ def test_format_value_rounds_a_float_to_float32() -> None:
     assert shortest_float(0.1) == 0.1
     assert shortest_float(0.10000000149) == 0.1
     assert shortest_float(1 / 3) == 0.33333334
-
-
-# The PX4 hash
-
-
-def bitwise_crc(data: bytes) -> int:
-    """Return PX4's CRC-32, computed bit by bit from its definition."""
-    crc = 0
-    for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = crc >> 1 ^ (0xEDB88320 if crc & 1 else 0)
-    return crc
-
-
-@pytest.mark.parametrize(
-    ("data", "crc"),
-    [
-        (b"", 0),
-        (b"A", 0x01DB7106),
-        (b"123456789", 0x2DFD2D88),
-        (b"SYS_AUTOSTART" + (4001).to_bytes(4, "little"), 0x8B5000C6),
-    ],
-)
-def test_crc_vectors(data: bytes, crc: int) -> None:
-    assert crc32_px4(data) == crc == bitwise_crc(data)
-
-
-@thorough
-@given(st.binary(max_size=64), st.binary(max_size=64))
-def test_crc_can_be_computed_in_parts(first: bytes, second: bytes) -> None:
-    assert crc32_px4(second, crc32_px4(first)) == bitwise_crc(first + second)
-
-
-def test_px4_hash_sorts_names_and_excludes_volatile_ones() -> None:
-    table = [
-        param(4001, 4001, ParamType.INT32, name="SYS_AUTOSTART"),
-        param(0x40C00000, 6.0, name="MC_ROLL_P"),
-        param(0xFFB3B4C0, -5000000, ParamType.INT32, name="A_"),
-        param(1, 1, ParamType.INT32, name="AB"),
-        param(2, 2, ParamType.INT32, name="LND_FLIGHT_T_LO"),
-    ]
-    expected = bitwise_crc(
-        b"AB" + (1).to_bytes(4, "little")
-        + b"A_" + bytes.fromhex("c0b4b3ff")
-        + b"MC_ROLL_P" + bytes.fromhex("0000c040")
-        + b"SYS_AUTOSTART" + (4001).to_bytes(4, "little")
-    )  # fmt: skip
-    for seed in range(5):
-        random.Random(seed).shuffle(table)
-        assert px4_hash(table, leave_out=["LND_FLIGHT_T_LO", "NOT_THERE"]) == expected
-    assert px4_hash(table) != expected
-    assert px4_hash([]) == 0
-    assert px4_hash(table[:1]) == crc32_px4(hash_chunk(table[0]))

@@ -17,7 +17,8 @@ from paramclient.errors import (
     UnknownParameter,
     UsageError,
 )
-from paramclient.model.values import Encoding, Param, ParamType, Trust, Value, px4_hash
+from paramclient.model.px4_hash import hash_params
+from paramclient.model.values import Encoding, Param, ParamType, Trust, WireValue
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import (
     ComponentIdentified,
@@ -88,7 +89,7 @@ class Desk:
     def hear(
         self,
         name: str,
-        value: Value = 0.0,
+        value: WireValue = 0.0,
         kind: int = ParamType.REAL32,
         *,
         index: int = NO_INDEX,
@@ -145,7 +146,7 @@ def fetched(desk: Desk, *, announce: bool = True) -> None:
     """Let a table of three be fetched, under its hash."""
     fetch = desk.machine.begin_fetch(desk.now)
     if announce:
-        desk.hash(px4_hash([known(name, float(at), index=at) for at, name in enumerate("ABC")]))
+        desk.hash(hash_params([known(name, float(at), index=at) for at, name in enumerate("ABC")]))
     desk.send_list("A", "B", "C")
     desk.machine.end_fetch(fetch, desk.now)
     desk.take()
@@ -627,8 +628,8 @@ def test_a_change_makes_an_announced_hash_old() -> None:
 def test_a_hash_received_before_the_cache_was_read_confirms_it() -> None:
     desk = Desk()
     params = [known("A", 1, index=0), known("B", 2, index=1)]
-    desk.hash(px4_hash(params), count=2)
-    desk.cached(*params, confirmed=px4_hash(params), volatile_known=True)
+    desk.hash(hash_params(params), count=2)
+    desk.cached(*params, confirmed=hash_params(params), volatile_known=True)
     assert {param.trust for param in desk.machine.table.params.values()} == {Trust.VERIFIED}
     assert [change.name for change in desk.changes] == ["A", "B"]
     assert desk.machine.state == "cached"
@@ -641,7 +642,7 @@ def test_without_such_a_hash_it_stays_cached(announced: int | None) -> None:
     params = [known("A", 1, index=0), known("B", 2, index=1)]
     if announced is not None:
         desk.hash(announced, count=2)
-    desk.cached(*params, confirmed=px4_hash(params), volatile_known=True)
+    desk.cached(*params, confirmed=hash_params(params), volatile_known=True)
     assert {param.trust for param in desk.machine.table.params.values()} == {Trust.CACHED}
 
 
@@ -649,10 +650,10 @@ def test_values_received_before_the_cache_was_read_are_kept() -> None:
     desk = Desk()
     desk.hear("A", 9, ParamType.INT32, index=0, count=2)
     params = [known("A", 1, index=0), known("B", 2, index=1)]
-    desk.cached(*params, confirmed=px4_hash(params), volatile_known=True)
+    desk.cached(*params, confirmed=hash_params(params), volatile_known=True)
     table = desk.machine.table
     assert (table.params["A"].value, table.params["B"].value) == (9, 2)
-    assert table.hash == px4_hash(listed(table)) != px4_hash(params)
+    assert table.hash == hash_params(listed(table)) != hash_params(params)
 
 
 def test_a_hash_that_cannot_be_computed_is_lost_when_something_has_moved() -> None:

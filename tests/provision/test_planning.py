@@ -13,7 +13,7 @@ from paramclient.metadata import Metadata, ParamInfo
 from paramclient.model.group_switches import ARDUPILOT_SWITCHES, PX4_SWITCHES, is_group_switch
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import Encoding, Param, ParamType, Value, bits_of, from_bits
+from paramclient.model.values import Encoding, Param, ParamType, WireValue, bits_of, from_bits
 from paramclient.provision import CATEGORIES, MISSING, WRONG, Plan, PlanStatus, overlay, plan
 from paramclient.provision.apply_rules import OUT_OF_RANGE, READ_ONLY, ApplyRule, rules_for
 from paramclient.provision.planning import SUGGESTIONS_MAX
@@ -30,7 +30,7 @@ class Info:
     reboot_required: bool = False
 
 
-def held(**values: Value | tuple[ParamType | int, Value]) -> dict[str, Param]:
+def held(**values: WireValue | tuple[ParamType | int, WireValue]) -> dict[str, Param]:
     """Return a vehicle's table: an int is an INT32, a float a REAL32, other types are given."""
     table: dict[str, Param] = {}
     for name, entry in values.items():
@@ -41,7 +41,7 @@ def held(**values: Value | tuple[ParamType | int, Value]) -> dict[str, Param]:
     return table
 
 
-def written(**values: Value) -> ParamSet:
+def written(**values: WireValue) -> ParamSet:
     return ParamSet({name: WrittenParam(name, value) for name, value in values.items()}, source="a file")
 
 
@@ -176,7 +176,7 @@ def test_parameters_that_are_no_settings_are_left_out_unless_included(
 def test_a_measured_value_is_a_calibration_if_the_vehicle_does_not_measure_it(
     autopilot: str, name: str, switch: str, value: int
 ) -> None:
-    def category(held_value: int, **wanted: Value) -> str:
+    def category(held_value: int, **wanted: WireValue) -> str:
         table = held(**{name: 1, switch: held_value})
         return plan(table, written(**{name: 2}, **wanted), autopilot=autopilot).rows[name].category
 
@@ -247,7 +247,7 @@ def test_include_takes_categories_and_globs(include: str | list[str]) -> None:
     ],
 )
 def test_a_value_that_the_type_cannot_hold_is_invalid(
-    kind: ParamType, value: Value, encoding: Encoding, says: str
+    kind: ParamType, value: WireValue, encoding: Encoding, says: str
 ) -> None:
     table = held(P=(kind, 0))
     made = plan(table, written(P=value), encoding=encoding, include=CATEGORIES)

@@ -9,7 +9,7 @@ import pytest
 
 from paramclient import InvalidParameters, ParamSet, ParamType, Rename, Renames, UsageError, WrittenParam
 from paramclient.model.identity import Identity, version_text
-from paramclient.model.values import Encoding, Param, Value, bits_of
+from paramclient.model.values import Encoding, Param, WireValue, bits_of
 from paramclient.provision import (
     MISSING,
     WRONG,
@@ -37,23 +37,23 @@ RENAMES = Renames(
     ],
     "names.yaml",
 )
-TABLE: dict[str, Value | tuple[ParamType, Value]] = {
+TABLE: dict[str, WireValue | tuple[ParamType, WireValue]] = {
     "WP_SPD": 10.0,
     "RTL_ALT_M": (ParamType.INT16, 15),
     "INS_ACCOFFS_X": 0.5,
     "EK2_ENABLE": (ParamType.INT8, 0),
     "OTHER": 1.0,
 }
-GROUP: dict[str, Value | tuple[ParamType, Value]] = {"EK2_GPS_TYPE": (ParamType.INT8, 0)}
+GROUP: dict[str, WireValue | tuple[ParamType, WireValue]] = {"EK2_GPS_TYPE": (ParamType.INT8, 0)}
 NOT_HERE = "in names.yaml, which this vehicle does not have either"
 
 
-def written(values: Mapping[str, Value], identity: Identity | None = None) -> ParamSet:
+def written(values: Mapping[str, WireValue], identity: Identity | None = None) -> ParamSet:
     params = {name: WrittenParam(name, value) for name, value in values.items()}
     return ParamSet(params, identity=identity, source="a file")
 
 
-def held(**values: Value | tuple[ParamType, Value]) -> dict[str, Param]:
+def held(**values: WireValue | tuple[ParamType, WireValue]) -> dict[str, Param]:
     """Return a vehicle's table; an entry without a type is a REAL32."""
     table: dict[str, Param] = {}
     for name, entry in values.items():

@@ -33,7 +33,7 @@ from paramclient.errors import (
 from paramclient.metadata import ParamInfo
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType, Value, bits_of, from_bits
+from paramclient.model.values import ParamType, WireValue, bits_of, from_bits
 from paramclient.protocol import wire
 from paramclient.protocol.ftp.packets import Opcode, Packet
 from paramclient.provision import (
@@ -54,11 +54,11 @@ from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, GenericVehicle, P
 from paramclient.sim.param_table import Entry
 from tests.shell import FlakyLink, Tap, a_client, residue, swiftly
 
-SETTINGS: dict[str, Value | tuple[ParamType, Value]] = {
+SETTINGS: dict[str, WireValue | tuple[ParamType, WireValue]] = {
     f"TUNE_{number:02}": number / 4 if number % 3 else number for number in range(30)
 }
 """Parameters that most of these tests set."""
-OTHERS: dict[str, Value | tuple[ParamType, Value]] = {
+OTHERS: dict[str, WireValue | tuple[ParamType, WireValue]] = {
     "STAT_RUNTIME": 5,
     "MAV_SYS_ID": 1,
     "SYSID_THISMAV": (ParamType.INT16, 1),
@@ -71,7 +71,7 @@ OTHERS: dict[str, Value | tuple[ParamType, Value]] = {
     "EK2_ENABLE": (ParamType.INT8, 0),
     "SMALL": (ParamType.INT8, 1),
 }
-GROUP: dict[str, Value | tuple[ParamType, Value]] = {
+GROUP: dict[str, WireValue | tuple[ParamType, WireValue]] = {
     "EK2_ALT_M_NSE": 3.0,
     "EK2_GPS_TYPE": (ParamType.INT8, 0),
 }
@@ -112,7 +112,7 @@ class RevertingVehicle(PX4Vehicle):
             super()._write(self._entry("TUNE_19"), bits_of(4.75, ParamType.REAL32))
 
 
-CLAMPED: dict[str, Value | tuple[ParamType, Value]] = {
+CLAMPED: dict[str, WireValue | tuple[ParamType, WireValue]] = {
     "MPC_TILTMAX_AIR": 45.0,
     "MPC_TILTMAX_LND": 12.0,
     "MPC_XY_VEL_MAX": 12.0,
@@ -146,13 +146,13 @@ def px4(kind: type[PX4Vehicle] = PX4Vehicle, **options: Any) -> PX4Vehicle:
 EVERY_KIND = pytest.mark.parametrize("make", [ardupilot, px4], ids=["ardupilot", "px4"])
 
 
-def written(values: Mapping[str, Value], **options: Any) -> ParamSet:
+def written(values: Mapping[str, WireValue], **options: Any) -> ParamSet:
     return ParamSet({name: WrittenParam(name, value) for name, value in values.items()}, **options)
 
 
-def another(*names: str) -> dict[str, Value]:
+def another(*names: str) -> dict[str, WireValue]:
     """Return values that differ from those of SETTINGS."""
-    wanted: dict[str, Value] = {}
+    wanted: dict[str, WireValue] = {}
     for name in names or SETTINGS:
         value = SETTINGS[name]
         assert not isinstance(value, tuple | bytes)
@@ -314,8 +314,11 @@ def downloads(tap: Tap) -> int:
 @pytest.mark.parametrize("ftp", [True, False])
 @swiftly
 async def test_two_downloads_suffice_for_any_file(ftp: bool) -> None:
-    switch: dict[str, Value | tuple[ParamType, Value]] = {"GRIP_ENABLE": (ParamType.INT8, 1)}
-    grip: dict[str, Value | tuple[ParamType, Value]] = {"GRIP_TYPE": (ParamType.INT8, 0), "GRIP_REGRAB": 1.0}
+    switch: dict[str, WireValue | tuple[ParamType, WireValue]] = {"GRIP_ENABLE": (ParamType.INT8, 1)}
+    grip: dict[str, WireValue | tuple[ParamType, WireValue]] = {
+        "GRIP_TYPE": (ParamType.INT8, 0),
+        "GRIP_REGRAB": 1.0,
+    }
     groups = {"EK2_ENABLE": GROUP, "GRIP_ENABLE": grip}
     vehicle = ArduPilotVehicle(table=SETTINGS | OTHERS | switch, groups=groups, ftp=ftp)
     tap = Tap(vehicle)
@@ -355,9 +358,13 @@ async def test_two_downloads_suffice_for_any_file(ftp: bool) -> None:
 async def test_members_of_a_group_to_reveal_are_requested_during_the_file_download(
     listed: int, ftp: bool, is_beside: bool
 ) -> None:
-    hidden: dict[str, Value | tuple[ParamType, Value]] = {f"GRIP_{number}": 1.0 for number in range(30)}
-    fence: dict[str, Value | tuple[ParamType, Value]] = {f"FENCE_{number}": 1.0 for number in range(listed)}
-    switches: dict[str, Value | tuple[ParamType, Value]] = dict.fromkeys(
+    hidden: dict[str, WireValue | tuple[ParamType, WireValue]] = {
+        f"GRIP_{number}": 1.0 for number in range(30)
+    }
+    fence: dict[str, WireValue | tuple[ParamType, WireValue]] = {
+        f"FENCE_{number}": 1.0 for number in range(listed)
+    }
+    switches: dict[str, WireValue | tuple[ParamType, WireValue]] = dict.fromkeys(
         ("GRIP_ENABLE", "FENCE_ENABLE"), (ParamType.INT8, 0)
     )
     table = SETTINGS | OTHERS | switches | fence
@@ -721,7 +728,7 @@ async def test_restore_writes_an_earlier_state_of_the_vehicle() -> None:
 
 @swiftly
 async def test_restore_skips_measured_and_read_only_parameters() -> None:
-    own: dict[str, Value | tuple[ParamType, Value]]
+    own: dict[str, WireValue | tuple[ParamType, WireValue]]
     own = {"BARO1_GND_PRESS": 94500.0, "BARO1_DEVID": 65540, "INS_GYROFFS_X": 0.25, "LOCKED": 1.0}
     vehicle = ArduPilotVehicle(
         table=SETTINGS | OTHERS | own, read_only=["BARO1_GND_PRESS", "BARO1_DEVID", "LOCKED"], live_period=0.0
@@ -1238,7 +1245,7 @@ class Scenario:
             self.options = {"reboot": True, "include": "identity"}
         self.wanted = written(wanted)
 
-    def truth(self) -> dict[str, Value]:
+    def truth(self) -> dict[str, WireValue]:
         """Return all values of the vehicle, hidden ones included."""
         return {entry.name: entry.value for entry in self.vehicle._entries}
 

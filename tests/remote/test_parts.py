@@ -18,9 +18,13 @@ from paramclient import (
     AnotherVehicle,
     CacheError,
     Change,
+    Changed,
     Changes,
     CommandRefused,
     Component,
+    ExtParams,
+    ExtSetRefused,
+    FirstValue,
     InvalidParameters,
     LinkError,
     NoReply,
@@ -30,24 +34,28 @@ from paramclient import (
     ParamType,
     Refused,
     Removed,
+    SetFailed,
     Trust,
     TypeMismatch,
     UnknownParameter,
     UsageError,
     ValueNotApplied,
+    ValueUnsupported,
     VehicleArmed,
 )
 from paramclient.client.client import implementation_of, local_client
 from paramclient.client.link_client import LinkClient
 from paramclient.client.link_component import LinkComponent
+from paramclient.client.link_extended_params import LinkExtParams
 from paramclient.documents.param import ParamDoc
 from paramclient.model.notation import parse_number
-from paramclient.model.values import Value, from_bits, type_name
+from paramclient.model.values import TYPES_BY_NAME, WireValue, from_bits, type_name
 from paramclient.remote import RemoteComponent
 from paramclient.remote.bounded import EVENT_BYTES_MAX, EventReader
 from paramclient.remote.decoding import param_of, value_as_sent
 from paramclient.remote.mirror import LOADING_CHANGES_MAX, Mirror
 from paramclient.remote.problems import error_of
+from paramclient.remote.remote_extended_params import RemoteExtParams
 from paramclient.remote.service_address import CLIENT_TOKEN_VARIABLE, ServiceAddress, chosen_token
 from paramclient.remote.service_client import ServiceClient
 
@@ -150,6 +158,7 @@ def test_the_remote_classes_define_every_public_name_of_the_local_ones() -> None
     [
         *((ParamClient, LinkClient), (ParamClient, ServiceClient)),
         *((Component, LinkComponent), (Component, RemoteComponent)),
+        *((ExtParams, LinkExtParams), (ExtParams, RemoteExtParams)),
     ],
     ids=lambda kind: kind.__name__,
 )
@@ -182,7 +191,7 @@ def test_local_client_refuses_a_client_of_a_service() -> None:
 # Documents
 
 
-def a_param(kind: int, bits: int, *, is_raw: bool, default: Value | None = None) -> Param:
+def a_param(kind: int, bits: int, *, is_raw: bool, default: WireValue | None = None) -> Param:
     value = from_bits(bits, kind, is_raw=is_raw)
     known = ParamType(kind) if kind <= ParamType.REAL64 else kind
     return Param("PARAM", value, known, 3, bits, Trust.VERIFIED, default)
@@ -192,7 +201,7 @@ def through_json(param: Param) -> Param:
     return param_of(json.loads(json.dumps(ParamDoc.kept(param).as_json(), allow_nan=False)))
 
 
-@given(st.sampled_from([*ParamType]), st.data())
+@given(st.sampled_from([*TYPES_BY_NAME.values()]), st.data())
 def test_a_parameter_loses_no_bit_on_the_way(kind: ParamType, data: st.DataObject) -> None:
     bits = data.draw(st.integers(0, (1 << 8 * kind.size) - 1))
     param = a_param(kind, bits, is_raw=False)
@@ -210,7 +219,7 @@ def test_raw_bytes_stay_raw(kind: int, bits: int) -> None:
     param = a_param(kind, bits, is_raw=True)
     came = through_json(param)
     assert (came, came.value, came.is_raw) == (param, param.value, True)
-    assert type_name(came.type) == type_name(param.type)
+    assert type_name(came.type_number) == type_name(param.type_number)
 
 
 @pytest.mark.parametrize("value", [0, -(2**63), 2**64, 2.0, -0.0, 1e300, math.inf, -math.inf, math.nan])
@@ -234,6 +243,11 @@ ERRORS: list[ParamClientError] = [
     TypeMismatch("no", **WHOM, name="A"),
     ValueNotApplied("no", **WHOM, name="A", requested=1.5, actual=b"\x01\x02\x03\x04"),
     ValueNotApplied("no", **WHOM, name="A", requested=3, actual=math.inf),
+    ValueNotApplied("no", **WHOM, name="A", requested="0x01", actual=b"\x00\xff" * 9),
+    ValueNotApplied("no", **WHOM, name="A", requested="NaN", actual=2**64 - 1),
+    ExtSetRefused("no", **WHOM, name="A", code=9),
+    ValueUnsupported("no", **WHOM, name="A", code=1),
+    SetFailed("no", **WHOM, name="A", code=2),
     VehicleArmed("no", **WHOM),
     AnotherVehicle(1, 1, "this", "that"),
     NoReply("A of 1/1", attempts=4, waited=2.1234),
@@ -307,7 +321,7 @@ def param(value: int, trust: Trust = Trust.LIVE, name: str = "A") -> Param:
     return Param(name, value, ParamType.INT32, 0, value, trust)
 
 
-def shown(mirror: Mirror) -> dict[str, tuple[Value, Trust]]:
+def shown(mirror: Mirror) -> dict[str, tuple[WireValue, Trust]]:
     return {name: (each.value, each.trust) for name, each in mirror.params.items()}
 
 
@@ -339,16 +353,16 @@ def test_a_first_table_is_no_change_and_a_later_one_tells_what_is_different() ->
         Change("B", param(2, name="B"), param(5, name="B")),
         Change("D", None, param(6, name="D")),
     ]
-    assert [type(each) for each in changes] == [Removed, Change, Added]
+    assert [type(each) for each in changes] == [Removed, Changed, Added]
     assert list(mirror.params) == ["A", "B", "D"]
 
 
 def test_added_and_removed_names_are_reported_as_such() -> None:
     mirror = Mirror()
     loaded(mirror, 1)
-    assert type(mirror.take(2, Change("A", None, param(1)))) is Change, "the service receives the table"
+    assert type(mirror.take(2, Change("A", None, param(1)))) is FirstValue, "the service receives the table"
     assert type(mirror.take(3, Added("B", None, param(1, name="B")))) is Added
-    assert type(mirror.take(4, Added("B", None, param(2, name="B")))) is Change, "it is here"
+    assert type(mirror.take(4, Added("B", None, param(2, name="B")))) is Changed, "it is here"
     assert type(mirror.take(5, Change("B", param(2, name="B"), None))) is Removed
 
 
@@ -368,8 +382,8 @@ def test_a_slow_listener_receives_the_sum_of_what_came_and_went() -> None:
     told = [changes._take() for _ in range(4)]
     assert [each and (type(each), each.name) for each in told] == [
         (Added, "A"),
-        (Change, "C"),
-        (Change, "D"),
+        (Changed, "C"),
+        (FirstValue, "D"),
         None,
     ]
 

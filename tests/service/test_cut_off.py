@@ -67,9 +67,7 @@ def test_one_whose_process_has_died_is_told_once(notes: SetupNotes, clock: Clock
     assert [note.is_told for note in notes.cut_off(tells=True)] == [True]
 
 
-def test_one_that_the_end_of_the_service_cuts_off_says_how_far_it_was(
-    notes: SetupNotes, clock: Clock
-) -> None:
+def test_a_set_up_cut_off_by_the_end_of_the_service_has_its_progress(notes: SetupNotes, clock: Clock) -> None:
     running = begun(notes)
     running.note(done=3, total=20, key=None)
     running.note(done=9, total=20, key=None)

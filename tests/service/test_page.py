@@ -15,10 +15,13 @@ from playwright.sync_api import Browser, Locator, Page, Route, expect, sync_play
 
 from paramclient import ParamCache, ParamClient
 from paramclient.links import SimLink
+from paramclient.model.ext_params import ExtParamType
 from paramclient.service import Settings
 from paramclient.service.access import AccessSettings
 from paramclient.service.tokens import Tokens
-from paramclient.sim import PX4Vehicle
+from paramclient.sim import Camera, PX4Vehicle
+from paramclient.sim.camera import ExtEntries
+from paramclient.testing import SimVehicle
 from tests.page import BROWSER, BROWSER_OPTIONS, HIGHEST, HOSTILE, Bench, at_work
 
 FILES = Path(__file__).parents[2] / "paramclient/service/page"
@@ -549,7 +552,29 @@ def test_a_file_is_compared_chosen_from_and_applied(sight: Sight, bench: Bench) 
 
 
 @needs_browser
-def test_what_is_no_parameter_file_is_said_to_be_none(sight: Sight) -> None:
+def test_a_file_of_changed_names_is_used_in_the_plan_and_in_the_apply(sight: Sight, bench: Bench) -> None:
+    content = "1\t1\tOLD_PITCH_MAX\t0.42\t9\n"
+    sight.page.get_by_role("button", name="Compare").click()
+    sight.dialog.locator("input[type=file]").set_input_files(
+        {"name": "old.params", "mimeType": "text/plain", "buffer": content.encode()}
+    )
+    sight.page.get_by_role("button", name="Take over").click()
+    expect(sight.line("OLD_PITCH_MAX")).to_contain_text("cannot be set")
+    names = sight.dialog.locator("#renames")
+    names.set_input_files({"name": "n.yaml", "mimeType": "text/yaml", "buffer": b"- old: OLD_PITCH_MAX\n"})
+    expect(sight.dialog.get_by_role("alert")).to_contain_text("n.yaml")
+    rules = b"- {old: OLD_PITCH_MAX, new: MC_PITCHRATE_MAX, factor: 100}\n"
+    names.set_input_files({"name": "n.yaml", "mimeType": "text/yaml", "buffer": rules})
+    expect(sight.dialog.get_by_role("alert")).to_have_text("")
+    expect(sight.line("OLD_PITCH_MAX")).to_contain_text("here MC_PITCHRATE_MAX")
+    sight.dialog.get_by_role("button", name="Apply 1 value").click()
+    expect(sight.line("OLD_PITCH_MAX")).to_contain_text("accepted")
+    sight.dialog.get_by_role("button", name="Done").click()
+    assert bench.px4.values["MC_PITCHRATE_MAX"] == 42
+
+
+@needs_browser
+def test_a_file_that_is_no_parameter_file_is_reported(sight: Sight) -> None:
     sight.page.get_by_role("button", name="Compare").click()
     sight.dialog.locator("input[type=file]").set_input_files(
         {"name": "photo.jpg", "mimeType": "image/jpeg", "buffer": bytes(range(256))}
@@ -812,3 +837,128 @@ def test_after_a_gap_everything_is_loaded_anew(sight: Sight) -> None:
         }"""
     )
     assert begun == ["begin", "change", "begin", "change", "begin", "begin"]
+
+
+# extended parameters
+
+
+@pytest.fixture
+def camera(tmp_path: Path) -> Iterator[tuple[Bench, Camera]]:
+    """A service with a camera among its vehicles."""
+    table: ExtEntries = {
+        "CLOCK": (ExtParamType.INT64, -(2**53) - 1),
+        "SIZE": (ExtParamType.UINT64, 2**64 - 1),
+        "MODE": (ExtParamType.UINT8, 1),
+        "EV": 0.5,
+        "NAME": "Front <b>camera</b>",
+        "KEY": b"\xff\x00\xfe",
+        "<iframe/>": "one\ntwo",
+    }
+    vehicle = Camera(table, system=4, supported={"MODE": [1, 2]}, failing=["EV"])
+    with at_work(tmp_path, more={"camera": SimVehicle(vehicle)}) as bench:
+        until(lambda: any(each["system"] == 4 for each in bench.ask("GET", "/components")["components"]))
+        yield bench, vehicle
+
+
+def opened(sight: Sight) -> None:
+    """Open the extended parameters of the selected component."""
+    sight.page.get_by_role("button", name="Extended parameters of the component").click()
+    expect(sight.dialog).to_contain_text("Extended parameters of")
+
+
+@needs_browser
+def test_extended_parameters_are_shown_and_set(
+    visit: Callable[..., Sight], camera: tuple[Bench, Camera]
+) -> None:
+    bench, vehicle = camera
+    sight = visit(bench.url)
+    offer = sight.page.get_by_role("button", name="Extended parameters of the component")
+    expect(offer).to_be_hidden()
+    sight.page.get_by_role("navigation").get_by_role("button", name="4/100").click()
+    opened(sight)
+    expect(sight.dialog).to_contain_text("None are known yet.")
+    sight.dialog.get_by_role("button", name="Fetch all").click()
+    expect(sight.dialog).to_contain_text("7 extended parameters")
+
+    def field(name: str) -> Locator:
+        return sight.dialog.get_by_label(f"Value of {name}", exact=True)
+
+    def put(name: str, text: str) -> Locator:
+        field(name).fill(text)
+        sight.dialog.get_by_role("button", name=f"Set {name}", exact=True).click()
+        return sight.line(name).locator(".remark")
+
+    for name, text in {
+        "CLOCK": "-9007199254740993",
+        "SIZE": "18446744073709551615",
+        "MODE": "1",
+        "EV": "0.5",
+        "NAME": "Front <b>camera</b>",
+        "KEY": "hex:ff00fe",
+        "<iframe/>": "one\ntwo",
+    }.items():
+        expect(field(name)).to_have_value(text)
+    values = vehicle.ext_values
+    expect(put("CLOCK", "9007199254740995")).to_have_text("accepted")
+    expect(put("SIZE", "0x8000000000000001")).to_have_text("accepted")
+    expect(field("SIZE")).to_have_value(str(2**63 + 1))
+    expect(put("NAME", "Rear, \u00fc")).to_have_text("accepted")
+    expect(put("KEY", "hex:80 01")).to_have_text("accepted")
+    expect(put("<iframe/>", "three\nfour")).to_have_text("accepted")
+    assert vehicle.ext_values == values | {
+        "CLOCK": 2**53 + 3,
+        "SIZE": 2**63 + 1,
+        "NAME": "Rear, \u00fc",
+        "KEY": b"\x80\x01",
+        "<iframe/>": "three\nfour",
+    }
+    expect(put("MODE", "9")).to_contain_text("refused: 4/100 did not set MODE to 9: value unsupported")
+    expect(field("MODE")).to_have_value("9")
+    expect(put("MODE", "256")).to_contain_text("UINT8 holds 0 to 255")
+    expect(put("KEY", "hex:0")).to_contain_text("pairs of hexadecimal digits")
+    expect(put("EV", "1.5")).to_contain_text("refused")
+    assert vehicle.ext_values["MODE"] == 1
+    field("MODE").fill("2")
+    field("MODE").press("Enter")
+    expect(sight.line("MODE").locator(".remark")).to_have_text("accepted")
+    expect(sight.spoken).to_contain_text("MODE: accepted")
+
+
+@needs_browser
+def test_extended_parameters_follow_what_others_change(
+    visit: Callable[..., Sight], camera: tuple[Bench, Camera]
+) -> None:
+    bench, vehicle = camera
+    bench.ask("POST", "/components/4/100/extended/fetch", {})
+    sight = visit(bench.url)
+    sight.page.get_by_role("navigation").get_by_role("button", name="4/100").click()
+    opened(sight)
+    name = sight.dialog.get_by_label("Value of NAME")
+    expect(name).to_have_value("Front <b>camera</b>")
+    bench.ask("PATCH", "/components/4/100/extended/params", {"values": {"NAME": "Rear", "MODE": 2}})
+    expect(name).to_have_value("Rear")
+    expect(sight.line("MODE").locator(".remark")).to_have_text("now 2, by local")
+    name.fill("typed")
+    bench.ask("PATCH", "/components/4/100/extended/params", {"values": {"NAME": "Top"}})
+    expect(sight.line("NAME").locator(".remark")).to_have_text("now Top, by local")
+    expect(name).to_have_value("typed")
+    bench.do(vehicle.remove_ext_param, "MODE")
+    bench.do(vehicle.add_ext_param, "NEW", "text")
+    bench.ask("POST", "/components/4/100/extended/fetch", {})
+    expect(sight.line("MODE")).to_be_hidden()
+    expect(sight.dialog.get_by_label("Value of NEW")).to_have_value("text")
+
+
+@needs_browser
+def test_who_may_only_read_sees_extended_values(visit: Callable[..., Sight], tmp_path: Path) -> None:
+    vehicle = Camera({"NAME": "Front"}, system=4)
+    settings = Settings(access=AccessSettings(read_only=True))
+    with at_work(tmp_path, settings, more={"camera": SimVehicle(vehicle)}) as bench:
+        until(lambda: any(each["system"] == 4 for each in bench.ask("GET", "/components")["components"]))
+        bench.ask("POST", "/components/4/100/extended/fetch", {})
+        sight = visit(bench.url)
+        sight.page.get_by_role("navigation").get_by_role("button", name="4/100").click()
+        opened(sight)
+        expect(sight.line("NAME")).to_contain_text("Front")
+        expect(sight.dialog.get_by_role("button", name="Set NAME")).to_be_hidden()
+        expect(sight.dialog.get_by_role("textbox")).to_have_count(0)

@@ -17,7 +17,8 @@ import httpx
 import pytest
 
 from paramclient import ParamCache
-from paramclient.cache import TableState, TableUpdate
+from paramclient.cache import FleetDiff, TableState, TableUpdate
+from paramclient.documents.fleet import FleetDiffDoc
 from paramclient.files import FileForm, dumps, loads
 from paramclient.links import SimLink
 from paramclient.model.paramset import ParamSet, WrittenParam
@@ -26,6 +27,7 @@ from paramclient.protocol import wire
 from paramclient.service import AccessSettings, Hub, Settings, Tokens, create_app
 from paramclient.service.body_limits import LINE_BYTES_MAX, PARAM_FILE_BYTES_MAX
 from paramclient.service.quota import LONG_REQUESTS_OF_HOLDER_MAX
+from paramclient.service.routes import history as history_room
 from paramclient.service.routes.param_files import file_response
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
 from paramclient.sim.vehicle import Vehicle
@@ -164,9 +166,59 @@ async def test_a_file_is_planned_applied_and_verified(
     assert on_board.values["TUNE_01"] == pytest.approx(1.35)
 
 
+RULES = """- {old: OLD_TUNE, new: TUNE_01, factor: 0.01}
+- {old: TUNE_02, new: NEW_TUNE}
+"""
+
+
 @BOTH
 @swiftly
-async def test_who_does_not_wait_gets_a_job_and_is_told_how_far_it_is(
+async def test_names_that_changed_with_the_firmware_are_compared_planned_and_applied(
+    vehicle: Callable[..., Vehicle], tmp_path: Path
+) -> None:
+    on_board = vehicle()
+    renames = {"name": "names.yaml", "text": RULES}
+    asked = {"wanted": {"values": {"OLD_TUNE": 775, "NEW_TUNE": 3.5, "GONE": 1}}, "renames": renames}
+    async with serving(on_board, place=tmp_path) as service:
+        differences = (await service.post(f"{HERE}/diff", {**asked, "partial": True}))["params"]
+        assert differences["OLD_TUNE"]["right_name"] == "TUNE_01"
+        assert differences["NEW_TUNE"]["right_name"] == "TUNE_02"
+        assert differences.keys() == {"OLD_TUNE", "NEW_TUNE", "GONE"}
+        plan = await service.post(f"{HERE}/plan", asked)
+        assert plan["params"]["OLD_TUNE"]["vehicle_name"] == "TUNE_01"
+        assert plan["params"]["OLD_TUNE"]["wanted"] == 7.75
+        assert plan["params"]["GONE"]["category"] == "missing"
+        assert (await service.post(f"{HERE}/verify", asked))["counts"]["different"] == 2
+        result = await service.post(f"{HERE}/apply", {**asked, "only": ["OLD_*", "NEW_*"]})
+        assert result["counts"]["set"] == 2
+        assert (await service.post(f"{HERE}/verify", asked))["counts"]["same"] == 2
+        assert on_board.values["TUNE_01"] == 7.75
+        assert on_board.values["TUNE_02"] == 3.5
+
+
+@pytest.mark.parametrize(
+    ("text", "status", "told"),
+    [
+        ("- {old: A, new: B}\n- {old: B, new: A}\n", 422, "return to"),
+        ("- {old: A, new: B, factor: 0}\n", 422, "factor"),
+        ("{", 422, "YAML"),
+        ("- {old: A, new: B}\n" * 25_000, 413, "60,000"),
+        ("x" * (LINE_BYTES_MAX + 1), 413, "bytes"),
+    ],
+)
+@swiftly
+async def test_a_wrong_file_of_changed_names_is_rejected(
+    text: str, status: int, told: str, tmp_path: Path
+) -> None:
+    asked = {"wanted": {"values": {"TUNE_01": 1}}, "renames": {"name": "names.yaml", "text": text}}
+    async with serving(px4(), place=tmp_path) as service:
+        for path in ("diff", "plan", "verify", "apply"):
+            assert told in (await service.post(f"{HERE}/{path}", asked, status))["detail"]
+
+
+@BOTH
+@swiftly
+async def test_an_apply_without_waiting_is_a_job_with_progress(
     vehicle: Callable[..., Vehicle], tmp_path: Path
 ) -> None:
     async with serving(vehicle(), place=tmp_path) as service:
@@ -427,7 +479,7 @@ async def test_a_table_comes_as_a_file_of_every_form_and_goes_back(vehicle: Call
         for form in WRITABLE:
             answer = await service.file(f"{HERE}/file", form=form)
             disposition = answer.headers["content-disposition"]
-            assert re.fullmatch(r'file_response; filename="[A-Za-z0-9._-]+"', disposition)
+            assert re.fullmatch(r'attachment; filename="[A-Za-z0-9._-]+"', disposition)
             assert answer.headers["content-type"] == "application/octet-stream"
             assert answer.headers["x-content-type-options"] == "nosniff"
             name = disposition.split('"')[1]
@@ -458,7 +510,7 @@ async def test_the_name_of_a_file_is_safe_whoever_the_vehicle_is() -> None:
     async with Hub([], cache=False) as hub:
         answer = await file_response(hub, params, FileForm.QGC)
     name = "autopilot_200-9-1-20261118-110640.params"
-    assert answer.headers["content-disposition"] == f'file_response; filename="{name}"'
+    assert answer.headers["content-disposition"] == f'attachment; filename="{name}"'
 
 
 @swiftly
@@ -654,6 +706,45 @@ async def test_vehicles_are_compared_with_each_other(tmp_path: Path) -> None:
         file = await service.post("/api/v1/fleet/diff", {"file": {"name": "a.param", "text": "MODE,3\n"}})
         assert file["different"] is True
         assert (await service.post("/api/v1/fleet/diff", {}, 422))["status"] == 422
+
+
+@pytest.mark.parametrize(
+    "asked", [{"names": ["TUNE_0?", "MODE", "T*_02"]}, {"values": {"TUNE_03": 1, "MODE": 5, "NO_SUCH": 2}}]
+)
+@swiftly
+async def test_vehicles_are_compared_in_parts(
+    asked: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a whole and name by name gives the same; what is too large is not even begun."""
+    parts: list[int] = []
+
+    def noted(*given: Any, **options: Any) -> FleetDiff:
+        found = compare(*given, **options)
+        parts.append(len(found.names))
+        return found
+
+    compare = ParamCache.fleet_diff
+    monkeypatch.setattr(ParamCache, "fleet_diff", noted)
+    async with serving(px4(), px4(system=2), px4(system=3), place=tmp_path) as service:
+        await service.ask("PUT", f"{HERE}/params/MODE", json={"value": 5})
+        whole = await service.post("/api/v1/fleet/diff", asked)
+        count = len(whole["names"])
+        assert count >= 3
+        assert parts == [count]
+        with ParamCache(tmp_path / "cache.sqlite3") as cache:
+            wanted = asked.get("names") or ParamSet(
+                {name: WrittenParam(name, value) for name, value in asked["values"].items()}
+            )
+            assert whole == FleetDiffDoc.of(compare(cache, wanted)).as_json()
+        parts.clear()
+        monkeypatch.setattr(history_room, "FLEET_CELLS_OF_PART", 5)
+        assert await service.post("/api/v1/fleet/diff", asked) == whole
+        assert parts == [1] * count
+        parts.clear()
+        monkeypatch.setattr(history_room, "FLEET_CELLS_MAX", 3 * count - 1)
+        told = await service.post("/api/v1/fleet/diff", asked, 413)
+        assert f"At most {count - 1} names can be compared among 3 vehicles" in told["detail"]
+        assert not parts
 
 
 # descriptions

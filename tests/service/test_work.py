@@ -43,6 +43,7 @@ from paramclient.service import (
     Tokens,
     create_app,
     jobs,
+    metrics,
     responses,
 )
 from paramclient.service import hub as hub_room
@@ -57,7 +58,13 @@ from paramclient.service.param_sources import (
     parse_upload,
 )
 from paramclient.service.problems import ServiceError
-from paramclient.service.quota import LARGE_GETS_OF_HOLDER_MAX, LONG_REQUESTS_OF_HOLDER_MAX, Quota
+from paramclient.service.quota import (
+    LARGE_GETS_OF_HOLDER_MAX,
+    LONG_REQUESTS_OF_HOLDER_MAX,
+    WAITING_REQUESTS_MAX,
+    WAITING_REQUESTS_OF_HOLDER_MAX,
+    Quota,
+)
 from paramclient.service.responses import encode_document
 from paramclient.service.route_context import run_until_disconnect
 from paramclient.service.routes import apply as setup_room
@@ -437,6 +444,31 @@ async def test_a_table_is_copied_out_in_a_thread(monkeypatch: pytest.MonkeyPatch
             assert seen["of"] <= {READER, "paramclient service"}, path
 
 
+@pytest.mark.asyncio
+async def test_metrics_components_and_fetches_are_encoded_in_a_thread_of_their_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async with service(GenericVehicle(table=TABLE)) as (hub, browser):
+        await fetched(browser)
+        is_free = threading.Event()
+        calls = (metrics, "generate_latest"), (responses, "encode_document")
+        async with anyio.create_task_group() as tasks:
+            for run in (hub.run_in_thread, hub.run_in_file_thread):  # a locked cache, a long comparison
+                tasks.start_soon(run, is_free.wait)
+            try:
+                with threads_of(monkeypatch, *calls) as seen:
+                    with anyio.fail_after(30):
+                        answers = [await browser.get(path) for path in ("/metrics", "/api/v1/components")]
+                        answers.append(await browser.post("/api/v1/fetch", json={}))
+            finally:
+                is_free.set()
+        assert [answer.status_code for answer in answers] == [200] * 3, [each.text for each in answers]
+        assert "paramclient_component_parameters{" in answers[0].text
+        assert [each["component"] for each in answers[1].json()["components"]] == [1]
+        assert [each["component"] for each in answers[2].json()["results"]] == [1]
+        assert seen == {name: {"paramclient responses"} for _, name in calls}
+
+
 @swiftly
 async def test_the_document_of_the_api_is_made_once_and_in_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     async with service() as (_, browser):
@@ -536,6 +568,75 @@ async def test_plans_have_a_quota_for_each_holder_and_for_all(monkeypatch: pytes
             monkeypatch.setattr(hub, "long_requests", Quota("requests", most=0, most_of_holder=1))
             problem(await other.post("/api/v1/files", content=b"A 1\n", headers=A_FILE), 429, "too-many")
         assert answers == [504] * LONG_REQUESTS_OF_HOLDER_MAX
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "status"),
+    [
+        ("/api/v1/find", {"system": 77, "timeout_s": 20}, 504),
+        ("/api/v1/find", {"system": 77, "only": True, "timeout_s": 20}, 504),
+        (f"{C}/successor", {"system": 77, "timeout_s": 20}, 504),
+        (f"{C}/params/ABC_1_P01/read", {"timeout_s": 20}, 504),
+    ],
+)
+@swiftly
+async def test_waiting_requests_have_a_quota_for_each_holder_and_for_all(
+    path: str, body: dict[str, Any], status: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vehicle = Tap(GenericVehicle(table=TABLE))
+    async with service(vehicle) as (hub, browser), a_browser(create_app(hub), client=("::1", 1)) as other:
+        await fetched(browser)
+        vehicle.is_deaf = True
+        statuses: list[int] = []
+
+        async def ask() -> None:
+            statuses.append((await browser.post(path, json=body)).status_code)
+
+        async with anyio.create_task_group() as tasks:
+            for _ in range(WAITING_REQUESTS_OF_HOLDER_MAX):
+                tasks.start_soon(ask)
+            await anyio.sleep(0.5)
+            assert not statuses, "they wait"
+            told = problem(await browser.post(path, json=body), 429, "too-many")
+            assert told["most"] == WAITING_REQUESTS_OF_HOLDER_MAX
+            assert (await browser.get(f"{C}/params")).status_code == 200
+            assert (await other.post("/api/v1/find", json={})).status_code == 200
+            none_left = Quota("requests", most=0, most_of_holder=1)
+            monkeypatch.setattr(hub, "waiting_requests", {True: none_left, False: none_left})
+            problem(await other.post("/api/v1/find", json={}), 429, "too-many")
+        assert statuses == [status] * WAITING_REQUESTS_OF_HOLDER_MAX
+
+
+@swiftly
+async def test_waiting_readers_keep_no_writer_and_no_other_reader_out() -> None:
+    vehicle = Tap(GenericVehicle(table=TABLE))
+    readers = [f"reader{number}-0123456789abcdef" for number in range(4)]
+    lines = "".join(f"r{number} read {each}\n" for number, each in enumerate(readers))
+    tokens = Tokens.of_text(lines + f"anna write {ANNA['Authorization'].removeprefix('Bearer ')}\n")
+    settings = Settings(access=AccessSettings(tokens=tokens))
+    async with (
+        Hub([vehicle], cache=False, fetches=False) as hub,
+        a_browser(create_app(hub, settings)) as browser,
+    ):
+        await browser.post("/api/v1/find", json={}, headers=ANNA)
+        absent = {"system": 77, "timeout_s": 30}
+        statuses: list[int] = []
+
+        async def ask(token: str) -> None:
+            answer = await browser.post("/api/v1/find", json=absent, headers=bearer(token))
+            statuses.append(answer.status_code)
+
+        async with anyio.create_task_group() as tasks:
+            for reader in readers[:3]:
+                for _ in range(WAITING_REQUESTS_MAX):
+                    tasks.start_soon(ask, reader)
+                await anyio.sleep(0.5)
+            found = await browser.post("/api/v1/find", json={}, headers=bearer(readers[3]))
+            assert found.status_code == 200
+            written = await browser.put(f"{C}/params/ABC_1_P01", json={"value": 3}, headers=ANNA)
+            assert written.status_code == 200, written.text
+        assert statuses.count(504) == 64 + 32 + 16
+        assert statuses.count(429) == 3 * WAITING_REQUESTS_MAX - (64 + 32 + 16)
 
 
 @swiftly
@@ -687,6 +788,25 @@ async def test_a_component_that_the_link_has_forgotten_does_not_break_the_end_of
 
 
 @swiftly
+async def test_metrics_are_collected_a_part_at_a_time() -> None:
+    turns = Turns()
+
+    class Counted:
+        link = SimpleNamespace(name="a", state="open")
+        address = (1, 1)
+
+        @property
+        def component(self) -> Any:
+            turns.note()
+            return SimpleNamespace(state="active", sync_state="synced", params={}, round_trip=None)
+
+    hub: Any = SimpleNamespace(followed=[Counted() for _ in range(1_000)])
+    families = await metrics._component_metrics(hub)
+    assert [len(family.samples) for family in families] == [1_000, 1_000, 1_000, 0]
+    assert turns.most == COMPONENTS_PER_TURN
+
+
+@swiftly
 async def test_many_components_are_looked_at_few_at_a_time() -> None:
     turns = Turns()
     looked: Any = SimpleNamespace(publish_changes=turns.note)
@@ -695,7 +815,10 @@ async def test_many_components_are_looked_at_few_at_a_time() -> None:
         await anyio.sleep(9)
         return {"type": "http.disconnect"}
 
-    request: Any = SimpleNamespace(receive=receive)
+    hub = SimpleNamespace(waiting_requests={True: Quota("requests", most=1, most_of_holder=1)})
+    app = SimpleNamespace(state=SimpleNamespace(hub=hub))
+    state = {"quota": "anna", "role": "write", "read_only": False}
+    request: Any = SimpleNamespace(receive=receive, app=app, scope={"state": state})
 
     async def work() -> int:
         return 7
@@ -751,7 +874,7 @@ def test_in_a_document_of_one_line_no_comment_is_sought(monkeypatch: pytest.Monk
     assert not sought
 
 
-@pytest.mark.parametrize("number", ["9" * 4_300, "9" * (DIGITS_MAX + 1), "0." + "3" * 200])
+@pytest.mark.parametrize("number", ["9" * 4_300, "9" * (DIGITS_MAX + 1), "0." + "3" * (DIGITS_MAX + 1)])
 @swiftly
 async def test_a_body_with_endless_numbers_is_not_parsed(
     number: str, monkeypatch: pytest.MonkeyPatch

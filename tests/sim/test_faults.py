@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
+from typing import Literal
 
 import pytest
 
@@ -258,7 +259,9 @@ class TestClock:
         assert time.time_boot_ms == 5000
 
     @pytest.mark.parametrize(("kind", "asked"), [("copter", [True]), ("plane", []), ("rover", [])])
-    def test_ardupilot_sends_system_time_when_its_main_loop_runs(self, kind: str, asked: list[bool]) -> None:
+    def test_ardupilot_sends_system_time_when_its_main_loop_runs(
+        self, kind: Literal["copter", "plane", "rover"], asked: list[bool]
+    ) -> None:
         """A Copter only on request; an earlier request is acknowledged, and SYSTEM_TIME sent then."""
         vehicle = ArduPilotVehicle(table=TEN, kind=kind)
         station = Station(vehicle).wait(5.5)

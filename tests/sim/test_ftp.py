@@ -7,7 +7,8 @@ from itertools import pairwise
 import pytest
 
 from paramclient.errors import FileErrorCode, UsageError
-from paramclient.model.values import ParamType, crc32_px4
+from paramclient.model.px4_hash import crc32_px4
+from paramclient.model.values import ParamType
 from paramclient.protocol import wire
 from paramclient.protocol.ftp import param_pck
 from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, Opcode, Packet

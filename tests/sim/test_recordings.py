@@ -8,16 +8,16 @@ from collections.abc import Callable, Iterable
 
 import pytest
 
+from paramclient.model.px4_hash import hash_params
 from paramclient.model.values import (
     Encoding,
     Param,
     ParamType,
-    Value,
+    WireValue,
     decode_value,
     encode_value,
     from_bits,
     known_type,
-    px4_hash,
 )
 from paramclient.protocol import wire
 from paramclient.protocol.ftp import param_pck
@@ -111,8 +111,8 @@ class TestDecoding:
         assert {value.param_count for value in values} == {903}
         volatile = [row.name for row in px4_table() if row.volatile]
         assert len(volatile) == 58
-        assert px4_hash(found, leave_out=volatile) == PX4_HASH
-        assert px4_hash(found) != PX4_HASH
+        assert hash_params(found, leave_out=volatile) == PX4_HASH
+        assert hash_params(found) != PX4_HASH
 
     def test_ardupilots_table(self) -> None:
         values = param_values(from_vehicle("ardupilot_full_download"))
@@ -407,7 +407,7 @@ class TestReplay:
         recorded values."""
         name = "ardupilot_get_set"
         recorded = compared(from_vehicle(name))
-        events: list[tuple[float, str, Value]] = [
+        events: list[tuple[float, str, WireValue]] = [
             (time - 0.005, message.param_id, struct.unpack("<f", message.raw)[0])
             for time, message in recorded
             if isinstance(message, wire.ParamValue)

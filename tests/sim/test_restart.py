@@ -293,7 +293,7 @@ def test_a_late_call_does_not_change_the_end_of_a_reboot() -> None:
 
 def test_invalid_reboot_arguments_are_rejected() -> None:
     with pytest.raises(UsageError, match="copter, plane, rover"):
-        ArduPilotVehicle(kind="blimp")
+        ArduPilotVehicle(kind="blimp")  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="reboot_down"):
         generic(reboot_down=-1.0)
     with pytest.raises(UsageError, match="A_ENABLE"):

@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 
 from paramclient import sim
 from paramclient.errors import ParamErrorCode, UsageError
-from paramclient.model.values import Param, ParamType, Value, px4_hash
+from paramclient.model.px4_hash import hash_params
+from paramclient.model.values import TYPES_BY_NAME, Param, ParamType, WireValue
 from paramclient.protocol import wire
 from paramclient.sim import (
     Air,
@@ -48,7 +49,7 @@ class TestTables:
         assert list(vehicle.params.values()) == [vehicle.param(name) for name in SMALL]
 
     def test_a_table_with_all_types(self) -> None:
-        rows = [SimParam(f"T{kind}", kind, 1) for kind in ParamType]
+        rows = [SimParam(f"T{kind}", kind, 1) for kind in TYPES_BY_NAME.values()]
         assert [row.bits for row in rows] == [1] * 8 + [0x3F800000, 0x3FF0000000000000]
         assert SimParam("N", ParamType.INT64, -2).bits == 2**64 - 2
         odd = SimParam("ODD", 77, b"\x01\x02\x03\x04")
@@ -365,7 +366,10 @@ class TestOptions:
 
 class TestGeneric:
     def test_every_type_byte_wise(self) -> None:
-        vehicle = GenericVehicle({f"T{int(kind)}": (kind, 1) for kind in ParamType} | {"T77": (77, b"abcd")})
+        kinds: dict[str, tuple[int, WireValue]] = {
+            f"T{int(kind)}": (kind, 1) for kind in TYPES_BY_NAME.values()
+        }
+        vehicle = GenericVehicle(kinds | {"T77": (77, b"abcd")})
         station = Station(vehicle)
         by_name = {value.param_id: value for value in station.ask(LIST)}
         assert by_name["T2"].raw == b"\x01\0\0\0"
@@ -489,7 +493,7 @@ class TestPX4:
         after = vehicle.announced_hash()
         assert after != before
         volatile = [row.name for row in px4_table() if row.volatile]
-        assert after == px4_hash(vehicle.params.values(), leave_out=volatile)
+        assert after == hash_params(vehicle.params.values(), leave_out=volatile)
 
     def test_invalid_requests_are_not_answered(self) -> None:
         vehicle = PX4Vehicle()
@@ -787,7 +791,7 @@ class TestArduPilot:
         assert len(station.ask(LIST)) == 4
 
     def test_values_are_cast(self) -> None:
-        table: dict[str, Value | tuple[ParamType | int, Value]] = {
+        table: dict[str, WireValue | tuple[ParamType | int, WireValue]] = {
             "BYTE": (ParamType.INT8, -5),
             "BIG": 16777217,
             "DOUBLE": (ParamType.REAL64, 1e300),

@@ -18,9 +18,11 @@ class ExtChange:
         old: the parameter before, or None for a new one.
         new: the parameter now, or None when the component no longer has it.
         by: the author, as in `Change`.
+        is_added: whether the component has a parameter that its last complete list lacked.
     """
 
     name: str
     old: ExtParam | None
     new: ExtParam | None
     by: str = "vehicle"
+    is_added: bool = False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Protocol
 
 from paramclient.errors import ExtAckResult
@@ -106,11 +107,9 @@ class ExtendedParams(Machine):
             self.reads.defer(message, until, now)
             return
         by = self.writes.author(name) or self._authors.of(name, now)
-        self._store(param, by, now if moment is None else moment, now)
+        self._store(param, by, now if moment is None else moment, now, message.param_index)
         if name not in self.table.params:
             return  # more names than the table may hold
-        if message.param_index != NO_INDEX:
-            self.table.use_index(name, message.param_index)
         self.fetches.heard(message, now)
         self.reads.heard(message, now)
 
@@ -182,6 +181,7 @@ class ExtendedParams(Machine):
         """Forget everything: another vehicle has the address."""
         self.report(self.table.forget())
         self.fetches.is_spoken = False
+        self.fetches.last = None
         self.restart(now)
 
     def tick(self, now: float) -> None:
@@ -226,12 +226,18 @@ class ExtendedParams(Machine):
         self.batches.fail_all(error, now)
         self.writes.fail_all(error, now)
 
-    def _store(self, param: ExtParam, by: str, moment: float, now: float | None = None) -> None:
-        """Store an observed value, and report its change."""
+    def _store(
+        self, param: ExtParam, by: str, moment: float, now: float | None = None, index: int = NO_INDEX
+    ) -> None:
+        """Store an observed value with its index, and report its change."""
         now = moment if now is None else now
         change = self.table.store(param, by, moment)
+        if index != NO_INDEX and param.name in self.table.params:
+            self.table.use_index(param.name, index)
         if change is None:
             return
+        is_added = change.old is None and self.fetches.last is not None
+        change = replace(change, new=self.table.params[param.name], is_added=is_added)
         old = change.old
         if old is not None:
             news = ParamExtValue(param.name, param.raw, param.type, 0, NO_INDEX)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import Literal
 
 from paramclient.errors import NoReply
 from paramclient.model.ext_params import ExtParam
@@ -42,7 +43,7 @@ class ExtFetchResult:
     params: Mapping[str, ExtParam]
     count: int | None
     missing: tuple[int, ...]
-    source: str
+    source: Literal["stream", "cache"]
     elapsed: float
     notes: tuple[str, ...] = ()
 

@@ -6,7 +6,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final, Literal, Protocol
 
 from paramclient.errors import (
     ExtAckResult,
@@ -52,7 +52,7 @@ class ExtSetResult:
     """
 
     name: str
-    status: str
+    status: Literal["accepted", "adjusted"]
     requested: ExtValue
     actual: ExtValue
     param: ExtParam
@@ -388,7 +388,9 @@ class ExtWrites(Machine):
     def _succeed(self, write: ExtWrite, actual: ExtParam, now: float) -> None:
         actual = self._table.params.get(write.name, actual)  # with its index
         assert write.wanted is not None, "it was sent"
-        status = "accepted" if write.wanted.same_value(actual) else "adjusted"
+        status: Literal["accepted", "adjusted"] = (
+            "accepted" if write.wanted.same_value(actual) else "adjusted"
+        )
         self._trace("%s/%s %s: %s after try %s", *self._target, write.name, status, write.attempts)
         result = ExtSetResult(write.name, status, write.value, actual.value, actual, write.attempts)
         self._leave(write, now)

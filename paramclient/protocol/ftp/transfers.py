@@ -274,7 +274,7 @@ class FileTransfers(Machine):
         return self._begin(FileList(self._line_at(now), path, now), now)
 
     def checksum(self, path: str, now: float) -> FileChecksum:
-        """Let the server compute the CRC-32 of a file, which is that of `paramclient.model.values.crc32_px4`.
+        """Let the server compute the CRC-32 of a file; see `paramclient.model.px4_hash.crc32_px4`.
 
         Raises:
             UsageError: the path is invalid.

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from paramclient.model.params import CompactParam, compact_param, param_of
-from paramclient.model.values import Param, Value
+from paramclient.model.values import Param, WireValue
 
-__all__ = ["Added", "Change", "Removed"]
+__all__ = ["Added", "Change", "Changed", "FirstValue", "Removed"]
 
 _new = tuple.__new__  # the constructor of a tuple ends in this call and takes several times as long
 
 
-class Change(tuple[str, CompactParam | None, CompactParam | None, str, Value | None, Value | None]):
+class Change(tuple[str, CompactParam | None, CompactParam | None, str, WireValue | None, WireValue | None]):
     """One parameter that appeared, changed its value or was removed.
 
-    Each first value makes a change; the parameters in it are therefore built only on access. `Added` and
-    `Removed` are the changes of the table itself.
+    Every change is a `Changed`, a `FirstValue`, an `Added` (which is a `FirstValue`) or a `Removed`. After
+    `isinstance(change, Changed)`, type checkers know that `old` and `new` are not None.
+
+    The parameters are built only on access, as each first value makes a change.
 
     Args:
         name: param_id.
@@ -27,6 +29,8 @@ class Change(tuple[str, CompactParam | None, CompactParam | None, str, Value | N
     __slots__ = ()
 
     def __new__(cls, name: str, old: Param | None, new: Param | None, by: str = "vehicle") -> Change:
+        if cls is Change:
+            cls = Removed if new is None else FirstValue if old is None else Changed
         before, now = (None if each is None else compact_param(each) for each in (old, new))
         defaults = (None if each is None else each.default for each in (new, old))
         return _new(cls, (name, before, now, by, *defaults))
@@ -43,7 +47,9 @@ class Change(tuple[str, CompactParam | None, CompactParam | None, str, Value | N
         """
         if new is None:
             return Removed(name, old, new, by)
-        return (Added if is_added and old is None else Change)(name, old, new, by)
+        if old is not None:
+            return Changed(name, old, new, by)
+        return (Added if is_added else FirstValue)(name, old, new, by)
 
     def __getnewargs__(self) -> tuple[str, Param | None, Param | None, str]:
         return self.name, self.old, self.new, self.by
@@ -82,11 +88,43 @@ class Change(tuple[str, CompactParam | None, CompactParam | None, str, Value | N
         return f"{type(self).__name__}({members})"
 
 
-class Added(Change):
+class Changed(Change):
+    """A parameter with another value or type than before."""
+
+    __slots__ = ()
+
+    @property
+    def old(self) -> Param:
+        """The parameter before."""
+        return _present(super().old)
+
+    @property
+    def new(self) -> Param:
+        """The parameter now."""
+        return _present(super().new)
+
+
+class FirstValue(Change):
+    """A parameter that the table did not have before."""
+
+    __slots__ = ()
+
+    @property
+    def old(self) -> None:
+        """None: the table had no value before."""
+        return None
+
+    @property
+    def new(self) -> Param:
+        """The parameter now."""
+        return _present(super().new)
+
+
+class Added(FirstValue):
     """A parameter that the vehicle has and the table lacked when it was complete last.
 
     Examples are a parameter that a `set` of `*_ENABLE` reveals, and one outside the vehicle's list that is
-    read by name. The first values of a table that was never complete are plain changes.
+    read by name. The first value of each parameter of a table that was never complete is a plain `FirstValue`.
     """
 
     __slots__ = ()
@@ -96,3 +134,18 @@ class Removed(Change):
     """A parameter that the vehicle no longer has."""
 
     __slots__ = ()
+
+    @property
+    def old(self) -> Param:
+        """The parameter before."""
+        return _present(super().old)
+
+    @property
+    def new(self) -> None:
+        """None: the vehicle no longer has the parameter."""
+        return None
+
+
+def _present(param: Param | None) -> Param:
+    assert param is not None  # by the class of the change
+    return param

@@ -28,6 +28,7 @@ from paramclient.protocol.params.fetch_result import (
     Announcement,
     FetchContext,
     FetchResult,
+    FetchSource,
     Policy,
     Progress,
     Sampled,
@@ -143,7 +144,31 @@ class Fetch(Operation[FetchResult]):
         self.file_failed: bool | None = None
         self._notes: tuple[str, ...] = ()
         self._left_out_before = table.left_out
-        if policy is Policy.CACHE_ONLY or refresh or listed:
+        self._choose_source(announced, sampled, now, is_download=refresh or listed)
+
+    def _choose_source(
+        self, announced: Announcement | None, sampled: Sampled | None, now: float, *, is_download: bool
+    ) -> None:
+        """Begin in the cheapest reliable way: with the cached table if the vehicle confirms it.
+
+        In this order:
+
+        - A download, if the caller requests one (`_begin_download`, which chooses between file and list). If
+          the policy forbids downloads, `_begin_download` ends with the cached table.
+        - A sample, if the caller accepts one, the table is complete, and the vehicle has no hash (`_sample`).
+        - The rest of an interrupted download, or all of it, if the table has no hash or is incomplete
+          (`_begin_or_resume`).
+        - The cached table, if its hash equals the vehicle's (`_compare`). The hash is requested if it was not
+          received recently. A mismatch, or no response, begins a download.
+
+        Args:
+            announced: the vehicle's last `_HASH_CHECK`.
+            sampled: the options of a sample that the caller accepts.
+            now: the time.
+            is_download: whether the caller requests a download.
+        """
+        table = self._table
+        if self._fetch_policy is Policy.CACHE_ONLY or is_download:
             self._begin_download(now)
         elif sampled is not None and table.complete and table.count and not self._context.expects_hash:
             self._sample(sampled, table.count, now)
@@ -695,7 +720,7 @@ class Fetch(Operation[FetchResult]):
 
     def _result(
         self,
-        source: str,
+        source: FetchSource,
         count: int,
         missing: tuple[int, ...],
         confirmed: int | None,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final
+from typing import Final, Literal, TypeAlias
 
 from paramclient.model.values import Param, Trust
 from paramclient.protocol.ftp import FileTransfers
@@ -19,7 +19,10 @@ from paramclient.protocol.requests.context import Context
 from paramclient.protocol.scheduler import ListAdmission
 from paramclient.protocol.wire import ParamValue
 
-__all__ = ["Announcement", "FetchResult", "FetchContext", "Policy", "Progress", "Sampled"]
+__all__ = ["Announcement", "FetchResult", "FetchContext", "FetchSource", "Policy", "Progress", "Sampled"]
+
+FetchSource: TypeAlias = Literal["cache", "ftp", "stream"]
+"""Where a fetch has the values from: the cache, the packed file (MAVFTP) or the list."""
 
 FRESH_HASH: Final = 1.0
 """Seconds for which an announced hash is used without a new request. The hash is requested when a component
@@ -150,7 +153,7 @@ class FetchResult:
     system: int
     component: int
     params: Mapping[str, Param]
-    source: str
+    source: FetchSource
     count: int
     received: int
     missing: tuple[int, ...]

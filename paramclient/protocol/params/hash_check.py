@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from paramclient.model.hash_exclusions import find_volatile
+from paramclient.model.px4_hash import find_volatile
 from paramclient.protocol.params.fetch_notes import MOVED, NO_HASH_BEFORE_DOWNLOAD, UNPROVEN
 from paramclient.protocol.params.fetch_result import Announcement
 from paramclient.protocol.params.table import Table

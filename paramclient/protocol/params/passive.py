@@ -9,7 +9,14 @@ from typing import Final
 from paramclient.errors import NoReply
 from paramclient.model.values import is_portable_name
 from paramclient.protocol.params.fetch import Fetch
-from paramclient.protocol.params.fetch_result import Announcement, FetchContext, FetchResult, Policy, Progress
+from paramclient.protocol.params.fetch_result import (
+    Announcement,
+    FetchContext,
+    FetchResult,
+    FetchSource,
+    Policy,
+    Progress,
+)
 from paramclient.protocol.params.hash_check import HashCheck
 from paramclient.protocol.params.passive_file import FileObserver, ObservedPack
 from paramclient.protocol.params.sync import Sync
@@ -67,7 +74,7 @@ class PassiveTable:
         self._whole = whole
         self._began_at = 0.0
         self._is_whole = False
-        self._source = "stream"
+        self._source: FetchSource = "stream"
 
     def heard(self, message: ParamValue, now: float) -> None:
         """Process a PARAM_VALUE of the component, after the table has stored it."""
@@ -111,7 +118,7 @@ class PassiveTable:
         """Return the table as a result if it is known to match the vehicle's."""
         if not self._sync.synced:
             return None
-        source = self._source if self._is_whole else "cache"
+        source: FetchSource = self._source if self._is_whole else "cache"
         return self._result(source, (), self._table.hash, now, notes)
 
     def result(self, now: float, notes: tuple[str, ...] = ()) -> FetchResult | None:
@@ -150,7 +157,7 @@ class PassiveTable:
         if len(self.names) == total and not was_whole:
             self._complete("ftp" if is_all else "stream", now)
 
-    def _complete(self, source: str, now: float) -> None:
+    def _complete(self, source: FetchSource, now: float) -> None:
         """Finish the table: every index was received."""
         table = self._table
         self._is_whole = True
@@ -171,7 +178,7 @@ class PassiveTable:
 
     def _result(
         self,
-        source: str,
+        source: FetchSource,
         missing: tuple[int, ...],
         confirmed: int | None,
         now: float,

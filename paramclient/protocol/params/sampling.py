@@ -112,7 +112,7 @@ class Sampling(Operation[Sample]):
             words = f"the vehicle has {count} parameters, and not {self._count}"
         elif known is None or known.name != name:
             words = f"parameter {index} is {name}"
-        elif known.type != number or as_sent(known.bits, number, self._encoding) != raw:
+        elif known.type_number != number or as_sent(known.bits, number, self._encoding) != raw:
             words = f"{name} has another value"
         if words:
             self.cancel()

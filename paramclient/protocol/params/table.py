@@ -8,7 +8,6 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from struct import unpack
 from typing import Final, NamedTuple
 
-from paramclient.model.hash_exclusions import hash_of
 from paramclient.model.params import (
     CACHED,
     COMPACT_NO_INDEX,
@@ -27,12 +26,13 @@ from paramclient.model.params import (
     with_index,
     with_trust_number,
 )
+from paramclient.model.px4_hash import hash_bits
 from paramclient.model.values import (
     Encoding,
     Param,
     ParamType,
     Trust,
-    Value,
+    WireValue,
     as_sent,
     bits_of_wire,
     from_bits,
@@ -40,7 +40,7 @@ from paramclient.model.values import (
     known_type,
 )
 from paramclient.protocol.ftp.param_pck import Pack
-from paramclient.protocol.params.change import Added, Change, Removed
+from paramclient.protocol.params.change import Added, Change, Changed, FirstValue, Removed
 from paramclient.protocol.params.change_origin import is_ours
 from paramclient.protocol.wire import NO_INDEX, PARAMETERS_MAX, ParamValue
 
@@ -167,7 +167,7 @@ class Table:
     def hash(self) -> int | None:
         if self._hash_is_stale:
             self._hash_is_stale = False
-            self._hash = hash_of(self.listed_bits(), leave_out=self.volatile)
+            self._hash = hash_bits(self.listed_bits(), leave_out=self.volatile)
         return self._hash
 
     @property
@@ -302,7 +302,7 @@ class Table:
         self._record_change(name, old, by, before, seen_at)
         if self._hash is not None:
             self._invalidate_hash(name)
-        return _new(Change, (name, old, new, by, self._defaults.get(name), before))
+        return _new(Changed, (name, old, new, by, self._defaults.get(name), before))
 
     def store_file_entry(
         self,
@@ -356,7 +356,7 @@ class Table:
             return None
         self._record_change(name, old, "vehicle", before, seen_at)
         self._invalidate_hash(name)
-        kind = self._kind_of_first if old is None else Change
+        kind = self._kind_of_first if old is None else Changed
         return _new(kind, (name, old, new, "vehicle", initial, before))
 
     def take_pack(self, pack: Pack, moment: float, newer: Collection[str], *, start: int = 0) -> list[Change]:
@@ -493,7 +493,7 @@ class Table:
             moments: as in `fill`.
         """
         seen = {} if moments is None else moments
-        changes = []
+        changes: list[Change] = []
         for name, cached in as_params(params).held.items():
             old = self._held.get(name)
             if old is None or trust_of(old) != CACHED or name in self.dirty or same_held(old, cached):
@@ -507,7 +507,7 @@ class Table:
             self._wire.pop(name, None)  # the same value from the vehicle must then count as a change
             if self._hash is not None:
                 self._invalidate_hash(name)
-            changes.append(_new(Change, (name, old, new, "vehicle", self._defaults.get(name), before)))
+            changes.append(_new(Changed, (name, old, new, "vehicle", self._defaults.get(name), before)))
         return changes
 
     def change_count(self, count: int) -> None:
@@ -610,7 +610,7 @@ class Table:
     @property
     def _kind_of_first(self) -> type[Change]:
         """The class of the change by the first value of a name."""
-        return Added if self.complete or self._was_complete else Change
+        return Added if self.complete or self._was_complete else FirstValue
 
     @property
     def is_provable(self) -> bool:
@@ -740,7 +740,7 @@ class Table:
         self._name_quota.taken -= len(changes)
         return changes
 
-    def _set_default(self, name: str, default: Value | None) -> None:
+    def _set_default(self, name: str, default: WireValue | None) -> None:
         if default is None:
             self._defaults.pop(name, None)
         else:
@@ -748,10 +748,11 @@ class Table:
 
     def _change(self, name: str, old: CompactParam | None, new: CompactParam) -> Change:
         default = self._defaults.get(name)
-        return _new(Change, (name, old, new, "vehicle", default, default))
+        kind = FirstValue if old is None else Changed
+        return _new(kind, (name, old, new, "vehicle", default, default))
 
     def _record_change(
-        self, name: str, old: CompactParam | None, by: str, default: Value | None, seen_at: float
+        self, name: str, old: CompactParam | None, by: str, default: WireValue | None, seen_at: float
     ) -> None:
         """Record that a value has changed, at the moment that the table already has for it.
 
@@ -776,7 +777,7 @@ class Table:
         self.dirty[name] = by
 
     def _merge_cached(
-        self, name: str, heard: CompactParam, cached: CompactParam, default: Value | None
+        self, name: str, heard: CompactParam, cached: CompactParam, default: WireValue | None
     ) -> list[Change]:
         """Complete a received value with what its message lacks: the default and the exact integer."""
         bits, number, is_raw, trust, place = unpack_fields(heard)

@@ -28,7 +28,8 @@ from enum import StrEnum
 from typing import Final, NamedTuple
 
 from paramclient.errors import FileTransferError, PackError
-from paramclient.model.values import Encoding, Param, ParamType, Trust, as_sent, crc32_px4
+from paramclient.model.px4_hash import crc32_px4
+from paramclient.model.values import Encoding, Param, ParamType, Trust, as_sent
 from paramclient.protocol.ftp import BUSY, CommittedWrite, FileChecksums, FileRead, FileTransfers
 from paramclient.protocol.ftp.file_write import BLOCKS_IN_FLIGHT_MAX
 from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, FRAME_OVERHEAD
@@ -287,7 +288,7 @@ class Uploads:
         known = self._table.params.get(name)
         if known is None or known.index is None or known.trust is Trust.CACHED or known.is_raw:
             return None
-        return known if known.type in PACKABLE and not INTERNAL.fullmatch(name) else None
+        return known if known.type_number in PACKABLE and not INTERNAL.fullmatch(name) else None
 
     def is_quicker(self, values: Sequence[Param]) -> bool:
         """Return whether an upload of these parameters should take less time than their PARAM_SETs."""
@@ -371,9 +372,9 @@ def _is_known(name: str | None, table: Table) -> bool:
     param = None if name is None else table.params.get(name)
     if param is None or param.trust is Trust.CACHED or param.is_raw:
         return False
-    return param.type in PACKABLE and not MOVING.fullmatch(param.name)
+    return param.type_number in PACKABLE and not MOVING.fullmatch(param.name)
 
 
 def _packed(param: Param) -> PackedParam:
-    assert isinstance(param.type, ParamType)
-    return PackedParam(param.name, param.type, param.bits)
+    assert isinstance(param.type_number, ParamType)
+    return PackedParam(param.name, param.type_number, param.bits)

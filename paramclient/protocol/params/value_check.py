@@ -21,8 +21,8 @@ AMBIGUITY_WINDOW: Final = 0.3
 """Seconds after a change in which a PARAM_VALUE with the previous value is ambiguous: ArduPilot takes the
 value of a read when it queues the response, and sends it up to 100 ms later. Jitter comes on top."""
 LATER_CHANGE_TIME: Final = 1.2
-"""Seconds from the acknowledgement until a value is read again on PX4, whose modules clamp values 25 to 815
-ms after it, and set others up to 1 s after it (measured)."""
+"""Seconds from the acknowledgement until a value is read again on PX4, whose modules clamp the value, or set
+other parameters, up to 1.1 s after it (measured)."""
 LATE_ANSWER_TIME: Final = 1.0
 """Seconds after a request was sent in which its response may still arrive."""
 REREADS_MAX: Final = 256

@@ -7,7 +7,7 @@ from functools import partial
 from typing import Final
 
 from paramclient.errors import ContestedAddress, LinkError
-from paramclient.model.hash_exclusions import find_volatile
+from paramclient.model.px4_hash import find_volatile
 from paramclient.model.values import Trust
 from paramclient.protocol.params.reads import Read, Reads
 from paramclient.protocol.params.table import Table

@@ -17,7 +17,7 @@ from paramclient.errors import (
     ValueNotApplied,
     VehicleError,
 )
-from paramclient.model.values import Param, Value
+from paramclient.model.values import Param, Value, WireValue
 from paramclient.protocol.ftp.param_pck import PackedParam
 from paramclient.protocol.params.upload import ParamUpload, UploadHooks, Uploads
 from paramclient.protocol.params.writes import SetResult, Write
@@ -64,7 +64,7 @@ class SetOutcome:
 
     Attributes:
         name: param_id, as requested.
-        requested: the requested value.
+        requested: the requested value: a number, or bytes if bytes were requested.
         status: what became of it.
         result: the result as of `set` for an accepted or adjusted value, else None. Over a service, also None
             if the value is not on the disk.
@@ -73,7 +73,7 @@ class SetOutcome:
     """
 
     name: str
-    requested: Value
+    requested: WireValue
     status: SetStatus
     result: SetResult | None = None
     error: ParamClientError | None = None
@@ -85,9 +85,15 @@ class SetOutcome:
 
     @property
     def actual(self) -> Value | None:
-        """The value that the vehicle has reported after the write; None if it has reported none."""
+        """The value that the vehicle has reported after the write, as `Param.value`; None if none."""
+        reported = self.reported
+        return int.from_bytes(reported, "little") if isinstance(reported, bytes) else reported
+
+    @property
+    def reported(self) -> WireValue | None:
+        """The value that the vehicle has reported after the write, as `Param.settable`; None if none."""
         if self.result is not None:
-            return self.result.actual
+            return self.result.param.settable
         actual = self.error.actual if isinstance(self.error, ValueNotApplied) else None
         return None if isinstance(actual, str) else actual
 
@@ -157,7 +163,7 @@ class BatchRules:
         uploads: the component's; None if the values are not to be written as a file.
     """
 
-    begin: Callable[[str, Value, float, bool], Write]
+    begin: Callable[[str, WireValue, float, bool], Write]
     cancel: Callable[[Write, float], None]
     committed: Callable[[Write, float], None]
     unfile: Callable[[Write, float], None]
@@ -177,7 +183,7 @@ class WriteBatch(Operation[tuple[SetOutcome, ...]]):
         on_outcome: called after each outcome.
     """
 
-    def __init__(self, pairs: Sequence[tuple[str, Value]], rules: BatchRules, begun_at: float) -> None:
+    def __init__(self, pairs: Sequence[tuple[str, WireValue]], rules: BatchRules, begun_at: float) -> None:
         super().__init__(begun_at)
         self.ended: list[SetOutcome] = []
         self.failure: ParamClientError | None = None

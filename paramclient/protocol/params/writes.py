@@ -6,7 +6,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Literal, Protocol
 
 from paramclient.errors import (
     NoReply,
@@ -20,6 +20,7 @@ from paramclient.model.values import (
     ParamType,
     Trust,
     Value,
+    WireValue,
     decode_value,
     encode_value,
     format_value,
@@ -47,30 +48,34 @@ class SetResult:
         name: param_id.
         status: "accepted" (the vehicle holds the requested value, as far as the type can represent it), or
             "adjusted" (the vehicle changed the value: ArduPilot makes 1234 of 1234.7 for an integer; modules
-            of PX4 clamp values within a second, which is seen while the value is watched).
-        requested: the requested value.
-        actual: the value that the vehicle reports.
+            of PX4 change values up to 1.1 s later, which is seen while the value is watched).
+        requested: the requested value: a number, or bytes if bytes were requested.
         param: the parameter as it is now.
         attempts: PARAM_SETs sent; a parameter file with the value counts as one.
         note: a further sentence: PX4 does not save a change as small as this one.
     """
 
     name: str
-    status: str
-    requested: Value
-    actual: Value
+    status: Literal["accepted", "adjusted"]
+    requested: WireValue
     param: Param
     attempts: int
     note: str = ""
+
+    @property
+    def actual(self) -> Value:
+        """The value that the vehicle reports: `param.value`."""
+        return self.param.value
 
     @property
     def adjusted(self) -> bool:
         return self.status == "adjusted"
 
     def __str__(self) -> str:
-        actual = format_value(self.actual, self.param.type)
+        number = self.param.type_number
+        actual = format_value(self.param.settable, number)
         if self.adjusted:
-            return f"{self.name} = {actual} (adjusted from {format_value(self.requested, self.param.type)})"
+            return f"{self.name} = {actual} (adjusted from {format_value(self.requested, number)})"
         return f"{self.name} = {actual}"
 
 
@@ -90,7 +95,7 @@ class Write(Operation[SetResult]):
     def __init__(
         self,
         name: str,
-        value: Value,
+        value: WireValue,
         policy: RetryPolicy,
         begun_at: float,
         asker: str | None = None,
@@ -122,9 +127,9 @@ class Write(Operation[SetResult]):
     def filed_as(self) -> PackedParam | None:
         """The entry of a parameter file that sets what its PARAM_SET would set; None where it cannot."""
         wanted = self.wanted
-        if not self.is_filed or wanted is None or not isinstance(wanted.type, ParamType):
+        if not self.is_filed or wanted is None or not isinstance(wanted.type_number, ParamType):
             return None
-        return PackedParam(wanted.name, wanted.type, wanted.bits)
+        return PackedParam(wanted.name, wanted.type_number, wanted.bits)
 
     @property
     def attempts(self) -> int:
@@ -207,7 +212,7 @@ class Writes(Machine):
     def set(
         self,
         name: str,
-        value: Value,
+        value: WireValue,
         now: float,
         asker: str | None = None,
         *,
@@ -232,7 +237,7 @@ class Writes(Machine):
             self._start(write, now)
         return write
 
-    def check_finite(self, name: str, value: Value, *, force: bool) -> None:
+    def check_finite(self, name: str, value: WireValue, *, force: bool) -> None:
         """Check that a value may be sent as far as it must be a finite number.
 
         Raises:
@@ -278,7 +283,7 @@ class Writes(Machine):
         """Return whether a PARAM_VALUE has the value of the active PARAM_SET to its name."""
         write = self._active(message.param_id)
         wanted = None if write is None else write.wanted
-        if wanted is None or wanted.type != message.param_type:
+        if wanted is None or wanted.type_number != message.param_type:
             return False
         return wanted.bits == decode_value(message.raw, message.param_type, self._table.encoding)[1]
 
@@ -294,7 +299,8 @@ class Writes(Machine):
                 self._succeed(write, now)
         elif message.param_type != write.number:
             if write.was_retyped:
-                words = f"it is written as {type_name(write.number)} and reported as {type_name(heard.type)}"
+                reported = type_name(heard.type_number)
+                words = f"it is written as {type_name(write.number)} and reported as {reported}"
                 self._fail(write, self._type_mismatch(write, words), now)
             else:
                 write.was_retyped = True
@@ -411,7 +417,7 @@ class Writes(Machine):
             return
         if write.is_filed:
             assert known is not None
-            write.before, write.number = known, known.type
+            write.before, write.number = known, known.type_number
             self._prepare(write, now)
         elif known is not None and known.trust is not Trust.CACHED:
             self._begin(write, known, now)
@@ -420,7 +426,7 @@ class Writes(Machine):
 
     def _begin(self, write: Write, known: Param, now: float) -> None:
         write.before = known
-        write.number = known.type
+        write.number = known.type_number
         self._transmit(write, now)
 
     def _transmit(self, write: Write, now: float) -> None:
@@ -444,6 +450,10 @@ class Writes(Machine):
     def _prepare(self, write: Write, now: float) -> bytes | None:
         """Set the value that proves the write, and return its 4 bytes; end the write if it cannot be sent."""
         encoding = self._table.encoding
+        known = write.before
+        if known is not None and known.is_raw and write.value == known.value and not write.is_forced:
+            self._fail(write, self._raw_number(write, known), now)
+            return None
         try:
             raw = encode_value(write.value, write.number, encoding)
         except UsageError as error:
@@ -496,12 +506,12 @@ class Writes(Machine):
         actual = self._params[write.name]
         wanted = write.wanted
         exact = wanted is not None and wanted.same_value(actual)
-        if exact and actual.type != ParamType.REAL32 and not isinstance(write.value, bytes):
-            exact = actual.value == write.value
-        status = "accepted" if exact else "adjusted"
+        if exact and actual.type_number != ParamType.REAL32 and not isinstance(write.value, bytes):
+            exact = actual.settable == write.value
+        status: Literal["accepted", "adjusted"] = "accepted" if exact else "adjusted"
         before = write.before if self._context.is_px4 else None
         note = "" if before is None else note_on_small_change(before, actual)
-        result = SetResult(write.name, status, write.value, actual.value, actual, write.attempts, note)
+        result = SetResult(write.name, status, write.value, actual, write.attempts, note)
         self._trace("%s/%s %s: %s after try %s", *self._target, write.name, status, write.attempts)
         if write.settle > 0.0:
             if write.read is not None:
@@ -519,7 +529,7 @@ class Writes(Machine):
         """Compare the value that was read after the watch with the acknowledged one."""
         actual = self._params[write.name]
         if not result.param.same_value(actual):
-            result = replace(result, status="adjusted", actual=actual.value)
+            result = replace(result, status="adjusted")
         self._leave(write, now)
         write.finish(replace(result, param=actual), now)
 
@@ -554,15 +564,22 @@ class Writes(Machine):
 
     def _not_applied(self, write: Write, actual: Param) -> Exception:
         system, component = self._target
-        number = actual.type
+        number = actual.type_number
         return ValueNotApplied(
-            f"{system}/{component} keeps {write.name} at {format_value(actual.value, number)}; "
+            f"{system}/{component} keeps {write.name} at {format_value(actual.settable, number)}; "
             f"{format_value(write.value, number)} was sent {write.attempts} times",
             system=system,
             component=component,
             name=write.name,
             requested=write.value,
-            actual=actual.value,
+            actual=actual.settable,
+        )
+
+    def _raw_number(self, write: Write, known: Param) -> UsageError:
+        return UsageError(
+            f"{write.name} = {known.value} was not sent: this is the number of the raw bytes that "
+            f"{self._target[0]}/{self._target[1]} has instead of a {type_name(known.type_number)}. "
+            "Pass `Param.settable`, or force it."
         )
 
     def _type_mismatch(self, write: Write, words: str) -> Exception:

@@ -1,15 +1,20 @@
 """The retry policy: when a request counts as lost, how it is repeated, and when it is given up.
 
 `RetryPolicy` has the timeouts of one component, by its measured round trip and packet loss. Each kind of
-request has a class of its own, whose objects count the attempts of one request:
+request has a section of its own, with its constants and a class that counts the attempts of one request, in
+this order:
 
-- `Attempts`: the rule that the others refine.
-- `WriteAttempts`: PARAM_SET. `ExtWriteAttempts`: PARAM_EXT_SET.
-- `CommandAttempts`: COMMAND_LONG. `MessageAttempts`, `VersionAttempts`: MAV_CMD_REQUEST_MESSAGE.
-- `ReadAttempts`, `ReadRetries`: PARAM_REQUEST_READ. `NameRetries`: the search for names.
-- `ListAttempts`: PARAM_REQUEST_LIST. `ExtListAttempts`: PARAM_EXT_REQUEST_LIST.
-- `FileAttempts`, `BurstAttempts`, `BlockRetries`: MAVFTP. `OpenRetries`: the parameter file.
-- `Schedule`, `ClockSchedule`: requests at fixed times, where no round trip is measured.
+- All requests: `Attempts`, the rule that the others refine. A request is repeated after the measured timeout,
+  and given up after 5 to 60 attempts, by the packet loss (`RetryPolicy.tries`), or after 5 attempts if
+  nothing was received for 20 s.
+- PARAM_SET: `WriteAttempts`. PARAM_EXT_SET: `ExtWriteAttempts`.
+- COMMAND_LONG: `CommandAttempts`. MAV_CMD_REQUEST_MESSAGE: `MessageAttempts`, `VersionAttempts`.
+- PARAM_REQUEST_READ, PARAM_EXT_REQUEST_READ: `ReadAttempts`, `ReadRetries`. The search for names:
+  `NameRetries`.
+- PARAM_REQUEST_LIST: `ListAttempts`. PARAM_EXT_REQUEST_LIST: `ExtListAttempts`.
+- MAVFTP: `FileAttempts`. The blocks of a file: `BurstAttempts`, `BlockRetries`. The parameter file:
+  `OpenRetries`.
+- Requests at fixed times, where no round trip is measured: `Schedule`. SYSTEM_TIME: `ClockSchedule`.
 
 To change a retry rule, change this module. The senders of the requests ask it and have no rules of their own.
 """
@@ -961,6 +966,8 @@ class ListAttempts(Attempts):
         return max(LIST_END_GAPS * longest, SILENCE_AT_PACE_MIN if is_near_end else STREAM_PAUSE_MAX)
 
 
+# PARAM_EXT_REQUEST_LIST
+
 EXT_UNHEARD_ATTEMPTS: Final = 6
 """Requests for the list to a component that has never sent an extended parameter: with half of the exchanges
 lost, all of them are lost once in 60 times."""
@@ -1298,7 +1305,7 @@ class BlockRetries:
         return min(math.ceil(math.log(COPY_RISK) / math.log(loss)) - 1, FILE_READ_COPIES_MAX)
 
 
-# whole downloads
+# the parameter file
 
 FILE_READS_MAX: Final = 2
 """Reads of a parameter file that turns out to be invalid or stale: it is generated for each reader, and a gap
@@ -1318,7 +1325,7 @@ FILE_IN_USE_RETRY: Final = 5.0
 ArduPilot ends a session 3 s after its last reply to any station, so frequent attempts would keep an unused
 session open."""
 FETCH_RESTARTS_MAX: Final = 8
-"""Restarts of the vehicle, or changes of its identity, after which a fetch is given up."""
+"""Times that a fetch starts over because the vehicle has rebooted or is another one; then it is given up."""
 
 
 class OpenRetries:

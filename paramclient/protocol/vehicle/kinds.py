@@ -9,6 +9,7 @@ from paramclient.protocol.wire import (
     MAV_AUTOPILOT_GENERIC,
     MAV_AUTOPILOT_INVALID,
     MAV_AUTOPILOT_PX4,
+    MAV_TYPE_GCS,
     MAV_TYPE_GENERIC,
     enum_word,
 )
@@ -16,7 +17,7 @@ from paramclient.protocol.wire import (
 __all__ = ["kind_in_words"]
 
 _AUTOPILOTS: Final = {MAV_AUTOPILOT_ARDUPILOTMEGA: "ArduPilot", MAV_AUTOPILOT_PX4: "PX4"}
-_VEHICLES: Final = {1: "plane", 10: "rover", 11: "boat"}
+_VEHICLES: Final = {1: "plane", MAV_TYPE_GCS: "ground station", 10: "rover", 11: "boat"}
 """Names of MAV_TYPE for users, where they differ from those of the enumeration."""
 
 

@@ -108,6 +108,8 @@ CAPABILITY_PARAM_ENCODE_C_CAST: Final = 131072
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
+    """HEARTBEAT: the kind and the state of a component, with the numbers of MAVLink's enumerations."""
+
     type: int
     autopilot: int
     base_mode: int = 0

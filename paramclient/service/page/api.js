@@ -6,7 +6,10 @@ const BASE = "/api/v1";
 const REQUEST_TIMEOUT = 15_000;
 const PULSE = 10_000;
 const LONGEST_PAUSE = 10_000;
-const KINDS = ["hello", "component", "change", "params", "resynced", "progress", "job", "link", "gap"];
+const KINDS = [
+  ...["hello", "component", "change", "params", "resynced", "progress", "job", "link", "gap"],
+  ...["extended_change", "extended_params", "extended_progress"],
+];
 
 /** An error of the service, with its text; `status` is 0 if the service cannot be reached. */
 export class Problem extends Error {

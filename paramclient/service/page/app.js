@@ -6,6 +6,7 @@ import { Details } from "./details.js";
 import { showKeys } from "./dialogs.js";
 import { announce, button, byId, el, isNarrow, onceAFrame, setText } from "./dom.js";
 import { CellEditor } from "./editor.js";
+import { hasExtended } from "./extended.js";
 import { Grid } from "./grid.js";
 import { nameOf, review, told, undo } from "./review.js";
 import { NEWS_FOR, OTHERS, store } from "./store.js";
@@ -186,7 +187,9 @@ function emptyText(count, total, component, table) {
     return component.fetch
       ? "Loading the parameters."
       : table.isLoaded
-        ? `No parameters are known${component.is_kept ? "." : " yet. Fetch requests them from the vehicle."}`
+        ? `No parameters are known${component.is_kept ? "." : " yet. Fetch requests them from the vehicle."}${
+            hasExtended(component) ? " Extended shows the extended ones." : ""
+          }`
         : "Loading …";
   if (shown.filter === "changed" && !shown.words.length)
     return table.sorted.some((row) => row.isChanged !== null)

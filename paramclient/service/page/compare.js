@@ -10,6 +10,8 @@ import { many, moment, numberText } from "./values.js";
 
 /** Maximum size of a parameter file in bytes, which is also the limit of the service. */
 const LARGEST_FILE = 2 * 2 ** 20;
+/** Maximum size of a file of changed names in bytes, which is also the limit of the service. */
+const LARGEST_RENAMES = 2 ** 20;
 const PLAN_TIMEOUT = 120_000;
 const JOB_PAUSE = 300;
 
@@ -204,6 +206,14 @@ export async function takeOver() {
     ),
     body,
   );
+  const renamesInput = el("input", { type: "file", id: "renames", accept: ".yaml,.yml,.json", on: { change: replan } });
+  const renamesLabel = el(
+    "label",
+    { class: "drop", for: "renames" },
+    el("span", { text: "Changed names: a YAML file with old and new names." }),
+    renamesInput,
+  );
+  let renames = null;
   let lines = [];
   let job = null;
   let hasBegun = false;
@@ -224,13 +234,14 @@ export async function takeOver() {
     if (hasBegun || armed.forbids) return;
     hasBegun = true;
     for (const line of lines) line.box.disabled = true;
-    all.disabled = apply.disabled = true;
+    all.disabled = apply.disabled = renamesInput.disabled = true;
     cancel.replaceChildren(el("span", { text: "Stop" }));
     summary.textContent = "Applying …";
     const include = chosen.filter((line) => line.status !== "set").map((line) => exactly(line.name));
     try {
       job = await request("POST", at(component, "/apply"), {
         wanted: other.source,
+        renames,
         only: chosen.map((line) => exactly(line.name)),
         include,
         allow_armed: armed.isArmed,
@@ -263,23 +274,56 @@ export async function takeOver() {
         el("b", { class: `outcome ${word.kind}`, text: word.text }),
         ` ${made}${row.reason ?? ""}`,
       );
-      const known = table.rows.get(line.name)?.document;
+      const known = table.rows.get(line.here)?.document;
       const isTaken = ["set", "adjusted", "unproven"].includes(row.status);
       outcomes.push({
-        name: line.name,
+        name: line.here,
         status: row.status,
         isTaken,
         before: line.before,
         restore: line.restore ?? known?.value,
       });
     }
-    table.sent = { names: new Set(chosen.map((line) => line.name)), outcomes, at: Date.now() };
+    table.sent = { names: new Set(chosen.map((line) => line.here)), outcomes, at: Date.now() };
     const late = result.reboot_required ?? [];
     summary.textContent = `${told(outcomes)}${late.length ? ` Takes effect after a reboot of the vehicle: ${late.join(", ")}.` : ""}`;
     fault.textContent = result.error ?? ended.problem?.detail ?? "";
     announce(summary.textContent);
     store.tell("pending");
     store.tell("table");
+  }
+
+  async function replan() {
+    const file = renamesInput.files[0];
+    fault.textContent = "";
+    renames = null;
+    if (file && file.size > LARGEST_RENAMES)
+      fault.textContent = `${file.name} has ${file.size} bytes; that is no file of names.`;
+    else if (file) renames = { name: file.name, text: await file.text() };
+    await makePlan();
+  }
+
+  async function makePlan() {
+    lines = [];
+    body.replaceChildren();
+    summary.textContent = "Planning the changes …";
+    refresh();
+    const asked = { wanted: other.source, renames };
+    try {
+      const plan = await request("POST", at(component, "/plan"), asked, { timeout: PLAN_TIMEOUT });
+      if (asked.renames !== renames) return; // another file was chosen meanwhile
+      lines = linesOf(plan, table, other, refresh);
+      body.replaceChildren(...lines.map((line) => line.element));
+      const count = lines.filter((line) => line.status === "set").length;
+      const left = lines.length - count;
+      summary.textContent = count
+        ? `${many(count, "value")} would be set${left ? `; ${left} would be left out unless you choose them` : ""}.`
+        : "No value would be written.";
+      refresh();
+    } catch (error) {
+      summary.textContent = "";
+      fault.textContent = error.message;
+    }
   }
 
   function stop() {
@@ -292,24 +336,11 @@ export async function takeOver() {
   });
   const opened = openDialog(
     `Take over from ${other.label}`,
-    el("div", {}, armed.element, fault, summary, table_),
+    el("div", {}, armed.element, fault, summary, table_, renamesLabel),
     buttons,
     { isHeld: () => hasBegun && !isOver, kind: "wide", focus: cancel },
   );
-  try {
-    const plan = await request("POST", at(component, "/plan"), { wanted: other.source }, { timeout: PLAN_TIMEOUT });
-    lines = linesOf(plan, table, other, refresh);
-    body.replaceChildren(...lines.map((line) => line.element));
-    const count = lines.filter((line) => line.status === "set").length;
-    const left = lines.length - count;
-    summary.textContent = count
-      ? `${many(count, "value")} would be set${left ? `; ${left} would be left out unless you choose them` : ""}.`
-      : "No value would be written.";
-    refresh();
-  } catch (error) {
-    summary.textContent = "";
-    fault.textContent = error.message;
-  }
+  await makePlan();
   await opened;
 }
 
@@ -329,10 +360,13 @@ function linesOf(plan, table, other, refresh) {
     .map((name) => ({ name, planned: plan.params[name] }))
     .filter(
       ({ name, planned }) =>
-        planned && planned.status !== "unchanged" && (table.rows.has(name) || planned.category === "missing"),
+        planned &&
+        planned.status !== "unchanged" &&
+        (table.rows.has(planned.vehicle_name ?? name) || planned.category === "missing"),
     )
     .map(({ name, planned }) => {
-      const row = table.rows.get(name);
+      const here = planned.vehicle_name ?? name;
+      const row = table.rows.get(here);
       const { status } = planned;
       const isDoubtful = status === "invalid" && planned.category === "out-of-range";
       const isOut = !row || planned.category === "missing" || (status === "invalid" && !isDoubtful);
@@ -355,14 +389,14 @@ function linesOf(plan, table, other, refresh) {
         "tr",
         { class: isOut ? "out" : "" },
         el("td", { class: "pick" }, box),
-        el("th", { scope: "row", text: name }),
+        el("th", { scope: "row", text: here === name ? name : `${name} (here ${here})` }),
         now,
         el("td", { class: "new", text: numberText(planned.wanted, row?.type ?? planned.type) }),
         remark,
       );
-      const line = { name, status, box, remark, element };
+      const line = { name, here, status, box, remark, element };
       line.follow = () => {
-        const { text, document } = table.rows.get(name) ?? {};
+        const { text, document } = table.rows.get(here) ?? {};
         line.before = text ?? "";
         line.restore = document?.bits ? { bits: document.bits } : document?.value;
         setText(now, line.before);

@@ -213,6 +213,7 @@ class Store {
     for (const event of early) this.take(event);
     if (!this.component) this.selected = first(this.components);
     this.tell("all");
+    this.tell("extended", null);
     await Promise.all([this.selected && this.loadTable(this.selected), this.loadKept()]);
   }
 
@@ -293,7 +294,7 @@ class Store {
       const component = this.components.get(key);
       if (component) component.fetch = event.done ? null : event;
       this.tell("components");
-    }
+    } else if (event.type.startsWith("extended_")) this.tell("extended", event);
   }
 
   takeComponent(key, event) {

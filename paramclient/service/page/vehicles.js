@@ -4,6 +4,7 @@ import { at, download, get, request } from "./api.js";
 import { announce, button, byId, el, setText } from "./dom.js";
 import { chooseOther } from "./compare.js";
 import { closeDialog, openDialog } from "./dialogs.js";
+import { offerExtended, showExtended } from "./extended.js";
 import { nameOf } from "./review.js";
 import { keyOf, store } from "./store.js";
 import { many, moment, span } from "./values.js";
@@ -147,6 +148,7 @@ function drawVehicle(component) {
   const parts = [TYPES[type], versionOf(identity?.firmware), place, count && many(count, "parameter")];
   setText(byId("subtitle"), parts.filter(Boolean).join(" · "));
   drawFetch(component);
+  offerExtended();
 }
 
 /** Formats a version of AUTOPILOT_VERSION: three bytes, then its type. */
@@ -175,6 +177,12 @@ export function drawActions() {
       id: "describe",
       hidden: true,
     }),
+    button("Extended", () => showExtended().catch(complain), {
+      drawing: "extended",
+      label: "Extended parameters of the component: text and 64-bit numbers",
+      id: "extended",
+      hidden: true,
+    }),
     store.mayWrite &&
       button("Snapshot", keepState, { drawing: "keep", label: "Snapshot: record the current values for a later restore" }),
     isHeard && button("Fetch", fetchAll, { drawing: "refresh", label: "Fetch all parameters from the vehicle" }),
@@ -182,6 +190,7 @@ export function drawActions() {
   byId("actions").replaceChildren(...actions.filter(Boolean));
   byId("meter-cancel").replaceChildren(button("Stop", stopFetch, { kind: "quiet" }));
   setText(byId("role"), store.mayWrite ? "" : "read-only");
+  offerExtended();
 }
 
 async function fetchAll() {

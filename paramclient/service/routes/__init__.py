@@ -1,7 +1,7 @@
 """The routes of the API.
 
-- `components`, `params`, `fetches`, `param_files`, `metadata`: components, parameters, fetches and jobs,
-  parameter files, metadata.
+- `components`, `params`, `extended`, `fetches`, `param_files`, `metadata`: components, parameters, extended
+  parameters, fetches and jobs, parameter files, metadata.
 - `history`, `apply`, `events`, `system`: earlier states, set-ups, the event stream, the service itself.
 """
 
@@ -15,6 +15,7 @@ from paramclient.service.routes import (
     apply,
     components,
     events,
+    extended,
     fetches,
     history,
     metadata,
@@ -29,6 +30,7 @@ ROUTERS: Final[tuple[APIRouter, ...]] = (
     system.router,
     components.router,
     params.router,
+    extended.router,
     metadata.router,
     fetches.router,
     apply.router,

@@ -28,9 +28,11 @@ from paramclient.service.param_sources import (
     Number,
     Patterns,
     Timestamp,
+    UploadedRenames,
     WantedParams,
     current_set,
     load_state,
+    read_renames,
     resolve_source,
 )
 from paramclient.service.problems import ServiceError
@@ -58,10 +60,14 @@ Result = TypeVar("Result")
 
 
 class DiffRequest(Body):
-    """Parameters to compare with those of a component; `known` compares without requests to the vehicle."""
+    """Parameters to compare with those of a component; `known` compares without requests to the vehicle.
+
+    With `renames`, a parameter that only one side has is compared with the parameter of its other name.
+    """
 
     wanted: WantedParams
     base: WantedParams | None = None
+    renames: UploadedRenames | None = None
     only: Patterns = ()
     partial: bool = False
     full: bool = False
@@ -70,10 +76,14 @@ class DiffRequest(Body):
 
 
 class PlanRequest(Body):
-    """Wanted parameters: those of `wanted`, overlaid by `over`, limited to `only`."""
+    """Wanted parameters: those of `wanted`, overlaid by `over`, limited to `only`.
+
+    With `renames`, a parameter that the vehicle has under another name gets the value under that name.
+    """
 
     wanted: WantedParams
     over: WantedParams | None = None
+    renames: UploadedRenames | None = None
     only: Patterns = ()
     include: Patterns = ()
     force: bool = False
@@ -165,6 +175,7 @@ async def apply_(
             allow_armed=body.allow_armed,
             skip_invalid=body.skip_invalid,
             force=body.force,
+            renames=await read_renames(hub, body.renames),
             durable=body.durable,
             timeout=body.timeout_s,
             asker=asker,
@@ -216,21 +227,24 @@ async def _diff(hub: Hub, target: FollowedComponent, body: DiffRequest) -> Respo
     if body.base is not None and not body.base.defaults:
         base = await resolve_source(hub, target, body.base)
     right = await _present(hub, target, body)
+    renames = await read_renames(hub, body.renames)
+    known, whole = left, right
+    if renames is not None:
+        known = await hub.run_in_file_thread(lambda: renames.apply_to(left, whole))
     if body.base is not None and body.base.defaults:
-        base = await hub.run_in_file_thread(lambda: defaults_of(left, right))
+        base = await hub.run_in_file_thread(lambda: defaults_of(known, whole))
         if not base:
             raise UsageError(NO_DEFAULTS)
     if body.partial:
-        whole = right
         right = await hub.run_in_file_thread(
-            lambda: replace(whole, params={name: each for name, each in whole.items() if name in left})
+            lambda: replace(whole, params={name: each for name, each in whole.items() if name in known})
         )
     sets = [left, right] if base is None else [left, right, base]
     found = [*await _described(hub, target, sets), None][:3]
 
     def encode() -> bytes:
         """Compare, and encode row by row: a full garbage collection of all rows would block every thread."""
-        outcome = compare(left, right, base=base, names=body.only or None)
+        outcome = compare(left, right, base=base, names=body.only or None, renames=renames)
         rows = DiffDoc.rows(outcome, *found, everything=body.full)
         return encode_document(DiffDoc.without_params(outcome), params=rows)
 
@@ -290,11 +304,17 @@ async def _planned(
 
 async def _plan(hub: Hub, target: FollowedComponent, body: PlanRequest) -> Plan:
     wanted = await _wanted(hub, target, body)
+    renames = await read_renames(hub, body.renames)
 
     async def work() -> Plan:
-        include, info = body.include, target.metadata
         return await prepare(
-            target.component, wanted, include=include, info=info, force=body.force, run=hub.run_in_file_thread
+            target.component,
+            wanted,
+            include=body.include,
+            info=target.metadata,
+            force=body.force,
+            renames=renames,
+            run=hub.run_in_file_thread,
         )
 
     return await _within(target, body.timeout_s, work)

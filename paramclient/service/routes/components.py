@@ -76,7 +76,7 @@ async def all_components(hub: HubArgument) -> Response:
         documents.append(followed.document)
         await anyio.lowlevel.checkpoint()
     found = ComponentsDoc(run=place.run, seq=place.seq, components=documents)
-    return await document_response(hub.run_in_thread, lambda: found)
+    return await document_response(hub.encode_in_thread, lambda: found)
 
 
 @router.get("/components/{system}/{component}")

@@ -15,7 +15,7 @@ from paramclient.documents.results import FetchedAllDoc, FetchResultDoc, SilentD
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.protocol.params.sampling import SAMPLE_SIZE
 from paramclient.service.hub import Hub
-from paramclient.service.jobs import Job
+from paramclient.service.jobs import FETCHES, Job
 from paramclient.service.problems import problem_of
 from paramclient.service.request_body import BodyRoute, long_request
 from paramclient.service.responses import JSON, document_response, encode_document
@@ -80,13 +80,14 @@ async def fetch(
     return result
 
 
-@router.post("/fetch")
+@router.post("/fetch", response_model=FetchedAllDoc)
 async def fetch_all(
     request: Request, hub: HubArgument, body: FetchAllRequest, link: LinkName = None
-) -> FetchedAllDoc:
+) -> Response:
     """Fetch the tables of all components, on all links in parallel."""
     with long_request(request):
-        return await run_until_disconnect(request, lambda: _fetch_all(hub, body, link), *hub.followed)
+        fetched = await run_until_disconnect(request, lambda: _fetch_all(hub, body, link), *hub.followed)
+        return await document_response(hub.encode_in_thread, lambda: fetched)
 
 
 @router.get("/jobs", response_model=JobsDoc)
@@ -110,7 +111,7 @@ async def one_job(hub: HubArgument, job: str) -> Response:
 async def cancel(request: Request, hub: HubArgument, job: str) -> Response:
     """Cancel a job. A download continues while another client waits for it."""
     found = hub.jobs.find(job)
-    if found.kind != "fetch":
+    if found.kind not in FETCHES:
         await require_write(request)
     found.cancel()
     return Response(status_code=204)

@@ -3,6 +3,7 @@ cache."""
 
 from __future__ import annotations
 
+import glob
 import math
 from collections.abc import Sequence
 from functools import partial
@@ -11,14 +12,16 @@ from typing import Annotated, Any, Final
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from pydantic import Field, model_validator
 
-from paramclient.cache import HISTORY_ENTRIES_MAX, CutOff, HistoryEntry
+from paramclient.cache import HISTORY_ENTRIES_MAX, CutOff, FleetDiff, HistoryEntry
 from paramclient.documents.cached import CachedTableDoc, VehicleDoc, VehiclesDoc
 from paramclient.documents.document import Body, InParts
+from paramclient.documents.extended_output import ExtHistoryDoc
 from paramclient.documents.fleet import FleetDiffDoc, NameSpreadDoc
 from paramclient.documents.history import HistoryDoc, SnapshotDoc, SnapshotsDoc, WholeSnapshotDoc
 from paramclient.documents.paramset import SetDoc
 from paramclient.errors import UsageError
 from paramclient.files import FileForm
+from paramclient.files.param_file import AUTOPILOT
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import check_name
 from paramclient.service.followed_component import FollowedComponent
@@ -38,7 +41,7 @@ from paramclient.service.param_sources import (
 )
 from paramclient.service.problems import ServiceError
 from paramclient.service.request_body import BodyRoute, long_request
-from paramclient.service.responses import JSON, document_response, encode_document
+from paramclient.service.responses import document_response, pack_entries, packed_response
 from paramclient.service.route_context import HubArgument, Target, require_write, run_until_disconnect
 from paramclient.service.routes.param_files import Form, From, file_response, parse_state
 
@@ -52,8 +55,11 @@ HISTORY_PAGE_LINES: Final = 100
 """Default number of lines of history in a response."""
 FLEET_NAMES_MAX: Final = 1_000
 """Maximum number of names and patterns of a fleet comparison."""
-FLEET_CELLS_MAX: Final = 250_000
-"""Maximum of names times vehicles of a fleet comparison: its response has up to 30 MB."""
+FLEET_CELLS_MAX: Final = 160_000
+"""Maximum of names times vehicles of a fleet comparison: its response has up to 31 MB, and our client reads
+32 MiB."""
+FLEET_CELLS_OF_PART: Final = 10_000
+"""Names times vehicles that are compared at once: they take 10 MB."""
 
 Key = Annotated[str, Path(max_length=400, description="Key of the vehicle in /vehicles, percent-encoded.")]
 Id = Annotated[int, Path(ge=1, le=255)]
@@ -116,6 +122,26 @@ async def history(
 ) -> Response:
     """Return the changes of values of a component, the newest last."""
     return await run_until_disconnect(request, lambda: _history(hub, target, name, limit, since, before))
+
+
+@router.get("/components/{system}/{component}/extended/history", response_model=ExtHistoryDoc)
+async def extended_history(
+    request: Request,
+    hub: HubArgument,
+    target: Target,
+    name: Name = None,
+    limit: Limit = HISTORY_PAGE_LINES,
+    since: Since = None,
+) -> Response:
+    """Return the newest changes of extended parameters of a component, the newest last."""
+
+    async def work() -> Response:
+        cache, component = require_cache(hub), target.component.component
+        key = await wait_for_key(hub, target)
+        lines = await read_cache(hub, lambda: cache.ext_history(key, component, name, limit, since))
+        return await document_response(hub.run_in_thread, partial(ExtHistoryDoc.of, lines))
+
+    return await run_until_disconnect(request, work)
 
 
 @router.get("/components/{system}/{component}/snapshots")
@@ -237,37 +263,50 @@ async def kept_file(
 async def fleet_diff(request: Request, hub: HubArgument, body: FleetDiffRequest) -> Response:
     """Compare all vehicles in the cache with each other, or with wanted values."""
     with long_request(request):
-        return await _fleet_diff(hub, body)
+        return await run_until_disconnect(request, lambda: _fleet_diff(hub, body))
 
 
 async def _fleet_diff(hub: Hub, body: FleetDiffRequest) -> Response:
     cache = require_cache(hub)
-    wanted: ParamSet | tuple[str, ...]
+    wanted: dict[str, WrittenParam] | None = None
+    number = body.component or AUTOPILOT
     if body.file is not None:
-        wanted = (await read_file(hub, body.file.read)).choose(body.component)
+        chosen = (await read_file(hub, body.file.read)).choose(body.component)
+        number = body.component or chosen.component or AUTOPILOT
+        wanted = dict(chosen)
     elif body.values is not None:
-        wanted = ParamSet(
-            {name: WrittenParam(check_name(name), value) for name, value in body.values.items()}
-        )
-    else:
-        wanted = tuple(map(check_name, body.names or ()))
-        if not wanted:
-            raise UsageError("give the names of the parameters to compare")
+        wanted = {name: WrittenParam(check_name(name), value) for name, value in body.values.items()}
+    asked = tuple(wanted if wanted is not None else map(check_name, body.names or ()))
+    if not asked:
+        raise UsageError("give the names of the parameters to compare")
     await flush_cache(hub)
     await hub.run_in_thread(cache.components)  # raises an error for an unreadable cache
-    found = await read_cache(hub, lambda: cache.fleet_diff(wanted, component=body.component))
-    cells = len(found.names) * len(found.vehicles)
-    if cells > FLEET_CELLS_MAX:
-        few = FLEET_CELLS_MAX // len(found.vehicles)
-        what = f"At most {few} names can be compared among {len(found.vehicles)} vehicles."
+    patterns = asked if wanted is None else ()
+    vehicles, names = await read_cache(hub, lambda: cache.fleet_names(patterns, component=number))
+    names = names if wanted is None else list(wanted)
+    if vehicles * len(names) > FLEET_CELLS_MAX:
+        few = FLEET_CELLS_MAX // vehicles
+        what = f"At most {few} names can be compared among {vehicles} vehicles."
         raise ServiceError(413, "too-large", what, most=FLEET_CELLS_MAX)
-    spreads = (NameSpreadDoc.of(each) for each in found.names)
-    head = FleetDiffDoc(
-        component=found.component, vehicles=len(found.vehicles), different=found.differs, names=[]
-    )
-    return Response(
-        await hub.run_in_file_thread(lambda: encode_document(head, names=spreads)), media_type=JSON
-    )
+
+    def compare(some: list[str]) -> FleetDiff:
+        if wanted is None:
+            return cache.fleet_diff(map(glob.escape, some), component=number)
+        return cache.fleet_diff(ParamSet({name: wanted[name] for name in some}), component=number)
+
+    is_different, parts = False, []
+    size = max(1, FLEET_CELLS_OF_PART // vehicles)
+    for start in range(0, len(names), size):
+        async with hub.fleet_comparisons:  # other accesses to the cache wait for one part at most
+            found = await read_cache(hub, partial(compare, names[start : start + size]))
+        is_different = is_different or found.differs
+        parts.append(await hub.run_in_file_thread(partial(_pack, found)))
+    head = FleetDiffDoc(component=number, vehicles=vehicles, different=is_different, names=[])
+    return packed_response(head, parts)
+
+
+def _pack(found: FleetDiff) -> bytes:
+    return pack_entries(map(NameSpreadDoc.of, found.names))
 
 
 async def _key(hub: Hub, target: FollowedComponent) -> str:

@@ -62,9 +62,10 @@ async def known_infos(
 @router.post("/metadata")
 async def described(request: Request, target: Target, body: DescribeRequest) -> DescribedDoc:
     """Fetch the descriptions from the component. They are cached for its firmware."""
-    metadata = await run_until_disconnect(
-        request, lambda: metadata_of(target.component, timeout=body.timeout_s), target
-    )
+    with long_request(request):
+        metadata = await run_until_disconnect(
+            request, lambda: metadata_of(target.component, timeout=body.timeout_s), target
+        )
     if metadata is None:
         raise ServiceError(404, "not-described", "The component provides no metadata of its parameters.")
     return _take(target, metadata)

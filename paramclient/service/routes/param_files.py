@@ -140,7 +140,7 @@ async def file_response(hub: Hub, params: ParamSet, form: FileForm) -> Response:
     """
     name = f"{_stem(params)}{_ending(form)}"
     data = await hub.run_in_thread(lambda: dumps(params, form=form, target=name))
-    headers = {"content-disposition": f'file_response; filename="{name}"'}
+    headers = {"content-disposition": f'attachment; filename="{name}"'}
     return Response(data, media_type="application/octet-stream", headers=headers)
 
 

@@ -22,7 +22,7 @@ from paramclient.errors import ParamClientError, UnknownParameter, UsageError
 from paramclient.model.params import copy_params
 from paramclient.model.patterns import NameChoice
 from paramclient.model.similar_names import did_you_mean, nearest_names
-from paramclient.model.values import Param, Value
+from paramclient.model.values import Param, WireValue
 from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome, SetStatus
 from paramclient.service.followed_component import FollowedComponent
 from paramclient.service.param_sources import PATTERNS_MAX, REQUEST_VALUES_MAX, Pattern
@@ -43,7 +43,7 @@ from paramclient.service.route_context import (
 if TYPE_CHECKING:
     from paramclient.metadata import Metadata, ParamInfo
 
-__all__ = ["router"]
+__all__ = ["PARAMS_PER_TURN", "Durable", "Name", "ReadByPathRequest", "ReadRequest", "read_key", "router"]
 
 router = APIRouter(
     prefix="/api/v1/components/{system}/{component}", tags=["parameters"], route_class=BodyRoute
@@ -159,9 +159,7 @@ async def read(request: Request, target: Target, body: ReadRequest) -> Response:
 @router.post("/params/{name:path}/read", responses={200: {"model": ParamDoc}}, response_class=Response)
 async def read_by_path(request: Request, target: Target, name: str, body: ReadByPathRequest) -> Response:
     """Read one parameter whose name is in the path; `#17` is an index."""
-    digits = name[1:] if name.startswith("#") else ""
-    key = int(digits) if digits.isascii() and digits.isdecimal() and len(digits) <= 5 else name
-    return await _read(request, target, key, body.timeout_s)
+    return await _read(request, target, read_key(name), body.timeout_s)
 
 
 @router.put("/params/{name:path}", dependencies=[Depends(require_write)])
@@ -180,7 +178,7 @@ async def write_many(request: Request, target: Target, body: WriteManyRequest) -
     """
     asker = author_of(request)
     results: dict[str, SetResultDoc | NotSetDoc] = {}
-    resolved: dict[str, Value] = {}
+    resolved: dict[str, WireValue] = {}
 
     async def resolve(name: str) -> None:
         try:
@@ -210,6 +208,12 @@ async def write_many(request: Request, target: Target, body: WriteManyRequest) -
             target.record_received(outcome.result.param.name)
     problem = None if done.error is None else problem_of(done.error)
     return SetManyDoc(results={name: results[name] for name in body.values}, problem=problem)
+
+
+def read_key(name: str) -> str | int:
+    """Return the name or index that a path names: `#17` is an index."""
+    digits = name[1:] if name.startswith("#") else ""
+    return int(digits) if digits.isascii() and digits.isdecimal() and len(digits) <= 5 else name
 
 
 async def _read(

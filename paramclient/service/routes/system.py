@@ -27,7 +27,7 @@ async def health(request: Request, hub: HubArgument) -> HealthDoc:
 @router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
 async def metrics(hub: HubArgument) -> Response:
     """Return the metrics for Prometheus in text format 0.0.4."""
-    return Response(metrics_text(hub), media_type=METRICS_MEDIA_TYPE)
+    return Response(await metrics_text(hub), media_type=METRICS_MEDIA_TYPE)
 
 
 @router.get("/api/v1/me")

@@ -180,7 +180,9 @@ class TestTheFormat:
             ([PackedParam("A", ParamType.INT8, 0, 256)], "more bits"),
         ],
     )
-    def test_what_cannot_stand_in_a_file(self, rows: list[PackedParam], words: str) -> None:
+    def test_entries_that_do_not_fit_the_format_are_refused(
+        self, rows: list[PackedParam], words: str
+    ) -> None:
         with pytest.raises(UsageError, match=words):
             encode(rows, with_defaults=True)
 

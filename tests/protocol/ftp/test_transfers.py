@@ -11,7 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from paramclient.errors import FileErrorCode, FileTransferError, LinkError, NoReply, UsageError
-from paramclient.model.values import ParamType, crc32_px4
+from paramclient.model.px4_hash import crc32_px4
+from paramclient.model.values import ParamType
 from paramclient.protocol import wire
 from paramclient.protocol.ftp import DirectoryEntry, FileRead, FileTransfers, FileWrite, param_pck
 from paramclient.protocol.ftp.file_read import WINDOW_MIN

@@ -184,7 +184,9 @@ class TestAnotherStation:
         check(world, vehicle, world.fetch(limit=10.0))
 
     @BOTH_AUTOPILOTS
-    def test_it_sets_values_meanwhile(self, kind: Make, loss: float) -> None:
+    def test_a_fetch_has_the_values_that_another_station_sets_meanwhile(
+        self, kind: Make, loss: float
+    ) -> None:
         vehicle = kind()
         names = [param.name for param in vehicle.listed if param.type == ParamType.REAL32][::60]
         sets = [

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 import pytest
 
 from paramclient.errors import LinkError, NoReply
-from paramclient.model.values import ParamType, Trust, Value
+from paramclient.model.values import TYPES_BY_NAME, ParamType, Trust, WireValue
 from paramclient.protocol import wire
 from paramclient.protocol.events import Fetched, ParamChanged
 from paramclient.protocol.params.change import Change
@@ -61,7 +61,7 @@ def names_read(world: Simulation) -> list[str]:
     return [read.param_id or str(read.param_index) for read in world.sent_of(ParamRequestRead)]
 
 
-def values_of(result: FetchResult) -> dict[str, Value]:
+def values_of(result: FetchResult) -> dict[str, WireValue]:
     return {name: param.value for name, param in result.params.items() if param.index is not None}
 
 
@@ -100,15 +100,15 @@ def test_a_first_fetch_from_ardupilot_asks_for_no_hash() -> None:
 
 
 def test_a_first_fetch_of_something_generic() -> None:
-    kinds: dict[str, Value | tuple[ParamType | int, Value]] = {
-        kind.name: (kind, b"\x01\x02\x03\x04" if kind.size > 4 else 1) for kind in ParamType
+    kinds: dict[str, WireValue | tuple[ParamType | int, WireValue]] = {
+        kind.name: (kind, b"\x01\x02\x03\x04" if kind.size > 4 else 1) for kind in TYPES_BY_NAME.values()
     }
     vehicle = GenericVehicle(kinds)
     result = Simulation(vehicle).fetch()
     assert result.hash is None
     assert list(result.params) == list(vehicle.params)
     for name, param in vehicle.params.items():
-        if param.type.size <= 4:  # type: ignore[union-attr]  # all types here are defined
+        if param.type.size <= 4:
             assert result.params[name].value == param.value
 
 

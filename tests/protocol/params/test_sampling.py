@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 from hypothesis import given
@@ -223,7 +223,7 @@ def test_the_confidence_of_the_default_sample() -> None:
 
 
 async def session_with(
-    endpoint: Endpoint, path: Path, *, accept: str = "verified", **options: Any
+    endpoint: Endpoint, path: Path, *, accept: Literal["verified", "sampled"] = "verified", **options: Any
 ) -> tuple[FetchResult, Component]:
     async with ParamClient(endpoint, cache=path) as client:
         component = await client.component()
@@ -279,6 +279,6 @@ async def test_invalid_sampling_options_are_refused() -> None:
     async with ParamClient(ArduPilotVehicle(), cache=False) as client:
         component = await client.component()
         with pytest.raises(UsageError, match="accept"):
-            await component.fetch_all(accept="perhaps")
+            await component.fetch_all(accept="perhaps")  # type: ignore[arg-type]
         with pytest.raises(UsageError, match="at least 1"):
             await component.fetch_all(accept="sampled", sample=0)

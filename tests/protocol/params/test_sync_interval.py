@@ -13,7 +13,7 @@ from paramclient.model.values import ParamType
 from paramclient.protocol import wire
 from paramclient.protocol.ftp.packets import Opcode, Packet
 from paramclient.protocol.params.fetch import Check
-from paramclient.protocol.params.fetch_result import FetchResult
+from paramclient.protocol.params.fetch_result import FetchResult, FetchSource
 from paramclient.protocol.params.sync import (
     FOREIGN_CHECK_INTERVAL,
     FOREIGN_SETTLING_TIME,
@@ -229,7 +229,7 @@ def test_start_values_are_read_singly_while_another_station_has_a_file_open() ->
 # the pace
 
 
-def took(seconds: float, source: str = "ftp", missing: tuple[int, ...] = ()) -> FetchResult:
+def took(seconds: float, source: FetchSource = "ftp", missing: tuple[int, ...] = ()) -> FetchResult:
     return FetchResult(1, 1, {}, source, 1, 1, missing, None, seconds)
 
 

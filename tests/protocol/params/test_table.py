@@ -7,7 +7,8 @@ from dataclasses import replace
 import pytest
 
 from paramclient.cache import HeardParams, StoredParam, UnixTimes
-from paramclient.model.values import Encoding, Param, ParamType, Trust, as_sent, px4_hash
+from paramclient.model.px4_hash import hash_params
+from paramclient.model.values import Encoding, Param, ParamType, Trust, as_sent
 from paramclient.protocol.params import table as room
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.table import Table
@@ -76,7 +77,7 @@ def test_another_encoding_goes_by_the_type_that_came_last() -> None:
     table.store_value(ParamValue("X", raw, 77, 1, 0), "vehicle")
     table.use_encoding(Encoding.C_CAST)
     assert (table.params["A"].value, table.params["A"].type) == (5, ParamType.INT16)
-    assert (table.params["X"].value, table.params["X"].type) == (raw, 77)
+    assert (table.params["X"].settable, table.params["X"].type_number) == (raw, 77)
 
 
 def test_index_65535_keeps_the_one_that_is_known() -> None:
@@ -139,8 +140,9 @@ def test_other_evidence_of_the_encoding_gives_other_values() -> None:
 def test_a_type_that_mavlink_does_not_define_is_kept() -> None:
     table = Table()
     table.store_value(ParamValue("X", b"\x01\x02\x03\x04", 77, 5, 1), "vehicle")
-    assert table.params["X"].type == 77
-    assert table.params["X"].value == b"\x01\x02\x03\x04"
+    param = table.params["X"]
+    assert (param.type, param.type_number) == (ParamType.UNKNOWN, 77)
+    assert (param.value, param.is_raw, param.settable) == (0x04030201, True, b"\x01\x02\x03\x04")
 
 
 # what the cache knows
@@ -208,7 +210,7 @@ def hashed(*, proven: bool) -> Table:
     table = Table()
     for index, name in enumerate("ABV"):
         table.store_value(param_value(name, 1.0, index=index), "vehicle")
-    table.confirm(px4_hash(listed(table), leave_out="V"), frozenset("V"), proven=proven)
+    table.confirm(hash_params(listed(table), leave_out="V"), frozenset("V"), proven=proven)
     return table
 
 
@@ -216,14 +218,14 @@ def test_a_hash_moves_with_the_values_once_it_is_known_what_it_covers() -> None:
     table = hashed(proven=True)
     before = table.hash
     table.store_value(param_value("A", 2.0, index=0), "us")
-    assert table.hash == px4_hash(listed(table), leave_out="V") != before
+    assert table.hash == hash_params(listed(table), leave_out="V") != before
     table.store_value(param_value("A", 1.0, index=0), "us")
     assert table.hash == before
 
 
 def test_a_hash_that_cannot_be_computed_ends_with_the_first_change() -> None:
     table = hashed(proven=False)
-    before = px4_hash(listed(table), leave_out="V")
+    before = hash_params(listed(table), leave_out="V")
     table.store_value(param_value("V", 2.0, index=2), "vehicle")
     assert table.hash == before
     table.store_value(param_value("A", 2.0, index=0), "us")
@@ -241,7 +243,7 @@ def test_a_volatile_value_does_not_change_the_hash() -> None:
 def test_a_parameter_that_goes_away_moves_it() -> None:
     table = hashed(proven=True)
     table.remove(lambda param: param.name == "A")
-    assert table.hash == px4_hash(listed(table), leave_out="V")
+    assert table.hash == hash_params(listed(table), leave_out="V")
 
 
 def test_without_confirmation_there_is_no_hash() -> None:

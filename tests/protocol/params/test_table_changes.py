@@ -6,7 +6,7 @@ import pytest
 
 from paramclient.model.values import ParamType
 from paramclient.protocol.events import ParamChanged
-from paramclient.protocol.params.change import Added, Change, Removed
+from paramclient.protocol.params.change import Added, Change, Changed, FirstValue, Removed
 from paramclient.protocol.params.sync import SyncSettings, SyncState
 from paramclient.protocol.params.sync_interval import PAUSE_MIN
 from paramclient.protocol.wire import FileTransfer, ParamRequestList
@@ -53,7 +53,7 @@ def test_a_group_that_is_switched_on_and_off_is_told_within_a_second(ftp: bool) 
     assert [(each.name, each.old, each.by) for each in changes(world, Added)] == [
         (name, None, "vehicle") for name in GROUP
     ]
-    assert [change.name for change in changes(world, Change)] == ["GRIP_ENABLE"]
+    assert [change.name for change in changes(world, Changed)] == ["GRIP_ENABLE"]
     table = world.machine.table
     assert {name: param.index for name, param in table.params.items()} == {
         name: param.index for name, param in board.params.items()
@@ -75,7 +75,7 @@ def test_a_group_that_is_switched_on_and_off_is_told_within_a_second(ftp: bool) 
 def test_the_first_values_of_a_table_are_not_added() -> None:
     world = World(vehicle())
     world.fetch()
-    assert len(changes(world, Change)) == len(TABLE)
+    assert len(changes(world, FirstValue)) == len(TABLE)
     assert changes(world, Added) == []
 
 
@@ -128,6 +128,6 @@ def test_a_kind_of_change_is_told_by_its_class() -> None:
     added = changes(world, Added)[0]
     assert repr(added).startswith("Added(name='GRIP_0'")
     assert Change.between(added.name, None, added.new, is_added=True) == added
-    assert type(Change.between(added.name, None, added.new)) is Change
-    assert type(Change.between(added.name, added.new, added.new, is_added=True)) is Change
+    assert type(Change.between(added.name, None, added.new)) is FirstValue
+    assert type(Change.between(added.name, added.new, added.new, is_added=True)) is Changed
     assert type(Change.between(added.name, added.new, None)) is Removed

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from paramclient.errors import NoReply, Refused, UnknownParameter, UsageError
-from paramclient.model.values import ParamType, Value, bits_of
+from paramclient.model.values import ParamType, WireValue, bits_of
 from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.ftp.packets import Opcode, Packet
@@ -23,8 +23,8 @@ from paramclient.protocol.station import Station
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, SimParam, Vehicle
 
 COUNT = 120
-VALUES: dict[str, Value] = {f"PARAM_{number:03}": float(number) for number in range(COUNT)}
-WANTED: dict[str, Value] = {name: float(number) + 0.5 for number, name in enumerate(VALUES)}
+VALUES: dict[str, WireValue] = {f"PARAM_{number:03}": float(number) for number in range(COUNT)}
+WANTED: dict[str, WireValue] = {name: float(number) + 0.5 for number, name in enumerate(VALUES)}
 OTHER = (254, 7)
 """Another station."""
 
@@ -90,10 +90,10 @@ class Ground:
         while self.now < end:
             self.step()
 
-    def begin(self, wanted: Mapping[str, Value], **options: Any) -> WriteBatch:
+    def begin(self, wanted: Mapping[str, WireValue], **options: Any) -> WriteBatch:
         return self.machine.write_many(list(wanted.items()), self.now, **options)
 
-    def write(self, wanted: Mapping[str, Value], **options: Any) -> WriteBatch:
+    def write(self, wanted: Mapping[str, WireValue], **options: Any) -> WriteBatch:
         batch = self.begin(wanted, **options)
         self.until(lambda: batch.done)
         self.machine.write_batches.end(batch, self.now)
@@ -104,7 +104,7 @@ class Ground:
     def requests(self, name: str) -> int:
         return self.vehicle.requests[name] - self.before[name]
 
-    def values(self, names: Mapping[str, Value] = WANTED) -> dict[str, Value]:
+    def values(self, names: Mapping[str, WireValue] = WANTED) -> dict[str, WireValue]:
         return {name: self.vehicle.param(name).value for name in names}
 
 
@@ -166,7 +166,7 @@ def test_every_outcome_is_that_of_a_param_set(param_error: bool) -> None:
         SimParam("COUNT_16", ParamType.INT16, 3),
         SimParam("BARO1_DEVID", ParamType.INT32, 5),
     ]
-    wanted: dict[str, Value] = {
+    wanted: dict[str, WireValue] = {
         **WANTED,
         "COUNT_16": 7.6,
         "BARO1_DEVID": 9,
@@ -279,7 +279,7 @@ def test_the_values_after_a_switch_are_written_after_it() -> None:
     table = [SimParam("GRP_ENABLE", ParamType.INT8, 0)]
     table += [SimParam(name, ParamType.REAL32, value) for name, value in VALUES.items()]
     ground = Ground(ArduPilotVehicle(table=table, groups={"GRP_ENABLE": group}))
-    wanted: dict[str, Value] = {**WANTED, "GRP_ENABLE": 1, **dict.fromkeys(group, 2.0)}
+    wanted: dict[str, WireValue] = {**WANTED, "GRP_ENABLE": 1, **dict.fromkeys(group, 2.0)}
     batch = ground.write(wanted)
     assert [outcome.name for outcome in batch.ended][COUNT] == "GRP_ENABLE"
     assert set(statuses(batch).values()) == {SetStatus.ACCEPTED}
@@ -324,7 +324,7 @@ def test_on_any_link_each_value_is_set_and_has_one_outcome(
     faults: dict[str, Any], numbers: list[int], param_error: bool
 ) -> None:
     ground = Ground(vehicle(param_error=param_error), **faults)
-    wanted: dict[str, Value] = {f"PARAM_{at:03}": float(number) for at, number in enumerate(numbers)}
+    wanted: dict[str, WireValue] = {f"PARAM_{at:03}": float(number) for at, number in enumerate(numbers)}
     batch = ground.write(wanted)
     assert set(statuses(batch).values()) == {SetStatus.ACCEPTED}
     assert ground.values() == VALUES | wanted

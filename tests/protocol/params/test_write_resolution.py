@@ -6,13 +6,13 @@ import math
 
 import pytest
 
-from paramclient.model.values import Param, ParamType, Value, bits_of
+from paramclient.model.values import Param, ParamType, WireValue, bits_of
 from paramclient.protocol.params.small_changes import CHANGE_MIN, note_on_small_change
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle
 from tests.simulation import Simulation
 
 
-def held(value: Value, kind: ParamType = ParamType.REAL32, default: float | None = None) -> Param:
+def held(value: WireValue, kind: ParamType = ParamType.REAL32, default: float | None = None) -> Param:
     return Param("A", value, kind, 0, bits_of(value, kind), default=default)
 
 

@@ -18,7 +18,7 @@ from paramclient.errors import (
     UsageError,
     ValueNotApplied,
 )
-from paramclient.model.values import Encoding, ParamType, Trust, Value, decode_value
+from paramclient.model.values import Encoding, ParamType, Trust, WireValue, decode_value
 from paramclient.protocol.params.reads import Reads
 from paramclient.protocol.params.table import Table
 from paramclient.protocol.params.writes import Write, Writes
@@ -47,10 +47,12 @@ class Desk:
         self.reads.is_idle = False
         self.writes = Writes(self.context, self.reads, self.table, permission=self)
 
-    def set(self, name: str, value: Value, asker: str | None = None) -> Write:
+    def set(self, name: str, value: WireValue, asker: str | None = None) -> Write:
         return self.writes.set(name, value, self.now, asker)
 
-    def hear(self, name: str, value: Value, kind: int = ParamType.REAL32, *, at: float | None = None) -> None:
+    def hear(
+        self, name: str, value: WireValue, kind: int = ParamType.REAL32, *, at: float | None = None
+    ) -> None:
         self.now = self.now if at is None else at
         self.take_in(param_value(name, value, kind=kind, encoding=self.table.encoding))
 
@@ -59,7 +61,7 @@ class Desk:
         self.writes.heard(message, self.now)
         self.reads.heard(message, self.now)
 
-    def knows(self, name: str, value: Value, kind: int = ParamType.REAL32) -> None:
+    def knows(self, name: str, value: WireValue, kind: int = ParamType.REAL32) -> None:
         """Let a value have been heard before."""
         self.hear(name, value, kind)
 
@@ -210,7 +212,7 @@ def test_nothing_is_sent_before_the_encoding_may_be_written() -> None:
         (ParamType.INT64, b"\x01\x02\x03\x04"),
     ],
 )
-def test_values_that_are_taken_as_they_are(kind: ParamType, value: Value) -> None:
+def test_values_that_are_taken_as_they_are(kind: ParamType, value: WireValue) -> None:
     desk = Desk()
     desk.take_in(ParamValue("A", bytes(4), kind, 10, 65535))
     write = desk.set("A", value)
@@ -222,6 +224,22 @@ def test_values_that_are_taken_as_they_are(kind: ParamType, value: Value) -> Non
     desk.take_in(ParamValue("A", message.raw, kind, 10, 65535))
     assert write.result is not None
     assert write.result.status == "accepted"
+
+
+def test_the_number_of_raw_bytes_is_not_written_as_a_number() -> None:
+    desk = Desk(Encoding.C_CAST)
+    infinite = struct.pack("<f", math.inf)
+    desk.take_in(ParamValue("A", infinite, ParamType.INT32, 10, 65535))
+    held = desk.table.params["A"]
+    assert (held.value, held.settable) == (0x7F800000, infinite)
+    write = desk.set("A", held.value)
+    assert isinstance(write.error, UsageError)
+    assert "number of the raw bytes" in str(write.error)
+    assert desk.sent == []
+    desk.set("A", held.settable)
+    [message] = desk.sent
+    assert isinstance(message, ParamSetMessage)
+    assert message.raw == infinite
 
 
 def test_minus_zero_will_do_for_zero_and_one_nan_not_for_another() -> None:
@@ -388,7 +406,7 @@ def test_the_write_before_it_is_not_taken_for_an_adjustment() -> None:
 # how it fails
 
 
-def silent(desk: Desk, write: Write, *, answering_reads: Value | None = None) -> Exception:
+def silent(desk: Desk, write: Write, *, answering_reads: WireValue | None = None) -> Exception:
     """Let a vehicle be silent on writes to A; it may answer reads of it."""
     for _ in range(1000):
         if write.done:
@@ -829,7 +847,7 @@ def test_a_watch_that_cannot_be_ended_says_that_the_value_was_acknowledged() -> 
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, struct.pack("<f", math.inf)])
-def test_what_the_vehicle_cannot_store_is_not_sent(value: Value) -> None:
+def test_nan_and_infinity_are_not_sent_unless_forced(value: WireValue) -> None:
     desk = Desk()
     desk.writes.against_non_finite = "it stops"
     write = desk.set("A", value)  # the type is not known yet

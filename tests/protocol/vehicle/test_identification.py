@@ -141,7 +141,9 @@ def test_when_the_encoding_is_certain() -> None:
     ("heartbeat", "has_parameters", "is_autopilot"),
     [(PX4, True, True), (Heartbeat(2, 0), True, True), (CAMERA, True, False), (GCS, False, False)],
 )
-def test_what_its_heartbeat_says(heartbeat: Heartbeat, has_parameters: bool, is_autopilot: bool) -> None:
+def test_the_heartbeat_tells_autopilot_and_type(
+    heartbeat: Heartbeat, has_parameters: bool, is_autopilot: bool
+) -> None:
     desk = Desk()
     desk.beat(heartbeat)
     assert desk.who.has_parameters is has_parameters

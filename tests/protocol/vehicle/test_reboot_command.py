@@ -128,7 +128,9 @@ class LateClock(Tap):
 @pytest.mark.parametrize("down", [0.0, 1.0, 3.0, 20.0])
 @pytest.mark.parametrize("ack", [True, False])
 @swiftly
-async def test_it_comes_back(make: Make, uptime: float, down: float, ack: bool) -> None:
+async def test_reboot_returns_when_the_vehicle_is_back(
+    make: Make, uptime: float, down: float, ack: bool
+) -> None:
     vehicle = make(reboot_down=down, reboot_ack=ack)
     starts = counted(vehicle)
     tap = Tap(vehicle)
@@ -306,7 +308,9 @@ async def test_an_armed_vehicle_refuses(make: Make, code: int) -> None:
 @pytest.mark.parametrize(("timeout", "patience"), [(None, REBOOT_TIMEOUT), (10.0, 10.0), (1.0, 1.0)])
 @pytest.mark.parametrize("ack", [True, False])
 @swiftly
-async def test_one_that_stays_away(ack: bool, timeout: float | None, patience: float) -> None:
+async def test_a_vehicle_that_does_not_return_is_no_reply(
+    ack: bool, timeout: float | None, patience: float
+) -> None:
     vehicle = generic(reboot_down=math.inf, reboot_ack=ack)
     async with a_client(vehicle) as client:
         component = await known(client)
@@ -332,7 +336,9 @@ async def test_one_that_stays_away(ack: bool, timeout: float | None, patience: f
     ids=["uid", "kind", "both"],
 )
 @swiftly
-async def test_another_vehicle_is_told(before: Make, after: Make, ack: bool) -> None:
+async def test_another_vehicle_after_the_reboot_raises_another_vehicle(
+    before: Make, after: Make, ack: bool
+) -> None:
     place = Exchanged(before(reboot_down=math.inf, reboot_ack=ack))
     async with a_client(place) as client:
         component = await known(client)

@@ -1,14 +1,17 @@
-"""Which parameters a PX4 vehicle leaves out of its hash."""
+"""PX4's hash, and which parameters a vehicle excludes from it."""
 
 from __future__ import annotations
 
+import random
 from collections.abc import Iterable
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from paramclient.model import hash_exclusions
-from paramclient.model.hash_exclusions import find_volatile
-from paramclient.model.values import Param, px4_hash
+from paramclient.model import px4_hash
+from paramclient.model.px4_hash import crc32_px4, find_volatile, hash_bits, hash_params
+from paramclient.model.values import Param, ParamType
 from paramclient.sim import px4_table
 from tests.simulation import known
 
@@ -17,7 +20,7 @@ VOLATILE = frozenset(row.name for row in px4_table() if row.volatile)
 
 
 def announced(params: Iterable[Param], volatile: Iterable[str]) -> int:
-    return px4_hash(params, leave_out=volatile)
+    return hash_params(params, leave_out=volatile)
 
 
 def found(
@@ -52,14 +55,14 @@ def test_a_firmware_with_one_more_or_one_less(name: str) -> None:
     assert found(REAL, announced(REAL, expected)) == (expected, True)
 
 
-def test_what_an_earlier_session_proved_is_tried_first() -> None:
+def test_names_proved_by_an_earlier_session_are_tried_first() -> None:
     strange = frozenset({"SYS_AUTOSTART", "MPC_XY_P", "BAT1_N_CELLS"})
     right = announced(REAL, strange)
     assert found(REAL, right)[1] is False
     assert found(REAL, right, believed=[*strange, "NO_LONGER_THERE"]) == (strange, True)
 
 
-def test_what_is_believed_may_be_on_top_of_the_usual() -> None:
+def test_believed_names_may_add_to_the_usual_ones() -> None:
     expected = VOLATILE | {"SYS_AUTOSTART", "MPC_XY_P"}
     assert found(REAL, announced(REAL, expected), believed=["SYS_AUTOSTART", "MPC_XY_P"]) == (
         expected,
@@ -78,7 +81,59 @@ def test_an_empty_table() -> None:
 
 
 def test_the_search_does_not_grow_with_the_square_of_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hash_exclusions, "HASHED_PARAMETERS_MAX", 100)
+    monkeypatch.setattr(px4_hash, "HASHED_PARAMETERS_MAX", 100)
     table = [known(f"N{number:02d}", number, index=number) for number in range(20)]
     assert found(table, announced(table, ["N04"])) == (frozenset({"N04"}), True)
     assert found(table, announced(table, ["N05"])) == (frozenset(), False)
+
+
+def bitwise_crc(data: bytes) -> int:
+    """Return PX4's CRC-32, computed bit by bit from its definition."""
+    crc = 0
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0xEDB88320 if crc & 1 else 0)
+    return crc
+
+
+@pytest.mark.parametrize(
+    ("data", "crc"),
+    [
+        (b"", 0),
+        (b"A", 0x01DB7106),
+        (b"123456789", 0x2DFD2D88),
+        (b"SYS_AUTOSTART" + (4001).to_bytes(4, "little"), 0x8B5000C6),
+    ],
+)
+def test_crc_vectors(data: bytes, crc: int) -> None:
+    assert crc32_px4(data) == crc == bitwise_crc(data)
+
+
+@settings(max_examples=500, deadline=None)
+@given(st.binary(max_size=64), st.binary(max_size=64))
+def test_crc_can_be_computed_in_parts(first: bytes, second: bytes) -> None:
+    assert crc32_px4(second, crc32_px4(first)) == bitwise_crc(first + second)
+
+
+def test_the_hash_sorts_names_and_excludes_volatile_ones() -> None:
+    table = [
+        Param("SYS_AUTOSTART", 4001, ParamType.INT32, 0, 4001),
+        Param("MC_ROLL_P", 6.0, ParamType.REAL32, 0, 0x40C00000),
+        Param("A_", -5000000, ParamType.INT32, 0, 0xFFB3B4C0),
+        Param("AB", 1, ParamType.INT32, 0, 1),
+        Param("LND_FLIGHT_T_LO", 2, ParamType.INT32, 0, 2),
+    ]
+    expected = bitwise_crc(
+        b"AB" + (1).to_bytes(4, "little")
+        + b"A_" + bytes.fromhex("c0b4b3ff")
+        + b"MC_ROLL_P" + bytes.fromhex("0000c040")
+        + b"SYS_AUTOSTART" + (4001).to_bytes(4, "little")
+    )  # fmt: skip
+    for seed in range(5):
+        random.Random(seed).shuffle(table)
+        assert hash_params(table, leave_out=["LND_FLIGHT_T_LO", "NOT_THERE"]) == expected
+    assert hash_params(table) != expected
+    assert hash_params([]) == 0
+    bits = {each.name: each.bits for each in table}
+    assert hash_bits(bits, leave_out=frozenset({"LND_FLIGHT_T_LO"})) == expected

@@ -1,21 +1,24 @@
-"""The parameters that a PX4 vehicle excludes from its hash, found by recomputing the hash.
+"""PX4's hash of its parameters, `_HASH_CHECK`: what it covers, and the search for the excluded parameters.
 
-PX4 does not include volatile parameters in `_HASH_CHECK`, and which ones are volatile depends on its version.
-The names below are only where the search begins; the set is *known* when the hash recomputed without it
-equals the one that the vehicle announced.
+The hash is a CRC-32 over the name and the four value bytes of each parameter in use, in the order of the
+names (`hash_params`, `hash_bits`). Volatile parameters are excluded, and which ones are volatile depends on
+PX4's version. The names below are only where the search begins (`find_volatile`); the set is *known* when the
+hash recomputed without it equals the one that the vehicle announced.
 """
 
 from __future__ import annotations
 
 import re
+import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from itertools import combinations
+from operator import itemgetter
 from typing import Final
 
-from paramclient.model.values import crc32_px4
+from paramclient.model.values import Param
 
-__all__ = ["find_volatile", "hash_of", "usual_volatile"]
+__all__ = ["crc32_px4", "find_volatile", "hash_bits", "hash_params", "usual_volatile"]
 
 HASHED_PARAMETERS_MAX: Final = 1_000_000
 """Parameters hashed while single names are tried, about 0.1 s: each attempt hashes the whole table."""
@@ -42,6 +45,29 @@ _GROUPS = tuple(
 )
 
 
+def crc32_px4(data: bytes, crc: int = 0) -> int:
+    """Return PX4's CRC-32: polynomial 0xEDB88320, reflected, start 0, no final xor (crc.c, `crc32part`).
+
+    MAVFTP and component metadata use the same one for files.
+    """
+    return zlib.crc32(data, crc ^ 0xFFFFFFFF) ^ 0xFFFFFFFF
+
+
+def hash_params(params: Iterable[Param], *, leave_out: Iterable[str] = ()) -> int:
+    """Return the value of PX4's `_HASH_CHECK` for a table.
+
+    Args:
+        params: the parameters in use, in any order; PX4's types have 4 bytes each.
+        leave_out: names of volatile parameters, which PX4 excludes from the hash.
+    """
+    return _hash(_hashed_bytes((param.name, param.bits) for param in params), frozenset(leave_out))
+
+
+def hash_bits(bits: Mapping[str, int], *, leave_out: frozenset[str]) -> int:
+    """Return the same as `hash_params` for parameters given by name and `Param.bits`."""
+    return _hash(_hashed_bytes(bits.items()), leave_out)
+
+
 def find_volatile(
     bits: Mapping[str, int], announced: int, *, believed: Iterable[str] = ()
 ) -> tuple[frozenset[str], bool]:
@@ -58,12 +84,12 @@ def find_volatile(
     Returns:
         The names, and True when the hash matches. Without a match: the best guess, and False.
     """
-    chunks = _chunks(bits)
+    hashed = _hashed_bytes(bits.items())
     guess: frozenset[str] | None = None
-    for candidate in _candidates([name for name, _ in chunks], frozenset(believed)):
+    for candidate in _candidates([name for name, _ in hashed], frozenset(believed)):
         if guess is None:
             guess = candidate
-        if crc32_px4(b"".join(chunk for name, chunk in chunks if name not in candidate)) == announced:
+        if _hash(hashed, candidate) == announced:
             return candidate, True
     return guess or frozenset(), False
 
@@ -73,17 +99,17 @@ def usual_volatile(names: Iterable[str]) -> frozenset[str]:
     return frozenset(name for name in names if _group_of(name) is not None)
 
 
-def hash_of(bits: Mapping[str, int], *, leave_out: frozenset[str]) -> int:
-    """Return the value of PX4's `_HASH_CHECK` for parameters given by their bits, see `px4_hash`."""
-    return crc32_px4(b"".join(chunk for name, chunk in _chunks(bits) if name not in leave_out))
-
-
-def _chunks(bits: Mapping[str, int]) -> list[tuple[str, bytes]]:
-    """Return the bytes that the hash covers of each parameter, in its order; see `hash_chunk`."""
+def _hashed_bytes(bits: Iterable[tuple[str, int]]) -> list[tuple[str, bytes]]:
+    """Return the bytes that the hash covers of each parameter, with its name, in the order of the hash: the
+    name without NUL, and the 4 value bytes."""
     return [
         (name, name.encode("latin-1") + (each & 0xFFFFFFFF).to_bytes(4, "little"))
-        for name, each in sorted(bits.items())
+        for name, each in sorted(bits, key=itemgetter(0))
     ]
+
+
+def _hash(hashed: Iterable[tuple[str, bytes]], leave_out: frozenset[str]) -> int:
+    return crc32_px4(b"".join(each for name, each in hashed if name not in leave_out))
 
 
 @lru_cache(maxsize=GROUP_NAMES_MAX)

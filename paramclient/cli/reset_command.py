@@ -1,0 +1,337 @@
+"""The subcommand reset: parameters back to the firmware's defaults."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Final
+
+import anyio
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from paramclient.cli.confirmation import can_confirm, confirm
+from paramclient.cli.exit_codes import ExitCode
+from paramclient.cli.metadata import MetadataChoice, from_file, info_of, known_of_session
+from paramclient.cli.options import LinkOptions
+from paramclient.cli.output import (
+    Coloured,
+    by_index,
+    print_document,
+    print_table,
+    printable,
+    progress_bar,
+    report,
+    say,
+)
+from paramclient.cli.param_names import ChosenNames, check_given, suggest
+from paramclient.cli.session import CommandSession, connect
+from paramclient.cli.write_outcomes import (
+    outcome_cells,
+    outcomes_code,
+    report_outcomes,
+    summary,
+    type_of,
+    write_all,
+)
+from paramclient.client.arguments import SETTLE_MAX
+from paramclient.client.reset import ResetChoice, read_unconfirmed
+from paramclient.errors import NoReply, ParamClientError, UsageError, VehicleError
+from paramclient.metadata import Metadata, metadata_of
+from paramclient.model.group_switches import is_group_switch
+from paramclient.model.notation import typed
+from paramclient.model.patterns import is_pattern
+from paramclient.model.values import Param, format_value
+from paramclient.model.wording import counted, first_of
+from paramclient.protocol.params.fetch_result import FetchResult
+from paramclient.protocol.params.write_batch import SetOutcome
+
+if TYPE_CHECKING:
+    from paramclient.documents.command_output import ResetOutputDoc
+
+__all__ = ["reset"]
+
+REFRESH_TIMEOUT: Final = 10.0
+"""Seconds to wait for the values that the vehicle's hash does not cover, without --timeout."""
+RESET_NAMES_MAX: Final = 10
+"""Parameters that a line names, so that it stays short; it gives the number of further ones."""
+
+_DEFAULTS: Final = LinkOptions()
+
+
+async def reset(
+    url: str,
+    /,
+    *names: str,
+    all_: Annotated[bool, Parameter(name="--all")] = False,
+    changed: bool = False,
+    dry_run: bool = False,
+    settle: Annotated[float, Parameter(validator=Number(gte=0, lte=SETTLE_MAX))] = 0.0,
+    durable: bool = False,
+    metadata: MetadataChoice = None,
+    yes: bool = False,
+    options: LinkOptions = _DEFAULTS,
+) -> int:
+    """Set parameters to the firmware's defaults, and verify each by the value that the vehicle reports.
+
+    Fetches the table first. ArduPilot, and PX4 from 1.18 on, give the defaults in the parameter file over
+    MAVFTP; defaults that the vehicle does not give are taken from its metadata. Parameters without a known
+    default are listed and not written. On a terminal, the changes are shown and must be confirmed. If several
+    vehicles are received, --system must choose one.
+
+    Exit code 1: a value was refused, a name is unknown, a default is not known, or the changes were not
+    confirmed.
+
+    Args:
+        url: The link.
+        names: The parameters, in upper or lower case, or patterns such as "MC_*".
+        all_: Reset all parameters, also the system id, calibration and statistics.
+        changed: Reset all parameters that differ from their default, as far as it is known.
+        dry_run: Print the values that would be sent, and send none of them.
+        settle: Seconds for which each value is watched until it is read again, as with set.
+        durable: End only when all values and their history are on the disk and survive a power loss.
+        metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
+        yes: Do not ask for confirmation.
+    """
+    if bool(names) + all_ + changed != 1:
+        raise UsageError("reset takes names, or --all, or --changed")
+    wanted = check_given(names)
+    described = from_file(metadata)
+    async with connect(url, options, only=True) as session:
+        fetched = await _fetch(session)
+        chosen = await _chosen(session, wanted) if names else _all_names(session)
+        if chosen is None:
+            return ExitCode.INCOMPLETE
+        code = ExitCode.DONE
+        if fetched.missing and any(map(is_pattern, wanted or "*")):
+            report(f"incomplete: {counted(len(fetched.missing), 'parameter')} were not received")
+            code = ExitCode.INCOMPLETE
+        params = await read_unconfirmed(
+            session.component.params, session.component.get, chosen, timeout=session.deadline.left()
+        )
+        if described is None:
+            described = await _known(session, metadata, params)
+        plan = _ResetPlan.of(session, params, described, lists_unknown=not changed)
+        if plan.choice.without_default:
+            code = ExitCode.INCOMPLETE
+        if dry_run:
+            plan.print_planned()
+            return code
+        if plan.choice.values and not yes and can_confirm(options):
+            plan.print_planned()
+            if not await confirm("go on?"):
+                return ExitCode.INCOMPLETE
+        outcomes: Sequence[SetOutcome] = []
+        began = anyio.current_time()
+        if plan.choice.values:
+            await session.check_only()
+            await session.announce_write()
+            outcomes = await write_all(
+                session,
+                [*plan.choice.values.items()],
+                plan.print_outcomes,
+                verb="resetting",
+                settle=settle,
+                force=False,
+                durable=durable,
+            )
+        line = summary(session, outcomes, anyio.current_time() - began)
+    plan.print_outcomes(outcomes)
+    if not options.json:
+        say(f"{line if outcomes else plan.nothing}; {len(plan.choice.unchanged)} had their default already")
+    report_outcomes(outcomes, described)
+    plan.report_unknown()
+    return max(code, outcomes_code(outcomes))
+
+
+async def _fetch(session: CommandSession) -> FetchResult:
+    """Fetch the table, with the values that the vehicle's hash does not cover."""
+    component, deadline = session.component, session.deadline
+    with progress_bar(f"fetching {session.label}") as progress:
+        result = await component.fetch_all(timeout=deadline.left(), progress=progress)
+    with suppress(NoReply):
+        await component.refreshed(timeout=deadline.left(REFRESH_TIMEOUT))
+    return result
+
+
+def _all_names(session: CommandSession) -> list[str]:
+    """Return the names of all parameters in the order of their writes."""
+    return _in_order(session, [param.name for param in by_index(session.component.params.values())])
+
+
+async def _chosen(session: CommandSession, wanted: Sequence[str]) -> list[str] | None:
+    """Return the names that names and patterns choose; None after a report of the unknown ones."""
+    chosen = ChosenNames.of(session.component, wanted)
+    errors: dict[str, ParamClientError] = {**chosen.errors}
+    for name in chosen.names:
+        if name not in session.component.params:
+            try:
+                await session.component.get(name, timeout=session.deadline.left())
+            except VehicleError as error:
+                errors[name] = error
+    if not errors:
+        return _in_order(session, chosen.names)
+    for unknown in (await suggest(session, errors)).values():
+        report(str(unknown))
+    report("nothing was written")
+    return None
+
+
+def _in_order(session: CommandSession, names: Sequence[str]) -> list[str]:
+    """Return the names in the order of their writes.
+
+    Switches such as *_ENABLE come last: their defaults may hide the parameters of their group.
+    """
+    autopilot = session.component.autopilot
+    return sorted(names, key=lambda name: is_group_switch(name, autopilot))
+
+
+async def _known(session: CommandSession, choice: str | None, params: Sequence[Param]) -> Metadata | None:
+    """Return the metadata of the vehicle, or None if there is none.
+
+    Without a choice of the user, it is downloaded only if the vehicle does not give a default.
+    """
+    found = await known_of_session(session, choice)
+    if found is not None or all(param.default is not None for param in params):
+        return found
+    try:
+        return await metadata_of(session.component, timeout=session.deadline.left())
+    except (UsageError, VehicleError, NoReply) as error:
+        say(printable(f"{session.label} gives no metadata with defaults: {error}"))
+        return None
+
+
+@dataclass(frozen=True, slots=True)
+class _ResetPlan:
+    """What a reset writes, and how it is printed.
+
+    Attributes:
+        session: the session.
+        choice: the values.
+        params: the parameters before the reset, by name.
+        described: metadata of the vehicle, or None.
+    """
+
+    session: CommandSession
+    choice: ResetChoice
+    params: Mapping[str, Param]
+    described: Metadata | None
+
+    @classmethod
+    def of(
+        cls,
+        session: CommandSession,
+        params: Sequence[Param],
+        described: Metadata | None,
+        *,
+        lists_unknown: bool,
+    ) -> _ResetPlan:
+        """Choose the values to write.
+
+        Args:
+            session: the session.
+            params: the parameters to reset.
+            described: metadata of the vehicle, or None.
+            lists_unknown: whether parameters without a known default are listed.
+        """
+        defaults = {} if described is None else described.defaults_of(each.name for each in params)
+        if not lists_unknown:
+            params = [each for each in params if each.default is not None or each.name in defaults]
+        return cls(session, ResetChoice.of(params, defaults), {each.name: each for each in params}, described)
+
+    @property
+    def nothing(self) -> str:
+        """The line about a reset without a value to write."""
+        return f"nothing to set on {self.session.receiver}"
+
+    def print_planned(self) -> None:
+        """Print the values that would be sent."""
+        choice = self.choice
+        if self.session.options.json:
+            from paramclient.documents.command_output import (  # only here: loads pydantic
+                ReceiverDoc,
+                ResetPlanDoc,
+                ResetValueDoc,
+            )
+
+            values = [
+                ResetValueDoc.of(self.params[name], value, self._source(name))
+                for name, value in choice.values.items()
+            ]
+            print_document(
+                ResetPlanDoc(
+                    vehicle=ReceiverDoc.of(self.session.component),
+                    values=values,
+                    unchanged=[*choice.unchanged],
+                    without_default=[*choice.without_default],
+                )
+            )
+            return
+        rows: list[tuple[object, ...]] = [
+            (name, self._before(name), self._default(name), f"default of {self._source(name)}")
+            for name in choice.values
+        ]
+        rows += [(name, self._before(name), None, _NO_DEFAULT) for name in choice.without_default]
+        if rows:
+            print_table(["name", "now", "default", "status"], rows, right="now default")
+        say(
+            printable(
+                f"{self.session.receiver}: {len(choice.values)} to reset, {len(choice.unchanged)} with their "
+                f"default, {len(choice.without_default)} without a known default; nothing was sent"
+            )
+        )
+
+    def print_outcomes(self, outcomes: Sequence[SetOutcome]) -> None:
+        """Print the outcomes as a table or as JSON."""
+        if self.session.options.json:
+            print_document(self._document(outcomes))
+            return
+        rows: list[tuple[object, ...]] = []
+        for outcome in outcomes:
+            name, _, actual, status = outcome_cells(self.session, outcome)
+            rows.append((name, self._before(outcome.name), self._default(outcome.name), actual, status))
+        for name in self.choice.without_default:
+            before = self._before(name)
+            rows.append((name, before, None, before, _NO_DEFAULT))
+        if rows:
+            print_table(["name", "before", "default", "now", "status"], rows, right="before default now")
+
+    def report_unknown(self) -> None:
+        """Print a line about the parameters without a known default, if there are any."""
+        unknown = self.choice.without_default
+        if unknown:
+            names = first_of(unknown, RESET_NAMES_MAX)
+            report(f"not written, as their default is not known: {names}")
+
+    def _document(self, outcomes: Sequence[SetOutcome]) -> ResetOutputDoc:
+        from paramclient.documents.command_output import (  # only here: loads pydantic
+            ReceiverDoc,
+            ResetOutputDoc,
+            WriteOutputDoc,
+        )
+
+        return ResetOutputDoc(
+            vehicle=ReceiverDoc.of(self.session.component),
+            results=[
+                WriteOutputDoc.of(each, type_of(self.session, each), info_of(self.described, each.name))
+                for each in outcomes
+            ],
+            unchanged=[*self.choice.unchanged],
+            without_default=[*self.choice.without_default],
+        )
+
+    def _source(self, name: str) -> str:
+        """Return the origin of a default: `vehicle` or `metadata`."""
+        return "metadata" if self.params[name].default is None else "vehicle"
+
+    def _before(self, name: str) -> str:
+        param = self.params[name]
+        return format_value(param.settable, param.type_number)
+
+    def _default(self, name: str) -> str:
+        return format_value(*typed(self.choice.values[name], self.params[name].type_number))
+
+
+_NO_DEFAULT: Final = Coloured("no known default", "yellow")
+"""The cell of a parameter that is not written."""

@@ -1,0 +1,158 @@
+"""The lines that `watch` prints: changes of parameters and events of the component, as text or JSON."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncGenerator
+from contextlib import aclosing
+from typing import TYPE_CHECKING, Final, TypeAlias
+
+from paramclient.cli.output import local_time, print_document, print_line, printable
+from paramclient.cli.session import CommandSession
+from paramclient.client.events import (
+    Contested,
+    Event,
+    Events,
+    Found,
+    Heard,
+    Lost,
+    Rebooted,
+    Resynced,
+    Uncontested,
+)
+from paramclient.client.extended_params import ExtChanges
+from paramclient.client.subscription import Changes
+from paramclient.model.ext_params import ExtValue, format_ext_value
+from paramclient.model.patterns import NameChoice
+from paramclient.model.values import format_value
+from paramclient.protocol.ext.change import ExtChange
+from paramclient.protocol.params.change import Added, Change
+
+if TYPE_CHECKING:
+    from paramclient.documents.document import Document
+
+__all__ = ["HEX", "ext_value_text", "print_changes_and_events"]
+
+HEX: Final = "hex:"
+"""The prefix of a value that is given as bytes in hexadecimal."""
+
+_ComponentEvent: TypeAlias = Lost | Found | Rebooted | Resynced | Contested | Uncontested
+
+
+async def print_changes_and_events(
+    session: CommandSession,
+    changes: Changes | ExtChanges,
+    events: Events,
+    known: set[str] | None,
+    wanted: NameChoice | None,
+) -> None:
+    """Print changes and events of the component until cancelled.
+
+    Args:
+        session: the session.
+        changes: the changes of the component, or of its extended parameters.
+        events: the events of the client.
+        known: names of the table at the start. The first value of any other parameter is not a change. None:
+            the first value of every parameter is not a change.
+        wanted: the names to watch; None for all.
+    """
+    async with aclosing(_merged(changes, events)) as news:
+        async for each in news:
+            if isinstance(each, Change | ExtChange):
+                is_first = each.old is None and not _is_added(each)
+                if is_first and (known is None or each.name in known):
+                    known = known and known - {each.name}
+                    continue
+                if wanted is not None and not wanted.has(each.name):
+                    continue
+                text = _change_text(each)
+            elif isinstance(each, Heard) or each.component is not session.component:
+                continue
+            else:
+                text = _event_text(each)
+            at = session.now
+            if session.options.json:
+                print_document(_line(each, at))
+            else:
+                print_line(f"{local_time(at)}  {text}")
+
+
+async def _merged(
+    changes: Changes | ExtChanges, events: Events
+) -> AsyncGenerator[Change | ExtChange | Event]:
+    """Yield changes and events in the order of their arrival."""
+    waiting: dict[asyncio.Future[Change | ExtChange | Event], Changes | ExtChanges | Events] = {}
+
+    def wait(feed: Changes | ExtChanges | Events) -> None:
+        waiting[asyncio.ensure_future(anext(feed))] = feed
+
+    try:
+        wait(changes)
+        wait(events)
+        while waiting:
+            done, _ = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
+            for each in [each for each in waiting if each in done]:
+                feed = waiting.pop(each)
+                if not isinstance(each.exception(), StopAsyncIteration):  # else a log has ended
+                    wait(feed)
+                    yield each.result()
+    finally:
+        for each in waiting:
+            if not each.cancel():
+                each.exception()  # both end with the link; one error is reported
+
+
+def _line(news: Change | ExtChange | _ComponentEvent, at: float) -> Document:
+    """Return the JSON document of a change or an event."""
+    if isinstance(news, ExtChange):
+        from paramclient.documents.extended_output import ExtChangeLineDoc  # only here: loads pydantic
+
+        return ExtChangeLineDoc.of(news, at)
+    from paramclient.documents.command_output import ChangeLineDoc, EventLineDoc  # only here: loads pydantic
+
+    return ChangeLineDoc.of(news, at) if isinstance(news, Change) else EventLineDoc.of(news, at)
+
+
+def _change_text(change: Change | ExtChange) -> str:
+    if isinstance(change, Change):
+        old, new = (
+            "none" if param is None else format_value(param.settable, param.type_number)
+            for param in (change.old, change.new)
+        )
+    else:
+        old, new = (
+            "none" if param is None else printable(ext_value_text(param.value, param.type))
+            for param in (change.old, change.new)
+        )
+    if _is_added(change):
+        return f"{change.name}  added: {new}  ({change.by})"
+    if change.new is None:
+        return f"{change.name}  removed, was {old}  ({change.by})"
+    return f"{change.name}  {old} -> {new}  ({change.by})"
+
+
+def _is_added(change: Change | ExtChange) -> bool:
+    return change.is_added if isinstance(change, ExtChange) else isinstance(change, Added)
+
+
+def _event_text(event: _ComponentEvent) -> str:
+    match event:
+        case Lost():
+            text = f"lost: nothing received for {event.silence:.1f} s"
+        case Found():
+            text = f"found after {event.silence:.1f} s"
+        case Rebooted():
+            text = "rebooted"
+        case Contested():
+            text = f"contested: {'; '.join(event.contest.claimants)}"
+        case Uncontested():
+            text = "no longer contested"
+        case Resynced():
+            count = len(event.changed)
+            text = f"resynced: {count or 'no'} {'value' if count == 1 else 'values'} had changed"
+    return f"{event.component.system}/{event.component.component} {text}"
+
+
+def ext_value_text(value: ExtValue, number: int) -> str:
+    """Return the text of an extended value, as subcommands print and take it."""
+    return f"{HEX}{value.hex()}" if isinstance(value, bytes) else format_ext_value(value, number)

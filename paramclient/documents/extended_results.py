@@ -1,0 +1,82 @@
+"""Documents of the results of fetches and writes of extended parameters."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from paramclient.documents.document import Document, Maybe, Scalar
+from paramclient.documents.extended_param import ExtParamDoc, ext_value_json
+from paramclient.documents.problem import Problem
+from paramclient.documents.results import NotSetDoc
+from paramclient.model.ext_params import ExtParamType
+
+if TYPE_CHECKING:
+    from paramclient.protocol.ext.fetch import ExtFetchResult
+    from paramclient.protocol.ext.writes import ExtSetResult
+
+__all__ = ["ExtFetchResultDoc", "ExtSetManyDoc", "ExtSetResultDoc"]
+
+
+class ExtFetchResultDoc(Document):
+    """The result of a fetch of extended parameters; see `ExtFetchResult`.
+
+    The parameters are in the component's table. `count` is null if the component has not announced it.
+    """
+
+    link: str
+    system: int
+    component: int
+    source: str
+    count: int | None
+    received: int
+    missing: list[int]
+    elapsed_s: float
+    notes: list[str]
+
+    @classmethod
+    def of(cls, result: ExtFetchResult, *, link: str) -> ExtFetchResultDoc:
+        """Return the document of an `ExtFetchResult`, without the parameters."""
+        return cls(
+            link=link,
+            system=result.system,
+            component=result.component,
+            source=result.source,
+            count=result.count,
+            received=len(result.params),
+            missing=list(result.missing),
+            elapsed_s=round(result.elapsed, 4),
+            notes=list(result.notes),
+        )
+
+
+class ExtSetResultDoc(Document):
+    """The result of a write of an extended parameter: accepted, or adjusted; see `ExtSetResult`.
+
+    `requested` and `actual` are null for bytes that are no text; `param` has the bytes of the actual value.
+    """
+
+    name: str
+    status: str
+    requested: Scalar | None
+    actual: Scalar | None
+    attempts: int
+    param: ExtParamDoc
+
+    @classmethod
+    def of(cls, result: ExtSetResult) -> ExtSetResultDoc:
+        """Return the document of an `ExtSetResult`."""
+        return cls(
+            name=result.name,
+            status=result.status,
+            requested=ext_value_json(result.requested, ExtParamType.REAL64),
+            actual=ext_value_json(result.actual, result.param.type),
+            attempts=result.attempts,
+            param=ExtParamDoc.kept(result.param),
+        )
+
+
+class ExtSetManyDoc(Document):
+    """The results of several writes by name, and why not all were tried."""
+
+    results: dict[str, ExtSetResultDoc | NotSetDoc]
+    problem: Maybe[Problem] = None

@@ -1,0 +1,270 @@
+"""Routes of extended parameters: known values, reads, writes, fetches, parallel to those of `params`."""
+
+from __future__ import annotations
+
+from typing import Annotated, Final
+
+import anyio
+import anyio.lowlevel
+from fastapi import APIRouter, Depends, Query, Request, Response
+from pydantic import Field, StrictInt
+
+from paramclient.documents.document import Body, Document, InParts
+from paramclient.documents.extended_param import ExtParamDoc
+from paramclient.documents.extended_results import ExtFetchResultDoc, ExtSetManyDoc, ExtSetResultDoc
+from paramclient.documents.job import JobDoc
+from paramclient.documents.results import NotSetDoc
+from paramclient.errors import ParamClientError, UnknownParameter, UsageError
+from paramclient.model.ext_params import EXT_VALUE_SIZE, ExtParamType, ExtValue, check_ext_value
+from paramclient.model.patterns import NameChoice
+from paramclient.model.similar_names import did_you_mean, nearest_names
+from paramclient.model.values import check_name
+from paramclient.protocol.ext.write_batch import ExtSetManyResult, ExtSetOutcome
+from paramclient.protocol.params.write_batch import SetStatus
+from paramclient.service.followed_component import FollowedComponent
+from paramclient.service.param_sources import PATTERNS_MAX, REQUEST_VALUES_MAX, Pattern
+from paramclient.service.problems import problem_of
+from paramclient.service.request_body import BodyRoute
+from paramclient.service.responses import JSON
+from paramclient.service.route_context import (
+    Finite,
+    HubArgument,
+    Seconds,
+    Target,
+    author_of,
+    holder_of,
+    require_write,
+    run_until_disconnect,
+)
+from paramclient.service.routes.fetches import job_response, wait_for_job
+from paramclient.service.routes.params import (
+    PARAMS_PER_TURN,
+    Durable,
+    Name,
+    ReadByPathRequest,
+    ReadRequest,
+    read_key,
+)
+
+__all__ = ["router"]
+
+router = APIRouter(
+    prefix="/api/v1/components/{system}/{component}/extended",
+    tags=["extended parameters"],
+    route_class=BodyRoute,
+)
+
+WORDS: Final = {"NaN": float("nan"), "Infinity": float("inf"), "-Infinity": float("-inf")}
+"""Numbers that JSON does not have."""
+
+
+class ExtParamsDoc(Document):
+    """Extended parameters by name, and the number of the last event included."""
+
+    run: str
+    seq: int
+    params: dict[str, ExtParamDoc]
+
+
+class HexValue(Body):
+    """The bytes of a CUSTOM value, or of a type that MAVLink does not define, as in `hex` of a parameter."""
+
+    hex: Annotated[str, Field(pattern="^([0-9a-fA-F]{2}){0,128}$")]
+
+
+class NumberValue(Body):
+    """A number as text: digits of a 64-bit integer, which JavaScript cannot hold as a number, or `NaN`."""
+
+    number: Annotated[str, Field(pattern="^(-?[0-9]{1,20}|NaN|-?Infinity)$")]
+
+
+ExtValueInput = Annotated[
+    StrictInt | Finite | Annotated[str, Field(max_length=EXT_VALUE_SIZE)] | HexValue | NumberValue,
+    Field(
+        description=(
+            'A number for a numeric type, text for CUSTOM, {"hex": "00ff"} for other bytes. "NaN", "Infinity"'
+            ' and "-Infinity" are numbers for REAL32 and REAL64. {"number": "9007199254740993"} is a number.'
+        )
+    ),
+]
+
+
+class ExtWriteRequest(Body):
+    """One value."""
+
+    value: ExtValueInput
+    durable: Durable = False
+    timeout_s: Seconds = None
+
+
+class ExtWriteManyRequest(Body):
+    """Several values, by name."""
+
+    values: Annotated[dict[Name, ExtValueInput], InParts, Field(min_length=1, max_length=REQUEST_VALUES_MAX)]
+    durable: Durable = False
+    timeout_s: Seconds = None
+
+
+class ExtFetchRequest(Body):
+    """Options of a fetch; see `ExtParams.fetch_all`. With `wait` false, the response is a job."""
+
+    timeout_s: Seconds = None
+    wait: bool = True
+
+
+@router.get("/params", responses={200: {"model": ExtParamsDoc}}, response_class=Response)
+async def known_extended_params(
+    hub: HubArgument,
+    target: Target,
+    names: Annotated[
+        list[Pattern], Query(max_length=PATTERNS_MAX, description="Names or patterns such as CAM_*.")
+    ] = [],  # noqa: B006 - FastAPI copies it
+) -> Response:
+    """Return all known extended parameters, without traffic."""
+    target.publish_changes()
+    place, table = hub.feed.position, dict(target.extended.ext.params)
+    choice = NameChoice(names)
+    chosen = await hub.run_in_file_thread(lambda: list(filter(choice.has, table))) if names else list(table)
+    parts = []
+    for start in range(0, len(chosen), PARAMS_PER_TURN):
+        params = [table[name] for name in chosen[start : start + PARAMS_PER_TURN]]
+        parts.append(target.extended.object_of(params)[1:-1])
+        await anyio.lowlevel.checkpoint()
+    content = f'{{"run":"{place.run}","seq":{place.seq},"params":{{{",".join(parts)}}}}}'
+    return Response(content, media_type=JSON)
+
+
+@router.get("/params/{name:path}", responses={200: {"model": ExtParamDoc}}, response_class=Response)
+async def known_extended_param(target: Target, name: str) -> Response:
+    """Return one known extended parameter, without traffic."""
+    param = target.extended.ext.params.get(name)
+    if param is None:
+        raise _unknown(target, name)
+    return Response(target.extended.json_of(param), media_type=JSON)
+
+
+@router.post("/read", responses={200: {"model": ExtParamDoc}}, response_class=Response)
+async def read_extended(request: Request, target: Target, body: ReadRequest) -> Response:
+    """Read one extended parameter from the component, by name or index."""
+    key = body.index if body.name is None else body.name
+    if key is None or None not in (body.name, body.index):
+        raise UsageError("the body needs either `name` or `index`")
+    return await _read(request, target, key, body.timeout_s)
+
+
+@router.post("/params/{name:path}/read", responses={200: {"model": ExtParamDoc}}, response_class=Response)
+async def read_extended_by_path(
+    request: Request, target: Target, name: str, body: ReadByPathRequest
+) -> Response:
+    """Read one extended parameter whose name is in the path; `#17` is an index."""
+    return await _read(request, target, read_key(name), body.timeout_s)
+
+
+@router.put("/params/{name:path}", dependencies=[Depends(require_write)])
+async def write_extended(
+    request: Request, target: Target, name: str, body: ExtWriteRequest
+) -> ExtSetResultDoc:
+    """Write one extended parameter, and wait until the component has acknowledged the value."""
+    asker = author_of(request)
+
+    async def work() -> ExtSetResultDoc:
+        value = await _resolve(target, name, body.value)
+        result = await target.extended.ext.set(
+            name, value, timeout=body.timeout_s, durable=body.durable, asker=asker
+        )
+        return ExtSetResultDoc.of(result)
+
+    return await run_until_disconnect(request, work, target)
+
+
+@router.patch("/params", dependencies=[Depends(require_write)])
+async def write_many_extended(request: Request, target: Target, body: ExtWriteManyRequest) -> ExtSetManyDoc:
+    """Write several extended parameters in order, several at a time. The response has each result.
+
+    A refused value does not stop the others. After the loss of the component or the timeout, `problem` says
+    why the remaining values were not tried.
+    """
+    asker = author_of(request)
+    results: dict[str, ExtSetResultDoc | NotSetDoc] = {}
+    resolved: dict[str, ExtValue] = {}
+
+    async def resolve(name: str) -> None:
+        try:
+            resolved[check_name(name)] = await _resolve(target, name, body.values[name])
+        except ParamClientError as error:
+            status = SetStatus.REFUSED if isinstance(error, UsageError) else SetStatus.NOT_TRIED
+            results[name] = NotSetDoc(status=status, problem=problem_of(error))
+
+    async def work() -> ExtSetManyResult:
+        async with anyio.create_task_group() as tasks:
+            for name in body.values:
+                tasks.start_soon(resolve, name)
+        pairs = [(name, resolved[name]) for name in body.values if name in resolved]
+        return await target.extended.ext.set_many(
+            pairs, timeout=body.timeout_s, durable=body.durable, asker=asker
+        )
+
+    done = await run_until_disconnect(request, work, target)
+    results |= {outcome.name: _document_of(outcome) for outcome in done.outcomes}
+    problem = None if done.error is None else problem_of(done.error)
+    return ExtSetManyDoc(results={name: results[name] for name in body.values}, problem=problem)
+
+
+@router.post(
+    "/fetch",
+    response_model=ExtFetchResultDoc,
+    responses={202: {"model": JobDoc, "description": "The started job"}},
+)
+async def fetch_extended(
+    request: Request, hub: HubArgument, target: Target, body: ExtFetchRequest
+) -> ExtFetchResultDoc | Response:
+    """Download all extended parameters. Simultaneous requests share one download."""
+    job = hub.start_extended_fetch(target, author_of(request), holder_of(request), timeout=body.timeout_s)
+    if not body.wait:
+        return job_response(job)
+    result = await wait_for_job(request, job)
+    assert isinstance(result, ExtFetchResultDoc)
+    return result
+
+
+async def _read(
+    request: Request, target: FollowedComponent, key: str | int, timeout: float | None
+) -> Response:
+    ext = target.extended.ext
+    param = await run_until_disconnect(request, lambda: ext.get(key, timeout=timeout), target)
+    return Response(target.extended.json_of(param), media_type=JSON)
+
+
+def _document_of(outcome: ExtSetOutcome) -> ExtSetResultDoc | NotSetDoc:
+    if outcome.error is not None:
+        return NotSetDoc(status=outcome.status, problem=problem_of(outcome.error))
+    assert outcome.result is not None
+    return ExtSetResultDoc.of(outcome.result)
+
+
+async def _resolve(
+    target: FollowedComponent, name: str, given: int | float | str | HexValue | NumberValue
+) -> ExtValue:
+    """Return the value of a request.
+
+    Raises:
+        UsageError: the value is too long.
+        ParamClientError: the component did not send the type of the parameter, where it is needed.
+    """
+    if isinstance(given, HexValue):
+        return bytes.fromhex(given.hex)
+    if isinstance(given, NumberValue):
+        return WORDS[given.number] if given.number in WORDS else int(given.number)
+    if isinstance(given, str) and given in WORDS:
+        ext = target.extended.ext
+        known = ext.params.get(name) or await ext.get(name)
+        return WORDS[given] if known.type in (ExtParamType.REAL32, ExtParamType.REAL64) else given
+    return check_ext_value(given)
+
+
+def _unknown(target: FollowedComponent, name: str) -> UnknownParameter:
+    system, component = target.address
+    nearest = nearest_names(name, target.extended.ext.params)
+    what = f"{system}/{component} has no known extended parameter {name!r}. POST …/read requests it"
+    what += f".{did_you_mean(nearest)}" if nearest else ""
+    return UnknownParameter(what, system=system, component=component, name=name, nearest=nearest)

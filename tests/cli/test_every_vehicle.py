@@ -1,0 +1,186 @@
+"""--all of fetch, get, set and save: every vehicle on a link; and this computer's own ids."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from paramclient import read_file
+from paramclient.cli import set_command
+from paramclient.metadata import Metadata, ParamInfo
+from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
+from tests.commands import Command, Put, behind, in_process, leaping
+from tests.shell import Tap
+
+SHARED: dict[str, int | float] = {"GAIN": 4.0, "MODE": 2}
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Command:
+    """Run the command line in this process, on simulated time, with a new cache."""
+    leaping(monkeypatch)
+    return in_process(capsys, "--cache", str(tmp_path / "cache.sqlite3"))
+
+
+@pytest.fixture
+def put(monkeypatch: pytest.MonkeyPatch) -> Put:
+    return behind(monkeypatch, "udpin:0.0.0.0:14550")
+
+
+@pytest.fixture
+def vehicles() -> tuple[PX4Vehicle, ArduPilotVehicle]:
+    return (
+        PX4Vehicle(system=1, table=SHARED | {"OF_PX4": 1.5}),
+        ArduPilotVehicle(system=2, live=(), table=SHARED),
+    )
+
+
+def test_get_reads_from_every_vehicle(
+    command: Command, put: Put, vehicles: tuple[PX4Vehicle, ArduPilotVehicle]
+) -> None:
+    url = put(Air(vehicles))
+    read = command("get", url, "GAIN", "--all")
+    assert (read.code, read.err) == (0, "")
+    assert read.words[0] == ["vehicle", "name", "value", "type", "index"]
+    assert [line[:3] for line in read.words[1:]] == [["1/1", "GAIN", "4.0"], ["2/1", "GAIN", "4.0"]]
+    read = command("get", url, "OF_*", "--all", "--json")
+    assert read.code == 1
+    first, second = read.json["vehicles"]
+    assert (first["system"], first["component"]) == (1, 1)
+    assert first["params"]["OF_PX4"]["value"] == 1.5
+    assert (second["system"], second["params"]) == (2, {})
+    assert "OF_*" in second["errors"]
+    assert "2/1 ardupilot: " in read.err
+    assert read.json["errors"] == []
+
+
+def test_fetch_prints_the_tables_of_every_vehicle(
+    command: Command, put: Put, vehicles: tuple[PX4Vehicle, ArduPilotVehicle]
+) -> None:
+    url = put(Air(vehicles))
+    fetched = command("fetch", url, "--all", "--json")
+    assert fetched.code == 0
+    tables = {each["system"]: each for each in fetched.json["vehicles"]}
+    assert tables[1]["params"].keys() == vehicles[0].params.keys()
+    assert tables[2]["params"].keys() == vehicles[1].params.keys()
+    assert tables[2]["autopilot"] == "ardupilot"
+    shown = command("fetch", url, "--all", "--only", "GAIN")
+    assert [line[:3] for line in shown.words[1:]] == [["1/1", "GAIN", "4.0"], ["2/1", "GAIN", "4.0"]]
+    assert "parameters of 2/1 ardupilot from" in shown.err
+
+
+def test_one_vehicle_that_fails_stops_no_other(
+    command: Command, put: Put, vehicles: tuple[PX4Vehicle, ArduPilotVehicle]
+) -> None:
+    mute = PX4Vehicle(system=3, table=SHARED, dead=range(100), list_stops_at=0, list_stops=1e9)
+    read = command("get", put(Air([vehicles[0], mute])), "GAIN", "--all", "--timeout", "20")
+    assert read.code == 3
+    assert [line[:2] for line in read.words[1:]] == [["1/1", "GAIN"]]
+    assert "3/1 px4: " in read.err
+
+
+def test_set_writes_to_every_vehicle(
+    command: Command, put: Put, vehicles: tuple[PX4Vehicle, ArduPilotVehicle]
+) -> None:
+    url = put(Air(vehicles))
+    written = command("set", url, "GAIN", "6.5", "--all")
+    assert written.code == 0
+    assert [line[0] for line in written.words[1:]] == ["1/1", "2/1"]
+    assert [each.values["GAIN"] for each in vehicles] == [6.5, 6.5]
+    written = command("set", url, "GAIN", "7", "OF_PX4", "2", "--all", "--json")
+    assert written.code == 1
+    first, second = written.json["vehicles"]
+    assert [each["status"] for each in first["results"]] == ["accepted", "accepted"]
+    assert [each["status"] for each in second["results"]] == ["accepted", "refused"]
+    assert vehicles[0].values["OF_PX4"] == 2.0
+
+
+def test_save_writes_every_vehicle_into_one_file_or_into_one_each(
+    command: Command, put: Put, vehicles: tuple[PX4Vehicle, ArduPilotVehicle], tmp_path: Path
+) -> None:
+    url = put(Air(vehicles))
+    assert command("save", url, tmp_path / "fleet.yaml", "--all").code == 0
+    assert [each.system for each in read_file(tmp_path / "fleet.yaml").sets] == [1, 2]
+    saved = command("save", url, tmp_path / "quad-{system}.param", "--all", "--json")
+    assert saved.code == 0
+    assert [each["path"] for each in saved.json["files"]] == [
+        str(tmp_path / f"quad-{system}.param") for system in (1, 2)
+    ]
+    assert "OF_PX4" in read_file(tmp_path / "quad-1.param").choose()
+    assert "OF_PX4" not in read_file(tmp_path / "quad-2.param").choose()
+    alone = command("save", url, tmp_path / "one.yaml", "--all", "--system", "2")
+    assert alone.code == 0
+    assert [each.system for each in read_file(tmp_path / "one.yaml").sets] == [2]
+
+
+@pytest.mark.parametrize("option", [["--system", "1"], ["--split-peers"], ["--extended"]])
+@pytest.mark.parametrize("words", [["fetch"], ["get", "GAIN"], ["set", "GAIN", "1"]], ids=lambda w: w[0])
+def test_all_excludes_options_that_choose(command: Command, option: list[str], words: list[str]) -> None:
+    refused = command(words[0], "udpin:127.0.0.1:0", *words[1:], "--all", *option)
+    assert refused.code == 2
+    assert "--all" in refused.err
+
+
+def test_own_ids(command: Command, put: Put, vehicles: tuple[PX4Vehicle, ArduPilotVehicle]) -> None:
+    tap = Tap(vehicles[0])
+    url = put(tap)
+    assert command("get", url, "GAIN", "--source-system", "244", "--source-component", "191").code == 0
+    assert {(frame.system, frame.component) for _, frame, _ in tap.heard} == {(244, 191)}
+
+
+def test_a_diff_with_partial_leaves_out_the_rest_of_the_vehicle_on_either_side(
+    command: Command, put: Put, vehicles: tuple[PX4Vehicle, ArduPilotVehicle], tmp_path: Path
+) -> None:
+    url, file = put(vehicles[0]), tmp_path / "few.param"
+    file.write_text("GAIN,4\n")
+    for sides in ([file, url], [url, file]):
+        assert command("diff", *sides).code == 1
+        assert command("diff", *sides, "--partial").code == 0
+    file.write_text("GAIN,4\nGIAN,4\n")
+    for sides in ([file, url], [url, file]):
+        assert command("diff", *sides, "--partial").code == 1, "a name that the vehicle lacks is a difference"
+
+
+# Values that are probably wrong
+
+
+def described(name: str) -> Metadata:
+    return Metadata({name: ParamInfo(name, minimum=0, maximum=10)}, source="test")
+
+
+@pytest.mark.parametrize("kind", [PX4Vehicle, ArduPilotVehicle])
+@pytest.mark.parametrize(("name", "value"), [("GAIN", "11"), ("MODE", "3.5")], ids=["range", "fraction"])
+def test_a_doubtful_value_is_written_only_after_a_question(
+    command: Command,
+    put: Put,
+    monkeypatch: pytest.MonkeyPatch,
+    kind: type[PX4Vehicle | ArduPilotVehicle],
+    name: str,
+    value: str,
+) -> None:
+    vehicle = kind(table=SHARED)
+    url = put(vehicle)
+    monkeypatch.setattr(set_command, "from_file", lambda _: described("GAIN"))
+    before = dict(vehicle.values)
+
+    refused = command("set", url, name, value)
+    assert refused.code == 2
+    assert ("above the maximum of 10" if name == "GAIN" else "not a whole number") in refused.err
+    assert "--force" in refused.err
+    assert vehicle.values == before
+
+    answers = [False, True]
+
+    async def confirm(_question: str) -> bool:
+        return answers.pop(0)
+
+    monkeypatch.setattr(set_command, "can_ask", lambda: True)
+    monkeypatch.setattr(set_command, "confirm", confirm)
+    refused = command("set", url, name, value)
+    assert (refused.code, vehicle.values) == (2, before)
+    takes = name == "GAIN" or kind is ArduPilotVehicle  # PX4's encoding has no fraction for an integer
+    for arguments in ([], ["--force"]):
+        command("set", url, name, value, *arguments)
+        assert (vehicle.values != before) is takes
+    assert answers == []

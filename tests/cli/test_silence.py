@@ -1,0 +1,137 @@
+"""What commands say when nothing answers: what was received instead, and what is awaited."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import pytest
+
+from paramclient.cli import session as cli_session
+from paramclient.links import SimLink
+from paramclient.sim import Air, Endpoint, GenericVehicle, PX4Vehicle
+from paramclient.sim.other import OtherStation
+from tests.commands import Command, Put, behind, in_process, leaping
+from tests.ways import ServedClient
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Run the command line in this process, on simulated time and without a cache."""
+    leaping(monkeypatch)
+    run = in_process(capsys)
+    return lambda *words: run(*words, "--no-cache")
+
+
+@pytest.fixture
+def put(monkeypatch: pytest.MonkeyPatch) -> Put:
+    """Connect every URL to a simulated vehicle."""
+    return behind(monkeypatch, "sim:custom")
+
+
+class Deaf(PX4Vehicle):
+    """A vehicle that sends, and receives no request."""
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Lose what is sent to the vehicle."""
+
+
+SPEAKS = "1/1 sends heartbeats (the last one "
+CURE = "Check the link towards the vehicle, and whether the vehicle requires signed messages."
+
+
+def serve(monkeypatch: pytest.MonkeyPatch, far_end: Endpoint) -> None:
+    """Connect every URL to a service that has this vehicle."""
+    monkeypatch.setattr(
+        cli_session, "ParamClient", lambda url, **options: ServedClient(SimLink(far_end, "sim:custom"))
+    )
+
+
+@pytest.mark.parametrize("over_service", [False, True])
+@pytest.mark.parametrize("words", [["get", "A"], ["set", "A", 2], ["fetch"]])
+def test_a_vehicle_that_speaks_and_does_not_answer(
+    command: Command, put: Put, monkeypatch: pytest.MonkeyPatch, words: list[Any], over_service: bool
+) -> None:
+    url = put(Deaf(table={"A": 1}))
+    if over_service:
+        serve(monkeypatch, Deaf(table={"A": 1}))
+    done = command(words[0], url, *words[1:])
+    assert done.code == 3
+    assert SPEAKS in done.err, done.err
+    assert done.err.endswith(f"{CURE}\n")
+
+
+def test_one_cause_of_many_writes_is_explained_once(command: Command, put: Put) -> None:
+    done = command("set", put(Deaf(table={"A": 1, "B": 2})), "A", 2, "B", 3, "--json")
+    assert {each["status"] for each in done.json["results"]} == {"not tried"}, "the type could not be read"
+    assert all(CURE in each["reason"] for each in done.json["results"])
+    assert done.err.count(CURE) == 1
+
+
+def test_only_another_station_is_received(command: Command, put: Put) -> None:
+    done = command("get", put(Air([], others=[OtherStation(system=252)])), "A", "--timeout", 3)
+    assert done.code == 3
+    assert done.err == (
+        "paramclient: no reply: an autopilot in 3.0 s. Received on sim:custom so far: only 252/190 ground "
+        "station, and no vehicle.\n"
+    )
+
+
+def test_a_vehicle_that_falls_silent(command: Command, put: Put) -> None:
+    class Dying(GenericVehicle):
+        """A vehicle that is switched off by the first request."""
+
+        def data_to_send(self) -> list[bytes]:
+            frames = super().data_to_send()
+            return [] if self.requests["PARAM_REQUEST_READ"] else frames
+
+    done = command("get", put(Dying({"A": 1})), "A")
+    assert done.code == 3
+    assert "Nothing was received on sim:custom for " in done.err
+
+
+# On a terminal
+
+
+def use_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make stderr look like a terminal of 100 columns."""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "100")
+
+
+def drawn(err: str) -> list[str]:
+    """The texts of the line, as they were drawn one after the other."""
+    return err.split("\r\x1b[K")[1:]
+
+
+def test_a_terminal_shows_what_is_awaited(
+    command: Command, put: Put, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use_terminal(monkeypatch)
+    done = command("get", put(Air([], others=[OtherStation(system=252)])), "A", "--timeout", 3.2)
+    texts = drawn(done.err)
+    received = "Received on sim:custom so far: only 252/190 ground station, an"
+    assert texts[0] == "waiting for an autopilot on sim:custom (0 s). " + received[: 99 - 46]
+    assert texts[-2].startswith("waiting for an autopilot on sim:custom (3 s). ")
+    assert len(texts) == 7, "six times, and the erasure with the error after it"
+    assert texts[-1].startswith("paramclient: no reply: ")
+    silent = drawn(command("get", put(Deaf(table={"A": 1})), "A").err)
+    assert silent[0] == "waiting for A of 1/1 px4 (0 s)."
+    fetched = drawn(command("fetch", put(Deaf(table={"A": 1}))).err)
+    assert any(each.startswith("fetching 1/1 px4: waiting for the first response (") for each in fetched)
+    written = drawn(command("set", put(Deaf(table={"A": 1})), "A", 2).err)
+    assert written[0] == "waiting for 1/1 px4 to acknowledge PARAM_SET (0 s)."
+
+
+def test_a_quick_response_leaves_the_terminal_alone(
+    command: Command, put: Put, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use_terminal(monkeypatch)
+    done = command("get", put(GenericVehicle({"A": 1})), "A")
+    assert (done.code, done.err) == (0, "")
+
+
+def test_without_a_terminal_only_the_error_is_printed(command: Command, put: Put) -> None:
+    done = command("get", put(Deaf(table={"A": 1})), "A")
+    assert done.err.count("\n") == 1
+    assert "\x1b" not in done.err

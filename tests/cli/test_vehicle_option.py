@@ -1,0 +1,218 @@
+"""--vehicle and nicknames: a vehicle by address, kind, nickname or hardware id, on links and in the cache."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from paramclient import CacheError, ParamCache, UnknownVehicle, UsageError
+from paramclient.cache.nicknames import Nicknames, check_nickname
+from paramclient.cli import session as cli_session
+from paramclient.links import SimLink
+from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
+from tests.commands import Command, Put, behind, in_process, leaping
+from tests.ways import ServedClient
+
+TABLE: dict[str, Any] = {"A": 1.0, "B": 2.0}
+
+
+@pytest.fixture
+def cache(tmp_path: Path) -> Path:
+    return tmp_path / "cache.sqlite3"
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str], cache: Path, monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Run the command line in this process, on simulated time, with a new cache."""
+    leaping(monkeypatch)
+    return in_process(capsys, "--cache", str(cache))
+
+
+@pytest.fixture
+def put(monkeypatch: pytest.MonkeyPatch) -> Put:
+    """Connect every URL to a simulated vehicle."""
+    return behind(monkeypatch, "sim:custom")
+
+
+def px4(system: int = 1, **options: Any) -> PX4Vehicle:
+    return PX4Vehicle(system=system, **{"table": TABLE} | options)
+
+
+def copter(system: int = 4, **options: Any) -> ArduPilotVehicle:
+    return ArduPilotVehicle(system=system, live=(), **{"table": TABLE} | options)
+
+
+@pytest.mark.parametrize("over_service", [False, True])
+@pytest.mark.parametrize("name", ["4", "4/1", "ardupilot", "ArduPilot"])
+def test_one_of_two_vehicles_is_written_to(
+    command: Command, put: Put, monkeypatch: pytest.MonkeyPatch, name: str, over_service: bool
+) -> None:
+    one, two = px4(), copter()
+    far_end: Endpoint = Air([one, two])
+    url = put(far_end)
+    if over_service:
+        monkeypatch.setattr(
+            cli_session, "ParamClient", lambda url, **options: ServedClient(SimLink(far_end, "sim:custom"))
+        )
+    done = command("set", url, "A", 7, "--vehicle", name)
+    assert done.code == 0, done.err
+    assert (one.values["A"], two.values["A"]) == (1.0, 7.0)
+
+
+def test_a_component_of_a_vehicle(command: Command, put: Put) -> None:
+    camera = GenericVehicle({"A": 5}, system=4, component=100)
+    url = put(Air([px4(), copter(), camera]))
+    for words in (["4/100"], ["4", "--component", "100"]):
+        done = command("get", url, "A", "--plain", "--json", "--vehicle", *words)
+        assert done.json["params"]["A"]["value"] == 5
+
+
+@pytest.mark.parametrize("words", [["get"], ["set"]])
+def test_a_kind_of_several_vehicles_lists_them(command: Command, put: Put, words: list[str]) -> None:
+    one, two = px4(), px4(2)
+    done = command(
+        words[0], put(Air([one, two, copter()])), "A", *["9"] * (words == ["set"]), "--vehicle", "px4"
+    )
+    assert (done.code, done.out) == (2, "")
+    assert done.err == (
+        "paramclient: 2 vehicles on this link are px4: 1/1 px4, 2/1 px4. Choose one with --system.\n"
+    )
+    assert (one.requests["PARAM_SET"], two.requests["PARAM_SET"]) == (0, 0)
+
+
+def test_a_kind_that_is_not_there(command: Command, put: Put) -> None:
+    done = command("get", put(copter()), "A", "--vehicle", "px4", "--timeout", 3)
+    assert (done.code, done.out) == (3, "")
+    assert "a vehicle with px4" in done.err
+    assert "Received on sim:custom so far: 4/1 ArduPilot quadrotor." in done.err
+
+
+def test_a_nickname_names_a_vehicle_everywhere(command: Command, put: Put, tmp_path: Path) -> None:
+    one, two = px4(), copter()
+    url = put(Air([one, two]))
+    for vehicle in ("1", "4"):
+        assert command("fetch", url, "--vehicle", vehicle).code == 0
+    named = command("cache", "name", "4/1", "tractor")
+    assert named.code == 0, named.err
+    assert named.out.startswith("tractor is uid:")
+    assert command("set", url, "A", 7, "--vehicle", "Tractor").code == 0
+    assert (one.values["A"], two.values["A"]) == (1.0, 7.0)
+    assert command("show", "tractor", "A", "--json").json["components"][0]["system"] == 4
+    assert command("history", "tractor", "A", "--json").json["history"][-1]["new"] == 7.0
+    file = tmp_path / "tractor.param"
+    for source in ("tractor", "cache:tractor"):
+        assert command("save", source, file).code == 0
+    assert command("diff", "tractor", file).code == 0
+    listed = command("cache", "list")
+    assert listed.rows[0][0] == "name"
+    assert [row[0] for row in listed.rows if "4/1" in row] == ["tractor"]
+    by_system = {each["system"]: each for each in command("cache", "list", "--json").json["components"]}
+    assert by_system[4]["nickname"] == "tractor"
+    assert "nickname" not in by_system[1]
+
+
+def test_another_vehicle_under_the_system_id_of_a_nickname(command: Command, put: Put) -> None:
+    assert command("fetch", put(copter())).code == 0
+    assert command("cache", "name", "4", "tractor").code == 0
+    other = px4(4)
+    done = command("set", put(other), "A", 7, "--vehicle", "tractor")
+    assert (done.code, done.out, other.requests["PARAM_SET"]) == (1, "", 0)
+    assert "another vehicle answers as 4/1: expected the hardware id " in done.err
+
+
+def test_kinds_and_addresses_in_the_cache(command: Command, put: Put) -> None:
+    for vehicle in (px4(), copter(), copter(5, uid2=bytes([7] * 18))):
+        assert command("fetch", put(vehicle)).code == 0
+    assert command("show", "px4", "--json").json["components"][0]["system"] == 1
+    assert command("show", "4/1", "--json").json["components"][0]["system"] == 4
+    several = command("show", "ardupilot")
+    assert (several.code, several.err.count("\n  ")) == (2, 2)
+    assert "fits 2 vehicles in the cache" in several.err
+    missing = command("show", "4/9")
+    assert missing.code == 2
+    assert "no vehicle has system id 4 and a table of component 9" in missing.err
+    both = command("show", "4/1", "--component", "2")
+    assert (both.code, both.out) == (2, "")
+    assert "4/1 names component 1, and --component names 2" in both.err
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["--vehicle", "4", "--system", "4"], "--vehicle and --system exclude each other"),
+        (["--vehicle", "4/1", "--component", "2"], "--vehicle 4/1 and --component 2 exclude each other"),
+        (["--vehicle", "px4", "--component", "1"], "--vehicle px4 and --component 1 exclude each other"),
+        (["--vehicle", "4/300"], "system and component ids are 1 to 255"),
+        (["--vehicle", "0"], "system and component ids are 1 to 255"),
+        (["--vehicle", "tractor"], "vehicle tractor is not in the cache"),
+        (["--vehicle", "tractor", "--no-cache"], "nicknames and hardware ids are looked up in the cache"),
+    ],
+)
+def test_names_that_name_nothing(command: Command, put: Put, words: list[str], reason: str) -> None:
+    tried = command("get", put(copter()), "A", *words)
+    assert (tried.code, tried.out) == (2, "")
+    assert reason in tried.err
+
+
+def test_a_nickname_is_removed_and_replaced(command: Command, put: Put, cache: Path) -> None:
+    for vehicle in (px4(), copter()):
+        assert command("fetch", put(vehicle)).code == 0
+    assert command("cache", "name", "1", "plough", "--json").json["nickname"] == "plough"
+    taken = command("cache", "name", "4", "Plough")
+    assert taken.code == 2
+    assert "Plough is the nickname of uid:" in taken.err
+    assert command("cache", "name", "plough", "barrow").code == 0
+    assert command("show", "plough").code == 2
+    assert command("show", "barrow").code == 0
+    assert command("cache", "name", "barrow", "--remove").out.endswith(" has no nickname now\n")
+    assert command("show", "barrow").code == 2
+    with ParamCache(cache) as kept:
+        assert kept.nicknames == {}
+    for words in (["1"], ["1", "a", "--remove"]):
+        assert "takes a nickname, or --remove" in command("cache", "name", *words).err
+
+
+def test_a_nickname_of_a_removed_vehicle(command: Command, put: Put) -> None:
+    assert command("fetch", put(copter())).code == 0
+    assert command("cache", "name", "4", "tractor").code == 0
+    assert command("cache", "remove", "tractor").code == 0
+    gone = command("show", "tractor")
+    assert gone.code == 2
+    assert "tractor is the nickname of uid:" in gone.err
+
+
+@pytest.mark.parametrize(
+    "text", ["", "1a", "a b", "a:b", "a" * 33, "cafe", "Beef00", "PX4", "ardupilot", "system", "é"]
+)
+def test_names_that_are_no_nickname(text: str) -> None:
+    with pytest.raises(UsageError, match="nickname"):
+        check_nickname(text)
+
+
+@pytest.mark.parametrize("text", ["a", "tractor", "T-2_b", "caf", "z" * 32])
+def test_names_that_may_be_a_nickname(text: str) -> None:
+    assert check_nickname(text) == text
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"a": 1}', "{"])
+def test_a_damaged_file_of_nicknames_is_kept_and_reported(cache: Path, content: str) -> None:
+    path = cache.with_suffix(".nicknames")
+    path.write_text(content)
+    names = Nicknames.beside(cache)
+    with pytest.raises(CacheError, match=r"cache\.nicknames"):
+        names.set("uid:1", "tractor")
+    assert path.read_text() == content
+    with ParamCache(cache) as kept, pytest.raises(CacheError):
+        kept.components("tractor")
+
+
+def test_the_file_of_nicknames_is_private(cache: Path) -> None:
+    names = Nicknames.beside(cache)
+    names.set("uid:1", "tractor")
+    assert names.load() == {"tractor": "uid:1"}
+    assert names.path.stat().st_mode & 0o077 == 0
+    assert [each.name for each in cache.parent.iterdir()] == ["cache.nicknames"]
+    with ParamCache(cache) as kept, pytest.raises(UnknownVehicle):
+        kept.set_nickname("4", "plough")

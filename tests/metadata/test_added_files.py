@@ -1,0 +1,150 @@
+"""Metadata files that the user adds: for which firmware each is used, and the subcommand metadata."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from paramclient import MetadataError, UsageError
+from paramclient.metadata import AddedFiles, MetadataStore
+from paramclient.model.identity import Identity
+from paramclient.model.px4_hash import crc32_px4
+from paramclient.sim import ArduPilotVehicle
+from tests.commands import Command, Put, behind, in_process, leaping
+
+DATA = Path(__file__).parent.parent / "data"
+ARDUPILOT, PX4 = 3, 12
+COPTER = Identity(1, "link", autopilot=ARDUPILOT, vehicle_type=2, firmware=0x04060100)
+"""A copter with 4.6.1."""
+
+
+def described(folder: Path, vehicle: str, maximum: int = 10) -> Path:
+    """Write a metadata file that gives GAIN a range, and return its path."""
+    path = folder / f"{vehicle}-{maximum}.xml"
+    path.write_text(
+        f'''<paramfile><vehicles><parameters name="{vehicle}"><param name="{vehicle}:GAIN" humanName="Gain"
+        documentation="A gain"><field name="Range">0 {maximum}</field></param><param name="{vehicle}:MODE"
+        humanName="Mode"><values><value code="2">Loiter</value></values></param></parameters></vehicles>
+        </paramfile>'''
+    )
+    return path
+
+
+def maximum(files: AddedFiles, identity: Identity, component: int = 1) -> float | None:
+    """Return the maximum by which it shows which file is used; None for no file."""
+    found = files.find(identity, component)
+    return None if found is None else found["GAIN"].maximum
+
+
+def test_the_most_exact_version_that_fits_is_used(tmp_path: Path) -> None:
+    files = AddedFiles(tmp_path / "added")
+    assert list(files) == []
+    assert maximum(files, COPTER) is None
+    files.add(described(tmp_path, "ArduCopter", 1))
+    files.add(described(tmp_path, "ArduCopter", 46), firmware="4.6")
+    files.add(described(tmp_path, "ArduCopter", 460), firmware="4.6.0")
+    files.add(described(tmp_path, "ArduPlane", 3))
+    assert [str(each) for each in files] == [
+        "copter any version",
+        "copter 4.6",
+        "copter 4.6.0",
+        "plane any version",
+    ]
+    assert maximum(files, COPTER) == 46
+    assert maximum(files, replace(COPTER, firmware=0x040600FF)) == 460
+    assert maximum(files, replace(COPTER, firmware=0x043C0000)) == 1, "4.60 is not 4.6"
+    assert maximum(files, replace(COPTER, firmware=0)) == 1, "the version is not known"
+    assert maximum(files, replace(COPTER, vehicle_type=13)) == 46, "a hexacopter"
+    assert maximum(files, replace(COPTER, vehicle_type=1)) == 3
+    assert maximum(files, replace(COPTER, vehicle_type=10)) is None
+    assert maximum(files, replace(COPTER, autopilot=PX4)) is None
+    assert maximum(files, COPTER, component=100) is None, "a camera"
+
+
+def test_files_are_replaced_and_removed(tmp_path: Path) -> None:
+    files = AddedFiles(tmp_path / "added")
+    for value in (5, 6):
+        added, metadata = files.add(described(tmp_path, "ArduCopter", value), firmware="4.6")
+        assert (added.kind, added.firmware, len(metadata)) == ("copter", "4.6", 2)
+    assert maximum(files, COPTER) == 6
+    with pytest.raises(UsageError, match=r"added: copter 4\.6"):
+        files.remove("copter")
+    assert files.remove("copter", "4.6").firmware == "4.6"
+    assert maximum(files, COPTER) is None
+
+
+def test_a_file_must_be_metadata_of_a_known_vehicle(tmp_path: Path) -> None:
+    files = AddedFiles(tmp_path / "added")
+    with pytest.raises(UsageError, match="names no vehicle type"):
+        files.add(DATA / "apm.pdef.xml")
+    assert files.add(DATA / "apm.pdef.json", "rover")[0].kind == "rover"
+    assert files.add(DATA / "parameters.json")[0].kind == "px4"
+    with pytest.raises(UsageError, match=r"written as 4\.6"):
+        files.add(DATA / "parameters.json", firmware="../4")
+    with pytest.raises(MetadataError):
+        files.add(DATA / "px4_flight.ulg", "px4")
+
+
+def test_a_damaged_copy_is_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    files = AddedFiles(tmp_path / "added")
+    added, _ = files.add(described(tmp_path, "ArduCopter"))
+    added.path.write_text("<")
+    assert files.find(COPTER, 1) is None
+    assert "copter.added" in caplog.text
+
+
+def test_a_store_prefers_what_the_vehicle_has_provided(tmp_path: Path) -> None:
+    store = MetadataStore(tmp_path / "metadata")
+    identity = replace(COPTER, git_hash="0badc0de")
+    before = store.has_notes
+    store.added.add(described(tmp_path, "ArduCopter", 7))
+    assert (before, store.has_notes) == (False, True)
+    own = described(tmp_path, "ArduCopter", 8).read_bytes()
+    found = store.known(identity, 1)
+    assert found is not None
+    assert found["GAIN"].maximum == 7
+    store.put(own, crc32_px4(own))
+    store.remember(identity, 1, crc32_px4(own))
+    found = store.known(identity, 1)
+    assert found is not None
+    assert found["GAIN"].maximum == 8
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Command:
+    leaping(monkeypatch)
+    return in_process(capsys, "--cache", str(tmp_path / "cache.sqlite3"))
+
+
+@pytest.fixture
+def put(monkeypatch: pytest.MonkeyPatch) -> Put:
+    return behind(monkeypatch, "udpin:0.0.0.0:14550")
+
+
+def test_every_command_uses_an_added_file(command: Command, put: Put, tmp_path: Path) -> None:
+    vehicle = ArduPilotVehicle(table={"GAIN": 4.0, "MODE": 0}, live=())
+    url = put(vehicle)
+    assert command("metadata", "list").err == "no metadata was added\n"
+    file = described(tmp_path, "ArduCopter")
+    added = command("metadata", "add", file, "--firmware", "4.6")
+    assert (added.code, added.err) == (0, f"2 descriptions from {file} for copter 4.6\n")
+    assert command("metadata", "list").rows[1] == ["copter", "4.6", "2"]
+    listed = command("metadata", "list", "--json").json
+    assert listed == {"metadata": [{"vehicle": "copter", "firmware": "4.6", "descriptions": 2}]}
+
+    assert command("set", url, "MODE=Loiter").code == 0
+    assert vehicle.values["MODE"] == 2
+    refused = command("set", url, "GAIN", 11)
+    assert refused.code == 2
+    assert "above the maximum of 10" in refused.err
+    assert "Loiter" in command("get", url, "MODE").out
+    command("fetch", url)
+    assert "Loiter" in command("show", 1, "MODE").out
+
+    removed = command("metadata", "remove", "copter", "--firmware", "4.6", "--json")
+    assert removed.json == {"vehicle": "copter", "firmware": "4.6"}
+    assert "Loiter" not in command("get", url, "MODE").out
+    assert command("set", url, "MODE=Loiter").code == 2
+    assert command("metadata", "remove", "copter").code == 2
