@@ -8,6 +8,7 @@
 #   make scale      250 systems on one link        make fuzz       each target of fuzz/ for a while
 #   make soak       10,000 sessions at random      make kills      1,000 programs killed as they write
 #   make attack     hostile clients and services   make fuzz-http  requests at random to the service
+#   make sync       the blocking client, from the asynchronous one
 #   make clean      remove all that was made
 #   make screenshots  what the page looks like, into docs/images
 #   make live LINK=udpin:127.0.0.1:14550   checks on a real vehicle, which must be disarmed
@@ -43,7 +44,7 @@ WORKERS ?= $(shell $(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 2)
 # the tests start some hundred processes; without bytecode each would compile paramclient anew, and each worker the tests
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test coverage soak kills live fuzz fuzz-http attack lint docs screenshots bench cost scale peers dist clean
+.PHONY: demo test coverage soak kills live fuzz fuzz-http attack lint docs screenshots sync bench cost scale peers dist clean
 .NOTPARALLEL:
 
 demo: $(VENV)/with-cli
@@ -91,6 +92,10 @@ docs: $(VENV)/with-docs
 
 screenshots: $(VENV)/with-test
 	$(BIN)/python -m tests.screenshots
+
+# after each change of the asynchronous interface; a test compares the result
+sync: $(VENV)/with-test
+	$(BIN)/python -m tests.sync_interface
 
 bench: $(VENV)/with-cli
 	$(BIN)/python bench/parse.py

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 import io
+import json
 import os
 import re
 import shlex
@@ -11,8 +14,10 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
+from typing import TypeVar, get_origin
 from unittest import mock
 
 import pytest
@@ -23,6 +28,7 @@ import paramclient.metadata
 import paramclient.provision
 import paramclient.remote
 import paramclient.sim
+import paramclient.sync
 import paramclient.testing
 from paramclient import cli
 from paramclient.cli.exit_codes import ExitCode
@@ -38,6 +44,11 @@ def name_of(page: Path) -> str:
 
 
 EVERY_PAGE = pytest.mark.parametrize("page", PAGES, ids=name_of)
+
+PUBLIC = [
+    *(paramclient, paramclient.links, paramclient.metadata, paramclient.provision),
+    *(paramclient.remote, paramclient.sim, paramclient.sync, paramclient.testing),
+]
 
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 DIRECTIVE = re.compile(r"^\.\. (\w+):: ([\w.]+)(?:\(\))?$", re.MULTILINE)
@@ -57,7 +68,7 @@ COMMANDS = [
     "info",
     "sim",
 ]
-COMMANDS += ["apply", "verify", "restore", "import", "serve", "token"]
+COMMANDS += ["--install-completion", "reset", "apply", "verify", "restore", "import", "serve", "token"]
 
 LINK = re.compile(r"\]\(([^)#\s]*)(?:#([^)\s]*))?\)")
 SERVICE = "http://127.0.0.1:8765"
@@ -128,12 +139,70 @@ def serving(*arguments: str, cwd: Path) -> Iterator[str]:
             process.terminate()
 
 
+SHOWN = re.compile(
+    r"^```python\n((?:(?!```).*\n)*)```\n\n(?:It prints\b.*\n\n)?```text\n((?:(?!```).*\n)*)```$",
+    re.MULTILINE,
+)
+"""A program, and the output that the page shows below it."""
+DURATION = re.compile(r"\d+\.\d+ s\b")
+
+
+def shown() -> Iterator[tuple[str, str, str]]:
+    """Every program whose page shows its output: the page, the program, and that output."""
+    for page in PAGES:
+        for code, output in SHOWN.findall(page.read_text(encoding="utf-8")):
+            yield name_of(page), code, output
+
+
 @pytest.mark.parametrize(
-    "program", [pytest.param(code, id=name) for name, code in programs() if not needs_service(code)]
+    "program",
+    [
+        pytest.param(code, id=name)
+        for name, code in programs()
+        if not needs_service(code) and code not in {each for _, each, _ in shown()}
+    ],
 )
 def test_a_program_runs(program: str, tmp_path: Path) -> None:
     folders = {"XDG_CACHE_HOME": str(tmp_path), "XDG_STATE_HOME": str(tmp_path)}
     run("-W", "error", "-c", program, cwd=tmp_path, **folders)
+
+
+@pytest.mark.parametrize(
+    ("program", "output"), [pytest.param(code, output, id=name) for name, code, output in shown()]
+)
+def test_a_program_prints_what_the_page_shows(program: str, output: str, tmp_path: Path) -> None:
+    folders = {"XDG_CACHE_HOME": str(tmp_path), "XDG_STATE_HOME": str(tmp_path)}
+    printed = run("-W", "error", "-c", program, cwd=tmp_path, **folders)
+    assert DURATION.sub("0.0 s", printed) == DURATION.sub("0.0 s", output)
+
+
+RECIPE = re.compile(r"^```sh\n(.*)\n```\n(?:\n```text\n((?:(?!```).*\n)*)```\n)?", re.MULTILINE)
+
+
+def test_the_commands_of_the_recipes_print_what_the_page_shows(tmp_path: Path) -> None:
+    """In one folder, in the order of the page. A command without a text below it prints nothing."""
+    page = (DOCS / "recipes.md").read_text(encoding="utf-8")
+    found = RECIPE.findall(page)
+    assert len(found) + len(blocks(DOCS / "recipes.md", "python")) == 20
+    for command, output in found:
+        name, *words = shlex.split(command)
+        assert name == "paramclient"
+        done = subprocess.run(
+            [sys.executable, "-m", "paramclient", *words],
+            cwd=tmp_path,
+            env=os.environ | {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path), "COLUMNS": "100"},
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            encoding="utf-8",
+            timeout=60,
+            check=False,
+        )
+        printed = "".join(f"{line.rstrip()}\n" for line in done.stdout.splitlines())
+        assert (done.returncode, printed) == (0, output), command + done.stderr
+
+
+def test_the_pages_show_the_output_of_their_programs() -> None:
+    assert {"quickstart", "sync", "setup", "extended", "recipes"} <= {name for name, _, _ in shown()}
 
 
 def test_the_programs_over_a_service_run(tmp_path: Path) -> None:
@@ -144,10 +213,34 @@ def test_the_programs_over_a_service_run(tmp_path: Path) -> None:
             run("-W", "error", "-c", code.replace(SERVICE, address), cwd=tmp_path)
 
 
-def test_programs_are_typed(tmp_path: Path) -> None:
+def write_programs(folder: Path) -> None:
     for name, code in programs():
-        file = tmp_path / f"{re.sub(r'[^a-z0-9]', '_', name.lower())}.py"
+        file = folder / f"{re.sub(r'[^a-z0-9]', '_', name.lower())}.py"
         file.write_text(code, encoding="utf-8")
+
+
+@pytest.mark.skipif(find_spec("basedpyright") is None, reason="basedpyright is not installed")
+def test_pyright_accepts_the_programs(tmp_path: Path) -> None:
+    write_programs(tmp_path)
+    settings = {
+        "extraPaths": [str(ROOT), *(path for path in sys.path if path.endswith("site-packages"))],
+        "pythonVersion": "3.11",
+        "typeCheckingMode": "strict",
+    }
+    (tmp_path / "pyrightconfig.json").write_text(json.dumps(settings), encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-m", "basedpyright", str(tmp_path)],
+        cwd=tmp_path,
+        capture_output=True,
+        encoding="utf-8",
+        timeout=300,
+        check=False,
+    )
+    assert done.stdout.replace(f"{tmp_path}/", "") == "0 errors, 0 warnings, 0 notes\n", done.stderr
+
+
+def test_programs_are_typed(tmp_path: Path) -> None:
+    write_programs(tmp_path)
     settings = ["--config-file", str(ROOT / "pyproject.toml"), "--cache-dir", str(ROOT / ".mypy_cache")]
     files = sorted(map(str, tmp_path.glob("*.py")))
     assert len(files) == len(list(programs()))
@@ -194,14 +287,7 @@ def test_every_page_is_in_the_table_of_contents() -> None:
         assert name == "index" or re.search(rf"^{name}$", index, re.MULTILINE), name
 
 
-@pytest.mark.parametrize(
-    "module",
-    [
-        *(paramclient, paramclient.links, paramclient.metadata, paramclient.provision),
-        *(paramclient.remote, paramclient.sim, paramclient.testing),
-    ],
-    ids=lambda m: m.__name__,
-)
+@pytest.mark.parametrize("module", PUBLIC, ids=lambda m: m.__name__)
 def test_every_public_name_is_in_the_pages(module: ModuleType) -> None:
     documented = set()
     for page in DOCS.glob("api/*.rst"):
@@ -213,6 +299,74 @@ def test_every_public_name_is_in_the_pages(module: ModuleType) -> None:
                 documented.add(f"{current}.{name}")
     public = {f"{module.__name__}.{name}" for name in module.__all__ if name != "__version__"}
     assert public == {name for name in documented if name.rpartition(".")[0] == module.__name__}
+
+
+MADE_BY_THE_LIBRARY = {
+    *("CachedComponent.of", "ClientStats.of", "RemoteComponent.__init__"),
+    *("Changes.push", "Events.push", "ExtChanges.push", "SimVehicle.__init__"),
+    *("ParamCache.save", "ParamCache.merge", "ParamCache.save_ext"),
+}
+"""Functions of public classes that only the library calls."""
+PASSED_BY_THE_LIBRARY = {"ClientThread"}
+"""Types of the first argument of blocking classes, which only the library creates."""
+
+
+def annotations_of(kind: type) -> Iterator[tuple[str, str, str]]:
+    """Yield name, annotation and module of the public attributes, arguments and results of a class."""
+    for base in kind.__mro__:
+        if base.__module__.startswith("paramclient"):
+            for name, text in vars(base).get("__annotations__", {}).items():
+                yield name, str(text), base.__module__
+            for name, member in vars(base).items():
+                function = member.fget if isinstance(member, property) else member
+                function = getattr(function, "__func__", function)
+                for text in getattr(function, "__annotations__", {}).values():
+                    yield name, str(text), base.__module__
+
+
+def find_type(word: str, module: str) -> object:
+    """Return what a name in an annotation denotes; None for one that no loaded module of ours has."""
+    found: object = sys.modules[module]
+    for part in word.split("."):
+        found = getattr(found, part, None)
+    if found is None:
+        ours = [each for name, each in sys.modules.items() if name.startswith("paramclient")]
+        found = next((vars(each)[word] for each in ours if word in vars(each)), None)
+    return found
+
+
+def is_of_the_library(found: object) -> bool:
+    """Return whether a type is a class or an alias of the library."""
+    if isinstance(found, TypeVar) or found is None:
+        return False
+    return get_origin(found) is not None or getattr(found, "__module__", "").startswith("paramclient")
+
+
+@pytest.mark.parametrize("module", PUBLIC, ids=lambda m: m.__name__)
+def test_every_type_in_a_public_signature_is_public(module: ModuleType) -> None:
+    public = {name for each in PUBLIC for name in each.__all__}
+    hidden = set()
+    for name in module.__all__:
+        member = getattr(module, name)
+        told = annotations_of(member) if isinstance(member, type) else []
+        if inspect.isfunction(member):
+            told = [("", str(text), member.__module__) for text in member.__annotations__.values()]
+        for attribute, text, place in told:
+            where = f"{name}.{attribute}".rstrip(".")
+            if (attribute.startswith("_") and attribute != "__init__") or where in MADE_BY_THE_LIBRARY:
+                continue
+            words = re.findall(r"[A-Za-z_][\w.]*", re.sub(r"Literal\[[^]]*\]", "", text))
+            hidden |= {
+                (where, word)
+                for word in words
+                if word.rpartition(".")[2] not in public | PASSED_BY_THE_LIBRARY
+                and is_of_the_library(find_type(word, place))
+            }
+    assert hidden == set()
+
+
+def test_the_package_shows_public_names_only() -> None:
+    assert dir(paramclient) == sorted(paramclient.__all__)
 
 
 def test_the_page_of_the_design_names_every_room() -> None:
@@ -248,15 +402,70 @@ def help_of(*words: str) -> str:
 
 
 def subcommand(words: list[str]) -> list[str]:
-    return words[:2] if words[0] in ("cache", "fleet", "signing") else words[:1]
+    return words[:2] if words[0] in ("cache", "fleet", "metadata", "signing") else words[:1]
+
+
+WRITES = {"set", "set_many", "reset", "reboot", "setup_signing", "write"}
+"""Methods that change a vehicle."""
+
+
+def writes_to_the_first(code: str) -> list[str]:
+    """Return the calls of a program that change the vehicle of a `component()` without an address."""
+    events: list[tuple[int, str, bool]] = []
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            is_first = any(
+                isinstance(each, ast.Call)
+                and isinstance(each.func, ast.Attribute)
+                and each.func.attr == "component"
+                and not each.args
+                and {"system", "component", "peer"}.isdisjoint(word.arg or "" for word in each.keywords)
+                for each in ast.walk(node.value)
+            )
+            events.append((node.lineno, node.targets[0].id, is_first))
+    found = []
+    for node in ast.walk(ast.parse(code)):
+        if not isinstance(node, ast.Call):
+            continue
+        target: ast.expr | None = None
+        if isinstance(node.func, ast.Attribute) and node.func.attr in WRITES:
+            target = node.func.value
+        elif isinstance(node.func, ast.Name) and node.func.id in ("apply", "restore") and node.args:
+            target = node.args[0]
+        if isinstance(target, ast.Name):
+            bound = [is_first for line, name, is_first in events if name == target.id and line <= node.lineno]
+            if bound and bound[-1]:
+                found.append(ast.unparse(node))
+    return found
+
+
+@pytest.mark.parametrize(
+    "code",
+    [pytest.param(code, id=name) for name, code in programs()]
+    + [
+        pytest.param(path.read_text(encoding="utf-8"), id=path.name)
+        for path in sorted((ROOT / "examples").rglob("*.py"))
+    ],
+)
+def test_programs_that_write_refuse_to_choose_among_several_vehicles(code: str) -> None:
+    assert not writes_to_the_first(code)
+
+
+def test_a_write_to_the_first_vehicle_is_found() -> None:
+    first = "vehicle = await client.component(timeout=3)"
+    program = "async def main():\n    {}\n    await vehicle.set('A', 1)\n"
+    assert writes_to_the_first(program.format(first)) == ["vehicle.set('A', 1)"]
+    assert not writes_to_the_first(program.format(first.replace("component(", "only_component(")))
+    assert not writes_to_the_first(program.format(first.replace("timeout", "system")))
 
 
 def test_every_command_is_shown_and_exists() -> None:
     used = {tuple(subcommand(words)) for words in commands()}
-    cache = {("cache", verb) for verb in ("list", "history", "path", "add", "remove", "copy")}
+    cache = {("cache", verb) for verb in ("list", "history", "path", "add", "name", "remove", "copy")}
     fleet = {("fleet", "diff")}
     signing = {("signing", verb) for verb in ("setup", "disable")}
-    assert used == {(verb,) for verb in COMMANDS} | cache | fleet | signing
+    metadata = {("metadata", verb) for verb in ("add", "list", "remove")}
+    assert used == {(verb,) for verb in COMMANDS} | cache | fleet | signing | metadata
     for words in used:
         assert words[-1] in help_of(*words)
 
@@ -275,8 +484,10 @@ def test_the_page_of_the_command_names_every_option() -> None:
         offered |= set(re.findall(r"--[a-z][a-z-]+", help_of(command)))
     for verb in ("setup", "disable"):
         offered |= set(re.findall(r"--[a-z][a-z-]+", help_of("signing", verb)))
-    for verb in ("list", "history", "path", "add", "remove", "copy"):
+    for verb in ("list", "history", "path", "add", "name", "remove", "copy"):
         offered |= set(re.findall(r"--[a-z][a-z-]+", help_of("cache", verb)))
     offered |= set(re.findall(r"--[a-z][a-z-]+", help_of("fleet", "diff")))
+    for verb in ("add", "list", "remove"):
+        offered |= set(re.findall(r"--[a-z][a-z-]+", help_of("metadata", verb)))
     named = set(re.findall(r"`(--[a-z][a-z-]+)", page))
     assert named - {"--help"} == offered - {"--help", "--version"}

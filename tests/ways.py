@@ -1,7 +1,7 @@
-"""The two ways to a vehicle: a client with a link of its own, and one over a service that has the link.
+"""The ways to a vehicle: a client with a link of its own, one over a service that has it, a blocking one.
 
-A test module that imports `pytest_generate_tests` and `way` runs each of its tests both ways, as far as they
-open their clients with `a_client`: what users see must be the same.
+A test module that imports `pytest_generate_tests` and `way` runs each of its tests in all ways, as far as
+they open their clients with `a_client`: what users see must be the same.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import pytest
 
-from paramclient import Component, ParamClient
+from paramclient import Component, Event, Events, ParamClient
 from paramclient.client.client import implementation_of
 from paramclient.client.link_component import LinkComponent
 from paramclient.client.local import local
@@ -24,13 +24,17 @@ from paramclient.remote.service_client import ServiceClient
 from paramclient.service import Hub, create_app
 from tests import shell
 from tests.asgi import ASGITransport
+from tests.blocked import BlockedClient, BlockedStream, block, unblocked
 
 __all__ = [
     "DIRECT",
     "ServedClient",
     "direct_only",
+    "drained",
+    "event_listeners",
     "listeners",
     "looks",
+    "push",
     "pytest_generate_tests",
     "served",
     "way",
@@ -38,6 +42,7 @@ __all__ = [
 
 DIRECT = "direct"
 SERVICE = "service"
+BLOCKING = "blocking"
 
 Test = TypeVar("Test", bound=Callable[..., object])
 
@@ -54,9 +59,9 @@ def direct_only(reason: str) -> Callable[[Test], Test]:
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Run each test both ways, but for those that are marked."""
+    """Run each test in all ways, but for those that are marked."""
     is_direct = hasattr(metafunc.function, "direct_only")
-    metafunc.parametrize("way", [DIRECT] if is_direct else [DIRECT, SERVICE], indirect=True)
+    metafunc.parametrize("way", [DIRECT] if is_direct else [DIRECT, SERVICE, BLOCKING], indirect=True)
 
 
 @pytest.fixture(autouse=True)
@@ -66,6 +71,10 @@ def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     if chosen == SERVICE:
         monkeypatch.setattr(shell, "client_of", ServedClient)
         monkeypatch.setattr(shell, "machine_of", lambda component: local(served(component)).machine)
+    if chosen == BLOCKING:
+        block(monkeypatch)
+        monkeypatch.setattr(shell, "client_of", BlockedClient)
+        monkeypatch.setattr(shell, "machine_of", lambda component: local(unblocked(component)).machine)
     return chosen
 
 
@@ -122,10 +131,30 @@ OPENED: weakref.WeakSet[ServedClient] = weakref.WeakSet()
 
 def listeners(component: Component) -> Collection[Changes]:
     """Who listens to the changes of a component."""
+    component = unblocked(component)
     if isinstance(component, RemoteComponent):
         return mirrored_of(component)._subscriptions
     assert isinstance(component, LinkComponent)
     return component._subscriptions
+
+
+def event_listeners(client: ParamClient) -> Collection[Events]:
+    """Who listens to the events of a client."""
+    return implementation_of(unblocked(client))._subscriptions
+
+
+def drained(events: Events) -> list[Event]:
+    """What waits for a listener, which does not get it any more."""
+    stream: Events = unblocked(events)
+    waiting = list(stream._waiting)
+    stream._waiting.clear()
+    return [events.shown(each) for each in waiting] if isinstance(events, BlockedStream) else waiting
+
+
+def push(events: Events, event: Event) -> None:
+    """Let something happen, for one listener alone."""
+    stream: Events = unblocked(events)
+    stream.push(unblocked(event))
 
 
 def looks(component: Component) -> str:

@@ -923,7 +923,9 @@ async def test_defaults_are_kept_over_sessions_and_go_with_the_firmware(path: Pa
 
 @pytest.mark.parametrize("kind", ["no file", "silent"])
 @swiftly
-async def test_that_there_is_no_file_is_remembered_for_the_firmware(path: Path, kind: str) -> None:
+async def test_a_vehicle_without_the_parameter_file_is_remembered_for_its_firmware(
+    path: Path, kind: str
+) -> None:
     vehicle = ArduPilotVehicle(live_period=0)
     server = vehicle._ftp
     assert server is not None

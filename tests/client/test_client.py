@@ -502,25 +502,10 @@ async def test_a_component_that_is_not_there(wanted: dict[str, Any], words: str)
 @swiftly
 async def test_a_component_that_is_not_there_and_what_was_received_instead() -> None:
     async with a_client(generic(autopilot=wire.MAV_AUTOPILOT_INVALID)) as client:
-        with pytest.raises(NoReply, match=rf"Received on {re.escape(client.link.name)} so far: 1/1\.$"):
+        with pytest.raises(
+            NoReply, match=rf"Received on {re.escape(client.link.name)} so far: 1/1 generic\.$"
+        ):
             await client.component(timeout=2.5)
-
-
-@pytest.mark.parametrize(
-    ("link", "components", "count", "words"),
-    [
-        ("udpin:a:1", [], 0, "Nothing was received on udpin:a:1. Is the vehicle sending to this port?"),
-        ("sim:px4", [], 0, "Nothing was received on sim:px4."),
-        ("tcp:a:1", [], 1500, "1,500 bytes were received on tcp:a:1, but no valid MAVLink frame."),
-        ("serial:a:1", [], 2, "2 bytes were received on serial:a:1, but no valid MAVLink frame. {}"),
-        ("a", [(2, 1), (1, 1), (1, 1)], 40, "Received on a so far: 1/1, 2/1."),
-        ("a", [(n, 1) for n in range(1, 8)], 40, "Received on a so far: 1/1, 2/1, 3/1, 4/1, 5/1 and 2 more."),
-    ],
-)
-@direct_only("opens no client")
-def test_a_silent_link_in_words(link: str, components: list[tuple[int, int]], count: int, words: str) -> None:
-    expected = words.format("Check the cable and the baud rate.")
-    assert arguments.silence_in_words(link, components, count) == expected
 
 
 # Reading and writing
@@ -1134,6 +1119,7 @@ async def test_a_dropped_changes_object_is_no_listener_any_more() -> None:
         changes = component.changes()
         assert len(listeners(component)) == 1
         del changes
+        await settled()
         assert not listeners(component)
 
 
@@ -1433,7 +1419,9 @@ async def test_nothing_rests_while_an_answer_is_awaited() -> None:
 
 @direct_only("it is about the reader of a link")
 @swiftly
-async def test_what_comes_during_a_rest_is_taken_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_datagrams_that_arrive_during_a_pause_are_processed_in_order(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     taken: list[bytes] = []
     receive = Station.receive
 
@@ -1587,7 +1575,7 @@ async def test_invalid_options_of_accept_and_sample_are_refused() -> None:
     async with a_client(generic()) as client:
         component = await client.component()
         with pytest.raises(UsageError, match='accept must be "verified" or "sampled", not \'all\''):
-            await component.fetch_all(accept="all")
+            await component.fetch_all(accept="all")  # type: ignore[arg-type]
         with pytest.raises(UsageError, match="sample must be at least 1 parameter, not 0"):
             await component.fetch_all(accept="sampled", sample=0)
         assert (await component.fetch_all(accept="sampled", sample=10**9, seed=time.time_ns())).complete

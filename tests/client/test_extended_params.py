@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+from unittest import mock
 
 import anyio
 import pytest
@@ -15,7 +19,8 @@ from paramclient import (
     ExtSettable,
     LinkError,
     NoReply,
-    ParamClient,
+    NotDurable,
+    ParamCache,
     Policy,
     Progress,
     SetFailed,
@@ -24,9 +29,12 @@ from paramclient import (
     UsageError,
     ValueUnsupported,
 )
-from paramclient.client.local import local
 from paramclient.sim import Air, Camera, PX4Vehicle
-from tests.shell import swiftly
+from tests import shell
+from tests.shell import a_client, settled, swiftly
+from tests.ways import direct_only, pytest_generate_tests, way
+
+__all__ = ["pytest_generate_tests", "way"]
 
 MANY = {f"PARAM_{number:03}": number for number in range(120)}
 
@@ -34,7 +42,7 @@ MANY = {f"PARAM_{number:03}": number for number in range(120)}
 @swiftly
 async def test_the_calls_of_a_camera() -> None:
     camera = Camera()
-    async with ParamClient(camera, cache=False) as client:
+    async with a_client(camera) as client:
         component = await client.component(1, 100)
         ext = component.ext
         assert (ext.is_expected, ext.is_spoken, ext.count, ext.is_complete) == (True, False, None, False)
@@ -57,7 +65,7 @@ async def test_the_calls_of_a_camera() -> None:
 async def test_a_vehicle_with_a_camera_on_one_link_that_loses_packets() -> None:
     camera = Camera(MANY, slow={"PARAM_001": 2.0})
     air = Air.symmetric([PX4Vehicle(table={"A": 1, "B": 2.0}), camera], loss=0.1, delay=0.03, seed=3)
-    async with ParamClient(air, cache=False) as client:
+    async with a_client(air) as client:
         vehicle = await client.component()
         component = await client.component(1, 100)
         plain, extended = await asyncio.gather(vehicle.fetch_all(), component.ext.fetch_all())
@@ -67,7 +75,7 @@ async def test_a_vehicle_with_a_camera_on_one_link_that_loses_packets() -> None:
         assert result.is_complete
         assert camera.ext_values == {name: value + 1 for name, value in MANY.items()}
         assert not vehicle.ext.params
-        assert not local(component).machine.is_busy
+        assert not shell.machine_of(component).is_busy
 
 
 @swiftly
@@ -79,7 +87,7 @@ async def test_outcomes_of_many_values() -> None:
         limits={"C": (0, 5)},
     )
     seen: list[ExtSetOutcome] = []
-    async with ParamClient(camera, cache=False) as client:
+    async with a_client(camera) as client:
         ext = (await client.component(1, 100)).ext
         await ext.fetch_all()
         pairs: list[tuple[str, ExtSettable]] = [
@@ -115,7 +123,7 @@ async def test_outcomes_of_many_values() -> None:
 @swiftly
 async def test_timeouts() -> None:
     camera = Camera(MANY, slow={"PARAM_001": 100.0})
-    async with ParamClient(camera, cache=False) as client:
+    async with a_client(camera) as client:
         component = await client.component(1, 100)
         ext = component.ext
         partial = await ext.fetch_all(timeout=0.1)
@@ -127,20 +135,20 @@ async def test_timeouts() -> None:
         result = await ext.set_many({"PARAM_001": 7, "PARAM_002": 7}, timeout=1.0)
         assert [each.status for each in result.outcomes] == ["unknown", "accepted"]
         assert isinstance(result.error, NoReply)
-        assert not local(component).machine.is_busy
-    async with ParamClient(Camera({}), cache=False) as client:
+        assert not shell.machine_of(component).is_busy
+    async with a_client(Camera({})) as client:
         component = await client.component(1, 100)
         with pytest.raises(NoReply, match="extended parameters of 1/100"):
             await component.ext.fetch_all(timeout=1.0)
         with pytest.raises(NoReply, match="after 6 tries"):
             await component.ext.fetch_all()
-        assert not local(component).machine.is_busy
+        assert not shell.machine_of(component).is_busy
 
 
 @swiftly
 async def test_progress() -> None:
     seen: list[Progress] = []
-    async with ParamClient(Camera(MANY, burst=1, period=0.02), cache=False) as client:
+    async with a_client(Camera(MANY, burst=1, period=0.02)) as client:
         ext = (await client.component(1, 100)).ext
         await ext.fetch_all(progress=seen.append)
     assert len(seen) > 10
@@ -151,17 +159,17 @@ async def test_progress() -> None:
 @swiftly
 async def test_changes() -> None:
     camera = Camera({"A": 1, "B": "text"})
-    async with ParamClient(camera, cache=False) as client:
+    async with a_client(camera) as client:
         component = await client.component(1, 100)
         changes = component.ext.changes()
         plain = component.changes()
         await component.ext.fetch_all()
-        await component.ext.set("A", 2, asker="anna")
+        await component.ext.set("A", 2)
         await component.ext.set("B", "other")
         await component.ext.set("B", "third")
         found: list[ExtChange] = [await anext(changes), await anext(changes)]
         assert [(each.name, each.old, each.new and each.new.value, each.by) for each in found] == [
-            ("A", None, 2, "us for anna"),
+            ("A", None, 2, "us"),
             ("B", None, "third", "us"),
         ]
         with anyio.move_on_after(1.0) as scope:
@@ -174,9 +182,35 @@ async def test_changes() -> None:
         await anext(changes)
 
 
+@direct_only("a service names the authors")
+@swiftly
+async def test_a_change_on_behalf_of_another() -> None:
+    async with a_client(Camera({"A": 1})) as client:
+        ext = (await client.component(1, 100)).ext
+        changes = ext.changes()
+        await ext.set("A", 2, asker="anna")
+        assert (await anext(changes)).by == "us for anna"
+
+
+@swiftly
+async def test_a_parameter_that_the_component_has_anew_is_added() -> None:
+    camera = Camera({"A": 1, "B": 2})
+    async with a_client(camera) as client:
+        ext = (await client.component(1, 100)).ext
+        camera.remove_ext_param("B")
+        changes = ext.changes()
+        await ext.fetch_all()
+        first = await anext(changes)
+        assert (first.name, first.new and first.new.index, first.is_added) == ("A", 0, False)
+        camera.add_ext_param("C", "text")
+        assert set((await ext.fetch_all()).params) == {"A", "C"}
+        second = await anext(changes)
+        assert (second.name, second.new and second.new.index, second.is_added) == ("C", 1, True)
+
+
 @swiftly
 async def test_a_cancelled_call_leaves_nothing_behind() -> None:
-    async with ParamClient(Camera(MANY, slow={"PARAM_001": 100.0}), cache=False) as client:
+    async with a_client(Camera(MANY, slow={"PARAM_001": 100.0})) as client:
         component = await client.component(1, 100)
         ext = component.ext
         for call in (
@@ -188,13 +222,14 @@ async def test_a_cancelled_call_leaves_nothing_behind() -> None:
             with anyio.move_on_after(0.05) as scope:
                 await call()
             assert scope.cancelled_caught
-            assert not local(component).machine.ext.is_busy
-            assert len(local(component).machine.ext.batches) == 0
+            await settled()
+            assert not shell.machine_of(component).ext.is_busy
+            assert len(shell.machine_of(component).ext.batches) == 0
 
 
 @swiftly
 async def test_arguments_that_are_rejected() -> None:
-    async with ParamClient(Camera(), cache=False) as client:
+    async with a_client(Camera()) as client:
         ext = (await client.component(1, 100)).ext
         with pytest.raises(UsageError, match="129 bytes"):
             await ext.set("CAM_NAME", "x" * 129)
@@ -210,7 +245,7 @@ async def test_arguments_that_are_rejected() -> None:
 
 @swiftly
 async def test_policies_that_allow_no_download() -> None:
-    async with ParamClient(Camera(), cache=False, policy=Policy.CACHE_ONLY) as client:
+    async with a_client(Camera(), policy=Policy.CACHE_ONLY) as client:
         ext = (await client.component(1, 100)).ext
         with pytest.raises(CacheError, match="the policy is cache-only"):
             await ext.fetch_all()
@@ -221,7 +256,7 @@ async def test_policies_that_allow_no_download() -> None:
 
 @swiftly
 async def test_a_client_that_only_listens() -> None:
-    async with ParamClient(Camera(), cache=False, listen_only=True) as client:
+    async with a_client(Camera(), listen_only=True) as client:
         ext = (await client.component(1, 100)).ext
         with pytest.raises(UsageError, match="only listens"):
             await ext.fetch_all()
@@ -231,7 +266,7 @@ async def test_a_client_that_only_listens() -> None:
 
 @swiftly
 async def test_a_closed_client() -> None:
-    async with ParamClient(Camera(), cache=False) as client:
+    async with a_client(Camera()) as client:
         ext = (await client.component(1, 100)).ext
     for call in (ext.fetch_all(), ext.get("CAM_MODE"), ext.set("CAM_MODE", 1), ext.set_many({"CAM_MODE": 1})):
         with pytest.raises(LinkError):
@@ -242,7 +277,53 @@ async def test_a_closed_client() -> None:
 
 @pytest.mark.asyncio
 async def test_the_link_of_a_camera_with_loss() -> None:
-    async with ParamClient("sim:camera?loss=0.2&delay=0.01&seed=5", cache=False) as client:
+    async with a_client("sim:camera?loss=0.2&delay=0.01&seed=5") as client:
         component = await client.component(1, 100)
         assert (await component.ext.fetch_all()).complete
         assert (await component.ext.set("CAM_NAME", "Rear")).actual == "Rear"
+
+
+@swiftly
+async def test_a_durable_set_is_on_the_disk_with_its_line_when_it_returns(tmp_path: Path) -> None:
+    path = tmp_path / "cache"
+    async with a_client(Camera({"A": 1, "B": "text"}), cache=path) as client:
+        ext = (await client.component(1, 100)).ext
+        for number, value in enumerate((5, 6, 6)):  # at once, with the component hardly known
+            assert (await ext.set("A", value, durable=True)).actual == value
+            with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as other:
+                lines = other.execute("SELECT count(*) FROM ext_history").fetchone()
+                assert lines == (min(number + 1, 2),)
+        result = await ext.set_many([("A", 7), ("B", b"\xff")], durable=True)
+        assert result.is_complete
+        with ParamCache(path) as cache:
+            assert {name: each.value for name, each in cache.extended().params.items()} == {
+                "A": 7,
+                "B": b"\xff",
+            }
+
+
+@swiftly
+async def test_without_a_disk_nothing_is_sent_or_it_is_said_what_the_component_has(tmp_path: Path) -> None:
+    camera = Camera({"A": 1, "B": 2, "C": 3}, supported={"C": [3]})
+    async with a_client(camera) as client:
+        ext = (await client.component(1, 100)).ext
+        for call in (ext.set("A", 5, durable=True), ext.set_many({"A": 5}, durable=True)):
+            with pytest.raises(UsageError, match="durable needs a cache"):
+                await call
+    assert camera.requests["PARAM_EXT_SET"] == 0
+    with ParamCache(tmp_path / "cache") as cache:
+        async with a_client(camera, cache=cache) as client:
+            ext = (await client.component(1, 100)).ext
+            await ext.fetch_all()
+            with mock.patch.object(cache, "sync", side_effect=CacheError("no room")):
+                with pytest.raises(NotDurable, match="1/100 has accepted A, but it is not on the disk"):
+                    await ext.set("A", 5, durable=True)
+                assert camera.ext_values["A"] == ext.params["A"].value == 5
+                result = await ext.set_many({"A": 6, "B": 6, "C": 6}, durable=True)
+            assert [each.status for each in result.outcomes] == ["accepted", "accepted", "refused"]
+            errors = [type(each.error) for each in result.outcomes]
+            assert errors == [NotDurable, NotDurable, ValueUnsupported]
+            assert isinstance(result.error, NotDurable)
+            assert "has accepted 2 values, but they are not on the disk" in str(result.error)
+            await ext.set("A", 7, durable=True)
+            assert cache.extended().params["A"].value == 7

@@ -15,7 +15,8 @@ from paramclient.client.link_client import SESSION_CLOSE_TIMEOUT
 from paramclient.client.local import local
 from paramclient.errors import FileErrorCode, FileTransferError, LinkError
 from paramclient.links import SimLink
-from paramclient.model.values import ParamType, crc32_px4
+from paramclient.model.px4_hash import crc32_px4
+from paramclient.model.values import ParamType
 from paramclient.protocol.ftp import DirectoryEntry
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, SimParam
 from tests.shell import FlakyLink, Tap, a_client, outcome, swiftly, tasks_beside

@@ -442,7 +442,9 @@ async def test_a_vehicle_that_changes_its_identity_each_time_fills_no_cache(
 
 
 @swiftly
-async def test_so_many_tables_are_kept_and_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_cached_tables_of_a_session_are_bounded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(cache_writer, "TABLES_MAX", 2)
     vehicles = [small_px4(system=system) for system in (1, 2, 3)]
     async with ParamClient(Air(vehicles), cache=tmp_path / "cache.sqlite3") as client:

@@ -92,6 +92,7 @@ async def test_a_link_that_drops_and_returns_is_told(caplog: pytest.LogCaptureFi
 def test_nothing_is_printed_unless_somebody_asks() -> None:
     program = """
 import asyncio, logging, paramclient
+paramclient.ParamClient  # loads its module
 names = [name for name in logging.root.manager.loggerDict if name.startswith("paramclient")]
 assert names and not any(logging.getLogger(name).handlers for name in names)
 async def main():

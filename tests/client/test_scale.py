@@ -170,7 +170,7 @@ def test_a_fetch_that_is_given_back_is_freed_without_a_garbage_collection() -> N
 
 @swiftly
 async def test_the_errors_of_silent_components_hold_no_calls() -> None:
-    station: Any = SimpleNamespace()
+    station: Any = SimpleNamespace(components={})
     together = FleetFetch(station, {}, system=None, refresh=False)
     for system in range(1, 4):
         fetch: Any = SimpleNamespace(error=None if system > 1 else NoReply("x", attempts=1, waited=1.0))

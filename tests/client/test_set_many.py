@@ -363,3 +363,11 @@ async def test_two_calls_at_once_both_end() -> None:
             tasks.start_soon(set_all, dict(reversed(MANY.items())))
         assert all(result.is_complete for result in results)
         assert values_of(vehicle.params, NEW) == values_of(component.params, NEW)
+
+
+@swiftly
+async def test_a_closed_client_writes_nothing() -> None:
+    async with a_client(generic()) as client:
+        component = await client.component()
+    with pytest.raises(LinkError):
+        await component.set_many({"PARAM_01": 5})

@@ -14,7 +14,7 @@ import pytest
 from paramclient import (
     Added,
     CacheError,
-    Change,
+    Changed,
     ClientClosed,
     Component,
     Event,
@@ -33,7 +33,6 @@ from paramclient import (
     Trust,
     UsageError,
 )
-from paramclient.client.client import implementation_of
 from paramclient.client.events import EVENTS_MAX
 from paramclient.client.subscription import Changes
 from paramclient.protocol import wire
@@ -53,7 +52,7 @@ from tests.shell import (
     swiftly,
     until,
 )
-from tests.ways import pytest_generate_tests, way
+from tests.ways import drained, event_listeners, push, pytest_generate_tests, way
 
 __all__ = ["pytest_generate_tests", "way"]
 
@@ -64,13 +63,6 @@ MISSES = (ParamRequestRead, ParamRequestList, ParamSetMessage)
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     return tmp_path / "parameters.sqlite3"
-
-
-def drained(events: Events) -> list[Event]:
-    """What waits for a listener."""
-    waiting = list(events._waiting)
-    events._waiting.clear()
-    return waiting
 
 
 def kinds(events: Events) -> list[type]:
@@ -185,7 +177,7 @@ async def test_parameters_that_appear_are_added_and_can_be_set(path: Path, ftp: 
             while len(told) < 6:
                 each = await anext(changes)
                 told += [] if each.name in {every.name for every in told} else [each]
-        assert [(type(each), each.name) for each in told][:2] == [(Change, "GRIP_ENABLE"), (Added, "GRIP_2")]
+        assert [(type(each), each.name) for each in told][:2] == [(Changed, "GRIP_ENABLE"), (Added, "GRIP_2")]
         assert {each.name for each in told if isinstance(each, Added)} == group.keys()
         await until(lambda: component.sync_state is SyncState.SYNCED)
         assert bits(component.params) == bits(vehicle.params)
@@ -550,7 +542,7 @@ async def test_events_end_with_the_client() -> None:
         events, others = client.events(), client.events()
         waiting = asyncio.ensure_future(outcome(anext(others)))
         await settled()
-        events.push(Lost(component, 5.0))
+        push(events, Lost(component, 5.0))
     assert isinstance(await waiting, ClientClosed)
     assert await anext(events) == Lost(component, 5.0), "what had come is given first"
     for each in (events, client.events()):
@@ -565,7 +557,7 @@ async def test_cancelled_a_listener_loses_nothing() -> None:
         events = client.events()
         with anyio.move_on_after(0.01):
             await anext(events)
-        events.push(Lost(component, 5.0))
+        push(events, Lost(component, 5.0))
         assert await anext(events) == Lost(component, 5.0)
 
 
@@ -575,7 +567,7 @@ async def test_a_slow_listener_misses_the_oldest_and_holds_no_more() -> None:
         component = await client.component()
         events = client.events()
         for number in range(EVENTS_MAX + 10):
-            events.push(Lost(component, float(number)))
+            push(events, Lost(component, float(number)))
         waiting = drained(events)
         assert len(waiting) == EVENTS_MAX
         assert waiting[0] == Lost(component, 10.0)
@@ -588,7 +580,8 @@ async def test_a_dropped_events_object_is_unsubscribed() -> None:
         gone: weakref.ref[Events] = weakref.ref(client.events())
         gc.collect()
         assert gone() is None
-        assert not implementation_of(client)._subscriptions
+        await settled()
+        assert not event_listeners(client)
 
 
 @swiftly

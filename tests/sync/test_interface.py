@@ -1,0 +1,91 @@
+"""The blocking classes have the calls of the asynchronous ones, with the same arguments."""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+import pytest
+
+import paramclient
+import paramclient.sync
+from paramclient.client.subscription import Subscription
+from tests.sync_interface import BLOCKING, Call, blocking_source
+
+NAMES = {"aclose": "close", "__aenter__": "__enter__", "__aexit__": "__exit__"}
+"""Calls that have another name."""
+
+BY_LOOPS = {"__aiter__", "__anext__", "push", "end"}
+"""What a loop needs of a stream, or the client itself."""
+
+
+def test_the_blocking_classes_are_as_generated() -> None:
+    assert BLOCKING.read_text(encoding="utf-8") == blocking_source(), "run `make sync`"
+
+
+def test_every_asynchronous_class_has_a_blocking_one() -> None:
+    """Classes with calls to await, streams, and what holds a component."""
+    offered = {name: getattr(paramclient, name) for name in paramclient.__all__}
+    classes = {name: thing for name, thing in offered.items() if inspect.isclass(thing)}
+    asynchronous = {
+        name
+        for name, thing in classes.items()
+        if any(map(inspect.iscoroutinefunction, list(vars(thing).values())))
+        or issubclass(thing, Subscription)
+        or (is_dataclass(thing) and "Component" in {each.type for each in fields(thing)})
+    }
+    assert asynchronous | {"Event"} == set(paramclient.sync.__all__)
+
+
+def test_every_call_has_the_same_arguments() -> None:
+    for name in paramclient.sync.__all__:
+        if name == "Event":
+            continue
+        asynchronous, blocking = getattr(paramclient, name), getattr(paramclient.sync, name)
+        if is_dataclass(asynchronous):
+            assert [(each.name, each.type) for each in fields(asynchronous)] == [
+                (each.name, each.type) for each in fields(blocking)
+            ]
+            continue
+        for member in {"__init__", "__aenter__", "__aexit__", *public(asynchronous)} & dir_of(asynchronous):
+            ours, theirs = getattr(blocking, NAMES.get(member, member)), getattr(asynchronous, member)
+            if inspect.isfunction(theirs) and member != "__init__":
+                assert inspect.signature(ours) == inspect.signature(theirs), f"{name}.{member}"
+            elif name == "ParamClient":
+                assert callable(ours) == callable(theirs), f"{name}.{member}"
+    assert inspect.signature(paramclient.sync.ParamClient) == inspect.signature(paramclient.ParamClient)
+
+
+def public(kind: Any) -> set[str]:
+    return {name for name in vars(kind) if not name.startswith("_")} - BY_LOOPS
+
+
+def dir_of(kind: Any) -> set[str]:
+    return set(dir(kind))
+
+
+@pytest.mark.parametrize(
+    ("call", "lines"),
+    [
+        (Call("f", ["a", "b"]), ["    return f(a, b)"]),
+        (Call("f", ["a" * 60, "b" * 39]), ["    return f(", f"        {'a' * 60}, {'b' * 39}", "    )"]),
+        (
+            Call("f", ["a" * 60, "b" * 60]),
+            ["    return f(", f"        {'a' * 60},", f"        {'b' * 60},", "    )"],
+        ),
+        (
+            Call("f", [Call("partial", ["a" * 60, "b" * 31]), "c"]),
+            [
+                "    return f(",
+                "        partial(",
+                f"            {'a' * 60}, {'b' * 31}",
+                "        ),",
+                "        c,",
+                "    )",
+            ],
+        ),
+    ],
+)
+def test_calls_are_laid_out_as_ruff_does(call: Call, lines: list[str]) -> None:
+    assert call.laid_out(4, "return ", "") == lines
