@@ -1,16 +1,16 @@
-# Everything happens in .venv, which is made at the first call; nothing is installed outside this folder.
+# Everything is installed into .venv, which the first call creates.
 #
 #   make demo       the main job on a simulated vehicle
-#   make test       the tests                      make coverage   the tests, and what they reach
-#   make lint       style and types                make docs       the pages, into docs/_build/html
-#   make bench      speed of parser and start      make dist       wheel and sdist, into dist
-#   make cost       CPU and memory                 make peers      downloads beside other programs
-#   make scale      250 systems on one link        make fuzz       each target of fuzz/ for a while
-#   make soak       10,000 sessions at random      make kills      1,000 programs killed as they write
-#   make attack     hostile clients and services   make fuzz-http  requests at random to the service
-#   make sync       the blocking client, from the asynchronous one
-#   make clean      remove all that was made
-#   make screenshots  what the page looks like, into docs/images
+#   make test       the tests                      make coverage   the tests with their coverage
+#   make lint       style and types                make docs       the documentation, into docs/_build/html
+#   make bench      parser and start-up time       make dist       wheel and sdist, into dist
+#   make cost       CPU and memory                 make peers      downloads, compared with other clients
+#   make scale      250 systems on one link        make fuzz       each target of fuzz/ for SECONDS
+#   make soak       10,000 random sessions         make kills      1,000 programs killed while they write
+#   make attack     hostile clients and services   make fuzz-http  random requests to the service
+#   make sync       generates the blocking client from the asynchronous one
+#   make clean      removes .venv and all other files that these commands create
+#   make screenshots  screenshots of the web page, into docs/images
 #   make live LINK=udpin:127.0.0.1:14550   checks on a real vehicle, which must be disarmed
 
 PYTHON ?= $(shell for python in python3 python3.14 python3.13 python3.12 python3.11; do \
@@ -34,14 +34,14 @@ READ_ONLY ?=
 REBOOT ?=
 
 MEASURED = 'model/*' 'protocol/*' 'sim/*' 'cache/*' 'files/*' errors.py
-# they start programs of their own, which are not measured, are about rooms that are not, or go where others have been
+# excluded from the coverage: tests of other rooms, and tests that start processes, in which coverage is not measured
 UNMEASURED = $(addprefix --ignore=tests/,cli test_bench.py test_docs.py test_examples.py links/test_links.py \
 	protocol/test_state_machine.py test_packaging.py)
 
-# many tests wait, for a process, a socket or a time limit, and leave their core to the others meanwhile
+# more workers than cores: many tests wait for a process, a socket or a timeout
 WORKERS ?= $(shell $(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 2)')
 
-# the tests start some hundred processes; without bytecode each would compile paramclient anew, and each worker the tests
+# the tests start several hundred processes; without bytecode, each of them would compile paramclient again
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test coverage soak kills live fuzz fuzz-http attack lint docs screenshots sync bench cost scale peers dist clean
@@ -66,14 +66,14 @@ soak: $(VENV)/with-test
 kills: $(VENV)/with-test
 	$(BIN)/python bench/kills.py --kills $(KILLS)
 
-# without LINK it says how to call it; see docs/testing.md
+# prints its usage without LINK; see docs/testing.md
 live: $(VENV)/with-test
 	@$(BIN)/python -m tests.live $(LINK) $(if $(KIND),--kind $(KIND)) $(if $(SYSTEM),--system $(SYSTEM)) \
 		$(if $(ONLY),--only '$(ONLY)') $(if $(LINK2),--second-link $(LINK2)) \
 		$(if $(filter yes,$(READ_ONLY)),--read-only) $(if $(filter yes,$(REBOOT)),--reboot)
 
-# one after the other; what reaches something new is put into fuzz/corpus, what breaks something into fuzz/findings;
-# `python -m fuzz.keep TARGET` leaves of a corpus what is needed
+# Inputs that reach new code are added to fuzz/corpus, inputs that fail to fuzz/findings. `python -m fuzz.keep TARGET`
+# removes the inputs of a corpus that are not needed.
 fuzz: $(VENV)/with-test $(VENV)/with-fuzz
 	@for target in $(TARGETS); do \
 		echo "== fuzz/$$target.py, $(SECONDS) s"; \
@@ -93,7 +93,7 @@ docs: $(VENV)/with-docs
 screenshots: $(VENV)/with-test
 	$(BIN)/python -m tests.screenshots
 
-# after each change of the asynchronous interface; a test compares the result
+# needed after each change of the asynchronous interface; a test compares the result
 sync: $(VENV)/with-test
 	$(BIN)/python -m tests.sync_interface
 
@@ -125,7 +125,7 @@ clean:
 	rm -rf $(VENV) dist docs/_build htmlcov .coverage .coverage.* .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# The environment, and what is installed into it: once, and again when pyproject.toml changes.
+# The virtual environment and its dependency groups, installed again when pyproject.toml changes.
 
 $(VENV)/made:
 	@test -n "$(PYTHON)" && "$(PYTHON)" -c $(IS_NEW_ENOUGH) || { \
@@ -139,7 +139,7 @@ $(VENV)/with-cli: pyproject.toml $(VENV)/made
 	@$(PIP) --editable '.[cli,remote,serial,service]'
 	@touch $@
 
-# dependency groups need pip 25.1, and the pip of the environment is as old as its Python
+# dependency groups need pip 25.1; the pip of a new environment may be older
 $(VENV)/with-test $(VENV)/with-lint $(VENV)/with-docs $(VENV)/with-peers $(VENV)/with-fuzz $(VENV)/with-fuzz-http: $(VENV)/with-%: pyproject.toml $(VENV)/with-cli
 	@echo "Installing what $* needs into $(VENV)"
 	@$(PIP) 'pip>=25.1'
