@@ -10,6 +10,7 @@
 #   make attack     hostile clients and services   make fuzz-http  random requests to the service
 #   make sync       generates the blocking client from the asynchronous one
 #   make clean      removes .venv and all other files that these commands create
+#   make pictures   the comparison with other clients as pictures, into docs/images
 #   make screenshots  screenshots of the web page, into docs/images
 #   make live LINK=udpin:127.0.0.1:14550   checks on a real vehicle, which must be disarmed
 
@@ -44,7 +45,7 @@ WORKERS ?= $(shell $(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 2)
 # the tests start several hundred processes; without bytecode, each of them would compile paramclient again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test coverage soak kills live fuzz fuzz-http attack lint docs screenshots sync bench cost scale peers dist clean
+.PHONY: demo test coverage soak kills live fuzz fuzz-http attack lint docs screenshots pictures sync bench cost scale peers dist clean
 .NOTPARALLEL:
 
 demo: $(VENV)/with-cli
@@ -92,6 +93,10 @@ docs: $(VENV)/with-docs
 
 screenshots: $(VENV)/with-test
 	$(BIN)/python -m tests.screenshots
+
+# needed after each change of the table in the README; a test compares the result
+pictures: $(VENV)/made
+	$(BIN)/python bench/pictures.py
 
 # needed after each change of the asynchronous interface; a test compares the result
 sync: $(VENV)/with-test
