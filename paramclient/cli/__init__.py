@@ -15,6 +15,7 @@
 - `waiting`: what a command waits for, on a terminal.
 - `output`, `param_rows`, `results`, `metadata`, `exit_codes`: tables, JSON, metadata and exit codes.
 - `write_outcomes`, `confirmation`: writes with their outcomes, and the question before them.
+- `download_strip`, `link_history`, `block_characters`: drawings of a download and of a link on a terminal.
 - `signals`: SIGINT and SIGTERM.
 """
 

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import suppress
 from typing import Final
 
 import anyio
 
+from paramclient.cli.block_characters import Marks, Piece, marks_for
 from paramclient.cli.exit_codes import ExitCode
+from paramclient.cli.link_history import LOSS, ROUND_TRIP, LinkHistory, history_lines
 from paramclient.cli.options import Seconds, TrafficOptions
 from paramclient.cli.output import live_view, milliseconds, print_document, print_line, print_table
 from paramclient.cli.session import Deadline, listen
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
+from paramclient.client.local import local
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.model.identity import autopilot_name
 from paramclient.protocol.stats.traffic import ComponentTraffic, TrafficReport
@@ -33,6 +37,11 @@ MEASURE_DELAY: Final = 2.0
 MEASURE_INTERVAL: Final = 4.0
 """Seconds between two reads that measure the round trip: request and response together take less of the link
 than the heartbeats of this client."""
+ROUND_TRIP_VALIDITY: Final = MEASURE_INTERVAL + 1.0
+"""Seconds for which a measured round trip is drawn: until the next measurement, and the second in which it
+comes."""
+SCALES: Final = {LOSS: lambda share: f"{share:.1%}", ROUND_TRIP: milliseconds}
+"""The quantities of the history as text."""
 _DEFAULTS: Final = TrafficOptions()
 NO_AUTOPILOT: Final = ("unknown", autopilot_name(MAV_AUTOPILOT_INVALID))
 """Autopilot names of components that have no parameters to read."""
@@ -48,8 +57,9 @@ async def link(
 ) -> int:
     """Print the components on a link, their message rates and the packet loss.
 
-    On a terminal the table is live until Ctrl-C. Otherwise, and with --json, it is printed once, after
-    --seconds (default 5). Packet loss is counted by the gaps in the frames' sequence numbers.
+    On a terminal the table is live until Ctrl-C, with packet loss and round trip over the last minute.
+    Otherwise, and with --json, it is printed once, after --seconds (default 5). Packet loss is counted by the
+    gaps in the frames' sequence numbers.
 
     Args:
         url: The link, such as udpin:0.0.0.0:14550, tcp:HOST:PORT or sim:px4.
@@ -103,18 +113,32 @@ async def _listen(client: ParamClient, seconds: float | None) -> TrafficReport:
 
 
 async def _show(client: ParamClient, seconds: float | None) -> TrafficReport:
+    marks = marks_for(sys.stdout)  # the live view replaces the stream
     with live_view() as draw:
         deadline = Deadline(seconds)  # starts after rich is loaded
+        history = LinkHistory(anyio.current_time(), validity=ROUND_TRIP_VALIDITY)
         while True:
             report = client.traffic_report()
             if report.frames:
-                draw(_COLUMNS, _rows(client, report), _lines(client, report))
+                trips = {
+                    address: local(component).machine.round_trip
+                    for address, component in client.components.items()
+                }
+                history.take(report, trips, anyio.current_time())
+                draw(_COLUMNS, _rows(client, report), [*_lines(client, report), *_drawn(history, marks)])
             else:
                 draw(_COLUMNS, (), ["", f"nothing received yet: {_pace(client, report)}"])
             left = deadline.left(REFRESH_INTERVAL)
             if not left:
                 return report
             await anyio.sleep(left)
+
+
+def _drawn(history: LinkHistory, marks: Marks) -> list[str | Sequence[Piece]]:
+    """Return the lines of the history, after an empty one; none before the first second."""
+    width = shutil.get_terminal_size().columns
+    lines = history_lines(history.rows(), SCALES, marks, width)
+    return ["", *lines] if lines else []
 
 
 async def _measure_round_trips(client: ParamClient) -> None:

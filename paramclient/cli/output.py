@@ -7,16 +7,19 @@ unchanged: JSON escapes all characters outside ASCII, and all other output is `p
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import sys
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import datetime
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 import anyio
 
+from paramclient.cli.block_characters import Piece, marks_for
+from paramclient.cli.download_strip import strip_lines
 from paramclient.model.values import Param, format_value
 from paramclient.protocol.params.fetch_result import Progress
 
@@ -28,6 +31,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Coloured",
+    "Draw",
     "StatusLine",
     "by_index",
     "default_text",
@@ -41,7 +45,13 @@ __all__ = [
     "progress_bar",
     "report",
     "say",
+    "wrapped",
 ]
+
+Draw: TypeAlias = Callable[
+    [Sequence[str], Iterable[Sequence[object]], Iterable["str | Sequence[Piece]"]], None
+]
+"""Draws columns, rows and lines. Text lines are made printable; pieces are shown as they are."""
 
 WIDTH_UNLIMITED: Final = 10_000
 """Width in columns of an output that is not a terminal, so that nothing is wrapped or cut."""
@@ -127,36 +137,61 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, rig
         right: the headings of the right-aligned columns, separated by spaces.
     """
     from rich.console import Console  # only here: not needed to get started
+    from rich.text import Text
 
     console = Console(width=None if sys.stdout.isatty() else WIDTH_UNLIMITED)
     held = [list(row) for row in rows]
     # rich would end the process when the output is closed
     with console.capture() as captured:
-        if (groups := _groups(columns, held, console.width)) is None:
-            console.print(_table(columns, held, right.split(), keeps_values=True))
-        else:
-            console.print(_stacked(columns, held, right.split(), groups), soft_wrap=True)
+        table = _fitting(columns, held, right.split(), console.width)
+        console.print(table, soft_wrap=isinstance(table, Text))
     lines = [line.rstrip() for line in captured.get().splitlines()]
     print(*lines, sep="\n", flush=True)
 
 
 @contextmanager
-def live_view() -> Iterator[Callable[[Sequence[str], Iterable[Sequence[object]], Iterable[str]], None]]:
+def live_view() -> Iterator[Draw]:
     """Yield a function that draws a table with lines below it, in the place of the one before.
 
-    The last one stays after the block. All columns except the first two are right-aligned.
+    The last one stays after the block. All columns except the first two are right-aligned. No value is broken
+    in two, as in `print_table`; lines are `wrapped`.
     """
     from rich.console import Console, Group  # only here: not needed to get started
     from rich.live import Live
     from rich.text import Text
 
-    with Live(console=Console(), auto_refresh=False) as live:
+    console = Console()
+    with Live(console=console, auto_refresh=False) as live:
 
-        def draw(columns: Sequence[str], rows: Iterable[Sequence[object]], lines: Iterable[str]) -> None:
-            below = [Text(printable(line)) for line in lines]
-            live.update(Group(_table(columns, rows, columns[2:]), *below), refresh=True)
+        def draw(
+            columns: Sequence[str], rows: Iterable[Sequence[object]], lines: Iterable[str | Sequence[Piece]]
+        ) -> None:
+            table = _fitting(columns, list(rows), columns[2:], console.width)
+            below: list[Text] = []
+            for line in lines:
+                if isinstance(line, str):
+                    below += map(Text, wrapped(printable(line), console.width))
+                else:
+                    below.append(Text.assemble(*line))
+            live.update(Group(table, *below), refresh=True)
 
         yield draw
+
+
+def wrapped(text: str, width: int) -> list[str]:
+    """Return a line as lines of at most this width, broken behind commas, colons and semicolons.
+
+    A value and its unit stay together. A clause that is longer than a line is left as it is, so that a
+    terminal wraps it at spaces.
+    """
+    lines = [""]
+    for clause in re.split(r"(?<=[,:;]) ", text):
+        longer = f"{lines[-1]} {clause}" if lines[-1] else clause
+        if len(longer) <= width or not lines[-1]:
+            lines[-1] = longer
+        else:
+            lines.append(clause)
+    return lines
 
 
 def report(text: str) -> None:
@@ -202,7 +237,8 @@ class StatusLine:
 def progress_bar(title: str) -> Iterator[Callable[[Progress], None] | None]:
     """Yield a function that draws the progress of a fetch; None if stderr is not a terminal.
 
-    Before the first response, the function says that it is awaited. Needs a running event loop.
+    Draws the parts of the download as a strip if the progress has them, otherwise a bar. Before the first
+    response, the function says that it is awaited. Needs a running event loop.
     """
     if not sys.stderr.isatty():
         yield None
@@ -222,7 +258,7 @@ def _bar(title: str, stack: ExitStack) -> Callable[[Progress], None]:
             line.draw(f"{title}: waiting for the first response", anyio.current_time() - began)
         if update is None and state.received:  # nothing is drawn for a fetch that needs no download
             line.end()
-            update = _start_bar(title, stack)
+            update = (_start_bar if state.ranges is None else _start_strip)(title, stack)
         if update is not None:
             update(state)
 
@@ -261,6 +297,31 @@ def _start_bar(title: str, stack: ExitStack) -> Callable[[Progress], None]:
         )
 
     return update
+
+
+def _start_strip(title: str, stack: ExitStack) -> Callable[[Progress], None]:
+    from rich.console import Console, Group  # only here: not needed to get started
+    from rich.live import Live
+    from rich.text import Text
+
+    console, marks = Console(stderr=True), marks_for(sys.stderr)
+    live = stack.enter_context(Live(console=console, auto_refresh=False, transient=True))
+
+    def update(state: Progress) -> None:
+        lines = strip_lines(title, state, marks, console.width)
+        live.update(Group(*(Text.assemble(*line) for line in lines)), refresh=True)
+
+    return update
+
+
+def _fitting(
+    columns: Sequence[str], rows: Sequence[Sequence[object]], right: Container[str], width: int
+) -> Table | Text:
+    """Return a table of at most this width, in which no value is broken in two; see `print_table`."""
+    groups = _groups(columns, rows, width)
+    if groups is None:
+        return _table(columns, rows, right, keeps_values=True)
+    return _stacked(columns, rows, right, groups)
 
 
 def _table(

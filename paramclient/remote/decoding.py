@@ -143,7 +143,7 @@ def check_kind(value: object, *kinds: type) -> None:
 
 def progress_of(document: Document) -> Progress:
     """Return the progress of a fetch."""
-    told = Progress(*(document[each.name] for each in fields(Progress)))
+    told = Progress(*(document[name] for name in ("received", "total", "rate", "seconds_left")))
     check_kind(told.received, int)
     check_kind(told.total, int, NoneType)
     check_kind(told.rate, int, float)

@@ -939,6 +939,33 @@ def test_link_is_live_on_a_terminal() -> None:
     assert strict(one.out)["components"][0]["system"] == 1
 
 
+def screen(text: str) -> str:
+    """What was printed, without the sequences that move the cursor and set colours."""
+    return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text).replace("\r", "")
+
+
+def test_a_live_link_draws_the_last_minute() -> None:
+    url = "sim:px4?loss=0.1&delay=0.02&seed=1"
+    shown = screen(on_terminal("link", url, "--seconds", 4.5, COLUMNS="90").out)
+    *_, last = shown.split("last 60 s, 0 to maximum, 1 s a column\n")
+    loss = last.split("\n")[0]
+    assert re.fullmatch(r"1/1 loss +[0-9.]+% [ ▁-█]{60}", loss)
+    assert loss[-60:].rstrip()[-1] in "▁▂▃▄▅▆▇█"
+
+
+def test_a_narrow_terminal_breaks_no_value_of_a_live_link() -> None:
+    url = "sim:px4?delay=0.02"
+    shown = screen(on_terminal("link", url, "--seconds", 3.5, COLUMNS="40", PYTHONIOENCODING="ascii").out)
+    *_, last = shown.split("from  what")
+    lines = [line.rstrip() for line in f"from  what{last}".split("\n")]
+    assert max(map(len, lines)) <= 40
+    for value in ("px4 quadrotor", r"[0-9.]+%", r"[0-9.]+ ms", r"[0-9.]+ s", r"HEARTBEAT [0-9.]+/s"):
+        assert any(re.search(rf"(^|  | |: ){value}([ ,:;]|$)", line) for line in lines), (value, lines)
+    assert "last 60 s, 0 to maximum, 4 s a column" in lines
+    assert any(re.fullmatch(r"1/1 loss +0\.0% +_+", line) for line in lines)
+    assert any(re.fullmatch(r" {4}round trip +[0-9]+ ms +[#%*]+", line) for line in lines)
+
+
 def test_a_live_link_ends_with_ctrl_c() -> None:
     ours, theirs = pty.openpty()
     try:
@@ -1503,6 +1530,24 @@ def test_progress_is_drawn_on_a_terminal(tmp_path: Path) -> None:
     plain = on_terminal("fetch", "sim:px4", "--no-cache", NO_COLOR="1")
     assert re.search(r"[0-9]+/903", plain.out)
     assert not re.search(r"\x1b\[(3|9)[0-9]m", plain.out)
+
+
+@pytest.mark.parametrize(("encoding", "strip"), [("utf-8", "[▁-█▒·]{40}"), ("ascii", "[_:=+*%#?.-]{40}")])
+def test_fetch_draws_what_the_radio_does(encoding: str, strip: str) -> None:
+    url = "sim:px4?loss=0.2&delay=0.05&seed=1"
+    environment = {"COLUMNS": "40", "PYTHONIOENCODING": encoding}
+    shown = on_terminal("fetch", url, "--no-cache", **environment)
+    assert shown.code == 0
+    lines = screen(shown.out).split("\n")
+    drawn = [line for line in lines if re.fullmatch(strip, line)]
+    assert len(drawn) > 5
+    assert any(re.search(r" [0-9]+ requested again$", line) for line in lines)
+    full, again, missing = ("█", "▒", "·") if encoding == "utf-8" else ("#", "?", ".")
+    assert again in "".join(drawn)
+    assert drawn[0].count(missing) > 20
+    assert drawn[-1].count(full) > 30
+    assert drawn[-1].count(missing) == 0
+    assert "\x1b[33m" in shown.out  # yellow, and not only another character
 
 
 def test_no_progress_is_drawn_for_a_cache_hit(warm: Path) -> None:

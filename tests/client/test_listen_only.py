@@ -15,6 +15,7 @@ from paramclient import (
     ParamClient,
     ParamType,
     Policy,
+    Progress,
     SyncState,
     Trust,
     UsageError,
@@ -176,8 +177,14 @@ async def test_a_list_with_gaps_ends_when_it_pauses_and_goes_on_with_what_others
         component = await client.component()
         channel.ask(LIST)
         began = anyio.current_time()
-        result = await component.fetch_all()
+        told: list[Progress] = []
+        result = await component.fetch_all(progress=told.append)
         assert result.missing == (3, 9)
+        assert told[-1].ranges is not None
+        parts = told[-1].ranges.split(5)
+        assert [(part.received, part.requested_again, part.missing) for part in parts] == [
+            *((4, 0, 1), (4, 0, 1), (5, 0, 0), (5, 0, 0), (5, 0, 0))
+        ]
         assert result.received == 23
         assert LIST_PAUSE_MAX <= anyio.current_time() - began < LIST_PAUSE_MAX + 3.0
         assert (component.state, component.sync_state) == ("partial", SyncState.UNSYNCED)

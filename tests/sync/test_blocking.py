@@ -124,6 +124,9 @@ def test_the_calls_of_the_asynchronous_client_without_await() -> None:
         with pytest.raises(NoReply):
             client.component(system=99, timeout=0.01)
     assert told[-1] == (Progress(25, 25, told[-1][0].rate, 0.0), threading.current_thread().name)
+    ranges = told[-1][0].ranges
+    assert ranges is not None
+    assert [part.received for part in ranges.split(5)] == [5] * 5
 
 
 def test_one_object_for_each_component() -> None:

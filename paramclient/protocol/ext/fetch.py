@@ -14,6 +14,7 @@ from paramclient.model.wording import counted
 from paramclient.protocol.ext.change import ExtChange
 from paramclient.protocol.ext.reads import ExtRead, ExtReads
 from paramclient.protocol.ext.table import ExtTable
+from paramclient.protocol.params.download_ranges import DownloadRange, DownloadRanges, split_indices
 from paramclient.protocol.params.fetch_result import Progress
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
@@ -67,6 +68,7 @@ class ExtFetch(Operation[ExtFetchResult]):
         request: the requests for the list.
         received: the names by index, since the fetch began.
         dead: indices whose reads were in vain.
+        requested_again: indices that a list was without, and that were requested again.
         value_at: when the last value was received; minus infinity before the first.
         quiet_since: when that was, or when the list was requested again.
         longest: the longest time between two values of the list in seconds; None before two.
@@ -79,6 +81,7 @@ class ExtFetch(Operation[ExtFetchResult]):
         self.request = request
         self.received: dict[int, str] = {}
         self.dead: set[int] = set()
+        self.requested_again: set[int] = set()
         self.value_at = self.quiet_since = -math.inf
         self.lists = 0
         self.first_at = math.inf
@@ -186,6 +189,7 @@ class ExtFetches(Machine):
             self._release(fetch)
             fetch.received.clear()
             fetch.dead.clear()
+            fetch.requested_again.clear()
             fetch.front = -1
             fetch.lists = 0
             fetch.longest = None
@@ -200,7 +204,12 @@ class ExtFetches(Machine):
     def progress(self, fetch: ExtFetch, now: float) -> Progress:
         """Return the progress of a fetch."""
         running = now - fetch.first_at if fetch.first_at < math.inf else 0.0
-        return Progress.after(len(fetch.received), self._table.count, fetch.came, running)
+        ranges = DownloadRanges("parameters", partial(self._split, fetch)) if fetch.has_begun else None
+        return Progress.after(len(fetch.received), self._table.count, fetch.came, running, ranges)
+
+    def _split(self, fetch: ExtFetch, number: int) -> tuple[DownloadRange, ...]:
+        requested = fetch.requested_again - fetch.dead
+        return split_indices(self._table.count or 0, number, fetch.received, requested)
 
     def tick(self, now: float) -> None:
         """Repeat the request for the list, or read what is missing after it."""
@@ -266,6 +275,7 @@ class ExtFetches(Machine):
         """Read each missing index, or request the list again: it is over."""
         missing = [index for index in self._missing(fetch) if index not in fetch.dead]
         self._trace("%s/%s: the extended list lacks %s", *self._target, len(missing))
+        fetch.requested_again.update(missing)
         if fetch.request.should_list_again(len(missing), self._table.count or 0, fetch.lists):
             fetch.lists += 1
             fetch.front = -1

@@ -55,6 +55,11 @@ class Blocks:
         return len(self._pieces)
 
     @property
+    def gaps(self) -> tuple[tuple[int, int], ...]:
+        """First byte and end of what is missing, as far as it is known to be in the file, rising."""
+        return tuple(self._gaps)
+
+    @property
     def beginning(self) -> bytes:
         """The first piece; b"" before it is received."""
         return self._pieces.get(0, b"")

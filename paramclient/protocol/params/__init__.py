@@ -3,6 +3,7 @@
 `boot_values`: reads again what a vehicle without a hash measures at boot.
 `change`: a change of one parameter.
 `change_origin`: the author of a change.
+`download_ranges`: the state of the parts of a download.
 `duplicate_names`: parameters that share a name.
 `fetch`: one fetch: cache, file, list or sample.
 `fetch_notes`: the sentences of `FetchResult.notes`.

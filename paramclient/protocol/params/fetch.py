@@ -364,7 +364,8 @@ class Fetch(Operation[FetchResult]):
             return self.file.progress(now)
         received, total = (0, self._table.count) if self.download is None else self.download.progress
         came = received - (0 if self.download is None else self.download.resumed)
-        return Progress.after(received, total, came, now - self.first_value_at)
+        ranges = None if self.download is None else self.download.ranges
+        return Progress.after(received, total, came, now - self.first_value_at, ranges)
 
     def _sample(self, sampled: Sampled, count: int, now: float) -> None:
         """Check the cached table by a sample of its parameters."""

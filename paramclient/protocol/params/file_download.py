@@ -13,6 +13,7 @@ from paramclient.protocol.ftp import BUSY, FileRead, FileTransfers
 from paramclient.protocol.ftp.packets import DATA_SIZE_MAX
 from paramclient.protocol.ftp.param_pck import PACK_SIZE_MAX, Pack, decode, total_of
 from paramclient.protocol.params.change import Change
+from paramclient.protocol.params.download_ranges import DownloadRange, DownloadRanges, split_bytes
 from paramclient.protocol.params.fetch_result import Progress
 from paramclient.protocol.params.table import Table
 from paramclient.protocol.requests.context import Context
@@ -158,7 +159,15 @@ class FileDownload(Operation[None]):
         share = min(job.received / job.size, 1.0) if job is not None and job.size else float(self.done)
         received, running = int(share * (total or 0)), now - self.begun_at - self.queue_wait(now)
         left = running * (1 - share) / share if share else None
-        return Progress(received, total, received / running if running > 0 else 0.0, left)
+        rate = received / running if running > 0 else 0.0
+        return Progress(received, total, rate, left, DownloadRanges("bytes", self._split))
+
+    def _split(self, number: int) -> tuple[DownloadRange, ...]:
+        job = self._job
+        size = None if job is None else job.size_known
+        if job is None or size is None:
+            return ()
+        return split_bytes(size, number, job.unreceived(), job.requested_again())
 
     @property
     def count(self) -> int | None:

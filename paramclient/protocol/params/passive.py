@@ -8,6 +8,7 @@ from typing import Final
 
 from paramclient.errors import NoReply
 from paramclient.model.values import is_portable_name
+from paramclient.protocol.params.download_ranges import DownloadRange, DownloadRanges, split_indices
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_result import (
     Announcement,
@@ -75,6 +76,10 @@ class PassiveTable:
         self._began_at = 0.0
         self._is_whole = False
         self._source: FetchSource = "stream"
+
+    def split(self, number: int) -> tuple[DownloadRange, ...]:
+        """Return the state of `number` parts of the indices; see `DownloadRanges.split`."""
+        return split_indices(self.count or 0, number, self.names, ())
 
     def heard(self, message: ParamValue, now: float) -> None:
         """Process a PARAM_VALUE of the component, after the table has stored it."""
@@ -254,7 +259,9 @@ class PassiveFetch(Fetch):
         return not (overheard.names or overheard.file.is_reading or overheard.is_log)
 
     def progress(self, now: float) -> Progress:
-        return Progress(len(self._overheard.names), self._overheard.count, 0.0, None)
+        overheard = self._overheard
+        ranges = None if overheard.count is None else DownloadRanges("parameters", overheard.split)
+        return Progress(len(overheard.names), overheard.count, 0.0, None, ranges)
 
     def _begin_download(self, now: float, present: Mapping[int, str] | None = None) -> None:
         overheard = self._overheard

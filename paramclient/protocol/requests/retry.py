@@ -607,6 +607,8 @@ class ReadAttempts(Attempts):
 
     def answered(self, now: float, *, is_sure: bool = True) -> None:
         is_sure = is_sure and self.is_measurable
+        if self.count == 1 and self.sent_at < math.inf:
+            self._policy.round_trip.note_response(now - self.sent_at)
         self._policy.answered(self.sent_at, now, 1 if is_sure else self.count + 1)
 
 

@@ -28,6 +28,9 @@ class RoundTrip:
         shortest: the shortest sample in seconds; infinity before the first.
         variation: the variation of the round trip, in seconds.
         samples: the number of samples.
+        response_time: seconds from the last read that was answered without a timeout to its response. It is
+            also known where copies of the read were sent at once, so that the response is no sample.
+        responses: the number of such reads.
         longest: the longest round trip in seconds that the responses to repeated requests are compatible
             with; infinity without any.
         list_loss: the expected share of lost exchanges, by the losses of a list; 0 before a list.
@@ -42,6 +45,8 @@ class RoundTrip:
         "heard_at",
         "list_loss",
         "longest",
+        "response_time",
+        "responses",
         "samples",
         "shortest",
         "smoothed",
@@ -56,6 +61,8 @@ class RoundTrip:
         self.longest = math.inf
         self.variation = 0.0
         self.samples = 0
+        self.response_time = 0.0
+        self.responses = 0
         self._answered = 0.0
         self._unanswered = 0.0
         self._first_timeout = first_timeout
@@ -113,6 +120,11 @@ class RoundTrip:
             self.smoothed += (sample - self.smoothed) / 8
         self.shortest = min(self.shortest, sample)
         self.samples += 1
+
+    def note_response(self, seconds: float) -> None:
+        """Record the time to the response of a read that had no timeout."""
+        self.response_time = seconds
+        self.responses += 1
 
     def forgive_early_timeouts(self, timeout: float) -> None:
         """Remove timeouts shorter than this one, in seconds, from the loss: the round trip is known now, and

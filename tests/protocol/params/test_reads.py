@@ -690,3 +690,36 @@ def test_an_index_beyond_the_count_of_the_cache_may_exist() -> None:
     read = desk.ask(7)
     desk.pass_time(120.0)
     assert isinstance(read.error, UnknownParameter)
+
+
+# the time of a response
+
+
+def test_a_read_with_copies_tells_how_long_its_response_took() -> None:
+    """Which copy was answered is unknown, so that it is no sample of the round trip."""
+    desk = Desk("A")
+    desk.measure(0.3)
+    samples = desk.round_trip.samples
+    for _ in range(20):
+        desk.retry.timed_out(1)  # a link that loses packets, on which copies are worthwhile
+    desk.ask("A")
+    desk.reads.tick(desk.now)
+    assert len(desk.take()) > 1
+    desk.pass_time(0.25)
+    desk.hear("A", index=1)
+    assert (desk.round_trip.responses, desk.round_trip.samples) == (1, samples)
+    assert desk.round_trip.response_time == pytest.approx(0.25)
+
+
+def test_a_read_that_was_repeated_tells_nothing_of_it() -> None:
+    desk = Desk("A")
+    desk.ask("A")
+    desk.pass_time(FIRST_TIMEOUT + 0.01)
+    assert desk.take() == ["A", "A"]
+    desk.hear("A", index=1)
+    assert desk.round_trip.responses == 0
+    desk.ask("A")
+    desk.pass_time(0.1)
+    desk.hear("A", index=1)
+    assert desk.round_trip.responses == 1
+    assert desk.round_trip.response_time == pytest.approx(0.1)
