@@ -43,7 +43,7 @@ from paramclient.cache import ParamCache, StoredParam, TableState, TableUpdate
 from paramclient.links import create_link, serve_endpoint
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param, ParamType
-from paramclient.sim import GenericVehicle
+from paramclient.sim import Endpoint, GenericVehicle
 
 ROOT: Final = Path(__file__).parent.parent
 CERT: Final = ROOT / "tests" / "data" / "tls_station.pem"
@@ -282,6 +282,26 @@ async def serving(
             shutil.rmtree(own, ignore_errors=True)
 
 
+@asynccontextmanager
+async def serving_vehicle(
+    rows: list[Row], vehicle: Endpoint, component: int, *fetches: str
+) -> AsyncIterator[Service]:
+    """Run a new service and a vehicle on its UDP link. Find its component, and fetch its parameters."""
+    with socket.socket(type=socket.SOCK_DGRAM) as free:
+        free.bind((HERE, 0))
+        port = free.getsockname()[1]
+    far_end = asyncio.create_task(serve_endpoint(vehicle, create_link(f"udpout:{HERE}:{port}")))
+    try:
+        async with serving(rows, f"udpin:{HERE}:{port}", "--no-cache", "--no-fetch") as service:
+            found = as_json({"component": component, "timeout_s": 60})
+            for path, body in (("/api/v1/find", found), *((each, b'{"timeout_s": 60}') for each in fetches)):
+                status, answer = await service.ask("POST", path, body, token(READER))
+                assert status == 200, answer
+            yield service
+    finally:
+        far_end.cancel()
+
+
 @contextmanager
 def connections(
     service: Service, count: int, source: str, data: bytes = b""
@@ -420,32 +440,43 @@ async def large_table(rows: list[Row], quick: bool) -> None:
         ("POST", f"{C}/plan", as_json(values)),
         ("POST", f"{C}/verify", as_json(values)),
     ]
-    with socket.socket(type=socket.SOCK_DGRAM) as free:
-        free.bind((HERE, 0))
-        port = free.getsockname()[1]
     vehicle = GenericVehicle(table=table, burst=100)
-    far_end = asyncio.create_task(serve_endpoint(vehicle, create_link(f"udpout:{HERE}:{port}")))
-    try:
-        async with serving(rows, f"udpin:{HERE}:{port}", "--no-cache", "--no-fetch") as service:
-            for path in ("/api/v1/find", f"{C}/fetch"):
-                status, answer = await service.ask("POST", path, b'{"timeout_s": 60}', token(READER))
+    async with serving_vehicle(rows, vehicle, 1, f"{C}/fetch") as service:
+        for method, path, body in asked:
+            service.attack = f"{len(table):,} parameters: {path.removeprefix(C)}"
+            with service.watched():
+                status, answer = await service.ask(method, path, body, token(READER))
                 assert status == 200, answer
-            for method, path, body in asked:
-                service.attack = f"{len(table):,} parameters: {path.removeprefix(C)}"
-                with service.watched():
-                    status, answer = await service.ask(method, path, body, token(READER))
-                    assert status == 200, answer
-            service.attack = f"{len(table):,} parameters: 6 diff at once"
-            with service.watched(late=LATE):
-                asked_at_once = [
-                    service.ask("POST", f"{C}/diff", as_json(values, known=True), token(READER))
-                    for _ in range(6)
+        service.attack = f"{len(table):,} parameters: 6 diff at once"
+        with service.watched(late=LATE):
+            asked_at_once = [
+                service.ask("POST", f"{C}/diff", as_json(values, known=True), token(READER)) for _ in range(6)
+            ]
+            statuses = [status for status, _ in await asyncio.gather(*asked_at_once)]
+            service.note("not answered", 0, sum(status != 200 for status in statuses), "times")
+        await many_answers(service, len(table))
+
+
+async def similar_names(rows: list[Row], quick: bool) -> None:
+    """Clause 7: unknown names that are similar to many of a vehicle, whose search is a comparison with
+    each."""
+    count = 1_500 if quick else 10_000
+    vehicle = GenericVehicle(table={f"MISSION_{n:04}_XYZ": float(n) for n in range(count)}, burst=100)
+    async with serving_vehicle(rows, vehicle, 1, f"{C}/fetch") as service:
+        for at_once, method, what in ((1, "GET", ""), (60, "POST", "/read")):
+            service.attack = f"{count:,} parameters: {at_once} {method} of an unknown similar name{what}"
+            with service.watched():
+                asked = [
+                    service.ask(
+                        method,
+                        f"{C}/params/MISSION_{number:04}_X{what}",
+                        b"" if method == "GET" else b'{"timeout_s": 60}',
+                        token(READER),
+                    )
+                    for number in range(at_once)
                 ]
-                statuses = [status for status, _ in await asyncio.gather(*asked_at_once)]
-                service.note("not answered", 0, sum(status != 200 for status in statuses), "times")
-            await many_answers(service, len(table))
-    finally:
-        far_end.cancel()
+                statuses = [status for status, _ in await asyncio.gather(*asked)]
+                service.note("not refused with 404", 0, sum(status != 404 for status in statuses), "times")
 
 
 async def many_answers(service: Service, size: int) -> None:
@@ -895,6 +926,7 @@ async def attack(quick: bool, only: str) -> list[Row]:
         "handshakes without TLS": lambda: on_service(handshakes, *bare),
         "requests": lambda: on_service(requests, *sim),
         "large table": lambda: large_table(rows, quick),
+        "similar names": lambda: similar_names(rows, quick),
         "many components": lambda: many_components(rows, quick),
         "large fleet": lambda: large_fleet(rows, quick),
         "slices": lambda: on_service(slices, *sim),

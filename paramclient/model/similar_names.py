@@ -16,27 +16,43 @@ differ in two of them. Unrelated names share more than half by chance: `ATC_RAT_
 AFFIX_LENGTH: Final = 2
 """Characters at the start or at the end that two names must share before they are compared: a comparison
 is slow."""
+COMPARED_NAMES_MAX: Final = 250
+"""Names that are compared: each takes about 10 µs. An autopilot has fewer with one start or end."""
 
 
 def nearest_names(name: str, names: Iterable[str]) -> tuple[str, ...]:
     """Return the names most similar to `name`, most similar first, at most `SIMILAR_NAMES_MAX`.
 
     Upper and lower case do not matter: a name that differs only in them is the first one. `name` itself is
-    left out. It takes less than 1 ms for the names of an autopilot.
+    left out. Of more than `COMPARED_NAMES_MAX` names with the start or the end of `name`, those that share
+    more characters are compared. It takes less than 1 ms for the names of an autopilot, and 8 ms for 10,000
+    names.
     """
     wanted = name.upper()
-    head, tail = wanted[:AFFIX_LENGTH], wanted[-AFFIX_LENGTH:]
     matcher = difflib.SequenceMatcher(autojunk=False)
     matcher.set_seq2(wanted)
     scored = []
-    for other in sorted(names):
-        upper = other.upper()
-        if not (upper.startswith(head) or upper.endswith(tail)) or other == name:
-            continue
+    for upper, other in _candidates(wanted, name, names):
         matcher.set_seq1(upper)
         if matcher.real_quick_ratio() >= SIMILARITY_MIN and matcher.quick_ratio() >= SIMILARITY_MIN:
             scored.append((-matcher.ratio(), other))
     return tuple(other for score, other in sorted(scored)[:SIMILAR_NAMES_MAX] if -score >= SIMILARITY_MIN)
+
+
+def _candidates(wanted: str, name: str, names: Iterable[str]) -> list[tuple[str, str]]:
+    """Return the names to compare with `name`, each in upper case and as given."""
+    found = [(other.upper(), other) for other in names if other != name]
+    length = AFFIX_LENGTH
+    while length == AFFIX_LENGTH or len(found) > COMPARED_NAMES_MAX:
+        head, tail = wanted[:length], wanted[-length:]
+        closer = [pair for pair in found if pair[0].startswith(head) or pair[0].endswith(tail)]
+        if length > AFFIX_LENGTH and not closer:
+            break
+        found = closer
+        if length >= len(wanted):
+            break
+        length *= 2
+    return sorted(found)[:COMPARED_NAMES_MAX]
 
 
 def did_you_mean(nearest: Sequence[str]) -> str:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import difflib
+
 import pytest
 
 from paramclient.model.params import ParamMap
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.patterns import NameChoice
-from paramclient.model.similar_names import did_you_mean, nearest_names
+from paramclient.model.similar_names import COMPARED_NAMES_MAX, did_you_mean, nearest_names
 from tests.simulation import known
 
 NAMES = ["MC_YAWRATE_P", "MC_YAW_P", "MC_ROLL_P", "MC_ROLLRATE_P", "MPC_XY_P", "ringBuffer"]
@@ -31,6 +33,25 @@ def test_a_name_is_not_suggested_for_itself_and_nothing_for_an_unlike_one() -> N
     assert "MC_YAW_P" not in nearest_names("MC_YAW_P", NAMES)
     assert nearest_names("BATTERY", NAMES) == ()
     assert nearest_names("BATTERY", []) == ()
+
+
+@pytest.mark.parametrize(
+    "name", ["MISSION_0123_YP", "MISSION_0123X_P", "MISSIO_0123_P", "mission_0123_p", "MISSIONX"]
+)
+def test_of_many_alike_names_few_are_compared(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    compared = 0
+
+    class Counted(difflib.SequenceMatcher[str]):
+        def real_quick_ratio(self) -> float:
+            nonlocal compared
+            compared += 1
+            return super().real_quick_ratio()
+
+    monkeypatch.setattr(difflib, "SequenceMatcher", Counted)
+    names = [f"MISSION_{number:04}_P" for number in range(10_000)]
+    found = nearest_names(name, names)
+    assert 0 < compared <= COMPARED_NAMES_MAX
+    assert found[:1] == (("MISSION_0123_P",) if "0123" in name else ())
 
 
 def test_suggestions_are_a_sentence() -> None:

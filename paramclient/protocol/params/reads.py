@@ -46,6 +46,8 @@ CONTROL_INDEX: Final = 0
 be answered."""
 COPY_RESERVE: Final = 2.0
 """Requests that the pacing must still allow when a request is sent again early."""
+NAMES_GIVEN_UP_MAX: Final = 2
+"""Reads by name that one tick gives up: the search for similar names takes up to 8 ms for each."""
 
 
 class ValueRead(Operation[Response]):
@@ -279,9 +281,12 @@ class ValueReads(Machine, Generic[Response]):
     def tick(self, now: float) -> None:
         """Repeat timed-out requests and give up reads that are out of attempts."""
         timeout = self._retry_policy.timeout
+        given_up = 0
         for read in [read for read in self._in_flight.values() if self._due_at(read) <= now]:
             if self._in_flight.get(read.key) is not read:
                 continue  # ended by the end of another read
+            if given_up >= NAMES_GIVEN_UP_MAX:
+                break  # the others are due in the next tick
             if read.ask_again_at < math.inf:
                 read.ask_again_at = math.inf
                 self._again.append(read)
@@ -291,6 +296,7 @@ class ValueReads(Machine, Generic[Response]):
             if self._retries.should_give_up(read.request, now, is_known=self._is_known(read.key)):
                 self._drop(read)
                 self._trace("%s/%s %s: given up after try %s", *self._target, read.key, read.attempts)
+                given_up += isinstance(read.key, str)
                 read.fail(self._timeout_error(read, now), now)
             else:
                 self._trace(

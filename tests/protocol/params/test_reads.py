@@ -14,7 +14,7 @@ from paramclient.errors import (
     TypeMismatch,
     UnknownParameter,
 )
-from paramclient.protocol.params.reads import CONTROL_INDEX, Key, Read, Reads
+from paramclient.protocol.params.reads import CONTROL_INDEX, NAMES_GIVEN_UP_MAX, Key, Read, Reads
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.pacing import BURST_MIN, FIRST_RATE
 from paramclient.protocol.requests.retry import (
@@ -723,3 +723,15 @@ def test_a_read_that_was_repeated_tells_nothing_of_it() -> None:
     desk.hear("A", index=1)
     assert desk.round_trip.responses == 1
     assert desk.round_trip.response_time == pytest.approx(0.1)
+
+
+def test_of_many_names_that_time_out_at_once_one_tick_gives_up_few() -> None:
+    desk = Desk("A")
+    reads = [desk.ask(f"NO_{number:02}") for number in range(20)]
+    most = 0
+    while not all(read.done for read in reads):
+        before = sum(read.done for read in reads)
+        desk.now += 30.0  # all that are in flight are due
+        desk.reads.tick(desk.now)
+        most = max(most, sum(read.done for read in reads) - before)
+    assert most == NAMES_GIVEN_UP_MAX
