@@ -36,6 +36,7 @@ from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
+from urllib.parse import urlencode
 
 from pymavlink.dialects.v20 import common
 
@@ -43,7 +44,7 @@ from paramclient.cache import ParamCache, StoredParam, TableState, TableUpdate
 from paramclient.links import create_link, serve_endpoint
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param, ParamType
-from paramclient.sim import Endpoint, GenericVehicle
+from paramclient.sim import Camera, Endpoint, GenericVehicle
 
 ROOT: Final = Path(__file__).parent.parent
 CERT: Final = ROOT / "tests" / "data" / "tls_station.pem"
@@ -488,19 +489,44 @@ async def many_answers(service: Service, size: int) -> None:
             statuses = [status for status, _ in await asyncio.gather(*asked)]
             service.note("not answered", 0, sum(status != 200 for status in statuses), "times")
     run = json.loads((await service.ask("GET", "/api/v1/components", b"", token(READER)))[1])["run"]
-    lines = [f"Host: 127.0.0.1:{service.port}", token(READER), "", ""]
     for count, path in ((1, "/api/v1/events"), (1, f"/api/v1/events?after={run}-0"), (128, f"{C}/params")):
-        service.attack = f"{size:,} parameters: {count} GET {path.removeprefix(C)[:20]}, and nobody reads"
-        data = "\r\n".join([f"GET {path} HTTP/1.1", *lines]).encode()
-        with service.watched(), connections(service, 0, ELSEWHERE) as held:
-            for _ in range(count):
-                one = socket.socket()
-                held.append(one)
-                one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4_096 if count > 1 else 4_000_000)
-                one.bind((ELSEWHERE, 0))
-                one.connect((HERE, service.port))
-                one.sendall(data)
-            await asyncio.sleep(1.5 if count == 1 else 4)
+        await unread(service, count, path, f"{size:,} parameters", 1.5 if count == 1 else 4)
+
+
+async def unread(service: Service, count: int, path: str, of: str, seconds: float) -> None:
+    """Request a path on many connections, and take none of the responses."""
+    service.attack = f"{of}: {count} GET {path.removeprefix(C)[-20:]}, and nobody reads"
+    lines = [f"GET {path} HTTP/1.1", f"Host: 127.0.0.1:{service.port}", token(READER), "", ""]
+    with service.watched(), connections(service, 0, ELSEWHERE) as held:
+        for _ in range(count):
+            one = socket.socket()
+            held.append(one)
+            one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4_096 if count > 1 else 4_000_000)
+            one.bind((ELSEWHERE, 0))
+            one.connect((HERE, service.port))
+            one.sendall("\r\n".join(lines).encode())
+        await asyncio.sleep(seconds)
+
+
+async def extended_params(rows: list[Row], quick: bool) -> None:
+    """Clause 7: requests of a reader for many extended parameters of 128 bytes each."""
+    count, extended = 300 if quick else 10_000, "/api/v1/components/1/100/extended"
+    camera = Camera({f"P{number:05}": "\U0001f6f0" * 32 for number in range(count)}, burst=50)
+    patterns = urlencode([("names", f"[a-\uffff][a-\uffff]{number}") for number in range(64)])
+    asked = [
+        *((1, path) for path in ("params", f"params?{patterns}", "params/P0000X")),
+        (16, "params"),
+    ]
+    async with serving_vehicle(rows, camera, 100, f"{extended}/fetch") as service:
+        for at_once, path in asked:
+            service.attack = f"{count:,} extended parameters: {at_once} GET {path[:15]}"
+            with service.watched():
+                answers = [
+                    service.ask("GET", f"{extended}/{path}", b"", token(READER)) for _ in range(at_once)
+                ]
+                statuses = [status for status, _ in await asyncio.gather(*answers)]
+                service.note("answered with 5xx or not", 0, sum(s >= 500 or not s for s in statuses), "times")
+        await unread(service, 120, f"{extended}/params", f"{count:,} extended parameters", 4)
 
 
 async def many_components(rows: list[Row], quick: bool) -> None:
@@ -926,6 +952,7 @@ async def attack(quick: bool, only: str) -> list[Row]:
         "handshakes without TLS": lambda: on_service(handshakes, *bare),
         "requests": lambda: on_service(requests, *sim),
         "large table": lambda: large_table(rows, quick),
+        "extended parameters": lambda: extended_params(rows, quick),
         "similar names": lambda: similar_names(rows, quick),
         "many components": lambda: many_components(rows, quick),
         "large fleet": lambda: large_fleet(rows, quick),

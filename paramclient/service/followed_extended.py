@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any, Final
 
 import anyio
@@ -65,9 +65,9 @@ class FollowedExtended:
         """Return a parameter as JSON."""
         return ext_param_json(param, self.heard_at(param.name))
 
-    def object_of(self, params: Iterable[ExtParam]) -> str:
-        """Return parameters as one JSON object, by name."""
-        return "{" + ",".join([f"{json.dumps(each.name)}:{self.json_of(each)}" for each in params]) + "}"
+    def member_of(self, param: ExtParam) -> str:
+        """Return a parameter as a member of a JSON object, by its name."""
+        return f"{json.dumps(param.name)}:{self.json_of(param)}"
 
     def publish_changes(self) -> None:
         """Publish parameters whose trust or index differs from the published one."""

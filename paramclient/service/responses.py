@@ -1,4 +1,4 @@
-"""Responses with documents, encoded in a worker thread, a long member entry by entry."""
+"""Responses with documents, encoded in a worker thread or as they are sent, a long member entry by entry."""
 
 from __future__ import annotations
 
@@ -15,7 +15,14 @@ from paramclient.documents.document import Document
 from paramclient.provision.runner import Runner
 from paramclient.service.event_feed import COMPACT_SEPARATORS
 
-__all__ = ["JSON", "document_response", "encode_document", "pack_entries", "packed_response"]
+__all__ = [
+    "JSON",
+    "document_response",
+    "encode_document",
+    "pack_entries",
+    "packed_response",
+    "streamed_response",
+]
 
 JSON: Final = "application/json"
 """Media type of JSON."""
@@ -24,6 +31,10 @@ LONG_MEMBER_ENTRIES: Final = 64
 
 PACKED_CHUNK_BYTES: Final = 65_536
 """Maximum number of bytes of a packed response that are unpacked at once."""
+STREAMED_ENTRIES_MAX: Final = 32
+"""Maximum number of entries of a streamed response that are encoded in one turn of the event loop: 1 ms."""
+STREAMED_CHUNK_LENGTH: Final = 32_768
+"""Number of characters from which the entries encoded so far are sent."""
 
 
 async def document_response(run: Runner, make: Callable[[], Document], *, status: int = 200) -> Response:
@@ -83,6 +94,31 @@ def packed_response(document: Document, parts: Sequence[bytes]) -> Response:
                 await anyio.lowlevel.checkpoint()
                 data = unpacker.decompress(unpacker.unconsumed_tail, PACKED_CHUNK_BYTES)
         yield end
+
+    return StreamingResponse(chunks(), media_type=JSON)
+
+
+def streamed_response(begin: str, entries: Iterable[str], end: str) -> Response:
+    """Return a JSON response with many entries that are encoded as they are sent.
+
+    It takes little memory until the client has received it, whatever the size of its entries.
+
+    Args:
+        begin, end: the text before and after the entries.
+        entries: creates each entry on demand, in the event loop.
+    """
+
+    async def chunks() -> AsyncIterator[str]:
+        yield begin
+        separator, part, length = "", list[str](), 0
+        for entry in entries:
+            part.append(entry)
+            length += len(entry)
+            if len(part) >= STREAMED_ENTRIES_MAX or length >= STREAMED_CHUNK_LENGTH:
+                yield separator + ",".join(part)
+                separator, part, length = ",", [], 0
+                await anyio.lowlevel.checkpoint()
+        yield (separator + ",".join(part) if part else "") + end
 
     return StreamingResponse(chunks(), media_type=JSON)
 

@@ -42,6 +42,7 @@ from paramclient.service import (
     Settings,
     Tokens,
     create_app,
+    followed_extended,
     jobs,
     metrics,
     responses,
@@ -65,11 +66,17 @@ from paramclient.service.quota import (
     WAITING_REQUESTS_OF_HOLDER_MAX,
     Quota,
 )
-from paramclient.service.responses import encode_document
+from paramclient.service.responses import (
+    STREAMED_CHUNK_LENGTH,
+    STREAMED_ENTRIES_MAX,
+    encode_document,
+    streamed_response,
+)
 from paramclient.service.route_context import run_until_disconnect
 from paramclient.service.routes import apply as setup_room
+from paramclient.service.routes import extended as extended_room
 from paramclient.service.routes import params as params_room
-from paramclient.sim import GenericVehicle
+from paramclient.sim import Camera, GenericVehicle
 from tests.asgi import a_browser
 from tests.served import C, met, problem, service
 from tests.shell import Tap, swiftly, until
@@ -703,6 +710,58 @@ async def test_a_table_is_read_a_part_at_a_time(monkeypatch: pytest.MonkeyPatch)
             answer = await browser.get(f"{C}/params{query}")
             assert list(answer.json()["params"]) == list(table)[:count]
         assert params_room.PARAMS_PER_TURN / 2 < turns.most <= params_room.PARAMS_PER_TURN
+
+
+@swiftly
+async def test_extended_parameters_are_chosen_in_a_thread_and_encoded_as_they_are_sent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    table = {f"ABC_P{number:04}": "\U0001f6f0" * 32 for number in range(3 * STREAMED_ENTRIES_MAX)}
+    extended = "/api/v1/components/1/100/extended"
+    async with service(Camera(table)) as (_, browser):
+        await met(browser, system=1, component=100)
+        assert (await browser.post(f"{extended}/fetch", json={})).status_code == 200
+        with threads_of(monkeypatch, (extended_room, "NameChoice")) as seen:
+            answer = await browser.get(f"{extended}/params", params={"names": ["ABC_P000*", "[a-\uffff]x"]})
+            assert list(answer.json()["params"]) == list(table)[:10]
+        assert seen == {"NameChoice": {READER}}
+        turns = Turns()
+
+        def ext_param_json(*given: Any) -> str:
+            turns.note()
+            return made(*given)
+
+        made = followed_extended.ext_param_json
+        monkeypatch.setattr(followed_extended, "ext_param_json", ext_param_json)
+        answer = await browser.get(f"{extended}/params")
+        assert list(answer.json()["params"]) == list(table)
+        assert turns.most == STREAMED_ENTRIES_MAX
+        assert (await browser.get(f"{extended}/params?names=NONE")).json()["params"] == {}
+
+
+@pytest.mark.asyncio
+async def test_of_a_streamed_response_nothing_is_made_before_it_can_be_sent() -> None:
+    made = 0
+    sizes: list[int] = []
+
+    def entries(length: int) -> Iterator[str]:
+        nonlocal made
+        for number in range(100):
+            made += 1
+            yield f'"{number}":"{"x" * length}"'
+
+    async def send(message: Any) -> None:
+        sizes.append(len(message.get("body", b"")))
+        assert made <= STREAMED_ENTRIES_MAX * len(sizes)
+
+    async def receive() -> Any:
+        await anyio.sleep_forever()
+
+    for length in (10, STREAMED_CHUNK_LENGTH):
+        made, sizes = 0, []
+        await streamed_response("{", entries(length), "}")({"type": "http"}, receive, send)
+        assert made == 100
+        assert max(sizes) < STREAMED_CHUNK_LENGTH + length + 20
 
 
 @swiftly

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Annotated, Final
 
 import anyio
-import anyio.lowlevel
 from fastapi import APIRouter, Depends, Query, Request, Response
 from pydantic import Field, StrictInt
 
@@ -25,7 +24,7 @@ from paramclient.service.followed_component import FollowedComponent
 from paramclient.service.param_sources import PATTERNS_MAX, REQUEST_VALUES_MAX, Pattern
 from paramclient.service.problems import problem_of
 from paramclient.service.request_body import BodyRoute
-from paramclient.service.responses import JSON
+from paramclient.service.responses import JSON, streamed_response
 from paramclient.service.route_context import (
     Finite,
     HubArgument,
@@ -38,7 +37,6 @@ from paramclient.service.route_context import (
 )
 from paramclient.service.routes.fetches import job_response, wait_for_job
 from paramclient.service.routes.params import (
-    PARAMS_PER_TURN,
     Durable,
     Name,
     ReadByPathRequest,
@@ -123,15 +121,11 @@ async def known_extended_params(
     """Return all known extended parameters, without traffic."""
     target.publish_changes()
     place, table = hub.feed.position, dict(target.extended.ext.params)
-    choice = NameChoice(names)
-    chosen = await hub.run_in_file_thread(lambda: list(filter(choice.has, table))) if names else list(table)
-    parts = []
-    for start in range(0, len(chosen), PARAMS_PER_TURN):
-        params = [table[name] for name in chosen[start : start + PARAMS_PER_TURN]]
-        parts.append(target.extended.object_of(params)[1:-1])
-        await anyio.lowlevel.checkpoint()
-    content = f'{{"run":"{place.run}","seq":{place.seq},"params":{{{",".join(parts)}}}}}'
-    return Response(content, media_type=JSON)
+    chosen = (
+        await hub.run_in_file_thread(lambda: NameChoice(names).choose(table)[0]) if names else table.keys()
+    )
+    entries = (target.extended.member_of(param) for name, param in table.items() if name in chosen)
+    return streamed_response(f'{{"run":"{place.run}","seq":{place.seq},"params":{{', entries, "}}")
 
 
 @router.get("/params/{name:path}", responses={200: {"model": ExtParamDoc}}, response_class=Response)
