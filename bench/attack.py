@@ -529,6 +529,30 @@ async def extended_params(rows: list[Row], quick: bool) -> None:
         await unread(service, 120, f"{extended}/params", f"{count:,} extended parameters", 4)
 
 
+async def descriptions(rows: list[Row], quick: bool) -> None:
+    """Clause 7: requests of a reader for a group of parameters whose description is as long as allowed."""
+    count = 300 if quick else 1_500
+    vehicle = GenericVehicle(table={f"ABC_P{number:05}": 1.0 for number in range(count)}, burst=100)
+    values = [{"value": number, "description": "v" * 4} for number in range(5_000)]
+    group = {"name": "ABC_P{n}", "longDesc": "x" * 40_000, "units": "m" * 2_000, "values": values}
+    given = {"wanted": {"values": {f"ABC_P{number:05}": 2 for number in range(count)}}, "known": True}
+    asked: list[tuple[int, str, str, bytes]] = [
+        *((at_once, "GET", path, b"") for at_once in (1, 4) for path in ("params?metadata=true", "metadata")),
+        (1, "POST", "diff", as_json(given)),
+    ]
+    async with serving_vehicle(rows, vehicle, 1, f"{C}/fetch") as service:
+        document = as_json({"version": 1, "parameters": [group]})
+        kind = "application/octet-stream"
+        status, answer = await service.ask("PUT", f"{C}/metadata", document, token(WRITER), kind=kind)
+        assert status == 200, answer
+        for at_once, method, path, body in asked:
+            service.attack = f"{count:,} long descriptions: {at_once} {method} {path}"
+            with service.watched():
+                answers = [service.ask(method, f"{C}/{path}", body, token(READER)) for _ in range(at_once)]
+                statuses = [status for status, _ in await asyncio.gather(*answers)]
+                service.note("not answered", 0, sum(status != 200 for status in statuses), "times")
+
+
 async def many_components(rows: list[Row], quick: bool) -> None:
     """Clause 7: requests of a reader for the maximum number of components, which one sender makes up."""
     count = 100 if quick else 1_000
@@ -953,6 +977,7 @@ async def attack(quick: bool, only: str) -> list[Row]:
         "requests": lambda: on_service(requests, *sim),
         "large table": lambda: large_table(rows, quick),
         "extended parameters": lambda: extended_params(rows, quick),
+        "long descriptions": lambda: descriptions(rows, quick),
         "similar names": lambda: similar_names(rows, quick),
         "many components": lambda: many_components(rows, quick),
         "large fleet": lambda: large_fleet(rows, quick),

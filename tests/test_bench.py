@@ -36,7 +36,7 @@ def bench(name: str, *arguments: str, code: int = 0) -> str:
     "group",
     [
         *("handshakes over", "requests", "large fleet", "slices", "waiting", "parsing", "guesses", "origins"),
-        *("stuck", "hostile", "similar", "extended"),
+        *("stuck", "hostile", "similar", "extended", "long"),
     ],
 )
 def test_attacks_are_held(group: str) -> None:

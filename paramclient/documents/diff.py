@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from pydantic import Field
 
 from paramclient.documents.document import Document, Maybe
-from paramclient.documents.param import WrittenParamDoc
+from paramclient.documents.param import WrittenParamDoc, short_text
 from paramclient.documents.paramset import OriginDoc
 from paramclient.model.comparison import Moved, Standing
 
@@ -57,7 +57,7 @@ class DifferenceDoc(Document):
             right=None if entry.right is None else WrittenParamDoc.compared(entry.right, right),
             base=None if entry.base is None else WrittenParamDoc.compared(entry.base, base),
             moved=entry.moved,
-            units=next((info.units for info in infos if info is not None and info.units), None),
+            units=short_text(next((info.units for info in infos if info is not None and info.units), None)),
             renamed=None if entry.renamed is None else WrittenParamDoc.compared(entry.renamed, right),
             right_name=None if entry.renamed is None else right_name,
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from paramclient.documents.document import Document, Maybe, Scalar
 from paramclient.model.notation import bits_text, bits_written, parse_value, value_json, value_written
@@ -22,7 +22,19 @@ if TYPE_CHECKING:
     from paramclient.metadata import Metadata, ParamInfo
     from paramclient.model.paramset import WrittenParam
 
-__all__ = ["DescribedDoc", "ReadOutputDoc", "InfoDoc", "InfosDoc", "ParamDoc", "WrittenParamDoc"]
+__all__ = [
+    "DescribedDoc",
+    "ReadOutputDoc",
+    "InfoDoc",
+    "InfosDoc",
+    "ParamDoc",
+    "WrittenParamDoc",
+    "short_text",
+]
+
+SHORT_TEXT_LENGTH_MAX: Final = 400
+"""Maximum number of characters of the members `text` and `units`, which thousands of rows may repeat. No
+request to the service accepts a longer name of a value."""
 
 """The types by name."""
 
@@ -71,8 +83,9 @@ class InfoDoc(Document):
 class ParamDoc(Document):
     """One parameter of a vehicle; in the JSON of the command line its name is the key of the document.
 
-    `text` is the meaning of the value in a word. `trust`, `is_default` and `heard_at` (unix seconds) come
-    with parameters of a table; `metadata` has all metadata of the parameter.
+    `text` is the meaning of the value in a word; above 400 characters, it is left out, and so are `units`.
+    `trust`, `is_default` and `heard_at` (unix seconds) come with parameters of a table; `metadata` has all
+    metadata of the parameter.
     """
 
     name: Maybe[str] = None
@@ -175,7 +188,7 @@ class WrittenParamDoc(Document):
     def compared(cls, param: WrittenParam, metadata: Metadata | None = None) -> WrittenParamDoc:
         """Return the document of a parameter of one side of a comparison, with the metadata of that side."""
         info = None if metadata is None else metadata.find(param.name)
-        text = None if info is None else info.text(param.settable) or None
+        text = None if info is None else short_text(info.text(param.settable))
         return cls.of(param).model_copy(update={"default": None, "comment": None, "text": text})
 
 
@@ -224,6 +237,11 @@ class DescribedDoc(Document):
     source: str
 
 
+def short_text(text: str | None) -> str | None:
+    """Return a text of metadata; None if it is empty or longer than `SHORT_TEXT_LENGTH_MAX`."""
+    return text if text and len(text) <= SHORT_TEXT_LENGTH_MAX else None
+
+
 def _members(param: Param, info: ParamInfo | None, *, whole: bool) -> dict[str, Any]:
     """Return the members of every `ParamDoc`."""
     members: dict[str, Any] = {
@@ -235,7 +253,7 @@ def _members(param: Param, info: ParamInfo | None, *, whole: bool) -> dict[str, 
     if param.default is not None:
         members["default"] = value_json(param.default, param.type_number)
     if info is not None:
-        members |= {"text": info.text(param.settable) or None, "units": info.units or None}
+        members |= {"text": short_text(info.text(param.settable)), "units": short_text(info.units)}
         if whole:
             members["metadata"] = InfoDoc.of(info)
     return members

@@ -19,6 +19,9 @@ CONTENT_SIZE_MAX: Final = 16 << 20
 SEPARATORS_MAX: Final = 400_000
 """Commas and opening brackets of a JSON file, which bound its values: 40 MB of memory. A file of 65,535
 parameters with five members has as many; PX4's has about 30,000."""
+DESCRIPTION_LENGTH_MAX: Final = 65_536
+"""Characters of all texts of one parameter: ten times the longest of ArduPilot. The description of a group
+may be that of thousands of parameters."""
 UNPACKING_MEMORY_MAX: Final = 96 << 20
 """Bytes of memory for unpacking. PX4 packs with a dictionary of 64 million, `xz -9`."""
 
@@ -50,27 +53,12 @@ def read_content(content: bytes, *, source: str) -> Metadata:
     Raises:
         MetadataError: as `read_metadata`.
     """
-    content = unpacked(content, source=source).removeprefix(b"\xef\xbb\xbf")
-    start = content.lstrip(b" \t\r\n")[:64]
-    if start.startswith(b"<"):
-        from paramclient.metadata import ardupilot  # imported here: loads pydantic
-
-        return ardupilot.read_xml(content, source=source)
-    if not start.startswith(b"{"):
-        what = "PX4's parameters.json, ArduPilot's apm.pdef.xml or apm.pdef.json"
-        raise MetadataError(f"{source}: is neither JSON nor XML; expected {what}", source=source)
-    from paramclient.metadata import ardupilot, px4  # imported here: both load pydantic
-
-    document = json_of(content, source=source)
-    if "parameters" in document:
-        return px4.read_parameters(document, source=source)
-    if "metadataTypes" in document:
-        raise MetadataError(
-            f"{source}: is the general metadata file, which only names other files; "
-            f"use the file with the parameters",
-            source=source,
-        )
-    return ardupilot.read_json(document, source=source)
+    metadata = _read_unpacked(unpacked(content, source=source).removeprefix(b"\xef\xbb\xbf"), source)
+    for name, info in metadata.params.items():
+        if info.text_length > DESCRIPTION_LENGTH_MAX:
+            what = f"the texts of {name!r:.40} have more than {DESCRIPTION_LENGTH_MAX:,} characters"
+            raise MetadataError(f"{source}: {what}", source=source)
+    return metadata
 
 
 def json_of(content: bytes, *, source: str) -> dict[str, object]:
@@ -116,6 +104,29 @@ def unpacked(content: bytes, *, source: str) -> bytes:
 
 
 _XZ: Final = b"\xfd7zXZ\0"
+
+
+def _read_unpacked(content: bytes, source: str) -> Metadata:
+    start = content.lstrip(b" \t\r\n")[:64]
+    if start.startswith(b"<"):
+        from paramclient.metadata import ardupilot  # imported here: loads pydantic
+
+        return ardupilot.read_xml(content, source=source)
+    if not start.startswith(b"{"):
+        what = "PX4's parameters.json, ArduPilot's apm.pdef.xml or apm.pdef.json"
+        raise MetadataError(f"{source}: is neither JSON nor XML; expected {what}", source=source)
+    from paramclient.metadata import ardupilot, px4  # imported here: both load pydantic
+
+    document = json_of(content, source=source)
+    if "parameters" in document:
+        return px4.read_parameters(document, source=source)
+    if "metadataTypes" in document:
+        raise MetadataError(
+            f"{source}: is the general metadata file, which only names other files; "
+            f"use the file with the parameters",
+            source=source,
+        )
+    return ardupilot.read_json(document, source=source)
 
 
 def _too_large(source: str) -> MetadataError:

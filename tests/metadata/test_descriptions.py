@@ -323,6 +323,21 @@ def test_an_undeclared_entity_is_rejected() -> None:
         read_content(b"<paramfile>&a;</paramfile>", source="the file")
 
 
+@pytest.mark.parametrize(
+    "members",
+    [
+        {"longDesc": "x" * formats.DESCRIPTION_LENGTH_MAX},
+        {"values": [{"value": number, "description": "x" * 1_000} for number in range(66)]},
+        {"bitmask": [{"index": number, "description": "x" * 1_100} for number in range(60)]},
+    ],
+)
+def test_the_texts_of_one_parameter_are_limited(members: dict[str, Any]) -> None:
+    """The description of a group may be that of thousands of parameters."""
+    document = {"version": 1, "parameters": [{"name": "A{n}", "shortDesc": "a", **members}]}
+    with pytest.raises(MetadataError, match=r"^p: the texts of 'A\{n\}' have more than 65,536 characters$"):
+        read_content(json.dumps(document).encode(), source="p")
+
+
 def test_a_file_with_too_large_content_is_rejected() -> None:
     packed = lzma.compress(bytes(formats.CONTENT_SIZE_MAX + 1), preset=1)
     assert len(packed) < 10_000

@@ -26,6 +26,7 @@ from paramclient.documents.component import ComponentsDoc
 from paramclient.documents.diff import DiffDoc, DifferenceDoc
 from paramclient.documents.document import Document
 from paramclient.documents.job import JobsDoc
+from paramclient.documents.param import InfoDoc
 from paramclient.errors import FileError, UsageError
 from paramclient.files import document_schema, dumps, formats, line_formats, loads, script
 from paramclient.files.param_file import TooManyParams
@@ -737,6 +738,38 @@ async def test_extended_parameters_are_chosen_in_a_thread_and_encoded_as_they_ar
         assert list(answer.json()["params"]) == list(table)
         assert turns.most == STREAMED_ENTRIES_MAX
         assert (await browser.get(f"{extended}/params?names=NONE")).json()["params"] == {}
+
+
+@swiftly
+async def test_descriptions_are_encoded_as_they_are_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    table = {f"ABC_P{number:03}": 1.0 for number in range(200)}
+    bits = [{"index": 0, "description": "b" * 500}]
+    group = {"name": "ABC_P{n}", "longDesc": "x" * 30_000, "units": "m" * 500, "bitmask": bits}
+    content = json.dumps({"version": 1, "parameters": [group]}).encode()
+    async with service(GenericVehicle(table=table)) as (_, browser):
+        await fetched(browser)
+        answer = await browser.put(f"{C}/metadata", content=content, headers=A_FILE)
+        assert answer.status_code == 200
+        turns = Turns()
+
+        def of(*given: Any) -> InfoDoc:
+            turns.note()
+            return made(*given)
+
+        made = InfoDoc.of
+        monkeypatch.setattr(InfoDoc, "of", of)
+        for query, count in (("", 200), ("?names=ABC_P00*", 10)):
+            answer = await browser.get(f"{C}/metadata{query}")
+            assert list(answer.json()["params"]) == list(table)[:count]
+        answer = await browser.get(f"{C}/params?metadata=true")
+        params = answer.json()["params"]
+        assert list(params) == list(table)
+        assert {len(each["metadata"]["long_description"]) for each in params.values()} == {30_000}
+        assert turns.most == 2, "32,768 characters"
+        assert not any({"text", "units"} & each.keys() for each in params.values()), "too long for many rows"
+        wanted = {"wanted": {"values": {"ABC_P001": 3}}, "known": True, "partial": True}
+        compared = (await browser.post(f"{C}/diff", json=wanted)).json()["params"]["ABC_P001"]
+        assert not {"text", "units"} & {*compared, *compared["left"], *compared["right"]}
 
 
 @pytest.mark.asyncio

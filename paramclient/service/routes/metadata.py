@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 
 from paramclient.documents.document import Body
-from paramclient.documents.param import DescribedDoc, InfosDoc
+from paramclient.documents.param import DescribedDoc, InfoDoc, InfosDoc
 from paramclient.metadata import Metadata, metadata_of, read_content
 from paramclient.model.patterns import NameChoice
 from paramclient.service.body_limits import METADATA_BYTES_MAX
@@ -15,7 +16,7 @@ from paramclient.service.followed_component import FollowedComponent
 from paramclient.service.param_sources import FILE_NAME_LENGTH_MAX, PATTERNS_MAX, Pattern
 from paramclient.service.problems import ServiceError
 from paramclient.service.request_body import BodyRoute, long_request
-from paramclient.service.responses import document_response
+from paramclient.service.responses import streamed_response
 from paramclient.service.route_context import (
     HubArgument,
     Seconds,
@@ -51,12 +52,15 @@ async def known_infos(
     if metadata is None:
         raise ServiceError(404, "not-described", "The service has no metadata of the component's parameters.")
     known = list(target.component.params)
-
-    def document() -> InfosDoc:
-        chosen = NameChoice(names)
-        return InfosDoc.of(metadata, [name for name in known if not names or chosen.has(name)])
-
-    return await document_response(hub.run_in_file_thread, document)
+    if names:
+        chosen = await hub.run_in_file_thread(lambda: NameChoice(names).choose(known)[0])
+        known = [name for name in known if name in chosen]
+    entries = (
+        f"{json.dumps(name)}:{InfoDoc.of(info).model_dump_json()}"
+        for name in known
+        if (info := metadata.find(name)) is not None
+    )
+    return streamed_response(f'{{"source":{json.dumps(metadata.source)},"params":{{', entries, "}}")
 
 
 @router.post("/metadata")

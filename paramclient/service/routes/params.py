@@ -28,7 +28,7 @@ from paramclient.service.followed_component import FollowedComponent
 from paramclient.service.param_sources import PATTERNS_MAX, REQUEST_VALUES_MAX, Pattern
 from paramclient.service.problems import problem_of
 from paramclient.service.request_body import BodyRoute
-from paramclient.service.responses import JSON
+from paramclient.service.responses import JSON, streamed_response
 from paramclient.service.route_context import (
     HubArgument,
     Seconds,
@@ -41,7 +41,7 @@ from paramclient.service.route_context import (
 )
 
 if TYPE_CHECKING:
-    from paramclient.metadata import Metadata, ParamInfo
+    from paramclient.metadata import ParamInfo
 
 __all__ = ["PARAMS_PER_TURN", "Durable", "Name", "ReadByPathRequest", "ReadRequest", "read_key", "router"]
 
@@ -131,11 +131,11 @@ async def known_params(
     if described is None:
         texts = await _texts(target, table, chosen, changed=changed)
         return Response(f"{head}{texts}}}}}", media_type=JSON)
-    heard_at = {name: target.heard_at(name) for name in chosen}
-    texts = await hub.run_in_thread(
-        lambda: _texts_with_metadata(_params_of(table, chosen, changed=changed), described, heard_at)
+    entries = (
+        f"{json.dumps(each.name)}:{_described(each, described.get(each.name), target.heard_at(each.name))}"
+        for each in _params_of(table, chosen, changed=changed)
     )
-    return Response(f"{head}{texts}}}}}", media_type=JSON)
+    return streamed_response(head, entries, "}}")
 
 
 @router.get("/params/{name:path}", responses={200: {"model": ParamDoc}}, response_class=Response)
@@ -282,16 +282,6 @@ async def _texts(
         parts.append(target.object_of(params)[1:-1])
         await anyio.lowlevel.checkpoint()
     return ",".join(filter(None, parts))
-
-
-def _texts_with_metadata(
-    params: Iterable[Param], metadata: Metadata, heard_at: Mapping[str, float | None]
-) -> str:
-    """Return the members of a JSON object with descriptions, in any thread."""
-    return ",".join(
-        f"{json.dumps(each.name)}:{_described(each, metadata.get(each.name), heard_at[each.name])}"
-        for each in params
-    )
 
 
 def _unknown(target: FollowedComponent, name: str) -> UnknownParameter:
