@@ -16,6 +16,8 @@ __all__ = ["Rename", "Renames"]
 
 PARAM_NAMES_MAX: Final = 16
 """Maximum number of names of one parameter. Each conversion multiplies the factors between two of them."""
+FACTOR_MAX: Final = 10**308
+"""Largest factor: the next power of ten is no float."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +173,9 @@ class Renames:
                 raise error(str(problem)) from None
         factor = entry.factor
         if isinstance(factor, bool) or not isinstance(factor, int | float):
-            raise error(f"the factor of {entry.old} is not a number: {factor!r}")
+            raise error(f"the factor of {entry.old} is not a number: {factor!r:.60}")
+        if isinstance(factor, int) and abs(factor) > FACTOR_MAX:
+            raise error(f"the factor of {entry.old} is beyond the range of a float")
         if factor == 0 or not math.isfinite(factor):
             raise error(
                 f"the factor of {entry.old} is {factor!r}; a value must be convertible in both directions"

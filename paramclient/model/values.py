@@ -248,9 +248,11 @@ def check_name(name: str) -> str:
     if not name:
         raise UsageError("a parameter name has at least one character")
     if not (name.isascii() and name.isprintable()):
-        raise UsageError(f"parameter name {name!r}: only printable ASCII characters are allowed")
+        raise UsageError(f"parameter name {name!r:.200}: only printable ASCII characters are allowed")
     if len(name) > NAME_LENGTH:
-        raise UsageError(f"parameter name {name!r} has {len(name)} bytes; a param_id holds {NAME_LENGTH}")
+        raise UsageError(
+            f"parameter name {name!r:.200} has {len(name)} bytes; a param_id holds {NAME_LENGTH}"
+        )
     return name
 
 

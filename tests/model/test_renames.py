@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from paramclient import FileError, ParamSet, ParamType, Rename, Renames, UsageError, WrittenParam
+from paramclient.files import loads_renames
 from paramclient.model.values import WireValue
 
 CHAIN = Renames([Rename("A", "B", 0.01), Rename("B", "C", 10)], "names.yaml")
@@ -128,6 +129,8 @@ def test_there_and_back_is_the_same_float32(value: int | float, factor: float) -
         ([("A", "B", math.nan)], "the factor of A is nan;"),
         ([("A", "B", -math.inf)], "the factor of A is -inf;"),
         ([("A", "B", True)], "the factor of A is not a number: True"),
+        ([("A", "B", 10**400)], "the factor of A is beyond the range of a float"),
+        ([("A", "B", -(10**5000))], "the factor of A is beyond the range of a float"),
         ([(f"A{n}", f"A{n + 1}") for n in range(16)], "A15 is one of more than 16 names of one parameter"),
         (
             [("A7", "A8"), *((f"A{n}", f"A{n + 1}") for n in (*range(7), *range(8, 16)))],
@@ -152,3 +155,13 @@ def test_the_note_about_a_missing_parameter_names_its_other_names() -> None:
 def test_the_rules_tell_their_source() -> None:
     assert repr(CHAIN) == "<Renames 2 from names.yaml>"
     assert len(CHAIN) == 2
+
+
+@pytest.mark.parametrize(
+    "entry",
+    ["{old: A, new: B, factor: [" + "x, " * 1_000 + "]}", "{old: '" + "x y " * 1_000 + "', new: B}"],
+)
+def test_a_long_entry_has_a_short_error(entry: str) -> None:
+    with pytest.raises(FileError) as error:
+        loads_renames(f"- {entry}\n".encode(), source="names.yaml")
+    assert len(str(error.value)) < 400
