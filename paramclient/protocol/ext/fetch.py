@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -16,6 +17,7 @@ from paramclient.protocol.ext.reads import ExtRead, ExtReads
 from paramclient.protocol.ext.table import ExtTable
 from paramclient.protocol.params.download_ranges import DownloadRange, DownloadRanges, split_indices
 from paramclient.protocol.params.fetch_result import Progress
+from paramclient.protocol.params.list_download import REQUESTED_INDICES_MAX
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
@@ -69,6 +71,8 @@ class ExtFetch(Operation[ExtFetchResult]):
         received: the names by index, since the fetch began.
         dead: indices whose reads were in vain.
         requested_again: indices that a list was without, and that were requested again.
+        reads: the open reads of missing indices.
+        unread: missing indices that are read next.
         value_at: when the last value was received; minus infinity before the first.
         quiet_since: when that was, or when the list was requested again.
         longest: the longest time between two values of the list in seconds; None before two.
@@ -90,6 +94,7 @@ class ExtFetch(Operation[ExtFetchResult]):
         self.came = 0
         self.count_changes = 0
         self.reads: dict[int, ExtRead] = {}
+        self.unread: deque[int] = deque()
 
     @property
     def has_begun(self) -> bool:
@@ -275,29 +280,39 @@ class ExtFetches(Machine):
         """Read each missing index, or request the list again: it is over."""
         missing = [index for index in self._missing(fetch) if index not in fetch.dead]
         self._trace("%s/%s: the extended list lacks %s", *self._target, len(missing))
-        fetch.requested_again.update(missing)
         if fetch.request.should_list_again(len(missing), self._table.count or 0, fetch.lists):
+            fetch.requested_again.update(missing)
             fetch.lists += 1
             fetch.front = -1
             fetch.longest = None
             fetch.quiet_since = now
             self._request(fetch, now)
             return
-        for index in missing:
-            read = self._reads.ask(index, now, urgent=False)
-            fetch.reads[index] = read
-            read.on_done.append(partial(self._read_ended, fetch, index, read))
+        fetch.unread.extend(missing)
+        self._read_next(fetch, now)
         self._look(fetch, now)
+
+    def _read_next(self, fetch: ExtFetch, now: float) -> None:
+        """Read missing indices, few at a time: a component may claim thousands."""
+        while fetch.unread and len(fetch.reads) < REQUESTED_INDICES_MAX:
+            index = fetch.unread.popleft()
+            if index not in fetch.received:
+                fetch.requested_again.add(index)
+                fetch.reads[index] = read = self._reads.ask(index, now, urgent=False)
+                read.on_done.append(partial(self._read_ended, fetch, index, read))
 
     def _read_ended(self, fetch: ExtFetch, index: int, read: ExtRead) -> None:
         if fetch.reads.pop(index, None) is not read:
             return  # the list has begun again, or the fetch has ended
         if read.error is not None:
             fetch.dead.add(index)
+        self._read_next(fetch, read.ended_at)
         self._look(fetch, read.ended_at)
 
     def _look(self, fetch: ExtFetch, now: float) -> None:
         """End the fetch if nothing is left to wait for."""
+        if len(fetch.received) + len(fetch.dead) < (self._table.count or 0):
+            return  # without a look at each index, for each value
         missing = self._missing(fetch)
         if missing and not (fetch.has_begun and set(missing) <= fetch.dead):
             return
@@ -329,6 +344,7 @@ class ExtFetches(Machine):
         self.current = None
 
     def _release(self, fetch: ExtFetch) -> None:
+        fetch.unread.clear()
         reads, fetch.reads = fetch.reads, {}
         for read in reads.values():
             self._reads.release(read)

@@ -57,9 +57,10 @@ class ExtTable:
         is_another = self.count is not None
         self.count = count
         if is_another:
+            for name in self._names.values():  # at a count that alternates, few have an index
+                if name in self.params:
+                    self.params[name] = self.params[name].with_index(None)
             self._names.clear()
-            for name, param in self.params.items():
-                self.params[name] = param.with_index(None)
         return is_another
 
     def use_index(self, name: str, index: int) -> None:

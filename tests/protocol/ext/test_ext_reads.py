@@ -3,18 +3,30 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from paramclient.errors import LinkError, NoReply, UnknownParameter, UsageError
-from paramclient.model.ext_params import ExtParamType
+from paramclient.model.ext_params import ExtParam, ExtParamType
 from paramclient.model.values import ParamType, Trust
 from paramclient.protocol import wire
+from paramclient.protocol.ext.extended import ExtendedParams
+from paramclient.protocol.ext.fetch import ExtFetch, ExtFetches
+from paramclient.protocol.params.list_download import REQUESTED_INDICES_MAX
 from paramclient.protocol.params.sync import SyncSettings
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.station import Station
-from paramclient.protocol.wire import Message, ParamExtRequestList, ParamExtRequestRead, ParamExtValue
+from paramclient.protocol.wire import (
+    PARAMETERS_MAX,
+    Message,
+    ParamExtRequestList,
+    ParamExtRequestRead,
+    ParamExtValue,
+)
 from paramclient.sim import Camera, GenericVehicle, camera_table
 from tests.protocol.ext.camera import CameraSession, lossy
 
@@ -343,3 +355,65 @@ def test_counts_and_indices_that_cannot_be(count: int, index: int) -> None:
     assert table.params["A"].index is None
     assert table.count in (None, 3)
     assert not table.complete
+
+
+def heard_values(count: int, indices: Iterable[int]) -> tuple[ExtendedParams, ExtFetch]:
+    """The extended parameters of a component that has sent these of a list."""
+    host: Any = SimpleNamespace(is_recipient_certain=True, ext_changed=lambda change: None)
+    params = ExtendedParams(Context((1, 100), lambda message: None), host)
+    fetch = params.begin_fetch(0.0)
+    for index in indices:
+        params.receive_value(ParamExtValue(f"P{index:05}", b"x", ExtParamType.CUSTOM, count, index), 0.1)
+    return params, fetch
+
+
+def test_the_values_of_a_list_are_counted_and_each_index_is_looked_at_only_at_the_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    looks = 0
+
+    def look(*given: Any) -> list[int]:
+        nonlocal looks
+        looks += 1
+        return missing(*given)
+
+    missing = ExtFetches._missing
+    monkeypatch.setattr(ExtFetches, "_missing", look)
+    _, fetch = heard_values(2_000, range(1_999))
+    assert looks == 0
+    _, fetch = heard_values(2_000, range(2_000))
+    assert fetch.done
+    assert looks < 5
+
+
+def test_of_many_missing_indices_few_are_read_at_a_time() -> None:
+    params, fetch = heard_values(PARAMETERS_MAX, [0])
+    now = 0.1
+    for _ in range(2_000):
+        now = max(now, params.next_deadline())
+        params.tick(now)
+        assert len(fetch.reads) <= REQUESTED_INDICES_MAX
+        assert len(params.reads) <= REQUESTED_INDICES_MAX + 1, "with the control read"
+    assert len(fetch.dead) > REQUESTED_INDICES_MAX
+    assert len(fetch.reads) == REQUESTED_INDICES_MAX
+
+
+def test_at_a_count_that_alternates_only_the_indices_heard_since_are_forgotten() -> None:
+    params, _ = heard_values(100, range(100))
+    replaced = 0
+
+    class Table(dict[str, ExtParam]):
+        def __setitem__(self, name: str, param: ExtParam) -> None:
+            nonlocal replaced
+            replaced += 1
+            super().__setitem__(name, param)
+
+    params.table.params = Table(params.table.params)
+    assert params.table.use_count(99)
+    assert replaced == 100
+    assert {param.index for param in params.table.params.values()} == {None}
+    for count in (100, 99, 100):
+        assert params.table.use_count(count)
+        params.table.use_index("P00007", 7)
+    assert replaced == 100 + 3 + 2
+    assert [name for name, param in params.table.params.items() if param.index is not None] == ["P00007"]
