@@ -72,11 +72,15 @@ class FollowedExtended:
     def publish_changes(self) -> None:
         """Publish parameters whose trust or index differs from the published one."""
         params, published = self.ext.params, self._published
-        differing = [
-            param
-            for name, param in params.items()
-            if (before := published.get(name)) is not param and before != param
-        ]
+        differing = []
+        for name, param in params.items():
+            before = published.get(name)
+            if before is param:
+                continue
+            if before == param:
+                published[name] = param  # a list brings equal ones, which need no second comparison
+            else:
+                differing.append(param)
         if len(differing) <= SINGLE_EXT_CHANGES_MAX:
             for param in differing:
                 before, published[param.name] = published.get(param.name), param

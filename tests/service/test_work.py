@@ -33,6 +33,7 @@ from paramclient.files.param_file import TooManyParams
 from paramclient.model import comparison as compare_room
 from paramclient.model import params as params_model
 from paramclient.model import patterns
+from paramclient.model.ext_params import ExtParam
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.patterns import NameChoice
 from paramclient.model.values import Param, ParamType
@@ -770,6 +771,32 @@ async def test_descriptions_are_encoded_as_they_are_sent(monkeypatch: pytest.Mon
         wanted = {"wanted": {"values": {"ABC_P001": 3}}, "known": True, "partial": True}
         compared = (await browser.post(f"{C}/diff", json=wanted)).json()["params"]["ABC_P001"]
         assert not {"text", "units"} & {*compared, *compared["left"], *compared["right"]}
+
+
+@swiftly
+async def test_extended_parameters_of_a_second_list_are_compared_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    compared = 0
+
+    def is_equal(one: ExtParam, other: object) -> bool:
+        nonlocal compared
+        compared += 1
+        return bool(equal(one, other))
+
+    extended = "/api/v1/components/1/100/extended"
+    async with service(Camera({f"P{number:03}": number for number in range(200)})) as (_, browser):
+        await met(browser, system=1, component=100)
+        for _ in range(2):
+            assert (await browser.post(f"{extended}/fetch", json={})).status_code == 200
+        equal = ExtParam.__eq__
+        monkeypatch.setattr(ExtParam, "__eq__", is_equal)
+        assert (await browser.post(f"{extended}/fetch", json={})).status_code == 200
+        assert 0 < compared <= 200
+        for _ in range(10):
+            assert (await browser.get(f"{extended}/params/P000")).status_code == 200
+            assert len((await browser.get(f"{extended}/params")).json()["params"]) == 200
+        assert compared <= 200
 
 
 @pytest.mark.asyncio
