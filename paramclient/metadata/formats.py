@@ -14,8 +14,9 @@ __all__ = ["PACKED_SIZE_MAX", "json_of", "read_content", "read_metadata", "unpac
 
 PACKED_SIZE_MAX: Final = 4 << 20
 """Bytes of a packed file, or of a file from a vehicle; PX4's has about 0.1 million."""
-CONTENT_SIZE_MAX: Final = 16 << 20
-"""Bytes of a file, and of an unpacked one; those of ArduPilot and PX4 have 2 to 5 million."""
+CONTENT_SIZE_MAX: Final = 8 << 20
+"""Bytes of a file, and of an unpacked one; those of ArduPilot and PX4 have 2 to 5 million. To read one takes
+up to seven times as much memory, if its text is not ASCII."""
 SEPARATORS_MAX: Final = 400_000
 """Commas and opening brackets of a JSON file, which bound its values: 40 MB of memory. A file of 65,535
 parameters with five members has as many; PX4's has about 30,000."""

@@ -323,6 +323,20 @@ def test_an_undeclared_entity_is_rejected() -> None:
         read_content(b"<paramfile>&a;</paramfile>", source="the file")
 
 
+def test_the_largest_file_takes_less_memory_than_a_request_may() -> None:
+    row = '{"name":"P%05d","longDesc":"\U0001f6f0' + "x" * 2_000 + '"}'
+    rows = ",".join(row % number for number in range(formats.CONTENT_SIZE_MAX // 2_100))
+    content = f'{{"version":1,"parameters":[{rows}]}}'.encode()
+    del rows
+    assert 0.9 * formats.CONTENT_SIZE_MAX < len(content) <= formats.CONTENT_SIZE_MAX
+    tracemalloc.start()
+    try:
+        read_content(content, source="p")
+        assert tracemalloc.get_traced_memory()[1] < 64e6 - len(content)
+    finally:
+        tracemalloc.stop()
+
+
 @pytest.mark.parametrize(
     "members",
     [
