@@ -15,7 +15,7 @@ from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.link_history import LOSS, ROUND_TRIP, LinkHistory, history_lines
 from paramclient.cli.options import Seconds, TrafficOptions
 from paramclient.cli.output import live_view, milliseconds, print_document, print_line, print_table
-from paramclient.cli.session import Deadline, listen
+from paramclient.cli.session import Deadline, listen, received_in_words
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
 from paramclient.client.local import local
@@ -70,9 +70,9 @@ async def link(
     limit = seconds if is_live or seconds is not None else LINK_LISTENING_TIME
     async with listen(url, options, listen_only=listen_only) as client:
         report = await _run_with_measurements(client, _show if is_live else _listen, limit)
-    if not report.frames:
-        noise = f" (but {report.bytes_received:,} other bytes)" if report.bytes_received else ""
-        raise NoReply(f"anything on {client.link.name}{noise}", attempts=0, waited=report.seconds)
+        if not report.frames:
+            hint = received_in_words(client)
+            raise NoReply(f"anything on {client.link.name}", attempts=0, waited=report.seconds, hint=hint)
     if options.json:
         from paramclient.documents.traffic import TrafficDoc  # only here: loads pydantic
 

@@ -31,6 +31,7 @@ __all__ = [
     "CommandSession",
     "connect",
     "listen",
+    "received_in_words",
     "receiver_in_words",
     "wait_for_firmware",
     "wait_for_vehicle",
@@ -231,10 +232,10 @@ async def wait_for_vehicle(
         found = await wait_for_kind(client, kind, timeout)
         if found is None:
             waited = anyio.current_time() - began
-            raise NoReply(awaited, attempts=0, waited=waited, hint=_received(client))
+            raise NoReply(awaited, attempts=0, waited=waited, hint=received_in_words(client))
         return found
 
-    return await while_waiting(look, f"{awaited} on {client.link.name}", lambda: _received(client))
+    return await while_waiting(look, f"{awaited} on {client.link.name}", lambda: received_in_words(client))
 
 
 def listen(url: str, options: TrafficOptions, *, listen_only: bool = False) -> ParamClient:
@@ -259,7 +260,7 @@ def listen(url: str, options: TrafficOptions, *, listen_only: bool = False) -> P
     )
 
 
-def _received(client: ParamClient) -> str:
+def received_in_words(client: ParamClient) -> str:
     """Return what was received on the link so far; "" over a service."""
     implementation = implementation_of(client)
     if not isinstance(implementation, LinkClient):
