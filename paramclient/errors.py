@@ -16,7 +16,7 @@ The tree shows the cause of each error::
     │   │   └── ExtSetRefused         the component did not set an extended parameter: PARAM_EXT_ACK
     │   │       ├── ValueUnsupported  it does not support the value, or has no such parameter
     │   │       └── SetFailed         it could not set the value
-    │   ├── TypeMismatch              the parameter has a type that cannot hold the value
+    │   ├── TypeMismatch              the parameter's type changed, or the vehicle reports TYPE_MISMATCH
     │   ├── ValueNotApplied           the vehicle kept another value and gave no reason
     │   ├── VehicleArmed              the vehicle is armed, and setting while armed was not allowed
     │   ├── FileTransferError         the vehicle refused an operation on a file
@@ -368,7 +368,10 @@ class SetFailed(ExtSetRefused):
 
 
 class TypeMismatch(VehicleError):
-    """The vehicle's parameter has another type than PARAM_SET had."""
+    """The parameter's type changed during a write, or the vehicle answered PARAM_ERROR with TYPE_MISMATCH.
+
+    A value that does not fit the known type is a `UsageError`, and is not sent.
+    """
 
 
 class ValueNotApplied(VehicleError):
