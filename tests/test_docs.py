@@ -9,6 +9,7 @@ import json
 import os
 import re
 import shlex
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -73,6 +74,8 @@ COMMANDS += ["--install-completion", "reset", "apply", "verify", "restore", "imp
 LINK = re.compile(r"\]\(([^)#\s]*)(?:#([^)\s]*))?\)")
 SERVICE = "http://127.0.0.1:8765"
 """The address of a service in programs."""
+SITL = "udpin:127.0.0.1:14550"
+"""The link of SITL in `sitl.md`."""
 HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
 
 
@@ -80,16 +83,69 @@ def blocks(page: Path, language: str) -> list[str]:
     return [code for kind, code in FENCE.findall(page.read_text(encoding="utf-8")) if kind == language]
 
 
+COMPARED = {
+    "pymavlink": "sim:ardupilot",
+    "MAVProxy": "sim:ardupilot",
+    "MAVSDK": "sim:px4",
+    "QGroundControl": "sim:ardupilot",
+    "Mission Planner": "sim:ardupilot",
+}
+"""The programs that `coming-from.md` compares with, and the vehicle with which its tables are tried."""
+REFUSED_IN_PART = "paramclient reset LINK --all"
+"""The command of these tables that ends with exit code 1: ArduPilot refuses its read-only parameters."""
+ROW = re.compile(r"^\|([^|\n]*)\|([^|\n]*)\|([^|\n]*)\|$", re.MULTILINE)
+CODE_SPAN = re.compile(r"`([^`]+)`")
+TABLE_PROGRAM = """\
+from paramclient import ParamSet, write_file
+from paramclient.sync import ParamClient
+
+with ParamClient("{link}", cache=False) as client:
+    vehicle = client.only_component()
+    vehicle.fetch_all()
+    write_file("other.parm", ParamSet.of(vehicle.params.values()))
+"""
+
+
+def compared_with(program: str) -> list[tuple[list[str], list[str]]]:
+    """Return the commands and the Python code of each row of a table of `coming-from.md`."""
+    text = (DOCS / "coming-from.md").read_text(encoding="utf-8")
+    section = text.partition(f"\n## {program}\n")[2].partition("\n## ")[0]
+    return [
+        (
+            [each for each in CODE_SPAN.findall(command) if each.startswith("paramclient ")],
+            [each for each in CODE_SPAN.findall(python) if re.search(r"\bvehicle\b", each)],
+        )
+        for _, command, python in ROW.findall(section)
+    ]
+
+
+def table_programs() -> Iterator[tuple[str, str]]:
+    """Yield a program for each table of `coming-from.md`, with all code of its column *Python*."""
+    for program, link in COMPARED.items():
+        code = TABLE_PROGRAM.format(link=link)
+        for _, lines in compared_with(program):
+            for line in lines:
+                is_expression = isinstance(ast.parse(line).body[0], ast.Expr)
+                code += f"    print({line})\n" if is_expression else f"    {line}\n"
+        yield f"coming-from-{program}", code
+
+
 def programs() -> Iterator[tuple[str, str]]:
     """Every Python program of the pages, with its name."""
     for page in PAGES:
         for number, code in enumerate(blocks(page, "python"), start=1):
             yield f"{name_of(page)}-{number}", code
+    yield from table_programs()
 
 
 def needs_service(code: str) -> bool:
     """Return whether a program is a client of a service."""
     return SERVICE in code
+
+
+def needs_vehicle(code: str) -> bool:
+    """Return whether a program needs a vehicle that sends to a UDP port."""
+    return f'ParamClient("{SITL}")' in code
 
 
 def commands() -> list[list[str]]:
@@ -159,7 +215,9 @@ def shown() -> Iterator[tuple[str, str, str]]:
     [
         pytest.param(code, id=name)
         for name, code in programs()
-        if not needs_service(code) and code not in {each for _, each, _ in shown()}
+        if not needs_service(code)
+        and not needs_vehicle(code)
+        and code not in {each for _, each, _ in shown()}
     ],
 )
 def test_a_program_runs(program: str, tmp_path: Path) -> None:
@@ -179,30 +237,112 @@ def test_a_program_prints_what_the_page_shows(program: str, output: str, tmp_pat
 RECIPE = re.compile(r"^```sh\n(.*)\n```\n(?:\n```text\n((?:(?!```).*\n)*)```\n)?", re.MULTILINE)
 
 
+def run_command(command: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """Run a command of a page in a folder, with a cache of its own; trailing spaces of the output are cut."""
+    name, *words = shlex.split(command)
+    assert name == "paramclient"
+    done = subprocess.run(
+        [sys.executable, "-m", "paramclient", *words],
+        cwd=cwd,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(cwd), "COLUMNS": "100"},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        encoding="utf-8",
+        timeout=60,
+        check=False,
+    )
+    done.stdout = "".join(f"{line.rstrip()}\n" for line in done.stdout.splitlines())
+    return done
+
+
 def test_the_commands_of_the_recipes_print_what_the_page_shows(tmp_path: Path) -> None:
     """In one folder, in the order of the page. A command without a text below it prints nothing."""
     page = (DOCS / "recipes.md").read_text(encoding="utf-8")
     found = RECIPE.findall(page)
     assert len(found) + len(blocks(DOCS / "recipes.md", "python")) == 20
     for command, output in found:
-        name, *words = shlex.split(command)
-        assert name == "paramclient"
-        done = subprocess.run(
-            [sys.executable, "-m", "paramclient", *words],
-            cwd=tmp_path,
-            env=os.environ | {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path), "COLUMNS": "100"},
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            encoding="utf-8",
-            timeout=60,
-            check=False,
-        )
-        printed = "".join(f"{line.rstrip()}\n" for line in done.stdout.splitlines())
-        assert (done.returncode, printed) == (0, output), command + done.stderr
+        done = run_command(command, tmp_path)
+        assert (done.returncode, done.stdout) == (0, output), command + done.stderr
+
+
+def test_the_quickstart_starts_from_the_cache_the_second_time(tmp_path: Path) -> None:
+    """The first program, twice, in an empty folder with an empty cache."""
+    program = blocks(DOCS / "quickstart.md", "python")[0]
+    first, second = blocks(DOCS / "quickstart.md", "text")[:2]
+    assert ("from stream" in first, "from cache" in second) == (True, True)
+    for output in (first, second):
+        printed = run("-c", program, cwd=tmp_path, XDG_CACHE_HOME=str(tmp_path / "cache"))
+        assert DURATION.sub("0.0 s", printed) == DURATION.sub("0.0 s", output)
+
+
+@pytest.mark.parametrize("program", COMPARED)
+def test_the_commands_for_users_of_other_programs_run(program: str, tmp_path: Path) -> None:
+    """Each command of the tables, in the order of the page, in one folder."""
+    assert run_command(f"paramclient fetch {COMPARED[program]} --tlog flight.tlog", tmp_path).returncode == 0
+    found = [command for commands, _ in compared_with(program) for command in commands]
+    assert len(found) > 4
+    for command in found:
+        words = command.replace("LINK", COMPARED[program])
+        done = run_command(f"{words} --timeout 1" if " watch " in words else words, tmp_path)
+        assert done.returncode == int(command == REFUSED_IN_PART), command + done.stderr
+
+
+@contextmanager
+def simulating(autopilot: str, link: str, cwd: Path) -> Iterator[None]:
+    """Run a simulated vehicle in a process of its own."""
+    words = ["-m", "paramclient", "sim", autopilot, "--link", link]
+    with subprocess.Popen(
+        [sys.executable, *words],
+        cwd=cwd,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stderr=subprocess.DEVNULL,
+    ) as process:
+        try:
+            yield
+        finally:
+            process.terminate()
+
+
+FILE_TO_WRITE = re.compile(r"Write this to `([\w.]+)`:\n\n```text\n(.*?)```", re.DOTALL)
+
+
+@pytest.mark.parametrize(("section", "autopilot"), [("PX4", "px4"), ("ArduPilot", "ardupilot")])
+def test_the_commands_for_sitl_print_what_the_page_shows(
+    section: str, autopilot: str, tmp_path: Path
+) -> None:
+    """With a simulated vehicle over UDP, on another port, instead of SITL."""
+    page = (DOCS / "sitl.md").read_text(encoding="utf-8")
+    text = page.partition(f"\n## {section}\n")[2].partition("\n## ")[0]
+    (start,) = (line for line in blocks(DOCS / "sitl.md", "sh") if line.startswith("paramclient sim "))
+    assert start == "paramclient sim px4 --link udpout:127.0.0.1:14550\n"
+    for name, content in FILE_TO_WRITE.findall(text):
+        (tmp_path / name).write_text(content, encoding="utf-8")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    found = RECIPE.findall(text)
+    assert len(found) == len(re.findall("^```sh$", text, re.MULTILINE)) == 6
+    with simulating(autopilot, f"udpout:127.0.0.1:{port}", tmp_path):
+        for command, output in found:
+            done = run_command(command.replace("14550", port), tmp_path)
+            assert (done.returncode, done.stdout) == (0, output), command + done.stderr
+        if autopilot == "px4":
+            (program,) = blocks(DOCS / "sitl.md", "python")
+            assert needs_vehicle(program)
+            run(
+                "-W",
+                "error",
+                "-c",
+                program.replace("14550", port),
+                cwd=tmp_path,
+                XDG_CACHE_HOME=str(tmp_path),
+            )
 
 
 def test_the_pages_show_the_output_of_their_programs() -> None:
-    assert {"quickstart", "sync", "setup", "extended", "recipes"} <= {name for name, _, _ in shown()}
+    assert {"quickstart", "sync", "setup", "extended", "recipes", "coming-from"} <= {
+        name for name, _, _ in shown()
+    }
 
 
 def test_the_programs_over_a_service_run(tmp_path: Path) -> None:
