@@ -16,8 +16,8 @@ __all__ = [
 ]
 
 SHARED_UIDS: Final = frozenset({"4954414c44494e4f"})
-"""Hardware ids that several vehicles share: every simulated PX4 reports this one (measured). The system id
-distinguishes the vehicles, as PX4 numbers the simulated vehicles on one machine."""
+"""Hardware ids that several vehicles share: each `sim:px4`, and PX4's SITL with system id 1, reports this one
+(measured). The system id distinguishes the vehicles."""
 
 _AGAINST_NON_FINITE = {
     "px4": "PX4 cannot save NaN and infinity: its parameter file becomes invalid, it saves nothing any more, "
