@@ -306,6 +306,11 @@ def simulating(autopilot: str, link: str, cwd: Path) -> Iterator[None]:
 FILE_TO_WRITE = re.compile(r"Write this to `([\w.]+)`:\n\n```text\n(.*?)```", re.DOTALL)
 
 
+def written(output: str) -> list[list[str]]:
+    """Return the rows of a table, without those of counters: the vehicle changes them once in 30 s."""
+    return [line.split() for line in output.splitlines() if " skipped " not in line]
+
+
 @pytest.mark.parametrize(("section", "autopilot"), [("PX4", "px4"), ("ArduPilot", "ardupilot")])
 def test_the_commands_for_sitl_print_what_the_page_shows(
     section: str, autopilot: str, tmp_path: Path
@@ -325,7 +330,7 @@ def test_the_commands_for_sitl_print_what_the_page_shows(
     with simulating(autopilot, f"udpout:127.0.0.1:{port}", tmp_path):
         for command, output in found:
             done = run_command(command.replace("14550", port), tmp_path)
-            assert (done.returncode, done.stdout) == (0, output), command + done.stderr
+            assert (done.returncode, written(done.stdout)) == (0, written(output)), command + done.stderr
         if autopilot == "px4":
             (program,) = blocks(DOCS / "sitl.md", "python")
             assert needs_vehicle(program)
