@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -10,8 +10,11 @@ from paramclient.cache import FleetDiff, FleetVehicle, Holder, NameSpread, Param
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import CacheOptions, Id
 from paramclient.cli.output import local_time, print_document, print_table, report, say
-from paramclient.errors import UsageError
+from paramclient.cli.param_names import unmatched_text
+from paramclient.errors import NotInCache, UsageError
+from paramclient.files.param_file import AUTOPILOT
 from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.patterns import NameChoice
 from paramclient.model.values import Param, ParamType, check_name, format_value
 from paramclient.model.wording import counted
 
@@ -31,14 +34,19 @@ def fleet_diff(
     differ.
 
     Args:
-        wanted: Names of parameters, or patterns such as 'MC_*'; or one parameter file.
+        wanted: Names of parameters in upper or lower case, or patterns such as 'MC_*'; or one parameter file.
         component: Compare this component instead of the autopilot.
     """
     if not wanted:
         raise UsageError("name the parameters to compare, or a parameter file")
     chosen = _chosen(wanted, component)
     with ParamCache(options.cache) as cache:
-        found = cache.fleet_diff(chosen, component=component)
+        try:
+            found = cache.fleet_diff(chosen, component=component)
+        except NotInCache:
+            if isinstance(chosen, ParamSet):
+                raise
+            found = cache.fleet_diff(_spelled(cache, chosen, component or AUTOPILOT), component=component)
     if options.json:
         from paramclient.documents.fleet import FleetDiffDoc  # only here: loads pydantic
 
@@ -62,6 +70,25 @@ def _chosen(wanted: tuple[str, ...], component: int | None) -> ParamSet | tuple[
     for note in file.notes:
         report(note)
     return file.choose(component)
+
+
+def _spelled(cache: ParamCache, wanted: Sequence[str], component: int) -> list[str]:
+    """Return the names in the cache that names and patterns choose, whatever their upper and lower case.
+
+    Raises:
+        NotInCache: one chooses none. The message suggests similar names.
+    """
+    _, known = cache.fleet_names(["*"], component=component)
+    names: dict[str, None] = {}
+    unmatched: list[str] = []
+    for text in wanted:
+        chosen, without = NameChoice([text]).divide(known)
+        names |= dict.fromkeys(sorted(chosen))
+        unmatched += without
+    if unmatched:
+        text = unmatched_text(unmatched, known, lambda: ())
+        raise NotInCache(f"no vehicle in the cache {cache.place} has a parameter {text}")
+    return list(names)
 
 
 def _print(found: FleetDiff) -> None:

@@ -18,7 +18,15 @@ from paramclient.model.patterns import NameChoice, is_pattern
 from paramclient.model.similar_names import did_you_mean, nearest_names
 from paramclient.model.values import check_name
 
-__all__ = ["ChosenNames", "cached_names", "check_given", "may_appear", "suggest", "unmatched_text"]
+__all__ = [
+    "ChosenNames",
+    "cached_names",
+    "check_given",
+    "may_appear",
+    "spelling",
+    "suggest",
+    "unmatched_text",
+]
 
 CACHED_TABLES_MAX: Final = 20
 """Tables of the cache whose names are suggested, those of the vehicles heard last: few firmwares differ."""
@@ -45,7 +53,7 @@ class ChosenNames:
         errors: dict[str, ParamClientError] = {}
         for text in given:
             if not is_pattern(text):
-                names[_spelled(text, component)] = None
+                names[spelling(text, component)] = None
                 continue
             chosen, _ = NameChoice([text]).divide(component.params)
             names |= dict.fromkeys(sorted(chosen))
@@ -131,13 +139,19 @@ def unmatched_text(
     return ", ".join(texts)
 
 
-def _spelled(name: str, component: Component) -> str:
-    """Return the vehicle's spelling of a name, whatever its upper and lower case."""
+def spelling(name: str, component: Component) -> str:
+    """Return the vehicle's spelling of a name, whatever its upper and lower case.
+
+    A name that fits several parameters in upper and lower case, and is none of them, is returned unchanged:
+    the vehicle has no such parameter.
+    """
     if name in component.params:
         return name
     upper = name.upper()
-    known = next((each for each in component.params if each.upper() == upper), None)
-    return known or (upper if component.autopilot in _CAPITALS else name)
+    known = [each for each in component.params if each.upper() == upper]
+    if known:
+        return known[0] if len(known) == 1 else name
+    return upper if component.autopilot in _CAPITALS else name
 
 
 def _no_match(pattern: str, component: Component) -> UnknownParameter:

@@ -32,6 +32,7 @@ from paramclient.cli.metadata import (
 )
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import print_document, print_table, printable, report, say
+from paramclient.cli.param_names import spelling
 from paramclient.cli.session import CommandSession, connect
 from paramclient.cli.write_outcomes import (
     OUTCOME_COLUMNS,
@@ -82,7 +83,7 @@ async def set_(
 
     Args:
         url: The link.
-        pairs: A parameter and its value, or NAME=VALUE. May be given several times.
+        pairs: A parameter, in upper or lower case, and its value, or NAME=VALUE. May be given several times.
         settle: Seconds for which each value is watched until it is read again. 1.2 shows values that PX4's
             modules clamp.
         force: Do not ask about values outside of the range, and fractions for integers, which ArduPilot cuts
@@ -155,7 +156,8 @@ async def _prepare(
     described: Metadata | None,
     choice: MetadataChoice,
 ) -> _Job:
-    """Return the values for a vehicle, names of values replaced by the numbers in its metadata."""
+    """Return names and values as the vehicle and its metadata have them."""
+    wanted = [(spelling(name, session.component), value) for name, value in wanted]
     if described is None:
         has_names = any(isinstance(value, str) for _, value in wanted)
         described = await known_of_session(session, choice, must=has_names)

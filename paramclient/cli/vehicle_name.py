@@ -12,15 +12,16 @@ from paramclient.cache import ParamCache
 from paramclient.cache.lookup import KINDS, address_of, find_vehicle
 from paramclient.client.client import ParamClient, implementation_of
 from paramclient.client.component import Component
-from paramclient.errors import AmbiguousVehicle, AnotherVehicle, UsageError
+from paramclient.errors import AmbiguousVehicle, AnotherVehicle, NoReply, UsageError
 from paramclient.protocol.vehicle_selection import LOOK_TIME
 
 __all__ = ["VehicleName", "check_kind", "check_uid", "wait_for_kind"]
 
 KIND_POLL_INTERVAL: Final = 0.05
 """Seconds between two checks whether a vehicle of a kind was heard."""
-UID_TIMEOUT: Final = 2.0
-"""Seconds to wait for the hardware id of a vehicle that is named by nickname or hardware id."""
+UID_TIMEOUT: Final = 5.0
+"""Seconds to wait for the hardware id of a vehicle that is named by nickname or hardware id: several attempts
+of the request on a link that loses half of the packets."""
 
 _SYSTEM_ID: Final = re.compile(r"[0-9]{1,3}")
 
@@ -135,18 +136,29 @@ def check_kind(client: ParamClient, kind: str) -> Component | None:
 
 
 async def check_uid(component: Component, uid: str | None) -> None:
-    """Check that a vehicle has the hardware id of the named one, if both are known.
+    """Check that a vehicle has the hardware id of the named one, if that is known.
 
     Raises:
         AnotherVehicle: it has another one.
+        NoReply: it does not report one.
     """
     if uid is None:
         return
+    began = anyio.current_time()
     with anyio.move_on_after(UID_TIMEOUT):
         while component.identity.uid is None:  # noqa: ASYNC110 - no event
             await anyio.sleep(KIND_POLL_INTERVAL)
     found = component.identity.uid
-    if found is not None and found != uid:
+    if found is None:
+        address = f"{component.system}/{component.component}"
+        raise NoReply(
+            f"the hardware id of {address}",
+            attempts=0,
+            waited=anyio.current_time() - began,
+            hint=f"The named vehicle has the hardware id {uid}, and another one may be on this link with its "
+            f"system id. --vehicle {address} chooses by address alone.",
+        )
+    if found != uid:
         raise AnotherVehicle(
             component.system, component.component, f"the hardware id {uid}", f"the hardware id {found}"
         )

@@ -313,3 +313,12 @@ def test_invalid_arguments_of_fleet_diff_are_errors(
     failed = command("fleet", "diff", *words)
     assert (failed.code, failed.out) == (code, "")
     assert text in failed.err
+
+
+def test_fleet_diff_takes_any_case_and_suggests_names(path: Path, command: Command) -> None:
+    three(path)
+    assert command("fleet", "diff", "a", "--json").json == command("fleet", "diff", "A", "--json").json
+    assert command("fleet", "diff", "a*", "--json").json == command("fleet", "diff", "A*", "--json").json
+    unknown = command("fleet", "diff", "PARAM_0", "param_00", "--component", 154)
+    assert (unknown.code, unknown.out) == (5, "")
+    assert unknown.err.endswith("has a parameter param_00 (did you mean PARAM_0?)\n")

@@ -75,9 +75,26 @@ def test_get_and_set_suggest_names_of_the_vehicle(command: Command, put: Put, pa
         outcome = command(*words)
         assert outcome.code == 1
         assert outcome.err.rstrip().endswith(". Did you mean MC_ROLL_P?")
-    wrong_case = command("set", put(vehicle), "mc_yaw_p", "5")
-    assert (wrong_case.code, vehicle.values["MC_YAW_P"]) == (1, 2.5), "only a name in full is written to"
-    assert "Did you mean MC_YAW_P?" in wrong_case.err
+
+
+@pytest.mark.parametrize("is_fetched", [True, False])
+@pytest.mark.parametrize("words", [["mc_yaw_p", "5"], ["Mc_Yaw_P=5"]])
+def test_set_takes_any_case(command: Command, put: Put, words: list[str], is_fetched: bool) -> None:
+    vehicle = px4()
+    if is_fetched:
+        assert command("fetch", put(vehicle)).code == 0
+    done = command("set", put(vehicle), *words, "--json")
+    assert (done.code, vehicle.values["MC_YAW_P"]) == (0, 5.0)
+    assert done.json["results"][0]["name"] == "MC_YAW_P"
+
+
+def test_a_name_that_fits_two_parameters_in_other_cases_is_not_written(command: Command, put: Put) -> None:
+    vehicle = GenericVehicle({"Gain": 1.0, "gain": 2.0}, param_error=True)
+    assert command("fetch", put(vehicle)).code == 0
+    assert command("set", put(vehicle), "GAIN", "5").code == 1
+    assert vehicle.values == {"Gain": 1.0, "gain": 2.0}
+    assert command("set", put(vehicle), "gain", "5").code == 0
+    assert vehicle.values == {"Gain": 1.0, "gain": 5.0}
 
 
 def test_without_a_table_of_the_vehicle_names_of_the_cache_are_suggested(command: Command, put: Put) -> None:

@@ -122,6 +122,18 @@ def test_another_vehicle_under_the_system_id_of_a_nickname(command: Command, put
     assert "another vehicle answers as 4/1: expected the hardware id " in done.err
 
 
+def test_a_vehicle_without_hardware_id_under_the_system_id_of_a_nickname(command: Command, put: Put) -> None:
+    assert command("fetch", put(copter())).code == 0
+    assert command("cache", "name", "4", "tractor").code == 0
+    other = copter(uid2=b"")
+    done = command("set", put(other), "A", 7, "--vehicle", "tractor")
+    assert (done.code, done.out, other.requests["PARAM_SET"]) == (3, "", 0)
+    assert done.err.startswith("paramclient: no reply: the hardware id of 4/1 in ")
+    assert done.err.endswith("--vehicle 4/1 chooses by address alone.\n")
+    assert command("set", put(other), "A", 7, "--vehicle", "4/1").code == 0
+    assert other.values["A"] == 7.0
+
+
 def test_kinds_and_addresses_in_the_cache(command: Command, put: Put) -> None:
     for vehicle in (px4(), copter(), copter(5, uid2=bytes([7] * 18))):
         assert command("fetch", put(vehicle)).code == 0
