@@ -424,7 +424,7 @@ class _Output:
     def __init__(self, found: Targets, *, as_json: bool, is_fleet: bool, full: bool) -> None:
         self._vehicles = {
             (each.system, each.component): NamedVehicle(
-                each.system, each.component, describe(each), receiver_in_words(each)
+                each.system, each.component, describe(each), receiver_in_words(each), each.identity
             )
             for each in found.vehicles
         }

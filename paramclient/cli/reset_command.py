@@ -250,10 +250,10 @@ class _ResetPlan:
         choice = self.choice
         if self.session.options.json:
             from paramclient.documents.command_output import (  # only here: loads pydantic
-                ReceiverDoc,
                 ResetPlanDoc,
                 ResetValueDoc,
             )
+            from paramclient.documents.receiver import ReceiverDoc
 
             values = [
                 ResetValueDoc.of(self.params[name], value, self._source(name))
@@ -306,10 +306,10 @@ class _ResetPlan:
 
     def _document(self, outcomes: Sequence[SetOutcome]) -> ResetOutputDoc:
         from paramclient.documents.command_output import (  # only here: loads pydantic
-            ReceiverDoc,
             ResetOutputDoc,
             WriteOutputDoc,
         )
+        from paramclient.documents.receiver import ReceiverDoc
 
         return ResetOutputDoc(
             vehicle=ReceiverDoc.of(self.session.component),

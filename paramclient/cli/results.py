@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.output import Coloured, print_table, printable, report, say
+from paramclient.model.identity import Identity
 from paramclient.model.notation import typed
 from paramclient.model.values import WireValue, format_value
 from paramclient.model.wording import counted, first_of
@@ -52,12 +53,14 @@ class NamedVehicle:
         component: its component id.
         label: its address and autopilot, `1/1 px4`.
         receiver: its address, kind and firmware, `1/1 PX4 quadrotor, firmware 1.16.0`.
+        identity: its identity at the start of the command.
     """
 
     system: int
     component: int
     label: str
     receiver: str
+    identity: Identity
 
 
 Cells: TypeAlias = list[object]
@@ -111,9 +114,12 @@ def applied_code(result: ApplyResult) -> ExitCode:
 
 def applied_doc(vehicle: NamedVehicle, result: ApplyResult, *, full: bool) -> ApplyResultDoc:
     """Return the JSON document of the result for one vehicle; unchanged values only if `full`."""
-    from paramclient.documents.setup import ApplyResultDoc  # only here: loads pydantic
+    from paramclient.documents.receiver import ReceiverDoc  # only here: loads pydantic
+    from paramclient.documents.setup import ApplyResultDoc
 
-    return ApplyResultDoc.of(result, system=vehicle.system, component=vehicle.component, full=full)
+    system, component = vehicle.system, vehicle.component
+    receiver = ReceiverDoc.at(system, component, vehicle.identity)
+    return ApplyResultDoc.of(result, system=system, component=component, full=full, vehicle=receiver)
 
 
 def interrupted_doc(vehicle: NamedVehicle, rows: Iterable[ApplyRow]) -> InterruptedDoc:

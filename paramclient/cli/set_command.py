@@ -33,7 +33,7 @@ from paramclient.cli.metadata import (
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import print_document, print_table, printable, report, say
 from paramclient.cli.param_names import spelling
-from paramclient.cli.session import CommandSession, connect
+from paramclient.cli.session import CommandSession, connect, wait_for_firmware
 from paramclient.cli.write_outcomes import (
     OUTCOME_COLUMNS,
     counted_outcomes,
@@ -179,7 +179,9 @@ async def _check_values(jobs: Sequence[_Job], *, force: bool) -> None:
         return
     if not can_ask():
         raise UsageError("nothing was written; --force writes these values all the same")
-    if not await confirm("Write these values all the same?"):
+    await wait_for_firmware([job.session.component for job in jobs], jobs[0].session.deadline)
+    receivers = ", ".join(job.session.receiver for job in jobs)
+    if not await confirm(f"Write these values to {receivers} all the same?"):
         raise UsageError("nothing was written")
 
 
@@ -238,10 +240,10 @@ def _document(
     session: CommandSession, outcomes: Sequence[SetOutcome], described: Metadata | None
 ) -> WritesOutputDoc:
     from paramclient.documents.command_output import (  # only here: loads pydantic
-        ReceiverDoc,
         WriteOutputDoc,
         WritesOutputDoc,
     )
+    from paramclient.documents.receiver import ReceiverDoc
 
     return WritesOutputDoc(
         vehicle=ReceiverDoc.of(session.component),
@@ -260,11 +262,13 @@ def _show_fleet(jobs: Sequence[_Job], done: Sequence[Sequence[SetOutcome]], opti
             FleetWritesDoc,
             VehicleWritesDoc,
         )
+        from paramclient.documents.receiver import ReceiverDoc
 
         documents = [
             VehicleWritesDoc(
                 system=job.session.component.system,
                 component=job.session.component.component,
+                vehicle=ReceiverDoc.of(job.session.component),
                 results=_document(job.session, outcomes, job.described).results,
             )
             for job, outcomes in pairs

@@ -6,6 +6,7 @@ Each document is built by its `of(…)` from an object of the library.
 - `param`, `paramset`: one parameter; parameters of a file or a snapshot.
 - `component`, `link`, `job`, `problem`: components, links, running work and errors of the service.
 - `results`: results of fetches and writes. `setup`: plans and results of set-ups.
+- `receiver`: the vehicle that is written to.
 - `diff`, `fleet`: comparisons of two sets and of many vehicles.
 - `cached`, `history`: tables, changes and snapshots in the cache.
 - `traffic`, `check`: traffic of a link; the diagnosis of a vehicle.

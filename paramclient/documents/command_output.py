@@ -9,12 +9,12 @@ from paramclient.client.events import Contested, Found, Lost, Resynced
 from paramclient.documents.component import ContestDoc
 from paramclient.documents.document import Document, Maybe, Scalar
 from paramclient.documents.param import ParamDoc, ReadOutputDoc
+from paramclient.documents.receiver import ReceiverDoc
 from paramclient.documents.setup import FailedVehicleDoc
-from paramclient.model.identity import autopilot_name, version_text
+from paramclient.model.identity import autopilot_name
 from paramclient.model.notation import hash_text, rounded, time_text, typed, value_json
 from paramclient.model.values import ParamType
 from paramclient.protocol.params.change import Added, Change, Removed
-from paramclient.protocol.vehicle.kinds import kind_in_words
 
 if TYPE_CHECKING:
     from paramclient.client.component import Component
@@ -43,7 +43,6 @@ __all__ = [
     "ImportedDoc",
     "PortDoc",
     "PortsDoc",
-    "ReceiverDoc",
     "RemovedMetadataDoc",
     "ResetOutputDoc",
     "ResetPlanDoc",
@@ -192,30 +191,6 @@ class WriteOutputDoc(Document):
         )
 
 
-class ReceiverDoc(Document):
-    """The vehicle that a subcommand writes to; `kind` is in words, and `firmware` null if it is not known."""
-
-    system: int
-    component: int
-    autopilot: str
-    kind: str
-    firmware: str | None
-    uid: str | None
-
-    @classmethod
-    def of(cls, component: Component) -> ReceiverDoc:
-        """Return the document of a component."""
-        identity = component.identity
-        return cls(
-            system=component.system,
-            component=component.component,
-            autopilot=component.autopilot,
-            kind=kind_in_words(identity.autopilot, identity.vehicle_type),
-            firmware=version_text(identity.firmware) if identity.firmware else None,
-            uid=identity.uid,
-        )
-
-
 class WritesOutputDoc(Document):
     """The outcomes of several writes to a vehicle, in their order."""
 
@@ -307,6 +282,7 @@ class VehicleWritesDoc(Document):
 
     system: int
     component: int
+    vehicle: ReceiverDoc
     results: list[WriteOutputDoc]
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 from pydantic import Field
 
 from paramclient.documents.document import Document, Maybe, Scalar
+from paramclient.documents.receiver import ReceiverDoc
 from paramclient.model.identity import version_text
 from paramclient.model.notation import typed, value_json
 from paramclient.model.values import WireValue, type_name
@@ -224,11 +225,12 @@ class ApplyResultDoc(Document):
     """The result of a set-up; see `ApplyResult`.
 
     `system` and `component` are the vehicle's address at the start, `now` is its address at the end. `extra`
-    is the number of the vehicle's other parameters.
+    is the number of the vehicle's other parameters. `vehicle` is in the output of the command.
     """
 
     system: int
     component: int
+    vehicle: Maybe[ReceiverDoc] = None
     now: AddressDoc
     complete: bool
     counts: dict[ApplyStatus, int]
@@ -240,7 +242,15 @@ class ApplyResultDoc(Document):
     elapsed_s: float
 
     @classmethod
-    def of(cls, result: ApplyResult, *, system: int, component: int, full: bool = False) -> ApplyResultDoc:
+    def of(
+        cls,
+        result: ApplyResult,
+        *,
+        system: int,
+        component: int,
+        full: bool = False,
+        vehicle: ReceiverDoc | None = None,
+    ) -> ApplyResultDoc:
         """Return the document of the result for a vehicle that had this address at the start.
 
         Unchanged parameters, and left-out ones that do not differ, are included only if `full`.
@@ -248,6 +258,7 @@ class ApplyResultDoc(Document):
         return cls(
             system=system,
             component=component,
+            vehicle=vehicle,
             now=AddressDoc(system=result.system, component=result.component),
             complete=result.complete,
             counts={status: result.counts.get(status, 0) for status in ApplyStatus},

@@ -91,6 +91,7 @@ def test_set_writes_to_every_vehicle(
     written = command("set", url, "GAIN", "7", "OF_PX4", "2", "--all", "--json")
     assert written.code == 1
     first, second = written.json["vehicles"]
+    assert [each["vehicle"]["kind"] for each in (first, second)] == ["PX4 quadrotor", "ArduPilot quadrotor"]
     assert [each["status"] for each in first["results"]] == ["accepted", "accepted"]
     assert [each["status"] for each in second["results"]] == ["accepted", "refused"]
     assert vehicles[0].values["OF_PX4"] == 2.0
@@ -172,7 +173,9 @@ def test_a_doubtful_value_is_written_only_after_a_question(
 
     answers = [False, True]
 
-    async def confirm(_question: str) -> bool:
+    async def confirm(question: str) -> bool:
+        kind_in_words = "PX4 quadrotor" if kind is PX4Vehicle else "ArduPilot quadrotor"
+        assert question.startswith(f"Write these values to 1/1 {kind_in_words}, firmware ")
         return answers.pop(0)
 
     monkeypatch.setattr(set_command, "can_ask", lambda: True)

@@ -114,9 +114,17 @@ def test_apply_prints_json(
     elapsed = told.pop("elapsed_s")
     assert elapsed > 0
     params = told.pop("params")
+    assert len(told["vehicle"].pop("uid")) == 36
     assert told == {
         "system": 1,
         "component": 1,
+        "vehicle": {
+            "system": 1,
+            "component": 1,
+            "autopilot": "ardupilot",
+            "kind": "ArduPilot quadrotor",
+            "firmware": "4.6.0-dev",
+        },
         "now": {"system": 1, "component": 1},
         "complete": False,
         "counts": {
