@@ -13,9 +13,9 @@ import anyio
 from cyclopts import App, CycloptsError, Parameter
 
 from paramclient.cli.exit_codes import ExitCode, code_of, text_of
-from paramclient.cli.output import printable, report, say
+from paramclient.cli.output import in_local_time, printable, report, say
 from paramclient.cli.signals import on_end_signal
-from paramclient.errors import ParamClientError
+from paramclient.errors import CacheError, ParamClientError
 from paramclient.version import __version__
 
 __all__ = ["command_line", "run"]
@@ -44,7 +44,8 @@ def run(arguments: Sequence[str]) -> int:
             report(str(error))
             return ExitCode.USAGE
         except ParamClientError as error:
-            report(text_of(error))
+            text = text_of(error)
+            report(in_local_time(text) if isinstance(error, CacheError) else text)
             return code_of(error)
         except BrokenPipeError:
             raise
@@ -277,7 +278,7 @@ _add(
     _app,
     "history:history",
     *("1 MC_ROLL_P", "1 'MC_*' --since '2h ago'", "1 --snapshots"),
-    arguments="VEHICLE [NAME...]",
+    arguments="[VEHICLE] [NAME...]",
 )
 _add(
     _app,

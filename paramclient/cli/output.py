@@ -35,6 +35,7 @@ __all__ = [
     "StatusLine",
     "by_index",
     "default_text",
+    "in_local_time",
     "live_view",
     "local_time",
     "milliseconds",
@@ -64,6 +65,12 @@ GAP: Final = 2
 """Blanks between two columns of a table, and before the second and later lines of a row."""
 SENTENCE_WIDTH_MIN: Final = 20
 """Columns that sentences in the last column of a table take at least; in less they are hard to read."""
+
+
+_UTC_TIME: Final = re.compile(
+    r"(?<!\S)[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}(\.[0-9]{3})?Z(?![^\s;,])"
+)
+"""A time in a message, between words."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +109,19 @@ def local_time(at: float) -> str:
     """Return a unix time as ISO 8601 in the time zone of this computer, with milliseconds and the zone."""
     text = datetime.fromtimestamp(at).astimezone().isoformat(timespec="milliseconds")
     return text.replace("+00:00", "Z")
+
+
+def in_local_time(text: str) -> str:
+    """Return a message of the cache with its times, which are in UTC, in the time zone of this computer."""
+
+    def local(found: re.Match[str]) -> str:
+        try:
+            at = datetime.fromisoformat(found[0]).astimezone()
+        except (ValueError, OverflowError):  # no time, but a name
+            return found[0]
+        return at.isoformat(timespec="milliseconds" if found[1] else "seconds").replace("+00:00", "Z")
+
+    return _UTC_TIME.sub(local, text)
 
 
 def by_index(params: Iterable[Param]) -> list[Param]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from paramclient.documents.document import Document
 from paramclient.documents.param import WrittenParamDoc
-from paramclient.files.param_file import ENDINGS, FileForm
+from paramclient.files.param_file import ENDINGS, WRITABLE, FileForm
 from paramclient.model.identity import autopilot_name
 from paramclient.model.notation import time_or_none
 
@@ -110,7 +110,7 @@ class FormatDoc(Document):
             name=form.value,
             title=_TITLES[form],
             endings=[ending for ending, each in ENDINGS.items() if each is form],
-            writes=form is not FileForm.PX4_SCRIPT,
+            writes=form in WRITABLE,
         )
 
 

@@ -27,6 +27,7 @@ __all__ = [
     "LogForm",
     "ParamFile",
     "TooManyParams",
+    "WRITABLE",
     "address",
     "parse_format",
     "format_of_name",
@@ -53,6 +54,10 @@ class FileForm(StrEnum):
     """paramclient's own format: all fields of every parameter, exactly."""
     YAML = "yaml"
     """paramclient's own format as YAML, for editing by hand. Reading it needs PyYAML."""
+
+
+WRITABLE: Final = tuple(form for form in FileForm if form is not FileForm.PX4_SCRIPT)
+"""Formats that can be written."""
 
 
 class LogForm(StrEnum):
@@ -163,7 +168,7 @@ def format_of_name(name: str) -> FileForm:
     form = ENDINGS.get(ending)
     if form is None:
         raise FileError(
-            f"unknown file extension {ending!r}. Choose a format ({_listed(FileForm)}), or one of the "
+            f"unknown file extension {ending!r}. Choose a format ({_listed(WRITABLE)}), or one of the "
             f"extensions {_listed(ENDINGS)}",
             source=name,
         )

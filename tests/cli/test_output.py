@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from paramclient.cli.output import local_time, print_table
+from paramclient.cli.output import in_local_time, local_time, print_table
 from paramclient.cli.time_arguments import parse_time
 from paramclient.sim import PX4Vehicle
 from tests.commands import Command, Put, behind, in_process, leaping
@@ -101,6 +101,27 @@ def test_times_are_local_with_their_zone_and_can_be_given_back(
     assert parse_time(line["time"], time.time() + 1000) == pytest.approx(
         parse_time(history.rows[1][0], time.time() + 1000)
     )
+
+
+@pytest.mark.usefixtures("in_zone")
+def test_messages_of_the_cache_have_local_times(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    leaping(monkeypatch)
+    command: Command = in_process(capsys, "--cache", str(tmp_path / "cache"))
+    put: Put = behind(monkeypatch, "sim:px4")
+    assert command("fetch", put(PX4Vehicle(table={"A": 1}))).code == 0
+    failed = command("restore", put(PX4Vehicle(table={"A": 1})), "2026-01-02 03:00", "--dry-run")
+    assert failed.code == 5
+    assert "at 2026-01-02T03:00:00+05:30 is not known: what is kept of its history begins at" in failed.err
+    assert re.search(r"begins at [0-9-]{10}T[0-9:]{8}\+05:30", failed.err)
+
+
+@pytest.mark.usefixtures("in_zone")
+def test_names_that_look_like_times_stay_as_they_are() -> None:
+    for text in ("2026-01-02T03:00:00Z.yaml", "/tmp/2026-01-02T03:00:00Z", "2026-99-02T03:00:00Z of it"):
+        assert in_local_time(text) == text
+    assert in_local_time("at 2026-01-01T21:30:00.250Z; later") == "at 2026-01-02T03:00:00.250+05:30; later"
 
 
 def test_without_an_offset_the_zone_is_z() -> None:

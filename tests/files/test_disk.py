@@ -68,6 +68,7 @@ def test_a_given_format_overrides_the_extension(tmp_path: Path) -> None:
 def test_an_unknown_extension_is_rejected(tmp_path: Path) -> None:
     error = refused(lambda: write_file(tmp_path / "quad.txt", PARAMS))
     assert "unknown file extension '.txt'. Choose a format (qgc, parm, mission-planner" in str(error)
+    assert "px4-script" not in str(error), "it can only be read"
     assert "one of the extensions .params, .parm, .param" in str(error)
     assert error.source == str(tmp_path / "quad.txt")
     assert listed(tmp_path) == []

@@ -124,7 +124,8 @@ class Added(FirstValue):
     """A parameter that the vehicle has and the table lacked when it was complete last.
 
     Examples are a parameter that a `set` of `*_ENABLE` reveals, and one outside the vehicle's list that is
-    read by name. The first value of each parameter of a table that was never complete is a plain `FirstValue`.
+    read by name. The first value of each parameter of a table that was never complete is a plain
+    `FirstValue`.
     """
 
     __slots__ = ()
