@@ -15,7 +15,7 @@ from paramclient.cli.extended import history_extended
 from paramclient.cli.options import CacheOptions, Id
 from paramclient.cli.output import local_time, print_document, print_table, say
 from paramclient.cli.param_names import cached_names, check_given, unmatched_text
-from paramclient.cli.sources import tables_in
+from paramclient.cli.sources import VehicleChoice, chosen_vehicle, tables_in
 from paramclient.cli.time_arguments import parse_time
 from paramclient.errors import NotInCache, UsageError
 from paramclient.model.notation import hash_text
@@ -28,9 +28,10 @@ _DEFAULTS: Final = CacheOptions()
 
 
 def history(
-    vehicle: str,
+    vehicle: str | None = None,
     /,
     *names: str,
+    cached: VehicleChoice = None,
     component: Id = None,
     since: str | None = None,
     limit: Annotated[int | None, Parameter(validator=Number(gte=1))] = None,
@@ -46,6 +47,7 @@ def history(
     Args:
         vehicle: Its system id, its hardware id in full, uid: and at least 6 digits of it, or its key.
         names: Print only these parameters: names in upper or lower case, or patterns such as "MC_*".
+        cached: The vehicle, instead of the first argument; all arguments are names then.
         component: Print only this component.
         since: Print only changes from this time on: 2h ago, yesterday, '2026-11-20 14:00'. A time
             without a zone is of this computer's time zone, as the printed ones are.
@@ -53,6 +55,9 @@ def history(
         snapshots: Print the snapshots instead of the changes.
         extended: Use extended parameters (PARAM_EXT_*), as of a camera.
     """
+    vehicle, names = chosen_vehicle(cached, vehicle, names)
+    if vehicle is None:
+        raise UsageError("history takes a vehicle in the cache: its system id, its hardware id, or its key")
     begin = None if since is None else parse_time(since, time.time())
     if begin is not None and not options.json:
         say(f"since {local_time(begin)}")

@@ -35,7 +35,7 @@ from paramclient.cli.output import (
 )
 from paramclient.cli.param_names import cached_names, check_given, unmatched_text
 from paramclient.cli.param_rows import show_file
-from paramclient.cli.sources import choose, is_file, open_file, tables_in
+from paramclient.cli.sources import VehicleChoice, choose, chosen_vehicle, is_file, open_file, tables_in
 from paramclient.errors import NotInCache, UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.identity import autopilot_name
@@ -66,6 +66,7 @@ def show(
     vehicle: str | None = None,
     /,
     *names: str,
+    cached: VehicleChoice = None,
     component: Id = None,
     changed: bool = False,
     metadata: MetadataChoice = None,
@@ -79,6 +80,7 @@ def show(
     Args:
         vehicle: A parameter file; a vehicle in the cache: its system id, its hardware id in full, uid: and at
             least 6 digits of it, or its key, also with the prefix cache:; or replay:FILE, a telemetry log.
+        cached: The vehicle in the cache, instead of the first argument; all arguments are names then.
         component: Print only this component.
         changed: Print only parameters that differ from the firmware's defaults.
         names: Print only these parameters of a vehicle, with their metadata: names in upper or lower case, or
@@ -86,6 +88,7 @@ def show(
         metadata: A file that describes parameters. Default: the stored metadata of the vehicle's firmware.
         extended: Use extended parameters (PARAM_EXT_*), as of a camera.
     """
+    vehicle, names = chosen_vehicle(cached, vehicle, names)
     if extended or (vehicle is not None and is_extended_source(vehicle)):
         if changed or metadata is not None:
             raise UsageError("--changed and --metadata are for plain parameters")

@@ -15,9 +15,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final, TypeAlias
 
 import anyio
+from cyclopts import Parameter
 
 from paramclient.cache import CachedSummary, ParamCache
 from paramclient.cache.lookup import address_of, is_vehicle_name
@@ -37,8 +38,10 @@ from paramclient.protocol.params.fetch_result import FetchResult
 from paramclient.provision.vehicle_params import FetchedSet, collect_set, incomplete_error, load_cached_set
 
 __all__ = [
+    "VehicleChoice",
     "check_link",
     "choose",
+    "chosen_vehicle",
     "collect_confirmed",
     "is_file",
     "names_vehicle",
@@ -55,6 +58,9 @@ SOURCES: Final = f"""\
                       digits of it, or its key; without cache: where it can be nothing else, as 1, uid:000200
 {FORMS}"""
 """The accepted sources, for messages."""
+
+VehicleChoice: TypeAlias = Annotated[str | None, Parameter(name="--vehicle")]
+"""The vehicle in the cache, of a subcommand that also takes it as its first argument."""
 
 _CACHED: Final = "cache:"
 """The prefix of a vehicle in the cache."""
@@ -235,6 +241,21 @@ def tables_in(cache: ParamCache, vehicle: str | None, component: int | None) -> 
             vehicles=held,
         )
     return chosen
+
+
+def chosen_vehicle(
+    option: str | None, vehicle: str | None, names: tuple[str, ...]
+) -> tuple[str | None, tuple[str, ...]]:
+    """Return the vehicle in the cache and the names, where --vehicle may name it instead of an argument.
+
+    Args:
+        option: the value of --vehicle, or None.
+        vehicle: the first argument: the vehicle, or with --vehicle a name; or None.
+        names: the further arguments.
+    """
+    if option is None:
+        return vehicle, names
+    return f"{_CACHED}{option.removeprefix(_CACHED)}", names if vehicle is None else (vehicle, *names)
 
 
 def _from_file(path: str, options: LinkOptions) -> ParamSet:

@@ -168,6 +168,29 @@ def test_names_that_name_nothing(command: Command, put: Put, words: list[str], r
     assert reason in tried.err
 
 
+@pytest.mark.parametrize("words", [["show"], ["history"], ["cache", "history"]])
+@pytest.mark.parametrize("name", ["tractor", "cache:tractor", "4", "4/1", "ardupilot"])
+def test_show_and_history_take_the_option(command: Command, put: Put, words: list[str], name: str) -> None:
+    vehicle = copter()
+    for each in (px4(), vehicle):
+        assert command("fetch", put(each)).code == 0
+    assert command("set", put(vehicle), "A", 7).code == 0
+    assert command("cache", "name", "4", "tractor").code == 0
+    for names in ([], ["a"], ["a", "B*"]):
+        by_option = command(*words, *names, "--vehicle", name)
+        by_argument = command(*words, "tractor", *names)
+        assert (by_option.code, by_option.out) == (0, by_argument.out)
+    unknown = command(*words, "A", "--vehicle", "nobody")
+    assert unknown.code == 2
+    assert "vehicle nobody is not in the cache" in unknown.err
+
+
+def test_history_needs_a_vehicle(command: Command) -> None:
+    failed = command("history")
+    assert (failed.code, failed.out) == (2, "")
+    assert "history takes a vehicle in the cache" in failed.err
+
+
 def test_a_nickname_is_removed_and_replaced(command: Command, put: Put, cache: Path) -> None:
     for vehicle in (px4(), copter()):
         assert command("fetch", put(vehicle)).code == 0
