@@ -116,7 +116,7 @@ if TYPE_CHECKING:
     from paramclient.protocol.params.download_ranges import DownloadRange, DownloadRanges
     from paramclient.protocol.params.fetch_result import FetchResult, FetchSource, Policy, Progress
     from paramclient.protocol.params.sampling import Sample
-    from paramclient.protocol.params.sync import SyncState
+    from paramclient.protocol.params.sync import ComponentState, SyncState
     from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome, SetStatus
     from paramclient.protocol.params.writes import SetResult
     from paramclient.protocol.stats.traffic import (
@@ -157,6 +157,7 @@ __all__ = [
     "CommandResult",
     "Comparison",
     "Component",
+    "ComponentState",
     "ComponentTraffic",
     "Contest",
     "Contested",
@@ -425,7 +426,7 @@ _HOMES: Final = {
         "Progress",
     ),
     "paramclient.protocol.params.sampling": ("Sample",),
-    "paramclient.protocol.params.sync": ("SyncState",),
+    "paramclient.protocol.params.sync": ("ComponentState", "SyncState"),
     "paramclient.protocol.params.write_batch": (
         "SetManyResult",
         "SetOutcome",

@@ -19,7 +19,7 @@ from paramclient.model.values import Encoding, Param, Settable, WireValue
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.params.fetch_result import FetchResult, Progress
 from paramclient.protocol.params.sampling import SAMPLE_SIZE
-from paramclient.protocol.params.sync import SyncState
+from paramclient.protocol.params.sync import ComponentState, SyncState
 from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome
 from paramclient.protocol.params.writes import SetResult
 from paramclient.protocol.vehicle.address_contest import Contest
@@ -90,7 +90,7 @@ class Component(ABC):
 
     @property
     @abstractmethod
-    def state(self) -> str:
+    def state(self) -> ComponentState:
         """State of the table: new, cached, fetching, synced, partial, contested or lost."""
 
     @property

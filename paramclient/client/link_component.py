@@ -39,7 +39,7 @@ from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_result import FetchResult, Progress, Sampled
 from paramclient.protocol.params.passive import PASSIVE_TIMEOUT
 from paramclient.protocol.params.sampling import SAMPLE_SIZE
-from paramclient.protocol.params.sync import SyncState
+from paramclient.protocol.params.sync import ComponentState, SyncState
 from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome
 from paramclient.protocol.params.writes import SetResult
 from paramclient.protocol.requests.operation import Operation
@@ -147,7 +147,7 @@ class LinkComponent(LocalComponent):
         return self.machine.table.hash if self.machine.table.complete else None
 
     @property
-    def state(self) -> str:
+    def state(self) -> ComponentState:
         """See `Component.state`."""
         return self.machine.state
 

@@ -38,7 +38,7 @@ from paramclient.protocol.params.fetch_result import FetchContext, FetchResult, 
 from paramclient.protocol.params.foreign_list import ForeignList
 from paramclient.protocol.params.name_search import NameSearch, NameSearches
 from paramclient.protocol.params.reads import Key, Read, Reads
-from paramclient.protocol.params.sync import Sync, SyncSettings, SyncState
+from paramclient.protocol.params.sync import ComponentState, Sync, SyncSettings, SyncState
 from paramclient.protocol.params.sync_interval import SyncInterval
 from paramclient.protocol.params.table import NameQuota, Table
 from paramclient.protocol.params.upload import Uploads
@@ -346,19 +346,19 @@ class ComponentMachine:
         return self._scheduler.is_busy
 
     @property
-    def state(self) -> str:
+    def state(self) -> ComponentState:
         """The state of the table: new, cached, fetching, synced, partial, contested, lost."""
         if self.presence.is_lost:
-            return "lost"
+            return ComponentState.LOST
         if self.peers.contest is not None:
-            return "contested"
+            return ComponentState.CONTESTED
         if self.fetch is not None:
-            return "fetching"
+            return ComponentState.FETCHING
         if self.sync.synced:
-            return "synced"
+            return ComponentState.SYNCED
         if not self.table.params:
-            return "new"
-        return "cached" if self.table.complete else "partial"
+            return ComponentState.NEW
+        return ComponentState.CACHED if self.table.complete else ComponentState.PARTIAL
 
     def _autopilots(self) -> Iterator[ComponentMachine]:
         """Yield the autopilot of its vehicle, where that is another component."""

@@ -25,7 +25,7 @@ from paramclient.model.values import Encoding, Param, Settable, WireValue, check
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.params.fetch_result import FetchResult, Progress
 from paramclient.protocol.params.sampling import SAMPLE_SIZE
-from paramclient.protocol.params.sync import SyncState
+from paramclient.protocol.params.sync import ComponentState, SyncState
 from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome, SetStatus
 from paramclient.protocol.params.writes import SetResult
 from paramclient.protocol.vehicle.address_contest import Contest
@@ -119,12 +119,12 @@ class RemoteComponent(Component):
         return hash_of(self._mirrored.document["hash"])
 
     @property
-    def state(self) -> str:
+    def state(self) -> ComponentState:
         """See `Component.state`. While the service cannot be reached, the state is *cached*."""
         state = self._mirrored.state
-        if not self._service.connection.is_away or state in ("lost", "new"):
+        if not self._service.connection.is_away or state in (ComponentState.LOST, ComponentState.NEW):
             return state
-        return "cached"
+        return ComponentState.CACHED
 
     @property
     def sync_state(self) -> SyncState:

@@ -19,7 +19,7 @@ from paramclient.model.values import Encoding
 from paramclient.protocol.ext.change import ExtChange
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.fetch_result import Progress
-from paramclient.protocol.params.sync import SyncState
+from paramclient.protocol.params.sync import ComponentState, SyncState
 from paramclient.protocol.wire import MAV_TYPE_GCS
 from paramclient.remote.decoding import (
     Document,
@@ -100,9 +100,9 @@ class MirroredComponent:
         return self.document["autopilot"] not in NOT_AUTOPILOTS and self.identity.vehicle_type != MAV_TYPE_GCS
 
     @property
-    def state(self) -> str:
+    def state(self) -> ComponentState:
         """State of its table, as last reported by the service."""
-        return "lost" if self.is_gone else str(self.document["state"])
+        return ComponentState.LOST if self.is_gone else ComponentState(self.document["state"])
 
     @property
     def has_extended(self) -> bool:
@@ -241,8 +241,9 @@ def _check(document: Document) -> None:
     Raises:
         KeyError, TypeError, ValueError: a member is missing or has a wrong type.
     """
-    for name in ("autopilot", "encoding_reason", "state"):
+    for name in ("autopilot", "encoding_reason"):
         check_kind(document[name], str)
+    ComponentState(document["state"])
     Encoding(document["encoding"])
     SyncState(document["sync_state"])
     hash_of(document["hash"])

@@ -34,7 +34,7 @@ from paramclient.protocol.ftp import FILE_SIZE_MAX, DirectoryEntry
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.fetch_result import FetchResult, Policy, Progress
 from paramclient.protocol.params.sampling import SAMPLE_SIZE
-from paramclient.protocol.params.sync import SyncState
+from paramclient.protocol.params.sync import ComponentState, SyncState
 from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome
 from paramclient.protocol.params.writes import SetResult
 from paramclient.protocol.stats.traffic import TrafficReport
@@ -468,7 +468,7 @@ class Component(Wrapper[AsyncComponent]):
         return self._thread.read(lambda: self._wrapped.hash)
 
     @property
-    def state(self) -> str:
+    def state(self) -> ComponentState:
         """State of the table: new, cached, fetching, synced, partial, contested or lost."""
         return self._thread.read(lambda: self._wrapped.state)
 

@@ -17,6 +17,7 @@ from paramclient import (
     Changed,
     ClientClosed,
     Component,
+    ComponentState,
     Event,
     Events,
     Found,
@@ -126,6 +127,7 @@ async def test_an_update_that_was_lost_is_told_within_one_interval() -> None:
         assert anyio.current_time() - began <= 10.5
         assert state(component) is SyncState.SYNCED
         assert component.state == "synced"
+        assert component.state is ComponentState.SYNCED
         assert bits(component.params) == bits(vehicle.params)
         assert not residue(component)
 

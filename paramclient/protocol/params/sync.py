@@ -24,7 +24,7 @@ from paramclient.protocol.requests.retry import FILE_IN_USE_RETRY
 from paramclient.protocol.vehicle.presence import Presence
 from paramclient.protocol.wire import HASH_CHECK, ParamValue
 
-__all__ = ["Sync", "SyncState", "SyncSettings"]
+__all__ = ["ComponentState", "Sync", "SyncState", "SyncSettings"]
 
 WATCH_INTERVAL: Final = 30.0
 """Seconds between two checks of the hash, by default."""
@@ -50,6 +50,28 @@ LOW_BANDWIDTH_GAP: Final = 0.1
 57600-baud radio carries 40."""
 
 _EXPIRED: Final = -math.inf  # the time of an announcement that is stale
+
+
+class ComponentState(StrEnum):
+    """The state of a component's table.
+
+    Attributes:
+        NEW: no parameter is known.
+        CACHED: complete, from the cache, and not confirmed by the vehicle.
+        FETCHING: being fetched.
+        SYNCED: fetched or confirmed, without a sign of change since.
+        PARTIAL: some parameters are known.
+        CONTESTED: several vehicles use the address of the component.
+        LOST: the component is lost.
+    """
+
+    NEW = "new"
+    CACHED = "cached"
+    FETCHING = "fetching"
+    SYNCED = "synced"
+    PARTIAL = "partial"
+    CONTESTED = "contested"
+    LOST = "lost"
 
 
 class SyncState(StrEnum):
