@@ -137,12 +137,14 @@ def candidates(words: Sequence[str], table: Table) -> Iterator[Candidate]:
     depth = 2 if command in groups else 1
     command = " ".join(before[:depth])
     options = table.get(command, {}).get("options", {})
-    given, expected, cache = _arguments(before[depth:], options)
+    given, expected, cache, vehicle = _arguments(before[depth:], options)
+    if vehicle is not None and POSITIONALS.get(command, ())[:1] == (VEHICLE,):
+        given = [vehicle, *given]  # all arguments are names then
     if expected is not None:
         option = options[expected]
         kind = _OPTION_KINDS.get(expected, option["takes"])
         choices = [(each, "") for each in option["choices"]]
-        yield from _fitting(choices or _of_kind(kind, given, command, cache), current)
+        yield from _fitting(choices or _of_kind(kind, given, command, cache, vehicle), current)
     elif current.startswith("-"):
         yield from _fitting(((name, option["help"]) for name, option in options.items()), current)
     else:
@@ -151,7 +153,7 @@ def candidates(words: Sequence[str], table: Table) -> Iterator[Candidate]:
             place = 1
             for word in given[1:]:
                 place = 1 if place == 2 or "=" in word else 2
-        yield from _fitting(_of_kind(_kind(command, place), given, command, cache), current)
+        yield from _fitting(_of_kind(_kind(command, place), given, command, cache, vehicle), current)
 
 
 def _fitting(found: Iterable[Candidate], current: str) -> Iterator[Candidate]:
@@ -172,18 +174,21 @@ def _subcommands(table: Table, group: str) -> Iterator[Candidate]:
             yield word, "" if rest and not group else told["help"]
 
 
-def _arguments(words: Sequence[str], options: dict[str, Any]) -> tuple[list[str], str | None, str | None]:
-    """Return the arguments without options, the option whose value is expected, and the given cache."""
-    given, expected, cache = [], None, None
+def _arguments(
+    words: Sequence[str], options: dict[str, Any]
+) -> tuple[list[str], str | None, str | None, str | None]:
+    """Return the arguments without options, the option whose value is expected, the cache and the vehicle."""
+    given, expected, cache, vehicle = [], None, None, None
     for word in words:
         if expected is not None:
             cache = word if expected == "--cache" else cache
+            vehicle = word if expected == "--vehicle" else vehicle
             expected = None
         elif word.startswith("-"):
             expected = word if options.get(word, {}).get("takes") is not None else None
         else:
             given.append(word)
-    return given, expected, cache
+    return given, expected, cache, vehicle
 
 
 def _kind(command: str, place: int) -> str:
@@ -193,7 +198,9 @@ def _kind(command: str, place: int) -> str:
     return kinds[min(place, len(kinds) - 1)]
 
 
-def _of_kind(kind: str, given: Sequence[str], command: str, cache: str | None) -> Iterator[Candidate]:
+def _of_kind(
+    kind: str, given: Sequence[str], command: str, cache: str | None, vehicle: str | None
+) -> Iterator[Candidate]:
     if kind == LINK:
         yield from _LINKS
     elif kind in (VEHICLE, SOURCE):
@@ -201,14 +208,20 @@ def _of_kind(kind: str, given: Sequence[str], command: str, cache: str | None) -
     elif kind == "system":
         yield from dict(_systems(cache)).items()
     elif kind == NAME:
-        owner = given[0] if given and POSITIONALS[command][0] == VEHICLE else None
+        owner = given[0] if given and POSITIONALS[command][0] == VEHICLE else vehicle
         yield from ((name, "") for name in _names(owner, cache))
 
 
 def _vehicles(place: str | None) -> Iterator[Candidate]:
+    """Yield the nicknames of the vehicles in the cache, then their keys."""
     with _OpenCache(place) as cache:
-        for vehicle in [] if cache is None else cache.vehicles():
-            yield vehicle.key, str(vehicle).partition("(")[2].rstrip(")")
+        if cache is None:
+            return
+        meanings = {each.key: str(each).partition("(")[2].rstrip(")") for each in cache.vehicles()}
+        for nickname, key in cache.nicknames.items():
+            if key in meanings:
+                yield nickname, meanings[key]
+        yield from meanings.items()
 
 
 def _systems(place: str | None) -> Iterator[Candidate]:
@@ -218,13 +231,16 @@ def _systems(place: str | None) -> Iterator[Candidate]:
 
 
 def _names(owner: str | None, place: str | None) -> list[str]:
-    """Return the cached names of a vehicle, by key or system id, or of the tables that changed last."""
+    """Return the cached names of a vehicle, by any of its names, or of the tables that changed last."""
+    from paramclient.errors import UsageError
+
     with _OpenCache(place) as cache:
         if cache is None:
             return []
-        tables = sorted(cache.components(), key=lambda each: each.updated_at, reverse=True)
-        if owner is not None:
-            tables = [each for each in tables if owner in (each.key, str(each.system))] or tables
+        tables = []
+        with suppress(UsageError):  # no vehicle has this name, or several have it
+            tables = cache.components(owner and owner.removeprefix("cache:"))
+        tables = sorted(tables or cache.components(), key=lambda each: each.updated_at, reverse=True)
         names: set[str] = set()
         for each in tables[:TABLES_READ_MAX]:
             table = cache.load(each.key, each.component)

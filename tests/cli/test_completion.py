@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from paramclient.cli.completion import POSITIONALS, candidates, split_line
 from paramclient.cli.completion_install import SCRIPTS
 from paramclient.cli.completion_table import make_table
 from paramclient.sim import PX4Vehicle
+from tests.caches import PX4, whole_table
 
 ROOT = Path(__file__).parent.parent.parent
 TIME_MAX = 0.3
@@ -77,6 +79,31 @@ def test_vehicles_and_names_of_the_cache(table: completion.Table, cache: Path) -
     assert words(f"show {option} uid", table) == [vehicle.key]
     assert words(f"show {option} 1 MC_ROLL_P", table) == ["MC_ROLL_P"]
     assert words(f"get {LINK} {option} --system ", table) == ["1"]
+
+
+def test_nicknames_are_completed_and_name_the_owner_of_parameters(
+    table: completion.Table, cache: Path
+) -> None:
+    with ParamCache(cache) as opened:
+        opened.save(whole_table(2, replace(PX4, system=2, uid="0002")))
+        (key,) = (each.key for each in opened.vehicles() if each.identity.system == 1)
+        opened.set_nickname("1", "tractor")
+    option = f"--cache {cache}"
+    for line in ("show", "history", "diff", "save", "cache remove"):
+        assert words(f"{line} {option} trac", table) == ["tractor"]
+    for line in ("search", f"get {LINK}", f"set {LINK}"):
+        assert words(f"{line} {option} --vehicle trac", table) == ["tractor"]
+    assert words(f"show {option} uid", table).count(key) == 1
+    for owner in ("tractor", "1", "1/1", key, "cache:tractor"):
+        for line in (
+            f"show {option} {owner} ",
+            f"show {option} --vehicle {owner} ",
+            f"get {LINK} {option} --vehicle {owner} ",
+        ):
+            names = words(line, table)
+            assert "MC_ROLL_P" in names
+            assert "PARAM_0" not in names
+    assert words(f"show {option} --vehicle tractor MC_ROLL_P MC_PITCH_P", table) == ["MC_PITCH_P"]
 
 
 def test_names_and_values_of_set_take_turns(table: completion.Table, cache: Path) -> None:
