@@ -9,6 +9,7 @@ all other classes are those of `paramclient`::
 
 - `blocking`: the classes, generated from the asynchronous ones.
 - `client_thread`: the thread in which the asynchronous client runs, and calls to it.
+- `fetch_iterator`: a fetch as an iterator of its progress.
 - `wrappers`: base classes of those in `blocking`: opening and closing, streams, mappings.
 """
 
@@ -31,6 +32,7 @@ from paramclient.sync.blocking import (
     Resynced,
     Uncontested,
 )
+from paramclient.sync.fetch_iterator import FetchIterator
 
 __all__ = [
     "Changes",
@@ -40,6 +42,7 @@ __all__ = [
     "Events",
     "ExtChanges",
     "ExtParams",
+    "FetchIterator",
     "Found",
     "Ftp",
     "Heard",

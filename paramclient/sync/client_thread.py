@@ -9,7 +9,8 @@ import os
 import threading
 import time
 import weakref
-from collections.abc import Awaitable, Callable
+from collections import deque
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import suppress
 from functools import partial
 from queue import Empty, SimpleQueue
@@ -22,7 +23,7 @@ from anyio.from_thread import BlockingPortal
 from paramclient.client.client import ParamClient
 from paramclient.errors import ClientClosed, UsageError
 
-__all__ = ["ClientThread", "EventLoopThread"]
+__all__ = ["ClientThread", "EventLoopThread", "ReportingCall"]
 
 THREAD_NAME: Final = "paramclient blocking client"
 """Name of the thread, in debuggers."""
@@ -38,6 +39,7 @@ takes to be closed on board."""
 logger = logging.getLogger(__name__)
 
 Result = TypeVar("Result")
+Item = TypeVar("Item")
 Report = ParamSpec("Report")
 
 _running: set[EventLoopThread] = set()
@@ -145,6 +147,24 @@ class ClientThread:
         call = _Call[Result]()
         return self._run(call, lambda: function(progress=call.reporter(progress)))
 
+    def begin_reporting(self, function: Callable[..., Awaitable[Result]]) -> ReportingCall[Any, Result]:
+        """Start an asynchronous function that reports progress, without waiting for it.
+
+        Args:
+            function: takes a callback as its argument `progress`.
+
+        Raises:
+            ClientClosed: the client is not open.
+            UsageError: the caller is in the event loop itself, or in a forked process.
+        """
+        call, reports = _Call[Result](), deque[Any]()
+        work = partial(function, progress=call.reporter(reports.append))
+        try:
+            thread = self._begin(call, lambda thread: thread.submit(partial(call.run, work)))
+        except _NoEventLoop as error:
+            raise ClientClosed(str(error), link=self._link) from None
+        return ReportingCall(call, thread, reports, self._link)
+
     def read(self, function: Callable[[], Result]) -> Result:
         """Run a function that does not wait, in the event loop while that runs. Return its result.
 
@@ -207,6 +227,20 @@ class ClientThread:
         Raises:
             _NoEventLoop: the client is not open.
         """
+        thread = self._begin(call, begin)
+        try:
+            return call.wait(thread)
+        except BaseException:
+            if call.is_running:
+                call.cancel(thread)
+            raise
+
+    def _begin(self, call: _Call[Result], begin: Callable[[EventLoopThread], None]) -> EventLoopThread:
+        """Begin a call. If that is interrupted, cancel it.
+
+        Raises:
+            _NoEventLoop: the client is not open.
+        """
         thread = self._thread
         if thread is None:
             raise _NoEventLoop("the client is not open; use `with` or `open`")
@@ -217,7 +251,7 @@ class ClientThread:
                 thread.check_caller()
                 call.is_running = True
                 begin(thread)
-            return call.wait(thread)
+            return thread
         except BaseException:
             if call.is_running:
                 call.cancel(thread)
@@ -384,8 +418,29 @@ class _Call(Generic[Result]):
             _NoEventLoop: the event loop has ended first.
             Exception: that of the function, or of a progress callback.
         """
-        while (news := self._next_news(thread, None)) is not None:
+        while self.receive(thread):
+            pass
+        return self.outcome()
+
+    def receive(self, thread: EventLoopThread) -> bool:
+        """Wait for a report, and call its callback; return False after the end instead.
+
+        Raises:
+            _NoEventLoop: the event loop has ended first.
+            Exception: that of the callback.
+        """
+        news = self._next_news(thread, None)
+        if news is not None:
             news()
+        return news is not None
+
+    def outcome(self) -> Result:
+        """Return the result of a call that has ended.
+
+        Raises:
+            _NoEventLoop: the event loop has ended first.
+            Exception: that of the function.
+        """
         if self._error is not None:
             raise self._error
         return self._result
@@ -393,13 +448,14 @@ class _Call(Generic[Result]):
     def cancel(self, thread: EventLoopThread) -> None:
         """Cancel the call, and wait for its end, at most `CANCEL_TIMEOUT` seconds."""
         self._is_cancelled = True
-        thread.call_soon(self._cancel_scope)
+        thread.call_soon(self.cancel_scope)
         deadline = time.monotonic() + CANCEL_TIMEOUT
         with suppress(Empty, _NoEventLoop):
             while self._next_news(thread, deadline) is not None:
                 pass
 
-    def _cancel_scope(self) -> None:
+    def cancel_scope(self) -> None:
+        """Cancel the call. To be called in the event loop."""
         if self._scope is not None:
             self._scope.cancel()
 
@@ -421,6 +477,71 @@ class _Call(Generic[Result]):
                     raise _NoEventLoop("the client was closed") from None
                 if left <= 0.0:
                     raise
+
+
+class ReportingCall(Iterator[Item], Generic[Item, Result]):
+    """A running call as an iterator of what it reports.
+
+    Ctrl-C while an item is awaited cancels the call, and so does dropping the last reference to this object.
+
+    Args:
+        call: the call, which runs.
+        thread: its event loop.
+        reports: what it has reported, and the iterator has not yet given.
+        link: name of the link, for errors.
+    """
+
+    def __init__(self, call: _Call[Result], thread: EventLoopThread, reports: deque[Item], link: str) -> None:
+        self._call = call
+        self._thread = thread
+        self._reports = reports
+        self._link = link
+        self._is_ended = False
+        weakref.finalize(self, thread.call_soon, call.cancel_scope).atexit = False
+
+    def __next__(self) -> Item:
+        while not self._reports:
+            if self._is_ended:
+                raise StopIteration
+            self._receive()
+        return self._reports.popleft()
+
+    @property
+    def result(self) -> Result:
+        """The result of the call, after its end; until then, waits for it and discards the reports.
+
+        Raises:
+            ClientClosed: the client was closed.
+            Exception: that of the function.
+        """
+        while not self._is_ended:
+            self._receive()
+            self._reports.clear()
+        return self._result()
+
+    def _receive(self) -> None:
+        """Wait for a report, or for the end of the call.
+
+        Raises:
+            ClientClosed: the client was closed.
+            Exception: that of the function.
+        """
+        try:
+            self._is_ended = not self._call.receive(self._thread)
+        except _NoEventLoop as error:
+            self._is_ended = True
+            raise ClientClosed(str(error), link=self._link) from None
+        except BaseException:
+            self._call.cancel(self._thread)
+            raise
+        if self._is_ended:
+            self._result()
+
+    def _result(self) -> Result:
+        try:
+            return self._call.outcome()
+        except _NoEventLoop as error:
+            raise ClientClosed(str(error), link=self._link) from None
 
 
 class _NoEventLoop(Exception):

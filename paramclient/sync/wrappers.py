@@ -23,6 +23,7 @@ __all__ = [
     "live_mapping",
     "live_params",
     "own_values",
+    "thread_of",
     "wrapped_by",
 ]
 
@@ -56,6 +57,11 @@ class Wrapper(Generic[Wrapped]):
 def wrapped_by(wrapper: Wrapper[Wrapped]) -> Wrapped:
     """Return the asynchronous object of a wrapper."""
     return wrapper._wrapped
+
+
+def thread_of(wrapper: Wrapper[Any]) -> ClientThread:
+    """Return the thread of the client to which the object of a wrapper belongs."""
+    return wrapper._thread
 
 
 class BlockingClient(Wrapper[ParamClient]):

@@ -36,7 +36,7 @@ from paramclient import (
 )
 from paramclient.links import Peer, SimLink
 from paramclient.sim import Air, Endpoint
-from paramclient.sync import Component, Heard, Lost, ParamClient, client_thread
+from paramclient.sync import Component, FetchIterator, Heard, Lost, ParamClient, client_thread
 from tests.cable import TIMEOUT
 from tests.shell import Late, Tap, bits, generic, small_px4
 
@@ -199,6 +199,46 @@ def test_progress_may_call_the_client_and_an_error_of_it_ends_the_call() -> None
             component.fetch_all(progress=stop)
         until(lambda: component.state != "fetching")
     assert states == ["fetching"]
+
+
+def test_the_progress_of_a_fetch_is_an_iterator() -> None:
+    with a_client(swift_px4()) as client:
+        component = client.component()
+        fetch = FetchIterator(component)
+        seen = [(progress.received, progress.total) for progress in fetch]
+        assert seen[-1] == (fetch.result.count, fetch.result.count)
+        assert fetch.result.complete
+        assert list(fetch) == []
+        assert FetchIterator(component, refresh=True).result.complete
+        with pytest.raises(UsageError):
+            list(FetchIterator(component, accept="sampled", sample=0))
+    with pytest.raises(ClientClosed):
+        FetchIterator(component)
+
+
+def test_a_body_may_call_the_client_while_a_fetch_reports() -> None:
+    with a_client(generic(burst=1, period=0.05)) as client:
+        component = client.component()
+        states = [component.state for _ in FetchIterator(component)]
+        assert states[0] == "fetching"
+
+
+def test_a_forgotten_iterator_cancels_its_fetch() -> None:
+    with a_client(generic(burst=1, period=0.2)) as client:
+        component = client.component()
+        fetch = FetchIterator(component)
+        next(fetch)
+        del fetch
+        gc.collect()
+        until(lambda: component.state != "fetching")
+
+
+def test_closing_the_client_ends_the_iterator_of_a_fetch() -> None:
+    with a_client(generic(burst=1, period=0.2)) as client:
+        fetch = FetchIterator(client.component())
+        next(fetch)
+    with pytest.raises(ClientClosed):
+        list(fetch)
 
 
 def test_an_exception_of_the_body_is_raised_unchanged() -> None:
@@ -518,7 +558,7 @@ def test_a_client_that_was_never_opened_is_forgotten() -> None:
 # Ctrl-C
 
 
-@pytest.mark.parametrize("call", ["component", "changes", "fetch_all", "get", "progress"])
+@pytest.mark.parametrize("call", ["component", "changes", "fetch_all", "get", "progress", "iterator"])
 def test_ctrl_c_ends_a_call_at_once(call: str) -> None:
     tap = Tap(generic(burst=1, period=0.2))
     with a_client(tap) as client:
@@ -533,6 +573,7 @@ def test_ctrl_c_ends_a_call_at_once(call: str) -> None:
             "fetch_all": component.fetch_all,
             "get": lambda: component.get("PARAM_01"),
             "progress": lambda: component.fetch_all(progress=sleep_in_callback),
+            "iterator": lambda: list(FetchIterator(component)),
         }
         tap.is_mute = call == "get"
         began = time.monotonic()

@@ -35,12 +35,12 @@ def test_every_asynchronous_class_has_a_blocking_one() -> None:
         or issubclass(thing, Subscription)
         or (is_dataclass(thing) and "Component" in {each.type for each in fields(thing)})
     }
-    assert asynchronous | {"Event"} == set(paramclient.sync.__all__)
+    assert asynchronous | {"Event", "FetchIterator"} == set(paramclient.sync.__all__)
 
 
 def test_every_call_has_the_same_arguments() -> None:
     for name in paramclient.sync.__all__:
-        if name == "Event":
+        if name in ("Event", "FetchIterator"):
             continue
         asynchronous, blocking = getattr(paramclient, name), getattr(paramclient.sync, name)
         if is_dataclass(asynchronous):
@@ -55,6 +55,15 @@ def test_every_call_has_the_same_arguments() -> None:
             elif name == "ParamClient":
                 assert callable(ours) == callable(theirs), f"{name}.{member}"
     assert inspect.signature(paramclient.sync.ParamClient) == inspect.signature(paramclient.ParamClient)
+
+
+def test_the_iterator_of_a_fetch_has_the_arguments_of_the_call() -> None:
+    wanted = inspect.signature(paramclient.sync.Component.fetch_all).parameters
+    ours = inspect.signature(paramclient.sync.FetchIterator).parameters
+    assert {**ours, "self": None}.keys() - {"component"} == wanted.keys() - {"progress"}
+    for name in ours.keys() - {"component"}:
+        assert (ours[name].default, ours[name].kind) == (wanted[name].default, wanted[name].kind)
+        assert ours[name].annotation == wanted[name].annotation
 
 
 def public(kind: Any) -> set[str]:
