@@ -74,11 +74,15 @@ async def known_of_session(
     component = session.component
     if choice == VEHICLE or must:
         progress = _DownloadNotice(session.label)
-        found = await metadata_of(component, timeout=session.deadline.left(), progress=progress)
+        found, refusal = None, None
+        try:
+            found = await metadata_of(component, timeout=session.deadline.left(), progress=progress)
+        except UsageError as error:  # over a service, which gives no files of the vehicle
+            refusal = error
         if found is None and choice != VEHICLE:
             found = await _stored(session, added_only=True)
         if found is None:
-            raise UsageError(
+            raise refusal or UsageError(
                 f"{session.label} does not describe its parameters; --metadata takes a file that does, and "
                 "`paramclient metadata add` remembers one"
             )
@@ -93,8 +97,7 @@ async def _stored(session: CommandSession, *, added_only: bool = False) -> Metad
     other sources since, and only the vehicle can confirm it.
     """
     component = session.component
-    cache = session.client.cache
-    store = None if cache is None else MetadataStore.beside(cache.path)
+    store = _store_of(session)
     if store is None or not store.has_notes:
         return None
     with anyio.move_on_after(session.deadline.left(FIRMWARE_TIMEOUT)):
@@ -102,6 +105,14 @@ async def _stored(session: CommandSession, *, added_only: bool = False) -> Metad
             await anyio.sleep(FIRMWARE_POLL_INTERVAL)
     find = store.added.find if added_only else store.known
     return await anyio.to_thread.run_sync(find, component.identity, component.component)
+
+
+def _store_of(session: CommandSession) -> MetadataStore | None:
+    """Return the metadata beside the user's cache, also for a service, whose client has no cache; or None."""
+    if session.options.place is False:
+        return None
+    cache = session.client.cache or ParamCache(session.options.cache)
+    return MetadataStore.beside(cache.path)
 
 
 class _DownloadNotice:

@@ -8,11 +8,14 @@ from pathlib import Path
 import pytest
 
 from paramclient import MetadataError, UsageError
+from paramclient.cli import session as cli_session
+from paramclient.links import SimLink
 from paramclient.metadata import AddedFiles, MetadataStore
 from paramclient.model.identity import Identity
 from paramclient.model.px4_hash import crc32_px4
 from paramclient.sim import ArduPilotVehicle
 from tests.commands import Command, Put, behind, in_process, leaping
+from tests.ways import ServedClient
 
 DATA = Path(__file__).parent.parent / "data"
 ARDUPILOT, PX4 = 3, 12
@@ -123,9 +126,16 @@ def put(monkeypatch: pytest.MonkeyPatch) -> Put:
     return behind(monkeypatch, "udpin:0.0.0.0:14550")
 
 
-def test_every_command_uses_an_added_file(command: Command, put: Put, tmp_path: Path) -> None:
+@pytest.mark.parametrize("over_service", [False, True])
+def test_every_command_uses_an_added_file(
+    command: Command, put: Put, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, over_service: bool
+) -> None:
     vehicle = ArduPilotVehicle(table={"GAIN": 4.0, "MODE": 0}, live=())
     url = put(vehicle)
+    if over_service:
+        monkeypatch.setattr(
+            cli_session, "ParamClient", lambda url, **options: ServedClient(SimLink(vehicle, "sim:custom"))
+        )
     assert command("metadata", "list").err == "no metadata was added\n"
     file = described(tmp_path, "ArduCopter")
     added = command("metadata", "add", file, "--firmware", "4.6")
@@ -139,9 +149,11 @@ def test_every_command_uses_an_added_file(command: Command, put: Put, tmp_path: 
     refused = command("set", url, "GAIN", 11)
     assert refused.code == 2
     assert "above the maximum of 10" in refused.err
+    assert vehicle.values["GAIN"] == 4.0
     assert "Loiter" in command("get", url, "MODE").out
-    command("fetch", url)
-    assert "Loiter" in command("show", 1, "MODE").out
+    if not over_service:
+        command("fetch", url)
+        assert "Loiter" in command("show", 1, "MODE").out
 
     removed = command("metadata", "remove", "copter", "--firmware", "4.6", "--json")
     assert removed.json == {"vehicle": "copter", "firmware": "4.6"}
