@@ -80,7 +80,7 @@ async def check(
         found = await wait_for_vehicle(
             client, named.system, named.component, kind=named.kind, timeout=heartbeat_timeout
         )
-        await check_uid(found, named.uid)
+        await check_uid(client, found, named.uid)
         left = deadline.left()
         assert left is not None
         measured = await check_vehicle(

@@ -197,7 +197,7 @@ async def connect(
             timeout=timeout,
             only=only,
         )
-        await check_uid(component, options.named.uid)
+        await check_uid(client, component, options.named.uid)
         yield CommandSession(client, component, deadline, options)
 
 

@@ -158,7 +158,7 @@ async def _send(
         vehicle = await wait_for_vehicle(
             client, named.system, named.component, kind=named.kind, timeout=timeout, only=True
         )
-        await check_uid(vehicle, named.uid)
+        await check_uid(client, vehicle, named.uid)
         await vehicle.setup_signing(key, link_is_safe=True)
         return vehicle.system, vehicle.component
 

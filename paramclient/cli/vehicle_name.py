@@ -135,8 +135,11 @@ def check_kind(client: ParamClient, kind: str) -> Component | None:
     return found[0] if found else None
 
 
-async def check_uid(component: Component, uid: str | None) -> None:
+async def check_uid(client: ParamClient, component: Component, uid: str | None) -> None:
     """Check that a vehicle has the hardware id of the named one, if that is known.
+
+    The hardware id may be that of the component, or of the autopilot with its system id: a camera reports its
+    own or none.
 
     Raises:
         AnotherVehicle: it has another one.
@@ -145,23 +148,32 @@ async def check_uid(component: Component, uid: str | None) -> None:
     if uid is None:
         return
     began = anyio.current_time()
+    reported = _reported_uids(client, component)
     with anyio.move_on_after(UID_TIMEOUT):
-        while component.identity.uid is None:  # noqa: ASYNC110 - no event
+        while uid not in reported and None in reported:
             await anyio.sleep(KIND_POLL_INTERVAL)
-    found = component.identity.uid
-    if found is None:
-        address = f"{component.system}/{component.component}"
-        raise NoReply(
-            f"the hardware id of {address}",
-            attempts=0,
-            waited=anyio.current_time() - began,
-            hint=f"The named vehicle has the hardware id {uid}, and another one may be on this link with its "
-            f"system id. --vehicle {address} chooses by address alone.",
-        )
-    if found != uid:
-        raise AnotherVehicle(
-            component.system, component.component, f"the hardware id {uid}", f"the hardware id {found}"
-        )
+            reported = _reported_uids(client, component)
+    if uid in reported:
+        return
+    system, number = component.system, component.component
+    found = next((each for each in reversed(reported) if each is not None), None)
+    if found is not None:
+        raise AnotherVehicle(system, number, f"the hardware id {uid}", f"the hardware id {found}")
+    raise NoReply(
+        f"the hardware id of {system}/{number}",
+        attempts=0,
+        waited=anyio.current_time() - began,
+        hint=f"The named vehicle has the hardware id {uid}, and another one may be on this link with its "
+        f"system id. --vehicle {system}/{number} chooses by address alone.",
+    )
+
+
+def _reported_uids(client: ParamClient, component: Component) -> list[str | None]:
+    """Return the hardware ids of a component and the autopilot of its system; None for one not yet known."""
+    autopilots = [each for each in client.autopilots if each.system == component.system]
+    if any(each is component for each in autopilots):
+        return [component.identity.uid]
+    return [component.identity.uid, *([each.identity.uid for each in autopilots] or [None])]
 
 
 def _of_kind(client: ParamClient, kind: str) -> list[Component]:

@@ -134,6 +134,24 @@ def test_a_vehicle_without_hardware_id_under_the_system_id_of_a_nickname(command
     assert other.values["A"] == 7.0
 
 
+@pytest.mark.parametrize("is_other", [False, True])
+def test_a_payload_of_a_nickname_is_known_by_the_autopilot_of_its_system(
+    command: Command, put: Put, is_other: bool
+) -> None:
+    """Components other than the autopilot report another hardware id, or none."""
+    autopilot = copter(uid2=b"another vehicle") if is_other else copter()
+    payload = GenericVehicle({"A": 5}, system=4, component=100)
+    assert command("fetch", put(copter())).code == 0
+    assert command("cache", "name", "4", "tractor").code == 0
+    url = put(Air([autopilot, payload]))
+    done = command("get", url, "A", "--plain", "--json", "--vehicle", "tractor", "--component", "100")
+    assert done.code == (1 if is_other else 0), done.err
+    if is_other:
+        assert "another vehicle answers as 4/100" in done.err
+    else:
+        assert done.json["params"]["A"]["value"] == 5
+
+
 def test_kinds_and_addresses_in_the_cache(command: Command, put: Put) -> None:
     for vehicle in (px4(), copter(), copter(5, uid2=bytes([7] * 18))):
         assert command("fetch", put(vehicle)).code == 0
