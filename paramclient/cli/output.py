@@ -10,11 +10,12 @@ import json
 import re
 import shutil
 import sys
+import textwrap
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import datetime
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Final, TextIO, TypeAlias
 
 import anyio
 
@@ -141,8 +142,8 @@ def print_document(document: Document) -> None:
 
 
 def print_line(text: str) -> None:
-    """Print one line of the result, and flush."""
-    print(printable(text), flush=True)
+    """Print one line of the result, wrapped at spaces on a terminal, and flush."""
+    print(_wrapped(printable(text), sys.stdout), flush=True)
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, right: str = "") -> None:
@@ -220,8 +221,28 @@ def report(text: str) -> None:
 
 
 def say(text: str) -> None:
-    """Print a line on stderr that accompanies a result."""
-    print(text, file=sys.stderr, flush=True)
+    """Print a line on stderr that accompanies a result, wrapped at spaces on a terminal."""
+    print(_wrapped(text, sys.stderr), file=sys.stderr, flush=True)
+
+
+def _wrapped(text: str, stream: TextIO) -> str:
+    """Return text whose lines fit a terminal: a terminal itself would break values and names in two."""
+    if not stream.isatty():
+        return text
+    width = shutil.get_terminal_size().columns
+    return "\n".join(_wrapped_line(line, width) for line in text.split("\n"))
+
+
+def _wrapped_line(line: str, width: int) -> str:
+    indent = line[: len(line) - len(line.lstrip())]
+    return textwrap.fill(
+        line,
+        width,
+        subsequent_indent=indent + " " * GAP,
+        break_long_words=False,
+        break_on_hyphens=False,
+        replace_whitespace=False,
+    )
 
 
 class StatusLine:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from paramclient.cli.output import in_local_time, local_time, print_table
+from paramclient.cli.output import in_local_time, local_time, print_line, print_table, say
 from paramclient.cli.time_arguments import parse_time
 from paramclient.sim import PX4Vehicle
 from tests.commands import Command, Put, behind, in_process, leaping
@@ -63,6 +63,27 @@ def test_sentences_in_the_last_column_are_wrapped_at_spaces(printed: Print) -> N
     assert len(lines) > 2
     assert max(map(len, lines)) <= 40
     assert " ".join(" ".join(lines[1:]).split()) == f"MC_ROLL_P {reason}"
+
+
+def test_lines_are_wrapped_at_spaces(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    change = "  changed: 2026-11-24T14:39:42.013+01:00  1500.125 -> 16777216.5  (us for ground station 2)"
+    print_line(change)
+    say(change)
+    assert capsys.readouterr() == (f"{change}\n", f"{change}\n"), "not for pipes and files"
+    monkeypatch.setenv("COLUMNS", "40")
+    for stream in (sys.stdout, sys.stderr):
+        monkeypatch.setattr(stream, "isatty", lambda: True)
+    print_line(change)
+    say(f"{change}\nshort")
+    out, err = capsys.readouterr()
+    assert err == f"{out}short\n"
+    assert max(map(len, out.splitlines())) <= 40
+    assert out.split() == change.split()
+    assert [len(line) - len(line.lstrip()) for line in out.splitlines()] == [2, 4, 4]
+    print_line("")
+    assert capsys.readouterr().out == "\n"
 
 
 # times
