@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         CachedExtTable,
         CachedVehicle,
         ExtHistoryEntry,
+        ExtSnapshot,
         FleetDiff,
         FleetValue,
         FleetVehicle,
@@ -101,6 +102,7 @@ if TYPE_CHECKING:
         same_value,
     )
     from paramclient.model.ext_params import ExtParam, ExtParamType, ExtSettable, ExtValue
+    from paramclient.model.ext_paramset import ExtParamSet
     from paramclient.model.identity import Identity
     from paramclient.model.params import ParamMap
     from paramclient.model.paramset import ParamSet, WrittenParam
@@ -176,6 +178,7 @@ __all__ = [
     "ExtFetchResult",
     "ExtHistoryEntry",
     "ExtParam",
+    "ExtParamSet",
     "ExtParamType",
     "ExtParams",
     "ExtSetManyResult",
@@ -183,6 +186,7 @@ __all__ = [
     "ExtSetRefused",
     "ExtSetResult",
     "ExtSettable",
+    "ExtSnapshot",
     "ExtValue",
     "FetchResult",
     "FetchSource",
@@ -282,6 +286,7 @@ _HOMES: Final = {
         "CachedExtTable",
         "CachedVehicle",
         "ExtHistoryEntry",
+        "ExtSnapshot",
         "FleetDiff",
         "FleetValue",
         "FleetVehicle",
@@ -380,6 +385,7 @@ _HOMES: Final = {
         "ExtSettable",
         "ExtValue",
     ),
+    "paramclient.model.ext_paramset": ("ExtParamSet",),
     "paramclient.model.identity": ("Identity",),
     "paramclient.model.params": ("ParamMap",),
     "paramclient.model.paramset": (

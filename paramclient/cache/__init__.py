@@ -3,6 +3,7 @@
 - `cells`: database cells: checks of their types, times and identities.
 - `database_url`: URL of a PostgreSQL database.
 - `ext_records`, `ext_tables`: extended parameters: records; updates, reads and copies.
+- `ext_snapshots`: snapshots of extended parameters, and their tables at an earlier time.
 - `file_ownership`: owner and access rights of files.
 - `file_table`: a parameter file as the table of a vehicle.
 - `fleet`: comparison of parameters across vehicles.
@@ -34,7 +35,13 @@
 
 from __future__ import annotations
 
-from paramclient.cache.ext_records import CachedExtTable, ExtHistoryEntry, ExtTableUpdate, StoredExtParam
+from paramclient.cache.ext_records import (
+    CachedExtTable,
+    ExtHistoryEntry,
+    ExtSnapshot,
+    ExtTableUpdate,
+    StoredExtParam,
+)
 from paramclient.cache.file_table import AddedTable
 from paramclient.cache.fleet import FleetDiff, FleetValue, FleetVehicle, Holder, NameSpread
 from paramclient.cache.interrupted_setups import CutOff, RunningSetup, SetupNotes
@@ -71,6 +78,7 @@ __all__ = [
     "CopyResult",
     "CutOff",
     "ExtHistoryEntry",
+    "ExtSnapshot",
     "ExtTableUpdate",
     "FleetDiff",
     "FleetValue",

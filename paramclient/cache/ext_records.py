@@ -9,7 +9,9 @@ from typing import Any, Final, NamedTuple, TypeAlias
 
 from paramclient.cache.cells import YEAR_10000, Damaged
 from paramclient.cache.param_columns import BY_VEHICLE
+from paramclient.cache.records import SnapshotSummary
 from paramclient.model.ext_params import EXT_VALUE_SIZE, ExtParam
+from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.identity import Identity
 from paramclient.model.values import Trust
 
@@ -17,6 +19,7 @@ __all__ = [
     "CachedExtTable",
     "ExtHistoryEntry",
     "ExtLine",
+    "ExtSnapshot",
     "ExtTableUpdate",
     "StoredExtParam",
     "ext_checksum",
@@ -125,6 +128,17 @@ class ExtHistoryEntry:
     old: ExtParam
     new: ExtParam | None
     by: str
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class ExtSnapshot(SnapshotSummary):
+    """A snapshot of a table of extended parameters. Its `hash` is None.
+
+    Attributes:
+        params: its parameters, and the identity of the vehicle at that time.
+    """
+
+    params: ExtParamSet = field(hash=False)
 
 
 def read_ext_rows(found: Iterable[Sequence[Any]]) -> dict[str, StoredExtParam]:

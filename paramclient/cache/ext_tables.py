@@ -1,6 +1,6 @@
 """Tables of extended parameters and their history: updates, reads, and copies between stores.
 
-The rules are those of plain tables, without hash, snapshots and earlier states: the later of two observations
+The rules are those of plain tables, without a hash: the later of two observations
 of a value counts, and every change of a stored value leaves a line of history in the same transaction. An
 observation that comes later than a newer one is dropped.
 """
@@ -38,12 +38,14 @@ class ExtDump:
         count, complete: as in `CachedExtTable`.
         rows: its parameters by name.
         lines: its history lines, in order.
+        known_since: time since which its states are known, or None.
     """
 
     count: int | None
     complete: bool
     rows: Mapping[str, StoredExtParam]
     lines: tuple[ExtLine, ...]
+    known_since: float | None
 
     @property
     def heard_last(self) -> float:
@@ -63,7 +65,11 @@ class ExtDump:
         return None
 
     def joined(self, other: ExtDump) -> ExtDump:
-        """Return the union of one table of two stores: the later observation of a value counts."""
+        """Return the union of one table of two stores: the later observation of a value counts.
+
+        If both have changes of their own, earlier states are not available before this merge, as two
+        independent histories form no sequence.
+        """
         rows = dict(self.rows)
         for name, row in other.rows.items():
             mine = rows.get(name)
@@ -74,7 +80,9 @@ class ExtDump:
         rows = {name: row for name, row in rows.items() if row.heard_at > gone.get(name, -math.inf)}
         later = max(self, other, key=lambda each: each.heard_last)
         is_complete = later.complete and set(rows) == set(later.rows)
-        return ExtDump(later.count, is_complete, rows, tuple(lines[-HISTORY_ENTRIES_MAX:]))
+        is_continued = set(lines) == set(later.lines)
+        since = later.known_since if is_continued else max(self.heard_last, other.heard_last)
+        return ExtDump(later.count, is_complete, rows, tuple(lines[-HISTORY_ENTRIES_MAX:]), since)
 
 
 def save_ext(
@@ -124,11 +132,16 @@ def _write(transaction: Transaction, owner: int, update: ExtTableUpdate, horizon
     complete = update.complete
     if complete is None:
         complete = state is not None and state.complete
+    since = None if state is None else state.known_since
+    if since is None and complete:
+        since = max([time_cell(update.at), *(row.heard_at for row in after.values())])
     transaction.put_ext_rows(owner, before, after)
-    transaction.put_ext_state(owner, ExtState(count, complete, ext_checksum(after)))
     if lines:
         transaction.add_ext_lines(owner, lines)
-        transaction.trim_ext_lines(owner, HISTORY_ENTRIES_MAX)
+        dropped = transaction.trim_ext_lines(owner, HISTORY_ENTRIES_MAX)
+        if dropped is not None and since is not None:
+            since = max(since, dropped)
+    transaction.put_ext_state(owner, ExtState(count, complete, ext_checksum(after), since))
 
 
 def load_ext(transaction: Transaction, key: str, component: int) -> CachedExtTable | None:
@@ -148,9 +161,8 @@ def take_ext(transaction: Transaction, owner: int) -> ExtDump | None:
     state = transaction.ext_state(owner)
     if state is None:
         return None
-    return ExtDump(
-        state.count, state.complete, transaction.ext_rows(owner), tuple(transaction.ext_lines(owner))
-    )
+    rows, lines = transaction.ext_rows(owner), tuple(transaction.ext_lines(owner))
+    return ExtDump(state.count, state.complete, rows, lines, state.known_since)
 
 
 def put_ext(transaction: Transaction, owner: int, whole: ExtDump | None) -> None:
@@ -158,5 +170,6 @@ def put_ext(transaction: Transaction, owner: int, whole: ExtDump | None) -> None
     transaction.drop_ext(owner)
     if whole is not None:
         transaction.put_ext_rows(owner, {}, whole.rows)
-        transaction.put_ext_state(owner, ExtState(whole.count, whole.complete, ext_checksum(whole.rows)))
+        state = ExtState(whole.count, whole.complete, ext_checksum(whole.rows), whole.known_since)
+        transaction.put_ext_state(owner, state)
         transaction.add_ext_lines(owner, whole.lines)

@@ -8,18 +8,20 @@ from dataclasses import dataclass, field, replace
 from typing import Generic, TypeVar
 
 from paramclient.cache import snapshots
-from paramclient.cache.ext_records import ExtTableUpdate
-from paramclient.cache.ext_tables import save_ext
+from paramclient.cache.ext_records import ExtSnapshot, ExtTableUpdate
+from paramclient.cache.ext_snapshots import ext_snapshot, store_ext_snapshot
+from paramclient.cache.ext_tables import load_ext, save_ext
 from paramclient.cache.merge import merge
 from paramclient.cache.reconciliation import reconcile
 from paramclient.cache.records import Snapshot, TableUpdate
 from paramclient.cache.transaction import Transaction
 from paramclient.errors import NotInCache
+from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import is_portable_name
 
-__all__ = ["Merge", "StoreOperation", "Remove", "Save", "SaveExt", "StoreSnapshot"]
+__all__ = ["Merge", "StoreOperation", "Remove", "Save", "SaveExt", "StoreExtSnapshot", "StoreSnapshot"]
 
 T_co = TypeVar("T_co", covariant=True)
 
@@ -138,18 +140,7 @@ class StoreSnapshot(StoreOperation[Snapshot]):
         return [(self.vehicle if isinstance(self.vehicle, str) else self.vehicle.key, self.component)]
 
     def do(self, transaction: Transaction) -> Snapshot:
-        [(key, _)] = self.tables
-        owner = transaction.owner_of(key, self.component)
-        if owner is None:
-            if isinstance(self.vehicle, str):
-                raise NotInCache(f"the table of {key}, component {self.component}, has just been removed")
-            autopilot = self.vehicle.autopilot if self.component == 1 else 0
-            new = TableUpdate(
-                identity=self.vehicle, component=self.component, autopilot=autopilot, at=self.at
-            )
-            owner = transaction.upsert_table(new)
-        [(_, kept)] = transaction.summaries(key, self.component)
-        identity = kept.identity if isinstance(self.vehicle, str) else self.vehicle
+        owner, identity = _owner_of_snapshot(transaction, self.vehicle, self.component, self.at)
         shown = self.resolved(transaction)
         assert shown.params is not None
         return snapshots.store(
@@ -185,6 +176,61 @@ class StoreSnapshot(StoreOperation[Snapshot]):
 
 
 @dataclass(frozen=True)
+class StoreExtSnapshot(StoreOperation[ExtSnapshot]):
+    """Store a snapshot of extended parameters, see `ParamCache.store_ext_snapshot`.
+
+    Attributes:
+        vehicle, component, at, reason, complete, number: as in `StoreSnapshot`.
+        params: the parameters; None for the stored table.
+    """
+
+    vehicle: Identity | str
+    component: int
+    params: ExtParamSet | None
+    at: float
+    reason: str
+    complete: bool = True
+    number: int | None = None
+
+    @property
+    def tables(self) -> Iterable[tuple[str, int | None]]:
+        return [(self.vehicle if isinstance(self.vehicle, str) else self.vehicle.key, self.component)]
+
+    def do(self, transaction: Transaction) -> ExtSnapshot:
+        owner, identity = _owner_of_snapshot(transaction, self.vehicle, self.component, self.at)
+        shown = self.resolved(transaction)
+        assert shown.params is not None
+        return store_ext_snapshot(
+            transaction,
+            owner,
+            replace(shown.params, identity=identity),
+            at=self.at,
+            reason=self.reason,
+            complete=shown.complete,
+            number=self.number,
+        )
+
+    def done(self, transaction: Transaction) -> ExtSnapshot:
+        """Return the stored snapshot of this time."""
+        [(key, _)] = self.tables
+        owner, at = transaction.owner_of(key, self.component), snapshots.kept_time(self.at)
+        number = None if owner is None else transaction.snapshot_at(owner, at, is_extended=True)
+        if owner is None or number is None:
+            raise NotInCache(f"the table of {key}, component {self.component}, has just been removed")
+        return ext_snapshot(transaction, owner, number)
+
+    def resolved(self, transaction: Transaction) -> StoreExtSnapshot:
+        """Return this operation with the parameters of the stored table, if it has none of its own."""
+        if self.params is not None:
+            return self
+        [(key, _)] = self.tables
+        found = load_ext(transaction, key, self.component)
+        if found is None:
+            raise NotInCache(f"{key}, component {self.component}, has no extended parameters in the cache")
+        return replace(self, params=ExtParamSet(found.params), complete=found.complete)
+
+
+@dataclass(frozen=True)
 class Remove(StoreOperation[int]):
     """Remove tables, see `ParamCache.remove`.
 
@@ -208,6 +254,26 @@ class Remove(StoreOperation[int]):
     def done(self, transaction: Transaction) -> int:
         """Return the number of tables at the time of the call."""
         return self.known
+
+
+def _owner_of_snapshot(
+    transaction: Transaction, vehicle: Identity | str, component: int, at: float
+) -> tuple[int, Identity]:
+    """Return the id of the table of a snapshot, which may be new, and the identity of the vehicle.
+
+    Raises:
+        NotInCache: the vehicle is named by its key, and the table is gone.
+    """
+    key = vehicle if isinstance(vehicle, str) else vehicle.key
+    owner = transaction.owner_of(key, component)
+    if owner is None:
+        if isinstance(vehicle, str):
+            raise NotInCache(f"the table of {key}, component {component}, has just been removed")
+        autopilot = vehicle.autopilot if component == 1 else 0
+        new = TableUpdate(identity=vehicle, component=component, autopilot=autopilot, at=at)
+        owner = transaction.upsert_table(new)
+    [(_, kept)] = transaction.summaries(key, component)
+    return owner, kept.identity if isinstance(vehicle, str) else vehicle
 
 
 def _kept(transaction: Transaction, owner: int) -> ParamSet:

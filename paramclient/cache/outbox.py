@@ -11,7 +11,7 @@ from typing import Any, Final, TypeVar
 
 from paramclient.cache.cells import Damaged, identity_cells, read_identity
 from paramclient.cache.ext_records import ExtTableUpdate, StoredExtParam
-from paramclient.cache.operations import Merge, Save, SaveExt, StoreOperation, StoreSnapshot
+from paramclient.cache.operations import Merge, Save, SaveExt, StoreExtSnapshot, StoreOperation, StoreSnapshot
 from paramclient.cache.param_columns import COLUMN_NAMES, StoredParam
 from paramclient.cache.records import TableState, TableUpdate
 from paramclient.cache.snapshots import read_written, written_cells
@@ -19,7 +19,10 @@ from paramclient.cache.sqlite import SqliteTransaction
 from paramclient.cache.sqlite_file import Database
 from paramclient.cache.transaction import Transaction
 from paramclient.cache.transfer import TableDump, put_snapshots, put_whole
+from paramclient.model.ext_params import ExtParam
+from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.paramset import ParamSet
+from paramclient.model.values import Trust
 
 __all__ = ["QueuedOperation", "LocalCopy", "packed", "unpacked"]
 
@@ -182,7 +185,12 @@ class LocalCopy:
 
     def snapshots(self, key: _Key) -> frozenset[int]:
         """Return the numbers of the snapshots of a table in this file."""
-        return self.read(lambda transaction: frozenset(each.id for each in transaction.snapshots(*key)))
+
+        def work(transaction: Transaction) -> frozenset[int]:
+            kinds = (transaction.snapshots(*key, is_extended=each) for each in (False, True))
+            return frozenset(each.id for kind in kinds for each in kind)
+
+        return self.read(work)
 
     def close(self) -> None:
         """Close the file."""
@@ -218,6 +226,13 @@ def packed(operation: StoreOperation[object]) -> bytes:
         rest = [operation.at, operation.reason, operation.hash, operation.complete, operation.number]
         shown = None if params is None else [written_cells(each) for each in params.values()]
         data = ["set down", who, operation.component, shown, *rest]
+    elif isinstance(operation, StoreExtSnapshot):
+        vehicle = operation.vehicle
+        who = vehicle if isinstance(vehicle, str) else identity_cells(vehicle)
+        ext = operation.params
+        rows = None if ext is None else [_ext_param_cells(each) for each in ext.params.values()]
+        last = [operation.at, operation.reason, operation.complete, operation.number]
+        data = ["set down ext", who, operation.component, rows, *last]
     else:
         raise TypeError(f"{type(operation).__name__} cannot be queued")
     return zlib.compress(json.dumps(data, separators=(",", ":")).encode("utf-8", "surrogatepass"))
@@ -240,6 +255,11 @@ def unpacked(data: object) -> StoreOperation[object]:
             return Merge(
                 [_update(each) for each in rest[0]], {(key, number): at for key, number, at in rest[1]}
             )
+        if kind == "set down ext":
+            who, component, rows, *last = rest
+            ext = None if rows is None else ExtParamSet({row[0]: _ext_param(*row) for row in rows})
+            vehicle = who if isinstance(who, str) else read_identity(who)
+            return StoreExtSnapshot(vehicle, component, ext, *last)
         who, component, shown, at, reason, crc, complete, number = rest
         params = None if shown is None else ParamSet({each.name: each for each in map(read_written, shown)})
         vehicle = who if isinstance(who, str) else read_identity(who)
@@ -305,6 +325,14 @@ def _ext_update(data: list[Any]) -> ExtTableUpdate:
         count=count,
         complete=complete,
     )
+
+
+def _ext_param_cells(param: ExtParam) -> list[Any]:
+    return [param.name, int(param.type), param.raw.hex(), param.index]
+
+
+def _ext_param(name: str, number: int, raw: str, index: int | None) -> ExtParam:
+    return ExtParam.of(name, bytes.fromhex(raw), number, index, Trust.CACHED)
 
 
 def _ext_row(name: str, number: int, raw: str, index: int | None, heard_at: float, by: str) -> StoredExtParam:

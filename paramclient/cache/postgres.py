@@ -316,9 +316,16 @@ class PostgresTransaction(Transaction):
             self.connection.execute(_PUT_ROWS, (owner, *map(list, StoredTable.of(rows).columns)))
 
     def add_snapshot(
-        self, owner: int, row: Sequence[object], blob: bytes, crc: int, number: int | None = None
+        self,
+        owner: int,
+        row: Sequence[object],
+        blob: bytes,
+        crc: int,
+        number: int | None = None,
+        *,
+        is_extended: bool = False,
     ) -> int:
-        given = super().add_snapshot(owner, row, blob, crc, number)
+        given = super().add_snapshot(owner, row, blob, crc, number, is_extended=is_extended)
         if number is not None and number < LOCAL_NUMBERS_MIN:
             self._all(
                 "SELECT setval('snapshot_id_seq', greatest((SELECT last_value FROM snapshot_id_seq), ?))",

@@ -136,5 +136,14 @@ MIGRATIONS: Final[tuple[tuple[str, ...], ...]] = (
         )""",
         "CREATE INDEX ext_history_of_component ON ext_history (owner, id)",
     ),
+    (
+        # Earlier versions did not record when a table of extended parameters was first complete.
+        "ALTER TABLE ext_table ADD COLUMN known_since double precision",
+        """UPDATE ext_table SET known_since = greatest(
+            coalesce((SELECT max(heard_at) FROM ext_param e WHERE e.owner = ext_table.owner), 0),
+            coalesce((SELECT max(at) FROM ext_history h WHERE h.owner = ext_table.owner), 0)
+        ) WHERE complete = 1""",
+        "ALTER TABLE snapshot ADD COLUMN is_extended smallint NOT NULL DEFAULT 0",
+    ),
 )
 """Statements from each version to the next. The version is the number of steps executed."""

@@ -25,10 +25,10 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 from uuid import uuid4
 
 from paramclient.cache.database_url import DatabaseAddress
-from paramclient.cache.operations import Remove, StoreOperation, StoreSnapshot
+from paramclient.cache.operations import Remove, StoreExtSnapshot, StoreOperation, StoreSnapshot
 from paramclient.cache.outbox import LocalCopy, QueuedOperation
 from paramclient.cache.postgres import PostgresDatabase, Revisions, Unavailable
-from paramclient.cache.records import CacheChange, Snapshot
+from paramclient.cache.records import CacheChange, SnapshotSummary
 from paramclient.cache.transaction import Transaction
 from paramclient.cache.transfer import LOCAL_NUMBERS_MIN, MergeTable, take_whole
 from paramclient.errors import CacheError, UsageError
@@ -164,7 +164,7 @@ class _Connection:
                 raise CacheError(
                     f"{self.away or 'the database is not connected'}; repeat the call after the reconnection"
                 )
-            if isinstance(operation, StoreSnapshot):
+            if isinstance(operation, StoreSnapshot | StoreExtSnapshot):
                 shown = self.local.read(operation.resolved)
                 own = LOCAL_NUMBERS_MIN + uuid4().int % LOCAL_NUMBERS_MIN
                 return self.local.spool(_numbered(shown, own), self._writer, number)
@@ -325,7 +325,7 @@ class _Connection:
         try:
             if not isinstance(operation, MergeTable):
                 kept = self.local.revisions()
-                number = result.id if isinstance(result, Snapshot) else None
+                number = result.id if isinstance(result, SnapshotSummary) else None
                 self.local.do(operation if number is None else _numbered(operation, number))
                 stale = {key for key in touched if kept.get(key) != before.get(key)}
                 for key in touched - stale:
@@ -466,6 +466,6 @@ def _news(payload: str) -> tuple[Any, ...] | None:
     return (writer, key, component, revision) if is_ours else None
 
 
-def _numbered(operation: StoreOperation[Any], number: int) -> StoreSnapshot:
-    assert isinstance(operation, StoreSnapshot)
+def _numbered(operation: StoreOperation[Any], number: int) -> StoreOperation[Any]:
+    assert isinstance(operation, StoreSnapshot | StoreExtSnapshot)
     return replace(operation, number=number)

@@ -32,12 +32,17 @@ from paramclient.model.values import WireValue, is_portable_name, known_type
 __all__ = [
     "CLOCK_SLACK",
     "SNAPSHOTS",
+    "kept_reason",
     "kept_time",
+    "no_such_snapshot",
     "read_written",
     "snapshot",
+    "snapshot_checksum",
+    "snapshots_near",
     "state_at",
     "store",
     "record_clock_rollback",
+    "utc_text",
     "written_cells",
 ]
 
@@ -84,10 +89,8 @@ def store(
     """
     assert params.identity is not None
     blob = _packed(params.identity, params)
-    text = reason.encode("utf-8", "backslashreplace").decode()  # a file name in it may not be UTF-8
-    text = text.replace("\0", "\\x00")  # PostgreSQL's text type does not allow NUL
-    row = (kept_time(at), text, len(params), hash, int(complete))
-    number = transaction.add_snapshot(owner, row, blob, _checksum(row, blob), number)
+    row = (kept_time(at), kept_reason(reason), len(params), hash, int(complete))
+    number = transaction.add_snapshot(owner, row, blob, snapshot_checksum(row, blob), number)
     transaction.trim_snapshots(owner, SNAPSHOTS)
     return snapshot(transaction, owner, number)
 
@@ -100,10 +103,10 @@ def snapshot(transaction: Transaction, owner: int, number: int) -> Snapshot:
     """
     found = transaction.snapshot(owner, number)
     if found is None:
-        raise NotInCache(_no_such(transaction, owner, number))
+        raise NotInCache(no_such_snapshot(transaction, owner, number))
     summary, row, blob, expected = found
     try:
-        if not isinstance(blob, bytes) or _checksum(row, blob) != expected:
+        if not isinstance(blob, bytes) or snapshot_checksum(row, blob) != expected:
             raise ValueError("it is not what was written")
         identity, params = _unpacked(blob)
     except (ArithmeticError, LookupError, TypeError, ValueError, Damaged, struct.error, zlib.error) as error:
@@ -121,6 +124,12 @@ def snapshot(transaction: Transaction, owner: int, number: int) -> Snapshot:
             f"snapshot {number} of {summary.key}",
         ),
     )
+
+
+def kept_reason(reason: str) -> str:
+    """Return the reason of a snapshot as it is stored."""
+    text = reason.encode("utf-8", "backslashreplace").decode()  # a file name in it may not be UTF-8
+    return text.replace("\0", "\\x00")  # PostgreSQL's text type does not allow NUL
 
 
 def kept_time(at: float) -> float:
@@ -153,15 +162,15 @@ def state_at(
         reach = (
             "is not known: its table was never complete"
             if since is None
-            else f"at {_text(when)} is not known: what is kept of its history begins at {_text(since)}"
+            else f"at {utc_text(when)} is not known: what is kept of its history begins at {utc_text(since)}"
         )
-        raise NotInCache(f"the state of {who} {reach}{_older(transaction, owner, when)}")
+        raise NotInCache(f"the state of {who} {reach}{snapshots_near(transaction, owner, when)}")
     twice = transaction.clock_rollback_over(owner, when)
     if twice is not None:
         back, until = twice
         raise NotInCache(
-            f"the state of {who} at {_text(when)} is ambiguous: the clock of this computer was set back"
-            f" from {_text(until)} to {_text(back)}{_older(transaction, owner, when)}"
+            f"the state of {who} at {utc_text(when)} is ambiguous: the clock of this computer was set back"
+            f" from {utc_text(until)} to {utc_text(back)}{snapshots_near(transaction, owner, when)}"
         )
     first = _first_events_after(transaction, owner, when)
     state = {name: first.get(name, row.value) for name, row in rows.items()} | first
@@ -190,25 +199,28 @@ def _first_events_after(transaction: Transaction, owner: int, when: float) -> di
     return first
 
 
-def _older(transaction: Transaction, owner: int, when: float) -> str:
+def snapshots_near(transaction: Transaction, owner: int, when: float, *, is_extended: bool = False) -> str:
     """Return the nearest snapshots of a time, for messages."""
-    found = transaction.snapshots_around(owner, when)
-    listed = " and ".join(f"snapshot {number} of {_text(at)}" for number, at in found)
+    found = transaction.snapshots_around(owner, when, is_extended=is_extended)
+    listed = " and ".join(f"snapshot {number} of {utc_text(at)}" for number, at in found)
     return f"; there is {listed}" if listed else "; there is no snapshot"
 
 
-def _no_such(transaction: Transaction, owner: int, number: int) -> str:
+def no_such_snapshot(transaction: Transaction, owner: int, number: int, *, is_extended: bool = False) -> str:
+    """Return the message for an unknown number, with the existing ones."""
     key, component, _ = transaction.component_row(owner)
-    kept = [str(each.id) for each in transaction.snapshots(key, component)]
+    kept = [str(each.id) for each in transaction.snapshots(key, component, is_extended=is_extended)]
     listed = f"those kept are {', '.join(kept)}" if kept else "none is kept"
     return f"there is no snapshot {number} of {key}, component {component}: {listed}"
 
 
-def _text(at: float) -> str:
+def utc_text(at: float) -> str:
+    """Return a time in UTC, for messages."""
     return f"{datetime.fromtimestamp(at, UTC):%Y-%m-%dT%H:%M:%SZ}"
 
 
-def _checksum(described: Sequence[object], blob: bytes) -> int:
+def snapshot_checksum(described: Sequence[object], blob: bytes) -> int:
+    """Return the checksum of a snapshot: of its row, and of its encoded parameters."""
     return zlib.crc32(blob, zlib.crc32(repr(tuple(described)).encode()))
 
 

@@ -184,6 +184,15 @@ MIGRATIONS: Final[tuple[Step, ...]] = (
         )""",
         "CREATE INDEX ext_history_of_component ON ext_history (owner)",
     ),
+    (
+        # Earlier versions did not record when a table of extended parameters was first complete.
+        "ALTER TABLE ext_table ADD COLUMN known_since REAL",
+        """UPDATE ext_table SET known_since = max(
+            ifnull((SELECT max(heard_at) FROM ext_param e WHERE e.owner = ext_table.owner), 0),
+            ifnull((SELECT max(at) FROM ext_history h WHERE h.owner = ext_table.owner), 0)
+        ) WHERE complete""",
+        "ALTER TABLE snapshot ADD COLUMN is_extended INTEGER NOT NULL DEFAULT 0",
+    ),
 )
 """Changes from each schema version to the next. The version is the number of steps executed. Released steps
 never change."""

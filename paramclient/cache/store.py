@@ -14,14 +14,15 @@ import platformdirs
 
 from paramclient.cache import fleet, snapshots, tables
 from paramclient.cache.database_url import DatabaseAddress, is_address
-from paramclient.cache.ext_records import CachedExtTable, ExtHistoryEntry, ExtTableUpdate
+from paramclient.cache.ext_records import CachedExtTable, ExtHistoryEntry, ExtSnapshot, ExtTableUpdate
+from paramclient.cache.ext_snapshots import ext_snapshot, ext_state_at
 from paramclient.cache.ext_tables import load_ext
 from paramclient.cache.file_table import AddedTable, FileTable
 from paramclient.cache.fleet import FleetDiff
 from paramclient.cache.interface import Store
 from paramclient.cache.lookup import find_vehicle
 from paramclient.cache.nicknames import Nicknames
-from paramclient.cache.operations import Merge, Remove, Save, SaveExt, StoreSnapshot
+from paramclient.cache.operations import Merge, Remove, Save, SaveExt, StoreExtSnapshot, StoreSnapshot
 from paramclient.cache.records import (
     CacheChange,
     CachedComponent,
@@ -36,6 +37,7 @@ from paramclient.cache.sqlite import SqliteStore
 from paramclient.cache.transaction import Transaction
 from paramclient.cache.transfer import CopyResult, copy_store
 from paramclient.errors import CacheError, NotInCache, UnknownVehicle, UsageError
+from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.identity import Identity
 from paramclient.model.notation import time_text
 from paramclient.model.paramset import ParamSet
@@ -230,6 +232,94 @@ class ParamCache:
                 self._choose(transaction, vehicle), component, name, limit, since
             )
         )
+
+    def ext_snapshot(
+        self, vehicle: str, component: int, *, reason: str, at: float | None = None
+    ) -> ExtSnapshot:
+        """Store a snapshot of the cached extended parameters of a component, and return it.
+
+        The cache keeps the newest `SNAPSHOTS` (50) of each table.
+
+        Args:
+            vehicle, component, reason, at: as in `snapshot`.
+
+        Raises:
+            UnknownVehicle: there is no such table.
+            AmbiguousVehicle: several vehicles have this name.
+            NotInCache: the component has no extended parameters in the cache.
+        """
+        moment = time.time() if at is None else at
+        key, _ = self._store.read(lambda transaction: self._table(transaction, vehicle, component))
+        return self._store.do(StoreExtSnapshot(key, component, None, moment, reason))
+
+    def store_ext_snapshot(
+        self,
+        vehicle: Identity | str,
+        component: int,
+        params: ExtParamSet,
+        *,
+        reason: str,
+        at: float | None = None,
+        complete: bool = True,
+    ) -> ExtSnapshot:
+        """Store a snapshot of given extended parameters, and return it.
+
+        The cached table does not change. The cache keeps the newest `SNAPSHOTS` (50) of each table.
+
+        Args:
+            vehicle, component, reason, at, complete: as in `store_snapshot`.
+            params: the parameters.
+
+        Raises:
+            UnknownVehicle: a name was given, and there is no such table.
+            AmbiguousVehicle: several vehicles have this name.
+        """
+        moment = time.time() if at is None else at
+        who = vehicle
+        if isinstance(vehicle, str):
+            who, _ = self._store.read(lambda transaction: self._table(transaction, vehicle, component))
+        return self._store.do(StoreExtSnapshot(who, component, params, moment, reason, complete))
+
+    def ext_snapshots(self, vehicle: str, component: int | None = None) -> list[SnapshotSummary]:
+        """Return the snapshots of a vehicle's extended parameters, without the parameters, newest last.
+
+        Args:
+            vehicle, component: as in `snapshots`.
+
+        Raises:
+            UnknownVehicle: no vehicle in the cache has this name.
+            AmbiguousVehicle: several vehicles have this name.
+        """
+        return self._store.read(
+            lambda transaction: transaction.snapshots(
+                self._choose(transaction, vehicle), component, is_extended=True
+            )
+        )
+
+    def ext_state_at(self, vehicle: str, component: int, when: float) -> ExtParamSet:
+        """Return the extended parameters of a component as they were at a given time.
+
+        As `state_at`, but parameters that appeared after `when` are included.
+
+        Args:
+            vehicle, component: as in `state_at`.
+            when: a float is a time, in unix seconds; an int is the id of a snapshot of extended parameters.
+
+        Raises:
+            UsageError: the time is not in unix seconds.
+            UnknownVehicle: there is no such table.
+            AmbiguousVehicle: several vehicles have this name.
+            CacheError: as from `state_at`.
+        """
+
+        def work(transaction: Transaction) -> ExtParamSet:
+            key, owner = self._table(transaction, vehicle, component)
+            if isinstance(when, int):
+                return ext_snapshot(transaction, owner, when).params
+            [(_, state)] = transaction.summaries(key, component)
+            return ext_state_at(transaction, owner, state.identity, when)
+
+        return self._store.read(work)
 
     def sync(self) -> None:
         """Sync all earlier writes to the disk, safe from power loss.

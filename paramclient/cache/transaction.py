@@ -100,11 +100,13 @@ class ExtState:
         count: param_count of the component, or None.
         complete: whether the table has every index below it.
         checksum: checksum of its parameters.
+        known_since: time since which its states are known, or None.
     """
 
     count: int | None
     complete: bool
     checksum: int
+    known_since: float | None
 
 
 class Transaction(ABC):
@@ -466,7 +468,14 @@ class Transaction(ABC):
     """SQL columns that order snapshots from old to new."""
 
     def add_snapshot(
-        self, owner: int, row: Sequence[object], blob: bytes, crc: int, number: int | None = None
+        self,
+        owner: int,
+        row: Sequence[object],
+        blob: bytes,
+        crc: int,
+        number: int | None = None,
+        *,
+        is_extended: bool = False,
     ) -> int:
         """Write a snapshot. Return its number.
 
@@ -476,18 +485,20 @@ class Transaction(ABC):
             blob: encoded parameters.
             crc: checksum.
             number: number that another store has assigned; None for the next one.
+            is_extended: whether it is of extended parameters.
         """
         given = () if number is None else (number,)
         return self._insert(
             f"INSERT INTO snapshot ({'id, ' * len(given)}owner, at, reason, size, hash, complete, params,"
-            f" checksum) VALUES ({'?, ' * len(given)}?, ?, ?, ?, ?, ?, ?, ?)",
-            (*given, owner, *row, blob, crc),
+            f" checksum, is_extended) VALUES ({'?, ' * len(given)}?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            (*given, owner, *row, blob, crc, int(is_extended)),
         )
 
-    def trim_snapshots(self, owner: int, keep: int) -> None:
-        """Delete all but the newest snapshots of a table."""
+    def trim_snapshots(self, owner: int, keep: int, *, is_extended: bool = False) -> None:
+        """Delete all but the newest snapshots of a table of plain or of extended parameters."""
         found = self._all(
-            f"SELECT s.id FROM snapshot s WHERE owner = ? ORDER BY {self._newest_first}", (owner,)
+            f"SELECT s.id FROM snapshot s WHERE owner = ? AND is_extended = ? ORDER BY {self._newest_first}",
+            (owner, int(is_extended)),
         )
         self._many("DELETE FROM snapshot WHERE id = ?", found[keep:])
 
@@ -499,30 +510,35 @@ class Transaction(ABC):
         """Return whether a snapshot of any table has this number."""
         return bool(self._all("SELECT 1 FROM snapshot WHERE id = ?", (number,)))
 
-    def snapshots(self, key: str, component: int | None) -> list[SnapshotSummary]:
-        """Return the snapshots of a vehicle's tables, newest last."""
+    def snapshots(
+        self, key: str, component: int | None, *, is_extended: bool = False
+    ) -> list[SnapshotSummary]:
+        """Return the snapshots of a vehicle's tables of plain or of extended parameters, newest last."""
         rows = self._all(
             f"SELECT {_SUMMARY} FROM snapshot s JOIN component c ON c.id = owner"
-            f" WHERE vehicle = ? AND component = coalesce(?, component) ORDER BY {self.SNAPSHOT_ORDER}",
-            (key, component),
+            " WHERE vehicle = ? AND component = coalesce(?, component) AND is_extended = ?"
+            f" ORDER BY {self.SNAPSHOT_ORDER}",
+            (key, component, int(is_extended)),
         )
         return [_snapshot(row) for row in rows]
 
     def snapshot(
-        self, owner: int, number: int
+        self, owner: int, number: int, *, is_extended: bool = False
     ) -> tuple[SnapshotSummary, Sequence[object], object, object] | None:
         """Return a snapshot: summary, row as written, encoded parameters, checksum; None if there is none."""
         found = self._all(
             f"SELECT {_SUMMARY}, params, s.checksum FROM snapshot s JOIN component c ON c.id = owner"
-            " WHERE s.id = ? AND owner = ?",
-            (number, owner),
+            " WHERE s.id = ? AND owner = ? AND is_extended = ?",
+            (number, owner, int(is_extended)),
         )
         if not found:
             return None
         *described, blob, expected = found[0]
         return _snapshot(described), described[3:], blob, expected
 
-    def snapshots_around(self, owner: int, when: float) -> list[tuple[int, float]]:
+    def snapshots_around(
+        self, owner: int, when: float, *, is_extended: bool = False
+    ) -> list[tuple[int, float]]:
         """Return number and time of the last snapshot up to a given time, and of the first after it."""
         return [
             (number, at)
@@ -530,33 +546,39 @@ class Transaction(ABC):
             for number, at in (
                 cells(row, "if")
                 for row in self._all(
-                    f"SELECT id, at FROM snapshot WHERE owner = ? AND {order} LIMIT 1", (owner, when)
+                    f"SELECT id, at FROM snapshot WHERE owner = ? AND is_extended = ? AND {order} LIMIT 1",
+                    (owner, int(is_extended), when),
                 )
             )
         ]
 
-    def snapshot_at(self, owner: int, when: float) -> int | None:
+    def snapshot_at(self, owner: int, when: float, *, is_extended: bool = False) -> int | None:
         """Return the number of the last snapshot with exactly this time, or None."""
-        [(number,)] = self._all("SELECT max(id) FROM snapshot WHERE owner = ? AND at = ?", (owner, when))
+        [(number,)] = self._all(
+            "SELECT max(id) FROM snapshot WHERE owner = ? AND is_extended = ? AND at = ?",
+            (owner, int(is_extended), when),
+        )
         return None if number is None else int(number)
 
     # extended parameters
 
     def ext_state(self, owner: int) -> ExtState | None:
         """Return the state of a table of extended parameters; None if there is none."""
-        found = self._all("SELECT count, complete, checksum FROM ext_table WHERE owner = ?", (owner,))
+        found = self._all(
+            "SELECT count, complete, checksum, known_since FROM ext_table WHERE owner = ?", (owner,)
+        )
         for row in found:
-            count, complete, crc = cells(row, "Iii")
-            return ExtState(count, bool(complete), crc)
+            count, complete, crc, known_since = cells(row, "IiiF")
+            return ExtState(count, bool(complete), crc, known_since)
         return None
 
     def put_ext_state(self, owner: int, state: ExtState) -> None:
         """Write the state of a table of extended parameters."""
         self._do(
-            "INSERT INTO ext_table (owner, count, complete, checksum) VALUES (?, ?, ?, ?)"
-            " ON CONFLICT (owner) DO UPDATE SET (count, complete, checksum)"
-            " = (excluded.count, excluded.complete, excluded.checksum)",
-            (owner, state.count, int(state.complete), state.checksum),
+            "INSERT INTO ext_table (owner, count, complete, checksum, known_since) VALUES (?, ?, ?, ?, ?)"
+            " ON CONFLICT (owner) DO UPDATE SET (count, complete, checksum, known_since)"
+            " = (excluded.count, excluded.complete, excluded.checksum, excluded.known_since)",
+            (owner, state.count, int(state.complete), state.checksum, state.known_since),
         )
 
     def ext_rows(self, owner: int) -> dict[str, StoredExtParam]:
@@ -604,13 +626,16 @@ class Transaction(ABC):
             [(owner, *line) for line in lines],
         )
 
-    def trim_ext_lines(self, owner: int, keep: int) -> None:
-        """Delete all but the newest history lines of extended parameters of a table."""
-        self._do(
-            "DELETE FROM ext_history WHERE owner = ? AND id <="
-            f" (SELECT id FROM ext_history WHERE owner = ? ORDER BY id DESC LIMIT 1 OFFSET {int(keep)})",
-            (owner, owner),
+    def trim_ext_lines(self, owner: int, keep: int) -> float | None:
+        """Delete all but the newest history lines of extended parameters of a table. Return the latest time
+        of the deleted ones, or None."""
+        dropped = (
+            "owner = ? AND id <="
+            f" (SELECT id FROM ext_history WHERE owner = ? ORDER BY id DESC LIMIT 1 OFFSET {int(keep)})"
         )
+        [(at,)] = self._all(f"SELECT max(at) FROM ext_history WHERE {dropped}", (owner, owner))
+        self._do(f"DELETE FROM ext_history WHERE {dropped}", (owner, owner))
+        return None if at is None else float(at)
 
     def ext_history(
         self, key: str, component: int | None, name: str | None, limit: int | None, since: float | None

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 from paramclient.cache.ext_tables import ExtDump, put_ext, take_ext
 from paramclient.cache.operations import StoreOperation
 from paramclient.cache.param_columns import StoredParam
-from paramclient.cache.records import CachedSummary, CachedVehicle, TableState, TableUpdate
+from paramclient.cache.records import CachedSummary, CachedVehicle, SnapshotSummary, TableState, TableUpdate
 from paramclient.cache.snapshots import SNAPSHOTS
 from paramclient.cache.tables import HISTORY_ENTRIES_MAX, hashed, write_state
 from paramclient.cache.transaction import NO_VALUE, HistoryLine, Transaction
@@ -45,11 +45,13 @@ class StoredSnapshot:
         row: at, reason, size, hash, complete.
         blob: its encoded parameters; None if the target has them.
         crc: its checksum.
+        is_extended: whether it is of extended parameters.
     """
 
     row: tuple[object, ...]
     blob: bytes | None = field(repr=False)
     crc: int
+    is_extended: bool = False
 
 
 @dataclass(frozen=True)
@@ -90,8 +92,11 @@ class TableDump:
         if any(line.at >= gone for line in set(other.lines) - set(self.lines)):
             return "a line of history"
         shots = {shot.crc for shot in self.shots.values()}
-        if len(shots) < SNAPSHOTS and any(shot.crc not in shots for shot in other.shots.values()):
-            return "a snapshot"
+        for is_extended in (False, True):
+            wanted = {shot.crc for shot in other.shots.values() if shot.is_extended is is_extended}
+            kept = sum(shot.is_extended is is_extended for shot in self.shots.values())
+            if kept < SNAPSHOTS and not wanted <= shots:
+                return "a snapshot"
         if other.ext is not None:
             return "its extended parameters" if self.ext is None else self.ext.lacks(other.ext)
         return None
@@ -136,7 +141,14 @@ class MergeTable(StoreOperation[None]):
         for number, shot in self.whole.shots.items():
             if shot.crc not in mine and shot.blob is not None:
                 is_free = number < LOCAL_NUMBERS_MIN and not transaction.has_snapshot(number)
-                transaction.add_snapshot(owner, shot.row, shot.blob, shot.crc, number if is_free else None)
+                transaction.add_snapshot(
+                    owner,
+                    shot.row,
+                    shot.blob,
+                    shot.crc,
+                    number if is_free else None,
+                    is_extended=shot.is_extended,
+                )
 
 
 def copy_store(
@@ -209,13 +221,14 @@ def take_whole(
         for name, line, at in transaction.added_names(owner)
     )
     shots = {}
-    for summary in transaction.snapshots(key, component):
-        kept = transaction.snapshot(owner, summary.id)
+    for summary, is_extended in _snapshots(transaction, key, component):
+        kept = transaction.snapshot(owner, summary.id, is_extended=is_extended)
         assert kept is not None
         _, row, blob, crc = kept
         if not isinstance(blob, bytes) or not isinstance(crc, int):
             raise CacheError(f"snapshot {summary.id} of {key}, component {component}, is damaged")
-        shots[summary.id] = StoredSnapshot(tuple(row), None if summary.id in having else blob, crc)
+        shown = None if summary.id in having else blob
+        shots[summary.id] = StoredSnapshot(tuple(row), shown, crc, is_extended)
     return TableDump(
         vehicle,
         table,
@@ -257,11 +270,22 @@ def put_whole(transaction: Transaction, whole: TableDump) -> int:
 
 def put_snapshots(transaction: Transaction, owner: int, whole: TableDump) -> None:
     """Replace the snapshots of a table by those of another store, with equal numbers."""
-    there = {each.id for each in transaction.snapshots(whole.table.key, whole.table.component)}
+    there = {each.id for each, _ in _snapshots(transaction, whole.table.key, whole.table.component)}
     transaction.drop_snapshots(there - whole.shots.keys())
     for number, shot in whole.shots.items():
         if number not in there and shot.blob is not None:
-            transaction.add_snapshot(owner, shot.row, shot.blob, shot.crc, number)
+            transaction.add_snapshot(
+                owner, shot.row, shot.blob, shot.crc, number, is_extended=shot.is_extended
+            )
+
+
+def _snapshots(transaction: Transaction, key: str, component: int) -> list[tuple[SnapshotSummary, bool]]:
+    """Return the snapshots of a table, and whether each is of extended parameters."""
+    return [
+        (each, is_extended)
+        for is_extended in (False, True)
+        for each in transaction.snapshots(key, component, is_extended=is_extended)
+    ]
 
 
 def _lacking(target: Store, whole: TableDump) -> str | None:

@@ -17,7 +17,14 @@ from cyclopts.validators import Number
 from paramclient.cache import ParamCache
 from paramclient.cli.confirmation import can_confirm, confirm
 from paramclient.cli.exit_codes import ExitCode, code_of
-from paramclient.cli.extended import apply_extended, is_extended_source, verify_extended
+from paramclient.cli.extended import (
+    apply_extended,
+    check_choice,
+    is_extended_link,
+    is_extended_source,
+    restore_extended,
+    verify_extended,
+)
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_session
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import print_document, printable, progress_bar, report, say
@@ -101,6 +108,7 @@ async def apply(
     renames: str | None = None,
     metadata: MetadataChoice = None,
     full: bool = False,
+    extended: bool = False,
     yes: bool = False,
     options: LinkOptions = _OPTIONS,
 ) -> ExitCode:
@@ -134,15 +142,18 @@ async def apply(
         metadata: A file that describes parameters, or vehicle to download the vehicle's own metadata: for
             the ranges of values, and for parameters that take effect after a reboot.
         full: Also print parameters that are unchanged or left out.
+        extended: Use extended parameters (PARAM_EXT_*), as of a camera. Files of them need no option.
         yes: Do not ask for confirmation.
     """
-    if is_extended_source(file):
-        if include or reboot or backup or over or all_vehicles or renames or metadata:
+    if extended or is_extended_source(file):
+        if include or reboot or over or all_vehicles or renames or metadata:
             raise UsageError(
-                f"{file} has extended parameters; --include, --reboot, --backup, --overlay, --all, "
-                "--renames and --metadata are for plain ones"
+                f"{file} has extended parameters; --include, --reboot, --overlay, --all, --renames and "
+                "--metadata are for plain ones"
             )
-        return await apply_extended(url, file, options, dry_run=dry_run, yes=yes, durable=durable)
+        return await apply_extended(
+            url, file, options, dry_run=dry_run, yes=yes, durable=durable, backup=backup
+        )
     check_pattern("--overlay", over, all_vehicles=all_vehicles)
     check_pattern("--backup", backup, all_vehicles=all_vehicles)
     chosen = from_file(metadata)
@@ -202,6 +213,7 @@ async def verify(
     renames: str | None = None,
     metadata: MetadataChoice = None,
     full: bool = False,
+    extended: bool = False,
     options: LinkOptions = _OPTIONS,
 ) -> ExitCode:
     """Compare a vehicle with a parameter file. Writes nothing.
@@ -222,8 +234,9 @@ async def verify(
         metadata: A file that describes parameters, or vehicle to download the vehicle's own metadata: for
             the ranges of values, and for parameters that take effect after a reboot.
         full: Also print parameters that have the wanted value or are left out.
+        extended: Use extended parameters (PARAM_EXT_*), as of a camera. Files of them need no option.
     """
-    if is_extended_source(file):
+    if extended or is_extended_source(file):
         if include or over or all_vehicles or renames or metadata:
             raise UsageError(
                 f"{file} has extended parameters; --include, --overlay, --all, --renames and --metadata are "
@@ -256,6 +269,8 @@ async def restore(
     backup: str | None = None,
     dry_run: bool = False,
     full: bool = False,
+    extended: bool = False,
+    plain: bool = False,
     yes: bool = False,
     options: LinkOptions = _OPTIONS,
 ) -> ExitCode:
@@ -278,8 +293,21 @@ async def restore(
         backup: A new file for the vehicle's present state.
         dry_run: Print the values that would be sent, and send none of them.
         full: Also print parameters that are unchanged or left out.
+        extended: Restore the extended parameters (PARAM_EXT_*) of the component, as of a camera. Without it,
+            a camera, gimbal or other payload is asked whether it has them.
+        plain: Restore the plain parameters, also of a component that has extended ones.
         yes: Do not ask for confirmation.
     """
+    check_choice(extended=extended, plain=plain)
+    is_plain_file = when is not None and is_file(when) and not is_extended_source(when)
+    if extended or (
+        not plain
+        and not is_plain_file
+        and ((when is not None and is_extended_source(when)) or await is_extended_link(url, options))
+    ):
+        if include or reboot or allow_armed or force:
+            raise UsageError("--include, --reboot, --allow-armed and --force are for plain parameters")
+        return await restore_extended(url, when, options, dry_run=dry_run, yes=yes, backup=backup)
     async with targets(url, options, all_vehicles=False, expect=None, only=True) as found:
         [vehicle] = found.vehicles
         state = await _load_state(found, vehicle, when, options)

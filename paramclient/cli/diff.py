@@ -8,7 +8,7 @@ from typing import Annotated, Final
 from cyclopts import Parameter
 
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.extended import diff_extended, is_extended_source
+from paramclient.cli.extended import are_extended, diff_extended, is_extended_source
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_sets, meaning_of, units_of
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import Coloured, print_document, print_table, printable, say
@@ -62,7 +62,8 @@ async def diff(
         metadata: A file that describes parameters. Default: the stored metadata of the vehicles' firmware.
         extended: Use extended parameters (PARAM_EXT_*), as of a camera.
     """
-    if extended or is_extended_source(left) or is_extended_source(right):
+    is_told = extended or is_extended_source(left) or is_extended_source(right)
+    if is_told or (base is None and not only and await are_extended((left, right), options)):
         if base is not None or only or renames is not None or metadata is not None:
             raise UsageError("--base, --only, --renames and --metadata are for plain parameters")
         return await diff_extended(left, right, options, partial=partial, everything=everything)

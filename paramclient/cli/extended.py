@@ -1,10 +1,11 @@
-"""Extended parameters in the subcommands fetch, get, set, watch, show, save, diff and apply."""
+"""Extended parameters in the subcommands that take them: fetch, get, set, watch, show, save, apply, …."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -15,18 +16,23 @@ from paramclient.cache import CachedExtTable, ParamCache
 from paramclient.cli.confirmation import can_confirm, confirm
 from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.options import CacheOptions, LinkOptions
-from paramclient.cli.output import print_document, print_table, printable, progress_bar, report, say
+from paramclient.cli.output import (
+    local_time,
+    print_document,
+    print_table,
+    printable,
+    progress_bar,
+    report,
+    say,
+)
 from paramclient.cli.session import CommandSession, connect
 from paramclient.cli.sources import check_link, is_file, names_vehicle, tables_in
+from paramclient.cli.targets import check_new
+from paramclient.cli.time_arguments import parse_when
 from paramclient.cli.watch_lines import HEX, ext_value_text, print_changes_and_events
-from paramclient.errors import CacheError, FileError, NoReply, NotInCache, UnknownParameter, UsageError
+from paramclient.errors import CacheError, NoReply, NotInCache, UnknownParameter, UsageError
 from paramclient.files import FileForm
-from paramclient.files.extended_document import (
-    ExtParamFile,
-    is_extended_file,
-    read_extended_file,
-    write_extended_file,
-)
+from paramclient.files.extended_document import is_extended_file, read_extended_file, write_extended_file
 from paramclient.model.ext_params import (
     ExtParam,
     ExtParamType,
@@ -35,14 +41,21 @@ from paramclient.model.ext_params import (
     encode_ext_value,
     ext_type_name,
 )
-from paramclient.model.notation import time_text
+from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.patterns import NameChoice, is_pattern
+from paramclient.model.similar_names import did_you_mean, nearest_names
 from paramclient.model.values import check_name
 from paramclient.model.wording import counted, first_of
 from paramclient.protocol.ext.write_batch import ExtSetOutcome
+from paramclient.protocol.params.write_batch import SetStatus
 from paramclient.protocol.vehicle.extended_kinds import expects_extended
+from paramclient.provision import ExtApplyResult, ExtPlan, load_extended_state
+from paramclient.provision import apply_extended as write_extended_set
+from paramclient.provision import restore_extended as restore_extended_set
+from paramclient.provision import verify_extended as verify_extended_set
 
 __all__ = [
+    "are_extended",
     "apply_extended",
     "check_choice",
     "diff_extended",
@@ -53,6 +66,7 @@ __all__ = [
     "is_extended_session",
     "is_extended_source",
     "may_be_extended",
+    "restore_extended",
     "save_extended",
     "set_extended",
     "show_extended",
@@ -142,8 +156,10 @@ async def fetch_extended(session: CommandSession) -> ExitCode:
 
 async def get_extended(session: CommandSession, names: Sequence[str]) -> ExitCode:
     """Read and print single extended parameters."""
+    names, unmatched = await _chosen_names(session, names)
     found, errors = await _read_all(session, names)
     params = [found[name] for name in names if name in found]
+    errors = [*unmatched, *errors]
     if session.options.json:
         from paramclient.documents.extended_output import ExtParamsOutputDoc  # only here: loads pydantic
 
@@ -153,6 +169,30 @@ async def get_extended(session: CommandSession, names: Sequence[str]) -> ExitCod
     for error in errors:
         report(str(error))
     return max((code_of(error) for error in errors), default=ExitCode.DONE)
+
+
+async def _chosen_names(
+    session: CommandSession, given: Sequence[str]
+) -> tuple[list[str], list[NoReply | UnknownParameter]]:
+    """Return the names that names and patterns choose, after a download if there is a pattern; and errors."""
+    component = session.component
+    ext = component.ext
+    if any(map(is_pattern, given)):
+        await ext.fetch_all(timeout=session.deadline.left())
+    names: dict[str, None] = {}
+    errors: list[NoReply | UnknownParameter] = []
+    for text in given:
+        chosen, _ = NameChoice([text]).divide(ext.params)
+        if chosen or not is_pattern(text):
+            exact = text in ext.params or not chosen
+            names |= dict.fromkeys([text] if exact and not is_pattern(text) else sorted(chosen))
+            continue
+        who = f"{component.system}/{component.component}"
+        what = f"{who} has no extended parameter that matches {text}"
+        errors.append(
+            UnknownParameter(what, system=component.system, component=component.component, name=text)
+        )
+    return list(names), errors
 
 
 async def _read_all(
@@ -165,13 +205,29 @@ async def _read_all(
     async def read(name: str) -> None:
         try:
             found[name] = await session.component.ext.get(name, timeout=session.deadline.left())
-        except (NoReply, UnknownParameter) as error:
+        except UnknownParameter as error:
+            errors.append(_with_nearest(error, session.component.ext.params))
+        except NoReply as error:
             errors.append(error)
 
     async with anyio.create_task_group() as tasks:
         for name in names:
             tasks.start_soon(read, name)
     return found, errors
+
+
+def _with_nearest(error: UnknownParameter, known: Iterable[str]) -> UnknownParameter:
+    """Return the error with the most similar ones of these names, if it names none."""
+    nearest = () if error.nearest or error.name is None else nearest_names(error.name, known)
+    if not nearest:
+        return error
+    return UnknownParameter(
+        f"{error}.{did_you_mean(nearest)}",
+        system=error.system,
+        component=error.component,
+        name=error.name,
+        nearest=nearest,
+    )
 
 
 def text_pairs(words: Sequence[str]) -> list[tuple[str, str]]:
@@ -199,13 +255,25 @@ async def set_extended(
     """Write extended parameters, and print the outcomes."""
     await session.check_only()
     await session.announce_write()
-    values: list[tuple[str, ExtValue]] = []
-    for name, text in pairs:
-        known = await session.component.ext.get(name, timeout=session.deadline.left())
-        values.append((name, value_of(name, text, known.type)))
-    result = await session.component.ext.set_many(values, timeout=session.deadline.left(), durable=durable)
-    _print_outcomes(session, result.outcomes)
-    return _code_of_outcomes(result.outcomes)
+    found, errors = await _read_all(session, list(dict.fromkeys(name for name, _ in pairs)))
+    for error in errors:
+        if not isinstance(error, UnknownParameter):
+            raise error
+    unknown = {error.name: error for error in errors if isinstance(error, UnknownParameter)}
+    values = [(name, value_of(name, text, found[name].type)) for name, text in pairs if name in found]
+    written: Iterable[ExtSetOutcome] = ()
+    if values:
+        result = await session.component.ext.set_many(
+            values, timeout=session.deadline.left(), durable=durable
+        )
+        written = result.outcomes
+    left = iter(written)
+    outcomes = [
+        next(left) if name in found else ExtSetOutcome(name, text, SetStatus.REFUSED, error=unknown[name])
+        for name, text in pairs
+    ]
+    _print_outcomes(session, outcomes)
+    return _code_of_outcomes(outcomes)
 
 
 def value_of(name: str, text: str, number: int) -> ExtValue:
@@ -269,10 +337,10 @@ def show_extended(
         params = _by_index(table.params.values())
         told = f"{len(params)} extended parameters of {table.key}, component {table.component}"
     if names:
-        unknown = [name for name in names if not any(each.name == name for each in params)]
-        if unknown:
-            raise NotInCache(f"not among the extended parameters: {', '.join(unknown)}")
-        params = [each for each in params if each.name in names]
+        chosen, unmatched = NameChoice(names).choose({each.name for each in params})
+        if unmatched:
+            raise NotInCache(f"not among the extended parameters: {unmatched}")
+        params = [each for each in params if each.name in chosen]
     if options.json:
         from paramclient.documents.extended_output import ExtParamsOutputDoc  # only here: loads pydantic
 
@@ -323,61 +391,130 @@ async def diff_extended(
     return ExitCode.DIFFERENT if different else ExitCode.DONE
 
 
-# apply
+# apply, verify, restore
 
 
 async def apply_extended(
-    url: str, file: str, options: LinkOptions, *, dry_run: bool, yes: bool, durable: bool = False
+    url: str,
+    file: str,
+    options: LinkOptions,
+    *,
+    dry_run: bool,
+    yes: bool,
+    durable: bool = False,
+    backup: str | None = None,
 ) -> ExitCode:
-    """Write the differing values of a file of extended parameters, and verify them by another download."""
-    content = read_extended_file(file)
+    """Write the differing values of a file of extended parameters, and verify them by another download.
+
+    The file may also be a vehicle in the cache, or a link.
+    """
+    content = await _source(file, options)
+    path = None if backup is None else check_new(backup)
+    async with connect(url, options, only=True) as session:
+        write = partial(
+            write_extended_set,
+            session.component,
+            content,
+            durable=durable,
+            backup=path,
+            before_writing=partial(_before_writing, session),
+        )
+        return await _write_set(session, content, write, dry_run=dry_run, yes=yes)
+
+
+async def restore_extended(
+    url: str,
+    when: str | None,
+    options: LinkOptions,
+    *,
+    dry_run: bool,
+    yes: bool,
+    backup: str | None = None,
+) -> ExitCode:
+    """Restore an earlier state of the extended parameters of a component.
+
+    `when` is a time, the number of a snapshot, or a backup file; None is the state before the last apply.
+    """
+    path = None if backup is None else check_new(backup)
     async with connect(url, options, only=True) as session:
         component = session.component
-        changes, now, faulty = await _compared(session, content, file)
-        if dry_run or not changes:
-            _print_plan(session, changes, now, is_dry=dry_run)
-            return ExitCode.INCOMPLETE if faulty or changes else ExitCode.DONE
-        if not yes and can_confirm(options):
-            _print_plan(session, changes, now, is_dry=True)
-            if not await confirm("go on?"):
-                return ExitCode.INCOMPLETE
-        await session.check_only()
-        await session.announce_write()
-        values = {name: param.value for name, param in changes.items()}
-        result = await component.ext.set_many(values, timeout=session.deadline.left(), durable=durable)
-        after = await component.ext.fetch_all(timeout=session.deadline.left())
-        _print_outcomes(session, result.outcomes)
-        code = _code_of_outcomes(result.outcomes)
-        for name, param in changes.items():
-            if name not in after.params or not param.same_value(after.params[name]):
-                code = max(code, ExitCode.INCOMPLETE)
-                held = "not there" if name not in after.params else _text(after.params[name])
-                report(f"{name}: {session.label} has {held}, and the file {_text(param)}")
-        return max(code, ExitCode.INCOMPLETE) if faulty else code
+        if when is not None and is_file(when):
+            state = read_extended_file(when)
+        else:
+            moment = None if when is None else parse_when(when, time.time())
+            state = await load_extended_state(component, moment)
+        at = "" if state.at is None else f", {local_time(state.at)}"
+        say(printable(f"the state: {len(state.params)} extended parameters from {state.source}{at}"))
+        before = partial(_before_writing, session)
+        write = partial(restore_extended_set, component, state, backup=path, before_writing=before)
+        return await _write_set(session, state, write, dry_run=dry_run, yes=yes)
+
+
+async def _before_writing(session: CommandSession) -> None:
+    await session.check_only()
+    await session.announce_write()
+
+
+async def _write_set(
+    session: CommandSession,
+    content: ExtParamSet,
+    write: Callable[..., Awaitable[ExtApplyResult]],
+    *,
+    dry_run: bool,
+    yes: bool,
+) -> ExitCode:
+    """Write a set of extended parameters, after the question of a terminal, and print the result."""
+    if dry_run or (not yes and can_confirm(session.options)):
+        plan = await verify_extended_set(session.component, content, timeout=session.deadline.left())
+        _report_impossible(session, plan, content)
+        if dry_run or not plan.changes:
+            _print_plan(session, plan, is_dry=dry_run)
+            return ExitCode.DONE if plan.is_met else ExitCode.INCOMPLETE
+        _print_plan(session, plan, is_dry=True)
+        if not await confirm("go on?"):
+            return ExitCode.INCOMPLETE
+    result = await write(timeout=session.deadline.left())
+    _report_impossible(session, result.plan, content)
+    if not result.plan.changes:
+        _print_plan(session, result.plan, is_dry=False)
+        return ExitCode.DONE if result.plan.is_met else ExitCode.INCOMPLETE
+    _print_outcomes(session, result.outcomes)
+    code = _code_of_outcomes(result.outcomes)
+    if result.error is not None and not any(result.error is each.error for each in result.outcomes):
+        report(str(result.error))
+        code = max(code, code_of(result.error))
+    now = {} if result.current is None else result.current
+    for name in result.different if result.current is not None else ():
+        held = "not there" if name not in now else _text(now[name])
+        wanted = _text(content.params[name])
+        report(f"{name}: {session.label} has {held}, and the file {wanted}")
+    return code if result.complete else max(code, ExitCode.INCOMPLETE)
 
 
 async def verify_extended(url: str, file: str, options: LinkOptions) -> ExitCode:
     """Compare the extended parameters of a component with a file. Writes nothing."""
-    content = read_extended_file(file)
+    content = await _source(file, options)
     async with connect(url, options) as session:
-        changes, now, faulty = await _compared(session, content, file)
+        plan = await verify_extended_set(session.component, content, timeout=session.deadline.left())
+        _report_impossible(session, plan, content)
         if options.json:
             from paramclient.documents.extended_output import ExtDiffDoc  # only here: loads pydantic
 
-            entries = [(name, now[name], param, "different") for name, param in changes.items()]
-            print_document(ExtDiffDoc.of(entries, is_same=not changes and not faulty))
+            print_document(ExtDiffDoc.of(_plan_entries(plan), is_same=plan.is_met))
         else:
-            if changes:
-                rows = ((name, _text(now[name]), _text(param)) for name, param in changes.items())
-                print_table(["name", "now", "wanted"], rows)
-            held = sum(name in now and param.same_value(now[name]) for name, param in content.params.items())
-            say(printable(f"{session.label} has {held} of {len(content.params)} values of {file}"))
-    return ExitCode.DIFFERENT if changes or faulty else ExitCode.DONE
+            _print_changes(plan)
+            held = sum(
+                name in plan.current and param.same_value(plan.current[name])
+                for name, param in content.params.items()
+            )
+            source = content.source
+            say(printable(f"{session.label} has {held} of {len(content.params)} values of {source}"))
+    return ExitCode.DONE if plan.is_met else ExitCode.DIFFERENT
 
 
 def history_extended(
     vehicle: str,
-    name: str | None,
+    names: Sequence[str],
     component: int | None,
     options: CacheOptions,
     *,
@@ -387,14 +524,18 @@ def history_extended(
     """Print the changes of a vehicle's extended parameters, the newest last."""
     with ParamCache(options.cache) as cache:
         key = tables_in(cache, vehicle, None)[0].key
-        entries = cache.ext_history(key, component, name, limit, since)
+        entries = cache.ext_history(key, component, None, None if names else limit, since)
+    if names:
+        choice = NameChoice(names)
+        entries = [each for each in entries if choice.has(each.name)]
+        entries = entries[-limit:] if limit else entries
     if options.json:
         from paramclient.documents.extended_output import ExtHistoryDoc  # only here: loads pydantic
 
         print_document(ExtHistoryDoc.of(entries))
         return ExitCode.DONE
     rows = (
-        (time_text(each.at), each.component, each.name, _text(each.old), _text(each.new), each.by)
+        (local_time(each.at), each.component, each.name, _text(each.old), _text(each.new), each.by)
         for each in entries
     )
     print_table(["time", "component", "name", "old", "new", "by"], rows)
@@ -410,6 +551,17 @@ async def is_extended_link(text: str, options: LinkOptions) -> bool:
     check_link(text)
     async with connect(text, options) as session:
         return await is_extended_session(session, extended=False, plain=False)
+
+
+async def are_extended(sources: Sequence[str], options: LinkOptions) -> bool:
+    """Return whether none of these sources is a file, and at least one is a link to a component that speaks
+    the extended protocol."""
+    if any(map(is_file, sources)):
+        return False
+    for text in sources:
+        if await is_extended_link(text, options):
+            return True
+    return False
 
 
 # internal
@@ -462,7 +614,7 @@ def _cached(vehicle: str | None, component: int | None, options: CacheOptions) -
     return tables[0]
 
 
-async def _source(text: str, options: LinkOptions) -> ExtParamFile:
+async def _source(text: str, options: LinkOptions) -> ExtParamSet:
     """Return the extended parameters of a file, a cached vehicle or a link.
 
     Raises:
@@ -479,7 +631,7 @@ async def _source(text: str, options: LinkOptions) -> ExtParamFile:
             raise NotInCache(f"the table of {table.key}, component {table.component}, is incomplete")
         params = {param.name: param for param in _by_index(table.params.values())}
         at = max(table.heard_at.values(), default=None)
-        return ExtParamFile(params, None, table.component, at, f"cache {table.key}")
+        return ExtParamSet(params, None, table.component, at, f"cache {table.key}")
     check_link(text)
     async with connect(text, options) as session:
         with progress_bar(f"fetching {session.label}") as progress:
@@ -488,56 +640,39 @@ async def _source(text: str, options: LinkOptions) -> ExtParamFile:
             missing = counted(len(result.missing), "extended parameter")
             raise NoReply(f"{missing} of {session.label}", attempts=0, waited=result.elapsed)
         params = {param.name: param for param in _by_index(result.params.values())}
-        return ExtParamFile(
+        return ExtParamSet(
             params, result.system, result.component, time.time(), f"link {session.client.link.name}"
         )
 
 
-async def _compared(
-    session: CommandSession, content: ExtParamFile, file: str
-) -> tuple[dict[str, ExtParam], Mapping[str, ExtParam], bool]:
-    """Return the parameters of a file that differ, those of the component, and whether the component lacks
-    some or has them in another type, which is reported."""
-    component = session.component
-    if content.component not in (None, component.component):
-        raise FileError(
-            f"it has the parameters of component {content.component}, and {session.label} is chosen",
-            source=file,
-        )
-    result = await component.ext.fetch_all(timeout=session.deadline.left())
-    if not result.complete:
-        raise NoReply(f"all extended parameters of {session.label}", attempts=0, waited=result.elapsed)
-    now = result.params
-    unknown = [name for name in content.params if name not in now]
-    if unknown:
-        report(f"{session.label} does not have {first_of(unknown, NAMES_SHOWN_MAX)}")
-    changes = {}
-    is_mismatched = False
-    for name, param in content.params.items():
-        held = now.get(name)
-        if held is not None and held.type != param.type:
-            is_mismatched = True
-            types = ext_type_name(held.type), ext_type_name(param.type)
-            report(f"{name} is {types[0]} on {session.label}, and {types[1]} in {file}")
-        elif held is not None and not held.same_value(param):
-            changes[name] = param
-    return changes, now, bool(unknown) or is_mismatched
+def _report_impossible(session: CommandSession, plan: ExtPlan, content: ExtParamSet) -> None:
+    """Report the wanted parameters that the component lacks, or has in another type."""
+    if plan.missing:
+        report(f"{session.label} does not have {first_of(plan.missing, NAMES_SHOWN_MAX)}")
+    for name in plan.mistyped:
+        types = ext_type_name(plan.current[name].type), ext_type_name(content.params[name].type)
+        report(f"{name} is {types[0]} on {session.label}, and {types[1]} in {content.source}")
 
 
-def _print_plan(
-    session: CommandSession, changes: Mapping[str, ExtParam], now: Mapping[str, ExtParam], *, is_dry: bool
-) -> None:
+def _plan_entries(plan: ExtPlan) -> list[tuple[str, ExtParam | None, ExtParam | None, str]]:
+    return [(name, plan.current[name], param, "different") for name, param in plan.changes.items()]
+
+
+def _print_changes(plan: ExtPlan) -> None:
+    if plan.changes:
+        rows = ((name, _text(plan.current[name]), _text(param)) for name, param in plan.changes.items())
+        print_table(["name", "now", "wanted"], rows)
+
+
+def _print_plan(session: CommandSession, plan: ExtPlan, *, is_dry: bool) -> None:
     if session.options.json:
         from paramclient.documents.extended_output import ExtDiffDoc  # only here: loads pydantic
 
-        entries = [(name, now[name], param, "different") for name, param in changes.items()]
-        print_document(ExtDiffDoc.of(entries, is_same=not changes))
+        print_document(ExtDiffDoc.of(_plan_entries(plan), is_same=not plan.changes))
         return
-    if changes:
-        rows = ((name, _text(now[name]), _text(param)) for name, param in changes.items())
-        print_table(["name", "now", "wanted"], rows)
+    _print_changes(plan)
     verb = "would be set" if is_dry else "set"
-    say(printable(f"{len(changes)} of {session.label} {verb}"))
+    say(printable(f"{len(plan.changes)} of {session.label} {verb}"))
 
 
 def _print_outcomes(session: CommandSession, outcomes: Sequence[ExtSetOutcome]) -> None:

@@ -64,17 +64,13 @@ def history(
     wanted = check_given(names)
     if snapshots and wanted:
         raise UsageError("--snapshots lists whole tables and takes no parameter name")
-    if extended:
-        if snapshots:
-            raise UsageError("there are no snapshots of extended parameters")
-        if len(wanted) > 1:
-            raise UsageError("--extended takes one parameter name")
-        name = wanted[0] if wanted else None
-        return history_extended(vehicle, name, component, options, limit=limit, since=begin)
+    if extended and not snapshots:
+        return history_extended(vehicle, wanted, component, options, limit=limit, since=begin)
     with ParamCache(options.cache) as cache:
         key = tables_in(cache, vehicle, None)[0].key
         if snapshots:
-            kept = [each for each in cache.snapshots(key, component) if begin is None or each.at >= begin]
+            found = cache.ext_snapshots(key, component) if extended else cache.snapshots(key, component)
+            kept = [each for each in found if begin is None or each.at >= begin]
             _print_snapshots(kept[-limit:] if limit else kept, options)
         else:
             entries = _entries(cache, key, component, wanted, begin)

@@ -6,8 +6,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from typing import Final
 
+from paramclient.cache import SnapshotSummary
 from paramclient.client.subscription import Subscription
 from paramclient.model.ext_params import ExtParam, ExtSettable
+from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.protocol.ext.change import ExtChange
 from paramclient.protocol.ext.fetch import ExtFetchResult
 from paramclient.protocol.ext.write_batch import ExtSetManyResult, ExtSetOutcome
@@ -204,6 +206,48 @@ class ExtParams(ABC):
                 lost.
             ContestedAddress: several vehicles use its address.
             LinkError: the link failed, or the client was closed.
+        """
+
+    @abstractmethod
+    async def store_snapshot(self, *, reason: str) -> int | None:
+        """Store a snapshot of the known parameters in the cache, as a restore point.
+
+        The values that were received before are in the cache and its history first.
+
+        Args:
+            reason: the reason, as text.
+
+        Returns:
+            The number of the snapshot; None if there is no cache.
+
+        Raises:
+            UsageError: no parameter is known.
+            CacheError: the cache cannot store it.
+            LinkError: the client was closed.
+        """
+
+    @abstractmethod
+    async def snapshots(self) -> list[SnapshotSummary]:
+        """Return the snapshots of the component's extended parameters, the newest last.
+
+        Raises:
+            UsageError: there is no cache.
+            CacheError: the cache cannot be read.
+            LinkError: the client was closed.
+        """
+
+    @abstractmethod
+    async def load_state(self, when: float) -> ExtParamSet:
+        """Return an earlier state of the parameters, from the cache.
+
+        Args:
+            when: a float is a time, in unix seconds; an int is the number of a snapshot. See
+                `ParamCache.ext_state_at`.
+
+        Raises:
+            UsageError: there is no cache, or the time is not in unix seconds.
+            CacheError: there is no such state, or the cache cannot be read.
+            LinkError: the client was closed.
         """
 
     @abstractmethod

@@ -6,16 +6,29 @@ import weakref
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from types import MappingProxyType
+from typing import Final
 
 import anyio
 
+from paramclient.cache import ParamCache, SnapshotSummary
 from paramclient.client.arguments import PROGRESS_CALL_INTERVAL, check_asked_name, check_requested_name
 from paramclient.client.batch_wait import wait_for_batch
 from paramclient.client.extended_params import ExtChanges
-from paramclient.client.local import LocalComponent, LocalExtParams
-from paramclient.errors import CacheError, NoReply, NotDurable, ParamClientError
+from paramclient.client.local import LocalComponent, LocalExtParams, wait_until_identified
+from paramclient.errors import (
+    CacheError,
+    NoReply,
+    NotDurable,
+    NotInCache,
+    ParamClientError,
+    UnknownVehicle,
+    UsageError,
+)
 from paramclient.model.ext_params import ExtParam, ExtSettable, check_ext_value
+from paramclient.model.ext_paramset import ExtParamSet
+from paramclient.model.identity import Identity
 from paramclient.protocol.ext.change import ExtChange
 from paramclient.protocol.ext.fetch import ExtFetch, ExtFetchResult
 from paramclient.protocol.ext.write_batch import ExtSetManyResult, ExtSetOutcome
@@ -25,6 +38,8 @@ from paramclient.protocol.params.fetch_result import Policy, Progress
 
 __all__ = ["LinkExtParams"]
 
+EXT_IDENTITY_TIMEOUT: Final = 10.0
+"""Seconds to wait for the identity of a vehicle: longer than all attempts to request it."""
 EXT_TIMEOUT_NOTE = "The fetch of extended parameters ended at its timeout."
 """Note of a partial result that a timeout ended."""
 
@@ -170,6 +185,47 @@ class LinkExtParams(LocalExtParams):
             machine.ext.fetches.end(fetch)
             component.wake()
 
+    async def store_snapshot(self, *, reason: str) -> int | None:
+        """See `ExtParams.store_snapshot`."""
+        client = self._component.client
+        client.check_open()
+        cache = client.cache
+        if cache is None:
+            return None
+        if not self.params:
+            raise UsageError(f"no extended parameter of {self._whose} is known; fetch them first")
+        identity = await self._written_identity()
+        params, number = ExtParamSet(dict(self.params)), self._machine.component
+        store = partial(cache.store_ext_snapshot, identity, number, params, reason=reason)
+        return (await client.cache_writer.run_in_thread(partial(store, complete=self.is_complete))).id
+
+    async def snapshots(self) -> list[SnapshotSummary]:
+        """See `ExtParams.snapshots`."""
+        cache = self._require_cache()
+        key, number = (await self._written_identity()).key, self._machine.component
+
+        def read() -> list[SnapshotSummary]:
+            try:
+                return cache.ext_snapshots(key, number)
+            except UnknownVehicle:  # no vehicle that was named, but one on the link
+                return []
+
+        return await self._component.client.cache_writer.run_in_thread(read)
+
+    async def load_state(self, when: float) -> ExtParamSet:
+        """See `ExtParams.load_state`."""
+        cache = self._require_cache()
+        key, number = (await self._written_identity()).key, self._machine.component
+
+        def read() -> ExtParamSet:
+            try:
+                return cache.ext_state_at(key, number, when)
+            except UnknownVehicle:  # no vehicle that was named, but one on the link
+                what = f"the cache {cache.place} has no earlier state of {key}, component {number}"
+                raise NotInCache(what) from None
+
+        return await self._component.client.cache_writer.run_in_thread(read)
+
     def changes(self) -> ExtChanges:
         """See `ExtParams.changes`."""
         self.listen(changes := ExtChanges())
@@ -197,6 +253,19 @@ class LinkExtParams(LocalExtParams):
         """End all streams: with this error, or with None at the end of a log."""
         for changes in list(self._subscriptions):
             changes.end(error)
+
+    def _require_cache(self) -> ParamCache:
+        self._component.client.check_open()
+        cache = self._component.client.cache
+        if cache is None:
+            raise UsageError("earlier states are in the cache, and the client has none; open it with a cache")
+        return cache
+
+    async def _written_identity(self) -> Identity:
+        """Return the identity of the vehicle, after all received values are in the cache."""
+        await wait_until_identified(self._component, EXT_IDENTITY_TIMEOUT)
+        await self._component.client.cache_writer.write_all()
+        return self._component.identity
 
     @property
     def _whose(self) -> str:

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Protocol, TypeVar
+from typing import Final, Protocol, TypeVar
+
+import anyio
 
 from paramclient.cache import ParamCache
 from paramclient.client.cache_writer import CacheWriter
@@ -28,7 +30,10 @@ from paramclient.protocol.params.fetch_result import FetchResult, Progress
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.station import Station
 
-__all__ = ["LocalClient", "LocalComponent", "LocalExtParams", "local", "not_given"]
+__all__ = ["LocalClient", "LocalComponent", "LocalExtParams", "local", "not_given", "wait_until_identified"]
+
+IDENTITY_POLL_INTERVAL: Final = 0.05
+"""Seconds between two looks at the identity of a vehicle: it has no event."""
 
 Result = TypeVar("Result")
 
@@ -206,6 +211,13 @@ def local(component: Component) -> LocalComponent:
     if not isinstance(component, LocalComponent):
         raise not_given("what this needs")
     return component
+
+
+async def wait_until_identified(component: LocalComponent, timeout: float) -> None:
+    """Wait until the vehicle is identified, at most `timeout` seconds, as its key in the cache requires."""
+    with anyio.move_on_after(timeout):
+        while component.settled_identity is None:  # noqa: ASYNC110 - no event
+            await anyio.sleep(IDENTITY_POLL_INTERVAL)
 
 
 def not_given(what: str) -> UsageError:

@@ -13,7 +13,7 @@ from paramclient.model.notation import time_text
 if TYPE_CHECKING:
     from paramclient.cache import ExtHistoryEntry
     from paramclient.files import FileForm
-    from paramclient.files.extended_document import ExtParamFile
+    from paramclient.model.ext_paramset import ExtParamSet
     from paramclient.protocol.ext.change import ExtChange
     from paramclient.protocol.ext.fetch import ExtFetchResult
     from paramclient.protocol.ext.write_batch import ExtSetOutcome
@@ -69,12 +69,18 @@ class ExtFetchOutputDoc(Document):
 
 
 class ExtWriteDoc(Document):
-    """The outcome of one write of an extended parameter."""
+    """The outcome of one write of an extended parameter.
+
+    `requested` and `actual` are null for bytes that are no text; `requested_hex` has such requested bytes,
+    and `actual_hex` the bytes of every actual value.
+    """
 
     name: str
     requested: Scalar | None
     actual: Scalar | None
     status: str
+    requested_hex: Maybe[str] = None
+    actual_hex: Maybe[str] = None
     reason: Maybe[str] = None
 
     @classmethod
@@ -86,6 +92,8 @@ class ExtWriteDoc(Document):
             requested=ext_value_json(outcome.requested, ExtParamType.REAL64),
             actual=None if result is None else ext_value_json(result.actual, result.param.type),
             status=outcome.status.value,
+            requested_hex=outcome.requested.hex() if isinstance(outcome.requested, bytes) else None,
+            actual_hex=None if result is None else result.param.raw.hex(),
             reason=None if outcome.error is None else str(outcome.error),
         )
 
@@ -204,7 +212,7 @@ class ExtSavedDoc(Document):
     count: int
 
     @classmethod
-    def of(cls, file: str, form: FileForm, content: ExtParamFile) -> ExtSavedDoc:
+    def of(cls, file: str, form: FileForm, content: ExtParamSet) -> ExtSavedDoc:
         """Return the document of a written file."""
         count = len(content.params)
         return cls(

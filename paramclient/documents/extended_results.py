@@ -11,10 +11,20 @@ from paramclient.documents.results import NotSetDoc
 from paramclient.model.ext_params import ExtParamType
 
 if TYPE_CHECKING:
+    from paramclient.model.ext_paramset import ExtParamSet
     from paramclient.protocol.ext.fetch import ExtFetchResult
     from paramclient.protocol.ext.writes import ExtSetResult
+    from paramclient.provision import ExtPlan
 
-__all__ = ["ExtFetchResultDoc", "ExtSetManyDoc", "ExtSetResultDoc"]
+__all__ = [
+    "ExtApplyResultDoc",
+    "ExtFetchResultDoc",
+    "ExtPlanDoc",
+    "ExtSetManyDoc",
+    "ExtSetResultDoc",
+    "ExtStateDoc",
+    "StoredExtSnapshotDoc",
+]
 
 
 class ExtFetchResultDoc(Document):
@@ -73,6 +83,70 @@ class ExtSetResultDoc(Document):
             attempts=result.attempts,
             param=ExtParamDoc.kept(result.param),
         )
+
+
+class ExtStateDoc(Document):
+    """An earlier state of the extended parameters of a component; `at` is in unix seconds."""
+
+    system: int | None
+    component: int | None
+    at: float | None
+    source: str
+    params: dict[str, ExtParamDoc]
+
+    @classmethod
+    def of(cls, state: ExtParamSet) -> ExtStateDoc:
+        """Return the document of a set."""
+        return cls(
+            system=state.system,
+            component=state.component,
+            at=state.at,
+            source=state.source,
+            params={name: ExtParamDoc.of(param) for name, param in state.params.items()},
+        )
+
+
+class StoredExtSnapshotDoc(Document):
+    """The number of a stored snapshot; null if the service has no cache."""
+
+    snapshot: int | None
+
+
+class ExtPlanDoc(Document):
+    """What a set-up of extended parameters would write; see `ExtPlan`. `changes` has the wanted values."""
+
+    system: int
+    component: int
+    is_met: bool
+    changes: dict[str, ExtParamDoc]
+    missing: list[str]
+    mistyped: list[str]
+
+    @classmethod
+    def of(cls, plan: ExtPlan) -> ExtPlanDoc:
+        """Return the document of an `ExtPlan`."""
+        return cls(
+            system=plan.system,
+            component=plan.component,
+            is_met=plan.is_met,
+            changes={name: ExtParamDoc.of(param) for name, param in plan.changes.items()},
+            missing=list(plan.missing),
+            mistyped=list(plan.mistyped),
+        )
+
+
+class ExtApplyResultDoc(Document):
+    """The result of a set-up of extended parameters; see `ExtApplyResult`."""
+
+    system: int
+    component: int
+    complete: bool
+    plan: ExtPlanDoc
+    results: dict[str, ExtSetResultDoc | NotSetDoc]
+    different: list[str]
+    snapshot: int | None
+    elapsed_s: float
+    problem: Maybe[Problem] = None
 
 
 class ExtSetManyDoc(Document):

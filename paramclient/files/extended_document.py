@@ -16,7 +16,6 @@ import math
 import os
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any, Final
 
 from paramclient.errors import FileError, UsageError
@@ -35,9 +34,10 @@ from paramclient.model.ext_params import (
     ext_type_name,
     ext_type_number,
 )
+from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.values import Trust, is_portable_name, shortest_float
 
-__all__ = ["ExtParamFile", "is_extended_file", "read_extended_file", "write_extended_file"]
+__all__ = ["ext_param_of_fields", "is_extended_file", "read_extended_file", "write_extended_file"]
 
 VERSION_KEY: Final = "paramclient_extended"
 """The key that marks such a document; its value is the version of the format."""
@@ -50,24 +50,6 @@ _marked: Final = re.compile(rb"""\A\s*(?:---\s*)?\{?\s*["']?paramclient_extended
 _WORDS: Final = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 
 
-@dataclass(frozen=True, slots=True)
-class ExtParamFile:
-    """The extended parameters of one component, of a file or to be written to one.
-
-    Attributes:
-        params: the parameters by name, in the order of the file.
-        system, component: MAVLink ids, or None.
-        at: time of the values in unix seconds, or None.
-        source: the file, or what the values are from, for messages.
-    """
-
-    params: Mapping[str, ExtParam]
-    system: int | None = None
-    component: int | None = None
-    at: float | None = None
-    source: str = ""
-
-
 def is_extended_file(path: str | os.PathLike[str]) -> bool:
     """Return whether an existing file begins as one of extended parameters.
 
@@ -77,7 +59,7 @@ def is_extended_file(path: str | os.PathLike[str]) -> bool:
     return _marked(read_bytes(os.fspath(path))[:200]) is not None
 
 
-def read_extended_file(path: str | os.PathLike[str]) -> ExtParamFile:
+def read_extended_file(path: str | os.PathLike[str]) -> ExtParamSet:
     """Read a file of extended parameters. Blocks until the disk has delivered it.
 
     Raises:
@@ -103,7 +85,7 @@ def read_extended_file(path: str | os.PathLike[str]) -> ExtParamFile:
 
 
 def write_extended_file(
-    path: str | os.PathLike[str], content: ExtParamFile, *, form: FileForm | None = None
+    path: str | os.PathLike[str], content: ExtParamSet, *, form: FileForm | None = None
 ) -> FileForm:
     """Write a file of extended parameters, and replace an existing one atomically.
 
@@ -133,7 +115,7 @@ def write_extended_file(
     return form
 
 
-def _head(content: ExtParamFile) -> dict[str, object]:
+def _head(content: ExtParamSet) -> dict[str, object]:
     about = {
         VERSION_KEY: EXT_VERSION,
         "system": content.system,
@@ -144,7 +126,7 @@ def _head(content: ExtParamFile) -> dict[str, object]:
     return {key: each for key, each in about.items() if each is not None}
 
 
-def _json_lines(content: ExtParamFile) -> Iterator[str]:
+def _json_lines(content: ExtParamSet) -> Iterator[str]:
     yield "{"
     for key, each in _head(content).items():
         yield f"  {json.dumps(key)}: {json.dumps(each)},"
@@ -157,7 +139,7 @@ def _json_lines(content: ExtParamFile) -> Iterator[str]:
     yield "}"
 
 
-def _yaml_lines(content: ExtParamFile) -> Iterator[str]:
+def _yaml_lines(content: ExtParamSet) -> Iterator[str]:
     for key, each in _head(content).items():
         yield f"{key}: {yaml_flow(each)}"
     yield "params:"
@@ -181,19 +163,24 @@ def _fields(param: ExtParam) -> dict[str, object]:
     return {"value": value, "type": kind}
 
 
-def _file(content: Mapping[str, Any], source: str) -> ExtParamFile:
+def _file(content: Mapping[str, Any], source: str) -> ExtParamSet:
     found = content["params"]
     if not isinstance(found, dict) or not found:
         raise ValueError("params must have parameters by name")
-    params = {name: _param(name, fields) for name, fields in found.items()}
+    params = {name: ext_param_of_fields(name, fields) for name, fields in found.items()}
     system, component = content.get("system"), content.get("component")
     for each in (system, component):
         if each is not None and not (isinstance(each, int) and 1 <= each <= 255):
             raise ValueError("system and component are numbers from 1 to 255")
-    return ExtParamFile(params, system, component, source=source)
+    return ExtParamSet(params, system, component, source=source)
 
 
-def _param(name: str, fields: object) -> ExtParam:
+def ext_param_of_fields(name: str, fields: object) -> ExtParam:
+    """Return the parameter that a document has under a name: `value` or `hex`, and `type`.
+
+    Raises:
+        ValueError: a field is not valid.
+    """
     if not isinstance(name, str) or not is_portable_name(name):
         raise ValueError(f"{name!r:.40} is no name of a parameter")
     if not isinstance(fields, dict) or not fields.keys() <= {"value", "hex", "type"}:

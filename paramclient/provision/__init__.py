@@ -3,6 +3,7 @@
 - `planning`: the values to write, their order, and the reason for each parameter that is not written.
 - `inspection`: read what a vehicle has; `prepare` and `verify`.
 - `apply_restore`: `apply` and `restore`; `execution` runs them, `results` holds their results.
+- `extended`: the same for extended parameters.
 - `fleet`: `apply_all` and `verify_all` for several vehicles.
 - `vehicle_params`: parameters of a vehicle or of the cache as a set.
 - `apply_rules`, `runner`: special parameters, long computations.
@@ -12,6 +13,14 @@ from __future__ import annotations
 
 from paramclient.provision.apply_restore import apply, restore
 from paramclient.provision.apply_rules import CATEGORIES
+from paramclient.provision.extended import (
+    ExtApplyResult,
+    ExtPlan,
+    apply_extended,
+    load_extended_state,
+    restore_extended,
+    verify_extended,
+)
 from paramclient.provision.fleet import Wanted, apply_all, verify_all
 from paramclient.provision.inspection import prepare, verify
 from paramclient.provision.planning import (
@@ -43,6 +52,8 @@ __all__ = [
     "ApplyRow",
     "ApplyStatus",
     "CATEGORIES",
+    "ExtApplyResult",
+    "ExtPlan",
     "FleetApplied",
     "FleetVerified",
     "MISSING",
@@ -58,10 +69,14 @@ __all__ = [
     "Wanted",
     "apply",
     "apply_all",
+    "apply_extended",
+    "load_extended_state",
     "overlay",
     "plan",
     "prepare",
     "restore",
+    "restore_extended",
     "verify",
     "verify_all",
+    "verify_extended",
 ]

@@ -11,7 +11,7 @@ from typing import Final, Self
 import anyio
 
 from paramclient.client.component import Component
-from paramclient.client.local import local
+from paramclient.client.local import local, wait_until_identified
 from paramclient.errors import LinkError, NoReply, UsageError, VehicleError
 from paramclient.model.params import copy_params
 from paramclient.model.paramset import ParamSet, WrittenParam
@@ -203,10 +203,7 @@ async def reread(component: Component, inspection: Inspection, names: Iterable[s
 
 async def wait_for_identity(component: Component) -> None:
     """Wait until the vehicle is identified, at most `SETUP_IDENTITY_TIMEOUT`, as the cache key requires."""
-    with anyio.move_on_after(SETUP_IDENTITY_TIMEOUT):
-        vehicle = local(component)
-        while vehicle.settled_identity is None:  # noqa: ASYNC110 - no event
-            await anyio.sleep(POLL_INTERVAL)
+    await wait_until_identified(local(component), SETUP_IDENTITY_TIMEOUT)
 
 
 async def prepare(

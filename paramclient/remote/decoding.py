@@ -9,11 +9,13 @@ from dataclasses import fields
 from types import NoneType
 from typing import Any, Final
 
+from paramclient.cache import SnapshotSummary
 from paramclient.client.stats import ClientStats
 from paramclient.documents.extended_param import ExtParamDoc
 from paramclient.documents.param import ParamDoc
 from paramclient.errors import LinkError, ParamClientError
 from paramclient.model.ext_params import ExtParam, ExtValue
+from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param, WireValue
 from paramclient.protocol.ext.fetch import ExtFetchResult
@@ -33,6 +35,8 @@ __all__ = [
     "ext_params_of",
     "ext_set_outcome_of",
     "ext_set_result_of",
+    "ext_snapshot_of",
+    "ext_state_of",
     "ext_value_as_sent",
     "fetch_result_of",
     "hash_of",
@@ -200,6 +204,34 @@ def set_outcome_of(document: Document, name: str, requested: WireValue, link: st
         return SetOutcome(name, requested, SetStatus(result.status), result)
     error = error_of(problem, status=problem["status"], link=link)
     return SetOutcome(name, requested, SetStatus(document["status"]), error=error)
+
+
+def ext_snapshot_of(document: Document, key: str) -> SnapshotSummary:
+    """Return a snapshot of extended parameters of the vehicle with this key, without its parameters."""
+    return SnapshotSummary(
+        int(document["id"]),
+        key,
+        int(document["component"]),
+        float(document["at"]),
+        str(document["reason"]),
+        int(document["size"]),
+        None,
+        bool(document["complete"]),
+    )
+
+
+def ext_state_of(document: Document, identity: Identity) -> ExtParamSet:
+    """Return an earlier state of the extended parameters of a vehicle."""
+    params = {name: ext_param_of({**each, "name": name}) for name, each in document["params"].items()}
+    at = document["at"]
+    return ExtParamSet(
+        params,
+        document["system"],
+        document["component"],
+        None if at is None else float(at),
+        str(document["source"]),
+        identity,
+    )
 
 
 def ext_value_as_sent(value: ExtValue) -> object:

@@ -8,10 +8,12 @@ from typing import Final
 
 import anyio
 
+from paramclient.cache import SnapshotSummary
 from paramclient.client.arguments import check_asked_name, check_requested_name
 from paramclient.client.extended_params import ExtChanges, ExtParams
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.model.ext_params import ExtParam, ExtSettable, ExtValue, check_ext_value
+from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.protocol.ext.fetch import ExtFetchResult
 from paramclient.protocol.ext.write_batch import ExtSetManyResult, ExtSetOutcome
 from paramclient.protocol.ext.writes import ExtSetResult
@@ -24,6 +26,8 @@ from paramclient.remote.decoding import (
     ext_fetch_result_of,
     ext_param_of,
     ext_set_outcome_of,
+    ext_snapshot_of,
+    ext_state_of,
     ext_value_as_sent,
 )
 from paramclient.remote.http import ServiceResponse
@@ -210,6 +214,38 @@ class RemoteExtParams(ExtParams):
         answer = await run_with_progress(fetch, None if progress is None else tell)
         with decode_errors(self._service.name):
             return ext_fetch_result_of(answer.document, self.params, anyio.current_time() - began)
+
+    async def store_snapshot(self, *, reason: str) -> int | None:
+        """See `ExtParams.store_snapshot`. The cache is that of the service."""
+        answer = await self._service.ask(
+            self._mirrored,
+            "extended/snapshots",
+            {"reason": reason},
+            None,
+            f"snapshot of {self._whose}",
+            is_write=True,
+        )
+        with decode_errors(self._service.name):
+            number = answer.document["snapshot"]
+            return None if number is None else int(number)
+
+    async def snapshots(self) -> list[SnapshotSummary]:
+        """See `ExtParams.snapshots`. The cache is that of the service."""
+        awaited = f"snapshots of {self._whose}"
+        answer = await self._service.ask(
+            self._mirrored, "extended/snapshots", None, None, awaited, method="GET"
+        )
+        key = self._mirrored.identity.key
+        with decode_errors(self._service.name):
+            return [ext_snapshot_of(each, key) for each in answer.document["snapshots"]]
+
+    async def load_state(self, when: float) -> ExtParamSet:
+        """See `ExtParams.load_state`. The cache is that of the service."""
+        body = {"snapshot": when} if isinstance(when, int) else {"at": when}
+        awaited = f"earlier state of {self._whose}"
+        answer = await self._service.ask(self._mirrored, "extended/state", body, None, awaited)
+        with decode_errors(self._service.name):
+            return ext_state_of(answer.document, self._mirrored.identity)
 
     def changes(self) -> ExtChanges:
         """See `ExtParams.changes`, and `RemoteComponent.changes` for the authors."""

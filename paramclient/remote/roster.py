@@ -258,7 +258,7 @@ class ServiceComponents:
         self,
         mirrored: MirroredComponent,
         what: str,
-        body: Mapping[str, Any],
+        body: Mapping[str, Any] | None,
         timeout: float | None,
         awaited: str,
         *,

@@ -28,7 +28,7 @@ class Service(Protocol):
         self,
         mirrored: MirroredComponent,
         what: str,
-        body: Mapping[str, Any],
+        body: Mapping[str, Any] | None,
         timeout: float | None,
         awaited: str,
         *,

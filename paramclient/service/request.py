@@ -39,7 +39,10 @@ TARGET_BYTES_MAX: Final = 8 * 1024
 SESSION_PATH: Final = "/api/v1/session"
 """Path of the sessions of browsers."""
 READING_POSTS: Final = frozenset(
-    {"diff", "fetch", "files", "find", "metadata", "plan", "read", "refreshed", "successor", "verify"}
+    {
+        *("diff", "fetch", "files", "find", "metadata", "plan", "read", "refreshed", "state", "successor"),
+        "verify",
+    }
 )
 """Last part of the paths whose POST changes nothing. All other POST requests, and methods other than GET,
 require write permission, so that a forgotten path is rejected."""
@@ -61,7 +64,7 @@ _LARGE_GETS: Final = frozenset(
 LARGE_RESPONSES: Final = {
     "GET": _LARGE_GETS,
     "HEAD": _LARGE_GETS,
-    "POST": frozenset({"diff", "files", "metadata", "plan", "verify"}),
+    "POST": frozenset({"diff", "files", "metadata", "plan", "state", "verify"}),
 }
 """Paths whose responses can have megabytes, by method: the last part of the path, or the one before an id."""
 BEARER_CHALLENGE: Final = [(b"www-authenticate", b'Bearer realm="paramclient"')]

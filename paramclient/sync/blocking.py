@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
-from paramclient.cache import ParamCache
+from paramclient.cache import ParamCache, SnapshotSummary
 from paramclient.client import events as asynchronous
 from paramclient.client.arguments import COMPONENT_TIMEOUT
 from paramclient.client.client import ParamClient as AsyncParamClient
@@ -22,6 +22,7 @@ from paramclient.client.signing import Signing
 from paramclient.client.stats import ClientStats
 from paramclient.links import Link
 from paramclient.model.ext_params import ExtParam, ExtSettable
+from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.identity import Identity
 from paramclient.model.params import ParamMap
 from paramclient.model.values import Encoding, Param, Settable, WireValue
@@ -1006,6 +1007,48 @@ class ExtParams(Wrapper[AsyncExtParams]):
             LinkError: the link failed, or the client was closed.
         """
         return self._thread.call_reporting(partial(self._wrapped.fetch_all, timeout=timeout), progress)
+
+    def store_snapshot(self, *, reason: str) -> int | None:
+        """Store a snapshot of the known parameters in the cache, as a restore point.
+
+        The values that were received before are in the cache and its history first.
+
+        Args:
+            reason: the reason, as text.
+
+        Returns:
+            The number of the snapshot; None if there is no cache.
+
+        Raises:
+            UsageError: no parameter is known.
+            CacheError: the cache cannot store it.
+            LinkError: the client was closed.
+        """
+        return self._thread.call(partial(self._wrapped.store_snapshot, reason=reason))
+
+    def snapshots(self) -> list[SnapshotSummary]:
+        """Return the snapshots of the component's extended parameters, the newest last.
+
+        Raises:
+            UsageError: there is no cache.
+            CacheError: the cache cannot be read.
+            LinkError: the client was closed.
+        """
+        return self._thread.call(self._wrapped.snapshots)
+
+    def load_state(self, when: float) -> ExtParamSet:
+        """Return an earlier state of the parameters, from the cache.
+
+        Args:
+            when: a float is a time, in unix seconds; an int is the number of a snapshot. See
+                `ParamCache.ext_state_at`.
+
+        Raises:
+            UsageError: there is no cache, or the time is not in unix seconds.
+            CacheError: there is no such state, or the cache cannot be read.
+            LinkError: the client was closed.
+        """
+        return self._thread.call(partial(self._wrapped.load_state, when))
 
     def changes(self) -> ExtChanges:
         """Return a stream of changes from now on, like `Component.changes`.

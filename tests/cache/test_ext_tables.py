@@ -17,11 +17,12 @@ import pytest
 from paramclient import ParamCache, Trust
 from paramclient.cache import ExtTableUpdate, StoredExtParam
 from paramclient.cache.cells import Damaged
-from paramclient.cache.operations import SaveExt
+from paramclient.cache.operations import SaveExt, StoreExtSnapshot
 from paramclient.cache.outbox import packed, unpacked
 from paramclient.cache.tables import HISTORY_ENTRIES_MAX
 from paramclient.errors import NotInCache, UnknownVehicle, UsageError
 from paramclient.model.ext_params import ExtParam, ExtParamType, ExtValue, encode_ext_value
+from paramclient.model.ext_paramset import ExtParamSet
 from tests.caches import NOW, PX4, stored, update, values, whole_table
 
 KINDS = ExtParamType
@@ -215,6 +216,119 @@ def test_a_copy_has_extended_parameters_too(path: Path, tmp_path: Path) -> None:
         assert values_in(copy) == {"A": 7, "B": "y"}
         assert [line[:2] for line in told_in(copy)] == [(1.0, "A"), (4.0, "B"), (5.0, "A")]
         assert cache.copy_to(copy).unchanged == 2
+
+
+def state_of(cache: ParamCache, when: float) -> dict[str, ExtValue]:
+    return {name: each.value for name, each in cache.ext_state_at(PX4.key, 100, when).params.items()}
+
+
+def test_snapshots_of_extended_parameters_are_apart_from_those_of_plain_ones(path: Path) -> None:
+    params = {
+        name: kept(name, value, index, kind) for index, (name, (kind, value)) in enumerate(EVERY_TYPE.items())
+    }
+    with ParamCache(path) as cache:
+        cache.save(update(stored("A", 1), component=100))
+        plain = cache.snapshot(PX4.key, 100, reason="plain")
+        made = cache.store_ext_snapshot(PX4, 100, ExtParamSet(params), reason="before apply", at=NOW + 1)
+        assert (made.component, made.size, made.hash, made.complete) == (100, len(params), None, True)
+        assert list(made.params.params.values()) == list(params.values())
+        assert made.params.identity == PX4
+        assert [each.id for each in cache.snapshots(PX4.key)] == [plain.id]
+        [summary] = cache.ext_snapshots(PX4.key)
+        assert (summary.id, summary.reason, summary.at) == (made.id, "before apply", NOW + 1)
+        assert cache.ext_snapshots(PX4.key, 1) == []
+        assert cache.ext_state_at(PX4.key, 100, made.id) == made.params
+        assert cache.ext_state_at(PX4.key, 100, NOW + 1) == made.params
+        with pytest.raises(NotInCache, match=f"no snapshot {plain.id} .*those kept are {made.id}$"):
+            cache.ext_state_at(PX4.key, 100, plain.id)
+        with pytest.raises(NotInCache, match=f"no snapshot {made.id} .*those kept are {plain.id}$"):
+            cache.state_at(PX4.key, 100, made.id)
+
+
+def test_a_snapshot_of_the_cached_extended_parameters(path: Path) -> None:
+    with ParamCache(path) as cache:
+        cache.save(update(stored("A", 1), component=1))
+        with pytest.raises(NotInCache, match="no extended parameters in the cache"):
+            cache.ext_snapshot(PX4.key, 1, reason="by hand")
+        cache.save_ext([learnt(A=1, B="x", complete=False)])
+        made = cache.ext_snapshot(PX4.key, 100, reason="by hand", at=NOW + 5)
+        cache.save_ext([learnt(A=2, at=NOW + 6)])
+        assert not made.complete
+        assert state_of(cache, made.id) == {"A": 1, "B": "x"}
+
+
+def test_extended_snapshots_are_bounded_apart_from_plain_ones(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("paramclient.cache.snapshots.SNAPSHOTS", 3)
+    monkeypatch.setattr("paramclient.cache.ext_snapshots.SNAPSHOTS", 3)
+    with ParamCache(path) as cache:
+        cache.save(update(stored("A", 1), component=100))
+        cache.save_ext([learnt(A=1)])
+        for number in range(5):
+            cache.snapshot(PX4.key, 100, reason="plain", at=NOW + number)
+            cache.ext_snapshot(PX4.key, 100, reason="extended", at=NOW + number)
+        assert [each.at - NOW for each in cache.snapshots(PX4.key)] == [2, 3, 4]
+        assert [each.at - NOW for each in cache.ext_snapshots(PX4.key)] == [2, 3, 4]
+
+
+def test_extended_parameters_at_an_earlier_time(path: Path) -> None:
+    with ParamCache(path) as cache:
+        cache.save_ext([learnt(A=1)])
+        with pytest.raises(NotInCache, match="never complete; there is no snapshot"):
+            state_of(cache, NOW)
+        cache.save_ext([learnt(A=1, B="x", at=NOW + 1, count=2, complete=True)])
+        cache.save_ext([learnt(A=2, at=NOW + 2), learnt(A=3, at=NOW + 3)])
+        cache.save_ext([learnt(at=NOW + 4, removed={"B": NOW + 4})])
+        cache.ext_snapshot(PX4.key, 100, reason="by hand", at=NOW + 5)
+        with pytest.raises(NotInCache, match=r"the history begins at .*; there is snapshot 1 of"):
+            state_of(cache, NOW + 0.5)
+        assert state_of(cache, NOW + 1) == {"A": 1, "B": "x"}
+        assert state_of(cache, NOW + 2.5) == {"A": 2, "B": "x"}
+        assert state_of(cache, NOW + 3) == {"A": 3, "B": "x"}
+        assert state_of(cache, NOW + 9) == {"A": 3}
+
+
+def test_earlier_states_end_with_the_dropped_history(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("paramclient.cache.ext_tables.HISTORY_ENTRIES_MAX", 3)
+    with ParamCache(path) as cache:
+        for number in range(6):
+            cache.save_ext([learnt(A=number, at=NOW + number, complete=True)])
+        assert [state_of(cache, NOW + number)["A"] for number in (2, 3, 4, 5)] == [2, 3, 4, 5]
+        with pytest.raises(NotInCache, match="the history begins at"):
+            state_of(cache, NOW + 1)
+
+
+def test_a_copy_has_the_snapshots_of_extended_parameters_too(path: Path, tmp_path: Path) -> None:
+    with ParamCache(path) as cache, ParamCache(tmp_path / "copy") as copy:
+        cache.save_ext([learnt(A=1, complete=True), learnt(A=2, at=NOW + 1)])
+        made = cache.ext_snapshot(PX4.key, 100, reason="by hand", at=NOW + 2)
+        assert cache.copy_to(copy).snapshots == 1
+        assert [each.reason for each in copy.ext_snapshots(PX4.key)] == ["by hand"]
+        assert copy.snapshots(PX4.key) == []
+        assert copy.ext_state_at(PX4.key, 100, NOW + 2).params == made.params.params
+        assert state_of(copy, NOW) == {"A": 1}
+        assert cache.copy_to(copy).unchanged == 1
+
+
+def test_queued_snapshots_come_back() -> None:
+    params = {name: kept(name, value, 3, kind) for name, (kind, value) in EVERY_TYPE.items()}
+    for operation in (
+        StoreExtSnapshot(PX4, 100, ExtParamSet(params), NOW, "before apply", False, 7),
+        StoreExtSnapshot(PX4.key, 100, None, NOW, "by hand"),
+    ):
+        assert unpacked(packed(operation)) == operation
+
+
+def test_a_damaged_snapshot_of_extended_parameters_is_an_error(path: Path) -> None:
+    with ParamCache(path) as cache:
+        cache.save_ext([learnt(A=1)])
+        made = cache.ext_snapshot(PX4.key, 100, reason="by hand")
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("UPDATE snapshot SET params = x'00'")
+        connection.commit()
+    with ParamCache(path) as cache, pytest.raises(NotInCache, match="is damaged: it is not what was written"):
+        cache.ext_state_at(PX4.key, 100, made.id)
 
 
 def test_queued_writes_come_back() -> None:

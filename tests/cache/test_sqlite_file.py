@@ -120,6 +120,7 @@ def make_older(path: Path, version: int) -> None:
     with connect(path) as connection:
         for table in ("ext_param", "ext_history", "ext_table"):
             connection.execute(f"DROP TABLE {table}")
+        connection.execute("ALTER TABLE snapshot DROP COLUMN is_extended")
         connection.execute("ALTER TABLE component DROP COLUMN source")
         connection.execute(f"PRAGMA user_version = {version}")
         if version == 4:

@@ -74,6 +74,8 @@ OF_A_FILE = {
     # damage of a file, and what needs no store
     "test_damage_is_noticed",
     "test_queued_writes_come_back",
+    "test_queued_snapshots_come_back",
+    "test_a_damaged_snapshot_of_extended_parameters_is_an_error",
     "test_a_queued_write_that_is_none_is_damaged",
 }
 

@@ -206,6 +206,93 @@ def test_apply_tells_what_it_cannot_do(command: Command, reach: Put, tmp_path: P
     assert (wrong.code, "it has the parameters of component 100" in wrong.err) == (2, True)
 
 
+def test_restore_undoes_the_last_apply(command: Command, reach: Put, tmp_path: Path) -> None:
+    camera = small()
+    before = camera.ext_values
+    url = reach(camera)
+    file, backup = tmp_path / "camera.yaml", tmp_path / "before.yaml"
+    file.write_text(
+        "paramclient_extended: 1\ncomponent: 100\nparams:\n"
+        '  CAM_NAME: {value: Rear, type: CUSTOM}\n  CAM_KEY: {hex: "01", type: CUSTOM}\n'
+    )
+    assert command("apply", url, file, *CAMERA, "--backup", backup).code == 0
+    assert camera.ext_values["CAM_NAME"] == "Rear"
+    again = command("apply", url, file, *CAMERA, "--backup", backup)
+    assert (again.code, "exists" in again.err) == (2, True)
+    command("set", url, *CAMERA, "CAM_MODE", 7)
+    restored = command("restore", url, backup, *CAMERA)
+    assert (restored.code, camera.ext_values) == (0, before), restored.err
+    assert command("restore", url, *CAMERA, "--include", "calibration").code == 2
+
+
+def test_restore_from_the_cache(command: Command, put: Put, tmp_path: Path) -> None:
+    camera = small()
+    before = camera.ext_values
+    url = put(camera)
+    empty = command("restore", url, *CAMERA)
+    assert (empty.code, "no snapshot from before an apply" in empty.err) == (5, True), empty.err
+    file = tmp_path / "camera.yaml"
+    file.write_text("paramclient_extended: 1\nparams:\n  CAM_NAME: {value: Rear, type: CUSTOM}\n")
+    assert command("apply", url, file, *CAMERA).code == 0
+    [kept] = command("history", 1, "--extended", "--snapshots").rows[1:]
+    assert (kept[0], kept[2:4], kept[-1]) == ("1", ["100", "4"], "before apply")
+    dry = command("restore", url, *CAMERA, "--dry-run")
+    assert (dry.code, dry.rows[1:]) == (1, [["CAM_NAME", "Rear", "Front"]])
+    assert "the state: 4 extended parameters from snapshot 1 of " in dry.err
+    restored = command("restore", url, *CAMERA)
+    assert (restored.code, camera.ext_values) == (0, before), restored.err
+    assert restored.rows[1:] == [["CAM_NAME", "Front", "Front", "accepted"]]
+    undone = command("restore", url, 2, *CAMERA, "--extended")
+    assert (undone.code, camera.ext_values["CAM_NAME"]) == (0, "Rear"), undone.err
+    assert command("restore", url, 99, *CAMERA).code == 5
+    assert command("restore", put(small()), *CAMERA, "--no-cache").code == 2
+
+
+def test_a_cached_table_is_applied(command: Command, put: Put) -> None:
+    camera = small()
+    url = put(camera)
+    assert command("fetch", url, *CAMERA).code == 0
+    camera.set_ext_param("CAM_NAME", "Rear")
+    done = command("apply", url, "cache:1", *CAMERA, "--extended")
+    assert (done.code, camera.ext_values["CAM_NAME"]) == (0, "Front"), done.err
+    assert command("verify", url, "cache:1", *CAMERA, "--extended").code == 0
+
+
+def test_an_unknown_name_does_not_stop_the_other_values(command: Command, reach: Put) -> None:
+    camera = small()
+    done = command("set", reach(camera), *CAMERA, "CAM_NAM", "x", "CAM_MODE", 5, "CAM_NAME", "Rear")
+    assert done.code == 1
+    assert done.rows[1:] == [
+        ["CAM_NAM", "x", "refused"],
+        ["CAM_MODE", "5", "5", "accepted"],
+        ["CAM_NAME", "Rear", "Rear", "accepted"],
+    ]
+    assert "1/100 has no CAM_NAM" in done.err
+    assert (camera.ext_values["CAM_MODE"], camera.ext_values["CAM_NAME"]) == (5, "Rear")
+
+
+def test_names_may_be_patterns_and_in_lower_case(command: Command, reach: Put) -> None:
+    url = reach(small())
+    found = command("get", url, *CAMERA, "cam_n*", "CAM_EV", "NO_*")
+    assert (found.code, [row[0] for row in found.rows[1:]]) == (1, ["CAM_NAME", "CAM_EV"])
+    assert "1/100 has no extended parameter that matches NO_*" in found.err
+    assert command("fetch", url, *CAMERA).code == 0
+    near = command("get", url, *CAMERA, "CAM_*", "CAM_NAMES")
+    assert "Did you mean CAM_NAME" in near.err
+
+
+def test_bytes_are_in_the_json_of_set(command: Command, reach: Put) -> None:
+    url = reach(small())
+    [done] = command("set", url, *CAMERA, "CAM_KEY", "hex:00ff", "--json").json["results"]
+    assert (done["requested"], done["requested_hex"], done["actual_hex"]) == (None, "00ff", "00ff")
+
+
+def test_links_of_cameras_are_compared_without_an_option(command: Command, put: Put) -> None:
+    url = put(small())
+    same = command("diff", url, url, *CAMERA)
+    assert (same.code, same.err.count("4 extended parameters")) == (0, 2), same.err
+
+
 def test_cached_extended_parameters_are_shown_offline(command: Command, put: Put) -> None:
     url = put(Air.symmetric([PX4Vehicle(table={"A": 1}), small()]))
     assert command("fetch", url).code == 0
@@ -267,7 +354,8 @@ def test_the_history_of_extended_parameters(command: Command, put: Put) -> None:
     assert len(command("history", 1, "CAM_NAME", "--extended").rows) == 2
     document = command("history", 1, "--extended", "--limit", 1, "--json").json
     assert [(each["name"], each["new"]["hex"]) for each in document["history"]] == [("CAM_KEY", "01")]
-    assert command("history", 1, "--extended", "--snapshots").code == 2
+    assert command("history", 1, "--extended", "--snapshots").rows[1:] == []
+    assert len(command("history", 1, "cam_*", "NO_SUCH", "--extended").rows) == 3
     assert command("history", 1).rows[1:] == []
 
 

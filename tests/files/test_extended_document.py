@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 from paramclient.errors import FileError
 from paramclient.files import read_file
 from paramclient.files.extended_document import (
-    ExtParamFile,
     is_extended_file,
     read_extended_file,
     write_extended_file,
 )
 from paramclient.model.ext_params import ExtParam, ExtParamType
+from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.values import Trust
 from paramclient.sim import Camera
 
@@ -53,7 +53,7 @@ def every_kind() -> dict[str, ExtParam]:
 def test_a_written_file_reads_back_unchanged(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"camera.{ending}"
     params = every_kind()
-    write_extended_file(path, ExtParamFile(params, 1, 100, 1_700_000_000.0, "link sim:camera"))
+    write_extended_file(path, ExtParamSet(params, 1, 100, 1_700_000_000.0, "link sim:camera"))
     assert is_extended_file(path)
     found = read_extended_file(path)
     assert dict(found.params) == params
@@ -75,7 +75,7 @@ def test_any_custom_value_comes_back(
 ) -> None:
     path = tmp_path_factory.getbasetemp() / f"any.{ending}"
     param = cached("A", raw[:128])
-    write_extended_file(path, ExtParamFile({"A": param}))
+    write_extended_file(path, ExtParamSet({"A": param}))
     assert read_extended_file(path).params["A"] == param
 
 
@@ -83,25 +83,25 @@ def test_any_custom_value_comes_back(
 def test_formats_that_cannot_hold_them(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"camera.{ending}"
     with pytest.raises(FileError, match=r"cannot hold extended parameters; write \.json or \.yaml"):
-        write_extended_file(path, ExtParamFile(every_kind()))
+        write_extended_file(path, ExtParamSet(every_kind()))
     assert not path.exists()
 
 
 def test_nothing_is_written_without_parameters(tmp_path: Path) -> None:
     with pytest.raises(FileError, match="no parameters"):
-        write_extended_file(tmp_path / "a.json", ExtParamFile({}))
+        write_extended_file(tmp_path / "a.json", ExtParamSet({}))
 
 
 def test_the_two_kinds_of_files_are_told_apart(tmp_path: Path) -> None:
     plain, extended = tmp_path / "plain.yaml", tmp_path / "camera.yaml"
     plain.write_text("paramclient: 1\nsets:\n  - params:\n      A: {value: 1, type: INT32}\n")
-    write_extended_file(extended, ExtParamFile(every_kind()))
+    write_extended_file(extended, ExtParamSet(every_kind()))
     assert not is_extended_file(plain)
     with pytest.raises(FileError, match="paramclient_extended is missing"):
         read_extended_file(plain)
     with pytest.raises(FileError, match="it has extended parameters, and plain ones are expected"):
         read_file(extended)
-    write_extended_file(tmp_path / "camera.json", ExtParamFile(every_kind()))
+    write_extended_file(tmp_path / "camera.json", ExtParamSet(every_kind()))
     with pytest.raises(FileError, match="it has extended parameters, and plain ones are expected"):
         read_file(tmp_path / "camera.json")
 

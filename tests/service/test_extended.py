@@ -355,3 +355,73 @@ async def told(heard: Heard) -> list[dict[str, Any]]:
 
 def done_param(hub: Hub, name: str) -> ExtParam:
     return hub.followed[0].extended.ext.params[name]
+
+
+@swiftly
+async def test_a_set_up_over_http(tmp_path: Path) -> None:
+    camera = Camera({"MODE": 1, "NAME": "Front", "KEY": b"\xff\0\xfe", "EV": 0.5}, failing=["EV"])
+    before = camera.ext_values
+    async with service(camera, cache=tmp_path / "cache") as (_, browser):
+        await met(browser, system=1, component=100)
+        wanted: dict[str, Any] = {
+            "MODE": {"type": "INT32", "value": 2},
+            "KEY": {"type": "CUSTOM", "hex": "00ff"},
+            "EV": {"type": "REAL32", "value": 2.5},
+            "NAME": {"type": "INT32", "value": 5},
+            "LOST": {"type": "CUSTOM", "value": "x"},
+        }
+        plan = (await browser.post(f"{E}/plan", json={"wanted": wanted})).json()
+        assert list(plan["changes"]) == ["MODE", "KEY", "EV"]
+        assert (plan["is_met"], plan["missing"], plan["mistyped"]) == (False, ["LOST"], ["NAME"])
+        assert camera.ext_values == before
+        done = (await browser.post(f"{E}/apply", json={"wanted": wanted})).json()
+        assert {name: each["status"] for name, each in done["results"].items()} == {
+            "MODE": "accepted",
+            "KEY": "accepted",
+            "EV": "refused",
+        }
+        assert done["results"]["EV"]["problem"]["error"] == "SetFailed"
+        assert (done["complete"], done["different"]) == (False, ["EV"])
+        assert (camera.ext_values["MODE"], camera.ext_values["KEY"]) == (2, b"\0\xff")
+        listed = (await browser.get(f"{E}/snapshots")).json()["snapshots"]
+        assert [(each["id"], each["reason"], each["size"]) for each in listed] == [
+            (done["snapshot"], "before apply", 4)
+        ]
+        made = await browser.post(f"{E}/snapshots", json={"reason": "by hand"})
+        assert (made.status_code, made.json()["snapshot"] > done["snapshot"]) == (201, True)
+        state = (await browser.post(f"{E}/state", json={"snapshot": made.json()["snapshot"]})).json()
+        assert (state["component"], state["params"]["MODE"]["value"]) == (100, 2)
+        restored = (await browser.post(f"{E}/restore", json={})).json()
+        assert (restored["complete"], camera.ext_values) == (True, before)
+        history = (await browser.get(f"{E}/history")).json()["history"]
+        assert "for" in history[-1]["by"], "the author is the one of the request"
+        problem(await browser.post(f"{E}/restore", json={"snapshot": 99}), 404, "unknown-state")
+        problem(await browser.post(f"{E}/restore", json={"snapshot": 1, "at": 5}), 422, "invalid-request")
+        bad = {"wanted": {"MODE": {"type": "INT32", "value": "text"}}}
+        problem(await browser.post(f"{E}/apply", json=bad), 422, "usage")
+
+
+@swiftly
+async def test_a_service_without_a_cache_has_no_earlier_states() -> None:
+    async with service(Camera({"A": 1})) as (_, browser):
+        await met(browser, system=1, component=100)
+        problem(await browser.get(f"{E}/snapshots"), 422, "usage")
+        wanted = {"A": {"type": "INT32", "value": 2}}
+        done = (await browser.post(f"{E}/apply", json={"wanted": wanted})).json()
+        assert (done["complete"], done["snapshot"]) == (True, None)
+
+
+@swiftly
+async def test_only_writers_may_restore(tmp_path: Path) -> None:
+    async with Hub([Camera({"A": 1})], cache=tmp_path / "cache", fetches=False) as hub:
+        app = create_app(hub, Settings(access=AccessSettings(read_only=True)))
+        async with a_browser(app) as browser:
+            await met(browser, system=1, component=100)
+            wanted = {"A": {"type": "INT32", "value": 1}}
+            for path, body in (
+                ("apply", {"wanted": wanted}),
+                ("restore", {}),
+                ("snapshots", {"reason": "x"}),
+            ):
+                problem(await browser.post(f"{E}/{path}", json=body), 403, "read-only")
+            assert (await browser.post(f"{E}/plan", json={"wanted": wanted})).json()["is_met"]

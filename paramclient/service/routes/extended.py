@@ -2,29 +2,53 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Final
+from typing import Annotated, Final, Self
 
 import anyio
 from fastapi import APIRouter, Depends, Query, Request, Response
-from pydantic import Field, StrictInt
+from pydantic import Field, StrictInt, model_validator
 
 from paramclient.documents.document import Body, Document, InParts
 from paramclient.documents.extended_param import ExtParamDoc
-from paramclient.documents.extended_results import ExtFetchResultDoc, ExtSetManyDoc, ExtSetResultDoc
+from paramclient.documents.extended_results import (
+    ExtApplyResultDoc,
+    ExtFetchResultDoc,
+    ExtPlanDoc,
+    ExtSetManyDoc,
+    ExtSetResultDoc,
+    ExtStateDoc,
+    StoredExtSnapshotDoc,
+)
+from paramclient.documents.history import SnapshotsDoc
 from paramclient.documents.job import JobDoc
 from paramclient.documents.results import NotSetDoc
 from paramclient.errors import ParamClientError, UnknownParameter, UsageError
+from paramclient.files.extended_document import ext_param_of_fields
 from paramclient.model.ext_params import EXT_VALUE_SIZE, ExtParamType, ExtValue, check_ext_value
+from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.patterns import NameChoice
 from paramclient.model.similar_names import did_you_mean, nearest_names
 from paramclient.model.values import check_name
 from paramclient.protocol.ext.write_batch import ExtSetManyResult, ExtSetOutcome
 from paramclient.protocol.params.write_batch import SetStatus
+from paramclient.provision import (
+    ExtApplyResult,
+    apply_extended,
+    load_extended_state,
+    restore_extended,
+    verify_extended,
+)
 from paramclient.service.followed_component import FollowedComponent
-from paramclient.service.param_sources import PATTERNS_MAX, REQUEST_VALUES_MAX, Pattern
+from paramclient.service.param_sources import (
+    PATTERNS_MAX,
+    REQUEST_VALUES_MAX,
+    Number,
+    Pattern,
+    Timestamp,
+)
 from paramclient.service.problems import problem_of
 from paramclient.service.request_body import BodyRoute
-from paramclient.service.responses import JSON, streamed_response
+from paramclient.service.responses import JSON, document_response, streamed_response
 from paramclient.service.route_context import (
     Finite,
     HubArgument,
@@ -101,6 +125,75 @@ class ExtWriteManyRequest(Body):
     values: Annotated[dict[Name, ExtValueInput], InParts, Field(min_length=1, max_length=REQUEST_VALUES_MAX)]
     durable: Durable = False
     timeout_s: Seconds = None
+
+
+class WantedExtParam(Body):
+    """A wanted value: a number, or text; or the bytes in `hex`, as in a file of extended parameters."""
+
+    type: Annotated[str, Field(max_length=20)]
+    value: StrictInt | Finite | Annotated[str, Field(max_length=EXT_VALUE_SIZE)] | None = None
+    hex: Annotated[str, Field(pattern="^([0-9a-fA-F]{2}){0,128}$")] | None = None
+
+
+class ExtPlanRequest(Body):
+    """Wanted extended parameters by name."""
+
+    wanted: Annotated[dict[Name, WantedExtParam], InParts, Field(min_length=1, max_length=REQUEST_VALUES_MAX)]
+    timeout_s: Seconds = None
+
+    @property
+    def wanted_set(self) -> ExtParamSet:
+        """The wanted parameters.
+
+        Raises:
+            UsageError: a value or type is not valid.
+        """
+        try:
+            return ExtParamSet(
+                {
+                    name: ext_param_of_fields(name, each.model_dump(exclude_none=True))
+                    for name, each in self.wanted.items()
+                }
+            )
+        except ValueError as error:
+            raise UsageError(str(error)) from None
+
+
+class ExtApplyRequest(ExtPlanRequest):
+    """Wanted extended parameters, with options."""
+
+    durable: Durable = False
+
+
+class EarlierState(Body):
+    """An earlier state: a snapshot, a time, or without both the state before the last apply."""
+
+    snapshot: Number | None = None
+    at: Timestamp | None = None
+
+    @model_validator(mode="after")
+    def _is_one(self) -> Self:
+        if self.snapshot is not None and self.at is not None:
+            raise ValueError("`snapshot` and `at` exclude each other")
+        return self
+
+    @property
+    def when(self) -> int | float | None:
+        """The number of the snapshot, the time, or None."""
+        return self.at if self.snapshot is None else self.snapshot
+
+
+class ExtRestoreRequest(EarlierState):
+    """The state to restore, with options."""
+
+    durable: Durable = False
+    timeout_s: Seconds = None
+
+
+class SnapshotRequest(Body):
+    """Reason of a snapshot."""
+
+    reason: Annotated[str, Field(min_length=1, max_length=200)]
 
 
 class ExtFetchRequest(Body):
@@ -219,6 +312,88 @@ async def fetch_extended(
     result = await wait_for_job(request, job)
     assert isinstance(result, ExtFetchResultDoc)
     return result
+
+
+@router.get("/snapshots")
+async def extended_snapshots(request: Request, target: Target) -> SnapshotsDoc:
+    """Return the snapshots of the extended parameters of a component, the newest last."""
+    kept = await run_until_disconnect(request, target.extended.ext.snapshots)
+    return SnapshotsDoc.of(kept, exact=True)
+
+
+@router.post("/snapshots", status_code=201, dependencies=[Depends(require_write)])
+async def create_extended_snapshot(
+    request: Request, target: Target, body: SnapshotRequest
+) -> StoredExtSnapshotDoc:
+    """Create a snapshot of the known extended parameters of a component."""
+    ext = target.extended.ext
+    number = await run_until_disconnect(request, lambda: ext.store_snapshot(reason=body.reason))
+    return StoredExtSnapshotDoc(snapshot=number)
+
+
+@router.post("/state", response_model=ExtStateDoc)
+async def extended_state(request: Request, hub: HubArgument, target: Target, body: EarlierState) -> Response:
+    """Return the extended parameters of a component as they were: of a snapshot, or at a time."""
+
+    async def work() -> Response:
+        state = await load_extended_state(target.component, body.when)
+        return await document_response(hub.run_in_file_thread, lambda: ExtStateDoc.of(state))
+
+    return await run_until_disconnect(request, work)
+
+
+@router.post("/plan")
+async def plan_extended(request: Request, target: Target, body: ExtPlanRequest) -> ExtPlanDoc:
+    """Compare a component with wanted extended parameters. Nothing is written."""
+
+    async def work() -> ExtPlanDoc:
+        return ExtPlanDoc.of(await verify_extended(target.component, body.wanted_set, timeout=body.timeout_s))
+
+    return await run_until_disconnect(request, work, target)
+
+
+@router.post("/apply", dependencies=[Depends(require_write)])
+async def apply_extended_(request: Request, target: Target, body: ExtApplyRequest) -> ExtApplyResultDoc:
+    """Write the wanted extended parameters that differ, and verify them by another download."""
+    asker = author_of(request)
+
+    async def work() -> ExtApplyResultDoc:
+        result = await apply_extended(
+            target.component, body.wanted_set, durable=body.durable, timeout=body.timeout_s, asker=asker
+        )
+        return _applied(result)
+
+    return await run_until_disconnect(request, work, target)
+
+
+@router.post("/restore", dependencies=[Depends(require_write)])
+async def restore_extended_(request: Request, target: Target, body: ExtRestoreRequest) -> ExtApplyResultDoc:
+    """Restore an earlier state of the extended parameters of a component."""
+    asker = author_of(request)
+
+    async def work() -> ExtApplyResultDoc:
+        state = await load_extended_state(target.component, body.when)
+        result = await restore_extended(
+            target.component, state, durable=body.durable, timeout=body.timeout_s, asker=asker
+        )
+        return _applied(result)
+
+    return await run_until_disconnect(request, work, target)
+
+
+def _applied(result: ExtApplyResult) -> ExtApplyResultDoc:
+    """Return the document of a result."""
+    return ExtApplyResultDoc(
+        system=result.plan.system,
+        component=result.plan.component,
+        complete=result.complete,
+        plan=ExtPlanDoc.of(result.plan),
+        results={outcome.name: _document_of(outcome) for outcome in result.outcomes},
+        different=list(result.different),
+        snapshot=result.snapshot,
+        elapsed_s=round(result.elapsed, 4),
+        problem=None if result.error is None else problem_of(result.error),
+    )
 
 
 async def _read(
