@@ -210,6 +210,10 @@ class ParamCache:
 
         return self._store.read(work)
 
+    def ext_sizes(self) -> dict[tuple[str, int], int]:
+        """Return the number of extended parameters of each component that has some, by key and component."""
+        return self._store.read(lambda transaction: transaction.ext_sizes())
+
     def ext_history(
         self,
         vehicle: str,

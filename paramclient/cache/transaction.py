@@ -581,6 +581,14 @@ class Transaction(ABC):
             (owner, state.count, int(state.complete), state.checksum, state.known_since),
         )
 
+    def ext_sizes(self) -> dict[tuple[str, int], int]:
+        """Return the number of extended parameters of each table that has some, by key and component."""
+        found = self._all(
+            "SELECT vehicle, component, count(*) FROM ext_param JOIN component c ON c.id = owner"
+            " GROUP BY vehicle, component"
+        )
+        return {(key, component): size for key, component, size in (cells(row, "sii") for row in found)}
+
     def ext_rows(self, owner: int) -> dict[str, StoredExtParam]:
         """Return the extended parameters of a table by name, in the order of their indices, then names.
 

@@ -112,7 +112,7 @@ def show(
 
         print_document(CachedTablesDoc(components=[view.document() for view in views]))
     elif is_list:
-        _print_summaries(summaries, nicknames)
+        _print_summaries(summaries, nicknames, {})
         say("paramclient show VEHICLE prints the table of one vehicle, by its system id or its key")
     elif not summaries:
         say(f"the cache {printable(cache.place)} is empty")
@@ -127,14 +127,17 @@ def show(
 def cache_list(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
     """List the tables in the cache, most recently received vehicles first."""
     with _open(options) as cache:
-        summaries, names = cache.components(), _names_by_key(cache)
+        summaries, names, extended = cache.components(), _names_by_key(cache), cache.ext_sizes()
     if options.json:
         from paramclient.documents.cached import CachedListDoc, CachedSummaryDoc  # only here: loads pydantic
 
-        components = [CachedSummaryDoc.of(each, names.get(each.key)) for each in summaries]
+        components = [
+            CachedSummaryDoc.of(each, names.get(each.key), extended.get((each.key, each.component)))
+            for each in summaries
+        ]
         print_document(CachedListDoc(path=cache.place, components=components))
     elif summaries:
-        _print_summaries(summaries, names)
+        _print_summaries(summaries, names, extended)
     else:
         say(f"the cache {printable(cache.place)} is empty")
     return ExitCode.DONE
@@ -368,25 +371,26 @@ def _names_by_key(cache: ParamCache) -> dict[str, str]:
     return {key: nickname for nickname, key in cache.nicknames.items()}
 
 
-def _print_summaries(summaries: Sequence[CachedSummary], names: Mapping[str, str]) -> None:
-    """Print a line for each table; with the nickname if any vehicle has one."""
+def _print_summaries(
+    summaries: Sequence[CachedSummary], names: Mapping[str, str], extended: Mapping[tuple[str, int], int]
+) -> None:
+    """Print a line for each table; with nickname and number of extended parameters if any table has one."""
     rows = (
         (
             *([names.get(each.key)] if names else []),
             f"{each.system}/{each.component}",
             autopilot_name(each.autopilot),
             each.size,
+            *([extended.get((each.key, each.component))] if extended else []),
             hash_text(each.hash),
             _synced(each),
             each.key,
         )
         for each in summaries
     )
-    print_table(
-        [*(["name"] if names else []), "component", "autopilot", "params", "hash", "synced", "key"],
-        rows,
-        right="params",
-    )
+    columns = [*(["name"] if names else []), "component", "autopilot", "params"]
+    columns += [*(["extended"] if extended else []), "hash", "synced", "key"]
+    print_table(columns, rows, right="params extended")
 
 
 def _synced(table: CachedSummary) -> str | None:

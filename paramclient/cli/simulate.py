@@ -131,12 +131,12 @@ _Id = Annotated[int, Parameter(validator=Number(gte=1, lte=255))]
 
 
 async def sim(
-    autopilot: Literal["px4", "ardupilot"],
+    autopilot: Literal["px4", "ardupilot", "camera"],
     /,
     *,
     link: str = "udpout:127.0.0.1:14550",
     system: _Id = 1,
-    component: _Id = 1,
+    component: Annotated[int | None, Parameter(validator=Number(gte=1, lte=255))] = None,
     param_error: bool = False,
     signing_key: Path | None = None,
     usb: bool = False,
@@ -146,15 +146,20 @@ async def sim(
     """Run a simulated vehicle for other programs, until Ctrl-C.
 
     Args:
-        autopilot: The firmware to simulate.
+        autopilot: The firmware to simulate, or a camera with extended parameters.
         link: The link to send to or to listen on. With port 0, the system chooses the port, which is printed.
         system: System id of the vehicle.
-        component: Component id of the vehicle.
+        component: Component id of the vehicle. Default: 1; 100 for a camera.
         param_error: Answer invalid requests with PARAM_ERROR, as newer firmware does.
         signing_key: A file with the signing key: the vehicle signs its frames and requires signed ones.
         usb: With a key, also accept unsigned frames, as ArduPilot does over USB.
     """
-    from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle  # only here: other subcommands need none
+    from paramclient.sim import (  # only here: other subcommands need none
+        Air,
+        ArduPilotVehicle,
+        Camera,
+        PX4Vehicle,
+    )
 
     spec = parse_link(link)
     if spec.kind is LinkKind.SIM:
@@ -163,14 +168,15 @@ async def sim(
             "udpout:127.0.0.1:14550"
         )
     real = create_link(spec)
-    make = PX4Vehicle if autopilot == "px4" else ArduPilotVehicle
+    kinds = {"px4": PX4Vehicle, "ardupilot": ArduPilotVehicle, "camera": Camera}
     options = vehicle_faults.options
     options.update({"param_error": param_error, "stream": real.is_stream, "usb": usb})
     if signing_key is not None:
         options.update({"signing_key": read_key(signing_key), "signing_timestamp": timestamp_now()})
-    vehicle = make(system=system, component=component, **options)
+    chosen = (100 if autopilot == "camera" else 1) if component is None else component
+    vehicle = kinds[autopilot](system=system, component=chosen, **options)
     air = Air.symmetric([vehicle], others=vehicle_faults.apply_to(vehicle), **asdict(faults))
-    announcement = _Announcement(f"{autopilot} {system}/{component}", spec)
+    announcement = _Announcement(f"{autopilot} {system}/{chosen}", spec)
     await serve_endpoint(air, real, task_status=announcement)
 
 

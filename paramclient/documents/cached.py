@@ -51,10 +51,19 @@ class CachedSummaryDoc(Document):
     updated_at: str | None
     source: Maybe[str] = None
     nickname: Maybe[str] = None
+    extended: Maybe[int] = None
 
     @classmethod
-    def of(cls, summary: CachedSummary, nickname: str | None = None) -> CachedSummaryDoc:
-        """Return the document of a `CachedSummary` of a vehicle with this nickname, or None."""
+    def of(
+        cls, summary: CachedSummary, nickname: str | None = None, extended: int | None = None
+    ) -> CachedSummaryDoc:
+        """Return the document of a `CachedSummary`.
+
+        Args:
+            summary: the table.
+            nickname: the nickname of the vehicle, or None.
+            extended: the number of extended parameters of the component, or None.
+        """
         return cls(
             key=summary.key,
             system=summary.system,
@@ -69,6 +78,7 @@ class CachedSummaryDoc(Document):
             updated_at=time_or_none(summary.updated_at),
             source=summary.source,
             nickname=nickname,
+            extended=extended,
         )
 
 

@@ -151,6 +151,17 @@ def simulated(*arguments: str) -> Iterator[str]:
 # fetch
 
 
+def test_a_simulated_camera_is_fetched_and_written_over_udp(live_command: Command) -> None:
+    camera = ("--component", 100, "--no-cache")
+    with simulated("camera", "--loss", "0.05", "--delay", "0.02", "--seed", "1") as url:
+        found = live_command("fetch", url, *camera, "--json")
+        assert found.code == 0, found.err
+        assert (found.json["count"], found.json["missing"]) == (16, [])
+        assert live_command("set", url, *camera, "CAM_NAME", "Rear", "CAM_CLOCK", 2**62 + 1).code == 0
+        params = live_command("get", url, *camera, "CAM_NAME", "CAM_CLOCK", "--json").json["extended"]
+        assert [each["value"] for each in params.values()] == ["Rear", 2**62 + 1]
+
+
 def test_fetch_prints_one_object_with_exactly_these_keys(command: Command, tmp_path: Path) -> None:
     cache = tmp_path / "cache.sqlite3"
     cold = command("fetch", "sim:px4", "--json", "--cache", cache)

@@ -293,6 +293,17 @@ def test_links_of_cameras_are_compared_without_an_option(command: Command, put: 
     assert (same.code, same.err.count("4 extended parameters")) == (0, 2), same.err
 
 
+def test_cache_list_has_the_number_of_extended_parameters(command: Command, put: Put) -> None:
+    url = put(Air.symmetric([PX4Vehicle(table={"A": 1}), small()]))
+    assert command("fetch", url).code == 0
+    assert "extended" not in command("cache", "list").rows[0]
+    assert command("fetch", url, *CAMERA).code == 0
+    listed = command("cache", "list")
+    assert {row[0]: row[3] for row in listed.rows[1:] if row[0] == "1/100"} == {"1/100": "4"}, listed.out
+    components = command("cache", "list", "--json").json["components"]
+    assert {each["component"]: each.get("extended") for each in components} == {1: None, 100: 4}
+
+
 def test_cached_extended_parameters_are_shown_offline(command: Command, put: Put) -> None:
     url = put(Air.symmetric([PX4Vehicle(table={"A": 1}), small()]))
     assert command("fetch", url).code == 0

@@ -4,6 +4,7 @@ holds."""
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from typing import Any
 
 from hypothesis import HealthCheck, settings
@@ -13,8 +14,10 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from paramclient.errors import NoReply, SetFailed, ValueNotApplied, ValueUnsupported
 from paramclient.model.ext_params import ExtParamType, ExtValue
 from paramclient.protocol.ext.fetch import ExtFetch
+from paramclient.protocol.ext.write_batch import ExtWriteBatch
 from paramclient.protocol.ext.writes import ExtWrite
 from paramclient.protocol.params.reads import ValueRead
+from paramclient.protocol.params.write_batch import SetStatus
 from paramclient.protocol.requests.operation import Operation
 from paramclient.sim import Air, Camera, FaultyLink
 from tests.protocol.ext.camera import CameraSession
@@ -74,11 +77,20 @@ class Extended(RuleBasedStateMachine):
         self.open: list[Operation[Any]] = []
         self.changed_at = -math.inf  # by another hand than ours
         self.was_cancelled: set[str] = set()
+        self.requested: dict[int, list[tuple[str, ExtValue]]] = {}  # the values of a batch
 
     @rule(name=NAMES, number=st.integers(0, 20))
     def write(self, name: str, number: int) -> None:
         session = self.session
         self.open.append(session.camera.write_ext(name, value_for(name, number), session.now))
+
+    @rule(pairs=st.lists(st.tuples(NAMES, st.integers(0, 20)), max_size=8))
+    def write_many(self, pairs: list[tuple[str, int]]) -> None:
+        session = self.session
+        values = [(name, value_for(name, number)) for name, number in pairs]
+        with suppress(NoReply):  # it is lost
+            self.open.append(session.camera.write_many_ext(values, session.now))
+            self.requested[id(self.open[-1])] = values
 
     @rule(key=NAMES | st.integers(0, len(TABLE) - 1))
     def read(self, key: str | int) -> None:
@@ -95,6 +107,8 @@ class Extended(RuleBasedStateMachine):
         self.open.remove(operation)
         if isinstance(operation, ExtWrite):
             self.was_cancelled.add(operation.name)
+        if isinstance(operation, ExtWriteBatch):
+            self.was_cancelled.update(name for name, _ in self.requested[id(operation)])
         self.give_back(operation)
 
     @rule(name=NAMES, number=st.integers(21, 40))
@@ -133,6 +147,8 @@ class Extended(RuleBasedStateMachine):
             self.open.remove(operation)
             if isinstance(operation, ExtWrite):
                 self.check(operation)
+            elif isinstance(operation, ExtWriteBatch):
+                self.check_batch(operation)
             elif operation.error is not None:
                 assert isinstance(operation.error, NoReply)
             self.give_back(operation)
@@ -167,10 +183,34 @@ class Extended(RuleBasedStateMachine):
         else:
             assert isinstance(error, NoReply), error
 
+    def check_batch(self, batch: ExtWriteBatch) -> None:
+        """One outcome for each value, in the order of the request, whatever the batch met."""
+        assert batch.result is not None
+        outcomes = batch.result
+        assert [(each.name, each.requested) for each in outcomes] == self.requested.pop(id(batch))
+        assert len(batch.ended) == len(outcomes)
+        for each in outcomes:
+            name = each.name
+            is_disturbed = self.changed_at >= batch.begun_at - SETTLING or name in self.was_cancelled
+            if each.status is SetStatus.ACCEPTED:
+                assert each.result is not None
+                assert each.result.actual == each.requested
+            elif each.status is SetStatus.ADJUSTED:
+                assert name == "CLAMPED" or is_disturbed
+            elif each.status is SetStatus.REFUSED:
+                assert name in ("PICKY", "BROKEN") or is_disturbed, each
+            else:
+                assert isinstance(each.error, NoReply), each
+        if any(each.status is SetStatus.NOT_TRIED for each in outcomes):
+            assert batch.failure is not None
+
     def give_back(self, operation: Operation[Any]) -> None:
         machine, now = self.session.camera, self.session.now
         if isinstance(operation, ExtWrite):
             machine.ext.writes.cancel(operation, now)
+        elif isinstance(operation, ExtWriteBatch):
+            machine.ext.batches.end(operation, now)
+            self.requested.pop(id(operation), None)
         elif isinstance(operation, ValueRead):
             machine.ext.reads.release(operation)
         else:
