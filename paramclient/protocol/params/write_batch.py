@@ -2,32 +2,22 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from functools import partial
-from typing import Final, Protocol
+from typing import Protocol
 
-from paramclient.errors import (
-    ContestedAddress,
-    NoReply,
-    ParamClientError,
-    UsageError,
-    ValueNotApplied,
-    VehicleError,
-)
+from paramclient.errors import NoReply, ParamClientError, ValueNotApplied
 from paramclient.model.values import Param, Value, WireValue
 from paramclient.protocol.ftp.param_pck import PackedParam
 from paramclient.protocol.params.upload import ParamUpload, UploadHooks, Uploads
 from paramclient.protocol.params.writes import SetResult, Write
+from paramclient.protocol.requests.bulk_writes import BulkOutcome, BulkResult, BulkWrites, SetStatus
 from paramclient.protocol.requests.machine import Machine
-from paramclient.protocol.requests.operation import Operation
-from paramclient.protocol.requests.pacing import WriteWindow
 from paramclient.protocol.wire import ParamValue
 
 __all__ = [
-    "UNANSWERED_WRITES_MAX",
     "Batch",
     "BatchRules",
     "SetManyResult",
@@ -35,53 +25,12 @@ __all__ = [
     "SetStatus",
     "WriteBatch",
     "WriteBatches",
-    "is_refusal",
 ]
-
-UNANSWERED_WRITES_MAX: Final = 3
-"""Consecutive writes without an acknowledgement, each after all its attempts, after which no further write is
-begun."""
-
-
-class SetStatus(StrEnum):
-    """What became of one value of a `set_many`."""
-
-    ACCEPTED = "accepted"
-    """The vehicle holds the requested value, as far as the type can represent it."""
-    ADJUSTED = "adjusted"
-    """The vehicle stored another value."""
-    REFUSED = "refused"
-    """The vehicle does not have the value: it refused it, or the value cannot be sent to it."""
-    UNKNOWN = "unknown"
-    """The value was sent and not acknowledged: the vehicle may have it."""
-    NOT_TRIED = "not tried"
-    """The value was not sent."""
 
 
 @dataclass(frozen=True, slots=True)
-class SetOutcome:
-    """The outcome of one value of a `set_many`.
-
-    Attributes:
-        name: param_id, as requested.
-        requested: the requested value: a number, or bytes if bytes were requested.
-        status: what became of it.
-        result: the result as of `set` for an accepted or adjusted value, else None. Over a service, also None
-            if the value is not on the disk.
-        error: the error that `set` would have raised, or None. For a value that was not tried, the error that
-            ended the call. An accepted or adjusted value has one (NotDurable) if it is not on the disk.
-    """
-
-    name: str
-    requested: WireValue
-    status: SetStatus
-    result: SetResult | None = None
-    error: ParamClientError | None = None
-
-    @property
-    def is_set(self) -> bool:
-        """Whether the vehicle has acknowledged the value, also if it adjusted it."""
-        return self.status in (SetStatus.ACCEPTED, SetStatus.ADJUSTED)
+class SetOutcome(BulkOutcome[WireValue, SetResult]):
+    """The outcome of one value of a `set_many`. `requested` is a number, or bytes if bytes were requested."""
 
     @property
     def actual(self) -> Value | None:
@@ -97,53 +46,10 @@ class SetOutcome:
         actual = self.error.actual if isinstance(self.error, ValueNotApplied) else None
         return None if isinstance(actual, str) else actual
 
-    def __str__(self) -> str:
-        if self.result is not None and self.error is None:
-            return str(self.result)
-        return f"{self.name}: {self.status}" + ("" if self.error is None else f": {self.error}")
 
-
-@dataclass(frozen=True, slots=True)
-class SetManyResult:
-    """The outcomes of a `set_many`.
-
-    Attributes:
-        system, component: MAVLink ids of the component.
-        outcomes: one for each requested value, in the order of the request.
-        error: why values were not tried, or why values are not on the disk; None otherwise.
-        elapsed: seconds.
-    """
-
-    system: int
-    component: int
-    outcomes: tuple[SetOutcome, ...]
-    error: ParamClientError | None
-    elapsed: float
-
-    def __getitem__(self, name: str) -> SetOutcome:
-        """Return the outcome of a name; of the last value for it if it was requested several times."""
-        for outcome in reversed(self.outcomes):
-            if outcome.name == name:
-                return outcome
-        raise KeyError(name)
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether the vehicle has acknowledged every value, also if it adjusted some, without an error."""
-        return self.error is None and all(outcome.is_set for outcome in self.outcomes)
-
-    @property
-    def counts(self) -> Mapping[SetStatus, int]:
-        """The number of values with each status."""
-        return Counter(outcome.status for outcome in self.outcomes)
-
-    def of(self, status: SetStatus) -> list[SetOutcome]:
-        """Return the outcomes with this status, in order."""
-        return [outcome for outcome in self.outcomes if outcome.status is status]
-
-    def __repr__(self) -> str:
-        counts = ", ".join(f"{count} {status}" for status, count in self.counts.items())
-        return f"<SetManyResult {self.system}/{self.component} {counts or 'nothing'} in {self.elapsed:.2f} s>"
+@dataclass(frozen=True, slots=True, repr=False)
+class SetManyResult(BulkResult[SetOutcome]):
+    """The outcomes of a `set_many`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,38 +80,24 @@ class BatchRules:
     uploads: Uploads | None
 
 
-class WriteBatch(Operation[tuple[SetOutcome, ...]]):
+class WriteBatch(BulkWrites[WireValue, Write, SetOutcome]):
     """The writes of one `set_many`; see `WriteBatches`.
 
-    Attributes:
-        ended: the outcomes so far, in the order in which they came.
-        failure: the error after which no further write is begun, or None.
-        on_outcome: called after each outcome.
+    Args:
+        pairs: names and values.
+        rules: what it needs of its component.
+        begun_at: the time.
     """
 
     def __init__(self, pairs: Sequence[tuple[str, WireValue]], rules: BatchRules, begun_at: float) -> None:
-        super().__init__(begun_at)
-        self.ended: list[SetOutcome] = []
-        self.failure: ParamClientError | None = None
-        self.on_outcome: Callable[[], None] = _ignore
-        self._pairs = pairs
+        super().__init__(pairs, begun_at)
         self._rules = rules
-        self._outcomes: dict[int, SetOutcome] = {}
-        self._open: dict[int, Write] = {}
-        self._window = WriteWindow()
-        self._waiting = deque(range(len(pairs)))  # numbers of the pairs that have not begun
         self._upload: ParamUpload | None = None
         self._unproven: deque[int] = deque()  # numbers of filed writes that go on with PARAM_SET
         self._barrier: int | None = None  # the open write that the next ones wait for
-        self._unanswered = 0
-
-    @property
-    def attempts(self) -> int:
-        """PARAM_SETs sent for the open writes."""
-        return sum(write.attempts for write in self._open.values())
 
     def proceed(self, now: float) -> None:
-        """Begin as many writes as may be in flight, and end when none is left."""
+        """See `BulkWrites.proceed`."""
         while self._unproven and self._in_flight < self._window.limit:
             self._rules.unfile(self._open[self._unproven.popleft()], now)
         while self.failure is None and self._waiting and self._may_begin():
@@ -227,18 +119,11 @@ class WriteBatch(Operation[tuple[SetOutcome, ...]]):
         except ParamClientError as error:
             if self._barrier == number:
                 self._barrier = None
-            if is_refusal(error):
-                self._record(number, SetStatus.REFUSED, error=error)
-            else:
-                self.stop(error)
-                self._record(number, SetStatus.NOT_TRIED, error=error)
+            self._not_begun(number, error)
             return
-        self._open[number] = write
-        if write.done:
-            self._take(number, write)
-        else:
+        if not write.done:
             write.on_acknowledged.append(self._acknowledged)
-            write.on_done.append(partial(self._ended, number, write))
+        self._follow(number, write)
 
     # by one file
 
@@ -308,44 +193,25 @@ class WriteBatch(Operation[tuple[SetOutcome, ...]]):
 
     # the end
 
-    def stop(self, error: ParamClientError) -> None:
-        """Begin no further write; the open ones end by themselves."""
-        self.failure = self.failure or error
-
     def interrupt(self, error: ParamClientError, now: float) -> None:
         """Begin no further write and end an upload; `Writes` ends the open writes."""
-        self.stop(error)
+        super().interrupt(error, now)
         self._cancel_upload(now)
-
-    @property
-    def open_names(self) -> list[str]:
-        """The names of the writes that have begun and not ended."""
-        return [write.name for write in self._open.values()]
 
     def give_up(self, error: ParamClientError, now: float) -> None:
-        """End at once: open writes are cancelled, and their outcome is unknown if anything was sent."""
-        if self.done:
-            return
-        self._cancel_upload(now)
-        self.failure = self.failure or error
-        self._cancel(now, lambda number, write: self._record_unanswered(number, write, error))
-        self._finish(now)
+        """See `BulkWrites.give_up`."""
+        if not self.done:
+            self._cancel_upload(now)
+        super().give_up(error, now)
 
     def discard(self, now: float) -> None:
-        """Cancel the open writes: the caller was cancelled."""
+        """See `BulkWrites.discard`."""
         self._cancel_upload(now)
-        self._waiting.clear()
-        self.on_outcome = _ignore
-        self._cancel(now, lambda number, write: None)
+        super().discard(now)
 
-    def _cancel(self, now: float, record: Callable[[int, Write], None]) -> None:
-        given_up, self._open = self._open, {}
-        for write in reversed(given_up.values()):  # the last first: no write that waits for another begins
-            write.drop_callbacks()
-            write.on_acknowledged.clear()
-            self._rules.cancel(write, now)
-        for number, write in given_up.items():
-            record(number, write)
+    def _cancel_write(self, write: Write, now: float) -> None:
+        write.on_acknowledged.clear()
+        self._rules.cancel(write, now)
 
     def _may_begin(self) -> bool:
         if not self._open:
@@ -373,48 +239,21 @@ class WriteBatch(Operation[tuple[SetOutcome, ...]]):
 
     def _take(self, number: int, write: Write) -> None:
         """Record the outcome of a write that has ended."""
-        del self._open[number]
         if self._barrier == number:
             self._barrier = None
-        error = write.error
-        if error is None:
-            result = write.result
-            assert result is not None
-            self._unanswered = 0
-            self._record(number, SetStatus(result.status), result=result)
-            return
-        assert isinstance(error, ParamClientError)
-        if is_refusal(error):
-            self._unanswered = 0
-            self._record(number, SetStatus.REFUSED, error=error)
-        else:
-            self._unanswered += 1
-            if not isinstance(error, NoReply) or self._unanswered >= UNANSWERED_WRITES_MAX:
-                self.stop(error)
-            self._record_unanswered(number, write, error)
+        super()._take(number, write)
 
-    def _record_unanswered(self, number: int, write: Write, error: ParamClientError) -> None:
-        status = SetStatus.UNKNOWN if write.attempts else SetStatus.NOT_TRIED
-        self._record(number, status, error=error)
+    def _outcome(
+        self, number: int, status: SetStatus, result: SetResult | None, error: ParamClientError | None
+    ) -> SetOutcome:
+        return SetOutcome(*self._pairs[number], status, result, error)
 
-    def _record(
-        self,
-        number: int,
-        status: SetStatus,
-        *,
-        result: SetResult | None = None,
-        error: ParamClientError | None = None,
-    ) -> None:
-        outcome = SetOutcome(*self._pairs[number], status, result, error)
-        self._outcomes[number] = outcome
-        self.ended.append(outcome)
-        self.on_outcome()
+    def _result_of(self, write: Write) -> SetResult:
+        assert write.result is not None
+        return write.result
 
-    def _finish(self, now: float) -> None:
-        for number in self._waiting:
-            self._record(number, SetStatus.NOT_TRIED, error=self.failure)
-        self._waiting.clear()
-        self.finish(tuple(self._outcomes[number] for number in range(len(self._pairs))), now)
+    def _is_sent(self, write: Write) -> bool:
+        return bool(write.attempts)
 
 
 class Batch(Protocol):
@@ -478,12 +317,3 @@ class WriteBatches(Machine):
         assert isinstance(error, ParamClientError)
         for batch in self._batches:
             batch.interrupt(error, now)
-
-
-def is_refusal(error: ParamClientError) -> bool:
-    """Return whether an error is about one value; otherwise it is about the vehicle or the link."""
-    return isinstance(error, (UsageError, VehicleError)) and not isinstance(error, ContestedAddress)
-
-
-def _ignore() -> None:
-    return

@@ -1,5 +1,6 @@
 """The policy of all requests: timeouts, retries and pacing.
 
+`bulk_writes`: many writes in one call, with one outcome for each.
 `context`: the facts that the machines of a component share.
 `machine`: the lifecycle of these machines.
 `operation`: an operation with one result or error.
