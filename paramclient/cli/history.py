@@ -57,7 +57,9 @@ def history(
     """
     vehicle, names = chosen_vehicle(cached, vehicle, names)
     if vehicle is None:
-        raise UsageError("history takes a vehicle in the cache: its system id, its hardware id, or its key")
+        raise UsageError(
+            "VEHICLE is missing: a vehicle in the cache, by system id, hardware id, nickname or key"
+        )
     begin = None if since is None else parse_time(since, time.time())
     if begin is not None and not options.json:
         say(f"since {local_time(begin)}")

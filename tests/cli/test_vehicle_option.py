@@ -206,7 +206,7 @@ def test_show_and_history_take_the_option(command: Command, put: Put, words: lis
 def test_history_needs_a_vehicle(command: Command) -> None:
     failed = command("history")
     assert (failed.code, failed.out) == (2, "")
-    assert "history takes a vehicle in the cache" in failed.err
+    assert "VEHICLE is missing: a vehicle in the cache" in failed.err
 
 
 def test_a_nickname_is_removed_and_replaced(command: Command, put: Put, cache: Path) -> None:
