@@ -6,6 +6,7 @@
 `scheduler`: many components on one link: which are due, and whose lists run.
 `addresses`: addresses of components and peers.
 `vehicle_selection`: the only vehicle that an incomplete address fits.
+`quick_transfer`: whether a large file may be read without a request of the user.
 `silence`: what was received instead of an awaited message, in words.
 `system_id_change`: the search for a vehicle under a new system id.
 `wire`: frames, messages, signatures.

@@ -186,6 +186,11 @@ class Traffic:
         """Frames of all components received twice."""
         return sum(source.repeated for source in self._sources.values())
 
+    @property
+    def has_radio(self) -> bool:
+        """Whether a telemetry radio has sent its status."""
+        return any(source.is_radio for source in self._sources.values())
+
     def report(self, now: float) -> TrafficReport:
         """Return the present counts."""
         began = now if self._began is None else self._began
@@ -279,6 +284,10 @@ class _Source:
     @property
     def repeated(self) -> int:
         return self._repeated.total
+
+    @property
+    def is_radio(self) -> bool:
+        return self._radio is not None
 
     def report(self, began: float, now: float) -> ComponentTraffic:
         system, component = self._address
