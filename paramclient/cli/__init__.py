@@ -14,6 +14,7 @@
 - `session`, `options`: an open link with its vehicle; options that several subcommands share.
 - `waiting`: what a command waits for, on a terminal.
 - `output`, `param_rows`, `results`, `metadata`, `exit_codes`: tables, JSON, metadata and exit codes.
+- `default_sources`: the metadata that gives the firmware's defaults.
 - `write_outcomes`, `confirmation`: writes with their outcomes, and the question before them.
 - `download_strip`, `link_history`, `block_characters`: drawings of a download and of a link on a terminal.
 - `signals`: SIGINT and SIGTERM.

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated, Final
 
 from cyclopts import Parameter
 
+from paramclient.cli.default_sources import DEFAULTS_HINT, defaults_in
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.extended import are_extended, diff_extended, is_extended_source
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_sets, meaning_of, units_of
@@ -16,11 +18,11 @@ from paramclient.cli.param_rows import described, value_text
 from paramclient.cli.sources import is_file, read_rules, resolve_all
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata
-from paramclient.model.comparison import Comparison, Difference, Moved, Standing, compare, defaults_of
+from paramclient.model.comparison import Comparison, Difference, Moved, Standing, compare
 from paramclient.model.notation import bits_written
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import type_name
-from paramclient.provision.vehicle_params import NO_DEFAULTS
+from paramclient.provision.vehicle_params import collect_defaults
 
 __all__ = ["diff"]
 
@@ -76,16 +78,22 @@ async def diff(
         named = second if rules is None else rules.apply_to(second, first)
         first = replace(first, params={name: first[name] for name in first if name in named})
     known = first if rules is None else rules.apply_to(first, second)
-    before = _defaults(known, second) if base == DEFAULTS else next(iter(third), None)
+    sides = _Sides([known, second, *third], options, chosen)
+    has_defaults = base == DEFAULTS
+    before = sides.defaults(known, second) if has_defaults else next(iter(third), None)
     if partial and not is_right_partial:
         second = replace(second, params={name: second[name] for name in second if name in known})
     outcome = compare(first, second, base=before, names=only or None, renames=rules)
-    sides = _Sides(first, second, before, options, chosen)
     shown = [entry for entry in outcome.entries if everything or entry.is_news]
     if options.json:
         from paramclient.documents.diff import DiffDoc  # only here: loads pydantic
 
-        print_document(DiffDoc.of(outcome, sides.left, sides.right, sides.base, everything=everything))
+        document = DiffDoc.of(
+            *(outcome, sides.left, sides.right, sides.base),
+            everything=everything,
+            has_defaults=has_defaults,
+        )
+        print_document(document)
     else:
         if shown:
             _print(outcome, shown, sides)
@@ -94,28 +102,25 @@ async def diff(
     return ExitCode.DONE if outcome.is_same else ExitCode.DIFFERENT
 
 
-def _defaults(left: ParamSet, right: ParamSet) -> ParamSet:
-    base = defaults_of(left, right)
-    if not base:
-        raise UsageError(NO_DEFAULTS)
-    return base
-
-
 class _Sides:
     """The metadata of each side: two versions of a firmware may name a value differently."""
 
-    def __init__(
-        self,
-        left: ParamSet,
-        right: ParamSet,
-        base: ParamSet | None,
-        options: LinkOptions,
-        chosen: Metadata | None,
-    ) -> None:
-        sets = [left, right] if base is None else [left, right, base]
+    def __init__(self, sets: Sequence[ParamSet], options: LinkOptions, chosen: Metadata | None) -> None:
         found = known_of_sets(sets, options) if chosen is None else [chosen] * len(sets)
-        self.left, self.right, self.base = [*found, None][:3]
+        self.left, self.right, self.base = [*found, found[0] or found[1]][:3]
         self.is_known = any(each is not None for each in found)
+
+    def defaults(self, left: ParamSet, right: ParamSet) -> ParamSet:
+        """Return the firmware's defaults of both sides.
+
+        Raises:
+            UsageError: they are not known.
+        """
+        sets = [left, right]
+        try:
+            return collect_defaults(sets, [*map(defaults_in, (self.left, self.right), sets)])
+        except UsageError as error:
+            raise UsageError(f"{error}; {DEFAULTS_HINT}") from None
 
     def units(self, entry: Difference) -> str:
         """Return the units of a parameter, or ""."""

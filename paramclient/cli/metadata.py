@@ -14,7 +14,8 @@ from cyclopts import Parameter
 from paramclient.cache import CachedComponent, ParamCache
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import print_line, printable, say
-from paramclient.cli.session import FIRMWARE_POLL_INTERVAL, FIRMWARE_TIMEOUT, CommandSession
+from paramclient.cli.session import FIRMWARE_POLL_INTERVAL, FIRMWARE_TIMEOUT, CommandSession, Deadline
+from paramclient.client.local import ServiceComponent
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata, MetadataStore, ParamInfo, metadata_of, read_metadata
 from paramclient.metadata.info import number_of
@@ -35,6 +36,7 @@ __all__ = [
     "parse_pairs",
     "print_descriptions",
     "problems",
+    "request_from_vehicle",
     "resolved",
     "units_of",
 ]
@@ -71,13 +73,11 @@ async def known_of_session(
         UsageError: the vehicle provides no metadata although it is required.
         VehicleError, NoReply, LinkError: as `metadata_of`.
     """
-    component = session.component
     if choice == VEHICLE or must:
-        progress = _DownloadNotice(session.label)
         found, refusal = None, None
         try:
-            found = await metadata_of(component, timeout=session.deadline.left(), progress=progress)
-        except UsageError as error:  # over a service, which gives no files of the vehicle
+            found = await request_from_vehicle(session)
+        except UsageError as error:  # over a service that refuses the request
             refusal = error
         if found is None and choice != VEHICLE:
             found = await _stored(session, added_only=True)
@@ -90,15 +90,38 @@ async def known_of_session(
     return await _stored(session)
 
 
+async def request_from_vehicle(session: CommandSession) -> Metadata | None:
+    """Return the metadata of the vehicle, requested by this program or the service; None if it has none.
+
+    Raises:
+        UsageError, VehicleError, NoReply, LinkError: as `metadata_of`.
+    """
+    if isinstance(session.component, ServiceComponent):
+        return await _of_service(session.component, session.deadline, loads=True)
+    progress = _DownloadNotice(session.label)
+    return await metadata_of(session.component, timeout=session.deadline.left(), progress=progress)
+
+
 async def _stored(session: CommandSession, *, added_only: bool = False) -> Metadata | None:
-    """Return the stored or added metadata of the vehicle's firmware, without any request; or None.
+    """Return the stored or added metadata of the vehicle's firmware, without any request to it; or None.
+
+    Over a service, that which the service has, without `added_only`.
 
     With `added_only`, what a vehicle has provided earlier is left out: the firmware may have been built from
     other sources since, and only the vehicle can confirm it.
     """
     component = session.component
     store = _store_of(session)
-    if store is None or not store.has_notes:
+    found = None if store is None else await _found_in(session, store, added_only=added_only)
+    if found is None and not added_only and isinstance(component, ServiceComponent):
+        found = await _of_service(component, session.deadline, loads=False)
+    return found
+
+
+async def _found_in(session: CommandSession, store: MetadataStore, *, added_only: bool) -> Metadata | None:
+    """Return the metadata in a store of the vehicle's firmware; or None."""
+    component = session.component
+    if not store.has_notes:
         return None
     with anyio.move_on_after(session.deadline.left(FIRMWARE_TIMEOUT)):
         while not component.identity.git_hash:  # noqa: ASYNC110 - no event
@@ -113,6 +136,17 @@ def _store_of(session: CommandSession) -> MetadataStore | None:
         return None
     cache = session.client.cache or ParamCache(session.options.cache)
     return MetadataStore.beside(cache.path)
+
+
+async def _of_service(component: ServiceComponent, deadline: Deadline, *, loads: bool) -> Metadata | None:
+    """Return the metadata that a service has, or with `loads` requests from the vehicle."""
+    from paramclient.documents.param import InfosDoc  # only here: loads pydantic
+
+    found = await component.read_descriptions(loads=loads, timeout=deadline.left())
+    try:
+        return None if found is None else InfosDoc.model_validate(found).metadata()
+    except (ArithmeticError, TypeError, ValueError) as error:
+        raise UsageError(f"the descriptions that the service gives are not valid: {error}") from error
 
 
 class _DownloadNotice:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from paramclient.cache import CachedComponent, CachedSummary, ParamCache
 from paramclient.cache.database_url import is_address
+from paramclient.cli.default_sources import defaults_in, report_no_defaults, say_sources
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.extended import is_extended_source, show_extended
 from paramclient.cli.logs import cache_of_log
@@ -37,13 +38,15 @@ from paramclient.cli.param_names import cached_names, check_given, unmatched_tex
 from paramclient.cli.param_rows import show_file
 from paramclient.cli.sources import VehicleChoice, choose, chosen_vehicle, is_file, open_file, tables_in
 from paramclient.errors import NotInCache, UsageError
-from paramclient.metadata import Metadata
+from paramclient.metadata import Metadata, MetadataStore
+from paramclient.model.defaults import add_default, default_of
 from paramclient.model.identity import autopilot_name
 from paramclient.model.notation import hash_text
+from paramclient.model.paramset import ParamSet
 from paramclient.model.patterns import NameChoice
 from paramclient.model.values import Param, format_value, type_name
 from paramclient.model.wording import counted
-from paramclient.provision.vehicle_params import NO_DEFAULTS, left_out_note
+from paramclient.provision.vehicle_params import left_out_note
 
 if TYPE_CHECKING:
     from paramclient.documents.cached import CachedTableDoc
@@ -82,10 +85,12 @@ def show(
             least 6 digits of it, or its key, also with the prefix cache:; or replay:FILE, a telemetry log.
         cached: The vehicle in the cache, instead of the first argument; all arguments are names then.
         component: Print only this component.
-        changed: Print only parameters that differ from the firmware's defaults.
+        changed: Print only parameters that differ from the firmware's defaults: those of the vehicle, else
+            those of its metadata.
         names: Print only these parameters of a vehicle, with their metadata: names in upper or lower case, or
             patterns such as "MC_*".
         metadata: A file that describes parameters. Default: the stored metadata of the vehicle's firmware.
+            With a parameter file only for --changed.
         extended: Use extended parameters (PARAM_EXT_*), as of a camera.
     """
     vehicle, names = chosen_vehicle(cached, vehicle, names)
@@ -94,9 +99,18 @@ def show(
             raise UsageError("--changed and --metadata are for plain parameters")
         return show_extended(vehicle, names, component, options)
     if vehicle is not None and is_file(vehicle):
-        if names or metadata is not None:
-            raise UsageError("names and --metadata go with a vehicle in the cache, not with a parameter file")
-        return show_file(open_file(vehicle), component, changed=changed, json=options.json)
+        if names or (metadata is not None and not changed):
+            raise UsageError(
+                "names, and --metadata without --changed, go with a vehicle in the cache, not with a "
+                "parameter file"
+            )
+        given = from_file(metadata, offline=True)
+
+        def known(sets: Sequence[ParamSet]) -> list[Metadata | None]:
+            store = MetadataStore.beside(ParamCache(options.cache).path)
+            return store.known_of_sets(sets) if given is None else [given] * len(sets)
+
+        return show_file(open_file(vehicle), component, known, changed=changed, json=options.json)
     wanted = tuple(check_given(names))
     described = from_file(metadata, offline=True)
     is_log = vehicle is not None and vehicle.lower().startswith("replay:")
@@ -118,8 +132,8 @@ def show(
         say(f"the cache {printable(cache.place)} is empty")
     for view in [] if options.json else views:
         _print_table(view)
-    if changed and tables and not any(_has_defaults(table) for table in tables):
-        report(NO_DEFAULTS)
+    if changed and tables and not any(view.has_defaults for view in views):
+        report_no_defaults()
         return ExitCode.INCOMPLETE
     return ExitCode.DONE
 
@@ -318,10 +332,6 @@ def _load(cache: ParamCache, summaries: Sequence[CachedSummary]) -> list[CachedC
     return tables
 
 
-def _has_defaults(table: CachedComponent) -> bool:
-    return any(param.default is not None for param in table.params.values())
-
-
 @dataclass(frozen=True, slots=True)
 class _View:
     """A cached table, and the part of it to show.
@@ -354,9 +364,18 @@ class _View:
         return cls(table, tuple(name for name in table.params if name in chosen), known, changed)
 
     @property
+    def has_defaults(self) -> bool:
+        """Whether the default of a parameter of the table is known."""
+        described = defaults_in(self.metadata, self.table.params)
+        return bool(described) or any(param.default is not None for param in self.table.params.values())
+
+    @property
     def params(self) -> Iterable[Param]:
         """The parameters to show."""
-        params = self.table.params.changed() if self.changed else self.table.params
+        params: Mapping[str, Param] = self.table.params
+        if self.changed:
+            differing = self.table.params.changed(defaults_in(self.metadata, params))
+            params = {name: params[name] for name in differing}
         return [params[name] for name in self.names if name in params] if self.names else params.values()
 
     def document(self) -> CachedTableDoc:
@@ -402,9 +421,10 @@ def _synced(table: CachedSummary) -> str | None:
 
 def _print_table(view: _View) -> None:
     table, changed, metadata = view.table, view.changed, view.metadata
-    if changed and not _has_defaults(table):
+    if changed and not view.has_defaults:
         return
-    params = by_index(view.params)
+    described = defaults_in(metadata, table.params) if changed else {}
+    params = [add_default(param, described.get(param.name)) for param in by_index(view.params)]
     rows = (
         (
             *(param.name, _value(param), *([default_text(param)] if changed else [])),
@@ -427,6 +447,8 @@ def _print_table(view: _View) -> None:
     crc = "" if table.hash is None else f"; hash {hash_text(table.hash)}"
     vehicle = f"{table.system}/{table.component} {autopilot_name(table.autopilot)} ({table.key})"
     if changed:
+        shown = [default_of(table.params[each.name], described.get(each.name)) for each in params]
+        say_sources(f"{table.system}/{table.component}", shown)
         text = f"{len(params)} of {table.size} parameters differ from their default: {vehicle}"
     else:
         text = f"{table.size} parameters of {vehicle}"

@@ -2,40 +2,64 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Final
 
+from paramclient.cli.default_sources import defaults_in, report_no_defaults, say_sources
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.output import local_time, print_document, print_table, printable, report, say
+from paramclient.cli.output import local_time, print_document, print_table, printable, say
 from paramclient.files import ParamFile
 from paramclient.files.param_file import address
+from paramclient.metadata import Metadata
 from paramclient.model.comparison import non_defaults
+from paramclient.model.defaults import Default, add_defaults, default_of
 from paramclient.model.identity import autopilot_name
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, WireValue, format_value, type_name
 from paramclient.model.wording import counted
-from paramclient.provision.vehicle_params import NO_DEFAULTS
 
 __all__ = ["described", "show_file", "value_text"]
 
 
-def show_file(file: ParamFile, component: int | None, *, changed: bool, json: bool) -> ExitCode:
-    """Print the parameters of a file; see `paramclient show`."""
+def show_file(
+    file: ParamFile,
+    component: int | None,
+    known: Callable[[Sequence[ParamSet]], Sequence[Metadata | None]],
+    *,
+    changed: bool,
+    json: bool,
+) -> ExitCode:
+    """Print the parameters of a file; see `paramclient show`.
+
+    Args:
+        file: the file.
+        component: the only component to print; None for all.
+        known: returns the metadata of each set; called with `changed` only.
+        changed: print only the parameters that differ from the firmware's defaults.
+        json: print JSON.
+    """
     sets = file.sets if component is None else [file.choose(component)]
+    shown = [*sets]
+    sources: dict[int, list[Default | None]] = {}
     if changed:
-        shown = [
-            non_defaults(each) for each in sets if any(param.default is not None for param in each.values())
-        ]
-    else:
-        shown = [*sets]
+        shown = []
+        for each, metadata in zip(sets, known(sets), strict=True):
+            more = defaults_in(metadata, each)
+            filled = add_defaults(each, more)
+            if any(param.default is not None for param in filled.values()):
+                differing = non_defaults(filled)
+                sources[len(shown)] = [default_of(each[name], more.get(name)) for name in differing]
+                shown.append(differing)
     if json:
         from paramclient.documents.paramset import FileDoc  # only here: loads pydantic
 
         print_document(FileDoc.of(file, shown))
     else:
-        for each in shown:
+        for place, each in enumerate(shown):
             _print_set(each, changed=changed)
+            say_sources(address(each), sources.get(place, ()))
     if changed and not shown:
-        report(NO_DEFAULTS)
+        report_no_defaults()
         return ExitCode.INCOMPLETE
     return ExitCode.DONE
 

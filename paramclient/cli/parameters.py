@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import anyio
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
+from paramclient.cli.default_sources import find_defaults, report_no_defaults, say_sources
 from paramclient.cli.every_vehicle import (
     Done,
     address_text,
@@ -54,6 +55,7 @@ from paramclient.cli.waiting import while_waiting
 from paramclient.cli.watch_lines import print_changes_and_events
 from paramclient.errors import CacheError, NoReply, ParamClientError, UsageError
 from paramclient.metadata import Metadata
+from paramclient.model.defaults import Default, add_default, default_of
 from paramclient.model.notation import hash_text
 from paramclient.model.patterns import NameChoice, is_pattern
 from paramclient.model.values import Param, Trust, format_value, type_name
@@ -87,6 +89,7 @@ async def fetch(
     accept: Literal["verified", "sampled"] = "verified",
     sample: Annotated[int | None, Parameter(validator=Number(gte=1))] = None,
     policy: Policy = Policy.AUTO,
+    metadata: MetadataChoice = None,
     extended: bool = False,
     plain: bool = False,
     all_: Annotated[bool, Parameter(name="--all")] = False,
@@ -101,11 +104,15 @@ async def fetch(
         names: Not accepted; the error names the commands that take names.
         only: Print only this name or pattern, such as "MC_*". May be given several times.
         refresh: Download all parameters even if the cache is up to date.
-        changed: Print only parameters that differ from the firmware's defaults.
+        changed: Print only parameters that differ from the firmware's defaults: those of the vehicle, else
+            those of its metadata.
         accept: With "sampled", a cached table of a vehicle without a hash is accepted if a sample of it
             agrees; the probability that the sample shows a change is printed.
         sample: Number of parameters in the sample. Default: 30.
         policy: Requests that may be sent to the vehicle: all that are needed, only for its hash, or none.
+        metadata: A file with the firmware's defaults; or vehicle, to download the vehicle's own metadata.
+            Default: the stored metadata of the firmware; else, with --changed, that of the vehicle if it can
+            be downloaded in 2 s.
         extended: Use the extended parameters (PARAM_EXT_*) of the component, as of a camera. Without it, a
             camera, gimbal or other payload is asked whether it has them.
         plain: Use the plain parameters, also of a component that has extended ones.
@@ -120,11 +127,23 @@ async def fetch(
     check_choice(extended=extended, plain=plain)
     if sample is not None and accept != "sampled":
         raise UsageError("--sample needs --accept sampled")
+    from_option = from_file(metadata)
     fetching = _Fetching(refresh, accept, sample or SAMPLE_SIZE, policy)
+
+    async def described(fetched: _Fetched) -> _Fetched:
+        """Add the defaults of the metadata, if they are shown."""
+        if not (changed or options.json or metadata is not None):
+            return fetched
+        found = await find_defaults(fetched.session, metadata, from_option, fetched.params, loads=changed)
+        return replace(fetched, described=found)
+
+    async def fetch_described(session: CommandSession) -> _Fetched:
+        return await described(await fetching.fetch(session))
+
     if all_:
         check_all(options, extended=extended)
         async with every_vehicle(url, options, policy=policy) as sessions:
-            fleet = await run_on_all(sessions, fetching.fetch)
+            fleet = await run_on_all(sessions, fetch_described)
         return _show_fleet(fleet, only, options, changed=changed)
     async with connect(url, options, policy=policy) as session:
         if await is_extended_session(session, extended=extended, plain=plain or changed):
@@ -133,14 +152,15 @@ async def fetch(
             return await fetch_extended(session)
         with progress_bar(f"fetching {session.label}") as progress:
             fetched = await fetching.fetch(session, progress)
-    has_defaults = any(param.default is not None for param in fetched.params)
+        fetched = await described(fetched)
+    has_defaults = fetched.has_defaults
     if only:
         chosen, unmatched = NameChoice(only).choose({param.name for param in fetched.params})
         if unmatched:
             raise UsageError(f"no parameter of {session.label} is called {unmatched}")
         fetched = replace(fetched, params=[param for param in fetched.params if param.name in chosen])
     if changed:
-        fetched = replace(fetched, params=[param for param in fetched.params if param.is_changed])
+        fetched = replace(fetched, params=fetched.changed)
     for note in fetched.notes:
         report(note)
     if options.json:
@@ -150,13 +170,12 @@ async def fetch(
             rows = ((*_cells(param), param.trust) for param in fetched.params)
             print_table([*_COLUMNS, "trust"], rows, right="value index")
         elif has_defaults:
-            rows = ((*_cells(param), param.trust, default_text(param)) for param in fetched.params)
+            rows = ((*_cells(param), param.trust, default_text(param)) for param in fetched.with_defaults)
             print_table([*_COLUMNS, "trust", "default"], rows, right="value index default")
+            say_sources(session.label, fetched.defaults)
         say(printable(fetched.summary))
     if changed and not has_defaults:
-        from paramclient.provision.vehicle_params import NO_DEFAULTS  # only here: loads provision
-
-        report(NO_DEFAULTS)
+        report_no_defaults()
         return ExitCode.INCOMPLETE
     if fetched.missing:
         report(fetched.incomplete)
@@ -303,7 +322,8 @@ class _Fetched:
     """The parameters that were received or confirmed in this session.
 
     A value that is only cached is left out, and its index counts as missing. If the policy prevents its
-    request, or a sample confirms the table, it is included and named in `cached`.
+    request, or a sample confirms the table, it is included and named in `cached`. `described` has defaults of
+    the metadata, by name.
     """
 
     session: CommandSession
@@ -313,6 +333,7 @@ class _Fetched:
     cached: list[str]
     bytes_received: int
     bytes_sent: int
+    described: Mapping[str, int | float] = field(default_factory=dict)
 
     @classmethod
     def of(cls, session: CommandSession, result: FetchResult, policy: Policy) -> _Fetched:
@@ -334,6 +355,27 @@ class _Fetched:
             bytes_received=session.client.bytes_received,
             bytes_sent=session.client.bytes_sent,
         )
+
+    @property
+    def with_defaults(self) -> list[Param]:
+        """The parameters with the defaults of the metadata, where the vehicle has given none."""
+        return [add_default(param, self.described.get(param.name)) for param in self.params]
+
+    @property
+    def defaults(self) -> list[Default | None]:
+        """The default of each parameter."""
+        return [default_of(param, self.described.get(param.name)) for param in self.params]
+
+    @property
+    def has_defaults(self) -> bool:
+        """Whether the default of a parameter is known."""
+        return any(default is not None for default in self.defaults)
+
+    @property
+    def changed(self) -> list[Param]:
+        """The parameters that differ from their default."""
+        pairs = zip(self.params, self.with_defaults, strict=True)
+        return [param for param, known in pairs if known.is_changed]
 
     @property
     def received(self) -> int:
@@ -381,6 +423,7 @@ class _Fetched:
             cached=self.cached,
             bytes_received=self.bytes_received,
             bytes_sent=self.bytes_sent,
+            described=self.described,
         )
 
 
@@ -393,14 +436,14 @@ def _show_fleet(
 ) -> int:
     """Print the tables of several vehicles, and what failed; return the exit code."""
     found = [each.result for each in fleet if each.result is not None]
-    has_defaults = any(param.default is not None for each in found for param in each.params)
+    has_defaults = any(each.has_defaults for each in found)
     if only:
         chosen, unmatched = NameChoice(only).choose({param.name for each in found for param in each.params})
         if unmatched and found:
             raise UsageError(f"no parameter of any vehicle is called {unmatched}")
         found = [replace(each, params=[p for p in each.params if p.name in chosen]) for each in found]
     if changed:
-        found = [replace(each, params=[param for param in each.params if param.is_changed]) for each in found]
+        found = [replace(each, params=each.changed) for each in found]
     for each in found:
         for note in each.notes:
             report(f"{each.session.label}: {note}")
@@ -413,11 +456,13 @@ def _show_fleet(
         rows = (
             (address_text(each.session), *_cells(param), param.trust, *([default_text(param)] * changed))
             for each in found
-            for param in each.params
+            for param in each.with_defaults
         )
         columns = ["vehicle", *_COLUMNS, "trust", *(["default"] * changed)]
         print_table(columns, rows, right="value index default")
         for each in found:
+            if changed:
+                say_sources(each.session.label, each.defaults)
             say(printable(each.summary))
     code = report_failures(fleet)
     for each in found:
@@ -425,9 +470,7 @@ def _show_fleet(
             report(each.incomplete)
             code = max(code, ExitCode.INCOMPLETE)
     if changed and not has_defaults:
-        from paramclient.provision.vehicle_params import NO_DEFAULTS  # only here: loads provision
-
-        report(NO_DEFAULTS)
+        report_no_defaults()
         code = max(code, ExitCode.INCOMPLETE)
     return code
 

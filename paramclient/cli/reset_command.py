@@ -13,7 +13,13 @@ from cyclopts.validators import Number
 
 from paramclient.cli.confirmation import can_confirm, confirm
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.metadata import MetadataChoice, from_file, info_of, known_of_session
+from paramclient.cli.metadata import (
+    MetadataChoice,
+    from_file,
+    info_of,
+    known_of_session,
+    request_from_vehicle,
+)
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import (
     Coloured,
@@ -38,7 +44,8 @@ from paramclient.cli.write_outcomes import (
 from paramclient.client.arguments import SETTLE_MAX
 from paramclient.client.reset import ResetChoice, read_unconfirmed
 from paramclient.errors import NoReply, ParamClientError, UsageError, VehicleError
-from paramclient.metadata import Metadata, metadata_of
+from paramclient.metadata import Metadata
+from paramclient.model.defaults import DefaultSource
 from paramclient.model.group_switches import is_group_switch
 from paramclient.model.notation import typed
 from paramclient.model.patterns import is_pattern
@@ -196,7 +203,7 @@ async def _known(session: CommandSession, choice: str | None, params: Sequence[P
     if found is not None or all(param.default is not None for param in params):
         return found
     try:
-        return await metadata_of(session.component, timeout=session.deadline.left())
+        return await request_from_vehicle(session)
     except (UsageError, VehicleError, NoReply) as error:
         say(printable(f"{session.label} gives no metadata with defaults: {error}"))
         return None
@@ -321,9 +328,9 @@ class _ResetPlan:
             without_default=[*self.choice.without_default],
         )
 
-    def _source(self, name: str) -> str:
-        """Return the origin of a default: `vehicle` or `metadata`."""
-        return "metadata" if self.params[name].default is None else "vehicle"
+    def _source(self, name: str) -> DefaultSource:
+        """Return the origin of a default that is written."""
+        return DefaultSource.METADATA if self.params[name].default is None else DefaultSource.VEHICLE
 
     def _before(self, name: str) -> str:
         param = self.params[name]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Final, Literal, TypeAlias
@@ -12,8 +12,10 @@ import anyio
 import anyio.to_thread
 from cyclopts import Parameter
 
+from paramclient.cli.default_sources import DEFAULTS_HINT, defaults_in, find_defaults, say_sources
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.extended import is_extended_link, is_extended_source, save_extended
+from paramclient.cli.metadata import MetadataChoice, from_file, known_of_sets
 from paramclient.cli.offline import tables_of
 from paramclient.cli.options import CacheOptions, LinkOptions
 from paramclient.cli.output import print_document, printable, progress_bar, report, say
@@ -24,11 +26,13 @@ from paramclient.client.component import Component
 from paramclient.errors import UsageError
 from paramclient.files import FileForm, write_file
 from paramclient.files.param_file import AUTOPILOT, address, format_of_name
+from paramclient.metadata import Metadata
+from paramclient.model.defaults import default_of
 from paramclient.model.paramset import ParamSet
 from paramclient.model.patterns import NameChoice
 from paramclient.model.wording import counted
 from paramclient.protocol.params.fetch_result import FetchResult
-from paramclient.provision.vehicle_params import cached_param_set, select_non_defaults
+from paramclient.provision.vehicle_params import NO_DEFAULTS, cached_param_set, select_non_defaults
 
 __all__ = ["save"]
 
@@ -48,6 +52,7 @@ async def save(
     only: Annotated[tuple[str, ...], Parameter(show_default=False)] = (),
     all_: Annotated[bool, Parameter(name="--all")] = False,
     refresh: bool = False,
+    metadata: MetadataChoice = None,
     extended: bool = False,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
@@ -63,12 +68,16 @@ async def save(
             in full, uid: and at least 6 digits of it, or its key.
         file: The file. Its ending determines the file format: .params, .parm, .param, .pck, .json, .yaml.
         form: The file format, if the ending does not determine it.
-        changed: Write only parameters that differ from the firmware's defaults.
+        changed: Write only parameters that differ from the firmware's defaults: those of the vehicle, else
+            those of its metadata.
         only: Write only this name or pattern, such as "MC_*". May be given several times.
         all_: Write all components of every vehicle that is heard in 3 s, or of the one with --system. A file
             with {system} or {uid} in its name becomes a file for each vehicle; otherwise the file format must
             be able to hold several components.
         refresh: Download all parameters even if the cache is up to date.
+        metadata: With --changed, a file with the firmware's defaults; or vehicle, to download the vehicle's
+            own metadata. Default: the stored metadata of the firmware; else that of the vehicle if it can be
+            downloaded in 2 s.
         extended: Use extended parameters (PARAM_EXT_*), as of a camera.
     """
     extended = extended or is_extended_source(where)
@@ -76,20 +85,25 @@ async def save(
         if changed or all_ or only:
             raise UsageError("--changed, --only and --all are for plain parameters")
         return await save_extended(where, file, None if form is None else FileForm(form), options)
+    if metadata is not None and not changed:
+        raise UsageError("--metadata gives the defaults for --changed")
     written = format_of_name(str(file)) if form is None else FileForm(form)
     if all_ and options.component is not None:
         raise UsageError("--all and --component exclude each other")
     if is_file(where):
         if refresh:
             raise UsageError(f"--refresh needs a link; {where!r} is a file")
-        sets, faults = _from_file(where, options, all_=all_, changed=changed)
+        chosen = _Changed(changed, metadata, from_file(metadata, offline=True))
+        sets, faults = _from_file(where, options, chosen, all_=all_)
     elif names_vehicle(where, options.cache):
         if refresh:
             raise UsageError(f"--refresh needs a link; {where!r} is a vehicle in the cache")
-        sets, faults = _from_cache(where, options, all_=all_, changed=changed)
+        chosen = _Changed(changed, metadata, from_file(metadata, offline=True))
+        sets, faults = _from_cache(where, options, chosen, all_=all_)
     else:
         check_link(where)
-        sets, faults = await _from_link(where, options, all_=all_, refresh=refresh, changed=changed)
+        chosen = _Changed(changed, metadata, from_file(metadata))
+        sets, faults = await _from_link(where, options, chosen, all_=all_, refresh=refresh)
     for fault in faults:
         report(fault)
     sets = _chosen(sets, only) if only else sets
@@ -103,8 +117,43 @@ async def save(
     return ExitCode.INCOMPLETE if faults or not sets else ExitCode.DONE
 
 
+@dataclass(frozen=True, slots=True)
+class _Changed:
+    """Whether only parameters that differ from the firmware's defaults are written.
+
+    Attributes:
+        is_chosen: whether they are.
+        choice: the value of --metadata.
+        given: the metadata of the file that it names, or None.
+    """
+
+    is_chosen: bool
+    choice: str | None
+    given: Metadata | None
+
+    def known_of(self, sets: Sequence[ParamSet], options: LinkOptions) -> list[Metadata | None]:
+        """Return the metadata of each set, without a link."""
+        if not self.is_chosen or self.given is not None:
+            return [self.given] * len(sets)
+        return known_of_sets(sets, options)
+
+    def add(
+        self, sets: list[ParamSet], whole: ParamSet, described: Mapping[str, int | float]
+    ) -> Sequence[str]:
+        """Add a set, or its non-default parameters if chosen; return the sentences on a failure."""
+        try:
+            sets.append(select_non_defaults(whole, described) if self.is_chosen else whole)
+        except UsageError as error:
+            hint = f"; {DEFAULTS_HINT}" if str(error) == NO_DEFAULTS else ""
+            return [f"{address(whole)}: {error}{hint}"]
+        if self.is_chosen:
+            written = sets[-1].values()
+            say_sources(address(whole), [default_of(each, described.get(each.name)) for each in written])
+        return []
+
+
 async def _from_link(
-    url: str, options: LinkOptions, *, all_: bool, refresh: bool, changed: bool
+    url: str, options: LinkOptions, changed: _Changed, *, all_: bool, refresh: bool
 ) -> tuple[list[ParamSet], list[str]]:
     """Return the parameters received or confirmed in this session, and sentences on incomplete tables."""
     sets: list[ParamSet] = []
@@ -120,7 +169,12 @@ async def _from_link(
                     f"{result.count} parameters were not received"
                 )
             else:
-                faults += _add(sets, found.set, changed=changed)
+                described: Mapping[str, int | float] = {}
+                if changed.is_chosen:
+                    params = [component.params[name] for name in found.set if name in component.params]
+                    one = replace(session, component=component)
+                    described = await find_defaults(one, changed.choice, changed.given, params)
+                faults += changed.add(sets, found.set, described)
     return sets, faults
 
 
@@ -147,20 +201,20 @@ async def _fetch(
 
 
 def _from_file(
-    path: str, options: LinkOptions, *, all_: bool, changed: bool
+    path: str, options: LinkOptions, changed: _Changed, *, all_: bool
 ) -> tuple[list[ParamSet], list[str]]:
     """Return the parameters of a file or an on-board log, and sentences on sets without changes."""
     file = open_file(path)
     chosen = file.sets if all_ else [choose(file, options.component, options.system)]
     sets: list[ParamSet] = []
     faults: list[str] = []
-    for each in chosen:
-        faults += _add(sets, each, changed=changed)
+    for each, known in zip(chosen, changed.known_of(chosen, options), strict=True):
+        faults += changed.add(sets, each, defaults_in(known, each))
     return sets, faults
 
 
 def _from_cache(
-    vehicle: str, options: LinkOptions, *, all_: bool, changed: bool
+    vehicle: str, options: LinkOptions, changed: _Changed, *, all_: bool
 ) -> tuple[list[ParamSet], list[str]]:
     """Return the cached parameters of a vehicle, and sentences on incomplete tables."""
     if options.no_cache or options.system is not None or options.encoding or options.timeout is not None:
@@ -185,7 +239,9 @@ def _from_cache(
                 f"{table.size}{of} parameters are in the cache"
             )
             continue
-        faults += _add(sets, cached_param_set(table), changed=changed)
+        whole = cached_param_set(table)
+        (metadata,) = changed.known_of([whole], options)
+        faults += changed.add(sets, whole, defaults_in(metadata, whole))
     return sets, faults
 
 
@@ -200,15 +256,6 @@ def _chosen(sets: Sequence[ParamSet], only: Sequence[str]) -> list[ParamSet]:
         raise UsageError(f"no parameter is called {unmatched}")
     parts = [replace(each, params={n: param for n, param in each.items() if n in names}) for each in sets]
     return [each for each in parts if each]
-
-
-def _add(sets: list[ParamSet], whole: ParamSet, *, changed: bool) -> Sequence[str]:
-    """Add a set, or with `changed` its non-default parameters; return the sentences on a failure."""
-    try:
-        sets.append(select_non_defaults(whole) if changed else whole)
-    except UsageError as error:
-        return [f"{address(whole)}: {error}"]
-    return []
 
 
 def _by_file(pattern: str, sets: Sequence[ParamSet]) -> dict[Path, list[ParamSet]]:

@@ -18,6 +18,7 @@ from paramclient.cli.param_names import unmatched_text
 from paramclient.cli.sources import tables_in
 from paramclient.errors import NotInCache
 from paramclient.metadata import Metadata, ParamInfo
+from paramclient.model.defaults import DefaultSource, default_of
 from paramclient.model.identity import autopilot_name
 from paramclient.model.values import check_name, format_value, type_name
 from paramclient.model.wording import counted
@@ -180,8 +181,10 @@ def _lines_of(
     yield f"{table.system}/{table.component} {autopilot_name(table.autopilot)} ({table.key})"
     value = format_value(param.settable, param.type_number)
     yield f"  value: {value}{f' ({meaning})' if meaning else ''}, {type_name(param.type_number)}"
-    if param.default is not None:
-        yield f"  default of the firmware: {format_value(param.default, param.type_number)}"
+    default = default_of(param, None if described is None else described.default)
+    if default is not None:
+        origin = " (from the metadata)" if default.source is DefaultSource.METADATA else ""
+        yield f"  default of the firmware: {format_value(default.value, param.type_number)}{origin}"
     yield f"  heard: {local_time(table.heard_at[name])}"
     for entry in changes:
         new = "removed" if entry.new is None else format_value(entry.new.settable, entry.new.type_number)

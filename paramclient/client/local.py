@@ -1,15 +1,16 @@
-"""LocalClient, LocalComponent and LocalExtParams: internal interface of clients on a link of this process.
+"""LocalClient, LocalComponent, LocalExtParams, ServiceComponent: internal interfaces of both kinds of client.
 
 `local` returns it for a component, `paramclient.client.client.local_client` for a client. The service,
 provision, metadata, diagnosis, MAVFTP and the fetch of several components use only these names. They are not
-part of `Component` and `ParamClient`. A component over a service has none of them.
+part of `Component` and `ParamClient`. A component over a service has none of them; `ServiceComponent` is what
+the command needs of it.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final, Protocol, TypeVar
+from typing import Any, Final, Protocol, TypeVar
 
 import anyio
 
@@ -30,7 +31,15 @@ from paramclient.protocol.params.fetch_result import FetchResult, Progress
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.station import Station
 
-__all__ = ["LocalClient", "LocalComponent", "LocalExtParams", "local", "not_given", "wait_until_identified"]
+__all__ = [
+    "LocalClient",
+    "LocalComponent",
+    "LocalExtParams",
+    "ServiceComponent",
+    "local",
+    "not_given",
+    "wait_until_identified",
+]
 
 IDENTITY_POLL_INTERVAL: Final = 0.05
 """Seconds between two looks at the identity of a vehicle: it has no event."""
@@ -200,6 +209,26 @@ class LocalComponent(Component):
     @abstractmethod
     def ignore(self, changes: Changes) -> None:
         """Push no further changes to this stream."""
+
+
+class ServiceComponent(Component):
+    """A component of a client over a service."""
+
+    @abstractmethod
+    async def read_descriptions(
+        self, *, loads: bool = False, timeout: float | None = None
+    ) -> Mapping[str, Any] | None:
+        """Return the metadata that the service has of the parameters as JSON (`InfosDoc`), or None.
+
+        Args:
+            loads: whether the service requests the metadata from the vehicle first.
+            timeout: seconds for that request; None for the choice of the service.
+
+        Raises:
+            NoReply: the vehicle did not respond, or the service cannot be reached.
+            LinkError: the service cannot be reached.
+            ParamClientError: the error that the service reports.
+        """
 
 
 def local(component: Component) -> LocalComponent:

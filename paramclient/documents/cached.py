@@ -295,7 +295,11 @@ class ParamInfoDoc(Document):
                     system=each.system,
                     component=each.component,
                     autopilot=autopilot_name(each.autopilot),
-                    param=ParamDoc.kept(each.params[name], heard_at=each.heard_at[name]),
+                    param=ParamDoc.kept(
+                        each.params[name],
+                        heard_at=each.heard_at[name],
+                        described=None if info is None else info.default,
+                    ),
                     changes=[HistoryEntryDoc.of(line) for line in changes[each.key, each.component]],
                 )
                 for each in tables

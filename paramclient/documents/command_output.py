@@ -11,6 +11,7 @@ from paramclient.documents.document import Document, Maybe, Scalar
 from paramclient.documents.param import ParamDoc, ReadOutputDoc
 from paramclient.documents.receiver import ReceiverDoc
 from paramclient.documents.setup import FailedVehicleDoc
+from paramclient.model.defaults import DefaultSource
 from paramclient.model.identity import autopilot_name
 from paramclient.model.notation import hash_text, rounded, time_text, typed, value_json
 from paramclient.model.values import ParamType
@@ -118,6 +119,7 @@ class FetchOutputDoc(Document):
         cached: list[str],
         bytes_received: int,
         bytes_sent: int,
+        described: Mapping[str, int | float] | None = None,
     ) -> FetchOutputDoc:
         """Return the document of a fetch of a component.
 
@@ -128,7 +130,9 @@ class FetchOutputDoc(Document):
             missing: indices that were not received.
             cached: names whose values are cached and not confirmed.
             bytes_received, bytes_sent: totals of the link.
+            described: defaults in the metadata by name, or None; see `default_of`.
         """
+        known = described or {}
         return cls(
             system=component.system,
             component=component.component,
@@ -147,7 +151,7 @@ class FetchOutputDoc(Document):
             elapsed_s=round(result.elapsed, 4),
             bytes_received=bytes_received,
             bytes_sent=bytes_sent,
-            params={param.name: ParamDoc.of(param) for param in params},
+            params={param.name: ParamDoc.of(param, described=known.get(param.name)) for param in params},
         )
 
 
@@ -213,10 +217,10 @@ class ResetValueDoc(Document):
     name: str
     value: Scalar
     default: Scalar
-    source: str
+    source: DefaultSource
 
     @classmethod
-    def of(cls, param: Param, default: WireValue, source: str) -> ResetValueDoc:
+    def of(cls, param: Param, default: WireValue, source: DefaultSource) -> ResetValueDoc:
         """Return the document of a parameter and its default."""
         return cls(
             name=param.name,

@@ -11,6 +11,7 @@ from paramclient.documents.document import Document, Maybe
 from paramclient.documents.param import WrittenParamDoc, short_text
 from paramclient.documents.paramset import OriginDoc
 from paramclient.model.comparison import Moved, Standing
+from paramclient.model.defaults import DefaultSource
 
 if TYPE_CHECKING:
     from paramclient.metadata import Metadata
@@ -22,8 +23,9 @@ __all__ = ["DiffDoc", "DifferenceDoc"]
 class DifferenceDoc(Document):
     """The comparison of one name; see `Difference`.
 
-    If the right side has the parameter under another name, `right_name` is that name, and `renamed` has the
-    left value as it compares with the right one.
+    If the base are the firmware's defaults, `default_source` is the origin of this one: `vehicle` or
+    `metadata`. If the right side has the parameter under another name, `right_name` is that name, and
+    `renamed` has the left value as it compares with the right one.
     """
 
     standing: Standing = Field(validation_alias="is", serialization_alias="is")
@@ -32,6 +34,7 @@ class DifferenceDoc(Document):
     left: WrittenParamDoc | None
     right: WrittenParamDoc | None
     base: WrittenParamDoc | None
+    default_source: Maybe[DefaultSource] = None
     moved: Moved | None
     units: Maybe[str] = None
     renamed: Maybe[WrittenParamDoc] = None
@@ -44,8 +47,15 @@ class DifferenceDoc(Document):
         left: Metadata | None = None,
         right: Metadata | None = None,
         base: Metadata | None = None,
+        default_source: DefaultSource | None = None,
     ) -> DifferenceDoc:
-        """Return the document of a `Difference`, with the metadata of each side."""
+        """Return the document of a `Difference`.
+
+        Args:
+            entry: the comparison of the name.
+            left, right, base: the metadata of each side, or None.
+            default_source: the origin of the base if it is the firmware's default, or None.
+        """
         right_name = entry.name if entry.renamed is None else entry.renamed.name
         sides = ((left, entry.name), (right, right_name))
         infos = [side.find(name) for side, name in sides if side is not None]
@@ -56,6 +66,7 @@ class DifferenceDoc(Document):
             left=None if entry.left is None else WrittenParamDoc.compared(entry.left, left),
             right=None if entry.right is None else WrittenParamDoc.compared(entry.right, right),
             base=None if entry.base is None else WrittenParamDoc.compared(entry.base, base),
+            default_source=default_source,
             moved=entry.moved,
             units=short_text(next((info.units for info in infos if info is not None and info.units), None)),
             renamed=None if entry.renamed is None else WrittenParamDoc.compared(entry.renamed, right),
@@ -83,6 +94,7 @@ class DiffDoc(Document):
         base: Metadata | None = None,
         *,
         everything: bool = False,
+        has_defaults: bool = False,
     ) -> DiffDoc:
         """Return the document of a `Comparison`.
 
@@ -90,11 +102,11 @@ class DiffDoc(Document):
             outcome: the comparison.
             left, right, base: the metadata of each side, or None.
             everything: include names that do not differ.
+            has_defaults: whether the base are the firmware's defaults.
         """
         head = cls.without_params(outcome)
-        return head.model_copy(
-            update={"params": dict(cls.rows(outcome, left, right, base, everything=everything))}
-        )
+        rows = cls.rows(outcome, left, right, base, everything=everything, has_defaults=has_defaults)
+        return head.model_copy(update={"params": dict(rows)})
 
     @classmethod
     def rows(
@@ -105,11 +117,13 @@ class DiffDoc(Document):
         base: Metadata | None = None,
         *,
         everything: bool = False,
+        has_defaults: bool = False,
     ) -> Iterator[tuple[str, DifferenceDoc]]:
         """Yield the members of `params`, each created when it is needed; see `of`."""
         for entry in outcome.entries:
             if everything or entry.is_news:
-                yield entry.name, DifferenceDoc.of(entry, left, right, base)
+                source = _source(entry) if has_defaults and entry.base is not None else None
+                yield entry.name, DifferenceDoc.of(entry, left, right, base, source)
 
     @classmethod
     def without_params(cls, outcome: Comparison) -> DiffDoc:
@@ -123,3 +137,9 @@ class DiffDoc(Document):
             moves=None if outcome.base is None else {moved: outcome.moves[moved] for moved in Moved},
             params={},
         )
+
+
+def _source(entry: Difference) -> DefaultSource:
+    """Return the origin of a default: one of the sides has it, else the metadata."""
+    is_given = any(side is not None and side.default is not None for side in (entry.left, entry.right))
+    return DefaultSource.VEHICLE if is_given else DefaultSource.METADATA

@@ -3,10 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 from paramclient.documents.document import Document, Maybe, Scalar
-from paramclient.model.notation import bits_text, bits_written, parse_value, value_json, value_written
+from paramclient.model.defaults import DefaultSource, default_of
+from paramclient.model.notation import (
+    bits_text,
+    bits_written,
+    parse_number,
+    parse_value,
+    value_json,
+    value_written,
+)
 from paramclient.model.values import (
     TYPES_BY_NAME,
     Param,
@@ -79,13 +89,47 @@ class InfoDoc(Document):
             group=info.group or None,
         )
 
+    def info(self, name: str) -> ParamInfo:
+        """Return the `ParamInfo` of a parameter, without its type.
+
+        Raises:
+            ArithmeticError, TypeError, ValueError: a member is not valid.
+        """
+        from paramclient.metadata.info import ParamInfo, number_of  # only here: loads the clients
+
+        def number(told: Scalar | None) -> int | float | None:
+            value = None if told is None else parse_number(told)
+            return None if isinstance(value, bytes) else value
+
+        named = {
+            value: text for key, text in (self.values or {}).items() if (value := number_of(key)) is not None
+        }
+        return ParamInfo(
+            name,
+            short_description=self.short_description or "",
+            long_description=self.long_description or "",
+            units=self.units or "",
+            minimum=number(self.minimum),
+            maximum=number(self.maximum),
+            increment=number(self.increment),
+            decimals=self.decimals,
+            default=number(self.default),
+            values=MappingProxyType(named),
+            bits=MappingProxyType({int(bit): text for bit, text in (self.bits or {}).items()}),
+            reboot_required=bool(self.reboot_required),
+            is_read_only=bool(self.is_read_only),
+            is_volatile=bool(self.is_volatile),
+            category=self.category or "",
+            group=self.group or "",
+        )
+
 
 class ParamDoc(Document):
     """One parameter of a vehicle; in the JSON of the command line its name is the key of the document.
 
-    `text` is the meaning of the value in a word; above 400 characters, it is left out, and so are `units`.
-    `trust`, `is_default` and `heard_at` (unix seconds) come with parameters of a table; `metadata` has all
-    metadata of the parameter.
+    `default_source` is the origin of `default`: `vehicle` or `metadata`. `text` is the meaning of the value
+    in a word; above 400 characters, it is left out, and so are `units`. `trust`, `is_default` and `heard_at`
+    (unix seconds) come with parameters of a table; `metadata` has all metadata of the parameter.
     """
 
     name: Maybe[str] = None
@@ -94,6 +138,7 @@ class ParamDoc(Document):
     index: int | None
     bits: str
     default: Maybe[Scalar] = None
+    default_source: Maybe[DefaultSource] = None
     is_default: Maybe[bool] = None
     trust: Maybe[str] = None
     heard_at: Maybe[float] = None
@@ -102,15 +147,24 @@ class ParamDoc(Document):
     metadata: Maybe[InfoDoc] = None
 
     @classmethod
-    def of(cls, param: Param, info: ParamInfo | None = None, *, whole: bool = False) -> ParamDoc:
+    def of(
+        cls,
+        param: Param,
+        info: ParamInfo | None = None,
+        *,
+        whole: bool = False,
+        described: int | float | None = None,
+    ) -> ParamDoc:
         """Return the document of a parameter, without its name.
 
         Args:
             param: the parameter.
             info: its metadata, or None.
             whole: whether to include all metadata.
+            described: its default in the metadata where `info` is None, or None; see `default_of`.
         """
-        return cls(**_members(param, info, whole=whole))
+        known, source = _with_default(param, info, described)
+        return cls(**_members(known, source, info, whole=whole))
 
     @classmethod
     def kept(
@@ -120,23 +174,28 @@ class ParamDoc(Document):
         *,
         heard_at: float | None = None,
         whole: bool = False,
+        described: int | float | None = None,
     ) -> ParamDoc:
         """Return the document of a parameter of a table: with name, trust and the time of its reception.
 
         Args:
-            param, info, whole: as in `of`.
+            param, info, whole, described: as in `of`.
             heard_at: unix time in seconds at which the value was received, or None.
         """
+        known, source = _with_default(param, info, described)
+        is_changed = known.is_changed
         return cls(
             name=param.name,
-            is_default=None if param.default is None else not param.is_changed,
+            is_default=None if is_changed is None else not is_changed,
             trust=param.trust.value,
             heard_at=heard_at,
-            **_members(param, info, whole=whole),
+            **_members(known, source, info, whole=whole),
         )
 
     def param(self, name: str) -> Param:
         """Return the parameter, without loss; without trust in the document, it is *cached*.
+
+        A default of the metadata is left out, as `Param.default` is what the vehicle has given.
 
         Args:
             name: param_id.
@@ -148,6 +207,7 @@ class ParamDoc(Document):
         kind = int(self.type.removeprefix("TYPE_")) if known is None else known
         bits = int(self.bits, 16)
         is_raw = isinstance(self.value, str) and self.value.startswith("0x")
+        default = None if self.default_source is DefaultSource.METADATA else self.default
         return Param(
             name,
             from_bits(bits, kind, is_raw=is_raw),
@@ -155,7 +215,7 @@ class ParamDoc(Document):
             self.index,
             bits,
             Trust.CACHED if self.trust is None else Trust(self.trust),
-            None if self.default is None else parse_value(self.default, kind),
+            None if default is None else parse_value(default, kind),
         )
 
 
@@ -229,6 +289,12 @@ class InfosDoc(Document):
             params={name: InfoDoc.of(info) for name, info in found.items() if info is not None},
         )
 
+    def metadata(self) -> Metadata:
+        """Return the metadata; see `InfoDoc.info`."""
+        from paramclient.metadata.info import Metadata  # only here: loads the clients
+
+        return Metadata.of((each.info(name) for name, each in self.params.items()), source=self.source)
+
 
 class DescribedDoc(Document):
     """The number of parameters, or groups of them, with metadata, and the origin of the metadata."""
@@ -242,8 +308,20 @@ def short_text(text: str | None) -> str | None:
     return text if text and len(text) <= SHORT_TEXT_LENGTH_MAX else None
 
 
-def _members(param: Param, info: ParamInfo | None, *, whole: bool) -> dict[str, Any]:
-    """Return the members of every `ParamDoc`."""
+def _with_default(
+    param: Param, info: ParamInfo | None, described: int | float | None
+) -> tuple[Param, DefaultSource | None]:
+    """Return a parameter with its default, and the origin of the default; see `default_of`."""
+    default = default_of(param, described if info is None else info.default)
+    if default is None or param.default is not None:
+        return param, None if default is None else default.source
+    return replace(param, default=default.value), default.source
+
+
+def _members(
+    param: Param, source: DefaultSource | None, info: ParamInfo | None, *, whole: bool
+) -> dict[str, Any]:
+    """Return the members of every `ParamDoc`, of a parameter with its default."""
     members: dict[str, Any] = {
         "value": value_json(param.settable, param.type_number),
         "type": type_name(param.type_number),
@@ -252,6 +330,7 @@ def _members(param: Param, info: ParamInfo | None, *, whole: bool) -> dict[str, 
     }
     if param.default is not None:
         members["default"] = value_json(param.default, param.type_number)
+        members["default_source"] = source
     if info is not None:
         members |= {"text": short_text(info.text(param.settable)), "units": short_text(info.units)}
         if whole:

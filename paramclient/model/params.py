@@ -12,6 +12,7 @@ import struct
 from collections.abc import ItemsView, Iterable, Iterator, Mapping, MutableMapping, ValuesView
 from typing import Final, TypeAlias, TypeVar, overload
 
+from paramclient.model.defaults import add_default
 from paramclient.model.similar_names import unknown_name
 from paramclient.model.values import Param, Trust, WireValue, from_bits, known_type, same_bits
 from paramclient.model.wording import counted
@@ -266,12 +267,18 @@ class ParamMap(Mapping[str, Param]):
     def __len__(self) -> int:
         return len(self._params)
 
-    def changed(self) -> dict[str, Param]:
+    def changed(self, defaults: Mapping[str, WireValue] | None = None) -> dict[str, Param]:
         """Return a copy of the parameters whose value differs from the firmware's default.
 
-        Parameters whose default the vehicle has not given are left out (see `Param.default`).
+        Parameters without a known default are left out.
+
+        Args:
+            defaults: defaults of parameters whose default the vehicle has not given (see `Param.default`), by
+                name, such as `Metadata.defaults_of`. They become the `default` of the returned parameters.
         """
-        return {name: param for name, param in self._params.items() if param.is_changed}
+        described = defaults or {}
+        known = (add_default(param, described.get(name)) for name, param in self._params.items())
+        return {param.name: param for param in known if param.is_changed}
 
     def __repr__(self) -> str:
         count = len(self._params)

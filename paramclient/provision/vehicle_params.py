@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from paramclient.errors import NoReply, NotInCache, UnknownVehicle, UsageError, VehicleError
-from paramclient.model.comparison import non_defaults
+from paramclient.model.comparison import defaults_of, non_defaults
+from paramclient.model.defaults import add_defaults
 from paramclient.model.params import copy_params
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Param, Trust
@@ -30,6 +31,7 @@ __all__ = [
     "set_maker",
     "load_state_before_apply",
     "load_cached_set",
+    "collect_defaults",
     "select_non_defaults",
     "incomplete_error",
     "left_out_note",
@@ -45,8 +47,9 @@ REFRESH_TIMEOUT: Final = 10.0
 NAMES_SHOWN_MAX: Final = 20
 """Parameters that a message names, so that it stays readable; it gives the number of further ones."""
 NO_DEFAULTS: Final = (
-    "the firmware's defaults are not known, so the parameters that differ from them cannot be found: the "
-    "defaults come with the parameter file over MAVFTP, which ArduPilot and PX4 from 1.18 on serve"
+    "the firmware's defaults are not known, so the parameters that differ from them cannot be found: they "
+    "come with the parameter file over MAVFTP, which ArduPilot and PX4 from 1.18 on serve, or with the "
+    "metadata of the firmware"
 )
 """The message for a request that needs the firmware's defaults when no parameter has one."""
 
@@ -233,15 +236,39 @@ def load_state_before_apply(cache: ParamCache, key: str, component: int) -> Para
     return cache.state_at(key, component, snapshots[-1].id)
 
 
-def select_non_defaults(whole: ParamSet) -> ParamSet:
+def select_non_defaults(whole: ParamSet, described: Mapping[str, int | float]) -> ParamSet:
     """Return the parameters of a set that differ from the firmware's defaults.
+
+    Args:
+        whole: the set.
+        described: defaults in the metadata by name, for parameters of the set without a default.
 
     Raises:
         UsageError: the defaults are not known, or no parameter differs.
     """
-    if not any(param.default is not None for param in whole.values()):
+    known = add_defaults(whole, described)
+    if not any(param.default is not None for param in known.values()):
         raise UsageError(NO_DEFAULTS)
-    found = non_defaults(whole)
+    found = {name: whole[name] for name in non_defaults(known)}
     if not found:
         raise UsageError("no parameter differs from its default")
-    return found
+    return replace(whole, params=found)
+
+
+def collect_defaults(sets: Sequence[ParamSet], described: Sequence[Mapping[str, int | float]]) -> ParamSet:
+    """Return the firmware's defaults of the parameters of sets: a base for `compare`.
+
+    Args:
+        sets: the sets.
+        described: defaults in the metadata of each set by name, for parameters without a default in the set.
+
+    Raises:
+        UsageError: the defaults are not known.
+    """
+    base = defaults_of(*(add_defaults(each, more) for each, more in zip(sets, described, strict=True)))
+    if not base:
+        raise UsageError(NO_DEFAULTS)
+    given = {name for each in sets for name, param in each.items() if param.default is not None}
+    if count := len(base.keys() - given):
+        base = replace(base, source=f"{base.source}, {count} of {len(base)} from the metadata")
+    return base

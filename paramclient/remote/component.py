@@ -16,7 +16,7 @@ from paramclient.client.arguments import (
 )
 from paramclient.client.component import Component
 from paramclient.client.extended_params import ExtParams
-from paramclient.client.local import not_given
+from paramclient.client.local import ServiceComponent, not_given
 from paramclient.client.subscription import Changes
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.model.identity import Identity
@@ -33,6 +33,7 @@ from paramclient.protocol.wire import PARAMETERS_MAX, SigningKey
 from paramclient.remote.connection import run_with_progress
 from paramclient.remote.decoding import (
     Document,
+    check_kind,
     decode_errors,
     fetch_result_of,
     hash_of,
@@ -43,7 +44,7 @@ from paramclient.remote.decoding import (
 )
 from paramclient.remote.http import ServiceResponse
 from paramclient.remote.mirrored_component import MirroredComponent
-from paramclient.remote.problems import error_of
+from paramclient.remote.problems import NotDescribed, error_of
 from paramclient.remote.remote_extended_params import RemoteExtParams
 from paramclient.remote.service import Service
 from paramclient.remote.write_parts import requests_of, write_in_parts
@@ -55,7 +56,7 @@ VALUES_PER_REQUEST_MAX: Final = 1000
 unknown."""
 
 
-class RemoteComponent(Component):
+class RemoteComponent(ServiceComponent):
     """A `Component` over a service; see `RemoteClient` for the differences.
 
     Attributes:
@@ -347,6 +348,25 @@ class RemoteComponent(Component):
     async def refreshed(self, *, timeout: float | None = None) -> None:
         """See `Component.refreshed`."""
         await self._service.ask(self._mirrored, "refreshed", {}, timeout, "the values outside the hash")
+
+    async def read_descriptions(
+        self, *, loads: bool = False, timeout: float | None = None
+    ) -> Mapping[str, Any] | None:
+        """See `ServiceComponent.read_descriptions`."""
+        service, mirrored = self._service, self._mirrored
+        awaited = f"the metadata of {self.system}/{self.component}"
+        try:
+            if loads:
+                await service.ask(mirrored, "metadata", {}, timeout, awaited)
+            answer = await service.connection.ask(
+                "GET", f"{mirrored.path}/metadata", awaited=awaited, link=mirrored.link_name
+            )
+        except NotDescribed:
+            return None
+        with decode_errors(service.name):
+            check_kind(answer.document, dict)
+        document: Document = answer.document
+        return document
 
     async def setup_signing(self, key: SigningKey | None, *, link_is_safe: bool = False) -> None:
         """Raise UsageError: SETUP_SIGNING needs the link itself, as it sends the key unencrypted."""

@@ -32,7 +32,7 @@ from paramclient.errors import (
 from paramclient.model.notation import parse_number
 from paramclient.model.values import WireValue
 
-__all__ = ["NotHeard", "error_of"]
+__all__ = ["NotDescribed", "NotHeard", "error_of"]
 
 Problem = Mapping[str, Any]
 
@@ -44,6 +44,10 @@ _REQUEST_ERRORS: Final = (400, 401, 403, 413, 421, 422)
 
 class NotHeard(NoReply):
     """The service does not know a component. It may appear soon if the service has just started."""
+
+
+class NotDescribed(UsageError):
+    """The service has no metadata of a component's parameters, and the component provides none."""
 
 
 def error_of(problem: Problem, *, status: int, link: str) -> ParamClientError:
@@ -68,6 +72,8 @@ def error_of(problem: Problem, *, status: int, link: str) -> ParamClientError:
         return LinkError(detail, link=str(problem.get("link", link)))
     if str(problem.get("type", "")).endswith(":unknown-component"):
         return NotHeard(detail.rstrip("."), attempts=0, waited=0.0)
+    if str(problem.get("type", "")).endswith(":not-described"):
+        return NotDescribed(detail)
     if status in _REQUEST_ERRORS or str(problem.get("type", "")).endswith(":ambiguous"):
         return UsageError(detail)
     return LinkError(f"{link}: {detail}", link=link)

@@ -6,6 +6,7 @@ Needs the extra `service`.
 - `hub`, `link`, `followed_component`, `followed_extended`: links and cache, one link, one component, its
   extended parameters.
 - `event_feed`, `jobs`: events, jobs.
+- `description_loader`: descriptions of parameters, loaded without a request.
 - `access`, `request`, `tokens`, `client_address`, `tls`: access checks of every request.
 - `acceptor`, `connection_slots`, `connections`: connections before TLS, their number, their limits.
 - `quota`, `body_limits`, `body_memory`, `log_limit`: limits of requests in progress, request bodies and log

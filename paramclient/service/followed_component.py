@@ -54,7 +54,8 @@ class FollowedComponent:
     Attributes:
         component: the component of the library.
         link: its link.
-        metadata: descriptions of its parameters, or None.
+        metadata: descriptions of its parameters, or None; see `describe`.
+        metadata_note: why the service has not loaded the descriptions without a request, or None.
         extended: its extended parameters.
     """
 
@@ -62,6 +63,7 @@ class FollowedComponent:
         self.component = local(component)
         self.link = link
         self.metadata: Metadata | None = None
+        self.metadata_note: str | None = None
         self._feed = feed
         self._published = as_params(component.params).copy()
         self._heard_at: dict[str, float] = {}
@@ -99,7 +101,22 @@ class FollowedComponent:
             key=self.key,
             progress=None if fetch is None else fetch.progress(anyio.current_time()),
             last=machine.fetches.last,
+            metadata_note=self.metadata_note,
         )
+
+    def describe(self, metadata: Metadata) -> None:
+        """Take descriptions of the parameters, and publish that the parameters have them."""
+        self.metadata_note = None
+        if self.metadata is not None and metadata.params == self.metadata.params:
+            return
+        self.metadata = metadata
+        self._texts.clear()
+        self.publish("params", {"count": len(self.component.params)})
+
+    def described_default(self, name: str) -> int | float | None:
+        """Return the default of a parameter in the descriptions, or None; see `default_of`."""
+        info = None if self.metadata is None else self.metadata.get(name)
+        return None if info is None else info.default
 
     def json_of(self, param: Param) -> str:
         """Return a parameter as JSON. The JSON of an unchanged value of the table is encoded once."""
@@ -107,11 +124,14 @@ class FollowedComponent:
         if not self._is_published(param):
             self._publish_value_changes()
             if not self._is_published(param):  # the table has a newer value than this response
-                return param_json(param, self._heard_at.get(name))
+                return self._encode(param, self._heard_at.get(name))
         text = self._texts.get(name)
         if text is None:
-            text = self._texts[name] = param_json(param, self._heard_at.get(name))
+            text = self._texts[name] = self._encode(param, self._heard_at.get(name))
         return text
+
+    def _encode(self, param: Param, heard_at: float | None) -> str:
+        return param_json(param, heard_at, self.described_default(param.name))
 
     def _is_published(self, param: Param) -> bool:
         published, name = self._published, param.name
@@ -243,8 +263,8 @@ class FollowedComponent:
         heard_at = None if new is None else self._heard_at.get(new.name)
 
         def write() -> str:
-            before = "null" if old is None else param_json(old, None)
-            after = "null" if new is None else param_json(new, heard_at)
+            before = "null" if old is None else self._encode(old, None)
+            after = "null" if new is None else self._encode(new, heard_at)
             members = f'"name":{json.dumps(name)},"old":{before},"new":{after},"by":{json.dumps(by)}'
             return f'{members},"kind":"{kind}"'
 
@@ -268,6 +288,7 @@ class FollowedComponent:
             component.is_armed,
             component.machine.fetches.last,
             self.link.state,
+            self.metadata_note,
             (ext.is_spoken, ext.is_expected, ext.is_complete, ext.count),
         )
 
@@ -286,9 +307,9 @@ class _ChangeForwarder(Changes):
         self._owner.handle_end(error)
 
 
-def param_json(param: Param, heard_at: float | None) -> str:
-    """Return a parameter as JSON."""
-    return ParamDoc.kept(param, heard_at=heard_at).model_dump_json()
+def param_json(param: Param, heard_at: float | None, described: int | float | None = None) -> str:
+    """Return a parameter as JSON, with its default; see `default_of`."""
+    return ParamDoc.kept(param, heard_at=heard_at, described=described).model_dump_json()
 
 
 def _now() -> float:

@@ -31,6 +31,7 @@ from paramclient.metadata.metadata_cache import MetadataStore
 from paramclient.model.notation import time_text
 from paramclient.protocol.silence import silence_of_link
 from paramclient.protocol.vehicle_selection import LOOK_TIME, VehicleChoice
+from paramclient.service.description_loader import DescriptionLoader
 from paramclient.service.event_feed import EventFeed
 from paramclient.service.followed_component import FollowedComponent
 from paramclient.service.jobs import Job, Jobs
@@ -71,7 +72,8 @@ class Hub:
         links: links by name, object or simulated vehicle, as for `ParamClient`; or pairs of a name and a
             function that creates a client.
         cache: as for `ParamClient`; shared by all links.
-        fetches: whether the table of every new component is fetched automatically.
+        fetches: whether the table of every new component is fetched automatically, and its descriptions where
+            the link is quick.
         options: options of each `ParamClient`: `system`, `component`, `signing`, `listen_only`, …
 
     Attributes:
@@ -121,6 +123,8 @@ class Hub:
         }
         self.fleet_comparisons = anyio.Semaphore(1)
         self._closing = anyio.Event()
+        store = None if self.cache is None else MetadataStore.beside(self.cache.path)
+        self._descriptions = DescriptionLoader(store, self.run_in_thread)
         self._setups = None if self.cache is None else SetupNotes.beside(self.cache.path)
         self._tasks: anyio.abc.TaskGroup | None = None
         self._link_tasks: anyio.abc.TaskGroup | None = None
@@ -391,7 +395,7 @@ class Hub:
             make()  # invalid options raise an error here
         if name in self.links:
             raise UsageError(f"the link {name} is given twice")
-        self.links[name] = ServiceLink(name, make, self.feed, self._on_found)
+        self.links[name] = ServiceLink(name, make, self.feed, self._on_found, self._on_checked)
 
     def _check_link(self, link: str | None) -> None:
         if link is not None and link not in self.links:
@@ -410,6 +414,12 @@ class Hub:
         """Handle a component that is new, found again, or restarted."""
         assert self._tasks is not None, "the hub is open"
         self._tasks.start_soon(self._load_component, followed)
+
+    def _on_checked(self, followed: FollowedComponent) -> None:
+        """Load the descriptions of a component if they are due."""
+        if self._fetches and not self.is_closing and self._descriptions.check(followed):
+            assert self._tasks is not None, "the hub is open"
+            self._tasks.start_soon(self._descriptions.begin(followed))
 
     async def _load_component(self, followed: FollowedComponent) -> None:
         """Load cached data of a component, then fetch its table."""
@@ -452,7 +462,9 @@ class Hub:
             followed.add_cached_times(cached.heard_at.items())
         store = MetadataStore.beside(cache.path)
         identity = component.identity
-        followed.metadata = await self.run_in_thread(lambda: store.known(identity, component.component))
+        known = await self.run_in_thread(lambda: store.known(identity, component.component))
+        if known is not None:
+            followed.describe(known)
 
 
 async def _wait_for_any(events: Iterable[anyio.Event]) -> None:

@@ -583,7 +583,7 @@ def test_fetch_prints_parameters_that_differ_from_the_defaults(command: Command)
     found = command("fetch", "sim:ardupilot", "--changed", "--json", "--no-cache").json
     assert list(found) == FETCH_KEYS
     assert (found["count"], found["received"], len(found["params"])) == (1382, 1382, 41)
-    assert list(found["params"]["RELAY1_FUNCTION"]) == [*PARAM_KEYS, "default"]
+    assert list(found["params"]["RELAY1_FUNCTION"]) == [*PARAM_KEYS, "default", "default_source"]
     assert found["params"]["RELAY1_FUNCTION"]["default"] == 0
     everything = command("fetch", "sim:ardupilot", "--json", "--no-cache").json["params"]
     assert {name: param for name, param in everything.items() if param["value"] != param["default"]} == (

@@ -175,6 +175,8 @@ def test_get_has_more_members_in_json_with_metadata(command: Command, put: Any) 
     done = command("get", url, "MC_ROLL_P", "COM_FLTMODE1", "--json", "--metadata", "vehicle", "--no-cache")
     params = done.json["params"]
     assert params["MC_ROLL_P"] == plain | {
+        "default": 6.5,
+        "default_source": "metadata",
         "units": "1/s",
         "metadata": {
             "short_description": "Gain from the error of the roll angle to the roll rate",

@@ -106,6 +106,7 @@ def test_a_parameter_has_its_members_in_order_and_no_empty_ones() -> None:
         "index": 4,
         "bits": "3fc00000",
         "default": 1.25,
+        "default_source": "vehicle",
         "is_default": False,
         "trust": "verified",
         "heard_at": 5.5,

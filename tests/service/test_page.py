@@ -235,6 +235,40 @@ def test_changed_from_default_lists_the_changed_parameters(visit: Callable[..., 
 
 
 @needs_browser
+def test_defaults_of_the_metadata_count_as_defaults(visit: Callable[..., Sight], tmp_path: Path) -> None:
+    """The service loads the descriptions of a PX4 without a request; the page offers a button for others."""
+    plain = SimVehicle(PX4Vehicle(system=5))
+    with at_work(tmp_path, more={"plain": plain}) as bench:
+        sight = visit(bench.url)
+        sight.find("MC_ROLL_P")
+        expect(sight.row("MC_ROLL_P").get_by_role("gridcell").nth(3)).to_contain_text("Gain from the error")
+        load = sight.page.get_by_role("button", name="Load descriptions")
+        expect(load).to_be_hidden()
+        third = sight.row("MC_ROLL_P").get_by_role("gridcell").nth(2)
+        expect(third).to_have_text("4.0")
+        expect(third).to_have_attribute("title", "Default of the metadata")
+        bench.set("MC_ROLL_P", 6.5)
+        sight.find("")
+        sight.page.get_by_role("button", name="Changed from default").click()
+        expect(sight.row("MC_ROLL_P")).to_be_visible()
+        changed = bench.ask("GET", "/components/1/1/params?link=px4&changed=true")["params"]
+        assert "MC_ROLL_P" in changed
+        expect(sight.page.locator("#count")).to_have_text(f"{len(changed)} of 903")
+        sight.find("MC_ROLL_P")
+        sight.search.press("Enter")
+        sight.grid.press("Space")
+        standard = sight.details.get_by_role("definition").first
+        expect(standard).to_have_text("4.0 1/s")
+        expect(standard).to_have_attribute("title", "Default of the metadata")
+        sight.details.press("Escape")
+        sight.choose("PX4 5/1")
+        expect(load).to_be_visible()
+        expect(load).to_have_attribute("title", "the vehicle serves no metadata")
+        load.click()
+        expect(sight.dialog.get_by_role("button", name="Load from the vehicle")).to_be_visible()
+
+
+@needs_browser
 def test_the_details_of_a_parameter(sight: Sight) -> None:
     sight.find("MC_ROLL_P")
     sight.search.press("Enter")

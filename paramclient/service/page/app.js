@@ -89,6 +89,7 @@ const draw = onceAFrame(() => {
 });
 const drawState = onceAFrame(() => {
   drawVehicles();
+  offerDescriptions();
   drawEmpty(grid.rows.length, store.table.rows.size);
 });
 

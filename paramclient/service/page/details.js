@@ -4,7 +4,7 @@ import { at, get } from "./api.js";
 import { button, byId, el, isNarrow } from "./dom.js";
 import { editorOf } from "./editor.js";
 import { authorOf, store } from "./store.js";
-import { defaultOf, meaningOf, moment, newsText, numberText, parse, rangeOf, span, textOf } from "./values.js";
+import { defaultOf, defaultSourceOf, meaningOf, moment, newsText, numberText, parse, rangeOf, span, textOf } from "./values.js";
 
 const MOST_HISTORY = 20;
 const TRUST = {
@@ -113,7 +113,7 @@ export class Details {
     );
     const standard = defaultOf(known);
     const facts = [
-      ["Default", standard !== null && `${standard}${meaning(standard, row)}`],
+      ["Default", standard !== null && `${standard}${meaning(standard, row)}`, defaultSourceOf(known)],
       ["Range", rangeOf(info)],
       ["Step", info?.increment !== undefined && numberText(info.increment, row.type)],
       ["Type", row.type],
@@ -128,7 +128,7 @@ export class Details {
     ];
     const shown = facts.filter(([, text]) => text !== null && text !== undefined && text !== false && text !== "");
     this.facts.replaceChildren(
-      ...shown.flatMap(([word, text]) => [el("dt", { text: word }), el("dd", { text: String(text) })]),
+      ...shown.flatMap(([word, text, title]) => [el("dt", { text: word }), el("dd", { text: String(text), title })]),
     );
     if (row.news && row.news.at !== this.newsAt) {
       this.newsAt = row.news.at;

@@ -4,7 +4,7 @@
  */
 
 import { byId, el, isNarrow, setAttribute, setText } from "./dom.js";
-import { defaultOf, newsText, textOf } from "./values.js";
+import { defaultOf, defaultSourceOf, newsText, textOf } from "./values.js";
 
 const SPARE = 10;
 const SETTLED = 120;
@@ -138,6 +138,7 @@ export class Grid {
       made.third,
       other ? (other.values.get(row.name)?.text ?? (other.isPartial ? "" : "–")) : (defaultOf(row.document) ?? ""),
     );
+    setAttribute(made.third, "title", other ? null : defaultSourceOf(row.document));
     setText(made.text, row.description);
     setText(made.mark, "");
     const states = [

@@ -1,7 +1,7 @@
 /** The state of the page: vehicles, tables, staged and written changes. Contains no rendering. */
 
 import { ASKER, at, get } from "./api.js";
-import { isChanged, meaningOf, sameText, textOf } from "./values.js";
+import { meaningOf, sameText, textOf } from "./values.js";
 
 /** Milliseconds for which changes by other clients are highlighted. */
 export const NEWS_FOR = 600_000;
@@ -24,13 +24,13 @@ class Row {
 
   take(document) {
     const info = document.metadata ?? this.info;
-    this.document = { ...document, metadata: info };
+    this.document = document;
     this.info = info;
     this.name = document.name;
     this.type = document.type;
     this.text = textOf(document);
     this.meaning = meaningOf(this.text, info, this.type);
-    this.isChanged = isChanged(this.document);
+    this.isChanged = document.is_default === undefined ? null : !document.is_default;
     this.description = info?.short_description ?? "";
     this.words = `${this.name} ${this.description} ${this.meaning} ${info?.long_description ?? ""}`.toLowerCase();
   }

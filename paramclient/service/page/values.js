@@ -135,18 +135,11 @@ export function sameText(a, b, type) {
   return type === "REAL32" ? Math.fround(x) === Math.fround(y) : x === y;
 }
 
-/** Returns whether a value differs from the firmware's default; null if the default is unknown. */
-export function isChanged(param) {
-  if (typeof param.is_default === "boolean") return !param.is_default;
-  const standard = defaultOf(param);
-  return standard === null ? null : !sameText(textOf(param), standard, param.type);
-}
-
 /** Formats the firmware's default; null if it is unknown. */
-export function defaultOf(param) {
-  const standard = param.default ?? param.metadata?.default;
-  return standard === null || standard === undefined ? null : numberText(standard, param.type);
-}
+export const defaultOf = (param) => (param.default === undefined ? null : numberText(param.default, param.type));
+
+/** Describes the origin of the default; null if it is unknown. */
+export const defaultSourceOf = (param) => param.default_source && `Default of the ${param.default_source}`;
 
 /** Formats a range: `0 to 12 1/s`. */
 export function rangeOf(info) {

@@ -1,7 +1,7 @@
 /** Vehicles and their states: the list, the status line, and the actions. */
 
 import { at, download, get, request } from "./api.js";
-import { announce, button, byId, el, setText } from "./dom.js";
+import { announce, button, byId, el, setAttribute, setText } from "./dom.js";
 import { chooseOther } from "./compare.js";
 import { closeDialog, openDialog } from "./dialogs.js";
 import { offerExtended, showExtended } from "./extended.js";
@@ -171,9 +171,8 @@ export function drawActions() {
   const actions = [
     button("Compare", () => chooseOther(), { drawing: "compare" }),
     button("Save", save, { drawing: "save" }),
-    button("Describe", describe, {
+    button("Load descriptions", describe, {
       drawing: "help",
-      label: "Load the descriptions of the parameters",
       id: "describe",
       hidden: true,
     }),
@@ -243,7 +242,7 @@ async function describe() {
     fault,
   );
   await openDialog(
-    `Describe the parameters of ${nameOf(component)}`,
+    `Descriptions for ${nameOf(component)}`,
     content,
     [button("Cancel", closeDialog, { kind: "quiet" }), ask],
     { focus: ask },
@@ -255,6 +254,7 @@ export function offerDescriptions() {
   const { table } = store;
   const isWanted = table.isLoaded && table.rows.size && !store.component?.is_kept;
   byId("describe").hidden = !isWanted || table.sorted.some((row) => row.info);
+  setAttribute(byId("describe"), "title", store.component?.metadata_note);
 }
 
 async function stopFetch() {

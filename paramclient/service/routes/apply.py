@@ -14,13 +14,13 @@ from paramclient.documents.diff import DiffDoc
 from paramclient.documents.document import Body, Document
 from paramclient.documents.job import JobDoc
 from paramclient.documents.setup import ApplyProgressDoc, ApplyResultDoc, InterruptedDoc, PlanDoc, VerifiedDoc
-from paramclient.errors import NoReply, UsageError
+from paramclient.errors import NoReply
 from paramclient.metadata import Metadata, MetadataStore
-from paramclient.model.comparison import compare, defaults_of
+from paramclient.model.comparison import compare
 from paramclient.model.paramset import ParamSet
 from paramclient.provision import ApplyProgress, ApplyResult, ApplyRow, Plan, apply, overlay, prepare, restore
 from paramclient.provision.apply_restore import restore_categories
-from paramclient.provision.vehicle_params import NO_DEFAULTS, FetchedSet, fetch_set
+from paramclient.provision.vehicle_params import FetchedSet, collect_defaults, fetch_set
 from paramclient.service.followed_component import FollowedComponent
 from paramclient.service.hub import Hub
 from paramclient.service.jobs import Job, Kind
@@ -231,21 +231,30 @@ async def _diff(hub: Hub, target: FollowedComponent, body: DiffRequest) -> Respo
     known, whole = left, right
     if renames is not None:
         known = await hub.run_in_file_thread(lambda: renames.apply_to(left, whole))
-    if body.base is not None and body.base.defaults:
-        base = await hub.run_in_file_thread(lambda: defaults_of(known, whole))
-        if not base:
-            raise UsageError(NO_DEFAULTS)
+    has_defaults = body.base is not None and body.base.defaults is not None
+    sets = [left, right] if base is None else [left, right, base]
+    described = await _described(hub, target, sets)
+    found = [*described, described[0] or described[1]][:3]
+    if has_defaults:
+        compared = [known, whole]
+
+        def defaults() -> ParamSet:
+            more = [
+                {} if each is None else each.defaults_of(names)
+                for each, names in zip(described, compared, strict=True)
+            ]
+            return collect_defaults(compared, more)
+
+        base = await hub.run_in_file_thread(defaults)
     if body.partial:
         right = await hub.run_in_file_thread(
             lambda: replace(whole, params={name: each for name, each in whole.items() if name in known})
         )
-    sets = [left, right] if base is None else [left, right, base]
-    found = [*await _described(hub, target, sets), None][:3]
 
     def encode() -> bytes:
         """Compare, and encode row by row: a full garbage collection of all rows would block every thread."""
         outcome = compare(left, right, base=base, names=body.only or None, renames=renames)
-        rows = DiffDoc.rows(outcome, *found, everything=body.full)
+        rows = DiffDoc.rows(outcome, *found, everything=body.full, has_defaults=has_defaults)
         return encode_document(DiffDoc.without_params(outcome), params=rows)
 
     return Response(await hub.run_in_file_thread(encode), media_type=JSON)

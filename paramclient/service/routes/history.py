@@ -22,6 +22,7 @@ from paramclient.documents.paramset import SetDoc
 from paramclient.errors import UsageError
 from paramclient.files import FileForm
 from paramclient.files.param_file import AUTOPILOT
+from paramclient.metadata import MetadataStore
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import check_name
 from paramclient.service.followed_component import FollowedComponent
@@ -207,10 +208,21 @@ async def vehicles(hub: HubArgument) -> Response:
 
 
 @router.get("/vehicles/{key:path}/{component}/params", response_model=CachedTableDoc)
-async def kept_params(hub: HubArgument, key: Key, component: Id) -> Response:
+async def kept_params(
+    hub: HubArgument,
+    key: Key,
+    component: Id,
+    metadata: Annotated[bool, Query(description="Include the descriptions of the parameters.")] = False,
+) -> Response:
     """Return the last known parameters of a vehicle."""
     table = await load_cached_table(hub, key, component)
-    return await document_response(hub.run_in_thread, lambda: CachedTableDoc.of(table, kept=True))
+    store = MetadataStore.beside(require_cache(hub).path)
+
+    def document() -> CachedTableDoc:
+        known = store.known(table.identity, table.component)
+        return CachedTableDoc.of(table, metadata=known, whole=metadata, kept=True)
+
+    return await document_response(hub.run_in_thread, document)
 
 
 @router.get("/vehicles/{key:path}/{component}/history", response_model=HistoryDoc)

@@ -89,6 +89,5 @@ async def described_by_file(
 
 
 def _take(target: FollowedComponent, metadata: Metadata) -> DescribedDoc:
-    target.metadata = metadata
-    target.publish("params", {"count": len(target.component.params)})
+    target.describe(metadata)
     return DescribedDoc(count=len(metadata), source=metadata.source)

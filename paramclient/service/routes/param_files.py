@@ -84,7 +84,15 @@ async def file(
             found = await fetch_set(
                 target.component, source=f"link {target.link.name}", run=hub.run_in_thread
             )
-        chosen = await hub.run_in_thread(lambda: select_non_defaults(found.set)) if changed else found.set
+        chosen = found.set
+        if changed:
+            metadata = target.metadata
+
+            def differing() -> ParamSet:
+                described = {} if metadata is None else metadata.defaults_of(found.set)
+                return select_non_defaults(found.set, described)
+
+            chosen = await hub.run_in_thread(differing)
         return await file_response(hub, chosen, form)
 
     return await run_until_disconnect(request, work, target)

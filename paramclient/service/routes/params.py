@@ -19,6 +19,7 @@ from paramclient.documents.document import Body, Document, InParts
 from paramclient.documents.param import ParamDoc
 from paramclient.documents.results import NotSetDoc, SetManyDoc, SetResultDoc
 from paramclient.errors import ParamClientError, UnknownParameter, UsageError
+from paramclient.model.defaults import add_default
 from paramclient.model.params import copy_params
 from paramclient.model.patterns import NameChoice
 from paramclient.model.similar_names import did_you_mean, nearest_names
@@ -133,7 +134,7 @@ async def known_params(
         return Response(f"{head}{texts}}}}}", media_type=JSON)
     entries = (
         f"{json.dumps(each.name)}:{_described(each, described.get(each.name), target.heard_at(each.name))}"
-        for each in _params_of(table, chosen, changed=changed)
+        for each in _params_of(target, table, chosen, changed=changed)
     )
     return streamed_response(head, entries, "}}")
 
@@ -264,11 +265,15 @@ def _named(known: Iterable[str], names: list[str]) -> list[str]:
     return [name for name in known if choice.has(name)]
 
 
-def _params_of(table: Mapping[str, Param], names: Iterable[str], *, changed: bool) -> Iterator[Param]:
+def _params_of(
+    target: FollowedComponent, table: Mapping[str, Param], names: Iterable[str], *, changed: bool
+) -> Iterator[Param]:
     """Yield the parameters with these names, each created on demand to keep garbage collections short."""
     for name in names:
         param = table.get(name)
-        if param is not None and (not changed or param.is_changed):
+        if param is not None and (
+            not changed or add_default(param, target.described_default(name)).is_changed
+        ):
             yield param
 
 
@@ -278,7 +283,7 @@ async def _texts(
     """Return the members of a JSON object, encoded in parts between which other tasks run."""
     parts = []
     for start in range(0, len(names), PARAMS_PER_TURN):
-        params = _params_of(table, names[start : start + PARAMS_PER_TURN], changed=changed)
+        params = _params_of(target, table, names[start : start + PARAMS_PER_TURN], changed=changed)
         parts.append(target.object_of(params)[1:-1])
         await anyio.lowlevel.checkpoint()
     return ",".join(filter(None, parts))

@@ -1,0 +1,238 @@
+"""The firmware's defaults in every command: of the vehicle, else of its metadata, each with its source."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from paramclient.cli import session as cli_session
+from paramclient.files import read_file
+from paramclient.links import SimLink
+from paramclient.model.values import ParamType
+from paramclient.protocol import wire
+from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam
+from tests.commands import Command, Put, behind, in_process, leaping
+from tests.shell import Tap
+from tests.ways import ServedClient
+
+TABLE = {"COM_FLTMODE1": 0, "EKF2_GPS_CTRL": 7, "MC_PITCH_P": 6.5, "MC_ROLL_P": 4.0}
+"""The defaults in the metadata of the simulated PX4."""
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Run the command line in this process, on simulated time, with a new cache."""
+    leaping(monkeypatch)
+    return in_process(capsys, "--cache", str(tmp_path / "cache.sqlite3"))
+
+
+@pytest.fixture
+def put(monkeypatch: pytest.MonkeyPatch) -> Put:
+    """Connect every URL to a simulated vehicle."""
+    return behind(monkeypatch, "udpin:0.0.0.0:14550")
+
+
+def quad(*, metadata: bool = True, **options: Any) -> PX4Vehicle:
+    """A PX4 with MC_ROLL_P changed from its default."""
+    vehicle = PX4Vehicle(table=TABLE, metadata=metadata, **options)
+    vehicle.set_param("MC_ROLL_P", 6.25)
+    return vehicle
+
+
+def a_file(folder: Path, **defaults: float) -> Path:
+    """A file of metadata with these defaults of floats."""
+    path = folder / "parameters.json"
+    entries = [{"name": name, "type": "Float", "default": value} for name, value in defaults.items()]
+    path.write_text(json.dumps({"version": 1, "parameters": entries}))
+    return path
+
+
+ROW = ["MC_ROLL_P", "6.25", "REAL32", "3", "live", "4.0"]
+SOURCES = "4 of 4 defaults from the metadata of the firmware, which does not have the defaults of an airframe"
+
+
+# fetch
+
+
+def test_fetch_loads_the_metadata_of_a_vehicle_on_a_quick_link(command: Command, put: Put) -> None:
+    done = command("fetch", put(quad()), "--changed")
+    assert done.code == 0, done.err
+    assert done.rows[1:] == [ROW]
+    assert "1/1 px4: 1 of 1 default from the metadata of the firmware" in done.err
+
+
+def test_it_is_remembered_for_the_firmware(command: Command, put: Put) -> None:
+    assert command("fetch", put(quad()), "--changed").code == 0
+    tap = Tap(quad())
+    done = command("fetch", put(tap), "--changed", "--json")
+    assert list(done.json["params"]) == ["MC_ROLL_P"]
+    param = done.json["params"]["MC_ROLL_P"]
+    assert (param["default"], param["default_source"]) == (4, "metadata")
+    assert not tap.messages(wire.FileTransfer)
+    everything = command("fetch", put(quad()), "--json").json["params"]
+    assert {name: each["default_source"] for name, each in everything.items()} == dict.fromkeys(
+        TABLE, "metadata"
+    )
+
+
+def test_without_changed_nothing_is_requested_for_defaults(command: Command, put: Put) -> None:
+    tap = Tap(quad())
+    done = command("fetch", put(tap), "--json")
+    assert "default" not in done.json["params"]["MC_ROLL_P"]
+    assert not tap.messages(wire.FileTransfer)
+
+
+def test_the_default_of_the_vehicle_has_priority(command: Command, put: Put, tmp_path: Path) -> None:
+    vehicle = ArduPilotVehicle(
+        table=[SimParam("A", ParamType.REAL32, 5.0, default=1.0), SimParam("B", ParamType.REAL32, 2.0)],
+        live=(),
+    )
+    described = a_file(tmp_path, A=5.0, B=2.0)
+    done = command("fetch", put(vehicle), "--changed", "--json", "--metadata", described)
+    assert {
+        name: (each["default"], each["default_source"]) for name, each in done.json["params"].items()
+    } == {"A": (1, "vehicle")}
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "reason"),
+    [
+        (lambda: quad(metadata=False), "the vehicle serves no metadata"),
+        (lambda: quad(armed=True), "the vehicle is armed"),
+        (lambda: PX4Vehicle(metadata=True, ftp_rate=2_000.0), "the transfer did not end within 2 s"),
+        (lambda: GenericVehicle(table={"A": 5.0}), "the vehicle does not announce MAVFTP"),
+    ],
+)
+def test_unknown_defaults_are_an_error_that_says_what_to_do(
+    command: Command, put: Put, vehicle: Any, reason: str
+) -> None:
+    done = command("fetch", put(vehicle()), "--changed")
+    assert (done.code, done.out) == (1, "")
+    assert f"no metadata was requested or received: {reason}\n" in done.err
+    assert "defaults are not known" in done.err
+    assert "--metadata vehicle requests it from a vehicle that serves it" in done.err
+
+
+def test_metadata_vehicle_takes_the_time_that_it_needs(command: Command, put: Put) -> None:
+    vehicle = PX4Vehicle(metadata=True, ftp_rate=2_000.0)
+    vehicle.set_param("MC_ROLL_P", 6.5)
+    done = command("fetch", put(vehicle), "--changed", "--metadata", "vehicle")
+    assert done.code == 0
+    assert "MC_ROLL_P" in [row[0] for row in done.rows]
+
+
+def test_the_default_of_a_file_counts_without_a_link_to_more(
+    command: Command, put: Put, tmp_path: Path
+) -> None:
+    vehicle = GenericVehicle(table={"A": 5.0, "B": 6.0})
+    done = command("fetch", put(vehicle), "--changed", "--metadata", a_file(tmp_path, A=2.5))
+    assert done.code == 0
+    assert [row[0] for row in done.rows[1:]] == ["A"]
+
+
+def test_each_of_several_vehicles_has_its_own_defaults(command: Command, put: Put) -> None:
+    other = PX4Vehicle(system=2, table=TABLE, metadata=True)
+    done = command("fetch", put(Air([quad(), other])), "--changed", "--all")
+    assert done.code == 0, done.err
+    assert [row[:2] for row in done.rows[1:]] == [["1/1", "MC_ROLL_P"]]
+
+
+# without a link, and files
+
+
+def test_a_cached_table_is_compared_with_the_remembered_metadata(command: Command, put: Put) -> None:
+    assert command("fetch", put(quad())).code == 0
+    assert command("show", "1", "--changed").code == 1
+    assert command("fetch", put(quad()), "--changed").code == 0
+    shown = command("show", "1", "--changed")
+    assert shown.code == 0, shown.err
+    assert [row[:3] for row in shown.rows[1:]] == [["MC_ROLL_P", "6.25", "4.0"]]
+    assert "1 of 1 default from the metadata" in shown.err
+    found = command("show", "1", "--changed", "--json").json["components"][0]["params"]
+    assert {name: each["default_source"] for name, each in found.items()} == {"MC_ROLL_P": "metadata"}
+    told = command("info", "MC_ROLL_P")
+    assert "default of the firmware: 4.0 (from the metadata)" in told.out
+    (vehicle,) = command("info", "MC_ROLL_P", "--json").json["vehicles"]
+    assert (vehicle["param"]["default_source"], vehicle["param"]["is_default"]) == ("metadata", False)
+
+
+def test_save_writes_what_differs(command: Command, put: Put, tmp_path: Path) -> None:
+    file = tmp_path / "changed.json"
+    done = command("save", put(quad()), file, "--changed")
+    assert done.code == 0, done.err
+    written = read_file(file).choose(None)
+    assert list(written) == ["MC_ROLL_P"]
+    assert written["MC_ROLL_P"].default is None, "a file has only what the vehicle gives"
+    again = command("save", "1", tmp_path / "cached.parm", "--changed")
+    assert again.code == 0, again.err
+    assert list(read_file(tmp_path / "cached.parm").choose(None)) == ["MC_ROLL_P"]
+    whole = tmp_path / "whole.parm"
+    assert command("save", "1", whole).code == 0
+    refused = command("save", "1", whole, "--metadata", file)
+    assert (refused.code, "--metadata gives the defaults for --changed" in refused.err) == (2, True)
+    given = a_file(tmp_path, MC_ROLL_P=6.25, MC_PITCH_P=1.0)
+    converted = command("save", whole, tmp_path / "part.parm", "--changed", "--metadata", given)
+    assert converted.code == 0, converted.err
+    assert list(read_file(tmp_path / "part.parm").choose(None)) == ["MC_PITCH_P"]
+    shown = command("show", whole, "--changed", "--metadata", given)
+    assert [row[0] for row in shown.rows[1:]] == ["MC_PITCH_P"]
+    assert "1 of 1 default from the metadata" in shown.err
+
+
+def test_a_comparison_with_the_defaults_takes_those_of_the_metadata(
+    command: Command, put: Put, tmp_path: Path
+) -> None:
+    file = tmp_path / "tuned.parm"
+    file.write_text("MC_ROLL_P,4\nMC_PITCH_P,7\n")
+    assert command("fetch", put(quad())).code == 0
+    words = ("diff", "1", file, "--partial", "--base", "defaults")
+    unknown = command(*words)
+    assert unknown.code == 2
+    assert "--metadata FILE takes a file" in unknown.err
+    assert command("fetch", put(quad()), "--changed").code == 0
+    found = command(*words, "--json").json
+    assert {name: (each["moved"], each["default_source"]) for name, each in found["params"].items()} == {
+        "MC_PITCH_P": ("right", "metadata"),
+        "MC_ROLL_P": ("left", "metadata"),
+    }
+    assert "2 of 2 from the metadata" in found["base"]["source"]
+    shown = command(*words)
+    assert "base: 2 parameters from the firmware's defaults, 2 of 2 from the metadata" in shown.err
+
+
+# over a service, and reset
+
+
+@pytest.fixture
+def served(monkeypatch: pytest.MonkeyPatch, put: Put) -> Put:
+    """Connect every URL to a service with the vehicle."""
+
+    def place(far_end: Any) -> str:
+        url = put(far_end)
+        monkeypatch.setattr(
+            cli_session, "ParamClient", lambda url, **options: ServedClient(SimLink(far_end, "sim:custom"))
+        )
+        return url
+
+    return place
+
+
+def test_over_a_service_the_metadata_is_that_of_the_service(command: Command, served: Put) -> None:
+    url = served(quad())
+    unknown = command("fetch", url, "--changed")
+    assert (unknown.code, unknown.out) == (1, "")
+    done = command("fetch", url, "--changed", "--json", "--metadata", "vehicle")
+    assert done.code == 0, done.err
+    param = done.json["params"]["MC_ROLL_P"]
+    assert (param["default"], param["default_source"]) == (4, "metadata")
+
+
+def test_reset_over_a_service_takes_the_metadata_of_the_vehicle(command: Command, served: Put) -> None:
+    vehicle = quad()
+    done = command("reset", served(vehicle), "--changed")
+    assert done.code == 0, done.err
+    assert done.rows[1:] == [["MC_ROLL_P", "6.25", "4.0", "4.0", "accepted"]]
+    assert vehicle.values["MC_ROLL_P"] == 4.0
