@@ -86,7 +86,7 @@ class DescriptionLoader:
             if store is not None:  # another vehicle with this firmware may have provided them since
                 known = await self._run_in_thread(lambda: store.known(identity, component.component))
                 if known is not None:
-                    followed.describe(known)
+                    followed.describe(known, identity)
                     return
             loaded = await load_if_quick(component, store=store or False)
         except LinkError:  # the vehicle is asked again when the link is back
@@ -98,7 +98,7 @@ class DescriptionLoader:
         if loaded.metadata is None:
             self._note(followed, loaded.note)
         elif followed.metadata is None:
-            followed.describe(loaded.metadata)
+            followed.describe(loaded.metadata, identity)
             logger.info("%s: %d descriptions loaded", _label(component), len(loaded.metadata))
 
     def _note(self, followed: FollowedComponent, note: str) -> None:

@@ -22,6 +22,7 @@ from paramclient.service.followed_extended import FollowedExtended
 
 if TYPE_CHECKING:
     from paramclient.metadata import Metadata
+    from paramclient.model.identity import Identity
     from paramclient.service.event_feed import EventFeed
 
 __all__ = ["FollowedComponent", "FollowedLink", "param_json"]
@@ -64,6 +65,7 @@ class FollowedComponent:
         self.link = link
         self.metadata: Metadata | None = None
         self.metadata_note: str | None = None
+        self._described_firmware: tuple[object, ...] | None = None
         self._feed = feed
         self._published = as_params(component.params).copy()
         self._heard_at: dict[str, float] = {}
@@ -104,11 +106,29 @@ class FollowedComponent:
             metadata_note=self.metadata_note,
         )
 
-    def describe(self, metadata: Metadata) -> None:
-        """Take descriptions of the parameters, and publish that the parameters have them."""
+    def describe(self, metadata: Metadata, identity: Identity | None = None) -> None:
+        """Take descriptions of the parameters, and publish that the parameters have them.
+
+        Args:
+            metadata: the descriptions. They are removed when the firmware is another one.
+            identity: the identity whose firmware they belong to; None for the present one.
+        """
         self.metadata_note = None
-        if self.metadata is not None and metadata.params == self.metadata.params:
+        self._described_firmware = _firmware_of(self.component.identity if identity is None else identity)
+        if self.metadata is None or metadata.params != self.metadata.params:
+            self._set_metadata(metadata)
+
+    def _forget_other_firmware(self) -> None:
+        """Remove descriptions of the firmware that the vehicle had before."""
+        if self.metadata is None:
             return
+        firmware, described = _firmware_of(self.component.identity), self._described_firmware
+        if described is None:
+            self._described_firmware = firmware
+        elif firmware not in (None, described):
+            self._set_metadata(None)
+
+    def _set_metadata(self, metadata: Metadata | None) -> None:
         self.metadata = metadata
         self._texts.clear()
         self.publish("params", {"count": len(self.component.params)})
@@ -176,6 +196,7 @@ class FollowedComponent:
 
     def publish_state_changes(self) -> None:
         """Publish changes of its state, and the progress of a fetch."""
+        self._forget_other_firmware()
         machine = self.component.machine
         fetch = machine.fetch
         if fetch is not None:
@@ -310,6 +331,13 @@ class _ChangeForwarder(Changes):
 def param_json(param: Param, heard_at: float | None, described: int | float | None = None) -> str:
     """Return a parameter as JSON, with its default; see `default_of`."""
     return ParamDoc.kept(param, heard_at=heard_at, described=described).model_dump_json()
+
+
+def _firmware_of(identity: Identity) -> tuple[object, ...] | None:
+    """Return the members of an identity that tell the firmware; None while they are unknown."""
+    if not identity.firmware and not identity.git_hash:
+        return None
+    return identity.autopilot, identity.vehicle_type, identity.firmware, identity.git_hash, identity.board
 
 
 def _now() -> float:

@@ -464,7 +464,7 @@ class Hub:
         identity = component.identity
         known = await self.run_in_thread(lambda: store.known(identity, component.component))
         if known is not None:
-            followed.describe(known)
+            followed.describe(known, identity)
 
 
 async def _wait_for_any(events: Iterable[anyio.Event]) -> None:

@@ -27,7 +27,7 @@ from paramclient.documents.diff import DiffDoc
 from paramclient.documents.document import Document
 from paramclient.documents.fleet import FleetDiffDoc
 from paramclient.documents.history import HistoryDoc, HistoryEntryDoc, SnapshotDoc
-from paramclient.documents.param import InfoDoc, ParamDoc, ReadOutputDoc, WrittenParamDoc
+from paramclient.documents.param import InfoDoc, InfosDoc, ParamDoc, ReadOutputDoc, WrittenParamDoc
 from paramclient.documents.paramset import FileDoc, FormatDoc, SetDoc, UploadedDoc
 from paramclient.documents.setup import ApplyResultDoc, InterruptedDoc, PlanDoc, VerifiedDoc
 from paramclient.errors import NoReply, UnknownParameter
@@ -121,6 +121,40 @@ def test_a_parameter_has_its_members_in_order_and_no_empty_ones() -> None:
         },
     }
     assert InfoDoc.of(ParamInfo("P")).as_json() == {}
+
+
+def test_the_default_of_metadata_is_told_apart_and_is_none_of_the_vehicle() -> None:
+    document = ParamDoc.kept(param("P", 1.5), described=2)
+    assert (document.default, document.default_source, document.is_default) == (2, "metadata", False)
+    assert document.param("P").default is None
+    given = ParamDoc.kept(Param("P", 1.5, ParamType.REAL32, 4, 0x3FC00000, Trust.LIVE, 1.5), described=2)
+    assert (given.default, given.default_source, given.is_default) == (1.5, "vehicle", True)
+    assert given.param("P").default == 1.5
+
+
+def test_metadata_goes_over_a_service_without_loss_but_for_types() -> None:
+    info = ParamInfo(
+        "P{n}",
+        short_description="short",
+        long_description="long",
+        units="m",
+        minimum=-1,
+        maximum=math.inf,
+        increment=0.1,
+        decimals=2,
+        default=0.5,
+        values={0: "off", 1.5: "half"},
+        bits={3: "three"},
+        reboot_required=True,
+        is_read_only=True,
+        is_volatile=True,
+        category="c",
+        group="g",
+    )
+    told = InfosDoc.of(Metadata.of([info], source="the file"), ["P7"])
+    metadata = InfosDoc.model_validate_json(told.model_dump_json()).metadata()
+    assert metadata.source == "the file"
+    assert dict(metadata) == {"P7": info.instance("P7", "7")}
 
 
 def test_errors_are_a_member_only_if_a_parameter_was_not_received() -> None:

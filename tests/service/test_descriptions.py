@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import anyio
 import httpx
@@ -238,3 +240,34 @@ async def test_a_file_of_a_user_stays_when_the_vehicle_is_found_again() -> None:
         await anyio.sleep(10.0)
         assert hub.followed[0].component.state == "synced"
         assert (await browser.get(f"{C}/params/{CHANGED}")).json()["default"] == 2
+
+
+@swiftly
+async def test_another_firmware_has_descriptions_of_its_own(tmp_path: Path) -> None:
+    vehicle = PX4Vehicle(metadata=True)
+    tap = Tap(vehicle)
+    async with serving(tap, tmp_path) as (hub, browser):
+        assert await described(hub)
+        first, asked = hub.followed[0].metadata, locations_requested(tap)
+        vehicle._version = replace(vehicle._version, git_hash=bytes(range(1, 9)))
+        vehicle.reboot(down=8.0)
+        await anyio.sleep(60.0)
+        assert hub.followed[0].component.identity.git_hash == bytes(range(1, 9))[::-1].hex()
+        assert hub.followed[0].metadata is not first
+        assert locations_requested(tap) == asked + 1
+        assert (await browser.get(f"{C}/params/{CHANGED}")).json()["default_source"] == "metadata"
+
+
+@swiftly
+async def test_a_vehicle_in_the_cache_has_its_defaults_and_descriptions(tmp_path: Path) -> None:
+    async with serving(changed(PX4Vehicle(metadata=True)), tmp_path) as (hub, browser):
+        assert await described(hub)
+        place = f"/api/v1/vehicles/{quote(str(hub.followed[0].key), safe='')}/1/params"
+        param = (await browser.get(place)).json()["params"][CHANGED]
+        assert (param["default_source"], param["is_default"], "metadata" in param) == (
+            "metadata",
+            False,
+            False,
+        )
+        whole = (await browser.get(place, params={"metadata": "true"})).json()["params"][CHANGED]
+        assert whole["metadata"]["units"] == "1/s"
