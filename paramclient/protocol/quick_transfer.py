@@ -17,8 +17,8 @@ QUICK_GAP_MAX: Final = 0.005
 """Seconds between two values of the list, above which the link is slow: PX4 sends one each 1 ms on UDP and
 USB, and each 6.7 ms on a serial port; a 57600-baud radio carries one each 25 ms."""
 QUICK_ROUND_TRIP_MAX: Final = 0.2
-"""Seconds of a round trip, above which the link is slow: the request, and opening and closing two files, take
-7 round trips, which leave less than a third of 2 s for the data."""
+"""Seconds of the shortest round trip, above which the link is slow (a busy computer makes others longer): the
+request, and opening and closing two files, take 7 round trips, which leave less than a third of 2 s."""
 
 
 def obstacle_to_quick_transfer(station: Station, machine: ComponentMachine) -> str | None:
@@ -30,7 +30,7 @@ def obstacle_to_quick_transfer(station: Station, machine: ComponentMachine) -> s
         station: the link.
         machine: the component.
     """
-    presence, round_trip = machine.presence, machine.round_trip.smoothed
+    presence, round_trip = machine.presence, machine.round_trip
     traffic = station.traffic
     if station.listens_only:
         return "the client only listens"
@@ -50,6 +50,6 @@ def obstacle_to_quick_transfer(station: Station, machine: ComponentMachine) -> s
         return "a telemetry radio is on the link"
     if machine.reads.pace.gap > QUICK_GAP_MAX:
         return f"the link is slow: its list came at less than {1.0 / QUICK_GAP_MAX:.0f} values/s"
-    if round_trip is not None and round_trip > QUICK_ROUND_TRIP_MAX:
+    if round_trip.samples and round_trip.shortest > QUICK_ROUND_TRIP_MAX:
         return f"the link is slow: a round trip takes more than {QUICK_ROUND_TRIP_MAX:g} s"
     return None

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Callable, Coroutine
 from typing import Final, TypeAlias
 
 from paramclient.client.local import LocalComponent
 from paramclient.errors import LinkError, ParamClientError
-from paramclient.metadata import Metadata, MetadataStore
+from paramclient.metadata import MetadataStore
 from paramclient.metadata.quick_download import load_if_quick, obstacle_to_load
 from paramclient.model.identity import Identity
 from paramclient.service.followed_component import FollowedComponent
-from paramclient.service.problems import ServiceError
 
 __all__ = ["DescriptionLoader"]
 
@@ -23,7 +22,6 @@ forgotten beyond that."""
 logger = logging.getLogger(__name__)
 
 Attempt: TypeAlias = tuple[str, tuple[int, int], Identity]
-RunInThread: TypeAlias = Callable[[Callable[[], Metadata | None]], Awaitable[Metadata | None]]
 
 
 class DescriptionLoader:
@@ -35,12 +33,10 @@ class DescriptionLoader:
 
     Args:
         store: the metadata cache, or None.
-        run_in_thread: runs blocking work.
     """
 
-    def __init__(self, store: MetadataStore | None, run_in_thread: RunInThread) -> None:
+    def __init__(self, store: MetadataStore | None) -> None:
         self._store = store
-        self._run_in_thread = run_in_thread
         self._attempts: dict[Attempt, None] = {}
         self._loading: set[str] = set()
 
@@ -81,18 +77,13 @@ class DescriptionLoader:
         return load
 
     async def _load(self, followed: FollowedComponent, identity: Identity) -> None:
-        component, store = followed.component, self._store
+        component = followed.component
         try:
-            if store is not None:  # another vehicle with this firmware may have provided them since
-                known = await self._run_in_thread(lambda: store.known(identity, component.component))
-                if known is not None:
-                    followed.describe(known, identity)
-                    return
-            loaded = await load_if_quick(component, store=store or False)
+            loaded = await load_if_quick(component, store=self._store or False)
         except LinkError:  # the vehicle is asked again when the link is back
             self._attempts.pop(_attempt(followed, identity), None)
             return
-        except (ParamClientError, ServiceError) as error:
+        except ParamClientError as error:
             self._note(followed, str(error))
             return
         if loaded.metadata is None:

@@ -124,7 +124,7 @@ class Hub:
         self.fleet_comparisons = anyio.Semaphore(1)
         self._closing = anyio.Event()
         store = None if self.cache is None else MetadataStore.beside(self.cache.path)
-        self._descriptions = DescriptionLoader(store, self.run_in_thread)
+        self._descriptions = DescriptionLoader(store)
         self._setups = None if self.cache is None else SetupNotes.beside(self.cache.path)
         self._tasks: anyio.abc.TaskGroup | None = None
         self._link_tasks: anyio.abc.TaskGroup | None = None
@@ -463,7 +463,7 @@ class Hub:
         store = MetadataStore.beside(cache.path)
         identity = component.identity
         known = await self.run_in_thread(lambda: store.known(identity, component.component))
-        if known is not None:
+        if known is not None and followed.metadata is None:
             followed.describe(known, identity)
 
 

@@ -237,7 +237,7 @@ def test_changed_from_default_lists_the_changed_parameters(visit: Callable[..., 
 @needs_browser
 def test_defaults_of_the_metadata_count_as_defaults(visit: Callable[..., Sight], tmp_path: Path) -> None:
     """The service loads the descriptions of a PX4 without a request; the page offers a button for others."""
-    plain = SimVehicle(PX4Vehicle(system=5))
+    plain = SimVehicle(PX4Vehicle(system=5, ftp=True))
     with at_work(tmp_path, more={"plain": plain}) as bench:
         sight = visit(bench.url)
         sight.find("MC_ROLL_P")
