@@ -58,7 +58,7 @@ MAY_IMPORT = {
     "files": {"errors", "model", "protocol.ftp.param_pck"},
     "client": SHELL | {"remote", "sim"},
     "remote": SHELL | {"documents"},
-    "sync": SHELL | {"sim"},
+    "sync": SHELL | {"sim", "metadata", "diagnosis", "provision"},
     "metadata": SHELL,
     "provision.apply_rules": {"errors", "model"},
     "provision.planning": {"errors", "model", "provision.apply_rules"},

@@ -6,7 +6,7 @@
 - `extended`: the same for extended parameters.
 - `fleet`: `apply_all` and `verify_all` for several vehicles.
 - `vehicle_params`: parameters of a vehicle or of the cache as a set.
-- `apply_rules`, `runner`: special parameters, long computations.
+- `apply_rules`, `runner`: special parameters; long computations and `before_writing`.
 """
 
 from __future__ import annotations

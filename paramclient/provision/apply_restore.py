@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Awaitable, Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Final
 
 import anyio
@@ -44,7 +44,7 @@ async def apply(
     timeout: float | None = None,
     asker: str | None = None,
     progress: Callable[[ApplyProgress], None] | None = None,
-    before_writing: Callable[[], Awaitable[object]] | None = None,
+    before_writing: Callable[[], object] | None = None,
 ) -> ApplyResult:
     """Write the wanted values to a vehicle, and verify each of them by reading it back at the end.
 
@@ -58,8 +58,8 @@ async def apply(
     values are still written.
 
     After the first PARAM_SET, a failure is not raised: `error` of the result holds it, and the rows hold the
-    outcome of each value so far. Cancellation leaves the values that were written on the vehicle. The next
-    call continues from there.
+    outcome of each value so far. Cancellation, or Ctrl-C in a blocking call, leaves the values that were
+    written on the vehicle. The next call continues from there.
 
     Args:
         component: the vehicle.
@@ -80,8 +80,8 @@ async def apply(
         timeout: seconds, after which the result reports how far the run came.
         asker: the author of the changes, as in `Component.set`.
         progress: called after each value and at the start of a phase; it must not raise.
-        before_writing: awaited once, after the vehicle was read, and before its state is stored and the
-            first value is written; its exceptions end the call.
+        before_writing: called once after the vehicle was read, before its state is stored and the first value
+            is written; awaited if it is asynchronous. Its exceptions end the call.
 
     Raises:
         InvalidParameters: some values are invalid, and `skip_invalid` is false.
@@ -123,7 +123,7 @@ async def restore(
     timeout: float | None = None,
     asker: str | None = None,
     progress: Callable[[ApplyProgress], None] | None = None,
-    before_writing: Callable[[], Awaitable[object]] | None = None,
+    before_writing: Callable[[], object] | None = None,
 ) -> ApplyResult:
     """Restore an earlier state of a vehicle: `apply`, with its own identity and calibration included.
 

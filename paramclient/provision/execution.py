@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final
@@ -55,6 +55,7 @@ from paramclient.provision.planning import (
     plan,
 )
 from paramclient.provision.results import ApplyProgress, ApplyResult, ApplyRow, ApplyStatus
+from paramclient.provision.runner import call_and_wait
 
 __all__ = ["ApplyOptions", "ApplyRun"]
 
@@ -97,7 +98,7 @@ class ApplyOptions:
     backup: str | os.PathLike[str] | None
     asker: str | None
     progress: Callable[[ApplyProgress], None] | None
-    before_writing: Callable[[], Awaitable[object]] | None
+    before_writing: Callable[[], object] | None
     reason: str
     skips_read_only: bool = False
 
@@ -175,7 +176,7 @@ class ApplyRun:
             raise InvalidParameters(invalid)
         self._check_resets()
         if self._options.before_writing is not None:
-            await self._options.before_writing()
+            await call_and_wait(self._options.before_writing)
         await self._store_state()
 
     async def write_and_verify(self) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import anyio
@@ -19,6 +19,7 @@ from paramclient.model.ext_params import ExtParam
 from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.protocol.ext.write_batch import ExtSetOutcome
 from paramclient.provision.apply_restore import BEFORE_RESTORE
+from paramclient.provision.runner import call_and_wait
 from paramclient.provision.vehicle_params import BEFORE_APPLY
 
 __all__ = [
@@ -146,7 +147,7 @@ async def apply_extended(
     timeout: float | None = None,
     asker: str | None = None,
     progress: Callable[[ExtSetOutcome], None] | None = None,
-    before_writing: Callable[[], Awaitable[object]] | None = None,
+    before_writing: Callable[[], object] | None = None,
 ) -> ExtApplyResult:
     """Write the wanted values that differ to a component, and verify them by another download.
 
@@ -165,8 +166,8 @@ async def apply_extended(
         timeout: seconds for the whole call; None: no limit.
         asker: the author of the changes, as in `Component.set`.
         progress: called with each outcome.
-        before_writing: awaited once if there is something to write, before the state is stored; its
-            exceptions end the call.
+        before_writing: called once if there is something to write, and awaited if it is asynchronous, before
+            the state is stored; its exceptions end the call.
 
     Raises:
         UsageError: as from `verify_extended`; or `durable` without a cache.
@@ -196,7 +197,7 @@ async def restore_extended(
     timeout: float | None = None,
     asker: str | None = None,
     progress: Callable[[ExtSetOutcome], None] | None = None,
-    before_writing: Callable[[], Awaitable[object]] | None = None,
+    before_writing: Callable[[], object] | None = None,
 ) -> ExtApplyResult:
     """Restore an earlier state of a component: `apply_extended` with a snapshot *before restore*.
 
@@ -254,7 +255,7 @@ async def _write(
     timeout: float | None,
     asker: str | None,
     progress: Callable[[ExtSetOutcome], None] | None,
-    before_writing: Callable[[], Awaitable[object]] | None,
+    before_writing: Callable[[], object] | None,
 ) -> ExtApplyResult:
     began = anyio.current_time()
 
@@ -264,7 +265,7 @@ async def _write(
     ext = component.ext
     plan = await verify_extended(component, wanted, timeout=timeout)
     if plan.changes and before_writing is not None:
-        await before_writing()
+        await call_and_wait(before_writing)
     source = f"{component.system}/{component.component} {reason}"
     ids = plan.system, plan.component
     before = ExtParamSet(plan.current, *ids, time.time(), source, component.identity)

@@ -42,7 +42,7 @@ async def apply_all(
     timeout: float | None = None,
     asker: str | None = None,
     progress: Callable[[Component, ApplyProgress], None] | None = None,
-    before_writing: Callable[[Component], Awaitable[object]] | None = None,
+    before_writing: Callable[[Component], object] | None = None,
 ) -> FleetApplied:
     """`apply` to several vehicles concurrently. A failure of one vehicle does not stop the others.
 

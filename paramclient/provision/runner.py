@@ -1,11 +1,12 @@
-"""Runners of long computations: in the calling task, or in a worker thread of a service."""
+"""Functions that the caller of a set-up gives: runners of long computations, and `before_writing`."""
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from typing import Protocol, TypeVar
 
-__all__ = ["Runner", "run_here"]
+__all__ = ["Runner", "call_and_wait", "run_here"]
 
 Result = TypeVar("Result")
 
@@ -23,3 +24,10 @@ class Runner(Protocol):
 async def run_here(work: Callable[[], Result], /) -> Result:
     """Run a computation in the calling task."""
     return work()
+
+
+async def call_and_wait(function: Callable[[], object]) -> None:
+    """Call a function; if it is asynchronous, wait for its end."""
+    result = function()
+    if inspect.isawaitable(result):
+        await result

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import inspect
+import subprocess
+import sys
 from dataclasses import fields, is_dataclass
 from typing import Any
 
 import pytest
 
 import paramclient
+import paramclient.diagnosis
+import paramclient.metadata
+import paramclient.provision
 import paramclient.sync
 from paramclient.client.subscription import Subscription
 from tests.sync_interface import BLOCKING, Call, blocking_source
@@ -18,6 +23,15 @@ NAMES = {"aclose": "close", "__aenter__": "__enter__", "__aexit__": "__exit__"}
 
 BY_LOOPS = {"__aiter__", "__anext__", "push", "end"}
 """What a loop needs of a stream, or the client itself."""
+
+
+FUNCTIONS = {
+    name: getattr(module, name)
+    for module in (paramclient.provision, paramclient.metadata, paramclient.diagnosis)
+    for name in module.__all__
+    if inspect.iscoroutinefunction(getattr(module, name))
+}
+"""The asynchronous functions that take a client or a component."""
 
 
 def test_the_blocking_classes_are_as_generated() -> None:
@@ -35,12 +49,36 @@ def test_every_asynchronous_class_has_a_blocking_one() -> None:
         or issubclass(thing, Subscription)
         or (is_dataclass(thing) and "Component" in {each.type for each in fields(thing)})
     }
-    assert asynchronous | {"Event", "FetchIterator"} == set(paramclient.sync.__all__)
+    others = {"Event", "FetchIterator", "Wanted", *FUNCTIONS}
+    assert asynchronous | others == set(paramclient.sync.__all__)
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_every_asynchronous_function_has_a_blocking_one(name: str) -> None:
+    ours, theirs = getattr(paramclient.sync, name), FUNCTIONS[name]
+    assert not inspect.iscoroutinefunction(ours)
+    assert ours.__doc__
+    ours, theirs = inspect.signature(ours), inspect.signature(theirs)
+    assert [(each.name, each.kind, each.default) for each in ours.parameters.values()] == [
+        (each.name, each.kind, each.default) for each in theirs.parameters.values()
+    ]
+    assert {each.name: each.annotation for each in ours.parameters.values()} == {
+        each.name: each.annotation for each in theirs.parameters.values()
+    }
+    assert ours.return_annotation == theirs.return_annotation
+
+
+def test_the_functions_are_imported_at_their_first_use() -> None:
+    program = "import sys, paramclient.sync; print('paramclient.provision' in sys.modules)"
+    run = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert run.stdout.strip() == "False"
 
 
 def test_every_call_has_the_same_arguments() -> None:
     for name in paramclient.sync.__all__:
-        if name in ("Event", "FetchIterator"):
+        if name in {"Event", "FetchIterator", "Wanted", *FUNCTIONS}:
             continue
         asynchronous, blocking = getattr(paramclient, name), getattr(paramclient.sync, name)
         if is_dataclass(asynchronous):
