@@ -53,6 +53,7 @@ from paramclient.model.values import Param, format_value
 from paramclient.model.wording import counted, first_of
 from paramclient.protocol.params.fetch_result import FetchResult
 from paramclient.protocol.params.write_batch import SetOutcome
+from paramclient.provision.apply_rules import READ_ONLY, rules_for
 
 if TYPE_CHECKING:
     from paramclient.documents.command_output import ResetOutputDoc
@@ -93,8 +94,10 @@ async def reset(
     Args:
         url: The link.
         names: The parameters, in upper or lower case, or patterns such as "MC_*".
-        all_: Reset all parameters, also the system id, calibration and statistics.
-        changed: Reset all parameters that differ from their default, as far as it is known.
+        all_: Reset all parameters, also the system id, calibration and statistics, except those that the
+            vehicle lets no client write.
+        changed: Reset all parameters that differ from their default, as far as it is known. The same
+            exception.
         dry_run: Print the values that would be sent, and send none of them.
         settle: Seconds for which each value is watched until it is read again, as with set.
         durable: End only when all values and their history are on the disk and survive a power loss.
@@ -107,7 +110,7 @@ async def reset(
     described = from_file(metadata)
     async with connect(url, options, only=True) as session:
         fetched = await _fetch(session)
-        chosen = await _chosen(session, wanted) if names else _all_names(session)
+        chosen, read_only = (await _chosen(session, wanted), ()) if names else _all_names(session)
         if chosen is None:
             return ExitCode.INCOMPLETE
         code = ExitCode.DONE
@@ -119,7 +122,7 @@ async def reset(
         )
         if described is None:
             described = await _known(session, metadata, params)
-        plan = _ResetPlan.of(session, params, described, lists_unknown=not changed)
+        plan = _ResetPlan.of(session, params, described, read_only, lists_unknown=not changed)
         if plan.choice.without_default:
             code = ExitCode.INCOMPLETE
         if dry_run:
@@ -148,7 +151,7 @@ async def reset(
     if not options.json:
         say(f"{line if outcomes else plan.nothing}; {len(plan.choice.unchanged)} had their default already")
     report_outcomes(outcomes, described)
-    plan.report_unknown()
+    plan.report_unwritten()
     return max(code, outcomes_code(outcomes))
 
 
@@ -162,9 +165,15 @@ async def _fetch(session: CommandSession) -> FetchResult:
     return result
 
 
-def _all_names(session: CommandSession) -> list[str]:
-    """Return the names of all parameters in the order of their writes."""
-    return _in_order(session, [param.name for param in by_index(session.component.params.values())])
+def _all_names(session: CommandSession) -> tuple[list[str], tuple[str, ...]]:
+    """Return the names of all parameters in the order of their writes, and those of read-only ones apart."""
+    rules = rules_for(session.component.autopilot)
+    writable: list[str] = []
+    read_only: list[str] = []
+    for param in by_index(session.component.params.values()):
+        rule = rules.left_out(param.name)
+        (read_only if rule is not None and rule.category == READ_ONLY else writable).append(param.name)
+    return _in_order(session, writable), tuple(read_only)
 
 
 async def _chosen(session: CommandSession, wanted: Sequence[str]) -> list[str] | None:
@@ -218,12 +227,14 @@ class _ResetPlan:
         choice: the values.
         params: the parameters before the reset, by name.
         described: metadata of the vehicle, or None.
+        read_only: names of parameters that the vehicle lets no client write, and that were not named.
     """
 
     session: CommandSession
     choice: ResetChoice
     params: Mapping[str, Param]
     described: Metadata | None
+    read_only: tuple[str, ...]
 
     @classmethod
     def of(
@@ -231,6 +242,7 @@ class _ResetPlan:
         session: CommandSession,
         params: Sequence[Param],
         described: Metadata | None,
+        read_only: tuple[str, ...],
         *,
         lists_unknown: bool,
     ) -> _ResetPlan:
@@ -240,12 +252,14 @@ class _ResetPlan:
             session: the session.
             params: the parameters to reset.
             described: metadata of the vehicle, or None.
+            read_only: as the attribute.
             lists_unknown: whether parameters without a known default are listed.
         """
         defaults = {} if described is None else described.defaults_of(each.name for each in params)
         if not lists_unknown:
             params = [each for each in params if each.default is not None or each.name in defaults]
-        return cls(session, ResetChoice.of(params, defaults), {each.name: each for each in params}, described)
+        choice = ResetChoice.of(params, defaults)
+        return cls(session, choice, {each.name: each for each in params}, described, read_only)
 
     @property
     def nothing(self) -> str:
@@ -272,6 +286,7 @@ class _ResetPlan:
                     values=values,
                     unchanged=[*choice.unchanged],
                     without_default=[*choice.without_default],
+                    read_only=[*self.read_only],
                 )
             )
             return
@@ -304,8 +319,10 @@ class _ResetPlan:
         if rows:
             print_table(["name", "before", "default", "now", "status"], rows, right="before default now")
 
-    def report_unknown(self) -> None:
-        """Print a line about the parameters without a known default, if there are any."""
+    def report_unwritten(self) -> None:
+        """Print a line about the read-only parameters, and one about those without a known default."""
+        if self.read_only and not self.session.options.json:
+            say(printable(f"left out, as they can only be read: {first_of(self.read_only, RESET_NAMES_MAX)}"))
         unknown = self.choice.without_default
         if unknown:
             names = first_of(unknown, RESET_NAMES_MAX)
@@ -326,6 +343,7 @@ class _ResetPlan:
             ],
             unchanged=[*self.choice.unchanged],
             without_default=[*self.choice.without_default],
+            read_only=[*self.read_only],
         )
 
     def _source(self, name: str) -> DefaultSource:

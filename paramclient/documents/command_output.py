@@ -209,6 +209,7 @@ class ResetOutputDoc(Document):
     results: list[WriteOutputDoc]
     unchanged: list[str]
     without_default: list[str]
+    read_only: list[str]
 
 
 class ResetValueDoc(Document):
@@ -238,6 +239,7 @@ class ResetPlanDoc(Document):
     values: list[ResetValueDoc]
     unchanged: list[str]
     without_default: list[str]
+    read_only: list[str]
 
 
 class FleetFetchDoc(Document):

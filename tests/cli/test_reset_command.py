@@ -118,6 +118,7 @@ def test_a_parameter_without_a_known_default_is_listed_and_not_written(command: 
         "results": [],
         "unchanged": [],
         "without_default": ["A", "B"],
+        "read_only": [],
     }
     only = command("reset", put(tap), "--changed")
     assert (only.code, only.out) == (0, ""), "only parameters that are known to differ"
@@ -173,7 +174,28 @@ def test_dry_run_sends_no_value(command: Command, put: Put) -> None:
         "values": [{"name": "COUNT", "value": 300, "default": 12, "source": "vehicle"}],
         "unchanged": ["MC_PITCH_P"],
         "without_default": [],
+        "read_only": [],
     }
+
+
+@pytest.mark.parametrize("choice", ["--all", "--changed"])
+def test_what_the_vehicle_lets_no_client_write_is_left_out_unless_it_is_named(
+    command: Command, put: Put, choice: str
+) -> None:
+    rows = [
+        SimParam("BARO1_GND_PRESS", ParamType.REAL32, 101325.0, default=0.0),
+        SimParam("RTL_ALT", ParamType.INT32, 1500, default=1500),
+    ]
+    vehicle = copter(table=rows, read_only=["BARO1_GND_PRESS"])
+    vehicle.set_param("RTL_ALT", 2000)
+    tap = Tap(vehicle)
+    done = command("reset", put(tap), choice)
+    assert (done.code, written(tap)) == (0, ["RTL_ALT"]), done.err
+    assert done.err.endswith("left out, as they can only be read: BARO1_GND_PRESS\n")
+    assert command("reset", put(vehicle), choice, "--json").json["read_only"] == ["BARO1_GND_PRESS"]
+    named = command("reset", put(vehicle), "BARO1_GND_PRESS")
+    assert named.code == 1
+    assert "BARO1_GND_PRESS: " in named.err
 
 
 @pytest.mark.parametrize("names", [["COUNT", "MC_ROLLP"], ["COUNT", "NOT_*"]])
