@@ -1,4 +1,4 @@
-"""Duration of downloads on good and bad links, compared with an oracle, and of sets, in simulated time.
+"""Duration of downloads on good and bad links, compared with an oracle, and of writes, in simulated time.
 
 A run is the session of a program without a cache: it knows nothing of the vehicle until the first heartbeat,
 and then begins the fetch. The time from the heartbeat on is measured, identification included.
@@ -19,6 +19,7 @@ import statistics
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from functools import partial
 from typing import Any
 
@@ -27,6 +28,7 @@ from oracle import FILE_FRAME, TellingLink, file_oracle_time, oracle_time
 from paramclient.model.values import Param, ParamType
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_result import FetchResult
+from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.params.upload import WriteWay
 from paramclient.protocol.params.write_batch import SetStatus
 from paramclient.protocol.station import Station
@@ -43,10 +45,27 @@ RADIO_SET_TIME_MAX = 1.3 * SET_VALUES * 37 / 5760.0
 shorter PARAM_SETs are on their way in the other direction."""
 SET_WAYS = {WriteWay.SETS: " one by one", WriteWay.FILE: " as a file", WriteWay.QUICKEST: ""}
 """How they are set, as in the names of the rows."""
+SWITCH = "GRIP_ENABLE"
+"""The switch of a group, which is in the real table."""
+GROUP_SIZE = 7
+"""Parameters of that group (recorded)."""
+PAUSE_BEFORE_SWITCH = 40.0
+"""Seconds after a fetch, so that it puts off nothing."""
+WATCH_INTERVAL = 30.0
+"""Seconds between two checks of the table, as by default."""
+SWITCH_TIME_MAX = 1.0
+"""Seconds from the acknowledgement of a switch until the table is in sync again."""
 UDP_FILE_RATE = 48_500.0
 """Bytes per second of a MAVFTP burst of an ArduPilot on UDP (measured)."""
 UDP_READ_RATE = 3 * UDP_FILE_RATE
 """Bytes per second of single MAVFTP reads from an ArduPilot on UDP."""
+
+
+class GroupChange(StrEnum):
+    """What happens to a group of parameters."""
+
+    SHOWN = "shown"
+    HIDDEN = "hidden"
 
 
 @dataclass(frozen=True)
@@ -65,6 +84,8 @@ class Row:
         sets: whether values are set instead of downloaded; there is no oracle then.
         way: how they are set.
         values: the number of them.
+        change: what happens to a group of parameters instead, or None; there is no oracle then.
+        downloads: whether the table is then downloaded, although single reads could follow it.
     """
 
     name: str
@@ -78,6 +99,8 @@ class Row:
     sets: bool = False
     way: WriteWay = WriteWay.QUICKEST
     values: int = SET_VALUES
+    change: GroupChange | None = None
+    downloads: bool = False
 
 
 @dataclass(frozen=True)
@@ -129,6 +152,7 @@ def rows() -> Iterator[Row]:
             yield Row(f"five {kind} on one radio 57600 {loss:.0%}", radio, served, faults, 1.1, vehicles=5)
     yield from file_rows()
     yield from set_rows()
+    yield from group_rows()
 
 
 def file_rows() -> Iterator[Row]:
@@ -212,52 +236,142 @@ def set_rows() -> Iterator[Row]:
                 )
 
 
+def group_rows() -> Iterator[Row]:
+    """Yield the rows that switch a group of the real quad on and off, whose table is then followed.
+
+    Each also with a download of the table, which is what remains where single reads cannot follow it.
+    """
+    group = {f"GRIP_{number}": 1.0 for number in range(GROUP_SIZE)}
+    links: tuple[tuple[str, dict[str, Any], dict[str, Any]], ...] = (
+        ("UDP 1 ms 0%", {"delay": 0.0005}, {}),
+        ("UDP 100 ms 5%", {"delay": 0.05, "loss": 0.05}, {}),
+        *(
+            (
+                f"radio 57600 {loss:.0%}",
+                {"loss": loss, "delay": 0.075, "rate": 5760.0, "queue": 1024.0},
+                {"burst": 1, "period": 0.025, "ftp_rate": 5760.0},
+            )
+            for loss in (0.0, 0.05)
+        ),
+    )
+    for link, faults, options in links:
+        for ftp, by in ((True, ""), (False, " without MAVFTP")):
+            make = partial(ArduPilotVehicle, groups={SWITCH: group}, live=(), ftp=ftp, **options)
+            for change in GroupChange:
+                for downloads, way in ((False, ""), (True, ", downloaded")):
+                    yield Row(
+                        f"group of {GROUP_SIZE} {change}, {link}{by}{way}",
+                        make,
+                        0.0,
+                        faults,
+                        math.inf,
+                        math.inf if downloads else SWITCH_TIME_MAX,
+                        change=change,
+                        downloads=downloads,
+                    )
+
+
+class Session:
+    """A station and the vehicle of a row, with its table fetched.
+
+    Attributes:
+        now: simulated seconds.
+        machine: the vehicle's component.
+    """
+
+    def __init__(self, row: Row, seed: int, sync_settings: SyncSettings | None = None) -> None:
+        self.vehicle = row.make()
+        links = (FaultyLink(**row.faults, seed=2 * seed), FaultyLink(**row.faults, seed=2 * seed + 1))
+        self._air = Air([self.vehicle], uplink=links[0], downlink=links[1])
+        self.station = Station(link="bench", is_stream=False, sync_settings=sync_settings)
+        self.now = 0.0
+        self._air.tick(self.now)
+        self.until(lambda: (1, 1) in self.station.components)
+        self.machine = self.station.components[1, 1]
+        fetch = self.machine.begin_fetch(self.now)
+        self.until(lambda: fetch.done)
+        self.machine.end_fetch(fetch, self.now)
+
+    def step(self) -> None:
+        """Go on to the next event."""
+        for data, _ in self.station.data_to_send():
+            self._air.receive(data, self.now)
+        deadline = self._air.next_deadline()
+        next_at = min(self.station.next_deadline(), math.inf if deadline is None else deadline)
+        self.now = max(next_at, self.now + 1e-7)
+        self._air.tick(self.now)
+        for data in self._air.data_to_send():
+            self.station.receive(data, None, self.now)
+        self.station.tick(self.now)
+
+    def until(self, condition: Callable[[], bool]) -> None:
+        """Go on until a condition holds, for `LIMIT` at most."""
+        while not condition() and self.now < LIMIT:
+            self.step()
+
+    def count(self) -> tuple[int, int, int]:
+        """Return the bytes sent and received so far, and the requests received by the vehicle."""
+        station = self.station
+        return station.bytes_sent, station.bytes_received, self.vehicle.requests.total()
+
+    def run_since(self, began: float, before: tuple[int, int, int], ended: float, *, is_right: bool) -> Run:
+        """Return the run from a time and a `count` on; there is no oracle."""
+        up, down, requests = (since - then for since, then in zip(self.count(), before, strict=True))
+        return Run(ended - began, is_right, up, down, requests, math.nan)
+
+
 def set_values(row: Row, seed: int) -> Run:
-    """Set values of the vehicle of a row, whose table is known; there is no oracle."""
-    vehicle = row.make()
-    links = (FaultyLink(**row.faults, seed=2 * seed), FaultyLink(**row.faults, seed=2 * seed + 1))
-    air = Air([vehicle], uplink=links[0], downlink=links[1])
-    station = Station(link="bench", is_stream=False)
-    now = 0.0
-
-    def step() -> None:
-        nonlocal now
-        for data, _ in station.data_to_send():
-            air.receive(data, now)
-        deadline = air.next_deadline()
-        now = max(min(station.next_deadline(), math.inf if deadline is None else deadline), now + 1e-7)
-        air.tick(now)
-        for data in air.data_to_send():
-            station.receive(data, None, now)
-        station.tick(now)
-
-    air.tick(now)
-    while (1, 1) not in station.components:
-        step()
-    machine = station.components[1, 1]
-    fetch = machine.begin_fetch(now)
-    while not fetch.done:
-        step()
-    machine.end_fetch(fetch, now)
-    began, up, down, requests = now, station.bytes_sent, station.bytes_received, vehicle.requests.total()
+    """Set values of the vehicle of a row, whose table is known."""
+    session = Session(row, seed)
+    machine, vehicle = session.machine, session.vehicle
+    began, before = session.now, session.count()
     machine.uploads.way = row.way
     names = [name for name, param in machine.table.params.items() if may_be_set(param)]
     step_size = len(names) / row.values
     chosen = [names[int(number * step_size)] for number in range(row.values)]
     wanted = {name: number + 0.5 for number, name in enumerate(chosen)}
-    batch = machine.write_many(list(wanted.items()), now)
-    while not batch.done and now < LIMIT:
-        step()
-    machine.write_batches.end(batch, now)
-    return Run(
-        batch.ended_at - began,
-        all(outcome.status is SetStatus.ACCEPTED for outcome in batch.ended)
-        and all(vehicle.params[name].value == value for name, value in wanted.items()),
-        station.bytes_sent - up,
-        station.bytes_received - down,
-        vehicle.requests.total() - requests,
-        math.nan,
+    batch = machine.write_many(list(wanted.items()), began)
+    session.until(lambda: batch.done)
+    machine.write_batches.end(batch, session.now)
+    true = vehicle.params
+    is_right = all(outcome.status is SetStatus.ACCEPTED for outcome in batch.ended) and all(
+        true[name].value == value for name, value in wanted.items()
     )
+    return session.run_since(began, before, batch.ended_at, is_right=is_right)
+
+
+def switch_group(row: Row, seed: int) -> Run:
+    """Switch a group on, or off, and measure from the acknowledgement until the table is in sync again."""
+    session = Session(row, seed, SyncSettings(WATCH_INTERVAL))
+    machine, vehicle = session.machine, session.vehicle
+
+    def pass_time(seconds: float) -> None:
+        ends = session.now + seconds
+        session.until(lambda: session.now >= ends)
+
+    def switch(value: int) -> None:
+        write = machine.write(SWITCH, value, session.now)
+        session.until(lambda: write.done)
+
+    pass_time(PAUSE_BEFORE_SWITCH)
+    if row.change is GroupChange.HIDDEN:
+        switch(1)
+        pass_time(PAUSE_BEFORE_SWITCH)
+    session.until(lambda: machine.sync.synced and not machine.is_waiting)
+    if row.downloads:
+        machine.table.doubt_value(
+            next(iter(machine.table.params))
+        )  # a value in doubt is a reason to fetch the table
+    before = session.count()
+    switch(0 if row.change is GroupChange.HIDDEN else 1)
+    began, count = session.now, len(vehicle.params)
+    session.until(lambda: machine.sync.synced and machine.table.count == count)
+    listed = {name: param for name, param in machine.table.params.items() if param.index is not None}
+    true = vehicle.params
+    is_right = listed.keys() == true.keys() and all(
+        param.same_value(true[name]) and param.index == true[name].index for name, param in listed.items()
+    )
+    return session.run_since(began, before, session.now, is_right=is_right)
 
 
 def may_be_set(param: Param) -> bool:
@@ -269,6 +383,8 @@ def download(row: Row, seed: int) -> Run:
     """Run a row with this library; return the run with the oracle's time."""
     if row.sets:
         return set_values(row, seed)
+    if row.change is not None:
+        return switch_group(row, seed)
     if row.vehicles == 1:
         return fetch(row, seed, oracle(row, seed))
     alone = replace(row, vehicles=1)

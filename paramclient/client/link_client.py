@@ -470,7 +470,8 @@ class LinkClient(LocalClient):
                 self.cache_writer.synced(machine, is_whole=is_whole)
                 is_to_be_written = True
             elif isinstance(event, TableResynced):
-                self.cache_writer.synced(machine, is_whole=False)
+                if event.hash is not None:  # otherwise single reads have followed it, and verified no value
+                    self.cache_writer.synced(machine, is_whole=False)
                 is_to_be_written = True
             if self._subscriptions:
                 self._announce(event)

@@ -547,7 +547,7 @@ class ComponentMachine:
             if number == ParamType.REAL32 and index == NO_INDEX:
                 message = table.with_known_type(message)
         if count != table.count and count <= PARAMETERS_MAX:
-            self._count_changed(count, now)
+            self._count_changed(count, name, now)
         authors = self._authors
         writes = self.writes
         by = writes.author(name) if writes.queues else None
@@ -1105,9 +1105,10 @@ class ComponentMachine:
         if version > self.version:
             self.version = version
 
-    def _count_changed(self, count: int, now: float) -> None:
+    def _count_changed(self, count: int, name: str, now: float) -> None:
+        """Process a changed param_count in a PARAM_VALUE of the parameter `name`."""
         if self.table.count is not None:
-            self.sync.count_changed(now)
+            self.sync.count_changed(count - self.table.count, now, name)
         self.table.change_count(count)
 
     def _doubt(self) -> None:
@@ -1213,6 +1214,10 @@ class ComponentMachine:
         """Doubt the table: another vehicle may respond by now."""
         if self.identification.settled and now - self.identification.known_at > IDENTITY_VALID_TIME:
             self.identification.ask_again(now)
+
+    def table_followed(self, changes: list[Change]) -> None:
+        """See `SyncHost`."""
+        self._fetch_changed(changes)
 
     def _fetch_changed(self, changes: list[Change]) -> None:
         """Report changes that a fetch has found without a PARAM_VALUE."""

@@ -7,7 +7,7 @@ import re
 import struct
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Literal, Unpack
 
 from paramclient.errors import ParamErrorCode, UsageError
@@ -16,7 +16,15 @@ from paramclient.protocol import wire
 from paramclient.protocol.ftp.packets import Opcode, Packet
 from paramclient.protocol.ftp.param_pck import PackedParam
 from paramclient.sim.ftp import PARAM_FILE, Address, FileServer
-from paramclient.sim.param_table import Entry, Table, ardupilot_table, as_table, ek2_group, with_system_id
+from paramclient.sim.param_table import (
+    Entry,
+    SimParam,
+    Table,
+    ardupilot_table,
+    as_table,
+    ek2_group,
+    with_system_id,
+)
 from paramclient.sim.vehicle import Vehicle, VehicleOptions
 
 __all__ = ["ArduPilotVehicle"]
@@ -46,7 +54,8 @@ class ArduPilotVehicle(Vehicle):
       default, the parameter never had another value, and it belongs to a group: of the real quad's table,
       all but the first 57.
     - A parameter that switches a group shows it while it is not 0 and hides it at 0: count and indices
-      change. Hidden parameters can be read and set by name.
+      change. A group may contain the switch of another one, which is shown while both are not 0. Hidden
+      parameters can be read and set by name.
     - MAVFTP serves `@PARAM/param.pck` and `files`: one session, 5 requests waiting, bursts limited to a third
       of the link (see `FileServer`). An uploaded param.pck sets parameters without announcing the changes.
     - SYSID_THISMAV takes effect with the next full second, on a Copter after a reboot, without announcement.
@@ -66,7 +75,8 @@ class ArduPilotVehicle(Vehicle):
         kind: "copter", "plane" or "rover".
         system, component: the vehicle's ids, 1 to 255.
         uid2: the reported hardware id, up to 18 bytes; by default unique for every system.
-        groups: by the name of a switch in the table, the parameters that are shown while it is not 0.
+        groups: by the name of a switch in the table or in another group, the parameters that are shown behind
+            it while it is not 0.
             None: with the table of the real quad, the 52 of EK2_ENABLE; with another table, none.
         reboot_groups: names of switches that take effect only after a reboot.
         read_only: names that cannot be set. None: those that ArduPilot marks as internal, such as
@@ -122,7 +132,8 @@ class ArduPilotVehicle(Vehicle):
             read_only = [name for name in every if _INTERNAL.fullmatch(name)]
         elif unknown := frozenset(read_only).difference(row.name for row in rows):
             raise UsageError(f"not in the table: {', '.join(sorted(unknown))}")
-        if unknown := frozenset(members).difference(row.name for row in rows):
+        every_row = tuple(_with_groups(rows, dict(members)))
+        if unknown := frozenset(members).difference(row.name for row in every_row):
             raise UsageError(f"not in the table: {', '.join(sorted(unknown))}")
         if uid2 is None:
             uid2 = (int.from_bytes(_UID2, "little") + system - 1).to_bytes(18, "little")
@@ -141,12 +152,12 @@ class ArduPilotVehicle(Vehicle):
         self._late_switches = frozenset(reboot_groups)
         if others := self._late_switches - self._switches:
             raise UsageError(f"reboot_groups that are not switches in groups: {', '.join(sorted(others))}")
-        self._was_on = {row.name: row.bits != 0 for row in rows if row.name in self._late_switches}
+        self._was_on = {row.name: row.bits != 0 for row in every_row if row.name in self._late_switches}
         self._read_only = frozenset(read_only)
         self._live = frozenset(live)
         self._live_period = live_period
         super().__init__(
-            as_table(member for row in rows for member in (row, *members.get(row.name, ()))),
+            as_table(every_row),
             system=system,
             component=component,
             encoding=Encoding.C_CAST,
@@ -170,9 +181,12 @@ class ArduPilotVehicle(Vehicle):
 
     def _is_listed(self, entry: Entry) -> bool:
         switch = self._switch_of.get(entry.name)
-        if switch is None:
-            return True
-        return self._was_on[switch] if switch in self._late_switches else self._entry(switch).bits != 0
+        while switch is not None:
+            is_on = self._was_on[switch] if switch in self._late_switches else self._entry(switch).bits != 0
+            if not is_on:
+                return False
+            switch = self._switch_of.get(switch)
+        return True
 
     def _timers(self) -> tuple[float, ...]:
         times = (self._read_at, self._look_at, self._answer_at, self._live_at)
@@ -492,6 +506,13 @@ _FILE_QUEUE = 19
 """MAVFTP responses that wait while a list occupies the main loop, in addition to the one in preparation."""
 _BACKLOG = 1000
 """Received frames that wait for processing."""
+
+
+def _with_groups(rows: Iterable[SimParam], groups: dict[str, tuple[SimParam, ...]]) -> Iterator[SimParam]:
+    """Yield parameters, each with the group behind it that it switches, and take that group."""
+    for row in rows:
+        yield row
+        yield from _with_groups(groups.pop(row.name, ()), groups)
 
 
 def _converted(value: float, kind: ParamType | int) -> int:

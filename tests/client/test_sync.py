@@ -7,6 +7,7 @@ import gc
 import weakref
 from collections.abc import Awaitable, Callable
 from pathlib import Path
+from typing import Any
 
 import anyio
 import pytest
@@ -162,12 +163,15 @@ async def test_an_interval_that_is_given_goes_for_lists_too() -> None:
 
 
 @swiftly
-@pytest.mark.parametrize("ftp", [True, False], ids=["file", "list"])
-async def test_parameters_that_appear_are_added_and_can_be_set(path: Path, ftp: bool) -> None:
+@pytest.mark.parametrize("source", ["file", "list", "reads"])
+async def test_parameters_that_appear_are_added_and_can_be_set(path: Path, source: str) -> None:
     group = {f"GRIP_{number}": number for number in range(5)}
-    vehicle = ArduPilotVehicle(
-        table={**VALUES, "GRIP_ENABLE": 0}, groups={"GRIP_ENABLE": group}, ftp=ftp, live=()
-    )
+    table = {**VALUES, "GRIP_ENABLE": 0}
+    options: dict[str, Any] = {"groups": {"GRIP_ENABLE": group}, "ftp": source == "file", "live": ()}
+    if source == "reads":  # they are faster than a slow list
+        table |= {f"Z_{number:03}": number for number in range(200)}
+        options |= {"burst": 1, "period": 0.025}
+    vehicle = ArduPilotVehicle(table=table, **options)
     async with a_client(vehicle, cache=path) as client:
         component = await client.component()
         await component.fetch_all()
@@ -179,7 +183,9 @@ async def test_parameters_that_appear_are_added_and_can_be_set(path: Path, ftp: 
             while len(told) < 6:
                 each = await anext(changes)
                 told += [] if each.name in {every.name for every in told} else [each]
-        assert [(type(each), each.name) for each in told][:2] == [(Changed, "GRIP_ENABLE"), (Added, "GRIP_2")]
+        assert (type(told[0]), told[0].name) == (Changed, "GRIP_ENABLE")
+        if source != "reads":  # they begin at once
+            assert (type(told[1]), told[1].name) == (Added, "GRIP_2")
         assert {each.name for each in told if isinstance(each, Added)} == group.keys()
         await until(lambda: component.sync_state is SyncState.SYNCED)
         assert bits(component.params) == bits(vehicle.params)
@@ -195,7 +201,12 @@ async def test_parameters_that_appear_are_added_and_can_be_set(path: Path, ftp: 
     with ParamCache(path) as cache:
         kept = cache.load(key, 1)
     assert kept is not None
-    assert (kept.count, kept.params.keys()) == (len(VALUES) + 1, vehicle.params.keys())
+    assert (kept.count, kept.params.keys()) == (len(table), vehicle.params.keys())
+    assert kept.complete
+    assert {name: param.index for name, param in kept.params.items()} == {
+        name: param.index for name, param in vehicle.params.items()
+    }
+    assert vehicle.requests["PARAM_REQUEST_LIST"] == {"file": 0, "list": 3, "reads": 1}[source]
 
 
 @swiftly

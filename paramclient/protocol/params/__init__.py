@@ -23,6 +23,7 @@
 `sync`: detection of changes that were missed.
 `sync_interval`: the interval of checks without a hash.
 `table`: the parameters, their trust and their hash.
+`table_shift`: single reads that follow a table after parameters were added or removed.
 `upload`: many values as one file, for ArduPilot.
 `value_check`: values that may be older than a change.
 `volatile_values`: reads of the values that a hash does not cover.

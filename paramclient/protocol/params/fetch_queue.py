@@ -111,6 +111,8 @@ class Fetches(Machine):
             (refresh and fetch.may_end_with_cache) or (sampled is None and fetch.is_sampling)
         ):
             fetch.restart(now)
+        if fetch is None:
+            self._sync.fetch_begins(now)
         may_sample = self.is_same_firmware and self._fetch_policy is Policy.AUTO and not self._sync.is_doubted
         if fetch is None and self.overheard is not None:
             fetch = self.current = PassiveFetch(self._fetch_context, self.overheard, now)

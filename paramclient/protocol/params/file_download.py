@@ -275,5 +275,6 @@ class FileDownload(Operation[None]):
             )
         )
         table.outdated_indices.clear()
+        table.previous_order = ()
         table.count = self._count = pack.total
         self._changed(changes)

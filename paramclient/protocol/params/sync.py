@@ -9,20 +9,23 @@ from functools import partial
 from typing import Final, Protocol
 
 from paramclient.errors import FileTransferError, UnknownParameter, UsageError
+from paramclient.model.group_switches import is_group_switch
 from paramclient.model.values import Trust
 from paramclient.protocol.ftp import BUSY, FileTransfers
+from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.change_origin import is_ours
 from paramclient.protocol.params.fetch import Check, Fetch
 from paramclient.protocol.params.fetch_result import Announcement, FetchResult, Policy
 from paramclient.protocol.params.reads import Read, Reads
 from paramclient.protocol.params.sync_interval import SyncInterval
 from paramclient.protocol.params.table import NAMES_MAX, Table
+from paramclient.protocol.params.table_shift import CountChange, TableShift, reads_expected
 from paramclient.protocol.params.volatile_values import VolatileReads
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.retry import FILE_IN_USE_RETRY
 from paramclient.protocol.vehicle.presence import Presence
-from paramclient.protocol.wire import HASH_CHECK, ParamValue
+from paramclient.protocol.wire import HASH_CHECK, MAV_AUTOPILOT_ARDUPILOTMEGA, ParamValue
 
 __all__ = ["ComponentState", "Sync", "SyncState", "SyncSettings"]
 
@@ -48,6 +51,20 @@ GAP_CHECK_INTERVAL: Final = 5.0
 LOW_BANDWIDTH_GAP: Final = 0.1
 """Seconds between two values of the list that indicate a low-bandwidth mode: PX4's sends 8 values/s, a
 57600-baud radio carries 40."""
+SHIFT_TIME_SHARE: Final = 0.5
+"""The share of a download's time that reads of the shifted indices may be expected to take: they may not
+succeed, and then the download follows."""
+READ_BATCH_TIME: Final = 0.1
+"""Seconds that the first reads wait for the next batch of ArduPilot (measured)."""
+COUNT_CHANGES_FOLLOWED_MAX: Final = 16
+"""Changes of the number of parameters that are followed without a download: more groups are not switched at
+once."""
+SHIFTS_MAX: Final = 8
+"""Times that the shifted indices are read anew because the number has changed again; then the table is
+fetched. While ArduPilot sends its list, the numbers before and after a change alternate."""
+STALE_COUNT_TIME: Final = 0.3
+"""Seconds after a change within which the number before may belong to a late response: ArduPilot takes
+responses to reads up to 100 ms before it sends them (measured), and the link adds its latency."""
 
 _EXPIRED: Final = -math.inf  # the time of an announcement that is stale
 
@@ -158,6 +175,9 @@ class SyncHost(Protocol):
     def end_fetch(self, fetch: Fetch, now: float) -> None:
         """Give a fetch back."""
 
+    def table_followed(self, changes: list[Change]) -> None:
+        """Report changes that no PARAM_VALUE brought: parameters were removed."""
+
     def resynced(self, changed: tuple[str, ...], confirmed: int | None) -> None:
         """Report that the table matches the vehicle's again, with the changed names and the hash."""
 
@@ -170,6 +190,10 @@ class Sync(Machine):
     `SyncSettings`, as a PARAM_VALUE of a change is sent once and never repeated. All but the first apply only
     to a table that was fetched on this link. Nothing is requested in high-latency mode, or on a link measured
     to be in a low-bandwidth mode, nor, except after changes, while other requests are in flight.
+
+    When parameters were added or removed, only the shifted indices are read where that is faster than a
+    download, see `TableShift`: of an ArduPilot, whose table keeps its order. The values that stay are then as
+    recent as before.
 
     With each interval, the values that the hash does not cover are read again. For a component without a hash
     the file, or the list, is fetched, as often as `sync_interval` says.
@@ -222,6 +246,15 @@ class Sync(Machine):
         self._volatile_at = -math.inf  # when values outside the hash may be read again
         self._reads_volatile = False  # after a match of the requested hash
         self._resync: Fetch | None = None
+        self._shift: TableShift | None = None
+        self._shift_at = -math.inf  # when the next one may begin
+        self._shifts = 0  # begun since the table was in sync
+        self._count_changed_at = -math.inf
+        self._count_changes: list[CountChange] | None = (
+            None  # since the table was in sync; None if it was not
+        )
+        self._last_switch = ""  # the group switch that has changed last
+        self._known_at = -math.inf  # the moment of the last fetched table
         self._was_marked_unsynced = False  # was synced and is not
         self._changed_names: dict[str, None] = {}  # names changed since then
 
@@ -230,7 +263,7 @@ class Sync(Machine):
         """The state of the table of a component that is not lost."""
         if self.synced:
             return SyncState.SYNCED
-        if self._resync is not None:
+        if self._resync is not None or self._shift is not None:
             return SyncState.RESYNCING
         return SyncState.CHECKING if self._is_checking else SyncState.UNSYNCED
 
@@ -271,6 +304,9 @@ class Sync(Machine):
                 if now is not None:
                     self._foreign_changed(now)
             self.expire_hash()
+        is_followed = self.synced or self._count_changes is not None
+        if now is not None and is_followed and self._is_switch(name):
+            self._last_switch = name
         if (self._was_marked_unsynced or self._resync is not None) and len(self._changed_names) < NAMES_MAX:
             self._changed_names[name] = None
 
@@ -280,16 +316,38 @@ class Sync(Machine):
         if announced is not None and announced.at != _EXPIRED:
             self.announced = replace(announced, at=_EXPIRED)
 
-    def count_changed(self, now: float) -> None:
+    def count_changed(self, added: int, now: float, carrier: str = "") -> None:
         """Process a changed count: the table has changed.
 
-        Without a hash, the table is fetched, by list where it does not come as a file.
+        Without a hash, the table is followed by reads, or fetched, by list where it does not come as a file.
+
+        Args:
+            added: parameters more than before; negative if there are fewer.
+            now: the time.
+            carrier: the parameter whose PARAM_VALUE had the changed count.
         """
+        if self.synced:
+            self._count_changes = []
+            self._shifts = 0
+        if (changes := self._count_changes) is not None:
+            is_late = now - self._count_changed_at < STALE_COUNT_TIME
+            if is_late and changes and changes[-1].added == -added:
+                changes.pop()
+            else:
+                changes.append(CountChange(carrier if self._is_switch(carrier) else self._last_switch, added))
+            if len(changes) > COUNT_CHANGES_FOLLOWED_MAX or self._shifts >= SHIFTS_MAX:
+                self._count_changes = None
+        self._count_changed_at = now
+        self._cancel_shift()
         self._mark_unsynced()
         if self._keeps_in_sync:
             self._has_count_changed = not self.expects_hash
-            pause = 0.0 if self.expects_hash else self._sync_interval.shortest_pause
-            self._check_at = min(self._check_at, max(now, self._checked_at + pause))
+            if self._is_shift_worthwhile(now):
+                earliest = self._shift_at
+            else:
+                pause = 0.0 if self.expects_hash else self._sync_interval.shortest_pause
+                earliest = self._checked_at + pause
+            self._check_at = min(self._check_at, max(now, earliest))
 
     def silence(self, now: float) -> None:
         """Process the end of a gap in which changes may have been missed.
@@ -322,6 +380,8 @@ class Sync(Machine):
         if result.source == "cache" and result.hash is None:
             self._not_confirmed()
             return False
+        self._count_changes = None
+        self._last_switch = ""
         table = self._table
         complete = result.complete and table.complete and not result.has_moved
         if result.hash is None:  # values from before the loss may have changed since
@@ -332,12 +392,19 @@ class Sync(Machine):
         self._has_count_changed &= not complete
         self._was_synced |= complete or result.has_moved
         self._changed_only_by_us = result.hash is not None
-        self._settled(now, now if result.hash is not None else now - result.elapsed)
+        self._known_at = now if result.hash is not None else now - result.elapsed
+        self._settled(now, self._known_at)
         if result.has_moved and self._keeps_in_sync:
             self._check_at = now + GAP_CHECK_INTERVAL
         if result.hash is not None:
             self._read_unhashed(result.hash, now)
         return True
+
+    def fetch_begins(self, now: float) -> None:
+        """Process the beginning of a fetch, which brings what reads of shifted indices would."""
+        if self._shift is not None:
+            self._cancel_shift()
+            self._check_at = now  # in case that the fetch is cancelled
 
     def contradicted(self) -> None:
         """Process a hash mismatch after which nothing can be fetched."""
@@ -349,6 +416,7 @@ class Sync(Machine):
         self._context.has_hash = None
         self.synced = self._was_synced = self._changed_only_by_us = False
         self._was_marked_unsynced = self._has_count_changed = False
+        self._last_switch = ""
         self.stop()
 
     # requests
@@ -403,6 +471,8 @@ class Sync(Machine):
         """Request nothing any more until there is a new reason."""
         self._settle_at = self._foreign_check_at = self._check_at = math.inf
         self._is_checking = self._reads_volatile = False
+        self._count_changes = None
+        self._cancel_shift()
 
     @property
     def must_not_poll(self) -> bool:
@@ -470,7 +540,7 @@ class Sync(Machine):
 
     def _check(self, now: float) -> None:
         """Check whether the table still matches the vehicle's, if the link is idle."""
-        if self.holds or self._host.is_link_busy:
+        if self.holds or self._shift is not None or self._host.is_link_busy:
             self._check_at = now + IDLE_CHECK_INTERVAL
             return
         self._plan_check(now, now)
@@ -479,6 +549,8 @@ class Sync(Machine):
         elif self.expects_hash:
             self._reads_volatile = self._keeps_in_sync
             self.ask(now)
+        elif self._has_count_changed and self._begin_shift(now):
+            return
         elif self._check_at < math.inf or self._has_count_changed:
             if self._files.is_in_use(now):
                 self._check_at = min(self._check_at, now + FILE_IN_USE_RETRY)
@@ -533,6 +605,74 @@ class Sync(Machine):
             self._is_checking = False
             if self._keeps_in_sync and not self.must_not_poll:
                 self._begin_resync(now, None)
+
+    @staticmethod
+    def _is_switch(name: str) -> bool:
+        return is_group_switch(name, "ardupilot")
+
+    def _is_shift_worthwhile(self, now: float) -> bool:
+        """Return whether reads of the shifted indices are expected to be clearly faster than a download."""
+        changes = self._count_changes
+        if not changes or self._context.autopilot != MAV_AUTOPILOT_ARDUPILOTMEGA or self.expects_hash:
+            return False
+        if len({change.added > 0 for change in changes}) > 1:
+            return False  # the order is certain for additions or removals only
+        return reads_expected(changes) <= SHIFT_TIME_SHARE * self._reads_within(self._download_time(now))
+
+    def _download_time(self, now: float) -> float:
+        """Return the expected seconds of a download of the whole table."""
+        may_use_file = self._host.may_use_file
+        wait = FILE_IN_USE_RETRY if may_use_file and self._files.is_in_use(now) else 0.0
+        return wait + self._sync_interval.download_time(may_use_file=may_use_file)
+
+    def _reads_within(self, seconds: float) -> int:
+        """Return how many reads the component serves within a time."""
+        round_trip = self._context.round_trip.smoothed or 0.0
+        return max(0, int((seconds - round_trip - READ_BATCH_TIME) * self._reads.pace.rate))
+
+    def _begin_shift(self, now: float) -> bool:
+        """Read the shifted indices; return False if the table must be fetched."""
+        changes, order, count = self._count_changes, self._table.followed_order, self._table.count
+        if not (changes and order and count and self._is_shift_worthwhile(now)):
+            return False
+        if len(order) + sum(change.added for change in changes) != count:
+            return False
+        self._shifts += 1
+        shift = self._shift = TableShift(
+            *(self._reads, order, count, changes, now),
+            reads_max=self._reads_within(self._download_time(now)),
+        )
+        self._context.trace(
+            "%s/%s: %s indices shift, they are read", *self._context.target, count - len(order)
+        )
+        if shift.done:
+            self._shift_ended(shift)
+        else:
+            shift.on_done.append(partial(self._shift_ended, shift))
+        return True
+
+    def _shift_ended(self, shift: TableShift) -> None:
+        """Take the table that the reads have shown; fetch it if they have not shown it."""
+        now, names = shift.ended_at, shift.result
+        self._shift = None
+        self._shift_at = now + (now - shift.begun_at)  # they take half of the time at most
+        self._count_changes = None
+        self._context.reschedule()
+        if names is None:
+            self._check_at = now
+            return
+        table = self._table
+        self._host.table_followed(table.settle(names))
+        table.complete = True
+        self.synced = True
+        self._has_count_changed = False
+        self._settled(now, self._known_at)
+
+    def _cancel_shift(self) -> None:
+        shift, self._shift = self._shift, None
+        if shift is not None:
+            shift.cancel()
+            shift.drop_callbacks()
 
     def _begin_resync(self, now: float, check: Check | None) -> None:
         fetch = self._resync = self._host.begin_fetch(now, refresh=check is not None, check=check)

@@ -111,6 +111,15 @@ class SyncInterval:
         times = self._times.get("ftp") or self._times.get("stream") or (0.0,)
         return max(PAUSE_MIN, median_low(times) * (1.0 / CHOSEN_SHARE - 1.0))
 
+    def download_time(self, *, may_use_file: bool) -> float:
+        """Return the expected seconds of a download of the whole table; 0 before a measurement.
+
+        Args:
+            may_use_file: whether the vehicle serves the file.
+        """
+        times = self._times.get("ftp" if self.has_file and may_use_file else "stream", (0.0,))
+        return median_low(times)
+
     @property
     def _time(self) -> float:
         """The duration of a fetch in seconds; 0 before the first measurement."""

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
+from random import Random
+from typing import Any
+
 import pytest
 
-from paramclient.model.values import ParamType
-from paramclient.protocol.events import ParamChanged
+from paramclient.model.values import ParamType, Trust
+from paramclient.protocol.events import Fetched, ParamChanged, TableResynced
 from paramclient.protocol.params.change import Added, Change, Changed, FirstValue, Removed
 from paramclient.protocol.params.sync import SyncSettings, SyncState
 from paramclient.protocol.params.sync_interval import PAUSE_MIN
-from paramclient.protocol.wire import FileTransfer, ParamRequestList
-from paramclient.sim import Air, ArduPilotVehicle
+from paramclient.protocol.wire import FileTransfer, ParamRequestList, ParamRequestRead
+from paramclient.sim import Air, ArduPilotVehicle, FaultyLink
 from tests.protocol.params.test_sync import INTERVAL, World, state
 
 GROUP = {f"GRIP_{number}": (ParamType.INT16, number) for number in range(7)}
@@ -18,6 +22,19 @@ TABLE = {
     **{f"A{number:02d}": (ParamType.INT32, number) for number in range(20)},
     "GRIP_ENABLE": (ParamType.INT8, 0),
     **{f"Z{number:02d}": (ParamType.INT32, number) for number in range(20)},
+}
+
+RADIO: dict[str, Any] = {"delay": 0.075, "rate": 5760.0, "queue": 1024}
+"""A radio of 57600 baud."""
+LARGE = {
+    **{f"A{number:03d}": (ParamType.INT32, number) for number in range(150)},
+    "GRIP_ENABLE": (ParamType.INT8, 0),
+    **{f"Z{number:03d}": (ParamType.INT32, number) for number in range(150)},
+}
+NESTED = {
+    "GRIP_ENABLE": {**GROUP, "GRIP_SUB_ENABLE": (ParamType.INT8, 0), "GRIP_LAST": (ParamType.INT8, 0)},
+    "GRIP_SUB_ENABLE": {f"GRIP_SUB_{number}": (ParamType.INT16, number) for number in range(4)},
+    "Z000": {f"OTHER_{number}": (ParamType.INT16, number) for number in range(5)},
 }
 
 
@@ -131,3 +148,300 @@ def test_a_kind_of_change_is_told_by_its_class() -> None:
     assert type(Change.between(added.name, None, added.new)) is FirstValue
     assert type(Change.between(added.name, added.new, added.new, is_added=True)) is Changed
     assert type(Change.between(added.name, added.new, None)) is Removed
+
+
+def slow(**options: Any) -> ArduPilotVehicle:
+    """A vehicle without MAVFTP and with a slow list, so that single reads are the cheapest way."""
+    groups = options.pop("groups", {"GRIP_ENABLE": GROUP})
+    return ArduPilotVehicle(table=LARGE, groups=groups, live=(), ftp=False, burst=1, period=0.025, **options)
+
+
+def followed(world: World, board: ArduPilotVehicle, within: float = 20.0) -> None:
+    """Wait until the table is in sync, and check that it is the vehicle's."""
+    began = world.now
+    world.until(lambda: state(world) is not SyncState.SYNCED or world.now > began + 0.3)
+    world.until(lambda: state(world) is SyncState.SYNCED or world.now > began + within)
+    table = world.machine.table
+    assert state(world) is SyncState.SYNCED
+    assert table.complete
+    assert table.count == len(board.params)
+    assert {name: (param.index, param.value) for name, param in table.params.items()} == {
+        name: (param.index, param.value) for name, param in board.params.items()
+    }
+    assert {param.trust for param in table.params.values()} == {Trust.LIVE}
+    assert table.previous_order == ()
+
+
+def downloads(world: World) -> int:
+    return len(world.sent_of(ParamRequestList)) + len(world.sent_of(FileTransfer))
+
+
+def real_size(*, ftp: bool, **options: Any) -> ArduPilotVehicle:
+    """The real quad with a group of 7, on a radio."""
+    groups = {"GRIP_ENABLE": GROUP}
+    return ArduPilotVehicle(
+        groups=groups, live=(), ftp=ftp, ftp_rate=5760.0, burst=1, period=0.025, **options
+    )
+
+
+@pytest.mark.parametrize("ftp", [True, False], ids=["file", "list"])
+@pytest.mark.parametrize("loss", [0.0, 0.05])
+def test_on_a_radio_a_group_is_followed_by_reads_within_a_second(ftp: bool, loss: float) -> None:
+    board = real_size(ftp=ftp)
+    air = Air(
+        [board],
+        uplink=FaultyLink(**RADIO, loss=loss, seed=1),
+        downlink=FaultyLink(**RADIO, loss=loss, seed=2),
+    )
+    world = World(air=air)
+    assert world.fetch().complete
+    world.run(70.0)
+    assert state(world) is SyncState.SYNCED
+    for value, kind in ((1, Added), (0, Removed)):
+        world.run(10.0)
+        world.events.clear()
+        world.sent.clear()
+        world.set("GRIP_ENABLE", value)
+        acknowledged_at = world.now
+        assert state(world) is not SyncState.SYNCED
+        followed(world, board)
+        assert world.now - acknowledged_at < 1.0, "the file takes 3 s, and the list 35 s"
+        assert sorted(each.name for each in changes(world, kind)) == sorted(GROUP)
+        assert [change.name for change in changes(world, Changed)] == ["GRIP_ENABLE"]
+        assert downloads(world) == 0
+        least = 14 if value else 7
+        assert least <= len(world.sent_of(ParamRequestRead)) <= (least if not loss else 3 * least)
+
+
+def test_reads_of_shifted_indices_do_not_put_off_the_next_file() -> None:
+    board = real_size(ftp=True)
+    world = World(air=Air([board], uplink=FaultyLink(**RADIO), downlink=FaultyLink(**RADIO)))
+    world.fetch()
+    world.run(30.0)
+    planned = world.machine.sync.next_deadline()
+    assert world.now + 10.0 < planned < math.inf
+    world.set("GRIP_ENABLE", 1)
+    followed(world, board)
+    assert world.machine.sync.next_deadline() == pytest.approx(planned)
+
+
+def test_values_that_stay_keep_their_moment() -> None:
+    world = in_sync(board := slow())
+    before = dict(world.machine.table.params.moments)
+    world.set("GRIP_ENABLE", 1)
+    followed(world, board)
+    after = world.machine.table.params.moments
+    assert sum(after[name] == moment for name, moment in before.items()) >= len(before) - 10
+    assert all(after[name] > max(before.values()) for name in GROUP)
+    assert downloads(world) == 0
+
+
+def test_the_changes_of_followed_reads_are_told_once() -> None:
+    world = in_sync(board := slow())
+    world.set("GRIP_ENABLE", 1)
+    followed(world, board)
+    assert [event.changed for event in world.told(TableResynced) if isinstance(event, TableResynced)] == [
+        ("GRIP_ENABLE", *GROUP)
+    ]
+    assert world.told(Fetched) == []
+    dirty = world.machine.table.take_dirty()
+    assert dirty.keys() >= {*GROUP, *(name for name in LARGE if name.startswith("Z"))}, "for the cache"
+
+
+def test_a_group_in_a_group_is_followed() -> None:
+    world = in_sync(board := slow(groups=NESTED))
+    world.set("GRIP_SUB_ENABLE", 1)  # hidden so far, and read by name
+    assert state(world) is SyncState.SYNCED
+    for name, value in (
+        ("GRIP_ENABLE", 1),
+        ("GRIP_SUB_ENABLE", 0),
+        ("GRIP_SUB_ENABLE", 1),
+        ("GRIP_ENABLE", 0),
+    ):
+        world.set(name, value)
+        followed(world, board)
+        world.run(5.0)
+    assert downloads(world) == 0
+
+
+def test_two_switches_in_a_row_are_followed_together() -> None:
+    world = in_sync(board := slow(groups=NESTED))
+    for value in (1, 0):
+        world.set("GRIP_ENABLE", value)
+        world.set("Z000", value)
+        followed(world, board)
+        world.run(5.0)
+    assert downloads(world) == 0
+
+
+def test_a_count_that_moves_again_during_the_reads_begins_them_anew() -> None:
+    world = in_sync(board := slow(groups=NESTED))
+    world.set("GRIP_ENABLE", 1)
+    world.run(0.15)
+    assert state(world) is SyncState.RESYNCING
+    board.set_param("Z000", 1)
+    followed(world, board)
+    assert sorted(each.name for each in changes(world, Added)) == sorted(
+        [*NESTED["GRIP_ENABLE"], *NESTED["Z000"]]
+    )
+    assert downloads(world) == 0
+
+
+def test_a_group_that_comes_and_goes_at_once_is_fetched() -> None:
+    world = in_sync(board := slow(groups=NESTED))
+    world.set("GRIP_ENABLE", 1)
+    world.run(0.15)
+    board.set_param("GRIP_ENABLE", 0)
+    followed(world, board)
+    assert downloads(world) == 1, "additions and removals leave no certain order"
+
+
+def test_one_group_for_another_of_the_same_size_is_fetched() -> None:
+    world = in_sync(board := slow(groups={**NESTED, "A000": {f"MORE_{n}": n for n in range(5)}}))
+    world.set("A000", 1)
+    world.run(60.0)
+    world.sent.clear()
+    board.set_param("A000", 0)
+    board.set_param("GRIP_ENABLE", 1)
+    board.set_param("Z000", 0)
+    followed(world, board)
+    assert downloads(world) <= 1
+
+
+@pytest.mark.parametrize("later", [0.0, 0.12, 3.0])
+def test_parameters_that_appear_elsewhere_and_later_are_found(later: float) -> None:
+    """The switch brings four at its place, and, once a driver runs, three behind another parameter."""
+    groups: dict[str, dict[str, Any]] = {
+        "GRIP_ENABLE": dict(list(GROUP.items())[:4]),
+        "A003": {f"LATE_{n}": 1.0 for n in range(3)},
+    }
+    board = slow(groups=groups, reboot_groups=["A003"])
+    board._was_on["A003"] = False
+    board._relist()
+    world = in_sync(board)
+    board.set_param("GRIP_ENABLE", 1)
+    world.run(later)
+    board._was_on["A003"] = True
+    board._relist()
+    board.set_param("A149", 5)
+    followed(world, board)
+    assert sorted(each.name for each in changes(world, Added)) == sorted(
+        [*groups["GRIP_ENABLE"], *groups["A003"]]
+    )
+
+
+def test_a_value_that_arrives_during_the_reads_counts() -> None:
+    world = in_sync(board := slow())
+    world.set("GRIP_ENABLE", 1)
+    world.run(0.15)
+    assert state(world) is SyncState.RESYNCING
+    board.set_param("GRIP_3", 30)
+    board.set_param("Z007", 70)
+    world.run(2.0)  # responses from before the change are read again after 1 s
+    followed(world, board)
+    assert world.machine.table.params["GRIP_3"].value == 30
+    assert downloads(world) == 0
+
+
+def test_a_fetch_of_the_user_takes_over() -> None:
+    world = in_sync(board := slow())
+    world.set("GRIP_ENABLE", 1)
+    world.run(0.15)
+    assert state(world) is SyncState.RESYNCING
+    result = world.fetch()
+    assert result.complete
+    assert result.source == "stream"
+    followed(world, board)
+    assert len(world.sent_of(ParamRequestList)) <= 1
+
+
+def test_after_a_cancelled_fetch_the_table_is_fetched_all_the_same() -> None:
+    world = in_sync(board := slow())
+    world.set("GRIP_ENABLE", 1)
+    world.run(0.15)
+    fetch = world.machine.begin_fetch(world.now)
+    world.run(0.05)
+    world.machine.end_fetch(fetch, world.now)
+    followed(world, board)
+    assert sorted(each.name for each in changes(world, Added)) == sorted(GROUP)
+
+
+def test_a_list_follows_where_a_read_is_not_answered() -> None:
+    at = list(LARGE).index("GRIP_ENABLE") + 3
+    world = in_sync(board := slow())
+    board._dead.add(at)
+    world.set("GRIP_ENABLE", 1)
+    world.run(20.0)
+    board._dead.clear()
+    assert len(world.sent_of(ParamRequestList)) >= 1
+    followed(world, board)
+
+
+def test_values_in_doubt_are_fetched() -> None:
+    world = in_sync(board := slow())
+    world.machine.table.doubt_value("A005")
+    world.set("GRIP_ENABLE", 1)
+    followed(world, board)
+    assert len(world.sent_of(ParamRequestList)) == 1
+
+
+def test_a_vehicle_that_is_lost_meanwhile_is_fetched() -> None:
+    world = in_sync(board := slow())
+    world.set("GRIP_ENABLE", 1)
+    world.run(0.15)
+    world.away(8.0)
+    world.run(2.0)
+    assert world.fetch().complete
+    followed(world, board)
+
+
+def test_a_large_group_is_fetched_at_once() -> None:
+    group = {f"GRIP_{number}": number for number in range(150)}
+    world = in_sync(board := slow(groups={"GRIP_ENABLE": group}))
+    world.set("GRIP_ENABLE", 1)
+    followed(world, board)
+    assert len(world.sent_of(ParamRequestList)) == 1
+    assert len(world.sent_of(ParamRequestRead)) <= 1
+
+
+def test_a_switch_that_others_set_unheard_is_found_by_the_next_value() -> None:
+    board = real_size(ftp=False)
+    world = in_sync(board)
+    world.unheard(board, GRIP_ENABLE=1)
+    world.sent.clear()
+    board.set_param("RTL_ALT", 1600)
+    followed(world, board)
+    assert downloads(world) == 0
+    assert 20 <= len(world.sent_of(ParamRequestRead)) < 80
+    assert sorted(each.name for each in changes(world, Added)) == sorted(GROUP)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_whatever_is_lost_ends_in_the_vehicles_table(seed: int) -> None:
+    random = Random(seed)
+    board = slow(groups=NESTED)
+    faults: dict[str, Any] = {
+        "loss": random.choice([0.05, 0.2, 0.4]),
+        "delay": 0.05,
+        "duplicate": 0.1,
+        "reorder": 0.1,
+    }
+    air = Air([board], uplink=FaultyLink(**faults, seed=seed), downlink=FaultyLink(**faults, seed=seed + 99))
+    world = World(air=air)
+    world.run(3.0)
+    assert world.fetch().complete
+    for _ in range(8):
+        for _ in range(random.choice([1, 1, 2])):
+            board.set_param(random.choice(["GRIP_ENABLE", "GRIP_SUB_ENABLE", "Z000"]), random.choice([0, 1]))
+            world.run(random.choice([0.05, 0.3, 2.0]))
+        board.set_param("A001", random.randrange(1000))
+        world.run(random.choice([0.0, 10.0]))
+    air.uplink, air.downlink = FaultyLink(delay=0.05), FaultyLink(delay=0.05)
+    for name, value in {"A001": 1, "GRIP_ENABLE": 1, "Z000": 1}.items():
+        board.set_param(name, value)
+        world.run(60.0)
+    table = world.machine.table
+    assert table.params.keys() == board.params.keys()
+    assert {name: param.index for name, param in table.params.items()} == {
+        name: param.index for name, param in board.params.items()
+    }
