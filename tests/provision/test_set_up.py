@@ -349,6 +349,56 @@ async def test_two_downloads_suffice_for_any_file(ftp: bool) -> None:
         assert requested.isdisjoint(unknown.keys() - of_a_hidden_group), "no hidden group can have them"
 
 
+def whole_tables(tap: Tap) -> int:
+    """Return the number of downloads of the whole table, as the vehicle has received their requests.
+
+    Each request for a list counts. A file counts with the first read after it was opened: it is opened again
+    where the response was lost, and that is still the same download.
+    """
+    files = 0
+    is_open = False
+    for message in tap.messages(wire.FileTransfer):
+        packet = Packet.unpack(message.payload)
+        if packet.opcode == Opcode.OPEN_FILE_RO:
+            is_open = packet.data.startswith(b"@PARAM/param.pck") and b"start=" not in packet.data
+        elif packet.opcode in (Opcode.READ_FILE, Opcode.BURST_READ_FILE):
+            files += is_open
+            is_open = False
+    return files + len(tap.messages(wire.ParamRequestList))
+
+
+@pytest.mark.parametrize("seed", range(6))
+@swiftly
+async def test_with_packet_loss_four_groups_take_two_downloads_and_six_seconds(seed: int) -> None:
+    """30 values, of which 4 show groups of the real quad, with 100 ms and 5 % loss in each direction."""
+    switches = ("GRIP_ENABLE", "SCR_ENABLE", "FOLL_ENABLE", "SPRAY_ENABLE")
+    groups: dict[str, dict[str, WireValue]] = {
+        switch: {f"{switch.removesuffix('ENABLE')}{number}": 1.0 for number in range(7 + (at < 2))}
+        for at, switch in enumerate(switches)
+    }
+    tap = Tap(vehicle := ArduPilotVehicle(groups=groups, live=()))
+    ways = [FaultyLink(loss=0.05, delay=0.05, seed=2 * seed + number) for number in (0, 1)]
+    wanted: dict[str, WireValue] = dict.fromkeys(switches, 1)
+    wanted |= {
+        name: 2.0 for switch in switches for name in list(groups[switch])[: 6 + (switch in switches[:2])]
+    }
+    assert len(wanted) == 30
+    async with a_client(Air([tap], uplink=ways[0], downlink=ways[1])) as client:
+        component = await client.component()
+        await anyio.sleep(10.0)  # what it measures at its start has been read
+        tap.heard.clear()
+        began = anyio.current_time()
+        result = await apply(component, written(wanted))
+        elapsed = anyio.current_time() - began
+        await anyio.sleep(5.0)  # the count that has moved is a reason for no more
+        downloaded = whole_tables(tap)
+    assert result.complete, result
+    assert set(statuses(result).values()) == {"set"}
+    assert {name: vehicle.param(name).value for name in wanted} == wanted
+    assert downloaded <= 2
+    assert elapsed <= 6.0
+
+
 @pytest.mark.parametrize(
     ("listed", "ftp", "is_beside"),
     [(6, True, True), (7, True, False), (6, False, False)],
