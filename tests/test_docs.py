@@ -283,6 +283,7 @@ def test_the_quickstart_starts_from_the_cache_the_second_time(tmp_path: Path) ->
 def test_the_commands_for_users_of_other_programs_run(program: str, tmp_path: Path) -> None:
     """Each command of the tables, in the order of the page, in one folder."""
     assert run_command(f"paramclient fetch {COMPARED[program]} --tlog flight.tlog", tmp_path).returncode == 0
+    assert run_command(f"paramclient save {COMPARED[program]} other.parm", tmp_path).returncode == 0
     found = [command for commands, _ in compared_with(program) for command in commands]
     assert len(found) > 4
     for command in found:
