@@ -112,12 +112,12 @@ async def apply(
     yes: bool = False,
     options: LinkOptions = _OPTIONS,
 ) -> ExitCode:
-    """Write the values of a parameter file to a vehicle, in an order that works, and verify each of them.
+    """Write the values of a parameter file to a vehicle, in dependency order, and verify each of them.
 
-    The state before is stored in the cache, for `restore`. On a terminal, the changes are shown and must be
+    The previous state is stored in the cache, for `restore`. On a terminal, the changes are shown and must be
     confirmed. Exit code 0: the vehicle has all values of the file. Exit code 1: some values differ. After an
     interruption, run the same command again to continue. If several vehicles are received, --system must
-    choose one, or --all all of them.
+    choose one, or --all must choose all.
 
     Args:
         url: The link, such as udpin:0.0.0.0:14550, or sim:ardupilot for a simulated vehicle.
@@ -125,24 +125,25 @@ async def apply(
         include: Include a category that is left out by default (identity, hardware, calibration, measured,
             counter, action, read-only, out-of-range), or a name or pattern such as "COMPASS_OFS*". May be
             given several times.
-        reboot: Reboot the vehicle if values take effect after a reboot.
+        reboot: Reboot the vehicle if values take effect only after a reboot.
         allow_armed: Continue if the vehicle is armed.
         skip_invalid: Skip invalid values and write the remaining ones.
         force: Send NaN and infinity also to PX4, which cannot save them and may stop, and to ArduPilot.
         durable: End only when the values and their history are on the disk and survive a power loss.
-        backup: A new file for the vehicle's state before; its ending determines the file format. {uid} and
-            {system} in the name are replaced by the vehicle's ids.
+        backup: A new file for the state before the first write; its extension determines the file format.
+            {uid} and {system} in the name are replaced by the vehicle's ids.
         over: A file whose parameters replace and extend those of FILE, with {uid} or {system} in its name
             for the vehicle's ids.
         all_vehicles: Set up all vehicles on the link, concurrently.
         expect: With --all, wait for this number of vehicles, and fail with fewer.
         dry_run: Print the values that would be sent, and send none of them.
         renames: A YAML file of names that firmware versions have changed. A parameter that the vehicle does
-            not have is taken as that of its other name.
-        metadata: A file that describes parameters, or vehicle to download the vehicle's own metadata: for
-            the ranges of values, and for parameters that take effect after a reboot.
+            not have is looked up under its other name.
+        metadata: A file that describes parameters, or vehicle to download the vehicle's own metadata: for the
+            ranges of values, and for parameters that take effect only after a reboot.
         full: Also print parameters that are unchanged or left out.
-        extended: Use extended parameters (PARAM_EXT_*), as of a camera. Files of them need no option.
+        extended: Use extended parameters (PARAM_EXT_*), such as those of a camera. Not needed with a file of
+            extended parameters.
         yes: Do not ask for confirmation.
     """
     if extended or is_extended_source(file):
@@ -230,11 +231,12 @@ async def verify(
         all_vehicles: Compare all vehicles on the link, concurrently.
         expect: With --all, wait for this number of vehicles, and fail with fewer.
         renames: A YAML file of names that firmware versions have changed. A parameter that the vehicle does
-            not have is taken as that of its other name.
-        metadata: A file that describes parameters, or vehicle to download the vehicle's own metadata: for
-            the ranges of values, and for parameters that take effect after a reboot.
+            not have is looked up under its other name.
+        metadata: A file that describes parameters, or vehicle to download the vehicle's own metadata: for the
+            ranges of values, and for parameters that take effect only after a reboot.
         full: Also print parameters that have the wanted value or are left out.
-        extended: Use extended parameters (PARAM_EXT_*), as of a camera. Files of them need no option.
+        extended: Use extended parameters (PARAM_EXT_*), such as those of a camera. Not needed with a file of
+            extended parameters.
     """
     if extended or is_extended_source(file):
         if include or over or all_vehicles or renames or metadata:
@@ -279,23 +281,23 @@ async def restore(
     Parameters that the state does not have are not changed. On a terminal, the changes are shown and must be
     confirmed. The exit codes are those of apply.
 
-    A time without a time zone is in the time zone of this computer, in which times are printed too, marked
-    with it: 2026-11-20T14:00:00.000+01:00. A time in UTC ends with Z: 2026-11-20T13:00Z.
+    A time without a time zone is in the time zone of this computer, in which times are printed too, with its
+    offset: 2026-11-20T14:00:00.000+01:00. A time in UTC ends with Z: 2026-11-20T13:00Z.
 
     Args:
         url: The link.
         when: A time, such as '2h ago' or '2026-11-20 14:00'; the number of a snapshot, from `history VEHICLE
             --snapshots`; or a backup file. Default: the state before the last apply.
         include: Include a category that is left out by default, or a name or pattern, as with apply.
-        reboot: Reboot the vehicle if values take effect after a reboot.
+        reboot: Reboot the vehicle if values take effect only after a reboot.
         allow_armed: Continue if the vehicle is armed.
         force: Send NaN and infinity also to PX4, which cannot save them and may stop, and to ArduPilot.
-        backup: A new file for the vehicle's present state.
+        backup: A new file for the current state of the vehicle.
         dry_run: Print the values that would be sent, and send none of them.
         full: Also print parameters that are unchanged or left out.
-        extended: Restore the extended parameters (PARAM_EXT_*) of the component, as of a camera. Without it,
-            a camera, gimbal or other payload is asked whether it has them.
-        plain: Restore the plain parameters, also of a component that has extended ones.
+        extended: Restore the extended parameters (PARAM_EXT_*) of the component, such as a camera. Without
+            this option, a camera, gimbal or other payload is asked whether it has extended parameters.
+        plain: Restore the plain parameters, even if the component has extended ones.
         yes: Do not ask for confirmation.
     """
     check_choice(extended=extended, plain=plain)

@@ -1,8 +1,8 @@
 """Candidates of shell completion: subcommands, options, and names of vehicles and parameters in the cache.
 
 The shell starts the command at each press of the completion key, with `COMPLETION_VARIABLE` in the
-environment; it has 0.3 s. Imports are therefore inside of the functions that need them, and what is known of
-the subcommands comes from a file that is written once for each version of the command (see
+environment. A completion takes at most 0.3 s. Imports are therefore inside the functions that need them, and
+the options of the subcommands are read from a file that is written once for each version of the command (see
 `completion_table`).
 """
 
@@ -24,7 +24,7 @@ TABLES_READ_MAX: Final = 8
 """Cached tables of which the parameter names are read, the latest first: each takes some milliseconds."""
 
 Candidate: TypeAlias = tuple[str, str]
-"""A word, and what it means; the latter may be empty."""
+"""A word and its description, which may be empty."""
 Table: TypeAlias = dict[str, dict[str, Any]]
 """Subcommands by name: `help`, and `options` by name with `help`, `takes` and `choices`."""
 
@@ -249,7 +249,7 @@ def _names(owner: str | None, place: str | None) -> list[str]:
 
 
 class _OpenCache:
-    """The cache as a context, None where there is none. A database is never asked: it may be far away."""
+    """The cache as a context manager; None if there is no cache file. Databases are skipped as slow."""
 
     def __init__(self, place: str | None) -> None:
         self._place = place

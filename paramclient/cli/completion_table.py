@@ -1,4 +1,4 @@
-"""What shell completion knows of the subcommands: their options, and what these take."""
+"""Table of the subcommands for shell completion: their options, and the arguments of the options."""
 
 from __future__ import annotations
 

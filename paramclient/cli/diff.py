@@ -51,8 +51,8 @@ async def diff(
     Exit code 0: both have the same names with the same values. Exit code 1: they differ.
 
     Args:
-        left: A parameter file; a vehicle in the cache, by its system id, its hardware id in full, uid: and at
-            least 6 digits of it, its key, or as cache:VEHICLE; or a link.
+        left: A parameter file; a vehicle in the cache, as 4, px4 or ardupilot, a nickname, its hardware id
+            (in full, or uid: and at least 6 digits), its key, or cache:VEHICLE; or a link.
         right: A file, a vehicle in the cache, or a link, like LEFT.
         base: A third source, or "defaults" for the firmware's defaults, to see which side differs from it.
         only: Compare only this name or pattern, such as "MC_*". May be given several times.
@@ -60,9 +60,9 @@ async def diff(
             one is not, those that only the left side has.
         everything: Also print parameters that do not differ.
         renames: A YAML file of names that firmware versions have changed. A parameter that only one side has
-            is compared with that of its other name.
+            is compared with the parameter of its other name.
         metadata: A file that describes parameters. Default: the stored metadata of the vehicles' firmware.
-        extended: Use extended parameters (PARAM_EXT_*), as of a camera.
+        extended: Use extended parameters (PARAM_EXT_*), such as those of a camera.
     """
     is_told = extended or is_extended_source(left) or is_extended_source(right)
     if is_told or (base is None and not only and await are_extended((left, right), options)):

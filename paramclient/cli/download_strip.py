@@ -1,4 +1,4 @@
-"""The strip of a download: a character for each part, by what was received and requested again of it."""
+"""The strip of a download: a character for each part, by the values received and requested again."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from paramclient.protocol.params.fetch_result import Progress
 __all__ = ["strip_lines"]
 
 STRIP_WIDTH_MAX: Final = 120
-"""Characters of a strip, at most: more are hard to take in at a glance."""
+"""Maximum number of characters of a strip: more are hard to read."""
 ITEM_GAP: Final = 2
 """Blanks between two items of a line."""
 RECEIVED_STYLE: Final = "green"

@@ -36,7 +36,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Done(Generic[Worked, T]):
-    """What became of the work on one vehicle: its result, or the error that ended it."""
+    """The outcome of the work on one vehicle: its result, or the error that ended it."""
 
     vehicle: Worked
     result: T | None = None
@@ -61,11 +61,11 @@ def check_all(options: LinkOptions, *, extended: bool) -> None:
 async def every_vehicle(
     url: str, options: LinkOptions, *, policy: Policy = Policy.AUTO
 ) -> AsyncIterator[list[CommandSession]]:
-    """Open a link, listen for 3 s, and yield a session for each vehicle that was heard, by system id.
+    """Open a link, listen for 3 s, and yield a session for each vehicle that was received, by system id.
 
     Raises:
         UsageError: no such link.
-        NoReply: no vehicle was heard.
+        NoReply: no vehicle was received.
         LinkError: the link cannot be opened, or failed.
     """
     async with connect(url, options, policy=policy) as session:
@@ -76,7 +76,7 @@ async def every_vehicle(
 async def run_on_all(
     vehicles: Sequence[Worked], work: Callable[[Worked], Awaitable[T]]
 ) -> list[Done[Worked, T]]:
-    """Work on all vehicles concurrently; return what became of each. The failure of one stops no other."""
+    """Work on all vehicles concurrently; return the outcomes. A failure of one does not stop the others."""
     done: dict[int, Done[Worked, T]] = {}
 
     async def run(place: int, vehicle: Worked) -> None:

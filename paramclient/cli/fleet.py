@@ -28,7 +28,7 @@ def fleet_diff(
     component: Id = None,
     options: CacheOptions = _DEFAULTS,
 ) -> ExitCode:
-    """Compare all vehicles in the cache: some parameters with each other, or with a parameter file.
+    """Compare parameters of all vehicles in the cache, with each other or with a parameter file.
 
     Without a file, vehicles that differ from the most common value are printed. Exit code 1: some vehicles
     differ.

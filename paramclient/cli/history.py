@@ -41,19 +41,20 @@ def history(
 ) -> ExitCode:
     """Print the changes of a vehicle's values: time, old and new value, author. The newest change is last.
 
-    A set-up that was interrupted by the end of the service has a line of its own. With --snapshots, print the
-    snapshots of the vehicle's tables instead, each with its number.
+    An apply or restore that was interrupted by the end of the service has a line of its own. With
+    --snapshots, print the snapshots of the vehicle's tables instead, each with its number.
 
     Args:
-        vehicle: Its system id, its hardware id in full, uid: and at least 6 digits of it, or its key.
+        vehicle: A vehicle in the cache: 4 or 4/1, px4 or ardupilot, a nickname, its hardware id (in full, or
+            uid: and at least 6 digits), or its key.
         names: Print only these parameters: names in upper or lower case, or patterns such as "MC_*".
-        cached: The vehicle, instead of the first argument; all arguments are names then.
+        cached: The vehicle, instead of the first argument; then all arguments are names.
         component: Print only this component.
-        since: Print only changes from this time on: 2h ago, yesterday, '2026-11-20 14:00'. A time
-            without a zone is of this computer's time zone, as the printed ones are.
+        since: Print only changes from this time on: 2h ago, yesterday, '2026-11-20 14:00'. A time without a
+            time zone is in the time zone of this computer, like the printed times.
         limit: Print at most this number of changes, the newest ones.
         snapshots: Print the snapshots instead of the changes.
-        extended: Use extended parameters (PARAM_EXT_*), as of a camera.
+        extended: Use extended parameters (PARAM_EXT_*), such as those of a camera.
     """
     vehicle, names = chosen_vehicle(cached, vehicle, names)
     if vehicle is None:

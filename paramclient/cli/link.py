@@ -33,13 +33,13 @@ REFRESH_INTERVAL: Final = 0.25
 MESSAGES_SHOWN_MAX: Final = 5
 """Kinds of messages that a line names for each component, so that it stays short."""
 MEASURE_DELAY: Final = 2.0
-"""Seconds until the first read that measures the round trip: by then all components are heard."""
+"""Seconds until the first read that measures the round trip: by then all components have been received."""
 MEASURE_INTERVAL: Final = 4.0
 """Seconds between two reads that measure the round trip: request and response together take less of the link
 than the heartbeats of this client."""
 ROUND_TRIP_VALIDITY: Final = MEASURE_INTERVAL + 1.0
-"""Seconds for which a measured round trip is drawn: until the next measurement, and the second in which it
-comes."""
+"""Seconds for which a measured round trip is drawn: until the next measurement, and the second in which that
+arrives."""
 SCALES: Final = {LOSS: lambda share: f"{share:.1%}", ROUND_TRIP: milliseconds}
 """The quantities of the history as text."""
 _DEFAULTS: Final = TrafficOptions()
@@ -58,13 +58,13 @@ async def link(
     """Print the components on a link, their message rates and the packet loss.
 
     On a terminal the table is live until Ctrl-C, with packet loss and round trip over the last minute.
-    Otherwise, and with --json, it is printed once, after --seconds (default 5). Packet loss is counted by the
-    gaps in the frames' sequence numbers.
+    Otherwise, and with --json, it is printed once, after --seconds (default 5). Packet loss is computed from
+    the gaps in the frames' sequence numbers.
 
     Args:
         url: The link, such as udpin:0.0.0.0:14550, tcp:HOST:PORT or sim:px4.
         seconds: Time to listen in seconds.
-        listen_only: Send nothing. The round trip is not measured then.
+        listen_only: Send nothing. The round trip is then not measured.
     """
     is_live = sys.stdout.isatty() and not options.json
     limit = seconds if is_live or seconds is not None else LINK_LISTENING_TIME
@@ -142,7 +142,7 @@ def _drawn(history: LinkHistory, marks: Marks) -> list[str | Sequence[Piece]]:
 
 
 async def _measure_round_trips(client: ParamClient) -> None:
-    """Read a value of each autopilot every `MEASURE_INTERVAL`, until cancelled."""
+    """Read a value of each component with an autopilot every `MEASURE_INTERVAL`, until cancelled."""
     await anyio.sleep(MEASURE_DELAY)
     async with anyio.create_task_group() as tasks:
         while True:

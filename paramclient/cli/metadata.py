@@ -107,7 +107,7 @@ async def _stored(session: CommandSession, *, added_only: bool = False) -> Metad
 
     Over a service, that which the service has, without `added_only`.
 
-    With `added_only`, what a vehicle has provided earlier is left out: the firmware may have been built from
+    With `added_only`, metadata that a vehicle has provided is left out: the firmware may have been built from
     other sources since, and only the vehicle can confirm it.
     """
     component = session.component

@@ -1,4 +1,4 @@
-"""The subcommands metadata add, list and remove: metadata files that are remembered for a firmware."""
+"""The subcommands metadata add, list and remove: metadata files that are stored for a firmware."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def metadata_add(
     firmware: str | None = None,
     options: CacheOptions = _DEFAULTS,
 ) -> ExitCode:
-    """Remember a metadata file for a vehicle type and a firmware version, for all commands and the service.
+    """Store a metadata file for a vehicle type and a firmware version, for all commands and the service.
 
     ArduPilot's vehicles do not provide their metadata; its files are at autotest.ardupilot.org/Parameters. A
     file that was added before for the same vehicle type and version is replaced.

@@ -81,9 +81,10 @@ def show(
     With --changed, exit code 1: the firmware's defaults are not known.
 
     Args:
-        vehicle: A parameter file; a vehicle in the cache: its system id, its hardware id in full, uid: and at
-            least 6 digits of it, or its key, also with the prefix cache:; or replay:FILE, a telemetry log.
-        cached: The vehicle in the cache, instead of the first argument; all arguments are names then.
+        vehicle: A parameter file; a vehicle in the cache: 4 or 4/1, px4 or ardupilot, a nickname, its
+            hardware id (in full, or uid: and at least 6 digits) or its key, also with the prefix cache:; or
+            replay:FILE, a telemetry log.
+        cached: The vehicle in the cache, instead of the first argument; then all arguments are names.
         component: Print only this component.
         changed: Print only parameters that differ from the firmware's defaults: those of the vehicle, else
             those of its metadata.
@@ -91,7 +92,7 @@ def show(
             patterns such as "MC_*".
         metadata: A file that describes parameters. Default: the stored metadata of the vehicle's firmware.
             With a parameter file only for --changed.
-        extended: Use extended parameters (PARAM_EXT_*), as of a camera.
+        extended: Use extended parameters (PARAM_EXT_*), such as those of a camera.
     """
     vehicle, names = chosen_vehicle(cached, vehicle, names)
     if extended or (vehicle is not None and is_extended_source(vehicle)):
@@ -166,15 +167,16 @@ def cache_add(
     force: bool = False,
     options: CacheOptions = _DEFAULTS,
 ) -> ExitCode:
-    """Make a parameter file the cached table of a vehicle, such as before a slow link is used.
+    """Make a parameter file the cached table of a vehicle, for example before using a slow link.
 
-    The table is marked with the file until the vehicle confirms or replaces it. If the hash of a PX4 agrees
-    at the first contact, nothing is downloaded; otherwise, and from a vehicle without a hash, the next fetch
-    downloads the table. A table that was received later than the file was written is not replaced.
+    The table is marked with the file until the vehicle confirms or replaces it. If PX4's hash matches the
+    table when the vehicle is received, nothing is downloaded; otherwise, and from a vehicle without a hash,
+    the next fetch downloads the table. A table that was received later than the file was written is not
+    replaced.
 
     Args:
-        vehicle: A vehicle in the cache, or the one that the file names: its system id, its hardware id in
-            full, uid: and at least 6 digits of it, or its key.
+        vehicle: A vehicle in the cache, or the one that the file names: 4 or 4/1, px4 or ardupilot, a
+            nickname, its hardware id (in full, or uid: and at least 6 digits), or its key.
         file: The parameter file. Without types, those of the vehicle's previous table or of another one of
             the same firmware are used.
         component: The component. Default: the autopilot, or the only one of the file.
@@ -216,7 +218,8 @@ def cache_remove(vehicle: str, /, *, component: Id = None, options: CacheOptions
     """Remove a vehicle from the cache: its tables and their history.
 
     Args:
-        vehicle: Its system id, its hardware id in full, uid: and at least 6 digits of it, or its key.
+        vehicle: A vehicle in the cache: 4 or 4/1, px4 or ardupilot, a nickname, its hardware id (in full, or
+            uid: and at least 6 digits), or its key.
         component: Remove only the table of this component.
     """
     with _open(options) as cache:
@@ -239,14 +242,15 @@ def cache_name(
     remove: bool = False,
     options: CacheOptions = _DEFAULTS,
 ) -> ExitCode:
-    """Give a vehicle a nickname, by which every subcommand then knows it, on links with --vehicle.
+    """Give a vehicle a nickname. Every subcommand accepts it, on links as --vehicle.
 
-    Nicknames are in a file beside the cache, on this computer only.
+    Nicknames are stored in a file beside the cache, on this computer only.
 
     Args:
-        vehicle: Its system id, its address as 4/1, its present nickname, its hardware id in full, uid: and at
-            least 6 digits of it, or its key.
-        nickname: 1 to 32 letters, digits, _ and -, beginning with a letter; in place of the previous one.
+        vehicle: A vehicle in the cache: 4 or 4/1, px4 or ardupilot, its current nickname, its hardware id (in
+            full, or uid: and at least 6 digits), or its key.
+        nickname: 1 to 32 letters, digits, _ and -, beginning with a letter. It replaces the previous
+            nickname.
         remove: Remove its nickname.
     """
     if (nickname is None) is not remove:
@@ -265,8 +269,8 @@ def cache_name(
 def cache_copy(source: str, target: str, /, *, json: bool = False) -> ExitCode:
     """Copy every table of a cache to another one, with history and snapshots, and verify the copy.
 
-    The target keeps what it has: the later of two values is kept, and nothing is duplicated. After an
-    interruption, run the same command again to continue.
+    Tables in both caches are merged: for each parameter, the later value is kept. Nothing is duplicated.
+    After an interruption, run the same command again to continue.
 
     Args:
         source: The cache to copy: a file, or the postgresql:// URL of a shared cache.

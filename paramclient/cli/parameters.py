@@ -107,16 +107,16 @@ async def fetch(
         changed: Print only parameters that differ from the firmware's defaults: those of the vehicle, else
             those of its metadata.
         accept: With "sampled", a cached table of a vehicle without a hash is accepted if a sample of it
-            agrees; the probability that the sample shows a change is printed.
+            matches; the probability that the sample detects a change is printed.
         sample: Number of parameters in the sample. Default: 30.
         policy: Requests that may be sent to the vehicle: all that are needed, only for its hash, or none.
         metadata: A file with the firmware's defaults; or vehicle, to download the vehicle's own metadata.
             Default: the stored metadata of the firmware; else, with --changed, that of the vehicle if it can
             be downloaded in 2 s.
-        extended: Use the extended parameters (PARAM_EXT_*) of the component, as of a camera. Without it, a
-            camera, gimbal or other payload is asked whether it has them.
-        plain: Use the plain parameters, also of a component that has extended ones.
-        all_: Fetch from every vehicle that is heard in 3 s.
+        extended: Use the extended parameters (PARAM_EXT_*) of the component, such as a camera. Without this
+            option, a camera, gimbal or other payload is asked whether it has extended parameters.
+        plain: Use the plain parameters, even if the component has extended ones.
+        all_: Fetch from every vehicle that is received within 3 s.
     """
     if names:
         given = shlex.quote(names[0])
@@ -202,10 +202,10 @@ async def get(
             fetched, from the cache if the vehicle's hash matches.
         names: Further parameters and patterns.
         metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
-        extended: Use the extended parameters (PARAM_EXT_*) of the component, as of a camera. Without it, a
-            camera, gimbal or other payload is asked whether it has them.
-        plain: Use the plain parameters, also of a component that has extended ones.
-        all_: Read from every vehicle that is heard in 3 s.
+        extended: Use the extended parameters (PARAM_EXT_*) of the component, such as a camera. Without this
+            option, a camera, gimbal or other payload is asked whether it has extended parameters.
+        plain: Use the plain parameters, even if the component has extended ones.
+        all_: Read from every vehicle that is received within 3 s.
     """
     check_choice(extended=extended, plain=plain)
     described = from_file(metadata)
@@ -245,17 +245,17 @@ async def watch(
     """Print changes of values by any source, as they happen, until Ctrl-C or --timeout.
 
     Updates the table first, and also prints values that have changed since the cache was written. Also prints
-    when the vehicle is lost, found or rebooted, and when its table matches again. Parameters that appear, as
-    after a change of an *_ENABLE, are watched as well if NAMES or a pattern fits.
+    when the vehicle is lost, found or rebooted, and when its table is in sync again. Parameters that appear
+    later, such as after a change of an *_ENABLE parameter, are watched too if a name or pattern matches.
 
     Args:
         url: The link.
         names: The parameters to watch, or patterns such as "MC_*". Default: all.
         policy: Requests that may be sent besides those for NAMES: all that are needed, only for the hash, or
             none.
-        extended: Watch the extended parameters (PARAM_EXT_*) of the component, as of a camera. Without it, a
-            component that usually has them is asked for its first one.
-        plain: Watch the plain parameters, also of a component that has extended ones.
+        extended: Watch the extended parameters (PARAM_EXT_*) of the component, such as a camera. Without this
+            option, a component that usually has extended parameters is asked for its first one.
+        plain: Watch the plain parameters, even if the component has extended ones.
     """
     check_choice(extended=extended, plain=plain)
     wanted = check_given(names)

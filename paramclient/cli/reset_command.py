@@ -1,4 +1,4 @@
-"""The subcommand reset: parameters back to the firmware's defaults."""
+"""The subcommand reset: sets parameters to the firmware's defaults."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ async def reset(
         changed: Reset all parameters that differ from their default, as far as it is known. The same
             exception.
         dry_run: Print the values that would be sent, and send none of them.
-        settle: Seconds for which each value is watched until it is read again, as with set.
+        settle: Seconds to watch each value before it is read again, as with set.
         durable: End only when all values and their history are on the disk and survive a power loss.
         metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
         yes: Do not ask for confirmation.

@@ -1,4 +1,4 @@
-"""Tables and exit codes of set-ups: plans, results of apply and restore, comparisons."""
+"""Tables and exit codes of plans, of results of apply and restore, and of comparisons."""
 
 from __future__ import annotations
 

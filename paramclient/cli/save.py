@@ -64,21 +64,21 @@ async def save(
 
     Args:
         where: The link, such as udpin:0.0.0.0:14550 or sim:px4; an on-board log (.bin, .ulg), for the values
-            at its end, or another parameter file; or a vehicle in the cache: its system id, its hardware id
-            in full, uid: and at least 6 digits of it, or its key.
-        file: The file. Its ending determines the file format: .params, .parm, .param, .pck, .json, .yaml.
-        form: The file format, if the ending does not determine it.
+            at its end, or another parameter file; or a vehicle in the cache: 4 or 4/1, px4 or ardupilot, a
+            nickname, its hardware id (in full, or uid: and at least 6 digits), or its key.
+        file: The file. Its extension determines the file format: .params, .parm, .param, .pck, .json, .yaml.
+        form: The file format, if the extension does not determine it.
         changed: Write only parameters that differ from the firmware's defaults: those of the vehicle, else
             those of its metadata.
         only: Write only this name or pattern, such as "MC_*". May be given several times.
-        all_: Write all components of every vehicle that is heard in 3 s, or of the one with --system. A file
-            with {system} or {uid} in its name becomes a file for each vehicle; otherwise the file format must
-            be able to hold several components.
+        all_: Write all components of every vehicle that is received within 3 s, or of the one with --system.
+            A file with {system} or {uid} in its name becomes a file for each vehicle; otherwise the file
+            format must be able to hold several components.
         refresh: Download all parameters even if the cache is up to date.
         metadata: With --changed, a file with the firmware's defaults; or vehicle, to download the vehicle's
             own metadata. Default: the stored metadata of the firmware; else that of the vehicle if it can be
             downloaded in 2 s.
-        extended: Use extended parameters (PARAM_EXT_*), as of a camera.
+        extended: Use extended parameters (PARAM_EXT_*), such as those of a camera.
     """
     extended = extended or is_extended_source(where)
     if extended or (not (changed or all_ or refresh or only) and await is_extended_link(where, options)):

@@ -1,4 +1,4 @@
-"""The subcommands search and info: parameters by words, and all that is known of one. They need no link."""
+"""The subcommands search and info, which need no link: find parameters by words, and describe one."""
 
 from __future__ import annotations
 
@@ -49,7 +49,8 @@ def search(
     Args:
         word: A word or a part of one.
         words: Further words.
-        vehicle: Search only this vehicle in the cache: its system id, its hardware id, or its key.
+        vehicle: Search only this vehicle in the cache: 4, px4 or ardupilot, a nickname, its hardware id, or
+            its key.
         limit: Print at most this number of parameters.
         metadata: A file that describes parameters. Default: the stored metadata of each vehicle's firmware.
     """
@@ -82,11 +83,12 @@ def info(
     metadata: MetadataChoice = None,
     options: CacheOptions = _DEFAULTS,
 ) -> ExitCode:
-    """Print what is known of a parameter: description, range, value names, cached values, last changes.
+    """Print the description, range, value names, cached values and last changes of a parameter.
 
     Args:
         name: The parameter, in upper or lower case.
-        vehicle: Only of this vehicle in the cache: its system id, its hardware id, or its key.
+        vehicle: Only of this vehicle in the cache: 4, px4 or ardupilot, a nickname, its hardware id, or its
+            key.
         metadata: A file that describes parameters. Default: the stored metadata of each vehicle's firmware.
     """
     check_name(name)

@@ -49,8 +49,8 @@ async def serve(
 ) -> int:
     """Open links and the cache, and share them with programs and browsers over HTTP.
 
-    A link that cannot be opened, or that has failed, is retried. The service stops in an orderly way on
-    SIGTERM and Ctrl-C.
+    A link that cannot be opened, or that has failed, is retried. On SIGTERM and Ctrl-C, the service answers
+    waiting requests, writes the cache and exits.
 
     Args:
         links: The links, such as udpin:0.0.0.0:14550 or serial:/dev/ttyACM0:57600.

@@ -78,7 +78,7 @@ class CommandSession:
 
     @property
     def now(self) -> float:
-        """The present unix time in seconds; for a log, the time of the last frame read from it."""
+        """The current unix time in seconds; for a log, the time of the last frame read from it."""
         link = self.client.link
         at = link.at if isinstance(link, ReplayLink) else None
         return time.time() if at is None else at
@@ -107,7 +107,7 @@ class CommandSession:
 
         Raises:
             AmbiguousVehicle: another vehicle is on the link, or has replaced the component.
-            NoReply: no vehicle is heard.
+            NoReply: no vehicle is received.
             LinkError: the link failed.
         """
         options, component = self.options, self.component
@@ -168,8 +168,8 @@ async def connect(
 
     Raises:
         UsageError: no such link, or options that exclude each other.
-        AmbiguousVehicle: with `only`, several vehicles were heard.
-        NoReply: the component was not heard.
+        AmbiguousVehicle: with `only`, several vehicles were received.
+        NoReply: the component was not received.
         LinkError: the link cannot be opened, or failed.
     """
     if options.peer is not None and not options.split_peers:

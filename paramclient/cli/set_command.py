@@ -77,24 +77,24 @@ async def set_(
     bytes as hex:00FF. As NAME=VALUE, it may also be the name of a value, or names of bits separated by |, if
     metadata describes the parameter: it is downloaded from the vehicle unless --metadata names a file. Many
     writes are in flight at a time; values of one name, and switches such as *_ENABLE, are written one after
-    the other. A refused value does not stop the others. If several vehicles are heard, --system must choose
-    one, or --all all of them. A value outside of the range in the metadata, and a fraction for a parameter
-    that is an integer, is written only after a question, and without a terminal only with --force.
+    the other. A refused value does not stop the others. If several vehicles are received, --system must
+    choose one, or --all must choose all. A value outside the range in the metadata, or a fraction for an
+    integer parameter, is written only after confirmation on a terminal, or with --force.
 
     Args:
         url: The link.
         pairs: A parameter, in upper or lower case, and its value, or NAME=VALUE. May be given several times.
-        settle: Seconds for which each value is watched until it is read again. 1.2 shows values that PX4's
-            modules clamp.
-        force: Do not ask about values outside of the range, and fractions for integers, which ArduPilot cuts
-            off. Send NaN and infinity also to PX4, which cannot save them and may stop, and to
+        settle: Seconds to watch each value before it is read again. 1.2 detects values that PX4's modules
+            clamp.
+        force: Do not ask about values outside the range, and fractions for integers, which ArduPilot
+            truncates. Send NaN and infinity also to PX4, which cannot save them and may stop, and to
             ArduPilot.
         durable: End only when all values and their history are on the disk and survive a power loss.
         metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
-        extended: Use the extended parameters (PARAM_EXT_*) of the component, as of a camera. Without it, a
-            camera, gimbal or other payload is asked whether it has them.
-        plain: Use the plain parameters, also of a component that has extended ones.
-        all_: Write to every vehicle that is heard in 3 s.
+        extended: Use the extended parameters (PARAM_EXT_*) of the component, such as a camera. Without this
+            option, a camera, gimbal or other payload is asked whether it has extended parameters.
+        plain: Use the plain parameters, even if the component has extended ones.
+        all_: Write to every vehicle that is received within 3 s.
     """
     if all_:
         check_all(options, extended=extended)

@@ -35,7 +35,7 @@ class SigningTarget(KeyOptions):
     """The vehicle, and the safety of the link. The texts below the fields are their help."""
 
     link_is_safe: bool = False
-    """Confirm that no other person or program can listen on this link: a USB cable, a wire. Default: ask."""
+    """Confirm that no other person or program can read this link: a USB cable, a wire. Default: ask."""
 
     vehicle: str | None = None
     """The vehicle: 4 or 4/1, px4 or ardupilot, or a nickname, hardware id or key of the cache. Instead of
@@ -48,7 +48,8 @@ class SigningTarget(KeyOptions):
     """Component id of the vehicle, 1 to 255. Default: the autopilot."""
 
     timeout: Seconds = None
-    """Timeout for the whole command in seconds. Default: 10 for the first heartbeat, and 10 for the proof."""
+    """Timeout for the whole command in seconds. Default: 10 for the first heartbeat, and 10 for the
+    verification."""
 
     json: bool = False
     """Print JSON."""
@@ -65,12 +66,12 @@ def setup(
 ) -> Callable[[], Awaitable[int]]:
     """Set the signing key of a vehicle, and verify that the vehicle signs with it.
 
-    The key is that of --signing-key, --signing-passphrase or the environment. It is sent in clear text: use a
-    link on which no other person or program can listen.
+    The key is taken from --signing-key, --signing-passphrase or the environment. It is sent unencrypted: use
+    a link that no other person or program can read.
 
     Args:
         url: The link, such as serial:/dev/ttyACM0:115200.
-        present_key: A file with the vehicle's present key, if the vehicle requires signed frames on this
+        present_key: A file with the vehicle's current key, if the vehicle requires signed frames on this
             link.
     """
     key = options.key
@@ -84,7 +85,7 @@ def setup(
 def disable(url: str, /, *, options: SigningTarget = _DEFAULTS) -> Callable[[], Awaitable[int]]:
     """Remove the signing key of a vehicle, and verify that it neither signs nor requires signed frames.
 
-    The present key (--signing-key, --signing-passphrase or the environment) is needed if the vehicle requires
+    The current key (--signing-key, --signing-passphrase or the environment) is needed if the vehicle requires
     signed frames: PX4 always does, ArduPilot not over USB.
 
     Args:
@@ -150,7 +151,7 @@ async def _send(
     key: SigningKey | None,
     present: SigningKey | None,
 ) -> tuple[int, int]:
-    """Send SETUP_SIGNING, signed with the vehicle's present key if known; return the vehicle's address."""
+    """Send SETUP_SIGNING, signed with the vehicle's current key if known; return the vehicle's address."""
     signing = None if present is None else Signing(present, SigningPolicy.ACCEPT_ALL)
     async with ParamClient(link, cache=False, signing=signing, **options.source) as client:
         timeout = VEHICLE_TIMEOUT if options.timeout is None else deadline.left()

@@ -54,8 +54,8 @@ __all__ = [
 
 SOURCES: Final = f"""\
   FILE                a parameter file, or an on-board log (.bin, .ulg), that exists
-  cache:VEHICLE       last known of a vehicle: its system id, its hardware id in full, uid: and at least 6
-                      digits of it, or its key; without cache: where it can be nothing else, as 1, uid:000200
+  cache:VEHICLE       the cached table of a vehicle: 4 or 4/1, px4 or ardupilot, a nickname, its hardware id
+                      (in full, or uid: and at least 6 digits), or its key; cache: may be left out
 {FORMS}"""
 """The accepted sources, for messages."""
 
@@ -85,7 +85,7 @@ async def resolve(text: str, options: LinkOptions, *, only: bool = False) -> Par
         AmbiguousVehicle: several vehicles in the cache have this name; with `only`, several are on the link.
         CacheError: the cached table is incomplete.
         VehicleError: some parameters were not received; the message names them.
-        NoReply: no vehicle was heard, or it did not answer.
+        NoReply: no vehicle was received, or it did not answer.
         LinkError: the link cannot be opened, or failed.
     """
     (params,) = await resolve_all([text], options, only=only)

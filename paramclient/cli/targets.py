@@ -1,4 +1,4 @@
-"""The vehicles of a set-up, one or all on a link, and the wanted parameters of each."""
+"""The vehicles of apply, verify and restore, one or all on a link, and the wanted parameters of each."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ Address: TypeAlias = tuple[int, int]
 """System id and component id."""
 
 FLEET_LISTENING_TIME: Final = 3.0
-"""Seconds in which every vehicle is heard, also on a link that loses two of three heartbeats."""
+"""Seconds in which every vehicle is received, even on a link that loses two of three heartbeats."""
 POLL_INTERVAL: Final = 0.05
-"""Seconds between two checks whether all expected vehicles have been heard."""
+"""Seconds between two checks whether all expected vehicles have been received."""
 PLACEHOLDERS: Final = ("{uid}", "{system}")
 """Placeholders in file names, which are replaced by the ids of the vehicle."""
 
@@ -103,8 +103,8 @@ async def targets(
 
     Raises:
         UsageError: no such link, or options that exclude each other.
-        AmbiguousVehicle: with `only`, several vehicles were heard, and the options name none.
-        NoReply: no vehicle was heard, or fewer than expected.
+        AmbiguousVehicle: with `only`, several vehicles were received, and the options name none.
+        NoReply: no vehicle was received, or fewer than expected.
         LinkError: the link cannot be opened, or failed.
     """
     if all_vehicles and (options.system is not None or options.vehicle is not None):
@@ -226,7 +226,7 @@ def describe(vehicle: Component) -> str:
 async def find_vehicles(
     client: ParamClient, component: int | None, expect: int | None, deadline: Deadline
 ) -> list[Component]:
-    """Return the vehicles on a link, by system id: those heard in 3 s, or as many as are expected.
+    """Return the vehicles on a link, by system id: those received within 3 s, or as many as are expected.
 
     Args:
         client: the client.
@@ -235,7 +235,7 @@ async def find_vehicles(
         deadline: the deadline of the command.
 
     Raises:
-        NoReply: fewer than expected were heard.
+        NoReply: fewer than expected were received.
         LinkError: the link failed.
     """
     timeout = deadline.left(FLEET_LISTENING_TIME if expect is None else VEHICLE_TIMEOUT)

@@ -1,4 +1,4 @@
-"""Writes of a subcommand: outcomes of the values, how they are printed, and what an interruption leaves."""
+"""Writes of a subcommand: outcomes of the values, and their output, also after an interruption."""
 
 from __future__ import annotations
 

@@ -278,9 +278,9 @@ class ParamClient:
 
         Without arguments, this is the autopilot whose heartbeat was received first; with only a system, the
         autopilot of that system; with only a component, the first component with that id. On a link with
-        several vehicles, the first one may be another one at the next start, and the call reports nothing
-        about the others. Use it in programs that only read, or that know that there is one vehicle. Programs
-        that write use `only_component`, which refuses to choose.
+        several vehicles, the result may be a different vehicle at the next start, and the call does not
+        report the other vehicles. Use it in programs that only read, or if the link has only one vehicle.
+        Programs that write use `only_component`, which raises AmbiguousVehicle instead.
 
         On return, a cached table is in `params`, unless the vehicle does not report its identity.
 

@@ -36,8 +36,8 @@ class Component(ABC):
     raise LinkError. A lost component (see `Lost`) receives no requests: waiting calls and new ones raise
     NoReply immediately, except a running `fetch_all`, which continues for a while, as the vehicle may be
     rebooting. A component whose address several vehicles use (see `Contested`) receives no requests either:
-    calls raise ContestedAddress. In both cases the table stays, and its values are *cached* until the vehicle
-    has confirmed them.
+    calls raise ContestedAddress. In both cases the table is kept, and its values are *cached* until the
+    vehicle has confirmed them.
 
     Attributes:
         system, component: MAVLink ids of the component.
@@ -75,7 +75,8 @@ class Component(ABC):
         """The extended parameters of the component (PARAM_EXT_*), with their own calls.
 
         Raises:
-            UsageError: the client is one over a service of an earlier version, which does not serve them.
+            UsageError: the client is connected to a service of an earlier version without extended
+                parameters.
         """
 
     @property
@@ -224,14 +225,14 @@ class Component(ABC):
         """Write many parameters in one call, and verify each as `set` does.
 
         Several writes are in flight at a time, as many as the vehicle serves. Writes to one name run in the
-        order given. A parameter that shows or hides others, such as `*_ENABLE`, is written alone: all writes
-        before it end first, and those after it begin afterwards. A value that is refused does not stop the
-        others.
+        order given. A parameter that reveals or hides others, such as `*_ENABLE`, is written alone: all
+        writes before it end first, and those after it begin afterwards. A value that is refused does not stop
+        the others.
 
-        If the vehicle is lost, the link fails, three writes in a row get no response or the timeout is over,
-        the call returns what was done: each value that was sent and not acknowledged is *unknown*, each other
-        one *not tried*, and `error` of the result has the cause. After cancellation it is unknown whether the
-        vehicle has the values that were sent.
+        If the vehicle is lost, the link fails, three writes in a row get no response or the timeout expires,
+        the call returns the outcomes so far: each value that was sent and not acknowledged is *unknown*, each
+        value that was not sent is *not tried*, and `error` of the result is the cause. After cancellation it
+        is unknown whether the vehicle has the values that were sent.
 
         Args:
             values: values by name, or pairs of name and value; a name may occur in several pairs. Values are
@@ -239,7 +240,7 @@ class Component(ABC):
             progress: called with each outcome in the order of their arrival, from this task. Over a service,
                 they arrive together.
             timeout: seconds for the whole call; None: no limit besides the number of attempts.
-            settle: seconds as in `set`, for which each value is watched; the other writes go on meanwhile.
+            settle: seconds as in `set`, for which each value is watched; the other writes continue meanwhile.
             force, asker: as in `set`.
             durable: return only after all values and history entries are synced to the disk. If that fails,
                 the `error` of the result and of each outcome is NotDurable.
@@ -322,8 +323,8 @@ class Component(ABC):
         until then, and `refreshed` waits for them.
 
         Otherwise the client downloads the packed file `param.pck` over MAVFTP if the component serves it: it
-        is faster than the list, exact, and has the firmware's defaults. Else it downloads the list. `source`
-        and `notes` of the result give the source and the reason.
+        is faster than the list, exact, and has the firmware's defaults. If not, it downloads the list.
+        `source` and `notes` of the result give the source and the reason.
 
         A client that only listens sends no request: it waits for a list that another station requests. The
         fetch ends when the table is complete, or 5 s after the last new value.
@@ -398,7 +399,7 @@ class Component(ABC):
         autopilot and type of the heartbeat. As after every boot, the table is *cached* until it is confirmed;
         parameters may have changed.
 
-        Concurrent calls share one reboot. After cancellation the vehicle may reboot nevertheless.
+        Concurrent calls share one reboot. After cancellation, the vehicle may still reboot.
 
         Args:
             system: the new system id, if a changed one takes effect with the reboot (MAV_SYS_ID of PX4,

@@ -53,9 +53,9 @@ class ExtParams(ABC):
     """The extended parameters of a component (PARAM_EXT_*); see `Component.ext`.
 
     Cameras, gimbals and companion computers have them: values of up to 128 bytes, with text and 64-bit types.
-    A component may have plain parameters as well; the two tables are apart, and one name may be in both.
+    A component may have plain parameters as well; the two tables are separate, and one name may be in both.
 
-    What `Component` says of cancellation, lost components and reconnection holds for these calls too.
+    Cancellation, lost components and reconnection are handled as in `Component`.
 
     Attributes:
         params: the known parameters by name. The mapping is read-only and follows the received messages.
@@ -117,8 +117,8 @@ class ExtParams(ABC):
     ) -> ExtSetResult:
         """Write one parameter with PARAM_EXT_SET, and return when the component has acknowledged the value.
 
-        An unknown type is read from the component first. A component that reports progress is waited for as
-        long as it does. Writes to one name run in the order of the calls, writes to different names in
+        An unknown type is read from the component first. While the component reports progress, the call
+        continues to wait. Writes to one name run in the order of the calls, writes to different names in
         parallel. After cancellation it is unknown whether the component has the value.
 
         Args:
@@ -136,12 +136,13 @@ class ExtParams(ABC):
             ValueUnsupported: the component does not support the value.
             SetFailed: the component could not set the value.
             ExtSetRefused: the component refused with a result that MAVLink does not define.
-            ValueNotApplied: the component keeps its previous value and acknowledges nothing.
+            ValueNotApplied: the component keeps its previous value and does not acknowledge the write.
             NoReply: the component did not respond. It is unknown whether it has the value.
             ContestedAddress: several vehicles use its address.
             LinkError: the link failed, or the client was closed.
-            CacheError: `durable`, and the cache cannot store the value. Nothing was written.
-            NotDurable: `durable`, and the component has the value, but the disk does not.
+            CacheError: with `durable`, the cache cannot store the value. Nothing was written.
+            NotDurable: with `durable`, the component has accepted the value, but it could not be written to
+                the disk.
         """
 
     @abstractmethod
@@ -157,8 +158,8 @@ class ExtParams(ABC):
         """Write many parameters in one call, each as `set` does.
 
         Several writes are in flight at a time. A value that is refused does not stop the others. If the
-        component is lost, the link fails, three writes in a row get no response or the timeout is over, the
-        call returns what was done, and `error` of the result has the cause.
+        component is lost, the link fails, three writes in a row get no response or the timeout expires, the
+        call returns the outcomes so far, and `error` of the result is the cause.
 
         Args:
             values: values by name, or pairs of name and value; a name may occur in several pairs.
@@ -175,7 +176,7 @@ class ExtParams(ABC):
             NoReply: the component is lost already. Nothing was written.
             ContestedAddress: several vehicles use its address. Nothing was written.
             LinkError: the link had failed already, or the client was closed.
-            CacheError: `durable`, and the cache cannot store values. Nothing was written.
+            CacheError: with `durable`, the cache cannot store values. Nothing was written.
         """
 
     @abstractmethod
@@ -187,8 +188,8 @@ class ExtParams(ABC):
     ) -> ExtFetchResult:
         """Download all parameters with PARAM_EXT_REQUEST_LIST, and read what the list lacks.
 
-        The protocol has no hash, so that a cached table cannot be confirmed without a download. A client
-        whose policy allows no download returns the known table.
+        The protocol has no hash, so a cached table cannot be confirmed without a download. A client whose
+        policy allows no download returns the known table.
 
         Concurrent calls share one fetch. Cancellation keeps the received values in the table.
 
@@ -212,7 +213,7 @@ class ExtParams(ABC):
     async def store_snapshot(self, *, reason: str) -> int | None:
         """Store a snapshot of the known parameters in the cache, as a restore point.
 
-        The values that were received before are in the cache and its history first.
+        All values received before the call are written to the cache and its history first.
 
         Args:
             reason: the reason, as text.

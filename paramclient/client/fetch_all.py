@@ -261,7 +261,7 @@ class FleetFetch:
         return error.with_hint(silence_of_component(self._station, machine, since, now))
 
     async def _end(self, wake: Callable[[], None]) -> None:
-        """Release all fetches, the last ones first: those without a turn must not get one that ends."""
+        """Release all fetches, the last ones first, so that no waiting fetch starts when another one ends."""
         for number, (address, fetch) in enumerate(reversed(self._fetches.items()), 1):
             machine = self._station.components.get(address)
             if machine is not None:  # the station may have forgotten it since

@@ -95,7 +95,7 @@ class LinkComponent(LocalComponent):
     Args:
         client: the client that follows it.
         machine: its protocol state.
-        heard_at: when it was heard first, by the clock of the event loop.
+        heard_at: time of its first message, by the clock of the event loop.
     """
 
     def __init__(self, client: LocalClient, machine: ComponentMachine, heard_at: float) -> None:

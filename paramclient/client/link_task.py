@@ -293,7 +293,7 @@ class LinkTask:
                     await anyio.lowlevel.checkpoint()
 
     def send_for_another(self, frame: bytes) -> None:
-        """Queue a frame of another program for every peer. Drop it if the queue is full or the link away."""
+        """Queue a frame of another program for every peer, unless the queue is full or the link is down."""
         if len(self._forwarded) < FORWARDED_QUEUE_MAX and not self.is_disconnected:
             self._forwarded.append(frame)
             self._station.overhear(frame, anyio.current_time())

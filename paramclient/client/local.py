@@ -42,7 +42,7 @@ __all__ = [
 ]
 
 IDENTITY_POLL_INTERVAL: Final = 0.05
-"""Seconds between two looks at the identity of a vehicle: it has no event."""
+"""Seconds between two checks of the identity of a vehicle: no event reports it."""
 
 Result = TypeVar("Result")
 
@@ -135,7 +135,7 @@ class LocalComponent(Component):
 
     @abstractmethod
     def is_cache_due(self, now: float) -> bool:
-        """Return whether the cached table is in `params`, or the timeout for it is over."""
+        """Return whether the cached table is in `params`, or the timeout for it has expired."""
 
     @abstractmethod
     async def wait_for_cache(self) -> None:
@@ -151,7 +151,7 @@ class LocalComponent(Component):
 
         Raises:
             UsageError: the client has no cache.
-            CacheError: the values cannot be written, or the timeout is over.
+            CacheError: the values cannot be written, or the timeout expired.
         """
 
     @abstractmethod
@@ -182,7 +182,7 @@ class LocalComponent(Component):
             progress: called about ten times a second, from this task.
 
         Raises:
-            NoReply: the timeout is over.
+            NoReply: the timeout expired.
             ParamClientError: the error with which the operation has ended.
         """
 

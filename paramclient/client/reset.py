@@ -24,7 +24,7 @@ class Reader(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class ResetChoice:
-    """What a reset writes.
+    """The values that a reset writes.
 
     Attributes:
         values: the defaults to write, by name, in the order of the names.
@@ -41,7 +41,7 @@ class ResetChoice:
         """Choose the values to write.
 
         Args:
-            params: the present parameters.
+            params: the current parameters.
             defaults: defaults of parameters whose default the vehicle has not given; the vehicle's own
                 default has priority.
         """

@@ -18,7 +18,7 @@ __all__ = ["Worker"]
 Result = TypeVar("Result")
 
 THREAD_END_INTERVAL: Final = 0.01
-"""Seconds between two looks whether a thread has ended."""
+"""Seconds between two checks whether a thread has ended."""
 
 
 class Worker:
@@ -57,7 +57,7 @@ class Worker:
         return call.future.result()
 
     def drop(self, error: Callable[[], Exception]) -> None:
-        """Do nothing that has not begun. Who waits for it, or asks for more, gets this error."""
+        """Drop all calls that have not begun: their callers, and later ones, get this error."""
         self._ended_with = error
         with suppress(Empty):
             while True:
@@ -66,7 +66,7 @@ class Worker:
                     call.give_up(error())
 
     async def abandon(self, error: Callable[[], Exception], within: float) -> None:
-        """End the thread: as `drop`, and what has begun is waited for no longer than these seconds."""
+        """End the thread as `drop` does. Wait at most these seconds for a call that has begun."""
         self.drop(error)
         thread = self._thread
         if thread is None:
@@ -105,7 +105,7 @@ class Worker:
 
 
 class _Call(Generic[Result]):
-    """One call: done in the thread, and told in the event loop."""
+    """One call: runs in the thread, and reports its end in the event loop."""
 
     def __init__(self, work: Callable[[], Result], waiting: dict[_Call[Any], None]) -> None:
         self.future: Future[Result] = Future()
@@ -116,7 +116,7 @@ class _Call(Generic[Result]):
         waiting[self] = None
 
     def run(self) -> None:
-        """Do it, in the thread."""
+        """Run the call in the thread."""
         done: Future[Result] = Future()
         try:
             done.set_result(self._work())
@@ -126,7 +126,7 @@ class _Call(Generic[Result]):
             anyio.from_thread.run_sync(self._tell, done, token=self._token)
 
     def give_up(self, error: Exception) -> None:
-        """Wait for it no longer."""
+        """Stop waiting for the call."""
         done: Future[Result] = Future()
         done.set_exception(error)
         self._tell(done)

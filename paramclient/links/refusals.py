@@ -1,4 +1,4 @@
-"""Why a link cannot be opened, in sentences: the cause, and what to do about it."""
+"""Reasons why a link cannot be opened, as sentences with the cause and the remedy."""
 
 from __future__ import annotations
 

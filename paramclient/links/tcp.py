@@ -27,7 +27,8 @@ SILENCE_TIMEOUT: Final = 15.0
 15 minutes). The heartbeat that every station sends each second needs an acknowledgement."""
 
 CONNECTIONS_MAX: Final = 64
-"""Connections of `tcpin` at a time; further ones are closed immediately, so that strangers use no memory."""
+"""Connections of `tcpin` at a time; further ones are closed immediately, which bounds the memory for unknown
+senders."""
 
 READ_SIZE: Final = 65536
 """Bytes that are read from one connection before the next one is read."""

@@ -54,8 +54,8 @@ DATAGRAMS_PER_READ: Final = 128
 """Datagrams that one `receive` returns at most, so that other tasks run during a burst."""
 
 PEERS_MAX: Final = 256
-"""Addresses that a listening link remembers, one for each system id: broadcasts go to those. The limit keeps
-strangers from using memory; messages to a single vehicle do not depend on it."""
+"""Addresses that a listening link remembers, one for each system id: broadcasts go to those. The limit bounds
+the memory for unknown senders; messages to a single vehicle do not depend on it."""
 
 PEER_TIMEOUT: Final = 60.0
 """Seconds without a valid frame after which an address is forgotten."""

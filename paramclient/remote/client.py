@@ -1,4 +1,4 @@
-"""RemoteClient: a `ParamClient` for the address of a service only, with a choice of how requests travel."""
+"""RemoteClient: a `ParamClient` for the address of a service only, with a choice of the HTTP transport."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["RemoteClient"]
 
 
 class RemoteClient(ParamClient):
-    """A `ParamClient` for the address of a service only. `ParamClient("http://HOST:8765")` works the same.
+    """A `ParamClient` for the address of a service only. `ParamClient("http://HOST:8765")` is equivalent.
 
     Differences from a client with its own link: The service has the links and the cache, so the arguments for
     both are refused. `params` of a component mirrors that of the service. While the service cannot be

@@ -102,7 +102,7 @@ class RemoteComponent(ServiceComponent):
         """See `Component.ext`.
 
         Raises:
-            UsageError: the service is one of an earlier version, which does not serve them.
+            UsageError: the service is of an earlier version without extended parameters.
         """
         if not self._mirrored.has_extended:
             raise not_given("extended parameters, as its version is too old")

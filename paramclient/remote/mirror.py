@@ -161,7 +161,7 @@ class TableMirror(ABC, Generic[TableParam, TableChange]):
 
     @abstractmethod
     def _parts(self, change: TableChange) -> tuple[str, TableParam | None, str, bool]:
-        """Return name, parameter and author of a change, and whether the component has it anew."""
+        """Return name, parameter and author of a change, and whether the parameter is new."""
 
 
 class Mirror(TableMirror[Param, Change]):

@@ -1,4 +1,4 @@
-"""Service: what the components of a service need of it."""
+"""Service: the interface of a service that its components use."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Service(Protocol):
         method: str = "POST",
         is_write: bool = False,
     ) -> ServiceResponse:
-        """Request something about a component, and wait until its effect is in the mirror.
+        """Send a request about a component, and wait until its effect is in the mirror.
 
         Args:
             mirrored: the component.

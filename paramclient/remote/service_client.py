@@ -378,7 +378,7 @@ class ServiceClient:
             await anyio.sleep(STATS_INTERVAL)
 
     def check_open(self) -> None:
-        """Check that the service can be asked.
+        """Check that requests can be sent.
 
         Raises:
             LinkError: the service cannot be reached, or the client is not open.

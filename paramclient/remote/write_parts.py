@@ -15,7 +15,7 @@ __all__ = ["requests_of", "write_in_parts"]
 Written = TypeVar("Written")
 Outcome = TypeVar("Outcome")
 Part: TypeAlias = tuple[list[Outcome], ParamClientError | None]
-"""The outcomes of the values of a request, and why some were not tried, or None."""
+"""The outcomes of the values of a request, and the reason if some were not tried, or None."""
 
 
 def requests_of(pairs: Iterable[tuple[str, Written]], most: int) -> Iterator[list[tuple[str, Written]]]:
@@ -42,13 +42,14 @@ async def write_in_parts(
 
     Args:
         parts: the values of each request.
-        write: sends a request with a timeout in seconds; returns its outcomes, and why some were not tried.
+        write: sends a request with a timeout in seconds; returns its outcomes, and the reason if some were
+            not tried.
         not_written: creates the outcome of a value that a failed request had, or that was not sent.
         timeout: seconds for all requests; None for no limit.
         progress: called with each outcome.
 
     Returns:
-        The outcomes of all values, and why some were not tried, or None.
+        The outcomes of all values, and the reason if some were not tried, or None.
 
     Raises:
         ParamClientError: the first request was refused. Nothing was written.

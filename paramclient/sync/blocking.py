@@ -251,9 +251,9 @@ class ParamClient(BlockingClient):
 
         Without arguments, this is the autopilot whose heartbeat was received first; with only a system, the
         autopilot of that system; with only a component, the first component with that id. On a link with
-        several vehicles, the first one may be another one at the next start, and the call reports nothing
-        about the others. Use it in programs that only read, or that know that there is one vehicle. Programs
-        that write use `only_component`, which refuses to choose.
+        several vehicles, the result may be a different vehicle at the next start, and the call does not
+        report the other vehicles. Use it in programs that only read, or if the link has only one vehicle.
+        Programs that write use `only_component`, which raises AmbiguousVehicle instead.
 
         On return, a cached table is in `params`, unless the vehicle does not report its identity.
 
@@ -403,7 +403,7 @@ class Component(Wrapper[AsyncComponent]):
     the client is closed, they raise LinkError. A lost component (see `Lost`) receives no requests: waiting
     calls and new ones raise NoReply immediately, except a running `fetch_all`, which continues for a while,
     as the vehicle may be rebooting. A component whose address several vehicles use (see `Contested`) receives
-    no requests either: calls raise ContestedAddress. In both cases the table stays, and its values are
+    no requests either: calls raise ContestedAddress. In both cases the table is kept, and its values are
     *cached* until the vehicle has confirmed them.
 
     Attributes:
@@ -454,7 +454,8 @@ class Component(Wrapper[AsyncComponent]):
         """The extended parameters of the component (PARAM_EXT_*), with their own calls.
 
         Raises:
-            UsageError: the client is one over a service of an earlier version, which does not serve them.
+            UsageError: the client is connected to a service of an earlier version without extended
+                parameters.
         """
         return ExtParams.of(self._thread, self._thread.read(lambda: self._wrapped.ext))
 
@@ -613,14 +614,14 @@ class Component(Wrapper[AsyncComponent]):
         """Write many parameters in one call, and verify each as `set` does.
 
         Several writes are in flight at a time, as many as the vehicle serves. Writes to one name run in the
-        order given. A parameter that shows or hides others, such as `*_ENABLE`, is written alone: all writes
-        before it end first, and those after it begin afterwards. A value that is refused does not stop the
-        others.
+        order given. A parameter that reveals or hides others, such as `*_ENABLE`, is written alone: all
+        writes before it end first, and those after it begin afterwards. A value that is refused does not stop
+        the others.
 
-        If the vehicle is lost, the link fails, three writes in a row get no response or the timeout is over,
-        the call returns what was done: each value that was sent and not acknowledged is *unknown*, each other
-        one *not tried*, and `error` of the result has the cause. After Ctrl-C it is unknown whether the
-        vehicle has the values that were sent.
+        If the vehicle is lost, the link fails, three writes in a row get no response or the timeout expires,
+        the call returns the outcomes so far: each value that was sent and not acknowledged is *unknown*, each
+        value that was not sent is *not tried*, and `error` of the result is the cause. After Ctrl-C it is
+        unknown whether the vehicle has the values that were sent.
 
         Args:
             values: values by name, or pairs of name and value; a name may occur in several pairs. Values are
@@ -628,7 +629,7 @@ class Component(Wrapper[AsyncComponent]):
             progress: called with each outcome in the order of their arrival, in the calling thread. Over a
                 service, they arrive together.
             timeout: seconds for the whole call; None: no limit besides the number of attempts.
-            settle: seconds as in `set`, for which each value is watched; the other writes go on meanwhile.
+            settle: seconds as in `set`, for which each value is watched; the other writes continue meanwhile.
             force, asker: as in `set`.
             durable: return only after all values and history entries are synced to the disk. If that fails,
                 the `error` of the result and of each outcome is NotDurable.
@@ -719,8 +720,8 @@ class Component(Wrapper[AsyncComponent]):
         until then, and `refreshed` waits for them.
 
         Otherwise the client downloads the packed file `param.pck` over MAVFTP if the component serves it: it
-        is faster than the list, exact, and has the firmware's defaults. Else it downloads the list. `source`
-        and `notes` of the result give the source and the reason.
+        is faster than the list, exact, and has the firmware's defaults. If not, it downloads the list.
+        `source` and `notes` of the result give the source and the reason.
 
         A client that only listens sends no request: it waits for a list that another station requests. The
         fetch ends when the table is complete, or 5 s after the last new value.
@@ -805,7 +806,7 @@ class Component(Wrapper[AsyncComponent]):
         autopilot and type of the heartbeat. As after every boot, the table is *cached* until it is confirmed;
         parameters may have changed.
 
-        Concurrent calls share one reboot. After Ctrl-C the vehicle may reboot nevertheless.
+        Concurrent calls share one reboot. After Ctrl-C, the vehicle may still reboot.
 
         Args:
             system: the new system id, if a changed one takes effect with the reboot (MAV_SYS_ID of PX4,
@@ -846,9 +847,9 @@ class ExtParams(Wrapper[AsyncExtParams]):
     """The extended parameters of a component (PARAM_EXT_*); see `Component.ext`.
 
     Cameras, gimbals and companion computers have them: values of up to 128 bytes, with text and 64-bit types.
-    A component may have plain parameters as well; the two tables are apart, and one name may be in both.
+    A component may have plain parameters as well; the two tables are separate, and one name may be in both.
 
-    What `Component` says of Ctrl-C, lost components and reconnection holds for these calls too.
+    Ctrl-C, lost components and reconnection are handled as in `Component`.
 
     Attributes:
         params: the known parameters by name. The mapping is read-only and follows the received messages.
@@ -912,8 +913,8 @@ class ExtParams(Wrapper[AsyncExtParams]):
     ) -> ExtSetResult:
         """Write one parameter with PARAM_EXT_SET, and return when the component has acknowledged the value.
 
-        An unknown type is read from the component first. A component that reports progress is waited for as
-        long as it does. Writes to one name run in the order of the calls, writes to different names in
+        An unknown type is read from the component first. While the component reports progress, the call
+        continues to wait. Writes to one name run in the order of the calls, writes to different names in
         parallel. After Ctrl-C it is unknown whether the component has the value.
 
         Args:
@@ -931,12 +932,13 @@ class ExtParams(Wrapper[AsyncExtParams]):
             ValueUnsupported: the component does not support the value.
             SetFailed: the component could not set the value.
             ExtSetRefused: the component refused with a result that MAVLink does not define.
-            ValueNotApplied: the component keeps its previous value and acknowledges nothing.
+            ValueNotApplied: the component keeps its previous value and does not acknowledge the write.
             NoReply: the component did not respond. It is unknown whether it has the value.
             ContestedAddress: several vehicles use its address.
             LinkError: the link failed, or the client was closed.
-            CacheError: `durable`, and the cache cannot store the value. Nothing was written.
-            NotDurable: `durable`, and the component has the value, but the disk does not.
+            CacheError: with `durable`, the cache cannot store the value. Nothing was written.
+            NotDurable: with `durable`, the component has accepted the value, but it could not be written to
+                the disk.
         """
         return self._thread.call(
             partial(self._wrapped.set, name, value, timeout=timeout, durable=durable, asker=asker)
@@ -954,8 +956,8 @@ class ExtParams(Wrapper[AsyncExtParams]):
         """Write many parameters in one call, each as `set` does.
 
         Several writes are in flight at a time. A value that is refused does not stop the others. If the
-        component is lost, the link fails, three writes in a row get no response or the timeout is over, the
-        call returns what was done, and `error` of the result has the cause.
+        component is lost, the link fails, three writes in a row get no response or the timeout expires, the
+        call returns the outcomes so far, and `error` of the result is the cause.
 
         Args:
             values: values by name, or pairs of name and value; a name may occur in several pairs.
@@ -972,7 +974,7 @@ class ExtParams(Wrapper[AsyncExtParams]):
             NoReply: the component is lost already. Nothing was written.
             ContestedAddress: several vehicles use its address. Nothing was written.
             LinkError: the link had failed already, or the client was closed.
-            CacheError: `durable`, and the cache cannot store values. Nothing was written.
+            CacheError: with `durable`, the cache cannot store values. Nothing was written.
         """
         return self._thread.call_reporting(
             partial(
@@ -986,8 +988,8 @@ class ExtParams(Wrapper[AsyncExtParams]):
     ) -> ExtFetchResult:
         """Download all parameters with PARAM_EXT_REQUEST_LIST, and read what the list lacks.
 
-        The protocol has no hash, so that a cached table cannot be confirmed without a download. A client
-        whose policy allows no download returns the known table.
+        The protocol has no hash, so a cached table cannot be confirmed without a download. A client whose
+        policy allows no download returns the known table.
 
         Concurrent calls share one fetch. Ctrl-C keeps the received values in the table.
 
@@ -1011,7 +1013,7 @@ class ExtParams(Wrapper[AsyncExtParams]):
     def store_snapshot(self, *, reason: str) -> int | None:
         """Store a snapshot of the known parameters in the cache, as a restore point.
 
-        The values that were received before are in the cache and its history first.
+        All values received before the call are written to the cache and its history first.
 
         Args:
             reason: the reason, as text.

@@ -168,7 +168,7 @@ class ClientThread:
     def read(self, function: Callable[[], Result]) -> Result:
         """Run a function that does not wait, in the event loop while that runs. Return its result.
 
-        What a client knows is readable also before it is opened and after it is closed: then the function
+        Received values can also be read before the client is opened and after it is closed: then the function
         runs in the thread of the caller.
 
         Raises:
@@ -463,7 +463,7 @@ class _Call(Generic[Result]):
         """Return the next progress call, or None after the end.
 
         Raises:
-            Empty: the deadline is over.
+            Empty: the deadline has passed.
             _NoEventLoop: the event loop has ended without an end of the call.
         """
         while True:

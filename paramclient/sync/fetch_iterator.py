@@ -18,9 +18,9 @@ __all__ = ["FetchIterator"]
 class FetchIterator(Iterator[Progress]):
     """`Component.fetch_all` as an iterator of its progress, for a progress bar or a widget.
 
-    The fetch starts at once. The iterator gives about ten items a second, and ends with the fetch; the
-    fetch's error ends it too. Ctrl-C while an item is awaited cancels the fetch, and so does dropping the
-    last reference to this object. Received values stay in the table.
+    The fetch starts immediately. The iterator yields about ten items a second and ends with the fetch; an
+    error of the fetch is raised by the iterator. Ctrl-C while an item is awaited cancels the fetch, and so
+    does dropping the last reference to this object. Received values stay in the table.
 
     Args:
         component: the component.
