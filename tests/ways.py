@@ -7,7 +7,7 @@ they open their clients with `a_client`: what users see must be the same.
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from types import TracebackType
 from typing import Any, TypeVar
 
@@ -81,13 +81,18 @@ def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
 class ServedClient(RemoteClient):
     """A client over a service in this process that has this link, and ends with it.
 
+    Args:
+        link: the link.
+        others: what further links of the service lead to, by their names.
+        options: of the client that the service makes for the link.
+
     Attributes:
         hub: of the service.
         own: the client that the service has made for the link; None before.
         roster: the components that it mirrors.
     """
 
-    def __init__(self, link: Any, **options: Any) -> None:
+    def __init__(self, link: Any, *, others: Mapping[str, Any] | None = None, **options: Any) -> None:
         self.own: ParamClient | None = None
         self._is_served = False
         OPENED.add(self)
@@ -98,7 +103,10 @@ class ServedClient(RemoteClient):
             self.own = unused.pop() if unused else ParamClient(link, **options)
             return self.own
 
-        self.hub = Hub([(first.link.name, make)], cache=False, fetches=False)
+        more = [
+            (name, lambda link=link: ParamClient(link, **options)) for name, link in (others or {}).items()
+        ]
+        self.hub = Hub([(first.link.name, make), *more], cache=False, fetches=False)
         super().__init__("http://127.0.0.1:8765", transport=ASGITransport(create_app(self.hub)))
         implementation = implementation_of(self)
         assert isinstance(implementation, ServiceClient)

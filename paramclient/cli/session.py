@@ -112,7 +112,9 @@ class CommandSession:
         """
         options, component = self.options, self.component
         kind = options.named.kind
-        if kind is not None and (check_kind(self.client, kind) or component) is component:
+        if kind is not None and (chosen := check_kind(self.client, kind)) in (None, component):
+            if chosen is component and component.address not in self.client.components:
+                return  # another link of the service has the same ids, and no vehicle of this kind
             await self.client.only_component(
                 component.system, component.component, timeout=self.deadline.left(RECHECK_TIMEOUT)
             )
@@ -261,11 +263,13 @@ def listen(url: str, options: TrafficOptions, *, listen_only: bool = False) -> P
 
 
 def received_in_words(client: ParamClient) -> str:
-    """Return what was received on the link so far; "" over a service."""
+    """Return what was received so far on the link, or the vehicles on the links of a service."""
     implementation = implementation_of(client)
-    if not isinstance(implementation, LinkClient):
-        return ""
-    return silence_of_link(implementation.station, client.link.name)
+    if isinstance(implementation, LinkClient):
+        return silence_of_link(implementation.station, client.link.name)
+    heard = implementation.autopilots_on_links
+    vehicles = ", ".join(f"{receiver_in_words(each)} on {each.identity.link}" for each in heard)
+    return f"The service has: {vehicles}." if vehicles else ""
 
 
 def _difference(found: Component, chosen: Component) -> str:

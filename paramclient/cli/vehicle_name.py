@@ -126,11 +126,18 @@ def check_kind(client: ParamClient, kind: str) -> Component | None:
     """
     found = _of_kind(client, kind)
     if len(found) > 1:
-        words = [f"{each.system}/{each.component} {each.autopilot}" for each in found]
+        spans_links = len({each.identity.link for each in found}) > 1
+        where = "on the links of this service" if spans_links else "on this link"
+        words = [
+            f"{each.system}/{each.component} {each.autopilot}"
+            + (f" on {each.identity.link}" if spans_links else "")
+            for each in found
+        ]
+        has_equal_systems = len({each.system for each in found}) < len(found)
         raise AmbiguousVehicle(
-            f"{len(found)} vehicles on this link are {kind}: {', '.join(words)}.",
+            f"{len(found)} vehicles {where} are {kind}: {', '.join(words)}.",
             vehicles=words,
-            choose_by="system",
+            choose_by="link" if spans_links and has_equal_systems else "system",
         )
     return found[0] if found else None
 
@@ -177,4 +184,5 @@ def _reported_uids(client: ParamClient, component: Component) -> list[str | None
 
 
 def _of_kind(client: ParamClient, kind: str) -> list[Component]:
-    return [each for each in client.autopilots if each.autopilot == kind and each.state != "lost"]
+    heard = implementation_of(client).autopilots_on_links
+    return [each for each in heard if each.autopilot == kind and each.state != "lost"]

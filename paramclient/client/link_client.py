@@ -186,6 +186,11 @@ class LinkClient(LocalClient):
         return [self._components[machine.address] for machine in found if machine is not None]
 
     @property
+    def autopilots_on_links(self) -> list[Component]:
+        """The same: there is one link."""
+        return self.autopilots
+
+    @property
     def link(self) -> Link:
         """See `ParamClient.link`."""
         return self._link

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from types import MappingProxyType
 from typing import Final, NoReturn
@@ -90,11 +90,12 @@ class ServiceClient:
     @property
     def autopilots(self) -> list[Component]:
         """See `ParamClient.autopilots`."""
-        found: dict[int, MirroredComponent] = {}
-        for (system, number), mirrored in self._unambiguous().items():
-            if mirrored.is_autopilot and (number == AUTOPILOT_COMPONENT or system not in found):
-                found[system] = mirrored
-        return [found[system].component for system in sorted(found)]
+        return _autopilots(self._unambiguous().values())
+
+    @property
+    def autopilots_on_links(self) -> list[Component]:
+        """The autopilots of every link, also those with equal ids on several links."""
+        return _autopilots(self._roster.components.values())
 
     def _unambiguous(self) -> dict[Address, MirroredComponent]:
         """Return the components whose ids are on one link only."""
@@ -384,3 +385,13 @@ class ServiceClient:
             LinkError: the service cannot be reached, or the client is not open.
         """
         self._connection.check_open()
+
+
+def _autopilots(components: Iterable[MirroredComponent]) -> list[Component]:
+    """Return the autopilot of each system on each link, component 1 before others, by system id."""
+    found: dict[tuple[int, str], MirroredComponent] = {}
+    for each in components:
+        link, system, number = each.key
+        if each.is_autopilot and (number == AUTOPILOT_COMPONENT or (system, link) not in found):
+            found[system, link] = each
+    return [found[place].component for place in sorted(found)]

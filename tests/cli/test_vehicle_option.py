@@ -89,6 +89,45 @@ def test_a_kind_that_is_not_there(command: Command, put: Put) -> None:
     assert "Received on sim:custom so far: 4/1 ArduPilot quadrotor." in done.err
 
 
+def over_two_links(monkeypatch: pytest.MonkeyPatch, one: Endpoint, other: Endpoint) -> None:
+    """Connect every URL to a service with these vehicles on two links."""
+    monkeypatch.setattr(
+        cli_session,
+        "ParamClient",
+        lambda url, **options: ServedClient(
+            SimLink(one, "sim:one"), others={"sim:two": SimLink(other, "sim:two")}
+        ),
+    )
+
+
+def test_a_kind_on_one_of_two_links_of_a_service_with_equal_ids(
+    command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, two = px4(), copter(1)
+    over_two_links(monkeypatch, one, two)
+    for value, kind in ((7, "px4"), (8, "ardupilot")):
+        done = command("set", "http://127.0.0.1:8765", "A", value, "--vehicle", kind)
+        assert done.code == 0, done.err
+    assert (one.values["A"], two.values["A"]) == (7.0, 8.0)
+
+
+def test_a_kind_on_both_links_of_a_service_lists_them(
+    command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, two = px4(), px4()
+    over_two_links(monkeypatch, one, two)
+    done = command("set", "http://127.0.0.1:8765", "A", 7, "--vehicle", "px4")
+    assert (done.code, done.out) == (2, "")
+    assert done.err == (
+        "paramclient: 2 vehicles on the links of this service are px4: 1/1 px4 on sim:one, "
+        "1/1 px4 on sim:two. Name its link in the address of the service: http://HOST:PORT?link=NAME.\n"
+    )
+    assert (one.requests["PARAM_SET"], two.requests["PARAM_SET"]) == (0, 0)
+    done = command("get", "http://127.0.0.1:8765", "A", "--vehicle", "ardupilot", "--timeout", 3)
+    assert done.code == 3
+    assert "The service has: 1/1 PX4 quadrotor, firmware 1.17.0-alpha on sim:one, 1/1 " in done.err
+
+
 def test_a_nickname_names_a_vehicle_everywhere(command: Command, put: Put, tmp_path: Path) -> None:
     one, two = px4(), copter()
     url = put(Air([one, two]))
