@@ -62,6 +62,8 @@ NOTICE_DELAY: Final = 0.5
 """Seconds after which a terminal shows what is awaited: most responses arrive earlier."""
 ERASE: Final = "\r\x1b[K"
 """Moves the cursor of a terminal to the start of the line, and erases the line."""
+ELLIPSIS: Final = "..."
+"""Stands for the middle of a shortened text; ASCII, which every terminal shows."""
 GAP: Final = 2
 """Blanks between two columns of a table, and before the second and later lines of a row."""
 SENTENCE_WIDTH_MIN: Final = 20
@@ -254,13 +256,16 @@ class StatusLine:
     def draw(self, text: str, seconds: float, more: str = "") -> None:
         """Draw a text, the seconds so far and a sentence, as much as fits on one line.
 
+        A text that leaves no space for the seconds is shortened in its middle.
+
         Nothing is drawn in the first `NOTICE_DELAY` seconds, and after `end`.
         """
         if seconds < NOTICE_DELAY or self._has_ended:
             return
-        whole = printable(f"{text} ({int(seconds)} s). {more}".rstrip())
         columns = shutil.get_terminal_size().columns - 1
-        self._write(whole[:columns])
+        duration = f" ({int(seconds)} s)."
+        shown = _shortened(printable(text), columns - len(duration)) + duration
+        self._write(f"{shown} {printable(more)}".rstrip()[:columns])
         self._is_drawn = True
 
     def end(self) -> None:
@@ -272,6 +277,14 @@ class StatusLine:
     def _write(self, text: str) -> None:
         sys.stderr.write(f"{ERASE}{text}")
         sys.stderr.flush()
+
+
+def _shortened(text: str, length: int) -> str:
+    """Return a text of at most `length` characters: its beginning and its end if it is longer."""
+    kept = length - len(ELLIPSIS)
+    if len(text) <= length or kept < 1:
+        return text
+    return f"{text[: kept - kept // 2]}{ELLIPSIS}{text[len(text) - kept // 2 :]}"
 
 
 @contextmanager
