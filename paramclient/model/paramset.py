@@ -19,6 +19,7 @@ from paramclient.model.values import (
     bits_of,
     format_value,
     known_type,
+    repr_of_param,
     same_bits,
 )
 from paramclient.model.wording import counted
@@ -76,6 +77,9 @@ class WrittenParam:
         given = (name, value, kind, default, comment, line, is_raw, number)
         for attribute, each in zip(self.__slots__, given, strict=True):
             object.__setattr__(self, attribute, each)
+
+    def __repr__(self) -> str:
+        return repr_of_param(self)
 
     @property
     def settable(self) -> WireValue:

@@ -14,9 +14,12 @@ import struct
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum, StrEnum
 from functools import lru_cache
-from typing import Final, SupportsFloat, SupportsIndex, TypeAlias
+from typing import TYPE_CHECKING, Final, SupportsFloat, SupportsIndex, TypeAlias
 
 from paramclient.errors import UsageError
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 __all__ = [
     "WIRE_SIZE",
@@ -38,6 +41,7 @@ __all__ = [
     "from_bits",
     "is_portable_name",
     "known_type",
+    "repr_of_param",
     "same_bits",
     "shortest_float",
     "type_name",
@@ -179,6 +183,9 @@ class Param:
         _set_is_raw(self, is_raw or not is_known)
         _set_type_number(self, number)
 
+    def __repr__(self) -> str:
+        return repr_of_param(self)
+
     @property
     def settable(self) -> WireValue:
         """The value as `set` takes it to write it to another vehicle: the four wire bytes where `is_raw`."""
@@ -208,6 +215,15 @@ class Param:
 
     def __str__(self) -> str:
         return f"{self.name} = {format_value(self.settable, self.type_number)}"
+
+
+def repr_of_param(param: DataclassInstance) -> str:
+    """Return the `repr` of a parameter: all fields, and `type_number` only of an unknown type."""
+    shown = [each.name for each in fields(param)]
+    if getattr(param, "type", None) is not ParamType.UNKNOWN:
+        shown.remove("type_number")
+    members = ", ".join(f"{name}={getattr(param, name)!r}" for name in shown)
+    return f"{type(param).__name__}({members})"
 
 
 _UNKNOWN: Final = ParamType.UNKNOWN

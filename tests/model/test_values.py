@@ -602,3 +602,19 @@ def test_format_value_rounds_a_float_to_float32() -> None:
     assert shortest_float(0.1) == 0.1
     assert shortest_float(0.10000000149) == 0.1
     assert shortest_float(1 / 3) == 0.33333334
+
+
+def test_repr_has_the_number_of_the_type_only_where_the_type_is_unknown() -> None:
+    known = Param("A", 1.5, ParamType.REAL32, 3, 0x3FC00000)
+    assert repr(known) == (
+        "Param(name='A', value=1.5, type=<ParamType.REAL32: 9>, index=3, bits=1069547520, "
+        "trust=<Trust.LIVE: 'live'>, default=None, is_raw=False)"
+    )
+    assert repr(Param("A", b"\1\0\0\0", 77, 3, 1)).endswith("is_raw=True, type_number=77)")
+    written = WrittenParam("A", 1, ParamType.INT32)
+    assert repr(written) == (
+        "WrittenParam(name='A', value=1, type=<ParamType.INT32: 6>, default=None, comment='', line=None, "
+        "is_raw=False)"
+    )
+    assert "type=None" in repr(WrittenParam("A", 1))
+    assert repr(WrittenParam("A", b"\1\0\0\0", 77)).endswith("type_number=77)")
