@@ -225,7 +225,7 @@ class ApplyResultDoc(Document):
     """The result of a set-up; see `ApplyResult`.
 
     `system` and `component` are the vehicle's address at the start, `now` is its address at the end. `extra`
-    is the number of the vehicle's other parameters. `vehicle` is in the output of the command.
+    is the number of the vehicle's other parameters. `vehicle` has its kind and firmware.
     """
 
     system: int

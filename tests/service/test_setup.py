@@ -139,6 +139,10 @@ async def test_a_file_is_planned_applied_and_verified(
 
         result = await service.post(f"{HERE}/apply", wanted)
         assert result["complete"] is True
+        told = result["vehicle"]
+        assert (told["system"], told["component"]) == (1, 1)
+        assert told["kind"] in ("PX4 quadrotor", "ArduPilot quadrotor")
+        assert told["firmware"]
         assert result["counts"]["set"] == 20
         assert result["params"]["TUNE_01"] == {
             "status": "set",

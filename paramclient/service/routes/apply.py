@@ -13,6 +13,7 @@ from pydantic import model_validator
 from paramclient.documents.diff import DiffDoc
 from paramclient.documents.document import Body, Document
 from paramclient.documents.job import JobDoc
+from paramclient.documents.receiver import ReceiverDoc
 from paramclient.documents.setup import ApplyProgressDoc, ApplyResultDoc, InterruptedDoc, PlanDoc, VerifiedDoc
 from paramclient.errors import NoReply
 from paramclient.metadata import Metadata, MetadataStore
@@ -408,7 +409,8 @@ def _begin(
         finally:
             if note is not None:
                 await hub.end_setup_record(note, is_cut_off=hub.is_closing and not is_whole)
-        return ApplyResultDoc.of(result, system=system, component=component, full=full)
+        vehicle = ReceiverDoc.at(system, component, target.component.identity)
+        return ApplyResultDoc.of(result, system=system, component=component, full=full, vehicle=vehicle)
 
     return hub.jobs.start(kind, target, run, author_of(request), holder_of(request))
 
