@@ -14,13 +14,25 @@ from paramclient.model.defaults import Default, DefaultSource
 from paramclient.model.values import Param
 from paramclient.model.wording import counted
 
-__all__ = ["DEFAULTS_HINT", "defaults_in", "find_defaults", "report_no_defaults", "say_sources"]
+__all__ = [
+    "DEFAULTS_HINT",
+    "STORED_DEFAULTS_HINT",
+    "defaults_in",
+    "find_defaults",
+    "report_no_defaults",
+    "say_sources",
+]
 
 DEFAULTS_HINT: Final = (
     "--metadata vehicle requests it from a vehicle that serves it, as PX4 does; --metadata FILE takes a "
     "file, and `paramclient metadata add FILE` remembers one"
 )
 """What to do if no defaults are known."""
+STORED_DEFAULTS_HINT: Final = (
+    "`paramclient fetch LINK --metadata vehicle` stores that of a vehicle that serves it, as PX4 does; "
+    "--metadata FILE takes a file, and `paramclient metadata add FILE` remembers one"
+)
+"""What to do if no defaults are known to a subcommand that requests no metadata from a vehicle."""
 
 
 def defaults_in(metadata: Metadata | None, names: Iterable[str]) -> Mapping[str, int | float]:
@@ -79,8 +91,8 @@ def say_sources(label: str, defaults: Iterable[Default | None]) -> None:
         say(printable(f"{label}: {what}, which does not have the defaults of an airframe"))
 
 
-def report_no_defaults() -> None:
+def report_no_defaults(hint: str = DEFAULTS_HINT) -> None:
     """Print that the defaults are not known, and what to do."""
     from paramclient.provision.vehicle_params import NO_DEFAULTS  # only here: loads provision
 
-    report(f"{NO_DEFAULTS}; {DEFAULTS_HINT}")
+    report(f"{NO_DEFAULTS}; {hint}")

@@ -8,7 +8,7 @@ from typing import Annotated, Final
 
 from cyclopts import Parameter
 
-from paramclient.cli.default_sources import DEFAULTS_HINT, defaults_in
+from paramclient.cli.default_sources import STORED_DEFAULTS_HINT, defaults_in
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.extended import are_extended, diff_extended, is_extended_source
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_sets, meaning_of, units_of
@@ -120,7 +120,7 @@ class _Sides:
         try:
             return collect_defaults(sets, [*map(defaults_in, (self.left, self.right), sets)])
         except UsageError as error:
-            raise UsageError(f"{error}; {DEFAULTS_HINT}") from None
+            raise UsageError(f"{error}; {STORED_DEFAULTS_HINT}") from None
 
     def units(self, entry: Difference) -> str:
         """Return the units of a parameter, or ""."""

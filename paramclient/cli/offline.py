@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from paramclient.cache import CachedComponent, CachedSummary, ParamCache
 from paramclient.cache.database_url import is_address
-from paramclient.cli.default_sources import defaults_in, report_no_defaults, say_sources
+from paramclient.cli.default_sources import STORED_DEFAULTS_HINT, defaults_in, report_no_defaults, say_sources
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.extended import is_extended_source, show_extended
 from paramclient.cli.logs import cache_of_log
@@ -134,7 +134,7 @@ def show(
     for view in [] if options.json else views:
         _print_table(view)
     if changed and tables and not any(view.has_defaults for view in views):
-        report_no_defaults()
+        report_no_defaults(STORED_DEFAULTS_HINT)
         return ExitCode.INCOMPLETE
     return ExitCode.DONE
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from paramclient.cli.default_sources import defaults_in, report_no_defaults, say_sources
+from paramclient.cli.default_sources import STORED_DEFAULTS_HINT, defaults_in, report_no_defaults, say_sources
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.output import local_time, print_document, print_table, printable, say
 from paramclient.files import ParamFile
@@ -40,26 +40,28 @@ def show_file(
     """
     sets = file.sets if component is None else [file.choose(component)]
     shown = [*sets]
-    sources: dict[int, list[Default | None]] = {}
+    defaults: list[dict[str, Default]] = [{} for _ in sets]
     if changed:
-        shown = []
+        shown, defaults = [], []
         for each, metadata in zip(sets, known(sets), strict=True):
             more = defaults_in(metadata, each)
             filled = add_defaults(each, more)
             if any(param.default is not None for param in filled.values()):
                 differing = non_defaults(filled)
-                sources[len(shown)] = [default_of(each[name], more.get(name)) for name in differing]
                 shown.append(differing)
+                known_defaults = {name: default_of(each[name], more.get(name)) for name in differing}
+                defaults.append({name: found for name, found in known_defaults.items() if found is not None})
     if json:
         from paramclient.documents.paramset import FileDoc  # only here: loads pydantic
 
-        print_document(FileDoc.of(file, shown))
+        origins = [{name: each.source for name, each in of_set.items()} for of_set in defaults]
+        print_document(FileDoc.of(file, shown, origins))
     else:
-        for place, each in enumerate(shown):
+        for each, of_set in zip(shown, defaults, strict=True):
             _print_set(each, changed=changed)
-            say_sources(address(each), sources.get(place, ()))
+            say_sources(address(each), of_set.values())
     if changed and not shown:
-        report_no_defaults()
+        report_no_defaults(STORED_DEFAULTS_HINT)
         return ExitCode.INCOMPLETE
     return ExitCode.DONE
 

@@ -12,7 +12,13 @@ import anyio
 import anyio.to_thread
 from cyclopts import Parameter
 
-from paramclient.cli.default_sources import DEFAULTS_HINT, defaults_in, find_defaults, say_sources
+from paramclient.cli.default_sources import (
+    DEFAULTS_HINT,
+    STORED_DEFAULTS_HINT,
+    defaults_in,
+    find_defaults,
+    say_sources,
+)
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.extended import is_extended_link, is_extended_source, save_extended
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_sets
@@ -93,16 +99,16 @@ async def save(
     if is_file(where):
         if refresh:
             raise UsageError(f"--refresh needs a link; {where!r} is a file")
-        chosen = _Changed(changed, metadata, from_file(metadata, offline=True))
+        chosen = _Changed(changed, metadata, from_file(metadata, offline=True), STORED_DEFAULTS_HINT)
         sets, faults = _from_file(where, options, chosen, all_=all_)
     elif names_vehicle(where, options.cache):
         if refresh:
             raise UsageError(f"--refresh needs a link; {where!r} is a vehicle in the cache")
-        chosen = _Changed(changed, metadata, from_file(metadata, offline=True))
+        chosen = _Changed(changed, metadata, from_file(metadata, offline=True), STORED_DEFAULTS_HINT)
         sets, faults = _from_cache(where, options, chosen, all_=all_)
     else:
         check_link(where)
-        chosen = _Changed(changed, metadata, from_file(metadata))
+        chosen = _Changed(changed, metadata, from_file(metadata), DEFAULTS_HINT)
         sets, faults = await _from_link(where, options, chosen, all_=all_, refresh=refresh)
     for fault in faults:
         report(fault)
@@ -125,11 +131,13 @@ class _Changed:
         is_chosen: whether they are.
         choice: the value of --metadata.
         given: the metadata of the file that it names, or None.
+        hint: what to do if no defaults are known.
     """
 
     is_chosen: bool
     choice: str | None
     given: Metadata | None
+    hint: str
 
     def known_of(self, sets: Sequence[ParamSet], options: LinkOptions) -> list[Metadata | None]:
         """Return the metadata of each set, without a link."""
@@ -144,7 +152,7 @@ class _Changed:
         try:
             sets.append(select_non_defaults(whole, described) if self.is_chosen else whole)
         except UsageError as error:
-            hint = f"; {DEFAULTS_HINT}" if str(error) == NO_DEFAULTS else ""
+            hint = f"; {self.hint}" if str(error) == NO_DEFAULTS else ""
             return [f"{address(whole)}: {error}{hint}"]
         if self.is_chosen:
             written = sets[-1].values()

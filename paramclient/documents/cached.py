@@ -253,12 +253,13 @@ class FoundDoc(Document):
 
 
 class KnownValueDoc(Document):
-    """The cached value of a parameter on one vehicle, and its last changes."""
+    """The cached value of a parameter on one vehicle, the time of its reception, and its last changes."""
 
     key: str
     system: int
     component: int
     autopilot: str
+    heard_at: str
     param: ParamDoc
     changes: list[HistoryEntryDoc]
 
@@ -295,9 +296,9 @@ class ParamInfoDoc(Document):
                     system=each.system,
                     component=each.component,
                     autopilot=autopilot_name(each.autopilot),
+                    heard_at=time_text(each.heard_at[name]),
                     param=ParamDoc.kept(
                         each.params[name],
-                        heard_at=each.heard_at[name],
                         described=None if info is None else info.default,
                     ),
                     changes=[HistoryEntryDoc.of(line) for line in changes[each.key, each.component]],

@@ -223,24 +223,32 @@ class WrittenParamDoc(Document):
     """A parameter of a file or of another set; its name is the key of the document.
 
     Without a type, `value` is the number as the file has it, and `bits` is null. In a comparison, `text` is
-    the meaning of the value in a word, if known, and `default` and `comment` are left out.
+    the meaning of the value in a word, if known, and `default` and `comment` are left out. `default_source`
+    is the origin of `default` where that of the metadata counts too.
     """
 
     value: Scalar
     type: str | None
     bits: str | None
     default: Maybe[Scalar] = None
+    default_source: Maybe[DefaultSource] = None
     comment: Maybe[str] = None
     text: Maybe[str] = None
 
     @classmethod
-    def of(cls, param: WrittenParam) -> WrittenParamDoc:
-        """Return the document of a `WrittenParam`, without its line number."""
+    def of(cls, param: WrittenParam, source: DefaultSource | None = None) -> WrittenParamDoc:
+        """Return the document of a `WrittenParam`, without its line number.
+
+        Args:
+            param: the parameter.
+            source: the origin of its default, if that is to be included.
+        """
         return cls(
             value=value_written(param.settable, param),
             type=None if param.type_number is None else type_name(param.type_number),
             bits=bits_written(param),
             default=None if param.default is None else value_written(param.default, param),
+            default_source=source,
             comment=param.comment or None,
         )
 

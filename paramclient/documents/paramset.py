@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Final
 
 from paramclient.documents.document import Document
@@ -13,6 +14,7 @@ from paramclient.model.notation import time_or_none
 
 if TYPE_CHECKING:
     from paramclient.files import ParamFile
+    from paramclient.model.defaults import DefaultSource
     from paramclient.model.paramset import ParamSet
 
 __all__ = ["FileDoc", "FormatDoc", "FormatsDoc", "OriginDoc", "SetDoc", "UploadedDoc"]
@@ -50,9 +52,15 @@ class SetDoc(OriginDoc):
     params: dict[str, WrittenParamDoc]
 
     @classmethod
-    def of(cls, params: ParamSet) -> SetDoc:
-        """Return the document of a `ParamSet`."""
-        written = {name: WrittenParamDoc.of(param) for name, param in params.items()}
+    def of(cls, params: ParamSet, sources: Mapping[str, DefaultSource] | None = None) -> SetDoc:
+        """Return the document of a `ParamSet`.
+
+        Args:
+            params: the set.
+            sources: the origins of its defaults by name, if they are to be included.
+        """
+        origins = sources or {}
+        written = {name: WrittenParamDoc.of(param, origins.get(name)) for name, param in params.items()}
         return cls(**OriginDoc.of(params).model_dump(), params=written)
 
 
@@ -64,10 +72,21 @@ class FileDoc(Document):
     components: list[SetDoc]
 
     @classmethod
-    def of(cls, file: ParamFile, sets: Iterable[ParamSet] | None = None) -> FileDoc:
-        """Return the document of a file; with `sets`, only of these sets of it."""
-        shown = file.sets if sets is None else sets
-        return cls(file=file.source, form=file.form, components=[SetDoc.of(each) for each in shown])
+    def of(
+        cls,
+        file: ParamFile,
+        sets: Iterable[ParamSet] | None = None,
+        sources: Iterable[Mapping[str, DefaultSource]] = (),
+    ) -> FileDoc:
+        """Return the document of a file.
+
+        Args:
+            file: the file.
+            sets: the sets of it to include; None for all.
+            sources: of each set, the origins of its defaults by name, if they are to be included.
+        """
+        shown = zip_longest(file.sets if sets is None else sets, sources)
+        return cls(file=file.source, form=file.form, components=[SetDoc.of(*each) for each in shown])
 
 
 class UploadedDoc(Document):

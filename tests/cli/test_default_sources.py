@@ -180,6 +180,9 @@ def test_save_writes_what_differs(command: Command, put: Put, tmp_path: Path) ->
     shown = command("show", whole, "--changed", "--metadata", given)
     assert [row[0] for row in shown.rows[1:]] == ["MC_PITCH_P"]
     assert "1 of 1 default from the metadata" in shown.err
+    [told] = command("show", whole, "--changed", "--metadata", given, "--json").json["components"]
+    assert told["params"]["MC_PITCH_P"]["default"] == 1.0
+    assert told["params"]["MC_PITCH_P"]["default_source"] == "metadata"
 
 
 def test_a_comparison_with_the_defaults_takes_those_of_the_metadata(
@@ -191,8 +194,12 @@ def test_a_comparison_with_the_defaults_takes_those_of_the_metadata(
     words = ("diff", "1", file, "--partial", "--base", "defaults")
     unknown = command(*words)
     assert unknown.code == 2
-    assert "--metadata FILE takes a file" in unknown.err
-    assert command("fetch", put(quad()), "--changed").code == 0
+    stores = "`paramclient fetch LINK --metadata vehicle` stores that of a vehicle that serves it"
+    assert f"{stores}, as PX4 does; --metadata FILE takes a file" in unknown.err
+    for others in (("show", "1", "--changed"), ("show", file, "--changed")):
+        assert stores in command(*others).err
+    assert stores in command("save", "1", tmp_path / "none.parm", "--changed").err
+    assert command("fetch", put(quad()), "--metadata", "vehicle").code == 0
     found = command(*words, "--json").json
     assert {name: (each["moved"], each["default_source"]) for name, each in found["params"].items()} == {
         "MC_PITCH_P": ("right", "metadata"),

@@ -66,6 +66,8 @@ def test_info_prints_description_values_and_changes(command: Command) -> None:
     assert (document["name"], document["metadata"]["units"]) == ("MC_ROLL_P", "1/s")
     [vehicle] = document["vehicles"]
     assert (vehicle["system"], vehicle["param"]["value"]) == (1, 7.5)
+    assert vehicle["changes"][-1]["time"] <= vehicle["heard_at"], "text in UTC, as every time of the command"
+    assert "heard_at" not in vehicle["param"]
     assert [each["new"] for each in vehicle["changes"]] == [6.5, 7.5]
 
 
