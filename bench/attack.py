@@ -553,6 +553,29 @@ async def descriptions(rows: list[Row], quick: bool) -> None:
                 service.note("not answered", 0, sum(status != 200 for status in statuses), "times")
 
 
+async def hostile_metadata(service: Service, quick: bool) -> None:
+    """Clause 7: metadata within the limits that takes long to parse."""
+    await service.ask("POST", "/api/v1/find", b'{"timeout_s": 60}', token(READER))
+    members = b",".join(b'"%06d":1' % number for number in range(198_000))
+    px4, copter = b'{"version":1,"parameters":[{"name":"A","x":%s}]}', b'{"json":{},"G":%s}'
+    attributes = b" ".join(b"a%d=''" % number for number in range(500_000))
+    files = {
+        "198,000 members": px4 % (b"{" + members + b"}"),
+        "198,000 strings": px4 % (b"[" + members.replace(b":1", b"") + b"]"),
+        "99,000 empty objects": px4 % (b"[" + b"{}," * 99_000 + b"1]"),
+        "198,000 lists in lists": px4 % (b"[" + (b"[" * 150 + b"]" * 150 + b",") * 1_300 + b"1]"),
+        "4,000,000 escapes": px4 % (b"[" + (b'"' + b"\\n" * 262_000 + b'",') * 15 + b"1]"),
+        "65,000 parameters": copter % (b"{" + b",".join(b'"A%05d":{}' % n for n in range(65_000)) + b"}"),
+        "500,000 attributes in XML": b"<paramfile><param name='A' %s/></paramfile>" % attributes,
+    }
+    for what, content in list(files.items())[: 3 if quick else None]:
+        service.attack = f"metadata with {what}"
+        with service.watched(late=LATE):
+            kind = "application/octet-stream"
+            status, _ = await service.ask("PUT", f"{C}/metadata", content, token(WRITER), kind=kind)
+            service.note("answered with 5xx or not", 0, status >= 500 or not status, "times")
+
+
 async def many_components(rows: list[Row], quick: bool) -> None:
     """Clause 7: requests of a reader for the maximum number of components, which one sender makes up."""
     count = 100 if quick else 1_000
@@ -978,6 +1001,7 @@ async def attack(quick: bool, only: str) -> list[Row]:
         "large table": lambda: large_table(rows, quick),
         "extended parameters": lambda: extended_params(rows, quick),
         "long descriptions": lambda: descriptions(rows, quick),
+        "hostile metadata": lambda: on_service(hostile_metadata, *bare),
         "similar names": lambda: similar_names(rows, quick),
         "many components": lambda: many_components(rows, quick),
         "large fleet": lambda: large_fleet(rows, quick),

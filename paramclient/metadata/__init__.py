@@ -6,6 +6,7 @@ The metadata is optional. It comes from a file (`read_metadata`) or from the veh
 - `quick_download`: automatic downloads, where the link is quick.
 - `added_files`: files that the user has added for a vehicle type and firmware version.
 - `formats`, `ardupilot`, `px4`: detection of the format, and one module for each format.
+- `json_parser`: JSON that is parsed value by value.
 """
 
 from __future__ import annotations

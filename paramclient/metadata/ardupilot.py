@@ -9,22 +9,33 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
-from typing import Any, Final
+from typing import Annotated, Final
 from xml.parsers import expat
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from paramclient.errors import MetadataError, UsageError
-from paramclient.metadata.info import BITS_MAX, Metadata, ParamInfo, number_of
-from paramclient.metadata.px4 import PARAMS_MAX, error_text, whole
+from paramclient.metadata.info import (
+    BITS_MAX,
+    DESCRIPTION_LENGTH_MAX,
+    Metadata,
+    ParamInfo,
+    names_of,
+    number_of,
+    too_long_texts,
+)
+from paramclient.metadata.px4 import PARAMS_MAX, VALUE_NAMES_MAX, error_text, whole
 
 __all__ = ["read_json", "read_xml"]
 
 GROUP_DEPTH_MAX: Final = 16
 """Levels of elements; the files have six."""
+XML_TAG_BYTES_MAX: Final = 65_536
+"""Bytes of a tag or a comment, which the parser handles in one call; the longest of ArduPilot has 7,000."""
+XML_BYTES_PER_CALL: Final = 16_384
+"""Bytes parsed in one call, in which no other thread runs for about 2 ms."""
 
 
 def read_xml(content: bytes, *, source: str) -> Metadata:
@@ -51,19 +62,30 @@ def read_json(document: object, *, source: str) -> Metadata:
     Raises:
         MetadataError: the document is invalid.
     """
-    try:
-        groups = _GROUPS.validate_python(document)
-        if groups.pop("json", None) is None:
-            raise MetadataError(
-                f'{source}: has no "json" member, which ArduPilot\'s files have', source=source
-            )
-        if sum(map(len, groups.values())) > PARAMS_MAX:
+    groups = {} if not isinstance(document, dict) else {**document}
+    if groups.pop("json", None) is None:
+        raise MetadataError(f'{source}: has no "json" member, which ArduPilot\'s files have', source=source)
+    count = 0
+    for group, described in groups.items():
+        if not isinstance(described, dict):
+            raise MetadataError(f"{source}, {group:.40}: Input should be a valid dictionary", source=source)
+        count += len(described)
+        if count > PARAMS_MAX:
             raise _too_many(source)
-        rows = {group: _ROWS.validate_python(described) for group, described in groups.items()}
-    except ValidationError as error:
-        raise MetadataError(f"{source}{error_text(error)}", source=source) from None
-    infos = (each.info(name, group) for group, described in rows.items() for name, each in described.items())
+    # one by one: pydantic lets no other thread run while it validates all in one call
+    infos = (
+        _described(each, source, (group, name)).info(name, group)
+        for group, described in groups.items()
+        for name, each in described.items()
+    )
     return _gathered(infos, source)
+
+
+def _described(content: object, source: str, within: tuple[str, str]) -> _Described:
+    try:
+        return _Described.model_validate(content)
+    except ValidationError as error:
+        raise MetadataError(f"{source}{error_text(error, within)}", source=source) from None
 
 
 @dataclass(slots=True)
@@ -104,6 +126,9 @@ class _Row:
         )
 
 
+_Names = Annotated[dict[str, str], Field(max_length=VALUE_NAMES_MAX)]
+
+
 class _Described(BaseModel):
     """A parameter in the JSON. A field that the build could not parse is one text."""
 
@@ -113,10 +138,10 @@ class _Described(BaseModel):
     long: str = Field("", alias="Description")
     user: str = Field("", alias="User")
     units: str = Field("", alias="Units")
-    range: dict[str, str] | str = Field("", alias="Range")
+    range: _Names | str = Field("", alias="Range")
     increment: str = Field("", alias="Increment")
-    values: dict[str, str] | str = Field("", alias="Values")
-    bits: dict[str, str] | str = Field("", alias="Bitmask")
+    values: _Names | str = Field("", alias="Values")
+    bits: _Names | str = Field("", alias="Bitmask")
     reboot_required: str = Field("", alias="RebootRequired")
     is_read_only: str = Field("", alias="ReadOnly")
     is_volatile: str = Field("", alias="Volatile")
@@ -140,10 +165,6 @@ class _Described(BaseModel):
         )
 
 
-_GROUPS: Final = TypeAdapter(dict[str, dict[str, Any]])
-_ROWS: Final = TypeAdapter(dict[str, _Described])
-
-
 class _XmlReader:
     """Reads the parameters of an XML file, element by element.
 
@@ -161,6 +182,7 @@ class _XmlReader:
         self._store: dict[str, str] | None = None
         self._key = ""
         self._text: list[str] = []
+        self._text_length = 0  # of the current parameter
 
     def parse(self, content: bytes) -> None:
         """Parse the file.
@@ -171,11 +193,19 @@ class _XmlReader:
         """
         parser = expat.ParserCreate()
         parser.buffer_text = True
+        if hasattr(parser, "SetReparseDeferralEnabled"):
+            parser.SetReparseDeferralEnabled(False)  # a tag is examined four times at most
         parser.StartDoctypeDeclHandler = self._refuse_doctype
         parser.StartElementHandler = self._begin
         parser.EndElementHandler = self._end
         parser.CharacterDataHandler = self._take
-        parser.Parse(content, True)
+        parsed = 0
+        for start in range(0, len(content), XML_BYTES_PER_CALL):
+            parser.Parse(content[start : start + XML_BYTES_PER_CALL], False)
+            parsed = max(parsed, parser.CurrentByteIndex)
+            if start - parsed > XML_TAG_BYTES_MAX:
+                raise self._error(f"has a tag or a comment of more than {XML_TAG_BYTES_MAX:,} bytes")
+        parser.Parse(b"", True)
 
     def _refuse_doctype(self, *_: object) -> None:
         raise self._error("has a document type (<!DOCTYPE …>), which ArduPilot's files do not have")
@@ -209,6 +239,9 @@ class _XmlReader:
     def _take(self, text: str) -> None:
         if self._store is not None:
             self._text.append(text)
+            self._text_length += len(text)
+            if self._row is not None and self._text_length > DESCRIPTION_LENGTH_MAX:
+                raise self._error(too_long_texts(self._row.name))
 
     def _end(self, tag: str) -> None:
         self._depth -= 1
@@ -217,6 +250,7 @@ class _XmlReader:
                 raise _too_many(self._source)
             self.found.append(self._row.info(self._group))
             self._row = None
+            self._text_length = 0
         elif self._store is not None and tag in _KEYS:
             self._store[self._key] = "".join(self._text)
             self._store = None
@@ -265,7 +299,7 @@ def _number(text: str) -> int | float | None:
 def _items(text: str) -> dict[str, str]:
     """Parse `0:Disabled,1:Enabled`; empty if any part has another format."""
     items = {}
-    for each in _ITEM.split(text):
+    for each in _parts(text):
         code, colon, name = each.partition(":")
         if not colon:
             return {}
@@ -273,14 +307,23 @@ def _items(text: str) -> dict[str, str]:
     return items
 
 
+def _parts(text: str) -> Iterator[str]:
+    """Split a text at `_ITEM`. Part by part: `re.split` lets no other thread run until it has ended."""
+    start = 0
+    for separator in _ITEM.finditer(text):
+        yield text[start : separator.start()]
+        start = separator.end()
+    yield text[start:]
+
+
 def _values(items: Mapping[str, str]) -> Mapping[int | float, str]:
     named = {_number(code): name.strip() for code, name in items.items()}
-    return MappingProxyType({code: name for code, name in named.items() if code is not None and name})
+    return names_of({code: name for code, name in named.items() if code is not None and name})
 
 
 def _bits(items: Mapping[str, str]) -> Mapping[int, str]:
     named = {_number(code): name.strip() for code, name in items.items()}
-    return MappingProxyType(
+    return names_of(
         {
             code: name
             for code, name in named.items()

@@ -8,21 +8,21 @@ from pathlib import Path
 from typing import Final
 
 from paramclient.errors import MetadataError
-from paramclient.metadata.info import Metadata
+from paramclient.metadata.info import DESCRIPTION_LENGTH_MAX, Metadata, too_long_texts
 
-__all__ = ["PACKED_SIZE_MAX", "json_of", "read_content", "read_metadata", "unpacked"]
+__all__ = [
+    "PACKED_SIZE_MAX",
+    "json_of",
+    "read_content",
+    "read_metadata",
+    "unpacked",
+]
 
 PACKED_SIZE_MAX: Final = 4 << 20
 """Bytes of a packed file, or of a file from a vehicle; PX4's has about 0.1 million."""
 CONTENT_SIZE_MAX: Final = 8 << 20
 """Bytes of a file, and of an unpacked one; those of ArduPilot and PX4 have 2 to 5 million. To read one takes
 up to seven times as much memory, if its text is not ASCII."""
-SEPARATORS_MAX: Final = 400_000
-"""Commas and opening brackets of a JSON file, which bound its values: 40 MB of memory. A file of 65,535
-parameters with five members has as many; PX4's has about 30,000."""
-DESCRIPTION_LENGTH_MAX: Final = 65_536
-"""Characters of all texts of one parameter: ten times the longest of ArduPilot. The description of a group
-may be that of thousands of parameters."""
 UNPACKING_MEMORY_MAX: Final = 96 << 20
 """Bytes of memory for unpacking. PX4 packs with a dictionary of 64 million, `xz -9`."""
 
@@ -57,8 +57,7 @@ def read_content(content: bytes, *, source: str) -> Metadata:
     metadata = _read_unpacked(unpacked(content, source=source).removeprefix(b"\xef\xbb\xbf"), source)
     for name, info in metadata.params.items():
         if info.text_length > DESCRIPTION_LENGTH_MAX:
-            what = f"the texts of {name!r:.40} have more than {DESCRIPTION_LENGTH_MAX:,} characters"
-            raise MetadataError(f"{source}: {what}", source=source)
+            raise MetadataError(f"{source}: {too_long_texts(name)}", source=source)
     return metadata
 
 
@@ -68,14 +67,12 @@ def json_of(content: bytes, *, source: str) -> dict[str, object]:
     Raises:
         MetadataError: the text is not a JSON object, or has too many values.
     """
-    if sum(map(content.count, (b",", b"[", b"{"))) > SEPARATORS_MAX:
-        raise MetadataError(f"{source}: has more than {SEPARATORS_MAX:,} values", source=source)
-    from pydantic_core import from_json  # imported here: takes time to load
+    from paramclient.metadata.json_parser import parse_json  # imported here: loads pydantic
 
     try:
-        document = from_json(content)
+        document = parse_json(content)
     except ValueError as error:
-        raise MetadataError(f"{source}: not JSON: {error}", source=source) from None
+        raise MetadataError(f"{source}: {error}", source=source) from None
     if not isinstance(document, dict):
         raise MetadataError(f"{source}: is JSON, but not an object", source=source)
     return document

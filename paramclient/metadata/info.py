@@ -11,22 +11,28 @@ import struct
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 from paramclient.errors import UsageError
 from paramclient.model.values import ParamType, WireValue, format_value, shortest_float
 from paramclient.model.wording import counted
 
-__all__ = ["Metadata", "ParamInfo", "number_of"]
+__all__ = ["DESCRIPTION_LENGTH_MAX", "Metadata", "ParamInfo", "names_of", "number_of", "too_long_texts"]
 
 CHOICES_LISTED_MAX: Final = 12
 """Names that an error lists; of more names it lists the closest ones, so that the error stays readable."""
 BITS_MAX: Final = 64
 """Bits of the widest type."""
+DESCRIPTION_LENGTH_MAX: Final = 65_536
+"""Characters of all texts of one parameter: ten times the longest of ArduPilot. The description of a group
+may be that of thousands of parameters."""
 INSTANCE: Final = "{n}"
 """Placeholder of the number in the name and texts of a group of equal parameters."""
 
 Key = TypeVar("Key", int, int | float)
+
+_NO_NAMES: Final[Mapping[Any, str]] = MappingProxyType({})
+"""Shared by all descriptions without names: a garbage collection examines each object of a file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +66,8 @@ class ParamInfo:
     increment: int | float | None = None
     decimals: int | None = None
     default: int | float | None = None
-    values: Mapping[int | float, str] = field(default_factory=lambda: MappingProxyType({}), hash=False)
-    bits: Mapping[int, str] = field(default_factory=lambda: MappingProxyType({}), hash=False)
+    values: Mapping[int | float, str] = field(default_factory=lambda: _NO_NAMES, hash=False)
+    bits: Mapping[int, str] = field(default_factory=lambda: _NO_NAMES, hash=False)
     reboot_required: bool = False
     is_read_only: bool = False
     is_volatile: bool = False
@@ -261,6 +267,16 @@ class Metadata(Mapping[str, ParamInfo]):
     def __repr__(self) -> str:
         origin = f" from {self.source}" if self.source else ""
         return f"<Metadata of {counted(len(self), 'param')}{origin}>"
+
+
+def too_long_texts(name: str) -> str:
+    """Return the reason to reject texts of a parameter longer than `DESCRIPTION_LENGTH_MAX`."""
+    return f"the texts of {name!r:.40} have more than {DESCRIPTION_LENGTH_MAX:,} characters"
+
+
+def names_of(named: Mapping[Key, str]) -> Mapping[Key, str]:
+    """Return names of values or bits as a read-only mapping."""
+    return MappingProxyType(named) if named else _NO_NAMES
 
 
 def number_of(text: str) -> int | float | None:

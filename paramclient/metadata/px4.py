@@ -7,14 +7,13 @@ versions only add fields. Unknown fields are ignored, as MAVLink requires.
 from __future__ import annotations
 
 import math
-from types import MappingProxyType
 from typing import Annotated, Any, Final, NotRequired, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, with_config
 from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
 
 from paramclient.errors import MetadataError
-from paramclient.metadata.info import BITS_MAX, Metadata, ParamInfo
+from paramclient.metadata.info import BITS_MAX, Metadata, ParamInfo, names_of
 from paramclient.model.values import ParamType
 
 __all__ = ["MetadataFile", "error_text", "read_general", "read_parameters", "whole"]
@@ -87,10 +86,8 @@ class _Parameter(_Strict):
             _finite(self.increment),
             self.decimals,
             None if self.default is None else whole(self.default),
-            MappingProxyType(
-                {value: name for value, name in values.items() if name and math.isfinite(value)}
-            ),
-            MappingProxyType({bit: name for bit, name in bits.items() if name}),
+            names_of({value: name for value, name in values.items() if name and math.isfinite(value)}),
+            names_of({bit: name for bit, name in bits.items() if name}),
             self.reboot_required,
             self.is_read_only,
             self.is_volatile,

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from paramclient import UsageError
 from paramclient.errors import MetadataError
 from paramclient.metadata import Metadata, ParamInfo, formats, read_content, read_metadata
+from paramclient.metadata.info import DESCRIPTION_LENGTH_MAX
 from paramclient.model.values import ParamType
 
 DATA = Path(__file__).parents[1] / "data"
@@ -340,7 +341,7 @@ def test_the_largest_file_takes_less_memory_than_a_request_may() -> None:
 @pytest.mark.parametrize(
     "members",
     [
-        {"longDesc": "x" * formats.DESCRIPTION_LENGTH_MAX},
+        {"longDesc": "x" * DESCRIPTION_LENGTH_MAX},
         {"values": [{"value": number, "description": "x" * 1_000} for number in range(66)]},
         {"bitmask": [{"index": number, "description": "x" * 1_100} for number in range(60)]},
     ],
