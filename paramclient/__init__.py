@@ -91,7 +91,7 @@ if TYPE_CHECKING:
         VehicleError,
     )
     from paramclient.files import FileForm, ParamFile, read_file, read_renames, write_file
-    from paramclient.files.param_file import LogForm
+    from paramclient.files.formats import LogForm
     from paramclient.model.comparison import (
         Comparison,
         Difference,
@@ -369,7 +369,7 @@ _HOMES: Final = {
         "read_renames",
         "write_file",
     ),
-    "paramclient.files.param_file": ("LogForm",),
+    "paramclient.files.formats": ("LogForm",),
     "paramclient.model.comparison": (
         "Comparison",
         "Difference",

@@ -27,8 +27,9 @@
 - `sqlite`: SQLite transactions.
 - `sqlite_file`: the SQLite file: opening, checks, replacement of a damaged one.
 - `store`: `ParamCache`, the public class.
+- `history_columns`: the stored form of a history line, and its columns.
 - `param_columns`: the stored form of a parameter, and its columns in both databases.
-- `tables`: tables and their history.
+- `table_updates`: updates of tables, with their history lines.
 - `transaction`: `Transaction`, one transaction in SQL.
 - `transfer`: copies of tables between stores.
 """
@@ -62,7 +63,7 @@ from paramclient.cache.records import (
 )
 from paramclient.cache.snapshots import CLOCK_SLACK, SNAPSHOTS
 from paramclient.cache.store import ParamCache, default_path
-from paramclient.cache.tables import HISTORY_ENTRIES_MAX
+from paramclient.cache.table_updates import HISTORY_ENTRIES_MAX
 from paramclient.cache.transfer import CopyResult
 
 __all__ = [

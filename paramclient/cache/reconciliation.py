@@ -19,13 +19,14 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
 
-from paramclient.cache import tables
+from paramclient.cache import table_updates
 from paramclient.cache.cells import time_cell
+from paramclient.cache.history_columns import HistoryLine, NumberedLine
 from paramclient.cache.merge import SAME_CHANGE_MAX
 from paramclient.cache.param_columns import BY_VEHICLE, StoredParam
 from paramclient.cache.records import CachedSummary, TableState, TableUpdate
 from paramclient.cache.snapshots import CLOCK_SLACK
-from paramclient.cache.tables import (
+from paramclient.cache.table_updates import (
     apply_update,
     check_times,
     forget_other_firmware,
@@ -34,7 +35,7 @@ from paramclient.cache.tables import (
     write_lines,
     write_state,
 )
-from paramclient.cache.transaction import HistoryLine, NumberedLine, Transaction
+from paramclient.cache.transaction import Transaction
 
 __all__ = ["TableHistory", "reconcile"]
 
@@ -341,7 +342,7 @@ def _write_past(
         transaction.add_lines(owner, [line for _, line in past.lines[len(kept) :]])
     else:
         transaction.replace_lines(owner, past.lines, start=kept[0][0])
-    at = transaction.trim_lines(owner, tables.HISTORY_ENTRIES_MAX)
+    at = transaction.trim_lines(owner, table_updates.HISTORY_ENTRIES_MAX)
     if at is not None:
         transaction.raise_known_since(owner, at)
 

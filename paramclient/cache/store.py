@@ -12,7 +12,7 @@ from types import TracebackType
 
 import platformdirs
 
-from paramclient.cache import fleet, snapshots, tables
+from paramclient.cache import fleet, snapshots, table_updates
 from paramclient.cache.database_url import DatabaseAddress, is_address
 from paramclient.cache.ext_records import CachedExtTable, ExtHistoryEntry, ExtSnapshot, ExtTableUpdate
 from paramclient.cache.ext_snapshots import ext_snapshot, ext_state_at
@@ -794,7 +794,7 @@ class ParamCache:
                 lambda transaction: transaction.history(key, component, name, limit, None)
             )
 
-        return tables.component(transaction, key, component, history=history)
+        return table_updates.component(transaction, key, component, history=history)
 
     def _choose(
         self,

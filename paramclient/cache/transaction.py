@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final, NamedTuple, TypeAlias
+from typing import Any, ClassVar, Final
 
 from paramclient.cache.cells import Damaged, cells, identity_cells, read_identity, time_cell
 from paramclient.cache.ext_records import (
@@ -20,72 +20,26 @@ from paramclient.cache.ext_records import (
     read_ext_line,
     read_ext_rows,
 )
-from paramclient.cache.param_columns import StoredParam, StoredTable, checksum, read_param
+from paramclient.cache.history_columns import (
+    HISTORY_COLUMNS,
+    HISTORY_MARKS,
+    HistoryLine,
+    NumberedLine,
+    read_entry,
+    read_line,
+)
+from paramclient.cache.param_columns import StoredParam, StoredTable, checksum
 from paramclient.cache.records import CachedSummary, CachedVehicle, HistoryEntry, SnapshotSummary, TableUpdate
 from paramclient.model.ext_params import ExtParam
 from paramclient.model.values import Trust
 
-__all__ = ["NO_VALUE", "ExtState", "HistoryLine", "LineValue", "NumberedLine", "Transaction"]
-
-LineValue: TypeAlias = tuple[int, int, int] | tuple[None, None, None]
-"""Type, bits and is_raw of a value, as in `StoredParam.value`; or `NO_VALUE`."""
-NO_VALUE: Final = (None, None, None)
-"""The new value of a parameter that was removed."""
-
-
-class HistoryLine(NamedTuple):
-    """A line of history as it is stored: columns of the table `history`.
-
-    To add a column: add a field here and its letter to `_LINE_CELLS`, and add the column to the table in
-    `sqlite_schema` and `postgres_schema`, with a new version of each. Users see a line as a `HistoryEntry`,
-    which `_entry` creates. Lines of extended parameters are `ExtLine` in `ext_records`.
-
-    Attributes:
-        at: unix seconds at which the new value was received.
-        name: param_id.
-        by: author of the change.
-        old_type, old_bits, old_is_raw: the previous value.
-        new_type, new_bits, new_is_raw: the new value; None if the parameter was removed.
-    """
-
-    at: float
-    name: str
-    by: str
-    old_type: int
-    old_bits: int
-    old_is_raw: int
-    new_type: int | None
-    new_bits: int | None
-    new_is_raw: int | None
-
-    @classmethod
-    def of(cls, at: float, name: str, by: str, old: tuple[int, int, int], new: LineValue) -> HistoryLine:
-        """Return the line of a change from one value to another, or to `NO_VALUE`."""
-        return cls(at, name, by, *old, *new)
-
-    @property
-    def old(self) -> tuple[int, int, int]:
-        """The previous value: type, bits and is_raw."""
-        return self[3:6]
-
-    @property
-    def new(self) -> LineValue:
-        """The new value, or `NO_VALUE`."""
-        values: LineValue = self[6:9]  # type: ignore[assignment]  # all three are None, or none is
-        return values
-
-
-NumberedLine: TypeAlias = tuple[int, HistoryLine]
-"""A history line with its number."""
+__all__ = ["ExtState", "Transaction"]
 
 # Columns of a vehicle, in the order of `identity_cells`.
 _IDENTITY: Final = (
     "system, link, uid, autopilot, vehicle_type, firmware, git_hash,"
     " board, vendor_id, product_id, capabilities"
 )
-_LINE: Final = ", ".join(HistoryLine._fields)
-_LINE_CELLS: Final = "fssiiiIII"  # the types of these columns, see `cells`
-_LINE_MARKS: Final = ", ".join("?" * len(HistoryLine._fields))
 _SUMMARY: Final = "s.id, vehicle, component, at, reason, size, s.hash, s.complete"
 
 
@@ -274,13 +228,13 @@ class Transaction(ABC):
         """Return the history of a vehicle, newest last."""
         end = "" if limit is None or limit < 0 else f" LIMIT {int(limit)}"
         rows = self._all(
-            f"SELECT component, {_LINE}"
+            f"SELECT component, {HISTORY_COLUMNS}"
             " FROM history h JOIN component c ON c.id = owner"
             " WHERE vehicle = ? AND component = coalesce(?, component) AND name = coalesce(?, name)"
             f" AND at >= coalesce(?, at) ORDER BY h.id DESC{end}",
             (key, component, name, since),
         )
-        return [_entry(row) for row in reversed(rows)]
+        return [read_entry(row) for row in reversed(rows)]
 
     def lines(self, owner: int, after: float | None = None) -> list[NumberedLine]:
         """Return the history lines of a table in order; with `after`, only those of a later time."""
@@ -296,7 +250,7 @@ class Transaction(ABC):
     def add_lines(self, owner: int, lines: Sequence[HistoryLine]) -> None:
         """Append history lines in this order."""
         self._many(
-            f"INSERT INTO history (owner, {_LINE}) VALUES (?, {_LINE_MARKS})",
+            f"INSERT INTO history (owner, {HISTORY_COLUMNS}) VALUES (?, {HISTORY_MARKS})",
             [(owner, *line) for line in lines],
         )
 
@@ -715,15 +669,14 @@ class Transaction(ABC):
         numbers = self._numbers(len(lines))  # above the deleted ones, so that added refer to either clearly
         self._do("DELETE FROM history WHERE owner = ? AND id >= ?", (owner, start))
         self._many(
-            f"INSERT INTO history (id, owner, {_LINE}) VALUES (?, ?, {_LINE_MARKS})",
+            f"INSERT INTO history (id, owner, {HISTORY_COLUMNS}) VALUES (?, ?, {HISTORY_MARKS})",
             [(number, owner, *line) for number, line in zip(numbers, lines, strict=True)],
         )
         return numbers
 
     def _lines(self, where: str, values: Sequence[object]) -> list[NumberedLine]:
-        found = self._all(f"SELECT id, {_LINE} FROM history WHERE owner = ?{where} ORDER BY id", values)
-        rows = (cells(row, f"i{_LINE_CELLS}") for row in found)
-        return [(number, HistoryLine._make(line)) for number, *line in rows]
+        sql = f"SELECT id, {HISTORY_COLUMNS} FROM history WHERE owner = ?{where} ORDER BY id"
+        return [read_line(row) for row in self._all(sql, values)]
 
     @abstractmethod
     def _numbers(self, count: int) -> Sequence[int]:
@@ -751,19 +704,6 @@ def _summary(row: Sequence[object]) -> tuple[int, CachedSummary]:
         updated_at=updated_at,
         file_works=None if file_works is None else bool(file_works),
         source=source,
-    )
-
-
-def _entry(row: Sequence[object]) -> HistoryEntry:
-    component, *values = cells(row, f"i{_LINE_CELLS}")
-    line = HistoryLine._make(values)
-    return HistoryEntry(
-        at=line.at,
-        component=component,
-        name=line.name,
-        old=read_param(line.name, *line.old),
-        new=None if None in line.new else read_param(line.name, *line.new),
-        by=line.by,
     )
 
 

@@ -31,7 +31,8 @@ from paramclient.cli.targets import find_vehicles
 from paramclient.client.component import Component
 from paramclient.errors import UsageError
 from paramclient.files import FileForm, write_file
-from paramclient.files.param_file import AUTOPILOT, address, format_of_name
+from paramclient.files.formats import format_of_name
+from paramclient.files.param_file import AUTOPILOT, address
 from paramclient.metadata import Metadata
 from paramclient.model.defaults import default_of
 from paramclient.model.paramset import ParamSet

@@ -13,9 +13,10 @@
 - `files`: MAVFTP calls.
 - `forwarding`: frames to and from one other program.
 - `link_client`, `link_component`, `link_extended_params`: the implementation over a link of this process.
-- `link_task`: link reader, sender and reconnection.
+- `link_task`: link reader and sender; reopens the link.
 - `local`: internal interface of a client and a component on a link of this process.
 - `recording`: telemetry log of a link.
+- `reconnection`: delays between attempts to reopen a link, and the timeout of calls.
 - `reset`: resets of parameters to the firmware's defaults.
 - `signing`: signing keys and options.
 - `signing_timestamps`: persistent signature timestamps.

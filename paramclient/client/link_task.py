@@ -18,6 +18,7 @@ from paramclient.client.loop_scheduler import (
     TURN_MAX,
     LoopScheduler,
 )
+from paramclient.client.reconnection import Backoff
 from paramclient.client.suspend_detection import SuspendDetector
 from paramclient.errors import LinkError
 from paramclient.links import Link, Peer
@@ -50,12 +51,6 @@ blocked until shortly after a deadline misses it by less than `LOOP_LATENCY_MIN`
 unread."""
 TIMEOUT_DELAY_MAX: Final = 3.0
 """Maximum seconds for which timeouts wait for the reader, on a link with a growing backlog."""
-LINK_TIMEOUT: Final = 10.0
-"""Seconds for which calls wait for a reconnection before they fail with the error of the link."""
-RECONNECT_BACKOFF_MIN: Final = 0.25
-"""Seconds before the first attempt to reopen a link; doubled after each attempt."""
-RECONNECT_BACKOFF_MAX: Final = 5.0
-"""Maximum seconds between two attempts to reopen a link."""
 FORWARDED_PER_TURN: Final = 16
 """Maximum number of frames of another program sent before frames of this client are sent again."""
 FORWARDED_QUEUE_MAX: Final = 1_000
@@ -355,7 +350,7 @@ class LinkTask:
             await self._sent.wait()
 
     async def _reconnect(self, error: LinkError) -> None:
-        """Reopen the link with backoff, without a time limit. Calls fail after `LINK_TIMEOUT`."""
+        """Reopen the link, without a time limit. `Backoff` has the delays, and the timeout of calls."""
         logger.warning("%s; reconnecting", error)
         self.is_disconnected = True
         self.notify()
@@ -363,16 +358,13 @@ class LinkTask:
         self._station.pause()
         for tap in self._taps:
             tap.pause()
-        deadline = anyio.current_time() + LINK_TIMEOUT
-        backoff = RECONNECT_BACKOFF_MIN
+        backoff = Backoff()
         while True:
-            left = deadline - anyio.current_time()
-            await anyio.sleep(min(backoff, left) if left > 0 else backoff)
-            backoff = min(backoff * 2, RECONNECT_BACKOFF_MAX)
+            await backoff.wait()
             try:
                 await self._link.open()
             except LinkError as again:
-                if anyio.current_time() >= deadline:
+                if backoff.is_timed_out:
                     self.fail_calls(again)
             else:
                 logger.info("%s: reconnected", self._link.name)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from paramclient.documents.document import Document
 from paramclient.documents.param import WrittenParamDoc
-from paramclient.files.param_file import ENDINGS, WRITABLE, FileForm
+from paramclient.files.formats import ENDINGS, WRITABLE, FileForm
 from paramclient.model.identity import autopilot_name
 from paramclient.model.notation import time_or_none
 

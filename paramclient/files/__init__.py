@@ -1,15 +1,17 @@
 """Parameter files: formats of QGroundControl, MAVProxy, Mission Planner and PX4, packed files, JSON, YAML.
 
-- `formats`, `param_file`, `disk`: the format of a file, its content, reading and replacing it.
+- `formats`, `param_file`: the known formats, the content of a file.
+- `conversion`, `disk`: from and to bytes, reading and replacing a file.
 - `line_formats`, `script`, `param_pck`, `document_format`, `document_schema`: one module for each kind.
 - `extended_document`: files of extended parameters.
 - `rename_file`: files of names that firmware versions have changed.
 - `text`, `includes`, `yamltext`: lines and bad lines, `@include` lines, YAML with JSON's rules.
 """
 
+from paramclient.files.conversion import LARGEST_FILE, dumps, loads
 from paramclient.files.disk import read_file, write_file
-from paramclient.files.formats import LARGEST_FILE, dumps, loads
-from paramclient.files.param_file import FileForm, ParamFile
+from paramclient.files.formats import FileForm
+from paramclient.files.param_file import ParamFile
 from paramclient.files.rename_file import loads_renames, read_renames
 
 __all__ = [

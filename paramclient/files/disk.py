@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import Final
 
 from paramclient.errors import FileError
-from paramclient.files.formats import LARGEST_FILE, dumps, loads
+from paramclient.files.conversion import LARGEST_FILE, dumps, loads
+from paramclient.files.formats import FileForm, format_of_name, parse_format
 from paramclient.files.includes import Includes
-from paramclient.files.param_file import FileForm, ParamFile, format_of_name, parse_format
+from paramclient.files.param_file import ParamFile
 from paramclient.model.paramset import ParamSet
 
 __all__ = ["read_bytes", "read_file", "replace_file", "write_file"]

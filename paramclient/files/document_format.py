@@ -20,7 +20,8 @@ from importlib.util import find_spec
 from typing import Any, Final, NoReturn
 
 from paramclient.errors import FileError, UsageError
-from paramclient.files.param_file import FileForm, ParamFile
+from paramclient.files.formats import FileForm
+from paramclient.files.param_file import ParamFile
 from paramclient.files.text import excerpt, is_plain, time_of
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, WireValue, format_value, shortest_float, type_name

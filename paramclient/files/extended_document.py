@@ -19,10 +19,10 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 from paramclient.errors import FileError, UsageError
+from paramclient.files.conversion import LARGEST_FILE
 from paramclient.files.disk import read_bytes, replace_file
 from paramclient.files.document_format import parse_json, parse_yaml, yaml_flow, yaml_key
-from paramclient.files.formats import LARGEST_FILE
-from paramclient.files.param_file import FileForm, format_of_name
+from paramclient.files.formats import FileForm, format_of_name
 from paramclient.files.text import decode_text, time_of
 from paramclient.model.ext_params import (
     EXT_VALUE_SIZE,

@@ -1,190 +1,98 @@
-"""Format detection, and conversion of parameter files from and to bytes."""
+"""FileForm: the supported file formats, and their file extensions.
+
+`conversion` detects the format of a file, and calls its parser:
+
+- `line_formats`: QGC, PARM and MISSION_PLANNER, with the `@include` lines of `includes`.
+- `param_pck`: PCK.
+- `script`: PX4_SCRIPT.
+- `document_format`: JSON and YAML. `extended_document` parses files of extended parameters.
+- `paramclient.logs.onboard`: on-board logs (`LogForm`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
+from enum import StrEnum
 from pathlib import PurePath
-from typing import Final, TypeAlias
+from typing import Final
 
 from paramclient.errors import FileError, UsageError
-from paramclient.files import document_format, line_formats, param_pck, script
-from paramclient.files.includes import Includes
-from paramclient.files.param_file import AUTOPILOT, ENDINGS, FileForm, ParamFile, address, parse_format
-from paramclient.files.text import decode_text, lines_of, time_of
-from paramclient.model.identity import autopilot_name, version_text
-from paramclient.model.paramset import ParamSet
-from paramclient.model.values import check_name
-from paramclient.model.wording import counted
 
-__all__ = ["LARGEST_FILE", "Content", "dumps", "loads"]
-
-LARGEST_FILE: Final = 16 * 1024 * 1024
-"""Largest parameter file, in bytes. 65,535 parameters, the most that an index can count, with names, bits,
-defaults and comments take less in the longest format."""
-
-Content: TypeAlias = ParamFile | ParamSet | Iterable[ParamSet]
-"""Content to write: a file as read, the parameters of one component, or of several."""
+__all__ = ["ENDINGS", "FileForm", "LogForm", "WRITABLE", "format_of_name", "parse_format"]
 
 
-def loads(
-    data: bytes,
-    *,
-    source: str = "",
-    form: FileForm | str | None = None,
-    includes: Includes | None = None,
-    params_max: int | None = None,
-) -> ParamFile:
-    """Parse a parameter file.
+class FileForm(StrEnum):
+    """Formats in which ground stations and autopilots store parameters."""
 
-    Detects the format from the content. MAVProxy and Mission Planner read each other's lists, so the
-    extension decides between them (`.parm`, `.param`); with another extension, a comma means Mission
-    Planner. If the first line matches no format, the extension decides which format the error describes.
-
-    Args:
-        data: the complete file.
-        source: the file's name, for errors and `ParamSet.source`.
-        form: the format; None to detect it.
-        includes: reads the files of `@include` lines; None rejects such lines, as bytes have no folder.
-        params_max: maximum number of parameters; None for any. A longer file is not read to its end.
-
-    Raises:
-        TooManyParams: the file has more parameters than `params_max`.
-        FileError: unknown format, damaged, or without parameters. The error names up to 20 bad lines.
-        UsageError: unknown format name.
-    """
-    form = None if form is None else parse_format(form)
-    if len(data) > LARGEST_FILE:
-        raise FileError(f"a parameter file has at most {LARGEST_FILE} bytes", source=source)
-    if not data:
-        raise FileError("the file is empty", source=source)
-    if form is FileForm.PCK or (form is None and param_pck.is_packed(data)):
-        return param_pck.read_packed(data, source)
-    text = decode_text(data, source)
-    form = form or _form_of(text, source)
-    match form:
-        case FileForm.QGC:
-            return line_formats.read_qgc(text, source, params_max)
-        case FileForm.PX4_SCRIPT:
-            return script.read_script(text, source, params_max)
-        case FileForm.JSON:
-            return document_format.read_json(text, source, params_max)
-        case FileForm.YAML:
-            return document_format.read_yaml(text, source, params_max)
-        case _:
-            return line_formats.read_pairs(text, form, source, includes, params_max)
+    QGC = "qgc"
+    """QGroundControl, `.params`: system, component, name, value and type, in columns."""
+    PARM = "parm"
+    """MAVProxy and ArduPilot, `.parm`: a name and a value."""
+    MISSION_PLANNER = "mission-planner"
+    """Mission Planner, `.param`: a name, a comma and a value."""
+    PCK = "pck"
+    """`param.pck`, the packed file that vehicles serve over MAVFTP."""
+    PX4_SCRIPT = "px4-script"
+    """Lines of a PX4 start script: `param set NAME VALUE`. Can only be read."""
+    JSON = "json"
+    """paramclient's own format: all fields of every parameter, exactly."""
+    YAML = "yaml"
+    """paramclient's own format as YAML, for editing by hand. Reading it needs PyYAML."""
 
 
-def dumps(content: Content, *, form: FileForm | str | None = None, target: str = "") -> bytes:
-    """Return the bytes of a parameter file.
+WRITABLE: Final = tuple(form for form in FileForm if form is not FileForm.PX4_SCRIPT)
+"""Formats that can be written."""
 
-    Args:
-        content: the content to write. A `ParamFile` keeps its header, footer and comments if the format
-            supports them; other content gets a header that names the vehicle.
-        form: the format; None for that of a `ParamFile`.
-        target: the name of the target file, for errors.
+
+class LogForm(StrEnum):
+    """Formats of on-board logs, which `paramclient.logs` reads. None of them can be written."""
+
+    DATAFLASH = "dataflash"
+    """ArduPilot, `.bin`."""
+    ULOG = "ulog"
+    """PX4, `.ulg`."""
+
+
+ENDINGS: Final = {
+    ".params": FileForm.QGC,
+    ".parm": FileForm.PARM,
+    ".param": FileForm.MISSION_PLANNER,
+    ".pck": FileForm.PCK,
+    ".json": FileForm.JSON,
+    ".yaml": FileForm.YAML,
+    ".yml": FileForm.YAML,
+}
+"""Formats by file extension, in lower case."""
+
+
+def parse_format(form: FileForm | str) -> FileForm:
+    """Return the format with this name.
 
     Raises:
-        FileError: the format cannot express the content (the guide lists what each can), or there are no
-            parameters.
-        UsageError: unknown format, or none given.
+        UsageError: there is no such format.
     """
-    if form is None and isinstance(content, ParamFile):
-        form = content.form
-    if form is None:
-        raise UsageError("give the format in which to write the parameters")
-    form = parse_format(form)
     try:
-        around = _as_file(content, form)
-        sets = [each for each in around.sets if each]
-        return _bytes(sets, form, around)
-    except UsageError as error:
-        raise FileError(str(error), source=target) from error
+        return FileForm(form)
+    except ValueError:
+        raise UsageError(f"unknown file format {form!r}; the formats are {_listed(FileForm)}") from None
 
 
-def _bytes(sets: list[ParamSet], form: FileForm, around: ParamFile) -> bytes:
-    if not sets:
-        raise UsageError("there are no parameters to write")
-    if len(sets) > 1 and form in (FileForm.PARM, FileForm.MISSION_PLANNER, FileForm.PCK):
-        held = ", ".join(map(address, sets))
-        raise UsageError(f"the format {form} holds one component, and there are {held}; choose one")
-    _check(sets)
-    match form:
-        case FileForm.PCK:
-            return param_pck.write_packed(sets[0])
-        case FileForm.PX4_SCRIPT:
-            raise UsageError("PX4 start scripts can be read but not written")
-        case FileForm.QGC:
-            lines = line_formats.write_qgc(sets, around)
-        case FileForm.JSON:
-            lines = document_format.write_json(sets, around)
-        case FileForm.YAML:
-            lines = document_format.write_yaml(sets, around)
-        case _:
-            lines = line_formats.write_pairs(sets, form, around)
-    return "".join(f"{line}\n" for line in lines).encode("utf-8", "backslashreplace")
-
-
-def _form_of(text: str, source: str) -> FileForm:
-    """Return the format of a text.
+def format_of_name(name: str) -> FileForm:
+    """Return the format for the extension of a file's name.
 
     Raises:
-        FileError: the text has no line with content.
+        FileError: the extension is unknown.
     """
-    if text.lstrip().startswith("{"):  # it may be one line of megabytes, in which no comment is sought
-        return FileForm.JSON
-    first = next((line for line in lines_of(text) if line.text), None)
-    if first is None:
-        raise FileError("the file contains no parameters", source=source)
-    if first.text.startswith("{"):
-        return FileForm.JSON  # behind comments
-    if line_formats.is_qgc_row(first.text):
-        return FileForm.QGC
-    if any(script.is_script_line(line.text) for line in lines_of(text)):
-        return FileForm.PX4_SCRIPT
-    if document_format.is_document(first.text):
-        return FileForm.YAML
-    named = ENDINGS.get(PurePath(source).suffix.lower())
-    if named in (FileForm.PARM, FileForm.MISSION_PLANNER):
-        return named
-    if named in (FileForm.QGC, FileForm.JSON, FileForm.YAML) and not line_formats.is_pair(first.text):
-        return named  # no other format is possible, and reading gives the error for this one
-    return FileForm.MISSION_PLANNER if "," in first.text else FileForm.PARM
+    ending = PurePath(name).suffix.lower()
+    form = ENDINGS.get(ending)
+    if form is None:
+        raise FileError(
+            f"unknown file extension {ending!r}. Choose a format ({_listed(WRITABLE)}), or one of the "
+            f"extensions {_listed(ENDINGS)}",
+            source=name,
+        )
+    return form
 
 
-def _as_file(content: Content, form: FileForm) -> ParamFile:
-    if isinstance(content, ParamFile):
-        return content
-    sets = (content,) if isinstance(content, ParamSet) else tuple(content)
-    if form in (FileForm.JSON, FileForm.YAML):
-        return ParamFile(sets, form)  # the document has fields for the header's facts
-    return ParamFile(sets, form, header=tuple(line for each in sets for line in _header_lines(each)))
-
-
-def _header_lines(params: ParamSet) -> Iterator[str]:
-    """Generate a description of a set, for the header of a file."""
-    who = params.identity
-    kind = "" if who is None else f", {autopilot_name(who.autopilot)}"
-    yield f"{counted(len(params), 'parameter')} of system/component {address(params)}{kind}"
-    if who is not None:
-        commit = f", commit {who.git_hash}" if who.git_hash else ""
-        firmware = f", firmware {version_text(who.firmware)}{commit}" if who.firmware else ""
-        yield f"of the vehicle {who.key}{firmware}"
-    if params.at is not None:
-        yield f"as of {time_of(params.at, 'seconds')}"
-    if params.source:
-        yield f"from {params.source}"
-
-
-def _check(sets: list[ParamSet]) -> None:
-    """Raise UsageError for invalid names or ids, or two sets of one component, which cannot be told apart."""
-    seen = set()
-    for each in sets:
-        for number in (each.system, each.component):
-            if number is not None and not 1 <= number <= 255:
-                raise UsageError(f"systems and components have ids from 1 to 255, not {number}")
-        for param in each.values():
-            check_name(param.name)
-        ids = (each.system, each.component or AUTOPILOT)
-        if ids in seen:
-            raise UsageError(f"two sets have the same component, {address(each)}")
-        seen.add(ids)
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(names)

@@ -17,8 +17,9 @@ from fnmatch import fnmatchcase
 from typing import Final
 
 from paramclient.errors import FileError, UsageError
+from paramclient.files.formats import FileForm
 from paramclient.files.includes import Includes
-from paramclient.files.param_file import AUTOPILOT, FileForm, ParamFile, TooManyParams
+from paramclient.files.param_file import AUTOPILOT, ParamFile, TooManyParams
 from paramclient.files.text import (
     Builder,
     Problems,

@@ -1,84 +1,18 @@
-"""ParamFile, the content of a parameter file, and FileForm, the supported formats.
-
-`formats` detects the format of a file, and calls its parser:
-
-- `line_formats`: QGC, PARM and MISSION_PLANNER, with the `@include` lines of `includes`.
-- `param_pck`: PCK.
-- `script`: PX4_SCRIPT.
-- `document_format`: JSON and YAML. `extended_document` parses files of extended parameters.
-- `paramclient.logs.onboard`: on-board logs (`LogForm`).
-"""
+"""ParamFile: the content of a parameter file."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
-from enum import StrEnum
-from pathlib import PurePath
 from typing import Final
 
-from paramclient.errors import FileError, UsageError
+from paramclient.errors import FileError
+from paramclient.files.formats import FileForm, LogForm
 from paramclient.model.paramset import ParamSet
 
-__all__ = [
-    "AUTOPILOT",
-    "ENDINGS",
-    "FileForm",
-    "LogForm",
-    "ParamFile",
-    "TooManyParams",
-    "WRITABLE",
-    "address",
-    "parse_format",
-    "format_of_name",
-]
+__all__ = ["AUTOPILOT", "ParamFile", "TooManyParams", "address"]
 
 AUTOPILOT: Final = 1
 """MAV_COMP_ID_AUTOPILOT1: the component of a file that names no component."""
-
-
-class FileForm(StrEnum):
-    """Formats in which ground stations and autopilots store parameters."""
-
-    QGC = "qgc"
-    """QGroundControl, `.params`: system, component, name, value and type, in columns."""
-    PARM = "parm"
-    """MAVProxy and ArduPilot, `.parm`: a name and a value."""
-    MISSION_PLANNER = "mission-planner"
-    """Mission Planner, `.param`: a name, a comma and a value."""
-    PCK = "pck"
-    """`param.pck`, the packed file that vehicles serve over MAVFTP."""
-    PX4_SCRIPT = "px4-script"
-    """Lines of a PX4 start script: `param set NAME VALUE`. Can only be read."""
-    JSON = "json"
-    """paramclient's own format: all fields of every parameter, exactly."""
-    YAML = "yaml"
-    """paramclient's own format as YAML, for editing by hand. Reading it needs PyYAML."""
-
-
-WRITABLE: Final = tuple(form for form in FileForm if form is not FileForm.PX4_SCRIPT)
-"""Formats that can be written."""
-
-
-class LogForm(StrEnum):
-    """Formats of on-board logs, which `paramclient.logs` reads. None of them can be written."""
-
-    DATAFLASH = "dataflash"
-    """ArduPilot, `.bin`."""
-    ULOG = "ulog"
-    """PX4, `.ulg`."""
-
-
-ENDINGS: Final = {
-    ".params": FileForm.QGC,
-    ".parm": FileForm.PARM,
-    ".param": FileForm.MISSION_PLANNER,
-    ".pck": FileForm.PCK,
-    ".json": FileForm.JSON,
-    ".yaml": FileForm.YAML,
-    ".yml": FileForm.YAML,
-}
-"""Formats by file extension, in lower case."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,36 +78,3 @@ class TooManyParams(FileError):
 def address(params: ParamSet) -> str:
     """Return the system and component id of a set, `1/100`, with a question mark for an unknown id."""
     return "/".join("?" if each is None else str(each) for each in (params.system, params.component))
-
-
-def parse_format(form: FileForm | str) -> FileForm:
-    """Return the format with this name.
-
-    Raises:
-        UsageError: there is no such format.
-    """
-    try:
-        return FileForm(form)
-    except ValueError:
-        raise UsageError(f"unknown file format {form!r}; the formats are {_listed(FileForm)}") from None
-
-
-def format_of_name(name: str) -> FileForm:
-    """Return the format for the extension of a file's name.
-
-    Raises:
-        FileError: the extension is unknown.
-    """
-    ending = PurePath(name).suffix.lower()
-    form = ENDINGS.get(ending)
-    if form is None:
-        raise FileError(
-            f"unknown file extension {ending!r}. Choose a format ({_listed(WRITABLE)}), or one of the "
-            f"extensions {_listed(ENDINGS)}",
-            source=name,
-        )
-    return form
-
-
-def _listed(names: Iterable[str]) -> str:
-    return ", ".join(names)

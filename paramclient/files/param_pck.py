@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from paramclient.errors import FileError, PackError, UsageError
-from paramclient.files.param_file import FileForm, ParamFile
+from paramclient.files.formats import FileForm
+from paramclient.files.param_file import ParamFile
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, bits_of, from_bits, same_bits, type_name
 from paramclient.protocol.ftp import param_pck

@@ -12,7 +12,8 @@ import re
 from typing import Final
 
 from paramclient.errors import UsageError
-from paramclient.files.param_file import FileForm, ParamFile, TooManyParams
+from paramclient.files.formats import FileForm
+from paramclient.files.param_file import ParamFile, TooManyParams
 from paramclient.files.text import Builder, Problems, TextLine, excerpt, lines_of, parse_number
 from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import check_name

@@ -16,7 +16,7 @@ from typing import Any, Final
 from pymavlink.DFReader import DFReader_binary
 
 from paramclient.errors import FileError, UsageError
-from paramclient.files.param_file import LogForm
+from paramclient.files.formats import LogForm
 from paramclient.logs.logged_params import LoggedChange, OnboardLog, log_link
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import WrittenParam

@@ -6,7 +6,8 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from paramclient.files.param_file import AUTOPILOT, LogForm
+from paramclient.files.formats import LogForm
+from paramclient.files.param_file import AUTOPILOT
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import WireValue

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from paramclient.errors import FileError, UsageError
-from paramclient.files.param_file import LogForm
+from paramclient.files.formats import LogForm
 from paramclient.logs.logged_params import OnboardLog
 
 __all__ = ["is_onboard_log", "read_onboard_log"]

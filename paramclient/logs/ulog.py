@@ -15,7 +15,7 @@ from pyulog import ULog
 from pyulog.exceptions import ULogException
 
 from paramclient.errors import FileError, UsageError
-from paramclient.files.param_file import LogForm
+from paramclient.files.formats import LogForm
 from paramclient.logs.logged_params import LoggedChange, OnboardLog, log_link
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import WrittenParam

@@ -30,7 +30,7 @@ from paramclient.model.renames import Renames
 from paramclient.model.values import WireValue
 from paramclient.protocol.params.change_origin import check_author
 from paramclient.protocol.params.write_batch import SetOutcome, SetStatus
-from paramclient.protocol.requests.pacing import WRITES_MAX
+from paramclient.protocol.requests.write_window import WRITES_IN_FLIGHT_MAX
 from paramclient.provision.apply_rules import READ_ONLY, rules_for
 from paramclient.provision.inspection import (
     POLL_INTERVAL,
@@ -363,7 +363,7 @@ class ApplyRun:
         """
         self._is_verified = False
         # ArduPilot may get all of them at once, as a file
-        in_flight = len(steps) if self._component.autopilot == "ardupilot" else WRITES_MAX
+        in_flight = len(steps) if self._component.autopilot == "ardupilot" else WRITES_IN_FLIGHT_MAX
         by_name = {step.name: step for step in steps}
         before = frozenset(self.sent)
         ended = 0

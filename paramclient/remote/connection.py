@@ -9,8 +9,9 @@ from typing import Any, Final, Protocol, TypeVar
 
 import anyio
 
-from paramclient.client import link_task
+from paramclient.client import reconnection
 from paramclient.client.arguments import PROGRESS_CALL_INTERVAL
+from paramclient.client.reconnection import Backoff
 from paramclient.errors import ClientClosed, LinkError, NoReply, ParamClientError
 from paramclient.remote.decoding import decode_errors
 from paramclient.remote.http import Requests, ServiceResponse, ServiceUnreachable, StreamPosition
@@ -142,12 +143,12 @@ class Connection:
                         if is_write and failure.may_be_done:
                             raise self._unknown(awaited, failure) from failure.error.__cause__
                         now = anyio.current_time()
-                        if now - asked_at > link_task.LINK_TIMEOUT:  # the request had been connected
+                        if now - asked_at > reconnection.LINK_TIMEOUT:  # the request had been connected
                             failing_since = now
                         failing_since = min(failing_since, now)
-                        if now - failing_since >= link_task.LINK_TIMEOUT:
+                        if now - failing_since >= reconnection.LINK_TIMEOUT:
                             raise failure.error from failure.error.__cause__
-                        await anyio.sleep(link_task.RECONNECT_BACKOFF_MIN)
+                        await anyio.sleep(reconnection.RECONNECT_BACKOFF_MIN)
             finally:
                 self._scopes.discard(scope)
         self.check_open()
@@ -222,21 +223,17 @@ class Connection:
 
     async def _wait_to_try_again(self, error: ParamClientError) -> None:
         """Wait for the next attempt after the connection was lost, or an attempt has failed."""
-        now = anyio.current_time()
         if not self.is_away:
             logger.warning("%s; reconnecting", error)
             self.is_away = True
-            self._deadline = now + link_task.LINK_TIMEOUT
-            self._backoff = link_task.RECONNECT_BACKOFF_MIN
+            self._backoff = Backoff()
             self._follower.leave()
             self.tell()
-        elif now >= self._deadline:
+        elif self._backoff.is_timed_out:
             name = self._requests.name
             self.broken = error if isinstance(error, LinkError) else LinkError(str(error), link=name)
             self._fail_calls()
-        left = self._deadline - now
-        await anyio.sleep(min(self._backoff, left) if left > 0 else self._backoff)
-        self._backoff = min(self._backoff * 2, link_task.RECONNECT_BACKOFF_MAX)
+        await self._backoff.wait()
 
     async def _is_reached(self, deadline: float) -> bool:
         """Wait until the service is connected. Return False at the deadline."""

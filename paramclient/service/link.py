@@ -22,6 +22,7 @@ from paramclient.client.events import (
     Resynced,
     Uncontested,
 )
+from paramclient.client.reconnection import Backoff
 from paramclient.documents.link import LinkDoc, StatsDoc
 from paramclient.errors import LinkError, ParamClientError, UsageError
 from paramclient.model.notation import hash_text, rounded
@@ -32,10 +33,6 @@ if TYPE_CHECKING:
 
 __all__ = ["COMPONENTS_PER_TURN", "ServiceLink"]
 
-REOPEN_BACKOFF: Final = 0.25
-"""Seconds before the second attempt to open a link. The backoff is doubled after each attempt."""
-REOPEN_BACKOFF_MAX: Final = 5.0
-"""Maximum number of seconds between two attempts to open a link."""
 LINK_STATE_CHECK_INTERVAL: Final = 0.2
 """Seconds between two checks for changes without an event: states, progress."""
 CHECKS_PER_VALUE_CHECK: Final = 5
@@ -108,13 +105,13 @@ class ServiceLink:
 
     async def run(self) -> None:
         """Keep the link open until cancelled."""
-        backoff = REOPEN_BACKOFF
+        backoff = Backoff()
         while True:
             try:
                 async with self._make() as client:
                     self.client = client
                     self._attach(client)
-                    backoff = REOPEN_BACKOFF
+                    backoff = Backoff()
                     await self._check_components()
             except (LinkError, UsageError) as error:  # UsageError: a missing library, an existing log
                 self._set_state("failed", str(error))
@@ -122,8 +119,7 @@ class ServiceLink:
                 self.client = None
                 for followed in list(self.followed.values()):
                     self.forget(followed)
-            await anyio.sleep(backoff)
-            backoff = min(backoff * 2, REOPEN_BACKOFF_MAX)
+            await backoff.wait()
 
     async def wait_for(self, system: int | None, component: int | None) -> FollowedComponent:
         """Wait for the component with this address, also while the link is reopened."""

@@ -19,7 +19,7 @@ from paramclient.cache import ExtTableUpdate, StoredExtParam
 from paramclient.cache.cells import Damaged
 from paramclient.cache.operations import SaveExt, StoreExtSnapshot
 from paramclient.cache.outbox import packed, unpacked
-from paramclient.cache.tables import HISTORY_ENTRIES_MAX
+from paramclient.cache.table_updates import HISTORY_ENTRIES_MAX
 from paramclient.errors import NotInCache, UnknownVehicle, UsageError
 from paramclient.model.ext_params import ExtParam, ExtParamType, ExtValue, encode_ext_value
 from paramclient.model.ext_paramset import ExtParamSet

@@ -30,11 +30,12 @@ from paramclient import ParamClient, Trust
 from paramclient.cache import CacheChange, CopyResult, ParamCache, StoredParam, TableState, TableUpdate
 from paramclient.cache.cells import Damaged
 from paramclient.cache.database_url import DatabaseAddress
+from paramclient.cache.history_columns import HistoryLine
 from paramclient.cache.operations import Save
 from paramclient.cache.outbox import LocalCopy, packed, unpacked
 from paramclient.cache.postgres import PostgresDatabase, PostgresTransaction, Unavailable
 from paramclient.cache.shared import SharedStore, _Connection
-from paramclient.cache.transaction import HistoryLine, Transaction
+from paramclient.cache.transaction import Transaction
 from paramclient.cache.transfer import take_whole
 from paramclient.errors import CacheError, UsageError
 from paramclient.model.values import Param, ParamType

@@ -26,7 +26,7 @@ from paramclient import (
 )
 from paramclient.client.cache_writer import CacheWriter
 from paramclient.protocol import wire
-from paramclient.protocol.requests.pacing import WRITES_MAX
+from paramclient.protocol.requests.write_window import WRITES_IN_FLIGHT_MAX
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam, Vehicle
 from tests import shell
 from tests.shell import VALUES, FlakyLink, Tap, a_client, generic, residue, small_px4, swiftly
@@ -169,7 +169,7 @@ async def test_as_many_writes_are_in_flight_as_the_vehicle_serves() -> None:
     assert len(times) == 200
     bursts = [sum(start <= at < start + 0.35 for at in times) for start in times]
     assert bursts[0] == 10
-    assert max(bursts) == WRITES_MAX
+    assert max(bursts) == WRITES_IN_FLIGHT_MAX
 
 
 @swiftly

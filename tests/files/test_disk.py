@@ -25,8 +25,8 @@ from paramclient import (
 )
 from paramclient.errors import UsageError
 from paramclient.files import LARGEST_FILE, dumps, loads
+from paramclient.files.formats import ENDINGS
 from paramclient.files.includes import FILES_MAX, INCLUDE_DEPTH_MAX
-from paramclient.files.param_file import ENDINGS
 
 ROOT = Path(__file__).parents[2]
 PARAMS = ParamSet({"A": WrittenParam("A", 5, ParamType.INT32), "B": WrittenParam("B", 0.5)}, 1, 1)

@@ -23,7 +23,7 @@ from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.params.write_batch import SetOutcome, SetStatus, WriteBatch
 from paramclient.protocol.params.writes import Write
 from paramclient.protocol.requests.operation import Operation
-from paramclient.protocol.requests.pacing import WRITES_MAX
+from paramclient.protocol.requests.write_window import WRITES_IN_FLIGHT_MAX
 from paramclient.protocol.station import Station
 from paramclient.protocol.wire import HASH_CHECK
 from paramclient.sim import (
@@ -559,7 +559,7 @@ class Sessions(RuleBasedStateMachine):
         most = len(self.names) + self.further_names + 10
         for machine in self.world.station.components.values():
             assert len(machine.reads) <= REQUESTED_INDICES_MAX + mine + 3 * most
-            assert len(machine.writes) <= mine + batches * WRITES_MAX
+            assert len(machine.writes) <= mine + batches * WRITES_IN_FLIGHT_MAX
             assert len(machine.write_batches) <= batches
             assert len(machine.table.params) <= most
             assert len(machine.table.dirty) <= most

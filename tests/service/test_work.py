@@ -28,7 +28,7 @@ from paramclient.documents.document import Document
 from paramclient.documents.job import JobsDoc
 from paramclient.documents.param import InfoDoc
 from paramclient.errors import FileError, UsageError
-from paramclient.files import document_schema, dumps, formats, line_formats, loads, script
+from paramclient.files import conversion, document_schema, dumps, line_formats, loads, script
 from paramclient.files.param_file import TooManyParams
 from paramclient.model import comparison as compare_room
 from paramclient.model import params as params_model
@@ -987,7 +987,7 @@ def test_in_a_document_of_one_line_no_comment_is_sought(monkeypatch: pytest.Monk
         sought.append(text)
         return iter(())
 
-    monkeypatch.setattr(formats, "lines_of", lines_of)
+    monkeypatch.setattr(conversion, "lines_of", lines_of)
     with pytest.raises(FileError):
         loads(b'{"a":"' + b"x" * 100_000 + b'"}')
     assert not sought

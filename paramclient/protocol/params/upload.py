@@ -46,7 +46,7 @@ from paramclient.protocol.params.file_download import PARAMETER_FILE
 from paramclient.protocol.params.table import Table
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.operation import Operation
-from paramclient.protocol.requests.pacing import WRITES_FIRST, WRITES_MAX
+from paramclient.protocol.requests.write_window import WRITES_IN_FLIGHT_FIRST, WRITES_IN_FLIGHT_MAX
 from paramclient.protocol.wire import NO_INDEX, ParamValue
 
 __all__ = ["ParamUpload", "UploadHooks", "Uploads", "WriteWay"]
@@ -341,11 +341,11 @@ def spans_of(entries: Mapping[str, PackedParam], table: Table) -> list[_Span]:
 
 def set_time(number: int, trip: float, rate: float) -> float:
     """Return the seconds that PARAM_SETs of this many values should take."""
-    rounds, window = 0, WRITES_FIRST
+    rounds, window = 0, WRITES_IN_FLIGHT_FIRST
     left = number
     while left > 0:
         left -= window
-        window = min(2 * window, WRITES_MAX)
+        window = min(2 * window, WRITES_IN_FLIGHT_MAX)
         rounds += 1
     size = VALUE_SIZE + (SET_SIZE if rate <= RADIO_RATE_MAX else 0)
     return max(rounds * trip, trip + number * size / rate)

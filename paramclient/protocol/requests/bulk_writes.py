@@ -12,7 +12,7 @@ from typing import Any, Final, Generic, Protocol, TypeVar
 
 from paramclient.errors import ContestedAddress, NoReply, ParamClientError, UsageError, VehicleError
 from paramclient.protocol.requests.operation import Operation
-from paramclient.protocol.requests.pacing import WriteWindow
+from paramclient.protocol.requests.write_window import WriteWindow
 
 __all__ = [
     "UNANSWERED_WRITES_MAX",

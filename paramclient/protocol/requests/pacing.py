@@ -1,4 +1,4 @@
-"""The rate limit of requests: adapts to what the component and its link serve."""
+"""The rate limit of reads: adapts to what the component and its link serve."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Final
 
 from paramclient.protocol.requests.round_trip import RoundTrip
 
-__all__ = ["WRITES_MAX", "Pace", "LinkBandwidth", "WriteWindow"]
+__all__ = ["Pace", "LinkBandwidth"]
 
 FIRST_RATE: Final = 50.0
 """Requests per second before any measurement: the rate of ArduPilot, the slowest autopilot."""
@@ -50,12 +50,6 @@ REQUEST_SIZE: Final = 16
 """Bytes of a PARAM_REQUEST_READ by index, in MAVLink 2."""
 VALUE_SIZE: Final = 37
 """Bytes of a PARAM_VALUE, in MAVLink 2."""
-
-WRITES_FIRST: Final = 10
-"""PARAM_SETs in flight at first: half of what ArduPilot queues of other requests."""
-WRITES_MAX: Final = 30
-"""PARAM_SETs in flight, at most: a real ArduPilot acknowledges 30 in one burst within 20 ms, a real PX4 20
-within 1 ms (measured), and the buffer of a telemetry radio holds about as many."""
 
 
 class LinkBandwidth:
@@ -304,23 +298,3 @@ class Pace:
         if now > self._tokens_at:
             self._tokens = min(self._tokens + (now - self._tokens_at) * self.rate, self._burst)
             self._tokens_at = now
-
-
-class WriteWindow:
-    """The number of PARAM_SETs that may be in flight: grows by one with each acknowledgement.
-
-    A vehicle applies and acknowledges a PARAM_SET in its next loop, so the writes need no rate. The limit
-    bounds what a slow link has to buffer, and the slow start lets the timeout follow its round trip.
-
-    Attributes:
-        limit: PARAM_SETs that may be in flight.
-    """
-
-    __slots__ = ("limit",)
-
-    def __init__(self) -> None:
-        self.limit = WRITES_FIRST
-
-    def acknowledged(self) -> None:
-        """Record an acknowledgement."""
-        self.limit = min(self.limit + 1, WRITES_MAX)

@@ -9,6 +9,7 @@
 `kinds`: autopilots and vehicle types as text.
 `metadata_location`: COMPONENT_METADATA.
 `peer_claims`: what one peer sends under an address.
-`presence`: heartbeats, loss, and detection of reboots.
+`presence`: heartbeats, silence, loss.
+`reboot_detection`: reboots, by heartbeats and times since boot.
 `reboot_command`: a reboot on command.
 """

@@ -10,7 +10,7 @@ from typing import Final, Generic, NamedTuple, TypeVar
 from paramclient.model.identity import SHARED_UIDS, hardware_id
 from paramclient.protocol.addresses import Peer, peer_in_words
 from paramclient.protocol.vehicle.kinds import kind_in_words
-from paramclient.protocol.vehicle.presence import REORDERING_TIME
+from paramclient.protocol.vehicle.reboot_detection import REORDERING_TIME
 from paramclient.protocol.wire import (
     SYSTEM_TIME_ID,
     AutopilotVersion,

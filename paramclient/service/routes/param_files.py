@@ -11,7 +11,7 @@ from fastapi import APIRouter, Query, Request, Response
 from paramclient.documents.paramset import FormatDoc, FormatsDoc, UploadedDoc
 from paramclient.errors import UsageError
 from paramclient.files import FileForm, dumps
-from paramclient.files.param_file import ENDINGS
+from paramclient.files.formats import ENDINGS
 from paramclient.model.identity import autopilot_name
 from paramclient.model.paramset import ParamSet
 from paramclient.provision.vehicle_params import fetch_set, select_non_defaults

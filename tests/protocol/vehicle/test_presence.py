@@ -8,15 +8,17 @@ from collections.abc import Sequence
 import pytest
 
 from paramclient.protocol.vehicle.presence import (
-    BOOT_CLOCK_WRAP,
-    CLOCKS_MAX,
-    FIRST_FRAMES,
     LOST_AFTER,
     LOST_AFTER_HIGH_LATENCY,
     LOST_AFTER_MAX,
+    Presence,
+)
+from paramclient.protocol.vehicle.reboot_detection import (
+    BOOT_CLOCK_WRAP,
+    CLOCKS_MAX,
+    FIRST_FRAMES,
     PATH_LATENCY_MAX,
     REORDERING_TIME,
-    Presence,
 )
 from paramclient.protocol.wire import (
     MAV_AUTOPILOT_PX4,

@@ -1,4 +1,4 @@
-"""Tables and their history lines. Each function runs inside the transaction of its caller.
+"""Updates of tables and their history lines. Each function runs inside the transaction of its caller.
 
 Only `apply_update` creates history lines: it compares every new value with the stored one, and a difference
 gives a line, written in the same transaction. Therefore every change of a stored value has its line, and if
@@ -13,10 +13,11 @@ from typing import Final
 
 from paramclient.cache import snapshots
 from paramclient.cache.cells import are_times, time_cell
+from paramclient.cache.history_columns import NO_VALUE, HistoryLine
 from paramclient.cache.observed_table import HeardParams
 from paramclient.cache.param_columns import BY_VEHICLE, StoredParam
 from paramclient.cache.records import CachedComponent, HistoryEntry, TableState, TableUpdate
-from paramclient.cache.transaction import NO_VALUE, HistoryLine, Transaction
+from paramclient.cache.transaction import Transaction
 from paramclient.model.identity import Identity
 
 __all__ = [
