@@ -137,7 +137,7 @@ SET: Final = {
 }
 ANSWERS: Final[dict[str, Any]] = {
     "GET /links": {"links": [{"name": "a", "state": "open", "listens_only": False, "stats": STATS}]},
-    "GET /me": {"name": "local", "asker": "local", "role": "write", "read_only": False},
+    "GET /me": {"name": "local", "author": "local", "role": "write", "read_only": False},
     "GET /components": {"run": RUN, "seq": 0, "components": [COMPONENT]},
     "GET /components/1/1/params": {"run": RUN, "seq": 0, "params": {"A": PARAM}},
     "POST /find": COMPONENT,

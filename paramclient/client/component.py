@@ -171,7 +171,7 @@ class Component(ABC):
         settle: float = 0.0,
         force: bool = False,
         durable: bool = False,
-        asker: str | None = None,
+        author: str | None = None,
     ) -> SetResult:
         """Write one parameter with PARAM_SET and verify the value that the vehicle acknowledges.
 
@@ -190,8 +190,8 @@ class Component(ABC):
                 which ignores them.
             durable: return only after the value and its history entry are synced to the disk, safe from power
                 loss. Otherwise they are written within 0.25 s, and a later power loss may still lose them.
-            asker: the user of the change, in printable ASCII: the change, and its history entry, then have
-                the author "us for ASKER".
+            author: the user of the change, in printable ASCII: the change, and its history entry, then have
+                the author "us for AUTHOR".
 
         Returns:
             Accepted, or adjusted: the vehicle stored another value.
@@ -220,7 +220,7 @@ class Component(ABC):
         settle: float = 0.0,
         force: bool = False,
         durable: bool = False,
-        asker: str | None = None,
+        author: str | None = None,
     ) -> SetManyResult:
         """Write many parameters in one call, and verify each as `set` does.
 
@@ -241,7 +241,7 @@ class Component(ABC):
                 they arrive together.
             timeout: seconds for the whole call; None: no limit besides the number of attempts.
             settle: seconds as in `set`, for which each value is watched; the other writes continue meanwhile.
-            force, asker: as in `set`.
+            force, author: as in `set`.
             durable: return only after all values and history entries are synced to the disk. If that fails,
                 the `error` of the result and of each outcome is NotDurable.
 
@@ -265,7 +265,7 @@ class Component(ABC):
         timeout: float | None = None,
         settle: float = 0.0,
         durable: bool = False,
-        asker: str | None = None,
+        author: str | None = None,
     ) -> ResetResult:
         """Set parameters to the firmware's defaults, and verify each as `set` does.
 
@@ -277,7 +277,7 @@ class Component(ABC):
             names: param_ids, at least one.
             defaults: defaults of parameters whose default the vehicle does not give, by name, such as
                 `Metadata.defaults_of`.
-            progress, settle, durable, asker: as in `set_many`.
+            progress, settle, durable, author: as in `set_many`.
             timeout: seconds for the whole call; None: no limit besides the number of attempts.
 
         Returns:
@@ -301,7 +301,7 @@ class Component(ABC):
             await read_unconfirmed(self.params, self.get, names, timeout=left()), defaults or {}
         )
         written = await self.set_many(
-            choice.values, progress=progress, timeout=left(), settle=settle, durable=durable, asker=asker
+            choice.values, progress=progress, timeout=left(), settle=settle, durable=durable, author=author
         )
         return ResetResult(written, choice.unchanged, choice.without_default)
 

@@ -113,7 +113,7 @@ class ExtParams(ABC):
         *,
         timeout: float | None = None,
         durable: bool = False,
-        asker: str | None = None,
+        author: str | None = None,
     ) -> ExtSetResult:
         """Write one parameter with PARAM_EXT_SET, and return when the component has acknowledged the value.
 
@@ -125,7 +125,7 @@ class ExtParams(ABC):
             name: param_id.
             value: a number for a numeric type; text, or bytes, of up to 128 bytes for CUSTOM.
             timeout: seconds; None: no limit besides the number of unanswered attempts.
-            durable, asker: as in `Component.set`.
+            durable, author: as in `Component.set`.
 
         Returns:
             Accepted, or adjusted: the component stored another value.
@@ -153,7 +153,7 @@ class ExtParams(ABC):
         progress: Callable[[ExtSetOutcome], None] | None = None,
         timeout: float | None = None,
         durable: bool = False,
-        asker: str | None = None,
+        author: str | None = None,
     ) -> ExtSetManyResult:
         """Write many parameters in one call, each as `set` does.
 
@@ -165,7 +165,7 @@ class ExtParams(ABC):
             values: values by name, or pairs of name and value; a name may occur in several pairs.
             progress: called with each outcome in the order of their arrival, from this task.
             timeout: seconds for the whole call; None: no limit besides the number of attempts.
-            durable, asker: as in `Component.set_many`.
+            durable, author: as in `Component.set_many`.
 
         Returns:
             One outcome for each value, in the order given: accepted, adjusted, refused, unknown or not tried.

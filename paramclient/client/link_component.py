@@ -222,7 +222,7 @@ class LinkComponent(LocalComponent):
         settle: float = 0.0,
         force: bool = False,
         durable: bool = False,
-        asker: str | None = None,
+        author: str | None = None,
     ) -> SetResult:
         """See `Component.set`."""
         ((name, checked),) = check_writes([(name, value)])
@@ -235,7 +235,7 @@ class LinkComponent(LocalComponent):
             name,
             checked,
             anyio.current_time(),
-            check_author(asker),
+            check_author(author),
             settle=check_settle(settle),
             force=force,
         )
@@ -258,7 +258,7 @@ class LinkComponent(LocalComponent):
         settle: float = 0.0,
         force: bool = False,
         durable: bool = False,
-        asker: str | None = None,
+        author: str | None = None,
     ) -> SetManyResult:
         """See `Component.set_many`."""
         pairs = check_writes(values)
@@ -275,7 +275,7 @@ class LinkComponent(LocalComponent):
                 progress(explain.outcome(outcome))
 
         batch = machine.write_many(
-            pairs, began, check_author(asker), settle=check_settle(settle), force=force
+            pairs, began, check_author(author), settle=check_settle(settle), force=force
         )
         try:
             self.wake()

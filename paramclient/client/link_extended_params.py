@@ -105,7 +105,7 @@ class LinkExtParams(LocalExtParams):
         *,
         timeout: float | None = None,
         durable: bool = False,
-        asker: str | None = None,
+        author: str | None = None,
     ) -> ExtSetResult:
         """See `ExtParams.set`."""
         machine = self._machine
@@ -115,7 +115,7 @@ class LinkExtParams(LocalExtParams):
         machine.check_uncontested()
         if durable:
             await self._component.wait_until_kept()
-        write = machine.write_ext(name, checked, anyio.current_time(), check_author(asker))
+        write = machine.write_ext(name, checked, anyio.current_time(), check_author(author))
         what = f"PARAM_EXT_SET {name} to {self._whose}"
         try:
             result = await self._component.wait(write, timeout, lambda: (what, write.attempts))
@@ -132,7 +132,7 @@ class LinkExtParams(LocalExtParams):
         progress: Callable[[ExtSetOutcome], None] | None = None,
         timeout: float | None = None,
         durable: bool = False,
-        asker: str | None = None,
+        author: str | None = None,
     ) -> ExtSetManyResult:
         """See `ExtParams.set_many`."""
         given = values.items() if isinstance(values, Mapping) else values
@@ -143,7 +143,7 @@ class LinkExtParams(LocalExtParams):
         if durable:
             await self._component.wait_until_kept()
         began = anyio.current_time()
-        batch = machine.write_many_ext(pairs, began, check_author(asker))
+        batch = machine.write_many_ext(pairs, began, check_author(author))
         try:
             self._component.wake()
             outcomes = await wait_for_batch(

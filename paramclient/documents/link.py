@@ -84,10 +84,10 @@ class HealthDoc(Document):
 class TokenHolderDoc(Document):
     """The caller: the name of the token and its role. If `read_only`, the service allows no writes.
 
-    `asker` is the author of the caller's changes in the history.
+    `author` is the author of the caller's changes in the history.
     """
 
     name: str
-    asker: str
+    author: str
     role: Literal["read", "write"]
     read_only: bool

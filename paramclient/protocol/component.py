@@ -727,7 +727,7 @@ class ComponentMachine:
         name: str,
         value: WireValue,
         now: float,
-        asker: str | None = None,
+        author: str | None = None,
         *,
         settle: float = 0.0,
         force: bool = False,
@@ -736,7 +736,7 @@ class ComponentMachine:
         """Write one parameter, also on behalf of another user.
 
         Args:
-            name, value, asker: as in `Component.set`.
+            name, value, author: as in `Component.set`.
             now: the time.
             settle: seconds from the acknowledgement until the value is read once more.
             force: send NaN and infinity also to an autopilot that cannot store them.
@@ -753,7 +753,7 @@ class ComponentMachine:
         if known is not None and known.trust is not Trust.CACHED and self.may_be_written:
             encode_value(value, known.type_number, self.table.encoding)
         self.writes.check_finite(name, value, force=force)
-        write = self.writes.set(name, value, now, asker, settle=settle, force=force, filed=filed)
+        write = self.writes.set(name, value, now, author, settle=settle, force=force, filed=filed)
         write.on_done.append(lambda: self._write_ended(write))
         return write
 
@@ -761,7 +761,7 @@ class ComponentMachine:
         self,
         pairs: Sequence[tuple[str, WireValue]],
         now: float,
-        asker: str | None = None,
+        author: str | None = None,
         *,
         settle: float = 0.0,
         force: bool = False,
@@ -770,7 +770,7 @@ class ComponentMachine:
 
         Args:
             pairs: names and values, in order.
-            now, asker, settle, force: as in `write`.
+            now, author, settle, force: as in `write`.
 
         Raises:
             UsageError: nothing may be sent.
@@ -779,7 +779,7 @@ class ComponentMachine:
         self.check_present(f"PARAM_SET to {self.system}/{self.component}", now)
 
         def begin(name: str, value: WireValue, at: float, filed: bool) -> Write:
-            return self.write(name, value, at, asker, settle=settle, force=force, filed=filed)
+            return self.write(name, value, at, author, settle=settle, force=force, filed=filed)
 
         def fileable(name: str) -> Param | None:
             name = self.spelling(name)
@@ -816,7 +816,7 @@ class ComponentMachine:
         self.check_present(f"{what} of {self.system}/{self.component}", now)
         return self.ext.read(key, now)
 
-    def write_ext(self, name: str, value: ExtValue, now: float, asker: str | None = None) -> ExtWrite:
+    def write_ext(self, name: str, value: ExtValue, now: float, author: str | None = None) -> ExtWrite:
         """Write one extended parameter; end it with `ext.writes.cancel`.
 
         Raises:
@@ -827,10 +827,10 @@ class ComponentMachine:
         known = self.ext.table.params.get(name)
         if known is not None and known.trust is not Trust.CACHED and self.is_recipient_certain:
             encode_ext_value(value, known.type)
-        return self.ext.write(name, value, now, asker)
+        return self.ext.write(name, value, now, author)
 
     def write_many_ext(
-        self, pairs: Sequence[tuple[str, ExtValue]], now: float, asker: str | None = None
+        self, pairs: Sequence[tuple[str, ExtValue]], now: float, author: str | None = None
     ) -> ExtWriteBatch:
         """Write several extended parameters; end the batch with `ext.batches.end`.
 
@@ -841,7 +841,7 @@ class ComponentMachine:
         self.check_present(f"PARAM_EXT_SET to {self.system}/{self.component}", now)
 
         def begin(name: str, value: ExtValue, at: float) -> ExtWrite:
-            return self.write_ext(name, value, at, asker)
+            return self.write_ext(name, value, at, author)
 
         batch = ExtWriteBatch(pairs, begin, self.ext.writes.cancel, now)
         self.ext.batches.begin(batch, now)

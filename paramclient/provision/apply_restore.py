@@ -42,7 +42,7 @@ async def apply(
     durable: bool = False,
     backup: str | os.PathLike[str] | None = None,
     timeout: float | None = None,
-    asker: str | None = None,
+    author: str | None = None,
     progress: Callable[[ApplyProgress], None] | None = None,
     before_writing: Callable[[], object] | None = None,
 ) -> ApplyResult:
@@ -78,7 +78,7 @@ async def apply(
         backup: a file for the state before the first write; its name determines the file format, see
             `paramclient.files`.
         timeout: seconds, after which the result reports how far the run came.
-        asker: the author of the changes, as in `Component.set`.
+        author: the author of the changes, as in `Component.set`.
         progress: called after each value and at the start of a phase; it must not raise.
         before_writing: called once after the vehicle was read, before its state is stored and the first value
             is written; awaited if it is asynchronous. Its exceptions end the call.
@@ -102,7 +102,7 @@ async def apply(
         renames=renames,
         durable=durable,
         backup=backup,
-        asker=asker,
+        author=author,
         progress=progress,
         before_writing=before_writing,
         reason=BEFORE_APPLY,
@@ -121,7 +121,7 @@ async def restore(
     force: bool = False,
     backup: str | os.PathLike[str] | None = None,
     timeout: float | None = None,
-    asker: str | None = None,
+    author: str | None = None,
     progress: Callable[[ApplyProgress], None] | None = None,
     before_writing: Callable[[], object] | None = None,
 ) -> ApplyResult:
@@ -135,7 +135,7 @@ async def restore(
         component: the vehicle.
         state: the earlier state, such as a snapshot or a backup file. Identity and calibration are left out
             unless the state names this vehicle as its own.
-        include, info, reboot, allow_armed, force, backup, timeout, asker, progress, before_writing: as in
+        include, info, reboot, allow_armed, force, backup, timeout, author, progress, before_writing: as in
             `apply`.
 
     Raises:
@@ -151,7 +151,7 @@ async def restore(
         skip_invalid=True,
         force=force,
         backup=backup,
-        asker=asker,
+        author=author,
         progress=progress,
         before_writing=before_writing,
         reason=BEFORE_RESTORE,

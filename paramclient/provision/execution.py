@@ -96,7 +96,7 @@ class ApplyOptions:
     renames: Renames | None = None
     durable: bool = False
     backup: str | os.PathLike[str] | None
-    asker: str | None
+    author: str | None
     progress: Callable[[ApplyProgress], None] | None
     before_writing: Callable[[], object] | None
     reason: str
@@ -125,7 +125,7 @@ class ApplyRun:
     _first_identity: Identity
 
     def __init__(self, component: Component, wanted: ParamSet | Plan, options: ApplyOptions) -> None:
-        check_author(options.asker)
+        check_author(options.author)
         self._component = component
         self._plan_identity: Identity | None = None
         if isinstance(wanted, Plan):
@@ -379,7 +379,7 @@ class ApplyRun:
             done = await self._component.set_many(
                 [(step.name, step.value) for step in steps],
                 force=self._options.force,
-                asker=self._options.asker,
+                author=self._options.author,
                 progress=take,
             )
         except ParamClientError:
@@ -477,7 +477,7 @@ class ApplyRun:
         """
         component = self._component
         with suppress(ParamClientError):
-            await component.set(step.name, step.value, asker=self._options.asker)
+            await component.set(step.name, step.value, author=self._options.author)
             acknowledged_at = anyio.current_time()
             while local(component).machine.presence.beat_at < acknowledged_at + SYSTEM_CHANGE_DELAY:  # noqa: ASYNC110 - no event
                 await anyio.sleep(POLL_INTERVAL)

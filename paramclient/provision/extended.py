@@ -145,7 +145,7 @@ async def apply_extended(
     durable: bool = False,
     backup: str | os.PathLike[str] | None = None,
     timeout: float | None = None,
-    asker: str | None = None,
+    author: str | None = None,
     progress: Callable[[ExtSetOutcome], None] | None = None,
     before_writing: Callable[[], object] | None = None,
 ) -> ExtApplyResult:
@@ -164,7 +164,7 @@ async def apply_extended(
         durable: return only when the values and their history are on the disk, see `ExtParams.set`.
         backup: a file for the state before the first write, JSON or YAML.
         timeout: seconds for the whole call; None: no limit.
-        asker: the author of the changes, as in `Component.set`.
+        author: the author of the changes, as in `Component.set`.
         progress: called with each outcome.
         before_writing: called once if there is something to write, and awaited if it is asynchronous, before
             the state is stored; its exceptions end the call.
@@ -182,7 +182,7 @@ async def apply_extended(
         durable=durable,
         backup=backup,
         timeout=timeout,
-        asker=asker,
+        author=author,
         progress=progress,
         before_writing=before_writing,
     )
@@ -195,7 +195,7 @@ async def restore_extended(
     durable: bool = False,
     backup: str | os.PathLike[str] | None = None,
     timeout: float | None = None,
-    asker: str | None = None,
+    author: str | None = None,
     progress: Callable[[ExtSetOutcome], None] | None = None,
     before_writing: Callable[[], object] | None = None,
 ) -> ExtApplyResult:
@@ -204,7 +204,7 @@ async def restore_extended(
     Args:
         component: the component.
         state: its earlier state, of `load_extended_state` or a backup file.
-        durable, backup, timeout, asker, progress, before_writing: as in `apply_extended`.
+        durable, backup, timeout, author, progress, before_writing: as in `apply_extended`.
 
     Raises:
         ParamClientError: as from `apply_extended`.
@@ -216,7 +216,7 @@ async def restore_extended(
         durable=durable,
         backup=backup,
         timeout=timeout,
-        asker=asker,
+        author=author,
         progress=progress,
         before_writing=before_writing,
     )
@@ -253,7 +253,7 @@ async def _write(
     durable: bool,
     backup: str | os.PathLike[str] | None,
     timeout: float | None,
-    asker: str | None,
+    author: str | None,
     progress: Callable[[ExtSetOutcome], None] | None,
     before_writing: Callable[[], object] | None,
 ) -> ExtApplyResult:
@@ -277,7 +277,7 @@ async def _write(
         return ExtApplyResult(plan, (), before, None, plan.current, None, anyio.current_time() - began)
     snapshot = await ext.store_snapshot(reason=reason)
     values = {name: param.value for name, param in plan.changes.items()}
-    done = await ext.set_many(values, progress=progress, timeout=left(), durable=durable, asker=asker)
+    done = await ext.set_many(values, progress=progress, timeout=left(), durable=durable, author=author)
     current: Mapping[str, ExtParam] | None = None
     error = done.error
     try:

@@ -40,7 +40,7 @@ async def apply_all(
     durable: bool = False,
     backup: Callable[[Component], str | os.PathLike[str]] | None = None,
     timeout: float | None = None,
-    asker: str | None = None,
+    author: str | None = None,
     progress: Callable[[Component, ApplyProgress], None] | None = None,
     before_writing: Callable[[Component], object] | None = None,
 ) -> FleetApplied:
@@ -50,7 +50,7 @@ async def apply_all(
         components: the vehicles.
         wanted: one set for all vehicles, or a set for each by (system, component) or by a call. `overlay`
             combines a shared set with one of a single vehicle.
-        include, reboot, allow_armed, skip_invalid, force, renames, durable, timeout, asker: as in `apply`.
+        include, reboot, allow_armed, skip_invalid, force, renames, durable, timeout, author: as in `apply`.
         info: returns the metadata for a vehicle.
         backup: returns the name of a vehicle's backup file.
         progress, before_writing: as in `apply`, with the vehicle as first argument.
@@ -78,7 +78,7 @@ async def apply_all(
             durable=durable,
             backup=None if backup is None else backup(component),
             timeout=timeout,
-            asker=asker,
+            author=author,
             progress=report,
             before_writing=None if before_writing is None else partial(before_writing, component),
         )

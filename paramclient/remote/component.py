@@ -204,7 +204,7 @@ class RemoteComponent(ServiceComponent):
         settle: float = 0.0,
         force: bool = False,
         durable: bool = False,
-        asker: str | None = None,
+        author: str | None = None,
     ) -> SetResult:
         """See `Component.set`.
 
@@ -245,7 +245,7 @@ class RemoteComponent(ServiceComponent):
         settle: float = 0.0,
         force: bool = False,
         durable: bool = False,
-        asker: str | None = None,
+        author: str | None = None,
     ) -> SetManyResult:
         """See `Component.set_many`.
 

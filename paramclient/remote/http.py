@@ -111,7 +111,7 @@ class Requests:
     ) -> None:
         self.name = address.name
         headers = {"User-Agent": f"paramclient/{__version__}", "Accept-Encoding": "gzip, deflate"}
-        headers["X-Asker"] = f"paramclient {os.getpid()}"  # author of changes, distinct for each program
+        headers["X-Author"] = f"paramclient {os.getpid()}"  # author of changes, distinct for each program
         if token is not None:
             headers["Authorization"] = f"Bearer {token}"
         self._has_token = token is not None

@@ -133,32 +133,32 @@ class MirroredComponent:
             self.seq = seq
             self._read(document)
 
-    def take_change(self, event: Document, asker: str) -> None:
+    def take_change(self, event: Document, author: str) -> None:
         """Process a change of a parameter.
 
         Args:
             event: the event.
-            asker: name of this client at the service, for changes by its own writes.
+            author: name of this client at the service, for changes by its own writes.
         """
         old, new, by = event["old"], event["new"], str(event["by"])
         change = Change.between(
             str(event["name"]),
             None if old is None else param_of(old, event["name"]),
             None if new is None else param_of(new, event["name"]),
-            "us" if asker and by == f"us for {asker}" else by,
+            "us" if author and by == f"us for {author}" else by,
             is_added=event.get("kind") == "added",
         )
         if (made := self.mirror.take(event["seq"], change)) is not None:
             self.publish([made])
 
-    def take_ext_change(self, event: Document, asker: str) -> None:
+    def take_ext_change(self, event: Document, author: str) -> None:
         """Process a change of an extended parameter; the arguments are those of `take_change`."""
         old, new, by = event["old"], event["new"], str(event["by"])
         change = ExtChange(
             str(event["name"]),
             None if old is None else ext_param_of(old, event["name"]),
             None if new is None else ext_param_of(new, event["name"]),
-            "us" if asker and by == f"us for {asker}" else by,
+            "us" if author and by == f"us for {author}" else by,
             event.get("kind") == "added",
         )
         if (made := self.ext_mirror.take(event["seq"], change)) is not None:

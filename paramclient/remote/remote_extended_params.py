@@ -102,11 +102,11 @@ class RemoteExtParams(ExtParams):
         *,
         timeout: float | None = None,
         durable: bool = False,
-        asker: str | None = None,
+        author: str | None = None,
     ) -> ExtSetResult:
         """See `ExtParams.set`. As in `Component.set`, a write whose response is lost is not sent again."""
         pair = (check_asked_name(name), check_ext_value(value))
-        check_author(asker)
+        check_author(author)
         awaited = f"PARAM_EXT_SET {name} to {self._whose}"
         ((outcome,), _) = await self._write([pair], timeout, awaited, durable=durable)
         if outcome.error is not None:
@@ -121,7 +121,7 @@ class RemoteExtParams(ExtParams):
         progress: Callable[[ExtSetOutcome], None] | None = None,
         timeout: float | None = None,
         durable: bool = False,
-        asker: str | None = None,
+        author: str | None = None,
     ) -> ExtSetManyResult:
         """See `ExtParams.set_many`.
 
@@ -131,7 +131,7 @@ class RemoteExtParams(ExtParams):
         """
         given = values.items() if isinstance(values, Mapping) else values
         pairs = [(check_asked_name(name), check_ext_value(value)) for name, value in given]
-        check_author(asker)
+        check_author(author)
         mirrored = self._mirrored
         self._service.connection.check_open()
         if mirrored.component.state == "lost":

@@ -55,7 +55,7 @@ class ServiceComponents:
         connection: connection with the event stream.
         components: all components, by link and ids, in the order of the service.
         subscriptions: event streams of the client.
-        asker: name of this client at the service.
+        author: name of this client at the service.
         are_links_stale: set after a change of a link.
     """
 
@@ -64,7 +64,7 @@ class ServiceComponents:
         self.connection = Connection(requests, self)
         self.components: dict[Key, MirroredComponent] = {}
         self.subscriptions: weakref.WeakSet[Events] = weakref.WeakSet()
-        self.asker = ""
+        self.author = ""
         self.are_links_stale = anyio.Event()
         self._requests = requests
         self._link = link
@@ -86,7 +86,7 @@ class ServiceComponents:
             case _ if mirrored is None:
                 self._is_list_stale = True
             case "change":
-                mirrored.take_change(event, self.asker)
+                mirrored.take_change(event, self.author)
             case "params":
                 mirrored.mirror.doubt()
                 self._stale[mirrored.key] = mirrored
@@ -96,7 +96,7 @@ class ServiceComponents:
             case "progress":
                 mirrored.progress.take(event)
             case "extended_change":
-                mirrored.take_ext_change(event, self.asker)
+                mirrored.take_ext_change(event, self.author)
             case "extended_params":
                 mirrored.ext_mirror.doubt()
                 self._stale[mirrored.key] = mirrored

@@ -349,7 +349,7 @@ class ServiceClient:
         with suppress(LinkError):  # an older service has no such resource
             answer = await self._requests.ask("GET", "/me")
             with decode_errors(self._service.name):
-                self._roster.asker = str(answer.document.get("asker", ""))
+                self._roster.author = str(answer.document.get("author", ""))
 
     async def _load_links(self) -> None:
         """Load the links and their counters.

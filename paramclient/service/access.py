@@ -1,6 +1,6 @@
 """Access checks of every request: host, origin, token or session, role, size of the body.
 
-An ASGI middleware in front of the application. The application finds the author of the request (`asker`,
+An ASGI middleware in front of the application. The application finds the author of the request (`author`,
 `name`), its permissions (`role`, `read_only`) and the holder of its quota (`quota`) in `scope["state"]`.
 Tokens and cookies are removed from its headers.
 """
@@ -64,7 +64,7 @@ SEND_CHUNK_BYTES: Final = 65_536
 """Maximum number of bytes of a response passed to the connection at once: the connection buffers unsent
 bytes."""
 CLIENT_NAME_LENGTH_MAX: Final = 64
-"""Maximum number of characters of the header X-Asker."""
+"""Maximum number of characters of the header X-Author."""
 
 API_POLICY: Final = "default-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; sandbox"
 """Content-Security-Policy of responses of the API."""
@@ -75,7 +75,7 @@ PAGE_POLICY: Final = (
 """Content-Security-Policy of the web page and the API reference."""
 ALLOWED_METHODS: Final = "GET, HEAD, POST, PUT, PATCH, DELETE"
 """Methods that pages of allowed origins may use."""
-ALLOWED_HEADERS: Final = "Authorization, Content-Type, Last-Event-ID, X-Asker"
+ALLOWED_HEADERS: Final = "Authorization, Content-Type, Last-Event-ID, X-Author"
 """Headers that pages of allowed origins may send."""
 EXPOSED_HEADERS: Final = "Content-Disposition, Location, Retry-After, X-Seq"
 """Response headers that pages of allowed origins may read."""
@@ -184,7 +184,7 @@ class AccessMiddleware:
             return
         self._check_role(request, holder)
         state = request.scope.setdefault("state", {})
-        state["asker"] = _author_of(request, holder if self._settings.tokens is not None else None)
+        state["author"] = _author_of(request, holder if self._settings.tokens is not None else None)
         state["name"] = None if holder is None else holder.name
         state["role"] = None if holder is None else holder.role
         state["read_only"] = self._settings.read_only
@@ -481,15 +481,17 @@ class _Response:
 
 
 def _author_of(request: Request, holder: TokenHolder | None) -> str:
-    """Return the author of changes for the history: `anna@10.0.0.2 (content of X-Asker)`."""
+    """Return the author of changes for the history: `anna@10.0.0.2 (content of X-Author)`."""
     who = "local" if holder is None else f"{holder.name}@{request.address}"
-    given = request.header(b"x-asker")
+    given = request.header(b"x-author")
     if given is None:
         return who
     client = given.decode("latin-1")
     if not 1 <= len(client) <= CLIENT_NAME_LENGTH_MAX or not (client.isascii() and client.isprintable()):
         raise RequestDenied(
-            400, "bad-request", f"X-Asker must have 1 to {CLIENT_NAME_LENGTH_MAX} printable ASCII characters."
+            400,
+            "bad-request",
+            f"X-Author must have 1 to {CLIENT_NAME_LENGTH_MAX} printable ASCII characters.",
         )
     return f"{who} ({client})"[:AUTHOR_LENGTH_MAX]
 

@@ -52,7 +52,7 @@ HOST_PATTERN: Final = re.compile(
 """A host name or an address, with an optional port."""
 UNIQUE_HEADERS: Final = (
     *(b"host", b"origin", b"authorization", b"content-type", b"content-length", b"transfer-encoding"),
-    *(b"sec-fetch-site", b"sec-fetch-mode", b"sec-fetch-dest", b"x-asker"),
+    *(b"sec-fetch-site", b"sec-fetch-mode", b"sec-fetch-dest", b"x-author"),
 )
 """Headers that must not be repeated: the application could use another value than the access checks."""
 _LARGE_GETS: Final = frozenset(

@@ -79,8 +79,8 @@ Target = Annotated[FollowedComponent, Depends(target_of)]
 
 def author_of(request: Request) -> str:
     """Return the author of a request for the history."""
-    asker: str = request.scope["state"]["asker"]
-    return asker
+    author: str = request.scope["state"]["author"]
+    return author
 
 
 def holder_of(request: Request) -> str:

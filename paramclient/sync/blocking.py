@@ -550,7 +550,7 @@ class Component(Wrapper[AsyncComponent]):
         settle: float = 0.0,
         force: bool = False,
         durable: bool = False,
-        asker: str | None = None,
+        author: str | None = None,
     ) -> SetResult:
         """Write one parameter with PARAM_SET and verify the value that the vehicle acknowledges.
 
@@ -568,8 +568,8 @@ class Component(Wrapper[AsyncComponent]):
                 which ignores them.
             durable: return only after the value and its history entry are synced to the disk, safe from power
                 loss. Otherwise they are written within 0.25 s, and a later power loss may still lose them.
-            asker: the user of the change, in printable ASCII: the change, and its history entry, then have
-                the author "us for ASKER".
+            author: the user of the change, in printable ASCII: the change, and its history entry, then have
+                the author "us for AUTHOR".
 
         Returns:
             Accepted, or adjusted: the vehicle stored another value.
@@ -596,7 +596,7 @@ class Component(Wrapper[AsyncComponent]):
                 settle=settle,
                 force=force,
                 durable=durable,
-                asker=asker,
+                author=author,
             )
         )
 
@@ -609,7 +609,7 @@ class Component(Wrapper[AsyncComponent]):
         settle: float = 0.0,
         force: bool = False,
         durable: bool = False,
-        asker: str | None = None,
+        author: str | None = None,
     ) -> SetManyResult:
         """Write many parameters in one call, and verify each as `set` does.
 
@@ -630,7 +630,7 @@ class Component(Wrapper[AsyncComponent]):
                 service, they arrive together.
             timeout: seconds for the whole call; None: no limit besides the number of attempts.
             settle: seconds as in `set`, for which each value is watched; the other writes continue meanwhile.
-            force, asker: as in `set`.
+            force, author: as in `set`.
             durable: return only after all values and history entries are synced to the disk. If that fails,
                 the `error` of the result and of each outcome is NotDurable.
 
@@ -653,7 +653,7 @@ class Component(Wrapper[AsyncComponent]):
                 settle=settle,
                 force=force,
                 durable=durable,
-                asker=asker,
+                author=author,
             ),
             progress,
         )
@@ -666,7 +666,7 @@ class Component(Wrapper[AsyncComponent]):
         timeout: float | None = None,
         settle: float = 0.0,
         durable: bool = False,
-        asker: str | None = None,
+        author: str | None = None,
     ) -> ResetResult:
         """Set parameters to the firmware's defaults, and verify each as `set` does.
 
@@ -678,7 +678,7 @@ class Component(Wrapper[AsyncComponent]):
             names: param_ids, at least one.
             defaults: defaults of parameters whose default the vehicle does not give, by name, such as
                 `Metadata.defaults_of`.
-            progress, settle, durable, asker: as in `set_many`.
+            progress, settle, durable, author: as in `set_many`.
             timeout: seconds for the whole call; None: no limit besides the number of attempts.
 
         Returns:
@@ -698,7 +698,7 @@ class Component(Wrapper[AsyncComponent]):
                 timeout=timeout,
                 settle=settle,
                 durable=durable,
-                asker=asker,
+                author=author,
             ),
             progress,
         )
@@ -909,7 +909,7 @@ class ExtParams(Wrapper[AsyncExtParams]):
         *,
         timeout: float | None = None,
         durable: bool = False,
-        asker: str | None = None,
+        author: str | None = None,
     ) -> ExtSetResult:
         """Write one parameter with PARAM_EXT_SET, and return when the component has acknowledged the value.
 
@@ -921,7 +921,7 @@ class ExtParams(Wrapper[AsyncExtParams]):
             name: param_id.
             value: a number for a numeric type; text, or bytes, of up to 128 bytes for CUSTOM.
             timeout: seconds; None: no limit besides the number of unanswered attempts.
-            durable, asker: as in `Component.set`.
+            durable, author: as in `Component.set`.
 
         Returns:
             Accepted, or adjusted: the component stored another value.
@@ -941,7 +941,7 @@ class ExtParams(Wrapper[AsyncExtParams]):
                 the disk.
         """
         return self._thread.call(
-            partial(self._wrapped.set, name, value, timeout=timeout, durable=durable, asker=asker)
+            partial(self._wrapped.set, name, value, timeout=timeout, durable=durable, author=author)
         )
 
     def set_many(
@@ -951,7 +951,7 @@ class ExtParams(Wrapper[AsyncExtParams]):
         progress: Callable[[ExtSetOutcome], None] | None = None,
         timeout: float | None = None,
         durable: bool = False,
-        asker: str | None = None,
+        author: str | None = None,
     ) -> ExtSetManyResult:
         """Write many parameters in one call, each as `set` does.
 
@@ -963,7 +963,7 @@ class ExtParams(Wrapper[AsyncExtParams]):
             values: values by name, or pairs of name and value; a name may occur in several pairs.
             progress: called with each outcome in the order of their arrival, in the calling thread.
             timeout: seconds for the whole call; None: no limit besides the number of attempts.
-            durable, asker: as in `Component.set_many`.
+            durable, author: as in `Component.set_many`.
 
         Returns:
             One outcome for each value, in the order given: accepted, adjusted, refused, unknown or not tried.
@@ -978,7 +978,7 @@ class ExtParams(Wrapper[AsyncExtParams]):
         """
         return self._thread.call_reporting(
             partial(
-                self._wrapped.set_many, own_values(values), timeout=timeout, durable=durable, asker=asker
+                self._wrapped.set_many, own_values(values), timeout=timeout, durable=durable, author=author
             ),
             progress,
         )

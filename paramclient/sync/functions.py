@@ -97,7 +97,7 @@ def apply_all(
     durable: bool = False,
     backup: Callable[[Component], str | os.PathLike[str]] | None = None,
     timeout: float | None = None,
-    asker: str | None = None,
+    author: str | None = None,
     progress: Callable[[Component, ApplyProgress], None] | None = None,
     before_writing: Callable[[Component], object] | None = None,
 ) -> FleetApplied:
@@ -126,7 +126,7 @@ def apply_all(
         durable=durable,
         backup=None if backup is None else fleet.for_each(backup),
         timeout=timeout,
-        asker=asker,
+        author=author,
     )
     callbacks: dict[str, Callable[..., object] | None] = {
         "progress": None if progress is None else fleet.with_component(progress),

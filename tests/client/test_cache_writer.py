@@ -502,8 +502,8 @@ async def test_a_change_of_ours_tells_who_asked_for_it(path: Path) -> None:
         assert (await component.fetch_all()).source == "cache"
         changes = component.changes()
         async with anyio.create_task_group() as tasks:
-            tasks.start_soon(partial(component.set, "PARAM_01", 100, asker="anna@10.0.0.2"))
-            tasks.start_soon(partial(component.set, "PARAM_02", 200, asker="ben@10.0.0.3 (script)"))
+            tasks.start_soon(partial(component.set, "PARAM_01", 100, author="anna@10.0.0.2"))
+            tasks.start_soon(partial(component.set, "PARAM_02", 200, author="ben@10.0.0.3 (script)"))
         told = {}
         for _ in range(2):
             change = await anext(changes)
@@ -522,8 +522,8 @@ async def test_every_own_write_is_in_the_history_however_briefly_it_was_valid(pa
         component = await client.component()
         before = (await component.get("PARAM_01")).value
         async with anyio.create_task_group() as tasks:
-            for value, asker in ((100, "anna"), (101, "ben"), (before, "anna"), (100, None)):
-                tasks.start_soon(partial(component.set, "PARAM_01", value, asker=asker))
+            for value, author in ((100, "anna"), (101, "ben"), (before, "anna"), (100, None)):
+                tasks.start_soon(partial(component.set, "PARAM_01", value, author=author))
         vehicle.set_param("PARAM_01", 7)
         await component.get("PARAM_01")
     with ParamCache(path) as cache:
@@ -544,7 +544,7 @@ async def test_a_write_is_told_of_as_ours_also_where_nobody_waits_for_it_any_mor
         await component.fetch_all()
         await component.get("PARAM_01")
         with anyio.move_on_after(0.1):
-            await component.set("PARAM_01", 100, asker="anna")
+            await component.set("PARAM_01", 100, author="anna")
         await asyncio.sleep(1)
         assert component.params["PARAM_01"].value == 100
         await asyncio.sleep(10)
@@ -565,7 +565,7 @@ async def test_a_write_is_in_the_history_also_where_the_cache_knew_nothing_befor
     before = vehicle.params["PARAM_01"].value
     async with ParamClient(vehicle, cache=path) as client:
         component = await client.component()
-        await component.set("PARAM_01", 100, asker="anna")
+        await component.set("PARAM_01", 100, author="anna")
         await component.fetch_all()
         await component.set("PARAM_02", 200)
     with ParamCache(path) as cache:
@@ -575,16 +575,16 @@ async def test_a_write_is_in_the_history_also_where_the_cache_knew_nothing_befor
     assert lines[0].old.value == before
 
 
-@pytest.mark.parametrize("asker", ["", "x" * 129, "a\nb", "Änne", "\x7f"])
+@pytest.mark.parametrize("author", ["", "x" * 129, "a\nb", "Änne", "\x7f"])
 @swiftly
-async def test_an_asker_must_be_printable_ascii(path: Path, asker: str) -> None:
+async def test_an_author_must_be_printable_ascii(path: Path, author: str) -> None:
     vehicle = small_px4()
     async with ParamClient(vehicle, cache=path) as client:
         component = await client.component()
-        with pytest.raises(UsageError, match="asker must have 1 to 128 printable ASCII"):
-            await component.set("PARAM_01", 100, asker=asker)
-        with pytest.raises(UsageError, match="asker must have"):
-            await apply(component, ParamSet({}), asker=asker)
+        with pytest.raises(UsageError, match="author must have 1 to 128 printable ASCII"):
+            await component.set("PARAM_01", 100, author=author)
+        with pytest.raises(UsageError, match="author must have"):
+            await apply(component, ParamSet({}), author=author)
 
 
 @swiftly

@@ -39,7 +39,7 @@ async def test_the_next_session_knows_the_table(tmp_path: Path) -> None:
     async with ParamClient(camera, cache=path) as client:
         ext = (await client.component(1, 100)).ext
         await ext.fetch_all()
-        await ext.set("CAM_NAME", "Rear", asker="anna")
+        await ext.set("CAM_NAME", "Rear", author="anna")
     found = kept(path)
     assert {name: param.value for name, param in found.params.items()} == TABLE | {"CAM_NAME": "Rear"}
     assert (found.count, found.complete) == (3, True)

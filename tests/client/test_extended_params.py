@@ -188,7 +188,7 @@ async def test_a_change_on_behalf_of_another() -> None:
     async with a_client(Camera({"A": 1})) as client:
         ext = (await client.component(1, 100)).ext
         changes = ext.changes()
-        await ext.set("A", 2, asker="anna")
+        await ext.set("A", 2, author="anna")
         assert (await anext(changes)).by == "us for anna"
 
 
@@ -239,8 +239,8 @@ async def test_arguments_that_are_rejected() -> None:
             await ext.get(-1)
         with pytest.raises(UsageError, match="not NoneType"):
             await ext.set_many({"CAM_MODE": None})  # type: ignore[arg-type]
-        with pytest.raises(UsageError, match="asker"):
-            await ext.set("CAM_MODE", 1, asker="")
+        with pytest.raises(UsageError, match="author"):
+            await ext.set("CAM_MODE", 1, author="")
 
 
 @swiftly

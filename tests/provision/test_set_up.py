@@ -519,7 +519,7 @@ async def test_every_written_value_records_its_author(bring: Callable[..., Any])
         await component.fetch_all()
         changes = component.changes()
         wanted = written({"TUNE_01": 8.0, "TUNE_02": 9.0, "MAV_SYS_ID": 7})
-        result = await bring(component, wanted, include="identity", asker="anna@10.0.0.2")
+        result = await bring(component, wanted, include="identity", author="anna@10.0.0.2")
         assert set(statuses(result).values()) == {"set"}
         told = {}
         with anyio.move_on_after(1.0):
@@ -529,7 +529,7 @@ async def test_every_written_value_records_its_author(bring: Callable[..., Any])
     async with a_client(Air([px4(), px4(system=2)])) as client:
         components = [await client.component(1), await client.component(2)]
         feeds = [each.changes() for each in components]
-        await apply_all(components, written({"TUNE_01": 8.0}), asker="anna@10.0.0.2")
+        await apply_all(components, written({"TUNE_01": 8.0}), author="anna@10.0.0.2")
         for feed in feeds:
             async for change in feed:
                 if change.name == "TUNE_01" and change.by != "vehicle":

@@ -72,7 +72,7 @@ def components(*told: object) -> list[bytes]:
 GOOD: dict[str, Sent] = {
     "/events": stream(HELLO),
     "/links": document({"links": []}),
-    "/me": document({"asker": "local"}),
+    "/me": document({"author": "local"}),
     "/components": components(component()),
 }
 
@@ -293,7 +293,7 @@ async def test_a_transport_may_have_read_the_answer() -> None:
             "run": RUN,
             "seq": 0,
             "components": [component()],
-            "asker": "local",
+            "author": "local",
             "params": {},
         }
         return httpx.Response(200, json=told)

@@ -373,11 +373,11 @@ def test_hosts_are_named_one_by_one(host: str) -> None:
 async def test_without_tokens_whoever_is_on_this_machine_may_write() -> None:
     door = Door()
     assert (await door.request("POST", WRITE, body=b"{}")).status == 200
-    local = {"asker": "local", "name": "local", "role": "write", "read_only": False}
+    local = {"author": "local", "name": "local", "role": "write", "read_only": False}
     assert door.state == {**local, "quota": "the address 10.0.0.2"}
     assert may_write(Asked(door.seen[-1][0]))
-    await door.request(raw=[(b"x-asker", b"calibrate.py")])
-    assert door.state["asker"] == "local (calibrate.py)"
+    await door.request(raw=[(b"x-author", b"calibrate.py")])
+    assert door.state["author"] == "local (calibrate.py)"
 
 
 @swiftly
@@ -412,34 +412,34 @@ async def test_with_tokens_nothing_is_done_for_nobody() -> None:
 async def test_a_token_says_who_asks_and_goes_no_further() -> None:
     door = Door(GUARDED)
     cookie = (b"cookie", b"other=1; paramclient-8765=nonsense")
-    assert (await door.request(token=ANNA, raw=[(b"x-asker", b"web page"), cookie])).status == 200
+    assert (await door.request(token=ANNA, raw=[(b"x-author", b"web page"), cookie])).status == 200
     assert door.state == {
-        "asker": "anna@10.0.0.2 (web page)",
+        "author": "anna@10.0.0.2 (web page)",
         "name": "anna",
         "role": "write",
         "read_only": False,
         "quota": "the token anna",
     }
     assert (await door.request(token=BEN, client=("::ffff:10.0.0.9", 1))).status == 200
-    assert (door.state["asker"], door.state["role"]) == ("ben@10.0.0.9", "read")
+    assert (door.state["author"], door.state["role"]) == ("ben@10.0.0.9", "read")
     assert (await door.request(token=BEN, client=("fe80::1%eth0", 1))).status == 200
-    assert door.state["asker"] == "ben@fe80::1"
+    assert door.state["author"] == "ben@fe80::1"
     for scope, _ in door.seen:
         assert not {b"authorization", b"cookie"} & {name for name, _ in scope["headers"]}
         assert ANNA not in repr(scope)
         assert BEN not in repr(scope)
     for wrong in (b"a\nb", b"\xe4", b"", b"x" * 65):
-        assert (await door.request(token=ANNA, raw=[(b"x-asker", wrong)])).problem == "bad-request"
+        assert (await door.request(token=ANNA, raw=[(b"x-author", wrong)])).problem == "bad-request"
 
 
 @swiftly
-async def test_an_asker_has_at_most_128_characters() -> None:
+async def test_an_author_has_at_most_128_characters() -> None:
     text = f"{'n' * 32} write {ANNA}"
     door = Door(AccessSettings(tokens=Tokens.of_text(text)))
     address = "2001:0db8:85a3:1111:2222:8a2e:3370:7334"
-    await door.request(token=ANNA, client=(address, 1), raw=[(b"x-asker", b"x" * 64)])
-    assert len(door.state["asker"]) == 128
-    assert door.state["asker"].startswith(f"{'n' * 32}@2001:db8:85a3:1111:2222:8a2e:3370:7334 (xxx")
+    await door.request(token=ANNA, client=(address, 1), raw=[(b"x-author", b"x" * 64)])
+    assert len(door.state["author"]) == 128
+    assert door.state["author"].startswith(f"{'n' * 32}@2001:db8:85a3:1111:2222:8a2e:3370:7334 (xxx")
 
 
 @pytest.mark.parametrize("given", ["Basic YTpi", "Bearer", "Bearer  ", "Token x", BEN])
@@ -506,7 +506,7 @@ async def test_a_browser_shows_its_token_once() -> None:
     assert BEN not in begun.headers["set-cookie"]
     cookie = cookie_of(begun)
     assert (await door.request(raw=[cookie])).status == 200
-    assert door.state["asker"] == "ben@10.0.0.2"
+    assert door.state["author"] == "ben@10.0.0.2"
     assert (await door.request("POST", WRITE, raw=[cookie])).problem == "forbidden"
     door.now = SESSION_LIFETIME
     assert (await door.request(raw=[cookie])).problem == "unauthenticated"
@@ -639,7 +639,7 @@ async def test_a_proxy_that_is_trusted_says_who_asks(raw: list[tuple[str, str]],
     door = Door(PROXY)
     headers = [(name.encode(), value.encode()) for name, value in raw]
     assert (await door.request(token=ANNA, raw=headers)).status == 200
-    assert door.state["asker"] == f"anna@{client}"
+    assert door.state["author"] == f"anna@{client}"
 
 
 @swiftly
@@ -647,13 +647,13 @@ async def test_forwarded_headers_count_only_from_trusted_proxies() -> None:
     told = [(b"x-forwarded-for", b"198.51.100.7"), (b"forwarded", b"for=198.51.100.8")]
     door = Door(PROXY)
     assert (await door.request(token=ANNA, raw=told, client=("10.0.0.3", 1))).status == 200
-    assert door.state["asker"] == "anna@10.0.0.3"
+    assert door.state["author"] == "anna@10.0.0.3"
     assert (await door.request(token=ANNA, raw=told)).problem == "bad-request", (
         "one of the two is not the proxy's"
     )
     door = Door(GUARDED)
     assert (await door.request(token=ANNA, raw=told)).status == 200
-    assert door.state["asker"] == "anna@10.0.0.2"
+    assert door.state["author"] == "anna@10.0.0.2"
 
 
 @swiftly
@@ -890,7 +890,7 @@ def handshake(door: Door, **options: Any) -> Any:
 async def test_a_websocket_is_let_in_like_everything_else() -> None:
     door = Door(GUARDED)
     assert (await handshake(door, token=BEN)).status == 101
-    assert door.state["asker"] == "ben@10.0.0.2"
+    assert door.state["author"] == "ben@10.0.0.2"
     own = (b"origin", b"http://127.0.0.1:8765")
     assert (await handshake(door, token=BEN, raw=[own])).status == 101
     door.seen.clear()
@@ -963,7 +963,7 @@ async def test_a_slash_in_a_name_is_a_part_of_it() -> None:
         [(b"content-type", b"application/json"), (b"content-type", b"text/plain")],
         [(b"origin", b"http://127.0.0.1:8765"), (b"origin", b"http://evil.example")],
         [(b"authorization", b"Bearer x"), (b"authorization", b"Bearer y")],
-        [(b"x-asker", b"x"), (b"x-asker", b"y")],
+        [(b"x-author", b"x"), (b"x-author", b"y")],
     ],
 )
 @swiftly

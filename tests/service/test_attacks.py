@@ -175,7 +175,7 @@ async def test_an_unknown_client_learns_nothing_and_changes_nothing() -> None:
             *(("GET", "/openapi.json"), ("GET", "/api/v1/events"), ("PUT", f"{C}/params/A")),
             *(("POST", f"{C}/reboot"), ("PATCH", f"{C}/params"), ("DELETE", "/api/v1/jobs/1")),
         ):
-            for more in ((), (bearer("wrong"),), ("Cookie: paramclient=x; session=y",), ("X-Asker: anna",)):
+            for more in ((), (bearer("wrong"),), ("Cookie: paramclient=x; session=y",), ("X-Author: anna",)):
                 head = service.head(
                     method, path, "Content-Type: application/json", f"Content-Length: {len(body)}", *more
                 )
@@ -188,7 +188,7 @@ async def test_an_unknown_client_learns_nothing_and_changes_nothing() -> None:
         refused = await service.ask("DELETE", "/api/v1/components", bearer(BEN))
         assert (refused.status, refused.problem) == (403, "forbidden")
         me = json.loads((await service.ask("GET", "/api/v1/me", bearer(BEN))).body)
-        assert me == {"name": "ben", "asker": "ben@127.0.0.1", "role": "read", "read_only": False}
+        assert me == {"name": "ben", "author": "ben@127.0.0.1", "role": "read", "read_only": False}
     assert vehicle.params["A"].value == 1.0
 
 
@@ -200,7 +200,7 @@ async def test_a_write_tells_who_asked_and_a_reader_cannot() -> None:
         more = ("Connection: close", "Content-Type: application/json", f"Content-Length: {len(body)}")
         head = service.head("PUT", f"{C}/params/A", *more, bearer(BEN))
         assert Answer.of(await service.send(head + body)).problem == "forbidden"
-        head = service.head("PUT", f"{C}/params/A", *more, bearer(ANNA), "X-Asker: calibrate.py")
+        head = service.head("PUT", f"{C}/params/A", *more, bearer(ANNA), "X-Author: calibrate.py")
         assert Answer.of(await service.send(head + body)).status == 200
         change = await anext(changes)
         assert (change.name, change.by) == ("A", "us for anna@127.0.0.1 (calibrate.py)")

@@ -145,9 +145,9 @@ class ExtendedParams(Machine):
         read.is_of_caller = True
         return read
 
-    def write(self, name: str, value: ExtValue, now: float, asker: str | None = None) -> ExtWrite:
+    def write(self, name: str, value: ExtValue, now: float, author: str | None = None) -> ExtWrite:
         """Write one parameter; end it with `writes.cancel`."""
-        return self.writes.set(name, value, now, asker)
+        return self.writes.set(name, value, now, author)
 
     def begin_fetch(self, now: float) -> ExtFetch:
         """Begin a fetch, or join the one in progress; give it back with `fetches.end`."""

@@ -82,12 +82,12 @@ class ExtWrite(Operation[ExtSetResult]):
     """
 
     def __init__(
-        self, name: str, value: ExtValue, policy: RetryPolicy, begun_at: float, asker: str | None
+        self, name: str, value: ExtValue, policy: RetryPolicy, begun_at: float, author: str | None
     ) -> None:
         super().__init__(begun_at)
         self.name = name
         self.value = value
-        self.by = by_us(asker)
+        self.by = by_us(author)
         self.request = ExtWriteAttempts(policy)
         self.wanted: ExtParam | None = None
         self.before: ExtParam | None = None
@@ -170,9 +170,9 @@ class ExtWrites(Machine):
         write = self._active(name)
         return None if write is None else write.by
 
-    def set(self, name: str, value: ExtValue, now: float, asker: str | None = None) -> ExtWrite:
+    def set(self, name: str, value: ExtValue, now: float, author: str | None = None) -> ExtWrite:
         """Begin a write, after the open ones to the same name."""
-        write = ExtWrite(name, value, self._policy, now, asker)
+        write = ExtWrite(name, value, self._policy, now, author)
         queue = self.queues.setdefault(name, deque())
         queue.append(write)
         if len(queue) == 1:

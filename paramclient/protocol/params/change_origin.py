@@ -29,24 +29,24 @@ batch of responses up to 100 ms before it sends them, and a PARAM_SET meanwhile 
 _NO_SET: Final = ("", -math.inf, b"")
 
 
-def check_author(asker: str | None) -> str | None:
+def check_author(author: str | None) -> str | None:
     """Return the author of a change, checked for the history.
 
     Raises:
         UsageError: it is empty, too long, or contains more than printable ASCII.
     """
-    if asker is None:
+    if author is None:
         return None
-    if not 1 <= len(asker) <= AUTHOR_LENGTH_MAX or not (asker.isascii() and asker.isprintable()):
+    if not 1 <= len(author) <= AUTHOR_LENGTH_MAX or not (author.isascii() and author.isprintable()):
         raise UsageError(
-            f"asker must have 1 to {AUTHOR_LENGTH_MAX} printable ASCII characters, not {asker!r:.200}"
+            f"author must have 1 to {AUTHOR_LENGTH_MAX} printable ASCII characters, not {author!r:.200}"
         )
-    return asker
+    return author
 
 
-def by_us(asker: str | None) -> str:
+def by_us(author: str | None) -> str:
     """Return the author of a change by our own write: "us", or "us for NAME"."""
-    return BY_US if asker is None else BY_US_FOR + asker
+    return BY_US if author is None else BY_US_FOR + author
 
 
 def is_ours(by: str) -> bool:

@@ -98,7 +98,7 @@ class Write(Operation[SetResult]):
         value: WireValue,
         policy: RetryPolicy,
         begun_at: float,
-        asker: str | None = None,
+        author: str | None = None,
         *,
         settle: float = 0.0,
         is_forced: bool = False,
@@ -107,7 +107,7 @@ class Write(Operation[SetResult]):
         super().__init__(begun_at)
         self.name = name
         self.value = value
-        self.by = by_us(asker)
+        self.by = by_us(author)
         self.settle = settle
         self.is_forced = is_forced
         self.is_filed = is_filed
@@ -214,7 +214,7 @@ class Writes(Machine):
         name: str,
         value: WireValue,
         now: float,
-        asker: str | None = None,
+        author: str | None = None,
         *,
         settle: float = 0.0,
         force: bool = False,
@@ -227,7 +227,7 @@ class Writes(Machine):
         gives it up with `unfile`.
         """
         write = Write(
-            *(name, value, self._retry_policy, now, asker), settle=settle, is_forced=force, is_filed=filed
+            *(name, value, self._retry_policy, now, author), settle=settle, is_forced=force, is_filed=filed
         )
         self.asked += 1
         queue = self.queues.setdefault(name, deque())

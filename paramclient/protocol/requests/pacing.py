@@ -62,10 +62,10 @@ class LinkBandwidth:
         each: requests per second for each of them.
     """
 
-    __slots__ = ("_askers", "_best", "_best_rate", "_came", "_sent", "_streams", "each")
+    __slots__ = ("_best", "_best_rate", "_came", "_paces", "_sent", "_streams", "each")
 
     def __init__(self) -> None:
-        self._askers: set[Pace] = set()
+        self._paces: set[Pace] = set()
         self._streams: dict[Pace, tuple[float, float]] = {}
         self._best: set[Pace] = set()  # with the lists of the best rate so far
         self._best_rate = self._sent = self._came = 0.0  # the sums, as each request uses all of it
@@ -73,12 +73,12 @@ class LinkBandwidth:
 
     def join(self, pace: Pace) -> None:
         """Add a component with open requests."""
-        self._askers.add(pace)
+        self._paces.add(pace)
         self._divide()
 
     def leave(self, pace: Pace) -> None:
         """Remove a component without open requests."""
-        self._askers.discard(pace)
+        self._paces.discard(pace)
         self._divide()
 
     def stream_seen(self, pace: Pace, rate: float, loss: float) -> None:
@@ -112,7 +112,7 @@ class LinkBandwidth:
         values = max(self._best_rate, self._rate())
         if values > 0.0:
             requests = values * VALUE_SIZE * UPSTREAM_SHARE / REQUEST_SIZE
-            self.each = max(requests, RATE_MIN) / max(len(self._askers), 1)
+            self.each = max(requests, RATE_MIN) / max(len(self._paces), 1)
 
 
 class Pace:

@@ -1,7 +1,7 @@
 /** Requests to the service, and its event stream. */
 
-/** Value of X-Asker in every request: the page recognizes its own changes by it. */
-export const ASKER = `page-${crypto.getRandomValues(new Uint16Array(1))[0].toString(16).padStart(4, "0")}`;
+/** Value of X-Author in every request: the page recognizes its own changes by it. */
+export const AUTHOR = `page-${crypto.getRandomValues(new Uint16Array(1))[0].toString(16).padStart(4, "0")}`;
 const BASE = "/api/v1";
 const REQUEST_TIMEOUT = 15_000;
 const PULSE = 10_000;
@@ -73,7 +73,7 @@ async function exchange(method, address, body, timeout) {
 
 async function attempt(method, address, body, timeout) {
   const ends = AbortSignal.timeout(timeout);
-  const options = { method, signal: ends, headers: { "X-Asker": ASKER }, cache: "no-store" };
+  const options = { method, signal: ends, headers: { "X-Author": AUTHOR }, cache: "no-store" };
   if (body instanceof Blob) {
     options.body = body;
     options.headers["Content-Type"] = "application/octet-stream";

@@ -1,6 +1,6 @@
 /** The state of the page: vehicles, tables, staged and written changes. Contains no rendering. */
 
-import { ASKER, at, get } from "./api.js";
+import { AUTHOR, at, get } from "./api.js";
 import { meaningOf, sameText, textOf } from "./values.js";
 
 /** Milliseconds for which changes by other clients are highlighted. */
@@ -328,7 +328,7 @@ class Store {
     const row = table.change(event);
     if (row?.info?.is_volatile) row.news = null;
     else if (row) {
-      if (event.by?.includes(ASKER)) row.news = null;
+      if (event.by?.includes(AUTHOR)) row.news = null;
       else this.tell("news", { key, row });
     }
     if (key === this.selected) this.tell("table");
@@ -384,7 +384,7 @@ const kept = (vehicle, { component, count, autopilot }) => ({
 /** Names the source of a change. */
 export function authorOf(by) {
   if (!by || by === "vehicle") return "the vehicle";
-  if (by.includes(ASKER)) return "you";
+  if (by.includes(AUTHOR)) return "you";
   if (by === "us") return "the service";
   return by.startsWith("us for ") ? by.slice(7) : by;
 }

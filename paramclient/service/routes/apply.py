@@ -164,7 +164,7 @@ async def apply_(
     """
     if body.dry_run:
         return await plan(request, hub, target, body)
-    asker = author_of(request)
+    author = author_of(request)
 
     async def work(publish_progress: Callable[[ApplyProgress], None]) -> ApplyResult:
         return await apply(
@@ -179,7 +179,7 @@ async def apply_(
             renames=await read_renames(hub, body.renames),
             durable=body.durable,
             timeout=body.timeout_s,
-            asker=asker,
+            author=author,
             progress=publish_progress,
         )
 
@@ -197,7 +197,7 @@ async def restore_(
     request: Request, hub: HubArgument, target: Target, body: RestoreRequest
 ) -> Document | Response:
     """Restore an earlier state of a component, with its own identity and calibration."""
-    asker = author_of(request)
+    author = author_of(request)
     if body.dry_run:
         with long_request(request):
             found = await run_until_disconnect(request, lambda: _plan_back(hub, target, body), target)
@@ -214,7 +214,7 @@ async def restore_(
             allow_armed=body.allow_armed,
             force=body.force,
             timeout=body.timeout_s,
-            asker=asker,
+            author=author,
             progress=publish_progress,
         )
 

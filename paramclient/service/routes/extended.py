@@ -252,12 +252,12 @@ async def write_extended(
     request: Request, target: Target, name: str, body: ExtWriteRequest
 ) -> ExtSetResultDoc:
     """Write one extended parameter, and wait until the component has acknowledged the value."""
-    asker = author_of(request)
+    author = author_of(request)
 
     async def work() -> ExtSetResultDoc:
         value = await _resolve(target, name, body.value)
         result = await target.extended.ext.set(
-            name, value, timeout=body.timeout_s, durable=body.durable, asker=asker
+            name, value, timeout=body.timeout_s, durable=body.durable, author=author
         )
         return ExtSetResultDoc.of(result)
 
@@ -271,7 +271,7 @@ async def write_many_extended(request: Request, target: Target, body: ExtWriteMa
     A refused value does not stop the others. After the loss of the component or the timeout, `problem` says
     why the remaining values were not tried.
     """
-    asker = author_of(request)
+    author = author_of(request)
     results: dict[str, ExtSetResultDoc | NotSetDoc] = {}
     resolved: dict[str, ExtValue] = {}
 
@@ -288,7 +288,7 @@ async def write_many_extended(request: Request, target: Target, body: ExtWriteMa
                 tasks.start_soon(resolve, name)
         pairs = [(name, resolved[name]) for name in body.values if name in resolved]
         return await target.extended.ext.set_many(
-            pairs, timeout=body.timeout_s, durable=body.durable, asker=asker
+            pairs, timeout=body.timeout_s, durable=body.durable, author=author
         )
 
     done = await run_until_disconnect(request, work, target)
@@ -355,11 +355,11 @@ async def plan_extended(request: Request, target: Target, body: ExtPlanRequest) 
 @router.post("/apply", dependencies=[Depends(require_write)])
 async def apply_extended_(request: Request, target: Target, body: ExtApplyRequest) -> ExtApplyResultDoc:
     """Write the wanted extended parameters that differ, and verify them by another download."""
-    asker = author_of(request)
+    author = author_of(request)
 
     async def work() -> ExtApplyResultDoc:
         result = await apply_extended(
-            target.component, body.wanted_set, durable=body.durable, timeout=body.timeout_s, asker=asker
+            target.component, body.wanted_set, durable=body.durable, timeout=body.timeout_s, author=author
         )
         return _applied(result)
 
@@ -369,12 +369,12 @@ async def apply_extended_(request: Request, target: Target, body: ExtApplyReques
 @router.post("/restore", dependencies=[Depends(require_write)])
 async def restore_extended_(request: Request, target: Target, body: ExtRestoreRequest) -> ExtApplyResultDoc:
     """Restore an earlier state of the extended parameters of a component."""
-    asker = author_of(request)
+    author = author_of(request)
 
     async def work() -> ExtApplyResultDoc:
         state = await load_extended_state(target.component, body.when)
         result = await restore_extended(
-            target.component, state, durable=body.durable, timeout=body.timeout_s, asker=asker
+            target.component, state, durable=body.durable, timeout=body.timeout_s, author=author
         )
         return _applied(result)
 

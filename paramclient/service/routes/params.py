@@ -166,8 +166,8 @@ async def read_by_path(request: Request, target: Target, name: str, body: ReadBy
 @router.put("/params/{name:path}", dependencies=[Depends(require_write)])
 async def write(request: Request, target: Target, name: str, body: WriteRequest) -> SetResultDoc:
     """Write one parameter, and verify the value that the vehicle reports."""
-    asker = author_of(request)
-    return await run_until_disconnect(request, lambda: _write(target, name, body.value, body, asker), target)
+    author = author_of(request)
+    return await run_until_disconnect(request, lambda: _write(target, name, body.value, body, author), target)
 
 
 @router.patch("/params", dependencies=[Depends(require_write)])
@@ -177,7 +177,7 @@ async def write_many(request: Request, target: Target, body: WriteManyRequest) -
     A refused value does not stop the others. After the loss of the vehicle or the timeout, `problem` says why
     the remaining values were not tried.
     """
-    asker = author_of(request)
+    author = author_of(request)
     results: dict[str, SetResultDoc | NotSetDoc] = {}
     resolved: dict[str, WireValue] = {}
 
@@ -199,7 +199,7 @@ async def write_many(request: Request, target: Target, body: WriteManyRequest) -
             settle=body.settle_s,
             force=body.force,
             durable=body.durable,
-            asker=asker,
+            author=author,
         )
 
     done = await run_until_disconnect(request, work, target)
@@ -233,7 +233,7 @@ def _document_of(outcome: SetOutcome) -> SetResultDoc | NotSetDoc:
 
 
 async def _write(
-    target: FollowedComponent, name: str, given: ValueInput, body: WriteRequest, asker: str
+    target: FollowedComponent, name: str, given: ValueInput, body: WriteRequest, author: str
 ) -> SetResultDoc:
     value = await resolve_value(target, name, given)
     result = await target.component.set(
@@ -243,7 +243,7 @@ async def _write(
         settle=body.settle_s,
         force=body.force,
         durable=body.durable,
-        asker=asker,
+        author=author,
     )
     target.record_received(result.param.name)
     return SetResultDoc.of(result)

@@ -35,7 +35,7 @@ async def me(request: Request) -> TokenHolderDoc:
     """Return name and permissions of the client."""
     state = request.scope["state"]
     return TokenHolderDoc(
-        name=state["name"], asker=author_of(request), role=state["role"], read_only=state["read_only"]
+        name=state["name"], author=author_of(request), role=state["role"], read_only=state["read_only"]
     )
 
 

@@ -47,8 +47,8 @@ class Desk:
         self.reads.is_idle = False
         self.writes = Writes(self.context, self.reads, self.table, permission=self)
 
-    def set(self, name: str, value: WireValue, asker: str | None = None) -> Write:
-        return self.writes.set(name, value, self.now, asker)
+    def set(self, name: str, value: WireValue, author: str | None = None) -> Write:
+        return self.writes.set(name, value, self.now, author)
 
     def hear(
         self, name: str, value: WireValue, kind: int = ParamType.REAL32, *, at: float | None = None
