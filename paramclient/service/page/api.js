@@ -3,9 +3,12 @@
 /** Value of X-Author in every request: the page recognizes its own changes by it. */
 export const AUTHOR = `page-${crypto.getRandomValues(new Uint16Array(1))[0].toString(16).padStart(4, "0")}`;
 const BASE = "/api/v1";
+/** Timeout of a request in milliseconds. */
 const REQUEST_TIMEOUT = 15_000;
-const PULSE = 10_000;
-const LONGEST_PAUSE = 10_000;
+/** Milliseconds between two checks whether the service responds. */
+const CHECK_INTERVAL = 10_000;
+/** Maximum milliseconds between two attempts to open the event stream. */
+const RETRY_INTERVAL_MAX = 10_000;
 const KINDS = [
   ...["hello", "component", "change", "params", "resynced", "progress", "job", "link", "gap"],
   ...["extended_change", "extended_params", "extended_progress"],
@@ -109,7 +112,7 @@ export class Stream {
     this.pause = 500;
     this.source = null;
     addEventListener("online", () => this.open());
-    setInterval(() => this.checkConnection(), PULSE);
+    setInterval(() => this.checkConnection(), CHECK_INTERVAL);
   }
 
   open() {
@@ -126,7 +129,7 @@ export class Stream {
     source.onerror = () => {
       if (source !== this.source) return;
       this.standing(false);
-      if (source.readyState === EventSource.CLOSED) this.again();
+      if (source.readyState === EventSource.CLOSED) this.retryLater();
     };
   }
 
@@ -142,24 +145,24 @@ export class Stream {
   }
 
   /** Handles the end of the browser's attempts: a token may be required, or the service is not running. */
-  again() {
+  retryLater() {
     this.source?.close();
     this.waiting = setTimeout(async () => {
       try {
         await get("/me");
         this.open();
       } catch {
-        this.again();
+        this.retryLater();
       }
     }, this.pause);
-    this.pause = Math.min(LONGEST_PAUSE, this.pause * 2);
+    this.pause = Math.min(RETRY_INTERVAL_MAX, this.pause * 2);
   }
 
   /** Reconnects after a silence: a lost network does not close the connection. */
   async checkConnection() {
     if (document.hidden || this.source?.readyState !== EventSource.OPEN) return;
     try {
-      await fetch("/health", { signal: AbortSignal.timeout(PULSE / 2), cache: "no-store" });
+      await fetch("/health", { signal: AbortSignal.timeout(CHECK_INTERVAL / 2), cache: "no-store" });
       if (this.isNumb) this.open();
       this.isNumb = false;
     } catch {

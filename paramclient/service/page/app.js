@@ -8,10 +8,10 @@ import { announce, button, byId, el, isNarrow, onceAFrame, setText } from "./dom
 import { CellEditor } from "./editor.js";
 import { hasExtended } from "./extended.js";
 import { Grid } from "./grid.js";
-import { nameOf, review, told, undo } from "./review.js";
-import { NEWS_FOR, OTHERS, store } from "./store.js";
+import { nameOf, outcomesText, review, undo } from "./review.js";
+import { HIGHLIGHT_TIME, OTHERS, store } from "./store.js";
 import { defaultOf, many, parse } from "./values.js";
-import { complain, drawActions, drawVehicles, offerDescriptions } from "./vehicles.js";
+import { drawActions, drawVehicles, offerDescriptions, showError } from "./vehicles.js";
 
 const FILTERS = {
   all: { text: "All", has: () => true },
@@ -183,7 +183,7 @@ function drawEmpty(count, total) {
 
 function emptyText(count, total, component, table) {
   if (count) return "";
-  if (!component) return store.isHeard ? "No vehicle found yet. Vehicles appear here automatically." : "";
+  if (!component) return store.isConnected ? "No vehicle found yet. Vehicles appear here automatically." : "";
   if (!total)
     return component.fetch
       ? "Loading the parameters."
@@ -215,7 +215,7 @@ function drawBar() {
     );
   } else if (sent) {
     bar.replaceChildren(
-      el("span", { text: `Sent: ${told(sent.outcomes)}` }),
+      el("span", { text: `Sent: ${outcomesText(sent.outcomes)}` }),
       sent.outcomes.some((each) => each.isTaken) ? button("Undo …", undo, { kind: "quiet", drawing: "undo" }) : "",
       button(
         "",
@@ -292,21 +292,21 @@ store.on("news", ({ key, row }) => {
 });
 setInterval(() => {
   for (const table of store.tables.values())
-    for (const row of table.rows.values()) if (row.news && Date.now() - row.news.at > NEWS_FOR) row.news = null;
+    for (const row of table.rows.values()) if (row.news && Date.now() - row.news.at > HIGHLIGHT_TIME) row.news = null;
   draw();
 }, 60_000);
 
 const stream = new Stream({
   begin: () =>
     store.begin().catch((error) => {
-      complain(error);
+      showError(error);
       setTimeout(() => stream.open(), 2000);
     }),
   take: (event) => store.take(event),
   standing: (isOpen) => {
-    if (store.isHeard === isOpen) return;
-    const before = store.isHeard;
-    store.isHeard = isOpen;
+    if (store.isConnected === isOpen) return;
+    const before = store.isConnected;
+    store.isConnected = isOpen;
     byId("away").hidden = isOpen;
     setText(
       byId("away"),
@@ -339,7 +339,7 @@ byId("search").addEventListener("keydown", (event) => {
   }
 });
 byId("group-choice").addEventListener("change", () => choose({ group: byId("group-choice").value }));
-byId("vehicle-choice").addEventListener("change", () => store.select(byId("vehicle-choice").value).catch(complain));
+byId("vehicle-choice").addEventListener("change", () => store.select(byId("vehicle-choice").value).catch(showError));
 byId("tools").append(
   button("", showKeys, { kind: "quiet only", drawing: "help", label: "Keys" }),
   button("", turnTheme, { kind: "quiet only", drawing: "theme", label: "Dark or light" }),

@@ -4,16 +4,18 @@ import { Problem, at, get, request } from "./api.js";
 import { announce, button, byId, el, setText } from "./dom.js";
 import { closeDialog, openDialog } from "./dialogs.js";
 import { valueText } from "./details.js";
-import { Caution, OUTCOMES, nameOf, told } from "./review.js";
+import { Caution, OUTCOMES, nameOf, outcomesText } from "./review.js";
 import { keyOf, store } from "./store.js";
 import { many, moment, numberText } from "./values.js";
 
 /** Maximum size of a parameter file in bytes, which is also the limit of the service. */
-const LARGEST_FILE = 2 * 2 ** 20;
+const FILE_BYTES_MAX = 2 * 2 ** 20;
 /** Maximum size of a file of changed names in bytes, which is also the limit of the service. */
-const LARGEST_RENAMES = 2 ** 20;
+const RENAMES_BYTES_MAX = 2 ** 20;
+/** Timeout of a plan in milliseconds. */
 const PLAN_TIMEOUT = 120_000;
-const JOB_PAUSE = 300;
+/** Milliseconds between two requests for the state of a job. */
+const JOB_POLL_INTERVAL = 300;
 
 /** Asks what to compare with; `file` is a file dropped onto the page. */
 export async function chooseOther(file = null) {
@@ -68,7 +70,7 @@ export function setOther(other) {
 }
 
 async function fromFile(file) {
-  if (file.size > LARGEST_FILE)
+  if (file.size > FILE_BYTES_MAX)
     throw new Problem(0, { detail: `${file.name} has ${file.size} bytes; that is no parameter file.` });
   const read = await request("POST", `/files?${new URLSearchParams({ name: file.name })}`, file);
   const source = { file: { name: file.name, base64: await base64(file) } };
@@ -286,7 +288,7 @@ export async function takeOver() {
     }
     table.sent = { names: new Set(chosen.map((line) => line.here)), outcomes, at: Date.now() };
     const late = result.reboot_required ?? [];
-    summary.textContent = `${told(outcomes)}${late.length ? ` Takes effect after a reboot of the vehicle: ${late.join(", ")}.` : ""}`;
+    summary.textContent = `${outcomesText(outcomes)}${late.length ? ` Takes effect after a reboot of the vehicle: ${late.join(", ")}.` : ""}`;
     fault.textContent = result.error ?? ended.problem?.detail ?? "";
     announce(summary.textContent);
     store.tell("pending");
@@ -297,7 +299,7 @@ export async function takeOver() {
     const file = renamesInput.files[0];
     fault.textContent = "";
     renames = null;
-    if (file && file.size > LARGEST_RENAMES)
+    if (file && file.size > RENAMES_BYTES_MAX)
       fault.textContent = `${file.name} has ${file.size} bytes; that is no file of names.`;
     else if (file) renames = { name: file.name, text: await file.text() };
     await makePlan();
@@ -368,8 +370,8 @@ function linesOf(plan, table, other, refresh) {
       const here = planned.vehicle_name ?? name;
       const row = table.rows.get(here);
       const { status } = planned;
-      const isDoubtful = status === "invalid" && planned.category === "out-of-range";
-      const isOut = !row || planned.category === "missing" || (status === "invalid" && !isDoubtful);
+      const isOutOfRange = status === "invalid" && planned.category === "out-of-range";
+      const isOut = !row || planned.category === "missing" || (status === "invalid" && !isOutOfRange);
       const box = el("input", {
         type: "checkbox",
         checked: status === "set",
@@ -377,11 +379,11 @@ function linesOf(plan, table, other, refresh) {
         "aria-label": `Set ${name}`,
         on: { change: refresh },
       });
-      const word = status === "set" ? "" : isOut ? "cannot be set" : isDoubtful ? "doubtful" : "left out";
+      const word = status === "set" ? "" : isOut ? "cannot be set" : isOutOfRange ? "doubtful" : "left out";
       const remark = el(
         "td",
         { class: "remark" },
-        word && el("b", { class: `outcome ${isDoubtful ? "warn" : "quiet"}`, text: word }),
+        word && el("b", { class: `outcome ${isOutOfRange ? "warn" : "quiet"}`, text: word }),
         ` ${(planned.reason || purposes.get(name) || "").replace(/^left out: /, "")}`,
       );
       const now = el("td", { class: "now" });
@@ -416,6 +418,6 @@ async function followJob(begun, tell) {
     } catch (error) {
       if (error.status !== 0) throw error;
     }
-    await new Promise((resolve) => setTimeout(resolve, JOB_PAUSE));
+    await new Promise((resolve) => setTimeout(resolve, JOB_POLL_INTERVAL));
   }
 }

@@ -6,7 +6,8 @@ import { editorOf } from "./editor.js";
 import { authorOf, store } from "./store.js";
 import { defaultOf, defaultSourceOf, meaningOf, moment, newsText, numberText, parse, rangeOf, span, textOf } from "./values.js";
 
-const MOST_HISTORY = 20;
+/** History entries shown, at most. */
+const HISTORY_ENTRIES_MAX = 20;
 const TRUST = {
   live: "heard from the vehicle",
   verified: "from the cache, confirmed by the vehicle",
@@ -140,7 +141,7 @@ export class Details {
     const component = store.component;
     if (!component) return;
     try {
-      const found = await get(at(component, "/history", { name: row.name, limit: MOST_HISTORY }));
+      const found = await get(at(component, "/history", { name: row.name, limit: HISTORY_ENTRIES_MAX }));
       if (this.name !== row.name) return;
       const entries = [...found.history].sort((a, b) => timeOf(b) - timeOf(a));
       this.past.replaceChildren(...entries.map((entry) => this.entry(entry, row)));

@@ -67,7 +67,7 @@ export function setAttribute(element, name, value) {
 export function announce(text) {
   const region = byId("spoken");
   region.append(el("p", { text }));
-  while (region.children.length > MOST_SPOKEN) region.firstChild.remove();
+  while (region.children.length > ANNOUNCEMENTS_MAX) region.firstChild.remove();
 }
 
 /** Returns a function that runs once per frame for all its calls. */
@@ -77,7 +77,7 @@ export function onceAFrame(work) {
     if (isDue) return;
     isDue = true;
     // a hidden page gets no frames, but must be current when it is shown again
-    const begin = document.hidden ? (run) => setTimeout(run, HIDDEN_PAUSE) : requestAnimationFrame;
+    const begin = document.hidden ? (run) => setTimeout(run, HIDDEN_FRAME_INTERVAL) : requestAnimationFrame;
     begin(() => {
       isDue = false;
       work();
@@ -89,8 +89,10 @@ export function onceAFrame(work) {
 export const isNarrow = () => matchMedia("(max-width: 760px)").matches;
 
 const SVG = "http://www.w3.org/2000/svg";
-const MOST_SPOKEN = 5;
-const HIDDEN_PAUSE = 200;
+/** Announcements that a screen reader still finds, at most. */
+const ANNOUNCEMENTS_MAX = 5;
+/** Milliseconds between two renderings of a hidden page. */
+const HIDDEN_FRAME_INTERVAL = 200;
 const PROPERTIES = { value: 1, checked: 1, disabled: 1, hidden: 1, indeterminate: 1, selected: 1, max: 1 };
 const DRAWINGS = {
   search: "M7 2.5a4.5 4.5 0 1 0 0 9 4.5 4.5 0 0 0 0-9ZM10.4 10.4 14 14",

@@ -1,7 +1,7 @@
 /** Editors of a value: a number with its range, a list of named values, or check boxes for bits. */
 
 import { button, byId, el, isNarrow } from "./dom.js";
-import { defaultOf, doubt, isFloat, maskOf, parse, rangeOf, sameText, textOf, textOfMask } from "./values.js";
+import { defaultOf, isFloat, maskOf, parse, rangeOf, sameText, textOf, textOfMask, warningOf } from "./values.js";
 
 const OTHER = "other";
 
@@ -17,11 +17,11 @@ export function editorOf(row, pending, { stage, leave, isCompact = true }) {
   const fault = el("p", { class: "fault", role: "alert" });
   const doubts = el("p", { class: "doubt", role: "status" });
   const news = el("p", { class: "doubt", role: "status" });
-  const say = (read) => {
+  const report = (read) => {
     fault.textContent = read.error ?? "";
-    doubts.textContent = read.error ? "" : doubt(read.text, info, type);
+    doubts.textContent = read.error ? "" : warningOf(read.text, info, type);
   };
-  const input = inputOf(row, value, hint.id, say);
+  const input = inputOf(row, value, hint.id, report);
   const form = el(
     "form",
     {
@@ -32,7 +32,7 @@ export function editorOf(row, pending, { stage, leave, isCompact = true }) {
         submit: (event) => {
           event.preventDefault();
           const read = input.read();
-          say(read);
+          report(read);
           if (read.error) input.first.focus();
           else {
             stage(read.text, read.send);
@@ -121,14 +121,14 @@ export class CellEditor {
   }
 }
 
-function inputOf(row, value, hintId, say) {
+function inputOf(row, value, hintId, report) {
   const { info, type } = row;
-  if (info?.bits && maskOf(value, type) !== null) return boxes(row, value, say);
-  if (info?.values) return list(row, value, hintId, say);
-  return number(row, value, hintId, say);
+  if (info?.bits && maskOf(value, type) !== null) return boxes(row, value, report);
+  if (info?.values) return list(row, value, hintId, report);
+  return number(row, value, hintId, report);
 }
 
-function number(row, value, hintId, say) {
+function number(row, value, hintId, report) {
   const { info, type, name } = row;
   const first = el("input", {
     class: "number",
@@ -140,7 +140,7 @@ function number(row, value, hintId, say) {
     "aria-label": `Value of ${name}`,
     "aria-describedby": hintId,
     on: {
-      input: () => say(parse(first.value, type)),
+      input: () => report(parse(first.value, type)),
       keydown: (event) => {
         if (event.key !== "ArrowUp" && event.key !== "ArrowDown") return;
         event.preventDefault();
@@ -151,13 +151,13 @@ function number(row, value, hintId, say) {
           (info?.increment ?? (isFloat(type) ? 0.1 : 1)) *
           (event.shiftKey ? 10 : 1);
         first.value = stepped(read.text, step, type);
-        say(parse(first.value, type));
+        report(parse(first.value, type));
       },
     },
   });
   const write = (text) => {
     first.value = text;
-    say(parse(text, type));
+    report(parse(text, type));
     first.focus();
   };
   return {
@@ -168,10 +168,10 @@ function number(row, value, hintId, say) {
   };
 }
 
-function list(row, value, hintId, say) {
+function list(row, value, hintId, report) {
   const { info, type, name } = row;
   const plain = (text) => text.replace(/\.0$/, "");
-  const field = number(row, value, hintId, say);
+  const field = number(row, value, hintId, report);
   const options = Object.entries(info.values).sort(([a], [b]) => Number(a) - Number(b));
   const isNamed = options.some(([each]) => each === plain(value));
   const first = el(
@@ -183,7 +183,7 @@ function list(row, value, hintId, say) {
         change: () => {
           field.first.hidden = first.value !== OTHER;
           if (first.value === OTHER) field.first.focus();
-          else say(parse(first.value, type));
+          else report(parse(first.value, type));
         },
       },
     },
@@ -207,7 +207,7 @@ function list(row, value, hintId, say) {
   };
 }
 
-function boxes(row, value, say) {
+function boxes(row, value, report) {
   const { info, type, name } = row;
   let mask = maskOf(value, type);
   const total = el("output", { class: "mask" });
@@ -223,7 +223,7 @@ function boxes(row, value, say) {
         change: () => {
           mask ^= 1n << BigInt(bit);
           show();
-          say(parse(text(), type));
+          report(parse(text(), type));
         },
       },
     });

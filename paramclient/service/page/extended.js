@@ -10,7 +10,7 @@ import { isFloat, isWhole, many, numberText, parse } from "./values.js";
 /** Prefix of a value that is given as bytes in hexadecimal digits. */
 const HEX = "hex:";
 /** Timeout in milliseconds for a list, and for a change that the component reports to be in progress. */
-const SLOW_TIMEOUT = 180_000;
+const EXTENDED_TIMEOUT = 180_000;
 
 /** Shows the button of the dialog for a component that has extended parameters, or usually has them. */
 export function offerExtended() {
@@ -139,11 +139,11 @@ export async function showExtended() {
     const missed = early;
     early = null;
     missed.forEach(change);
-    tellCount();
+    showCount();
     refresh();
   }
 
-  function tellCount() {
+  function showCount() {
     setText(state, lines.size ? many(lines.size, "extended parameter") : "None are known yet. Fetch requests them.");
   }
 
@@ -163,7 +163,7 @@ export async function showExtended() {
     if (event && keyOf(event) !== key) return;
     if (event?.type === "extended_change") early ? early.push(event) : change(event);
     else if (event?.type === "extended_progress") {
-      if (event.done) tellCount();
+      if (event.done) showCount();
       else setText(state, `Fetching ${event.received}${event.total ? ` of ${event.total}` : ""} …`);
     } else attempt(load);
   });
@@ -182,7 +182,7 @@ export async function showExtended() {
     fetch_.disabled = true;
     setText(state, "Fetching …");
     await attempt(async () => {
-      const done = await request("POST", at(component, "/extended/fetch"), {}, { timeout: SLOW_TIMEOUT });
+      const done = await request("POST", at(component, "/extended/fetch"), {}, { timeout: EXTENDED_TIMEOUT });
       await load();
       const missing = done.missing.length ? `, ${done.missing.length} are missing` : "";
       announce(`${many(done.received, "extended parameter")} received${missing}.`);
@@ -201,7 +201,7 @@ export async function showExtended() {
     line.tell("Sending …");
     try {
       const body = { values: { [param.name]: value } };
-      const answer = await request("PATCH", at(component, "/extended/params"), body, { timeout: SLOW_TIMEOUT });
+      const answer = await request("PATCH", at(component, "/extended/params"), body, { timeout: EXTENDED_TIMEOUT });
       const { status, problem, param: now } = answer.results[param.name];
       if (now) {
         line.text = field.value; // what was typed is sent

@@ -6,8 +6,10 @@
 import { byId, el, isNarrow, setAttribute, setText } from "./dom.js";
 import { defaultOf, defaultSourceOf, newsText, textOf } from "./values.js";
 
-const SPARE = 10;
-const SETTLED = 120;
+/** Rows rendered above and below the visible ones. */
+const OVERSCAN_ROWS = 10;
+/** Milliseconds without scrolling after which it has ended. */
+const SCROLL_END_DELAY = 120;
 
 export class Grid {
   /** `open(row)` edits, `show(row)` opens the details, `moved(row)` reports the selected row; `table()` is the shown table. */
@@ -64,8 +66,8 @@ export class Grid {
   /** Renders the rows that have become visible, in the elements of rows that are no longer visible. */
   draw(isAnew = true) {
     const top = Math.max(0, this.root.scrollTop - this.top);
-    const from = Math.max(0, Math.floor(top / this.height) - SPARE);
-    const to = Math.min(this.rows.length, Math.ceil((top + this.view) / this.height) + SPARE);
+    const from = Math.max(0, Math.floor(top / this.height) - OVERSCAN_ROWS);
+    const to = Math.min(this.rows.length, Math.ceil((top + this.view) / this.height) + OVERSCAN_ROWS);
     for (const [index, made] of this.made) {
       if (index < from || index >= to) {
         this.made.delete(index);
@@ -83,7 +85,7 @@ export class Grid {
     }
     for (const made of this.spare) made.row.hidden = true;
     clearTimeout(this.settling);
-    this.settling = setTimeout(() => this.settle(), SETTLED);
+    this.settling = setTimeout(() => this.settle(), SCROLL_END_DELAY);
     const shown = this.made.get(this.index);
     setAttribute(this.root, "aria-activedescendant", shown ? shown.row.id : null);
   }
@@ -154,7 +156,7 @@ export class Grid {
     const kind = states.filter(Boolean).join(" ");
     if (element.className !== kind) element.className = kind;
     setAttribute(element, "aria-selected", index === this.index);
-    setAttribute(made.value, "aria-description", said(row, pending));
+    setAttribute(made.value, "aria-description", rowDescription(row, pending));
     setAttribute(
       element,
       "title",
@@ -225,7 +227,7 @@ export class Grid {
 }
 
 /** Describes the marks of a row in words. */
-function said(row, pending) {
+function rowDescription(row, pending) {
   const words = [
     pending && `staged: ${pending.text}`,
     row.isChanged && "changed from default",

@@ -5,7 +5,7 @@ import { announce, button, el, setText } from "./dom.js";
 import { closeDialog, openDialog } from "./dialogs.js";
 import { valueText } from "./details.js";
 import { keyOf, store } from "./store.js";
-import { defaultOf, doubt, many, meaningOf, sameText } from "./values.js";
+import { defaultOf, many, meaningOf, sameText, warningOf } from "./values.js";
 
 /** Values in one request, fewer than the service accepts. */
 const VALUES_PER_REQUEST = 1000;
@@ -122,12 +122,12 @@ export async function review() {
     sent = { names: new Set(lines.keys()), outcomes: [], at: Date.now() };
     table.sent = sent;
     const queue = [...lines.values()];
-    while (queue.length) sent.outcomes.push(...(await sendTogether(component, queue.splice(0, VALUES_PER_REQUEST))));
+    while (queue.length) sent.outcomes.push(...(await sendBatch(component, queue.splice(0, VALUES_PER_REQUEST))));
     for (const each of sent.outcomes) if (each.isTaken) table.pending.delete(each.name);
     isSending = false;
     store.tell("pending");
     store.tell("table");
-    const said = told(sent.outcomes);
+    const said = outcomesText(sent.outcomes);
     summary.textContent = said;
     announce(said);
     const late = sent.outcomes.filter((each) => each.isTaken && each.isLate).map((each) => each.name);
@@ -166,7 +166,7 @@ export function undo() {
 }
 
 /** Counts the results in words. */
-export function told(outcomes) {
+export function outcomesText(outcomes) {
   const counts = new Map();
   for (const { status } of outcomes) {
     const { text } = OUTCOMES[status] ?? { text: status };
@@ -224,7 +224,7 @@ function remarksOf({ text, before }, row) {
   if (info?.is_read_only) remarks.push("The vehicle sets it itself.");
   const standard = defaultOf(row.document);
   if (standard !== null && sameText(text, standard, type)) remarks.push("The default.");
-  return [doubt(text, info, type), remarks.join(" ")];
+  return [warningOf(text, info, type), remarks.join(" ")];
 }
 
 function inWords(value, row) {
@@ -233,7 +233,7 @@ function inWords(value, row) {
 }
 
 /** Writes changes in one request and shows the result of each in its row. Returns the outcomes. */
-async function sendTogether(component, lines) {
+async function sendBatch(component, lines) {
   const parts = lines.map((line) => ({ line, outcome: outcomeBefore(line) }));
   const open = parts.filter(({ outcome }) => outcome.status !== "skipped");
   for (const { line } of open) {

@@ -4,14 +4,15 @@ import { AUTHOR, at, get } from "./api.js";
 import { meaningOf, sameText, textOf } from "./values.js";
 
 /** Milliseconds for which changes by other clients are highlighted. */
-export const NEWS_FOR = 600_000;
+export const HIGHLIGHT_TIME = 600_000;
 /** Milliseconds until a table is loaded again after an error. */
-const LOAD_AGAIN_AFTER = 2_000;
-const FEWEST_OF_A_GROUP = 2;
+const RELOAD_DELAY = 2_000;
+/** Parameters with one prefix from which on they are a group. */
+const GROUP_SIZE_MIN = 2;
 export const OTHERS = "Others";
 
 /** Prefix of the keys of cached vehicles; no link name starts with it. */
-const KEPT = "kept:";
+const CACHED_PREFIX = "kept:";
 
 export const keyOf = (component) => `${component.link} ${component.system}/${component.component}`;
 
@@ -59,7 +60,7 @@ class Table {
       const counts = new Map();
       for (const row of this.order) counts.set(prefix(row), (counts.get(prefix(row)) ?? 0) + 1);
       for (const row of this.order) {
-        row.group = row.info?.group || (counts.get(prefix(row)) < FEWEST_OF_A_GROUP ? OTHERS : prefix(row));
+        row.group = row.info?.group || (counts.get(prefix(row)) < GROUP_SIZE_MIN ? OTHERS : prefix(row));
         this.groups.set(row.group, (this.groups.get(row.group) ?? 0) + 1);
       }
     }
@@ -146,7 +147,7 @@ class Store {
     this.links = new Map();
     this.kept = new Map();
     this.selected = null;
-    this.isHeard = null;
+    this.isConnected = null;
     this.seq = -1;
     this.early = null;
     this.listeners = new Map();
@@ -205,7 +206,7 @@ class Store {
     this.links = new Map(links.links.map((link) => [link.name, link]));
     const documents = new Map(found.components.map((each) => [keyOf(each), each]));
     const before = this.components.get(this.selected);
-    if (before && !documents.has(this.selected)) documents.set(this.selected, gone(before));
+    if (before && !documents.has(this.selected)) documents.set(this.selected, asLost(before));
     this.components = documents;
     this.seq = found.seq;
     const early = this.early;
@@ -225,7 +226,7 @@ class Store {
     } catch (error) {
       if (!error.status) throw error;
     }
-    const found = vehicles.flatMap((vehicle) => vehicle.components.map((each) => kept(vehicle, each)));
+    const found = vehicles.flatMap((vehicle) => vehicle.components.map((each) => asCached(vehicle, each)));
     this.kept = new Map(found.map((each) => [keyOf(each), each]));
     this.tell("components");
   }
@@ -266,7 +267,7 @@ class Store {
     this.tell("table");
     const load = table.loads;
     const again = () => load === table.loads && key === this.selected && this.loadTable(key).catch(() => {});
-    if (mayWork) setTimeout(again, LOAD_AGAIN_AFTER);
+    if (mayWork) setTimeout(again, RELOAD_DELAY);
   }
 
   tableOf(key) {
@@ -301,7 +302,7 @@ class Store {
     if (event.seq <= this.seq) return;
     if (event.why === "forgotten") {
       const before = this.components.get(key);
-      if (key === this.selected && before) this.components.set(key, gone(before));
+      if (key === this.selected && before) this.components.set(key, asLost(before));
       else this.components.delete(key);
       this.loadKept().catch(() => {});
       const table = this.tables.get(key);
@@ -362,11 +363,11 @@ class Store {
 const NO_TABLE = new Table();
 
 /** A selected component that the service has removed: the selection does not change without a user action. */
-const gone = (component) => ({ ...component, is_lost: true, is_armed: null, state: "lost", silence_s: 0, fetch: null });
+const asLost = (component) => ({ ...component, is_lost: true, is_armed: null, state: "lost", silence_s: 0, fetch: null });
 
 /** A cached component in the shape of a connected one: it can be viewed, not changed. */
-const kept = (vehicle, { component, count, autopilot }) => ({
-  link: KEPT + vehicle.key,
+const asCached = (vehicle, { component, count, autopilot }) => ({
+  link: CACHED_PREFIX + vehicle.key,
   system: vehicle.system,
   component,
   autopilot,

@@ -112,7 +112,7 @@ export function parse(written, type) {
 }
 
 /** Returns a warning about a value from its metadata; the vehicle decides. */
-export function doubt(text, info, type) {
+export function warningOf(text, info, type) {
   if (!info) return "";
   const units = info.units ? ` ${info.units}` : "";
   const number = Number(text);

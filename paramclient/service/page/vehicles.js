@@ -42,13 +42,13 @@ const TYPES = {
   26: "gimbal",
   30: "camera",
 };
-const AWAY = { away: "link away", failed: "link failed", opening: "link opening" };
+const LINK_PROBLEMS = { away: "link away", failed: "link failed", opening: "link opening" };
 
 /** Returns the state of a component in words and as the kind of its dot. */
 export function stateOf(component) {
   if (component.is_kept) return { text: `in the cache, heard last ${moment(component.last_seen)}`, kind: "idle" };
   const link = store.links.get(component.link)?.state ?? component.link_state ?? "open";
-  if (link !== "open") return { text: AWAY[link] ?? link, kind: "bad" };
+  if (link !== "open") return { text: LINK_PROBLEMS[link] ?? link, kind: "bad" };
   if (component.is_lost)
     return { text: `lost${component.silence_s ? ` for ${span(component.silence_s)}` : ""}`, kind: "bad" };
   if (component.fetch) return { text: progressText(component.fetch), kind: "busy" };
@@ -68,13 +68,13 @@ export function drawVehicles() {
   if (component?.is_kept && !unheard.includes(component)) unheard.unshift(component); // connected again
   drawList(byId("vehicles"), components);
   if (!components.length) byId("vehicles").append(el("li", { class: "nothing", text: "None found yet." }));
-  drawKept(unheard);
+  drawCached(unheard);
   drawChoice(components, unheard);
   drawVehicle(component);
 }
 
 /** Renders cached vehicles separately: there may be hundreds, and they do not change. */
-function drawKept(unheard) {
+function drawCached(unheard) {
   const box = byId("kept-box");
   const key = JSON.stringify([store.selected, unheard.map((each) => [keyOf(each), each.last_seen])]);
   if (box.dataset.shown === key) return;
@@ -95,7 +95,7 @@ function drawList(list, components) {
         { data: { key } },
         el(
           "button",
-          { type: "button", class: "vehicle", on: { click: () => store.select(key).catch(complain) } },
+          { type: "button", class: "vehicle", on: { click: () => store.select(key).catch(showError) } },
           el("i", { class: "dot" }),
           el("b"),
           el("small"),
@@ -176,7 +176,7 @@ export function drawActions() {
       id: "describe",
       hidden: true,
     }),
-    button("Extended", () => showExtended().catch(complain), {
+    button("Extended", () => showExtended().catch(showError), {
       drawing: "extended",
       label: "Extended parameters of the component: text and 64-bit numbers",
       id: "extended",
@@ -197,7 +197,7 @@ async function fetchAll() {
     await request("POST", at(store.component, "/fetch"), { refresh: true, wait: false });
     announce("Fetching all parameters.");
   } catch (error) {
-    complain(error);
+    showError(error);
   }
 }
 
@@ -267,7 +267,7 @@ async function stopFetch() {
     for (const job of running) await request("DELETE", `/jobs/${encodeURIComponent(job.id)}`);
     if (!running.length) announce("The service started this fetch; it cannot be stopped here.");
   } catch (error) {
-    complain(error);
+    showError(error);
   }
 }
 
@@ -275,9 +275,9 @@ async function keepState() {
   try {
     await request("POST", at(store.component, "/snapshots"), { reason: "kept by hand" });
     announce("Snapshot created.");
-    tellShortly("Snapshot created. Compare shows it.");
+    showBriefly("Snapshot created. Compare shows it.");
   } catch (error) {
-    complain(error);
+    showError(error);
   }
 }
 
@@ -288,7 +288,7 @@ async function save() {
   try {
     ({ forms } = await get("/forms"));
   } catch (error) {
-    complain(error);
+    showError(error);
     return;
   }
   const list = el(
@@ -335,14 +335,14 @@ async function save() {
 }
 
 /** Shows an error until the next message. */
-export function complain(error) {
-  tellShortly(error.message, true);
+export function showError(error) {
+  showBriefly(error.message, true);
   announce(error.message);
 }
 
 let hiding = null;
 
-function tellShortly(text, isBad = false) {
+function showBriefly(text, isBad = false) {
   let note = byId("note");
   if (!note) {
     note = el("p", { id: "note" });
