@@ -58,7 +58,7 @@ UPGRADE: Final = (
     "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="
 )
 MEGABYTE: Final = 1_000_000
-PATIENCE: Final = 60.0
+TIMEOUT: Final = 60.0
 """Seconds to wait for the start of a process, and for a response."""
 
 REACHED: Final = 1.0
@@ -166,7 +166,7 @@ class Service:
         told = self.folder / "loop"
         told.unlink(missing_ok=True)
         self.process.send_signal(signal.SIGUSR1)
-        deadline = time.monotonic() + PATIENCE
+        deadline = time.monotonic() + TIMEOUT
         while not told.exists() and time.monotonic() < deadline:
             time.sleep(0.01)
         longest, late = json.loads(told.read_text())
@@ -212,7 +212,7 @@ class Service:
             )
             try:
                 writer.write("\r\n".join([*lines, "", ""]).encode() + body)
-                data = await asyncio.wait_for(reader.read(), PATIENCE)
+                data = await asyncio.wait_for(reader.read(), TIMEOUT)
             finally:
                 writer.transport.abort()
         head, _, content = data.partition(b"\r\n\r\n")
@@ -224,7 +224,7 @@ class Service:
         for _ in range(times):
             began = time.monotonic()
             status, _ = await self.ask(source=source)
-            longest = max(longest, time.monotonic() - began if status == 200 else PATIENCE)
+            longest = max(longest, time.monotonic() - began if status == 200 else TIMEOUT)
         self.note(what, REACHED, longest, "s")
 
     def is_busy(self) -> bool:
@@ -240,7 +240,7 @@ class Service:
         began = time.monotonic()
         self.process.send_signal(signal.SIGTERM)
         try:
-            self.process.wait(PATIENCE)
+            self.process.wait(TIMEOUT)
         except subprocess.TimeoutExpired:
             self.process.kill()
         return time.monotonic() - began
@@ -410,7 +410,7 @@ async def requests(service: Service, quick: bool) -> None:
         began = time.monotonic()
         status, _ = await service.ask("GET", f"{C}/params", b"", token(WRITER))
         service.note(
-            "a read of another token", 2.0, time.monotonic() - began if status == 200 else PATIENCE, "s"
+            "a read of another token", 2.0, time.monotonic() - began if status == 200 else TIMEOUT, "s"
         )
     service.attack = "60 open bodies of 1 MB"
     head = [f"POST {C}/diff HTTP/1.1", f"Host: 127.0.0.1:{service.port}", token(READER)]
@@ -585,7 +585,7 @@ async def many_components(rows: list[Row], quick: bool) -> None:
     async with serving(rows, f"udpin:{HERE}:{port}", "--no-cache", "--no-fetch") as service:
         beating = asyncio.create_task(beat(port, count))
         try:
-            deadline = time.monotonic() + PATIENCE
+            deadline = time.monotonic() + TIMEOUT
             known = 0
             while known < count and time.monotonic() < deadline:
                 await asyncio.sleep(0.5)
@@ -799,7 +799,7 @@ async def guesses(service: Service, quick: bool) -> None:
         status, _ = await service.ask(
             "GET", "/api/v1/me", b"", token(READER), *filter(None, [shown[1]]), source=sources[1]
         )
-        took = time.monotonic() - began if status == 200 else PATIENCE
+        took = time.monotonic() - began if status == 200 else TIMEOUT
         service.note(f"right token, {proxy}", limit, took, "s")
 
 
@@ -855,7 +855,7 @@ async def killed_apply(rows: list[Row], quick: bool) -> None:
             status, answer = await service.ask("POST", f"{C}/apply", body)
             assert status == 202, answer
             name = json.loads(answer)["id"]
-            deadline = time.monotonic() + PATIENCE
+            deadline = time.monotonic() + TIMEOUT
             while time.monotonic() < deadline:
                 job = json.loads((await service.ask("GET", f"/api/v1/jobs/{name}"))[1])
                 if (job["progress"] or {}).get("done") or job["state"] != "running":
@@ -931,7 +931,7 @@ async def hostile_service(rows: list[Row], quick: bool) -> None:
             stdout=subprocess.PIPE,
             env={**os.environ, "PYTHONPATH": str(ROOT)},
         )
-        out, _ = await asyncio.wait_for(client.communicate(), 2 * PATIENCE)
+        out, _ = await asyncio.wait_for(client.communicate(), 2 * TIMEOUT)
         server.close()
         kind, memory, seconds = out.decode().split()
         attack = f"a service sends a client {name}"

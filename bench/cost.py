@@ -42,9 +42,9 @@ from paramclient.sim import PX4Vehicle
 
 FRAMES_PER_SECOND = 150_000
 """The target for the rate of PARAM_VALUEs from bytes to table, per second."""
-MOST_LOAD = 0.05
+LOAD_MAX = 0.05
 """The target for listening, as a share of a core."""
-MOST_MEMORY = 300
+MEMORY_MAX = 300
 """The target for the memory of 1,000 parameters, in KiB."""
 
 TELEMETRY = 2_000
@@ -184,10 +184,10 @@ def print_load(seconds: float, burst: int) -> bool:
     finally:
         stop.set()
         sender.join()
-    is_met = load < MOST_LOAD
+    is_met = load < LOAD_MAX
     how = "one by one" if burst == 1 else f"{burst} at a time"
     print(f"hearing {heard:,.0f} other frames a second, {how}: {load:.1%} of a core", end="")
-    print(f" (target: under {MOST_LOAD:.0%} at {TELEMETRY:,}: {verdict(is_met)})")
+    print(f" (target: under {LOAD_MAX:.0%} at {TELEMETRY:,}: {verdict(is_met)})")
     return is_met
 
 
@@ -277,8 +277,8 @@ def print_memory(download: Download) -> bool:
     finally:
         tracemalloc.stop()
     kib = 1000 / 1024 / len(download.values)
-    is_met = used * kib <= MOST_MEMORY
-    print(f"\nmemory of 1,000 parameters: {used * kib:.0f} KiB (target: {MOST_MEMORY}: {verdict(is_met)})")
+    is_met = used * kib <= MEMORY_MAX
+    print(f"\nmemory of 1,000 parameters: {used * kib:.0f} KiB (target: {MEMORY_MAX}: {verdict(is_met)})")
     memo = (with_memo - used) * kib
     print(f"names that the decoder remembers, once for all components: {memo:.0f} KiB more")
     return is_met

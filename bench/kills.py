@@ -46,7 +46,7 @@ from paramclient.client.cache_writer import CACHE_FLUSH_INTERVAL
 from paramclient.sim import PX4Vehicle
 from tests.postgres import PROGRAMS, Server, database_on, server
 
-LONGEST_LIFE = 1.0
+LIFETIME_MAX = 1.0
 """Maximum seconds from the first set to the kill."""
 EARLY = 0.1
 """Share of the rounds in which the victim is killed before its first set."""
@@ -55,7 +55,8 @@ DURABLE = 0.3
 NAMES = [f"PARAM_{number:02}" for number in range(30)]
 FRESH_EVERY = 25
 """Rounds after which a new cache is used, because the history has a maximum length."""
-PATIENCE = 60.0
+TIMEOUT = 60.0
+"""Seconds to wait for the start of a process, and for its responses."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,7 @@ class Rounds:
         found = self._figures[kind]
         found.kills += 1
         is_early = self._dice.random() < EARLY
-        life = self._dice.uniform(0.0, LONGEST_LIFE)
+        life = self._dice.uniform(0.0, LIFETIME_MAX)
         self._durable = self._dice.choice((0.0, DURABLE))
         play = (
             self._play_service
@@ -207,7 +208,7 @@ class Rounds:
             line = told.readline()
             if line:
                 where = urlsplit(line.decode().strip())
-                connection = http.client.HTTPConnection(where.hostname or "", where.port, timeout=PATIENCE)
+                connection = http.client.HTTPConnection(where.hostname or "", where.port, timeout=TIMEOUT)
                 with suppress(OSError, http.client.HTTPException):
                     ask(connection, "POST", "/api/v1/find", {})
                     if not is_early:

@@ -59,7 +59,7 @@ LIMIT = 120.0
 """Timeout of one download in seconds."""
 SET_BY_STATIONS = re.compile(r"SR\d_\w+")
 """Parameters in which ArduPilot keeps the streams that a station requests, as MAVProxy does at its start."""
-START_PATIENCE = 30.0
+START_TIMEOUT = 30.0
 """Further seconds for the start of a client and its first heartbeat."""
 ROUND_TRIP = 0.1
 """Round-trip time in seconds of the cases with packet loss."""
@@ -229,7 +229,7 @@ class LiveField:
 
     async def _look(self) -> None:
         async with ParamClient(self.relay.link, cache=False) as client:
-            component = await client.component(timeout=START_PATIENCE)
+            component = await client.component(timeout=START_TIMEOUT)
             result = await component.fetch_all(timeout=LIMIT)
             listed = {name: param for name, param in result.params.items() if param.index is not None}
             self.journal.begin(component, listed)
@@ -449,7 +449,7 @@ class PythonClient:
             process.start()
             sender.close()
             try:
-                if not receiver.poll(limit + START_PATIENCE):
+                if not receiver.poll(limit + START_TIMEOUT):
                     return Outcome(math.inf, f"> {limit:.0f}")
                 seconds, values, problem = receiver.recv()
             except EOFError:
@@ -490,7 +490,7 @@ def judge(case: Case, seconds: float, values: Values, limit: float) -> Outcome:
 def fetch_with_paramclient(port: int, limit: float) -> tuple[float, Values]:
     async def fetch() -> tuple[float, Values]:
         async with ParamClient(f"udpin:127.0.0.1:{port}", cache=False) as client:
-            component = await client.component(timeout=START_PATIENCE)
+            component = await client.component(timeout=START_TIMEOUT)
             began = time.monotonic()
             result = await component.fetch_all(timeout=limit)
             seconds = time.monotonic() - began
@@ -504,7 +504,7 @@ def fetch_with_pymavlink(port: int, limit: float) -> tuple[float, Values]:
     from pymavlink import mavutil
 
     master = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}")
-    master.wait_heartbeat(timeout=START_PATIENCE)
+    master.wait_heartbeat(timeout=START_TIMEOUT)
     is_cast = master.messages["HEARTBEAT"].autopilot == wire.MAV_AUTOPILOT_ARDUPILOTMEGA
     values: dict[str, float] = {}
     missing: set[int] | None = None
@@ -546,7 +546,7 @@ def fetch_with_mavsdk(port: int, limit: float) -> tuple[float, Values]:
     log_subscribe(lambda *_: True)  # MAVSDK would log on stdout
     with Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION)) as mavsdk:
         mavsdk.add_any_connection(f"udpin://127.0.0.1:{port}")
-        system = mavsdk.first_autopilot(timeout_s=START_PATIENCE)
+        system = mavsdk.first_autopilot(timeout_s=START_TIMEOUT)
         if system is None:
             raise RuntimeError("heard no autopilot")
         param = Param(system)
@@ -584,7 +584,7 @@ class MavProxy:
                 stderr=subprocess.STDOUT,
                 text=True,
             ) as process:
-                watchdog = threading.Timer(limit + START_PATIENCE, process.kill)
+                watchdog = threading.Timer(limit + START_TIMEOUT, process.kill)
                 watchdog.start()
                 try:
                     return self._follow(process, case, asked_at, limit)

@@ -56,20 +56,20 @@ from paramclient.sim import PX4Vehicle, SimParam, px4_table
 SYSTEMS = (1, 10, 50, 250)
 LINKS = 20
 PARAMETERS = 1_000
-MOST_FRAMINGS = 4.0
+FRAMINGS_MAX = 4.0
 """The target at the largest size for the ratio to the bare framing."""
-MOST_MEMORY = 200
+MEMORY_MAX = 200
 """The target at the largest size for the memory, in MiB."""
-MOST_IN_CACHE = 0.1
+CACHE_SHARE_MAX = 0.1
 """The target at the largest size for the share of the CPU time that the cache uses."""
-LONGEST_BLOCK = 0.020
+BLOCKING_TIME_MAX = 0.020
 """The target at the largest size for the event-loop latency, in seconds."""
 
 WATCH_INTERVAL = 0.005
 """Seconds between two measurements of the event-loop latency."""
 SETTLING_TIME = 1.0
 """Seconds in which remaining work from before or after a fetch ends."""
-ROOM = 96 * 1024 * 1024
+RECORDED_BYTES_MAX = 96 * 1024 * 1024
 """Bytes of received data that are recorded for the framing. The memory is allocated before it is measured."""
 
 
@@ -152,12 +152,12 @@ def main() -> int:
 def print_verdicts(cold: Phase, warm: Phase) -> bool:
     """Print whether each target is met; return whether all are."""
     verdicts = {
-        f"at most {MOST_FRAMINGS:g} times the bare framing": cold.cpu <= MOST_FRAMINGS * cold.framing,
-        f"at most {MOST_IN_CACHE:.0%} of the time in the cache": cold.cache <= MOST_IN_CACHE * cold.cpu,
-        f"never blocked for more than {LONGEST_BLOCK * 1e3:.0f} ms": (
-            max(cold.computed, warm.computed) <= LONGEST_BLOCK
+        f"at most {FRAMINGS_MAX:g} times the bare framing": cold.cpu <= FRAMINGS_MAX * cold.framing,
+        f"at most {CACHE_SHARE_MAX:.0%} of the time in the cache": cold.cache <= CACHE_SHARE_MAX * cold.cpu,
+        f"never blocked for more than {BLOCKING_TIME_MAX * 1e3:.0f} ms": (
+            max(cold.computed, warm.computed) <= BLOCKING_TIME_MAX
         ),
-        f"at most {MOST_MEMORY} MiB": max(cold.grown, warm.grown) <= MOST_MEMORY,
+        f"at most {MEMORY_MAX} MiB": max(cold.grown, warm.grown) <= MEMORY_MAX,
     }
     for target, is_met in verdicts.items():
         print(f"      target: {target}: {'met' if is_met else 'missed'}")
@@ -211,8 +211,8 @@ class Record:
     """
 
     def __init__(self) -> None:
-        self._bytes = BytesIO(os.urandom(1024 * 1024) * (ROOM // (1024 * 1024)))
-        self._sizes = array("L", bytes(8 * ROOM // 32))
+        self._bytes = BytesIO(os.urandom(1024 * 1024) * (RECORDED_BYTES_MAX // (1024 * 1024)))
+        self._sizes = array("L", bytes(8 * RECORDED_BYTES_MAX // 32))
         self.begin()
 
     def begin(self) -> None:

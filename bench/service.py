@@ -33,16 +33,16 @@ LISTENERS = 200
 """The target for the number of listeners."""
 READS = 500
 """The target for the rate of reads, per second."""
-MOST_LOAD = 1.0
+LOAD_MAX = 1.0
 """The target for the CPU time, as a share of a core."""
-MOST_LATENCY = 0.25
+LATENCY_MAX = 0.25
 """The target for the latency of 99 of 100 reads, in seconds."""
 
 NAMES = ("MC_ROLL_P", "BAT1_N_CELLS", "COM_ARM_WO_GPS")
 """The parameters that are read."""
 CONNECTIONS = 20
 """Connections for the reads: each sends one request at a time, like one program."""
-PATIENCE = 30.0
+RESPONSE_TIMEOUT = 30.0
 """Seconds to wait for the start of a process, and for the last event."""
 
 _EVENT = re.compile(rb"^id: [0-9a-f]+-(\d+)\ndata: ", re.MULTILINE)
@@ -110,16 +110,16 @@ def show(figures: Figures, listeners: list[Listener], rate: int) -> bool:
     cuts = statistics.quantiles(figures.latencies, n=100)
     are_met = [
         whole == len(listeners),
-        share <= MOST_LOAD,
-        cuts[98] <= MOST_LATENCY,
+        share <= LOAD_MAX,
+        cuts[98] <= LATENCY_MAX,
     ]
     print(
         f"{len(listeners)} listeners: {whole} were told of every one of {told:,} events or more, in order"
         f"{verdict(are_met[0])}\n"
         f"{figures.reads:,} reads at {rate} a second, beside {figures.downloads} downloads: "
         f"{1000 * cuts[49]:.1f} ms each, {1000 * cuts[98]:.1f} ms for the slowest of 100 "
-        f"(target {1000 * MOST_LATENCY:.0f} ms){verdict(are_met[2])}\n"
-        f"{share:.2f} of a core in {figures.elapsed:.1f} s (target {MOST_LOAD:.2f}){verdict(are_met[1])}"
+        f"(target {1000 * LATENCY_MAX:.0f} ms){verdict(are_met[2])}\n"
+        f"{share:.2f} of a core in {figures.elapsed:.1f} s (target {LOAD_MAX:.2f}){verdict(are_met[1])}"
     )
     return all(are_met)
 
@@ -137,7 +137,7 @@ async def measure(
     listeners = [Listener() for _ in range(count)]
     figures = Figures()
     async with connection(where) as calls:
-        await call(calls, "POST", "/api/v1/find", {"timeout_s": PATIENCE})
+        await call(calls, "POST", "/api/v1/find", {"timeout_s": RESPONSE_TIMEOUT})
         following = [asyncio.create_task(listen(where, each)) for each in listeners]
         await until(lambda: all(each.first is not None for each in listeners))
         for name in NAMES:
@@ -157,7 +157,7 @@ async def measure(
 
 async def until(condition: Callable[[], bool]) -> None:
     """Poll until a condition is true."""
-    async with asyncio.timeout(PATIENCE):
+    async with asyncio.timeout(RESPONSE_TIMEOUT):
         while not condition():  # noqa: ASYNC110 - no event
             await asyncio.sleep(0.02)
 
@@ -249,7 +249,7 @@ def started(*words: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
         yield process, found[0]
     finally:
         process.terminate()
-        process.wait(PATIENCE)
+        process.wait(RESPONSE_TIMEOUT)
 
 
 def hold_to_one_core(process: subprocess.Popen[str]) -> None:

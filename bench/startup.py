@@ -15,7 +15,7 @@ import tempfile
 import time
 from pathlib import Path
 
-PATIENCE = 30.0
+START_TIMEOUT = 30.0
 """Timeout of one round in seconds, after which nothing was sent."""
 
 
@@ -33,7 +33,7 @@ def first_byte_after(cache: Path) -> float:
     """Run `fetch` against a socket that only listens; return the seconds until the first datagram."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
         listener.bind(("127.0.0.1", 0))
-        listener.settimeout(PATIENCE)
+        listener.settimeout(START_TIMEOUT)
         url = f"udpout:127.0.0.1:{listener.getsockname()[1]}"
         command = [sys.executable, "-m", "paramclient", "fetch", url, "--json", "--cache", str(cache)]
         began = time.perf_counter()

@@ -36,7 +36,7 @@ def main() -> None:
     with atheris.instrument_imports(include=["paramclient"]):
         target = importlib.import_module(f"fuzz.{asked.target}")
     arguments = [f"-max_total_time={asked.seconds}", f"-artifact_prefix={findings}/", "-print_final_stats=1"]
-    arguments += [f"-max_len={target.LONGEST}", "-len_control=0"]
+    arguments += [f"-max_len={target.INPUT_SIZE_MAX}", "-len_control=0"]
     atheris.Setup([sys.argv[0], *arguments, str(corpus), *options], target.run)
     atheris.Fuzz()
 

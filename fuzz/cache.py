@@ -27,9 +27,9 @@ from paramclient.errors import CacheError, UnknownVehicle
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param, ParamType, Trust
 
-__all__ = ["LONGEST", "run"]
+__all__ = ["INPUT_SIZE_MAX", "run"]
 
-LONGEST: Final = 256
+INPUT_SIZE_MAX: Final = 256
 """Maximum bytes of an input: longer ones are slow and find nothing new."""
 
 NAMES: Final = tuple(f"PARAM_{number}" for number in range(12))

@@ -31,9 +31,9 @@ from paramclient.protocol.vehicle.metadata_location import MetadataRequest
 from paramclient.protocol.vehicle.reboot_command import Reboot
 from paramclient.protocol.wire import HASH_CHECK, NO_INDEX, Framer, Message
 
-__all__ = ["LONGEST", "run"]
+__all__ = ["INPUT_SIZE_MAX", "run"]
 
-LONGEST: Final = 400
+INPUT_SIZE_MAX: Final = 400
 """Maximum bytes of an input: longer ones are slow and find nothing new."""
 
 BOUNDS: Final = (
@@ -57,15 +57,16 @@ KINDS: Final = (9, 6, 1, 4, 5, 2, 3, 7, 8, 10, 0, 255)
 AUTOPILOTS: Final = (12, 3, 0, 8)
 VALUES: Final[tuple[WireValue, ...]] = (0.0, 1, -1.5, 300, 1e39, math.nan, b"\1\2\3\4", -0.0)
 PAUSES: Final = (0.0, 0.001, 0.02, 0.1, 0.3, 1.0, 2.5, 5.1, 20.0, 70.0, 3600.0)
-MOST_OPERATIONS: Final = 12
-MOST_STEPS: Final = 60
+OPERATIONS_MAX: Final = 12
+"""Calls in one input."""
+STEPS_MAX: Final = 60
 """Ticks at one time that count as an endless loop."""
-MOST_SENT: Final = 400
+SENT_MAX: Final = 400
 """Frames that one step may send: a burst of reads, responses to the received frames, and repeats."""
-PATIENCE: Final = 1_800.0
+OPERATION_TIMEOUT: Final = 1_800.0
 """Seconds of final silence within which every request has ended. A queue of six checksums alone takes
 1,060 s: each may have 9 attempts, on a link with timeouts of 3.5 s."""
-MOST_TICKS: Final = 6000
+TICKS_MAX: Final = 6000
 """Deadlines within the final silence by which every request has ended."""
 
 
@@ -128,8 +129,8 @@ class _Session:
             if isinstance(operation, endless):
                 self.give_back(machine, operation)
         self.operations = [each for each in self.operations if not isinstance(each[1], endless)]
-        end = self.now + PATIENCE
-        for _ in range(MOST_TICKS):
+        end = self.now + OPERATION_TIMEOUT
+        for _ in range(TICKS_MAX):
             deadline = self.station.next_deadline()
             if deadline > end or all(op.done for _, op in self.operations):
                 break
@@ -144,17 +145,17 @@ class _Session:
 
     def settle(self) -> None:
         """Run due deadlines, collect sent frames, and check all invariants."""
-        for _ in range(MOST_STEPS):
+        for _ in range(STEPS_MAX):
             deadline = self.station.next_deadline()
             assert not math.isnan(deadline)
             if deadline > self.now:
                 break
             self.station.tick(self.now)
         else:
-            raise AssertionError(f"{MOST_STEPS} ticks at one moment, and something is still due")
+            raise AssertionError(f"{STEPS_MAX} ticks at one moment, and something is still due")
         sent = self.station.data_to_send()
         assert not (sent and self.listens)
-        assert len(sent) <= MOST_SENT, f"{len(sent)} frames at one moment"
+        assert len(sent) <= SENT_MAX, f"{len(sent)} frames at one moment"
         for data, _ in sent:
             (frame,) = self.framer.receive(data)
             message = wire.decode(frame)
@@ -351,7 +352,7 @@ class _Session:
     def keep(self, machine: ComponentMachine, operation: Operation[Any]) -> None:
         self.operations.append((machine, operation))
         self.begun.append(operation)
-        if len(self.operations) > MOST_OPERATIONS:
+        if len(self.operations) > OPERATIONS_MAX:
             self.give_back(*self.operations.pop(0))
 
     def give_back(self, machine: ComponentMachine, operation: Operation[Any]) -> None:

@@ -8,9 +8,9 @@ from fuzz.draw import Draw
 from paramclient.errors import FileError
 from paramclient.files import FileForm, ParamFile, dumps, loads
 
-__all__ = ["LONGEST", "run"]
+__all__ = ["INPUT_SIZE_MAX", "run"]
 
-LONGEST: Final = 1024
+INPUT_SIZE_MAX: Final = 1024
 """Maximum bytes of an input: longer ones are slow and find nothing new."""
 
 NAMES: Final = ("", "a.params", "a.parm", "a.param", "a.pck", "a.json", "a.yaml", "a.txt")

@@ -12,12 +12,13 @@ from paramclient.protocol import wire
 from paramclient.protocol.stats.sniffer import UNPROVEN_BYTES_MAX, Sniffer
 from paramclient.protocol.wire import Frame, Framer, Signer, SigningKey, SigningPolicy, Verifier
 
-__all__ = ["LONGEST", "run"]
+__all__ = ["INPUT_SIZE_MAX", "run"]
 
-LONGEST: Final = 1024
+INPUT_SIZE_MAX: Final = 1024
 """Maximum bytes of an input: longer ones are slow and find nothing new."""
 
-LONGEST_FRAME = 280
+FRAME_SIZE_MAX = 280
+"""Bytes of the longest frame: MAVLink 2 with a signature."""
 IDS = (0, 2, 20, 21, 22, 23, 76, 77, 110, 148, 235, 253, 256, 345, 397, 1, 33, 12915)
 """Message ids of whole frames: those that the library decodes, and some others."""
 
@@ -59,7 +60,7 @@ def _check_stream(chunks: list[bytes]) -> None:
     found: list[Frame] = []
     for chunk in chunks:
         found += framer.receive(chunk)
-        assert len(framer._tail) < LONGEST_FRAME
+        assert len(framer._tail) < FRAME_SIZE_MAX
     found += framer.flush()
     frames = _frames_of(b"".join(chunks))
     assert found == [frame for frame, _ in frames]
@@ -72,7 +73,7 @@ def _check_sniffer(chunks: list[bytes]) -> None:
     seen = []
     for chunk in chunks:
         seen += sniffer.receive(chunk)
-        assert len(sniffer._tail) <= UNPROVEN_BYTES_MAX + LONGEST_FRAME
+        assert len(sniffer._tail) <= UNPROVEN_BYTES_MAX + FRAME_SIZE_MAX
     seen += sniffer.flush()
     data = b"".join(chunks)
     # bytes that cannot be checked may count as a frame, but must not displace a verified frame

@@ -30,7 +30,7 @@ def main() -> None:
     kept = []
     for data in sorted(inputs, key=lambda each: (len(each), each)):
         steps = steps_of(target, data)
-        if len(data) <= target.LONGEST and not steps <= reached:
+        if len(data) <= target.INPUT_SIZE_MAX and not steps <= reached:
             kept.append(data)
             reached |= steps
     for path in corpus.iterdir():

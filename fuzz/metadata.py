@@ -9,9 +9,9 @@ from typing import Final
 from paramclient.errors import MetadataError, UsageError
 from paramclient.metadata import read_content
 
-__all__ = ["LONGEST", "run"]
+__all__ = ["INPUT_SIZE_MAX", "run"]
 
-LONGEST: Final = 3000
+INPUT_SIZE_MAX: Final = 3000
 """Maximum bytes of an input: longer ones are slow and find nothing new."""
 
 VALUES = (0, 1, -1, 255, 1 << 31, 0.0, 1.5, -0.0, math.nan, math.inf, 1e39, b"\1\2\3\4")

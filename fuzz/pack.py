@@ -7,12 +7,12 @@ from typing import Final
 from paramclient.errors import PackError
 from paramclient.protocol.ftp import param_pck
 
-__all__ = ["LONGEST", "run"]
+__all__ = ["INPUT_SIZE_MAX", "run"]
 
-LONGEST: Final = 1024
+INPUT_SIZE_MAX: Final = 1024
 """Maximum bytes of an input: longer ones are slow and find nothing new."""
 
-MOST_READ = 239
+READ_SIZE_MAX = 239
 
 
 def run(data: bytes) -> None:
@@ -29,7 +29,7 @@ def _check_table(data: bytes) -> None:
         assert 0 <= error.offset <= len(data)
         return
     assert len(held.entries) == int.from_bytes(data[2:4], "little") <= held.total
-    for size in (MOST_READ, 1 + len(data) % MOST_READ):
+    for size in (READ_SIZE_MAX, 1 + len(data) % READ_SIZE_MAX):
         again = param_pck.encode(
             held.entries, total=held.total, with_defaults=held.with_defaults, read_size=size
         )

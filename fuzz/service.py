@@ -21,9 +21,9 @@ from fuzz.draw import Draw
 from paramclient.errors import ParamClientError, UsageError
 from paramclient.remote import RemoteClient
 
-__all__ = ["LONGEST", "run"]
+__all__ = ["INPUT_SIZE_MAX", "run"]
 
-LONGEST: Final = 256
+INPUT_SIZE_MAX: Final = 256
 """Maximum bytes of an input: a few dozen changes."""
 
 RUN: Final = "0123456789abcdef"

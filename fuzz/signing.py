@@ -13,14 +13,14 @@ from paramclient.protocol import wire
 from paramclient.protocol.wire import Framer, Refusal, Signer, SigningKey, SigningPolicy, Verifier
 from paramclient.protocol.wire.signing import ADOPTED_TIMESTAMP_MAX, LAST_TIMESTAMP
 
-__all__ = ["LONGEST", "run"]
+__all__ = ["INPUT_SIZE_MAX", "run"]
 
-LONGEST: Final = 600
+INPUT_SIZE_MAX: Final = 600
 """Maximum bytes of an input: longer ones are slow and find nothing new."""
 
 SECRET: Final = bytes(range(32))
 OTHER_SECRET: Final = bytes(range(1, 33))
-MOST_STREAMS: Final = 4
+STREAMS_MAX: Final = 4
 MINUTE: Final = 60 * 100_000
 IDS: Final = (0, 22, 109, 166, 253, 256)
 LEAPS: Final = (1, 1, 2, 0, -1, 100_000, -MINUTE, -MINUTE - 1, MINUTE, 10**12, -(10**12), LAST_TIMESTAMP)
@@ -45,7 +45,7 @@ class _Session:
         self.time = draw.one_of(STARTS)
         self.now = 0.0
         self.signer = Signer(SigningKey(SECRET), link_id=draw.number(), timestamp=self.time)
-        self.verifier = Verifier(self.signer, self.policy, most_streams=MOST_STREAMS)
+        self.verifier = Verifier(self.signer, self.policy, most_streams=STREAMS_MAX)
         self.framer = Framer(stream=False)
         self.framer.guard = self.verifier.accepts
         self.heard: list[bytes] = []
@@ -92,7 +92,7 @@ class _Session:
         assert (dict(report.refused), dict(report.unproven)) == (self.refused, self.unproven)
         told = {bytes((each.system, each.component, each.link_id)): each.timestamp for each in report.streams}
         assert told == self.streams
-        assert len(told) <= MOST_STREAMS
+        assert len(told) <= STREAMS_MAX
 
     def _flaw(self, frame: bytes) -> Refusal | None:
         """Return why the rules refuse a frame, or None; record the timestamp of an accepted one."""
@@ -115,7 +115,7 @@ class _Session:
                 return Refusal.REPLAYED
         elif when + MINUTE < self.time:
             return Refusal.OLD
-        elif len(self.streams) == MOST_STREAMS:
+        elif len(self.streams) == STREAMS_MAX:
             return Refusal.TOO_MANY_STREAMS
         self.streams[stream] = when
         self.time = max(self.time, min(when, ADOPTED_TIMESTAMP_MAX))

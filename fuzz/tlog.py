@@ -26,9 +26,9 @@ from paramclient.model.values import Encoding, bits_of, decode_value
 from paramclient.protocol import wire
 from paramclient.protocol.wire import NO_INDEX, Framer, Message
 
-__all__ = ["LONGEST", "run"]
+__all__ = ["INPUT_SIZE_MAX", "run"]
 
-LONGEST: Final = 1024
+INPUT_SIZE_MAX: Final = 1024
 """Maximum bytes of an input: longer ones are slow and find nothing new."""
 
 YEAR = 366 * 86400 * 1_000_000

@@ -26,7 +26,7 @@ WHY_NONE = (
     " others may be made, by its URL, in PARAMCLIENT_TEST_POSTGRES"
 )
 
-_PATIENCE = 30.0
+_START_TIMEOUT = 30.0
 
 
 def _programs() -> Path | None:
@@ -83,7 +83,7 @@ class Server:
             stderr=subprocess.DEVNULL,
             start_new_session=True,
         )
-        deadline = time.monotonic() + _PATIENCE
+        deadline = time.monotonic() + _START_TIMEOUT
         while True:
             try:
                 psycopg.connect(self.url, connect_timeout=2).close()

@@ -27,7 +27,7 @@ from paramclient.sim import Endpoint, GenericVehicle, PX4Vehicle, SimParam
 P = ParamSpec("P")
 T = TypeVar("T")
 
-PATIENCE = 120.0
+TIMEOUT = 120.0
 """Seconds after which a test on real sockets gives up; nothing waits that long when all is well. On a machine
 that is busy with ten other programs the service takes half a minute to start in a process of its own."""
 
@@ -47,7 +47,7 @@ class SwiftLoop(asyncio.SelectorEventLoop):
         now: its clock.
         ahead: seconds that the time of day, as the cache is told it, is ahead of that.
         threads: calls in threads that are under way.
-        has_struck: whether the last `strike` met its task still at work.
+        has_run_action: whether the last `run_between_rounds` met its task still at work.
     """
 
     def __init__(self) -> None:
@@ -55,44 +55,46 @@ class SwiftLoop(asyncio.SelectorEventLoop):
         self.now = 1000.0
         self.ahead = time.time() - self.now
         self.threads = 0
-        self.has_struck = False
-        self._patient: list[asyncio.Future[None]] = []
+        self.has_run_action = False
+        self._settled_waiters: list[asyncio.Future[None]] = []
         self._rounds_left = 0
-        self._victim: asyncio.Task[Any] | None = None
-        self._blow: Callable[[], object] = _nothing
+        self._observed_task: asyncio.Task[Any] | None = None
+        self._action: Callable[[], object] = _nothing
 
     def time(self) -> float:
         return self.now
 
-    def strike(self, task: asyncio.Task[Any], blow: Callable[[], object], *, after: int) -> None:
+    def run_between_rounds(
+        self, task: asyncio.Task[Any], action: Callable[[], object], *, after: int
+    ) -> None:
         """Do this between two rounds of the loop, so many from now, if the task is not done by then."""
-        self.has_struck = False
+        self.has_run_action = False
         self._rounds_left = after
-        self._victim = task
-        self._blow = blow
+        self._observed_task = task
+        self._action = action
 
     async def settled(self) -> None:
         """Wait until nothing can happen any more without the clock."""
         waiter = self.create_future()
-        self._patient.append(waiter)
+        self._settled_waiters.append(waiter)
         await waiter
 
-    def has_told_the_patient(self) -> bool:
+    def wake_settled(self) -> bool:
         """Whether somebody waited for nothing to happen."""
-        patient, self._patient = self._patient, []
-        for waiter in patient:
+        waiters, self._settled_waiters = self._settled_waiters, []
+        for waiter in waiters:
             if not waiter.done():
                 waiter.set_result(None)
-        return bool(patient)
+        return bool(waiters)
 
     def begin_round(self) -> bool:
         """Whether there is something to do that was not there before."""
         self.now += 1e-6  # nothing is done in no time at all
         self._rounds_left -= 1
-        if self._rounds_left or self._victim is None or self._victim.done():
+        if self._rounds_left or self._observed_task is None or self._observed_task.done():
             return False
-        self.has_struck = True
-        self._blow()
+        self.has_run_action = True
+        self._action()
         return True
 
 
@@ -109,11 +111,11 @@ class _LeapingSelector(selectors.DefaultSelector):
         if ready or timeout == 0:
             return ready
         if loop.threads:  # one of them will wake the loop
-            ready = super().select(PATIENCE)
+            ready = super().select(TIMEOUT)
             if not ready:
-                raise RuntimeError(f"a thread was at work for {PATIENCE} s; the clock stood still meanwhile")
+                raise RuntimeError(f"a thread was at work for {TIMEOUT} s; the clock stood still meanwhile")
             return ready
-        if loop.has_told_the_patient():
+        if loop.wake_settled():
             return []
         if timeout is None:
             raise RuntimeError("everybody waits, and for nothing")
@@ -392,7 +394,7 @@ def tasks_beside() -> set[str]:
 
 async def until(condition: Callable[[], object], pause: float = 0.001) -> None:
     """Wait until something has come about of which nobody tells."""
-    with anyio.fail_after(PATIENCE):
+    with anyio.fail_after(TIMEOUT):
         while not condition():  # noqa: ASYNC110 - nobody tells
             await asyncio.sleep(pause)
 
@@ -408,7 +410,7 @@ def a_client(link: Any, **options: Any) -> ParamClient:
 
 
 client_of: Callable[..., ParamClient] = ParamClient
-"""What makes clients; see `tests/ways.py`."""
+"""What makes clients; see `tests/client_kinds.py`."""
 
 
 def _nothing() -> None:

@@ -23,7 +23,7 @@ from paramclient.sim import Air, ArduPilotVehicle, Endpoint
 
 __all__ = ["Memory", "Simulation", "is_so", "known", "listing_ardupilot", "param_value"]
 
-MOST_STEPS = 2000
+STEPS_MAX = 2000
 """Steps without any time passing that look like an endless loop."""
 PEER = "the only peer"
 
@@ -124,7 +124,7 @@ class Simulation:
 
     def exchange(self) -> None:
         """Do what is due at this moment, and hand over what either side has to send."""
-        for _ in range(MOST_STEPS):
+        for _ in range(STEPS_MAX):
             for data in self.air.data_to_send():
                 self.station.receive(data, PEER, self.now)
             self.station.tick(self.now)
@@ -140,7 +140,7 @@ class Simulation:
             if not outgoing and self.station.next_deadline() > self.now and self._air_deadline() > self.now:
                 self.check_deadline()
                 return
-        raise AssertionError(f"{MOST_STEPS} steps at {self.now}, and something is still due")
+        raise AssertionError(f"{STEPS_MAX} steps at {self.now}, and something is still due")
 
     def check_deadline(self) -> None:
         """Check that the station is due as early as its only component: no change of a deadline was missed.

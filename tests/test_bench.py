@@ -13,7 +13,7 @@ import pytest
 
 from paramclient.model.values import ParamType
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle
-from tests.flying import flying
+from tests.simulated_on_udp import flying
 
 ROOT = Path(__file__).parent.parent
 

@@ -18,13 +18,13 @@ from paramclient.model.values import Param, ParamType, WireValue
 from paramclient.protocol import wire
 from paramclient.protocol.ftp.packets import Opcode, Packet
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, Vehicle
-from tests.flying import flying
 from tests.live import __main__ as suite
 from tests.live.checks import checks
 from tests.live.choice import choose
 from tests.live.journal import Journal
 from tests.live.relay import Conditions, RealVehicle
 from tests.live.session import Check, Measured, Session
+from tests.simulated_on_udp import flying
 
 CHANNELS: dict[str, WireValue] = {
     f"RC{channel}_{what}": value

@@ -46,7 +46,7 @@ from paramclient.cache.ext_records import (
 from paramclient.cache.file_table import AddedTable
 from paramclient.cache.fleet import FleetDiff, FleetValue, FleetVehicle, Holder, NameSpread
 from paramclient.cache.interrupted_setups import CutOff, RunningSetup, SetupNotes
-from paramclient.cache.observed_table import HeardParams, UnixTimes
+from paramclient.cache.observed_table import ObservedParams, UnixTimes
 from paramclient.cache.param_columns import BY_VEHICLE, StoredParam
 from paramclient.cache.records import (
     BY_US,
@@ -85,7 +85,7 @@ __all__ = [
     "FleetValue",
     "FleetVehicle",
     "HISTORY_ENTRIES_MAX",
-    "HeardParams",
+    "ObservedParams",
     "HistoryEntry",
     "Holder",
     "NameSpread",

@@ -115,19 +115,19 @@ def ext_state_at(transaction: Transaction, owner: int, identity: Identity, when:
         return ext_snapshot(transaction, owner, exact).params
     state = transaction.ext_state(owner)
     since = None if state is None else state.known_since
-    who = f"the extended parameters of {identity.key}, component {number},"
+    title = f"the extended parameters of {identity.key}, component {number},"
     if since is None or when < since:
         reach = (
             "are not known: the table was never complete"
             if since is None
             else f"at {utc_text(when)} are not known: the history begins at {utc_text(since)}"
         )
-        raise NotInCache(f"{who} {reach}{snapshots_near(transaction, owner, when, is_extended=True)}")
+        raise NotInCache(f"{title} {reach}{snapshots_near(transaction, owner, when, is_extended=True)}")
     twice = transaction.clock_rollback_over(owner, when)
     if twice is not None:
         back, until = twice
         raise NotInCache(
-            f"{who} at {utc_text(when)} are ambiguous: the clock of this computer was set back from"
+            f"{title} at {utc_text(when)} are ambiguous: the clock of this computer was set back from"
             f" {utc_text(until)} to {utc_text(back)}"
             f"{snapshots_near(transaction, owner, when, is_extended=True)}"
         )
@@ -138,9 +138,9 @@ def ext_state_at(transaction: Transaction, owner: int, identity: Identity, when:
             known = params.get(name)
             index = None if known is None else known.index
             first.setdefault(name, ExtParam.of(name, old_raw, old_type, index, Trust.CACHED))
-    then = replace(identity, firmware=0, git_hash="", capabilities=0)
+    last_identity = replace(identity, firmware=0, git_hash="", capabilities=0)
     source = f"history of {identity.key}"
-    return ExtParamSet(params | first, identity.system, number, when, source, then)
+    return ExtParamSet(params | first, identity.system, number, when, source, last_identity)
 
 
 def _packed(identity: Identity, params: Mapping[str, ExtParam]) -> bytes:

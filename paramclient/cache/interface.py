@@ -65,7 +65,7 @@ class Store(Protocol):
         """Keep a table of this program in the local copy, for the time without a database connection."""
         ...
 
-    def subscribe(self, told: Callable[[CacheChange], None]) -> Callable[[], None]:
+    def subscribe(self, callback: Callable[[CacheChange], None]) -> Callable[[], None]:
         """Call a function, in a thread of the store, after each write of another station to a table.
 
         Return a function that ends the subscription.

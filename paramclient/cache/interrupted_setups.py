@@ -207,26 +207,26 @@ class SetupNotes:
 
 def _parsed(data: bytes) -> CutOff | None:
     """Return the note in a file: its first line, updated by later lines; None if it is not a note."""
-    told: dict[str, Any] = {}
+    entry: dict[str, Any] = {}
     kinds = {"began": float, "at": float, "system": int, "component": int, "done": int, "total": int}
     for line in data.split(b"\n")[:-1]:
         try:
             found = json.loads(line)
-            told |= {each.name: found[each.name] for each in fields(CutOff) if each.name in found}
+            entry |= {each.name: found[each.name] for each in fields(CutOff) if each.name in found}
         except (ValueError, TypeError, RecursionError):
             break
     try:
-        told |= {name: kind(told[name]) for name, kind in kinds.items() if name in told}
-        texts = [told[name] for name in ("id", "kind", "link", "asked_by")]
-        if not all(isinstance(text, str) for text in texts) or not isinstance(told["key"], str | None):
+        entry |= {name: kind(entry[name]) for name, kind in kinds.items() if name in entry}
+        texts = [entry[name] for name in ("id", "kind", "link", "asked_by")]
+        if not all(isinstance(text, str) for text in texts) or not isinstance(entry["key"], str | None):
             return None
-        return CutOff(**told)
+        return CutOff(**entry)
     except (KeyError, TypeError, ValueError, OverflowError):
         return None
 
 
-def _line(told: dict[str, Any]) -> bytes:
-    return json.dumps(told, separators=(",", ":")).encode() + b"\n"
+def _line(entry: dict[str, Any]) -> bytes:
+    return json.dumps(entry, separators=(",", ":")).encode() + b"\n"
 
 
 if sys.platform == "win32":

@@ -29,12 +29,12 @@ def merge(
     for update in updates:
         check_times(update)
         key = (update.identity.key, update.component)
-        past = tables.get(key)
-        if past is None:
-            past = tables[key] = _TableMerge(transaction, based_on.get(key))
-        past.take(update)
-    for past in tables.values():
-        past.finish()
+        table_merge = tables.get(key)
+        if table_merge is None:
+            table_merge = tables[key] = _TableMerge(transaction, based_on.get(key))
+        table_merge.take(update)
+    for table_merge in tables.values():
+        table_merge.finish()
 
 
 @dataclass
@@ -121,8 +121,8 @@ class _TableMerge:
         before = self.transaction.table(self.owner)
         whole_at = table.synced_at if table.complete and table.synced_at is not None else float("-inf")
         later: list[StoredParam] = []
-        heard = {item.name for item in update.params}
-        for name in set(self.overtaken) - heard if update.replace else update.removed:
+        observed = {item.name for item in update.params}
+        for name in set(self.overtaken) - observed if update.replace else update.removed:
             self.overtaken.pop(name, None)  # a later value of this name is another parameter
         for item in update.params:
             name = item.name

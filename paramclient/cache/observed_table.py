@@ -11,7 +11,7 @@ from typing import overload
 from paramclient.cache.param_columns import StoredParam, StoredTable
 from paramclient.model.params import Params
 
-__all__ = ["HeardParams", "UnixTimes"]
+__all__ = ["ObservedParams", "UnixTimes"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ class UnixTimes:
         return times
 
 
-class HeardParams(Sequence[StoredParam]):
+class ObservedParams(Sequence[StoredParam]):
     """Parameters of a live table to store. Each `StoredParam` is created on access.
 
     A write of a whole table creates none: its columns come from the packed values of the table.
@@ -94,7 +94,7 @@ class HeardParams(Sequence[StoredParam]):
         """Yield the name and the unix time of each parameter, without creating records."""
         for item in self._overwritten:
             yield item.name, item.heard_at
-        yield from zip(self._params.held, self._table.column("heard_at"), strict=True)
+        yield from zip(self._params.compact, self._table.column("heard_at"), strict=True)
 
     def first_table(self) -> StoredTable | None:
         """Return the first stored parameters of a table; None if a name may occur twice, or there is none."""
@@ -102,7 +102,7 @@ class HeardParams(Sequence[StoredParam]):
 
     @cached_property
     def _table(self) -> StoredTable:
-        times, moments, held = self._times, self._params.moments, self._params.held
+        times, moments, compact = self._times, self._params.moments, self._params.compact
         present = times.at - times.ahead
-        heard_at = times.of_all([moments.get(name, present) for name in held])
+        heard_at = times.of_all([moments.get(name, present) for name in compact])
         return StoredTable.of_live(self._params, self._volatile or frozenset(), heard_at)

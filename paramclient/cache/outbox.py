@@ -221,18 +221,18 @@ def packed(operation: StoreOperation[object]) -> bytes:
         data = ["merge", [_update_cells(each) for each in operation.updates], based_on]
     elif isinstance(operation, StoreSnapshot):
         vehicle = operation.vehicle
-        who = vehicle if isinstance(vehicle, str) else identity_cells(vehicle)
+        vehicle_cells = vehicle if isinstance(vehicle, str) else identity_cells(vehicle)
         params = operation.params
         rest = [operation.at, operation.reason, operation.hash, operation.complete, operation.number]
         shown = None if params is None else [written_cells(each) for each in params.values()]
-        data = ["set down", who, operation.component, shown, *rest]
+        data = ["set down", vehicle_cells, operation.component, shown, *rest]
     elif isinstance(operation, StoreExtSnapshot):
         vehicle = operation.vehicle
-        who = vehicle if isinstance(vehicle, str) else identity_cells(vehicle)
+        vehicle_cells = vehicle if isinstance(vehicle, str) else identity_cells(vehicle)
         ext = operation.params
         rows = None if ext is None else [_ext_param_cells(each) for each in ext.params.values()]
         last = [operation.at, operation.reason, operation.complete, operation.number]
-        data = ["set down ext", who, operation.component, rows, *last]
+        data = ["set down ext", vehicle_cells, operation.component, rows, *last]
     else:
         raise TypeError(f"{type(operation).__name__} cannot be queued")
     return zlib.compress(json.dumps(data, separators=(",", ":")).encode("utf-8", "surrogatepass"))
@@ -256,13 +256,13 @@ def unpacked(data: object) -> StoreOperation[object]:
                 [_update(each) for each in rest[0]], {(key, number): at for key, number, at in rest[1]}
             )
         if kind == "set down ext":
-            who, component, rows, *last = rest
+            vehicle_cells, component, rows, *last = rest
             ext = None if rows is None else ExtParamSet({row[0]: _ext_param(*row) for row in rows})
-            vehicle = who if isinstance(who, str) else read_identity(who)
+            vehicle = vehicle_cells if isinstance(vehicle_cells, str) else read_identity(vehicle_cells)
             return StoreExtSnapshot(vehicle, component, ext, *last)
-        who, component, shown, at, reason, crc, complete, number = rest
+        vehicle_cells, component, shown, at, reason, crc, complete, number = rest
         params = None if shown is None else ParamSet({each.name: each for each in map(read_written, shown)})
-        vehicle = who if isinstance(who, str) else read_identity(who)
+        vehicle = vehicle_cells if isinstance(vehicle_cells, str) else read_identity(vehicle_cells)
         return StoreSnapshot(vehicle, component, params, at, reason, crc, complete, number)
     except (AssertionError, LookupError, TypeError, ValueError, zlib.error) as error:
         raise Damaged(f"a queued operation is damaged: {error}") from error
@@ -284,10 +284,10 @@ def _update_cells(update: TableUpdate) -> list[Any]:
 
 
 def _update(data: list[Any]) -> TableUpdate:
-    who, component, autopilot, at, state, items, removed, is_whole, *times = data
+    vehicle_cells, component, autopilot, at, state, items, removed, is_whole, *times = data
     removed_at, whole_at = times or ({}, None)  # earlier versions wrote neither
     return TableUpdate(
-        identity=read_identity(who),
+        identity=read_identity(vehicle_cells),
         component=component,
         autopilot=autopilot,
         at=at,
@@ -314,9 +314,9 @@ def _ext_update_cells(update: ExtTableUpdate) -> list[Any]:
 
 
 def _ext_update(data: list[Any]) -> ExtTableUpdate:
-    who, component, autopilot, at, rows, removed, count, complete = data
+    vehicle_cells, component, autopilot, at, rows, removed, count, complete = data
     return ExtTableUpdate(
-        identity=read_identity(who),
+        identity=read_identity(vehicle_cells),
         component=component,
         autopilot=autopilot,
         at=at,

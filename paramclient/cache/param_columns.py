@@ -227,26 +227,26 @@ class StoredTable(Mapping[str, StoredParam]):
             volatile: names outside the vehicle's hash.
             heard_at: unix times of the observations, in the order of the parameters.
         """
-        held, defaults = params.held, params.defaults
-        if not held:
+        compact, defaults = params.compact, params.defaults
+        if not compact:
             return cls.of({})
-        bits, types, is_raw, _, places = zip(*iter_unpack_fields(b"".join(held.values())), strict=True)
-        initial: Sequence[int | None] = (None,) * len(held)
+        bits, types, is_raw, _, places = zip(*iter_unpack_fields(b"".join(compact.values())), strict=True)
+        initial: Sequence[int | None] = (None,) * len(compact)
         if defaults:
             initial = [
                 signed(bits_of(defaults[name], number)) if name in defaults else None
-                for name, number in zip(held, types, strict=True)
+                for name, number in zip(compact, types, strict=True)
             ]
         return cls(
             [
-                tuple(held),
+                tuple(compact),
                 types,
                 [signed(each) for each in bits] if max(bits) >> 63 else bits,
                 is_raw,
                 [None if place == COMPACT_NO_INDEX else place for place in places]
                 if COMPACT_NO_INDEX in places
                 else places,
-                bytes(map(volatile.__contains__, held)),
+                bytes(map(volatile.__contains__, compact)),
                 heard_at,
                 initial,
             ]
@@ -291,7 +291,7 @@ class StoredTable(Mapping[str, StoredParam]):
             Damaged: a value, type or index is not valid.
         """
         params = Params()
-        held, defaults = params.held, params.defaults
+        compact, defaults = params.compact, params.defaults
         read = ("name", "type", "bits", "is_raw", "param_index", "default_bits")
         for name, number, bits, is_raw, index, default_bits in zip(*map(self.column, read), strict=True):
             if not 0 <= number <= 255:
@@ -301,7 +301,7 @@ class StoredTable(Mapping[str, StoredParam]):
                 raise Damaged(f"{unsigned} is not a value of type {number}")
             place = COMPACT_NO_INDEX if index is None else index
             try:
-                held[name] = pack_fields(unsigned, number, bool(is_raw), CACHED, place)
+                compact[name] = pack_fields(unsigned, number, bool(is_raw), CACHED, place)
             except struct.error as error:
                 raise Damaged(f"an index is {place}: {error}") from error
             if default_bits is not None:

@@ -210,8 +210,12 @@ class PostgresDatabase:
             after = _revisions(connection, keys)
             changed = {each for each in {*before, *after} if before.get(each) != after.get(each)}
             writer = operations[-1][1]
-            news = [json.dumps([writer, key, number, after.get((key, number))]) for key, number in changed]
-            connection.execute("SELECT pg_notify(%s, told) FROM unnest(%s::text[]) AS told", (CHANNEL, news))
+            payloads = [
+                json.dumps([writer, key, number, after.get((key, number))]) for key, number in changed
+            ]
+            connection.execute(
+                "SELECT pg_notify(%s, payload) FROM unnest(%s::text[]) AS payload", (CHANNEL, payloads)
+            )
         return results, before, after
 
     @contextmanager

@@ -31,7 +31,7 @@ from paramclient.cache.table_updates import (
     check_times,
     forget_other_firmware,
     hashed,
-    heard_times,
+    observation_times,
     write_lines,
     write_state,
 )
@@ -191,12 +191,16 @@ def _write_values(
     part = update
     older: Sequence[StoredParam] = ()
     agrees = True
-    if seen.table is not None and not all(seen.is_news(name, at) for name, at in heard_times(update.params)):
+    if seen.table is not None and not all(
+        seen.is_newer(name, at) for name, at in observation_times(update.params)
+    ):
         part, older, agrees = _divided(update, seen, is_late=is_late)
     removed: Collection[str] = update.removed
     if update.replace:
-        removed = before.keys() - {name for name, _ in heard_times(update.params)} if before else ()
-    stays = {name for name in removed if name in before and not seen.is_news(name, update.removal_time(name))}
+        removed = before.keys() - {name for name, _ in observation_times(update.params)} if before else ()
+    stays = {
+        name for name in removed if name in before and not seen.is_newer(name, update.removal_time(name))
+    }
     after, lines, added = apply_update(part, before, stays.union(item.name for item in older))
     if len(after) != len(before) or after != before:
         transaction.put_table(owner, before, after)
@@ -218,7 +222,7 @@ def _divided(
     overtaken: dict[str, float] = {}  # older observations of these names are overtaken too
     for item in update.params:
         name = item.name
-        if not seen.is_news(name, item.heard_at):
+        if not seen.is_newer(name, item.heard_at):
             overtaken[name] = max(item.heard_at, overtaken.get(name, -math.inf))
     for item in update.params:
         name = item.name
@@ -234,8 +238,8 @@ def _divided(
         else:
             agrees = False
             if row.param_index is None and item.param_index is not None:
-                held = row._replace(param_index=item.param_index, volatile=item.volatile, by=item.by)
-                newer.append(held)
+                older_row = row._replace(param_index=item.param_index, volatile=item.volatile, by=item.by)
+                newer.append(older_row)
     count = None if update.table is None else update.table.count
     if is_late and table is not None and (count is None or table.count not in (None, count)):
         newer = [item._replace(param_index=None) for item in newer]  # the indices may belong to another count
@@ -290,7 +294,7 @@ class _Seen:
     horizon: float
     removal_times: Mapping[str, float] | None = None
 
-    def is_news(self, name: str, at: float) -> bool:
+    def is_newer(self, name: str, at: float) -> bool:
         """Return whether the cache has no later observation of a parameter.
 
         Args:
@@ -329,19 +333,19 @@ def _write_past(
     kept: list[NumberedLine] = transaction.lines_from(owner, since)
     ahead = max((place for place, (_, line) in enumerate(kept, 1) if line.at > seen.horizon), default=0)
     kept = kept[ahead:]
-    past = TableHistory(list(kept), known_since, transaction.first_times(owner))
+    history = TableHistory(list(kept), known_since, transaction.first_times(owner))
     for item in older:
         became = transaction.last_became(owner, item.name, since)
-        past.observe(item, seen.rows.get(item.name), ahead=became)
+        history.observe(item, seen.rows.get(item.name), ahead=became)
     for line in lines:  # after the observations, which refer to the rows before these changes
-        past.add(line)
-    transaction.add_first_times(owner, past.new_added_names.items())
-    if past.lines == kept:
+        history.add(line)
+    transaction.add_first_times(owner, history.new_added_names.items())
+    if history.lines == kept:
         return
-    if past.lines[: len(kept)] == kept:
-        transaction.add_lines(owner, [line for _, line in past.lines[len(kept) :]])
+    if history.lines[: len(kept)] == kept:
+        transaction.add_lines(owner, [line for _, line in history.lines[len(kept) :]])
     else:
-        transaction.replace_lines(owner, past.lines, start=kept[0][0])
+        transaction.replace_lines(owner, history.lines, start=kept[0][0])
     at = transaction.trim_lines(owner, table_updates.HISTORY_ENTRIES_MAX)
     if at is not None:
         transaction.raise_known_since(owner, at)

@@ -237,8 +237,8 @@ class CachedSummary:
         synced = "not synced"
         if self.synced_at is not None:
             synced = f"synced {datetime.fromtimestamp(self.synced_at, UTC):%Y-%m-%d %H:%MZ}"
-        who = f"{self.system}/{self.component} {autopilot_name(self.autopilot)}"
-        return f"<{type(self).__name__} {who} {self.size}{of} params {synced}>"
+        address = f"{self.system}/{self.component} {autopilot_name(self.autopilot)}"
+        return f"<{type(self).__name__} {address} {self.size}{of} params {synced}>"
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -273,7 +273,7 @@ class CachedComponent(CachedSummary):
             Damaged: a parameter is not valid.
         """
         params = table.params()
-        left_out = tuple(name for name in params.held if not is_portable_name(name))
+        left_out = tuple(name for name in params.compact if not is_portable_name(name))
         for name in left_out:
             del params[name]
         return cls(

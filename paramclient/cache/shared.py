@@ -95,9 +95,9 @@ class SharedStore:
         """See `Store.follow`."""
         self._connection.follow((key, component))
 
-    def subscribe(self, told: Callable[[CacheChange], None]) -> Callable[[], None]:
+    def subscribe(self, callback: Callable[[CacheChange], None]) -> Callable[[], None]:
         """See `Store.subscribe`."""
-        return self._connection.subscribe(told)
+        return self._connection.subscribe(callback)
 
     def close(self) -> None:
         """End the thread, and close the database connections and the file."""
@@ -130,7 +130,7 @@ class _Connection:
         self._wake_reader, self._wake_writer = socket.socketpair()
         self._wake_reader.setblocking(False)
         self._revisions: Revisions = {}
-        self._wanted: set[tuple[str, int]] = set()
+        self._stale_keys: set[tuple[str, int]] = set()
         self._subscribers: list[Callable[[CacheChange], None]] = []
 
     # calls of the store
@@ -174,17 +174,17 @@ class _Connection:
         with self._state:
             if not self._is_here:
                 return
-            self._wanted.add(key)
+            self._stale_keys.add(key)
         self._wake_listener()
 
-    def subscribe(self, told: Callable[[CacheChange], None]) -> Callable[[], None]:
-        self._subscribers.append(told)
+    def subscribe(self, callback: Callable[[CacheChange], None]) -> Callable[[], None]:
+        self._subscribers.append(callback)
         with suppress(CacheError):  # other calls report it; the subscription works after a reconnection
             self._ensure_connected()
 
         def end() -> None:
             with suppress(ValueError):
-                self._subscribers.remove(told)
+                self._subscribers.remove(callback)
 
         return end
 
@@ -259,7 +259,7 @@ class _Connection:
         with self._state:
             before, self._revisions = self._revisions, revisions
             old, self._listener = self._listener, listener
-            self._wanted |= {key for key, revision in kept.items() if revisions.get(key) != revision}
+            self._stale_keys |= {key for key, revision in kept.items() if revisions.get(key) != revision}
             self.away = None
             self._is_here = True
         if old is not None:
@@ -304,10 +304,10 @@ class _Connection:
 
     def _lose(self, error: Unavailable) -> None:
         with self._state:
-            is_news = self.away is None
+            is_new_failure = self.away is None
             self.away = str(error)
             self._is_here = False
-        if is_news:
+        if is_new_failure:
             copy = self.local
             meanwhile = f"using the local copy {copy.path}" if copy.exists else "reconnecting"
             _log.warning("%s; %s", error, meanwhile)
@@ -338,7 +338,7 @@ class _Connection:
                     self._revisions[key] = after[key]
                 else:
                     self._revisions.pop(key, None)
-            self._wanted |= stale
+            self._stale_keys |= stale
         if stale:
             self._wake_listener()
         return result
@@ -347,9 +347,9 @@ class _Connection:
         """Copy every requested table from the database to the local copy."""
         while self._is_here and not self._is_closed:
             with self._state:
-                if not self._wanted:
+                if not self._stale_keys:
                     return
-                key = self._wanted.pop()
+                key = self._stale_keys.pop()
             try:
                 with self._writing:
                     having = self.local.snapshots(key)
@@ -408,12 +408,12 @@ class _Connection:
             file = listener.fileno()
             selector.register(file, selectors.EVENT_READ)
             try:
-                if self._is_here and not self._wanted:
+                if self._is_here and not self._stale_keys:
                     selector.select()
             finally:
                 selector.unregister(file)
             self._drain_wakeup()
-            told = [_news(each.payload) for each in listener.notifies(timeout=0)]
+            notifications = [_notification(each.payload) for each in listener.notifies(timeout=0)]
         except Exception as error:  # after any error, the connection is unusable
             if listener is self._listener and self._is_here and not self._is_closed:
                 text = self._address.without_password(" ".join(str(error).split()))
@@ -421,21 +421,21 @@ class _Connection:
             return
         changed = set()
         with self._state:
-            for writer, key, component, revision in filter(None, told):
+            for writer, key, component, revision in filter(None, notifications):
                 if writer != self._writer:
                     changed.add((key, component))
                     self._revisions[key, component] = revision
         if changed:
             kept = self._kept()
             with self._state:
-                self._wanted |= changed & kept.keys()
+                self._stale_keys |= changed & kept.keys()
             self._tell(changed)
 
     def _tell(self, changed: set[tuple[str, int]]) -> None:
         for key, component in sorted(changed):
-            for told in list(self._subscribers):
+            for callback in list(self._subscribers):
                 try:
-                    told(CacheChange(key, component))
+                    callback(CacheChange(key, component))
                 except Exception:
                     _log.exception("a listener of the cache failed")
 
@@ -456,7 +456,7 @@ def _touched(operation: StoreOperation[Any], known: Revisions) -> Iterator[tuple
             yield from (each for each in known if each[0] == key)
 
 
-def _news(payload: str) -> tuple[Any, ...] | None:
+def _notification(payload: str) -> tuple[Any, ...] | None:
     """Parse a notification; None if it is not of a station, as any user of the database may send one."""
     try:
         writer, key, component, revision = json.loads(payload)

@@ -157,19 +157,19 @@ def state_at(
     exact = transaction.snapshot_at(owner, when)
     if exact is not None:
         return snapshot(transaction, owner, exact).params
-    who = f"{identity.key}, component {number}"
+    title = f"{identity.key}, component {number}"
     if since is None or when < since:
         reach = (
             "is not known: its table was never complete"
             if since is None
             else f"at {utc_text(when)} is not known: what is kept of its history begins at {utc_text(since)}"
         )
-        raise NotInCache(f"the state of {who} {reach}{snapshots_near(transaction, owner, when)}")
+        raise NotInCache(f"the state of {title} {reach}{snapshots_near(transaction, owner, when)}")
     twice = transaction.clock_rollback_over(owner, when)
     if twice is not None:
         back, until = twice
         raise NotInCache(
-            f"the state of {who} at {utc_text(when)} is ambiguous: the clock of this computer was set back"
+            f"the state of {title} at {utc_text(when)} is ambiguous: the clock of this computer was set back"
             f" from {utc_text(until)} to {utc_text(back)}{snapshots_near(transaction, owner, when)}"
         )
     first = _first_events_after(transaction, owner, when)
@@ -178,8 +178,8 @@ def state_at(
     for name, value in state.items():
         if value is not None and is_portable_name(name):
             params[name] = WrittenParam.of(read_param(name, *value))
-    then = replace(identity, firmware=0, git_hash="", capabilities=0)
-    return ParamSet(params, number, identity.system, then, when, f"history of {identity.key}")
+    last_identity = replace(identity, firmware=0, git_hash="", capabilities=0)
+    return ParamSet(params, number, identity.system, last_identity, when, f"history of {identity.key}")
 
 
 # The value before the first event after a given time; None if the name did not exist.

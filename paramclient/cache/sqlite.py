@@ -61,7 +61,7 @@ class SqliteStore:
     def follow(self, key: str, component: int) -> None:
         """Do nothing: the file has every table."""
 
-    def subscribe(self, told: Callable[[CacheChange], None]) -> Callable[[], None]:
+    def subscribe(self, callback: Callable[[CacheChange], None]) -> Callable[[], None]:
         """Do nothing: a file has no notifications."""
         return _nothing
 
@@ -161,8 +161,8 @@ class SqliteTransaction(Transaction):
                 for row in self.connection.execute(
                     f"{select} WHERE owner = ? AND name IN ({marks}){end}", (owner, *names)
                 ):
-                    name, line, heard = cells(row, "sif")
-                    found.append((owner, name, what, line, heard))
+                    name, line, observed_at = cells(row, "sif")
+                    found.append((owner, name, what, line, observed_at))
         return found
 
     def _packed(self, owner: int) -> Packed | None:

@@ -279,10 +279,10 @@ class ParamCache:
             AmbiguousVehicle: several vehicles have this name.
         """
         moment = time.time() if at is None else at
-        who = vehicle
+        target = vehicle
         if isinstance(vehicle, str):
-            who, _ = self._store.read(lambda transaction: self._table(transaction, vehicle, component))
-        return self._store.do(StoreExtSnapshot(who, component, params, moment, reason, complete))
+            target, _ = self._store.read(lambda transaction: self._table(transaction, vehicle, component))
+        return self._store.do(StoreExtSnapshot(target, component, params, moment, reason, complete))
 
     def ext_snapshots(self, vehicle: str, component: int | None = None) -> list[SnapshotSummary]:
         """Return the snapshots of a vehicle's extended parameters, without the parameters, newest last.
@@ -583,10 +583,10 @@ class ParamCache:
             AmbiguousVehicle: several vehicles have this name.
         """
         moment = time.time() if at is None else at
-        who = vehicle
+        target = vehicle
         if isinstance(vehicle, str):
-            who, _ = self._store.read(lambda transaction: self._table(transaction, vehicle, component))
-        return self._store.do(StoreSnapshot(who, component, params, moment, reason, hash, complete))
+            target, _ = self._store.read(lambda transaction: self._table(transaction, vehicle, component))
+        return self._store.do(StoreSnapshot(target, component, params, moment, reason, hash, complete))
 
     def snapshots(self, vehicle: str, component: int | None = None) -> list[SnapshotSummary]:
         """Return the snapshots of a vehicle's tables, without parameters, newest last.
@@ -689,9 +689,9 @@ class ParamCache:
         return self._store.read(work)
 
     def _check_fleet(
-        self, component: int, vehicles: Sized, chosen: Mapping[str, Iterable[str]], held: AbstractSet[str]
+        self, component: int, vehicles: Sized, chosen: Mapping[str, Iterable[str]], names: AbstractSet[str]
     ) -> None:
-        """Check that there are vehicles, and that each pattern has a name in `held`.
+        """Check that there are vehicles, and that each pattern has a name in `names`.
 
         Raises:
             NotInCache: the reason.
@@ -699,23 +699,23 @@ class ParamCache:
         if not vehicles:
             raise NotInCache(f"the cache {self.place} holds no table of component {component}")
         for name, like in chosen.items():
-            if held.isdisjoint(like):
+            if names.isdisjoint(like):
                 raise NotInCache(f"no vehicle in the cache {self.place} has a parameter {name}")
 
-    def subscribe(self, told: Callable[[CacheChange], None]) -> Callable[[], None]:
+    def subscribe(self, callback: Callable[[CacheChange], None]) -> Callable[[], None]:
         """Call a function after each write of another station to a table of the database.
 
         The call follows within 1 s. Writes during a lost connection are reported after the reconnection. For
         a file, the function is never called.
 
         Args:
-            told: called in a thread of the cache, with the table. It should return within milliseconds, and
-                may use the cache.
+            callback: called in a thread of the cache, with the table. It should return within milliseconds,
+                and may use the cache.
 
         Returns:
             A function that ends the subscription.
         """
-        return self._store.subscribe(told)
+        return self._store.subscribe(callback)
 
     def copy_to(
         self, target: ParamCache, *, progress: Callable[[str, int, int], None] | None = None

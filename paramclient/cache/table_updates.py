@@ -14,7 +14,7 @@ from typing import Final
 from paramclient.cache import snapshots
 from paramclient.cache.cells import are_times, time_cell
 from paramclient.cache.history_columns import NO_VALUE, HistoryLine
-from paramclient.cache.observed_table import HeardParams
+from paramclient.cache.observed_table import ObservedParams
 from paramclient.cache.param_columns import BY_VEHICLE, StoredParam
 from paramclient.cache.records import CachedComponent, HistoryEntry, TableState, TableUpdate
 from paramclient.cache.transaction import Transaction
@@ -27,7 +27,7 @@ __all__ = [
     "component",
     "forget_other_firmware",
     "hashed",
-    "heard_times",
+    "observation_times",
     "save",
     "write_lines",
     "write_state",
@@ -97,18 +97,18 @@ def apply_update(
         before: the stored rows.
         stays: names that the update does not remove.
     """
-    if not before and isinstance(update.params, HeardParams):
+    if not before and isinstance(update.params, ObservedParams):
         first = update.params.first_table()
         if first is not None:
             return first, [], zip(first, first.column("heard_at"), strict=True)
     after = dict(before)
     added: list[tuple[str, float]] = []
     observations = list(update.params)
-    heard = {item.name for item in observations}
+    observed = {item.name for item in observations}
     lines: list[HistoryLine] = [
         HistoryLine.of(update.removal_time(name), name, BY_VEHICLE, after.pop(name).value, NO_VALUE)
         for name in dict.fromkeys(before if update.replace else update.removed)
-        if name in before and name not in heard and name not in stays
+        if name in before and name not in observed and name not in stays
     ]
     for item in observations:
         name = item.name
@@ -127,15 +127,15 @@ def check_times(update: TableUpdate) -> None:
     Raises:
         UsageError: a time is not in unix seconds.
     """
-    times = [at for _, at in heard_times(update.params)]
+    times = [at for _, at in observation_times(update.params)]
     if not are_times(times):
         for at in times:
             time_cell(at)
 
 
-def heard_times(params: Sequence[StoredParam]) -> Iterable[tuple[str, float]]:
+def observation_times(params: Sequence[StoredParam]) -> Iterable[tuple[str, float]]:
     """Return the names and times of observations."""
-    if isinstance(params, HeardParams):
+    if isinstance(params, ObservedParams):
         return params.heard_at()
     return ((item.name, item.heard_at) for item in params)
 

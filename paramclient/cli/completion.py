@@ -166,12 +166,12 @@ def _fitting(found: Iterable[Candidate], current: str) -> Iterator[Candidate]:
 def _subcommands(table: Table, group: str) -> Iterator[Candidate]:
     """Yield the subcommands of a group; of the whole command for an empty name."""
     seen = set()
-    for name, told in table.items():
+    for name, option in table.items():
         head, _, rest = name.partition(" ")
         word = (rest if head == group else "") if group else head
         if word and word not in seen:
             seen.add(word)
-            yield word, "" if rest and not group else told["help"]
+            yield word, "" if rest and not group else option["help"]
 
 
 def _arguments(

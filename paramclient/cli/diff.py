@@ -84,7 +84,7 @@ async def diff(
     if partial and not is_right_partial:
         second = replace(second, params={name: second[name] for name in second if name in known})
     outcome = compare(first, second, base=before, names=only or None, renames=rules)
-    shown = [entry for entry in outcome.entries if everything or entry.is_news]
+    shown = [entry for entry in outcome.entries if everything or entry.is_shown]
     if options.json:
         from paramclient.documents.diff import DiffDoc  # only here: loads pydantic
 
@@ -147,15 +147,17 @@ def _cells(entry: Difference, sides: _Sides, *, has_base: bool) -> list[object]:
     if left == right and not entry.is_same:
         left, right = _with_bits(entry.left), _with_bits(entry.right)
     style = "bold red" if entry.moved is Moved.CONFLICT else _STYLES[entry.standing]
-    together = (Moved.BOTH, Moved.CONFLICT, None)
+    both_sides = (Moved.BOTH, Moved.CONFLICT, None)
     base = _shown(entry.base, sides.base)
     return [
         entry.name,
-        None if left is None else Coloured(left, style if entry.moved in (Moved.LEFT, *together) else ""),
-        None if right is None else Coloured(right, style if entry.moved in (Moved.RIGHT, *together) else ""),
+        None if left is None else Coloured(left, style if entry.moved in (Moved.LEFT, *both_sides) else ""),
+        None
+        if right is None
+        else Coloured(right, style if entry.moved in (Moved.RIGHT, *both_sides) else ""),
         *([base] if has_base else []),
         *([sides.units(entry)] if sides.is_known else []),
-        Coloured(_word(entry), style),
+        Coloured(_comparison_text(entry), style),
         *([entry.moved or "unknown"] if has_base else []),
     ]
 
@@ -176,7 +178,7 @@ def _with_bits(param: WrittenParam | None) -> str | None:
     return value_text(param) if bits is None else f"{value_text(param)} = 0x{bits}"
 
 
-def _word(entry: Difference) -> str:
+def _comparison_text(entry: Difference) -> str:
     """Return the comparison of an entry in words."""
     more = []
     if entry.renamed is not None:

@@ -68,7 +68,7 @@ def _cell(part: DownloadRange, marks: Marks) -> Piece:
 
 def _key(parts: Sequence[DownloadRange], marks: Marks, unit: str) -> list[list[Piece]]:
     """Return the characters with what they mean, and how many values or bytes that are."""
-    told = (
+    counts = (
         (marks.full, RECEIVED_STYLE, sum(part.received for part in parts), "received"),
         (
             marks.requested_again,
@@ -78,7 +78,7 @@ def _key(parts: Sequence[DownloadRange], marks: Marks, unit: str) -> list[list[P
         ),
         (marks.missing, MISSING_STYLE, sum(part.missing for part in parts), "missing"),
     )
-    items = [[(mark, style), (f" {number:,} {what}", "")] for mark, style, number, what in told]
+    items = [[(mark, style), (f" {number:,} {what}", "")] for mark, style, number, what in counts]
     if unit == "bytes":
         items.append([("in bytes", MISSING_STYLE)])
     return items

@@ -187,8 +187,8 @@ async def _chosen_names(
             exact = text in ext.params or not chosen
             names |= dict.fromkeys([text] if exact and not is_pattern(text) else sorted(chosen))
             continue
-        who = f"{component.system}/{component.component}"
-        what = f"{who} has no extended parameter that matches {text}"
+        label = f"{component.system}/{component.component}"
+        what = f"{label} has no extended parameter that matches {text}"
         errors.append(
             UnknownParameter(what, system=component.system, component=component.component, name=text)
         )
@@ -299,25 +299,25 @@ def value_of(name: str, text: str, number: int) -> ExtValue:
     return value
 
 
-async def watch_extended(session: CommandSession, wanted: Sequence[str]) -> ExitCode:
+async def watch_extended(session: CommandSession, name_patterns: Sequence[str]) -> ExitCode:
     """Print changes of extended parameters until the timeout of the options."""
     ext = session.component.ext
     changes, events = ext.changes(), session.client.events()
     known: set[str] | None = None
     if not session.client.listens_only:
-        if not wanted or any(map(is_pattern, wanted)):
+        if not name_patterns or any(map(is_pattern, name_patterns)):
             with suppress(CacheError):  # with an empty cache, all received parameters are new
                 await ext.fetch_all(timeout=session.deadline.left())
-        _, errors = await _read_all(session, [name for name in wanted if not is_pattern(name)])
+        _, errors = await _read_all(session, [name for name in name_patterns if not is_pattern(name)])
         if errors:
             for error in errors:
                 report(str(error))
             return max(map(code_of, errors))
         known = set(ext.params)
-    watched = ", ".join(wanted) if wanted else counted(len(ext.params), "extended parameter")
+    watched = ", ".join(name_patterns) if name_patterns else counted(len(ext.params), "extended parameter")
     say(printable(f"watching {watched} of {session.label}"))
     with anyio.move_on_after(session.deadline.left()):
-        choice = NameChoice(wanted) if wanted else None
+        choice = NameChoice(name_patterns) if name_patterns else None
         await print_changes_and_events(session, changes, events, known, choice)
     return ExitCode.DONE
 
@@ -331,11 +331,14 @@ def show_extended(
     """Print extended parameters of a file, or cached ones."""
     if vehicle is not None and is_file(vehicle):
         file = read_extended_file(vehicle)
-        params, told = list(file.params.values()), f"{len(file.params)} extended parameters from {vehicle}"
+        params, description = (
+            list(file.params.values()),
+            f"{len(file.params)} extended parameters from {vehicle}",
+        )
     else:
         table = _cached(vehicle, component, options)
         params = _by_index(table.params.values())
-        told = f"{len(params)} extended parameters of {table.key}, component {table.component}"
+        description = f"{len(params)} extended parameters of {table.key}, component {table.component}"
     if names:
         chosen, unmatched = NameChoice(names).choose({each.name for each in params})
         if unmatched:
@@ -347,7 +350,7 @@ def show_extended(
         print_document(ExtParamsOutputDoc.of(params))
     else:
         print_table(_COLUMNS, map(_cells, params), right="index")
-        say(printable(told))
+        say(printable(description))
     return ExitCode.DONE
 
 
@@ -485,9 +488,9 @@ async def _write_set(
         code = max(code, code_of(result.error))
     now = {} if result.current is None else result.current
     for name in result.different if result.current is not None else ():
-        held = "not there" if name not in now else _text(now[name])
-        wanted = _text(content.params[name])
-        report(f"{name}: {session.label} has {held}, and the file {wanted}")
+        actual = "not there" if name not in now else _text(now[name])
+        in_file = _text(content.params[name])
+        report(f"{name}: {session.label} has {actual}, and the file {in_file}")
     return code if result.complete else max(code, ExitCode.INCOMPLETE)
 
 
@@ -503,12 +506,12 @@ async def verify_extended(url: str, file: str, options: LinkOptions) -> ExitCode
             print_document(ExtDiffDoc.of(_plan_entries(plan), is_same=plan.is_met))
         else:
             _print_changes(plan)
-            held = sum(
+            equal = sum(
                 name in plan.current and param.same_value(plan.current[name])
                 for name, param in content.params.items()
             )
             source = content.source
-            say(printable(f"{session.label} has {held} of {len(content.params)} values of {source}"))
+            say(printable(f"{session.label} has {equal} of {len(content.params)} values of {source}"))
     return ExitCode.DONE if plan.is_met else ExitCode.DIFFERENT
 
 

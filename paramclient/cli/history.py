@@ -64,11 +64,11 @@ def history(
     begin = None if since is None else parse_time(since, time.time())
     if begin is not None and not options.json:
         say(f"since {local_time(begin)}")
-    wanted = check_given(names)
-    if snapshots and wanted:
+    name_patterns = check_given(names)
+    if snapshots and name_patterns:
         raise UsageError("--snapshots lists whole tables and takes no parameter name")
     if extended and not snapshots:
-        return history_extended(vehicle, wanted, component, options, limit=limit, since=begin)
+        return history_extended(vehicle, name_patterns, component, options, limit=limit, since=begin)
     with ParamCache(options.cache) as cache:
         key = tables_in(cache, vehicle, None)[0].key
         if snapshots:
@@ -76,10 +76,10 @@ def history(
             kept = [each for each in found if begin is None or each.at >= begin]
             _print_snapshots(kept[-limit:] if limit else kept, options)
         else:
-            entries = _entries(cache, key, component, wanted, begin)
+            entries = _entries(cache, key, component, name_patterns, begin)
             entries = entries[-limit:] if limit else entries
             oldest = entries[0].at if limit and len(entries) == limit else begin
-            notes = [] if wanted else SetupNotes.beside(cache.path).cut_off()
+            notes = [] if name_patterns else SetupNotes.beside(cache.path).cut_off()
             cut_off = [
                 note
                 for note in notes
@@ -92,21 +92,21 @@ def history(
 
 
 def _entries(
-    cache: ParamCache, key: str, component: int | None, wanted: Sequence[str], begin: float | None
+    cache: ParamCache, key: str, component: int | None, name_patterns: Sequence[str], begin: float | None
 ) -> list[HistoryEntry]:
     """Return the changes of the parameters that names and patterns choose; of all parameters without any.
 
     Raises:
         NotInCache: the vehicle has and had no such parameter.
     """
-    if not wanted:
+    if not name_patterns:
         return cache.history(key, component, None, None, begin)
     entries = cache.history(key, component)
     known = {entry.name for entry in entries}
     for each in cache.components(key):
         table = cache.load(key, each.component) if component in (None, each.component) else None
         known.update(() if table is None else table.params)
-    chosen, unmatched = NameChoice(wanted).divide(known)
+    chosen, unmatched = NameChoice(name_patterns).divide(known)
     if unmatched:
         text = unmatched_text(unmatched, known, lambda: cached_names(cache))
         raise NotInCache(f"no parameter of {key} in the cache is called {text}")

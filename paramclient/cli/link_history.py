@@ -158,21 +158,21 @@ def history_lines(
     """
     if not rows:
         return []
-    told = [scales[row.quantity](row.highest or 0.0) for row in rows]
+    maxima = [scales[row.quantity](row.highest or 0.0) for row in rows]
     label_width = max(len(row.address) for row in rows)
     quantity_width = max(len(row.quantity) for row in rows)
-    told_width = max(map(len, told))
-    left = width - label_width - quantity_width - told_width - 3
+    maximum_width = max(map(len, maxima))
+    left = width - label_width - quantity_width - maximum_width - 3
     columns = next((count for count in COLUMN_COUNTS if count <= left), 0)
     lines: list[list[Piece]] = []
     if columns:
         each = HISTORY_LENGTH // columns
         lines.append([(f"last {HISTORY_LENGTH} s, 0 to maximum, {each} s a column", "bold")])
     address = ""
-    for row, maximum in zip(rows, told, strict=True):
+    for row, maximum in zip(rows, maxima, strict=True):
         label = "" if row.address == address else row.address
         address = row.address
         drawn = sparkline(row.values, row.highest or 0.0, marks, columns) if columns else ""
-        text = f"{label:{label_width}} {row.quantity:{quantity_width}} {maximum:>{told_width}} "
+        text = f"{label:{label_width}} {row.quantity:{quantity_width}} {maximum:>{maximum_width}} "
         lines.append([(text, ""), (drawn, STYLES[row.quantity])])
     return lines

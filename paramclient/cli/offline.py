@@ -112,7 +112,7 @@ def show(
             return store.known_of_sets(sets) if given is None else [given] * len(sets)
 
         return show_file(open_file(vehicle), component, known, changed=changed, json=options.json)
-    wanted = tuple(check_given(names))
+    name_patterns = tuple(check_given(names))
     described = from_file(metadata, offline=True)
     is_log = vehicle is not None and vehicle.lower().startswith("replay:")
     with _open(options) if not is_log or vehicle is None else cache_of_log(vehicle) as cache:
@@ -120,8 +120,8 @@ def show(
         nicknames = _names_by_key(cache)
         is_list = vehicle is None and len(summaries) > 1 and not options.json
         tables = [] if is_list else _load(cache, summaries)
-        _check_known(cache, wanted, [name for table in tables for name in table.params])
-    views = [_View.of(table, wanted, described, cache, changed=changed) for table in tables]
+        _check_known(cache, name_patterns, [name for table in tables for name in table.params])
+    views = [_View.of(table, name_patterns, described, cache, changed=changed) for table in tables]
     if options.json:
         from paramclient.documents.cached import CachedTablesDoc  # only here: loads pydantic
 
@@ -311,13 +311,13 @@ def tables_of(options: CacheOptions, vehicle: str, component: int | None) -> lis
         return _load(cache, tables_in(cache, vehicle, component))
 
 
-def _check_known(cache: ParamCache, wanted: Sequence[str], known: Sequence[str]) -> None:
+def _check_known(cache: ParamCache, name_patterns: Sequence[str], known: Sequence[str]) -> None:
     """Check that each name and pattern fits a cached parameter.
 
     Raises:
         NotInCache: one fits none. The message suggests similar names.
     """
-    _, unmatched = NameChoice(wanted).divide(known)
+    _, unmatched = NameChoice(name_patterns).divide(known)
     if unmatched:
         text = unmatched_text(unmatched, known, lambda: cached_names(cache))
         raise NotInCache(f"not among the cached parameters: {text}")

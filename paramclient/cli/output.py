@@ -163,10 +163,10 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, rig
     from rich.text import Text
 
     console = Console(width=None if sys.stdout.isatty() else WIDTH_UNLIMITED)
-    held = [list(row) for row in rows]
+    cells = [list(row) for row in rows]
     # rich would end the process when the output is closed
     with console.capture() as captured:
-        table = _fitting(columns, held, right.split(), console.width)
+        table = _fitting(columns, cells, right.split(), console.width)
         console.print(table, soft_wrap=isinstance(table, Text))
     lines = [line.rstrip() for line in captured.get().splitlines()]
     print(*lines, sep="\n", flush=True)

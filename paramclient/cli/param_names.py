@@ -155,9 +155,9 @@ def spelling(name: str, component: Component) -> str:
 
 
 def _no_match(pattern: str, component: Component) -> UnknownParameter:
-    who = f"{component.system}/{component.component}"
+    label = f"{component.system}/{component.component}"
     return UnknownParameter(
-        f"{who} has no parameter that matches {pattern}",
+        f"{label} has no parameter that matches {pattern}",
         system=component.system,
         component=component.component,
         name=pattern,

@@ -209,18 +209,18 @@ async def get(
     """
     check_choice(extended=extended, plain=plain)
     described = from_file(metadata)
-    wanted = check_given((name, *names))
+    name_patterns = check_given((name, *names))
     if all_:
         check_all(options, extended=extended)
         async with every_vehicle(url, options) as sessions:
             read = await run_on_all(
-                sessions, lambda each: _read(each, wanted, described, metadata, draws=False)
+                sessions, lambda each: _read(each, name_patterns, described, metadata, draws=False)
             )
         return _show_read(read, options)
     async with connect(url, options) as session:
         if await is_extended_session(session, extended=extended, plain=plain):
-            return await get_extended(session, wanted)
-        params, errors, described = await _read(session, wanted, described, metadata)
+            return await get_extended(session, name_patterns)
+        params, errors, described = await _read(session, name_patterns, described, metadata)
     if options.json:
         from paramclient.documents.param import ReadOutputDoc  # only here: loads pydantic
 
@@ -258,28 +258,28 @@ async def watch(
         plain: Watch the plain parameters, even if the component has extended ones.
     """
     check_choice(extended=extended, plain=plain)
-    wanted = check_given(names)
+    name_patterns = check_given(names)
     async with connect(url, options, policy=policy, is_live=True) as session:
         if await is_extended_session(session, extended=extended, plain=plain):
-            return await watch_extended(session, wanted)
+            return await watch_extended(session, name_patterns)
         changes, events = session.component.changes(), session.client.events()
         listens = session.client.listens_only
-        has_pattern = any(map(is_pattern, wanted))
-        if not listens and (has_pattern or not wanted):
+        has_pattern = any(map(is_pattern, name_patterns))
+        if not listens and (has_pattern or not name_patterns):
             with suppress(CacheError):  # with an empty cache, all received parameters are new
                 await _fetch_all(session)
-        if wanted and not listens and (code := await _check_watched(session, wanted)):
+        if name_patterns and not listens and (code := await _check_watched(session, name_patterns)):
             return code
         known = None if listens else set(session.component.params)
-        watched = ", ".join(wanted) if wanted else f"{len(session.component.params)} parameters"
+        watched = ", ".join(name_patterns) if name_patterns else f"{len(session.component.params)} parameters"
         say(printable(f"watching {watched} of {session.label}"))
         failure: Exception | None = None
         async with anyio.create_task_group() as tasks:
-            if wanted and not has_pattern and not listens:
+            if name_patterns and not has_pattern and not listens:
                 tasks.start_soon(_follow_groups, session)
             with anyio.move_on_after(session.deadline.left()):
                 try:
-                    choice = NameChoice(wanted) if wanted else None
+                    choice = NameChoice(name_patterns) if name_patterns else None
                     await print_changes_and_events(session, changes, events, known, choice)
                 except Exception as error:  # raised here, the task group would wrap it in a group
                     failure = error
@@ -513,14 +513,14 @@ def _cells(param: Param) -> tuple[object, ...]:
 
 async def _read(
     session: CommandSession,
-    wanted: Sequence[str],
+    name_patterns: Sequence[str],
     described: Metadata | None,
     choice: MetadataChoice,
     *,
     draws: bool = True,
 ) -> tuple[list[Param], dict[str, ParamClientError], Metadata | None]:
     """Read the chosen parameters of a vehicle; return them, the errors by name, and the metadata."""
-    params, errors = await _get_chosen(session, wanted, draws=draws)
+    params, errors = await _get_chosen(session, name_patterns, draws=draws)
     if described is None:
         described = await known_of_session(session, choice)
     return params, errors, described
@@ -559,21 +559,23 @@ def _show_read(
 
 
 async def _get_chosen(
-    session: CommandSession, wanted: Sequence[str], *, draws: bool = True
+    session: CommandSession, name_patterns: Sequence[str], *, draws: bool = True
 ) -> tuple[list[Param], dict[str, ParamClientError]]:
     """Read the parameters that names and patterns choose; return them, and the errors by name.
 
     With a pattern, the table is fetched. Values that were received or confirmed by that are not read again.
     """
     component = session.component
-    has_pattern = any(map(is_pattern, wanted))
+    has_pattern = any(map(is_pattern, name_patterns))
     if has_pattern:
         await _fetch_all(session, draws=draws)
         with suppress(NoReply):
             await component.refreshed(timeout=session.deadline.left(REFRESH_TIMEOUT))
-    chosen = ChosenNames.of(component, wanted)
-    held = {name: component.params[name] for name in chosen.names if has_pattern and name in component.params}
-    fresh = {name: param for name, param in held.items() if param.trust is not Trust.CACHED}
+    chosen = ChosenNames.of(component, name_patterns)
+    known = {
+        name: component.params[name] for name in chosen.names if has_pattern and name in component.params
+    }
+    fresh = {name: param for name, param in known.items() if param.trust is not Trust.CACHED}
     asked = [name for name in chosen.names if name not in fresh]
     read, errors = await while_waiting(
         lambda _: _get_all(session, asked), f"{first_of(asked, AWAITED_NAMES_MAX)} of {session.label}"
@@ -620,13 +622,13 @@ def _report_all(errors: Iterable[ParamClientError]) -> int:
 # watch
 
 
-async def _check_watched(session: CommandSession, wanted: Sequence[str]) -> int:
+async def _check_watched(session: CommandSession, name_patterns: Sequence[str]) -> int:
     """Read the watched parameters, and report those that the vehicle does not have; return the exit code.
 
     A name or pattern of a group that the vehicle hides at present may appear later, and is no error.
     """
-    _, errors = await _get_chosen(session, [text for text in wanted if not is_pattern(text)])
-    patterns = [text for text in wanted if is_pattern(text)]
+    _, errors = await _get_chosen(session, [text for text in name_patterns if not is_pattern(text)])
+    patterns = [text for text in name_patterns if is_pattern(text)]
     errors |= ChosenNames.of(session.component, patterns).errors
     hidden = [name for name in errors if may_appear(name, session.component)]
     if hidden:

@@ -106,15 +106,15 @@ async def reset(
     """
     if bool(names) + all_ + changed != 1:
         raise UsageError("reset takes names, or --all, or --changed")
-    wanted = check_given(names)
+    name_patterns = check_given(names)
     described = from_file(metadata)
     async with connect(url, options, only=True) as session:
         fetched = await _fetch(session)
-        chosen, read_only = (await _chosen(session, wanted), ()) if names else _all_names(session)
+        chosen, read_only = (await _chosen(session, name_patterns), ()) if names else _all_names(session)
         if chosen is None:
             return ExitCode.INCOMPLETE
         code = ExitCode.DONE
-        if fetched.missing and any(map(is_pattern, wanted or "*")):
+        if fetched.missing and any(map(is_pattern, name_patterns or "*")):
             report(f"incomplete: {counted(len(fetched.missing), 'parameter')} were not received")
             code = ExitCode.INCOMPLETE
         params = await read_unconfirmed(
@@ -176,9 +176,9 @@ def _all_names(session: CommandSession) -> tuple[list[str], tuple[str, ...]]:
     return _in_order(session, writable), tuple(read_only)
 
 
-async def _chosen(session: CommandSession, wanted: Sequence[str]) -> list[str] | None:
+async def _chosen(session: CommandSession, name_patterns: Sequence[str]) -> list[str] | None:
     """Return the names that names and patterns choose; None after a report of the unknown ones."""
-    chosen = ChosenNames.of(session.component, wanted)
+    chosen = ChosenNames.of(session.component, name_patterns)
     errors: dict[str, ParamClientError] = {**chosen.errors}
     for name in chosen.names:
         if name not in session.component.params:

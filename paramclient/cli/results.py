@@ -75,7 +75,7 @@ def show_applied(results: Mapping[NamedVehicle, ApplyResult], *, full: bool) -> 
     _print(
         ["name", "before", "wanted", "now", "status", "reason"],
         {
-            vehicle: map(_applied_cells, result.rows.values() if full else result.news)
+            vehicle: map(_applied_cells, result.rows.values() if full else result.shown_rows)
             for vehicle, result in results.items()
         },
     )

@@ -293,5 +293,5 @@ def _show(files: Mapping[Path, Sequence[ParamSet]], form: FileForm, *, as_json: 
         print_document(documents[0] if len(documents) == 1 else SavedFilesDoc(files=documents))
         return
     for file, sets in files.items():
-        held = ", ".join(f"{counted(len(each), 'parameter')} of {address(each)}" for each in sets)
-        say(printable(f"{held} written to {file} ({form})"))
+        contents = ", ".join(f"{counted(len(each), 'parameter')} of {address(each)}" for each in sets)
+        say(printable(f"{contents} written to {file} ({form})"))

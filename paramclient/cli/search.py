@@ -54,10 +54,12 @@ def search(
         limit: Print at most this number of parameters.
         metadata: A file that describes parameters. Default: the stored metadata of each vehicle's firmware.
     """
-    wanted = [each.casefold() for each in (word, *words)]
+    lowered_words = [each.casefold() for each in (word, *words)]
     found = _Known.of(options, vehicle, from_file(metadata, offline=True))
     ranked = sorted(
-        (rank, name) for name in found.names if (rank := _rank(name, found.info(name), wanted)) is not None
+        (rank, name)
+        for name in found.names
+        if (rank := _rank(name, found.info(name), lowered_words)) is not None
     )
     names = [name for _, name in ranked[:limit]]
     if options.json:
@@ -164,14 +166,16 @@ class _Known:
         )
 
 
-def _rank(name: str, described: ParamInfo | None, wanted: Iterable[str]) -> int | None:
+def _rank(name: str, described: ParamInfo | None, lowered_words: Iterable[str]) -> int | None:
     """Return 0 if all words are in the name, 1 with the short description, 2 elsewhere; None if not."""
     places = [name.casefold()]
     if described is not None:
         places.append(f"{places[0]} {described.short_description}".casefold())
         named = " ".join([*described.values.values(), *described.bits.values(), described.group])
         places.append(f"{places[1]} {described.long_description} {named}".casefold())
-    return next((rank for rank, text in enumerate(places) if all(word in text for word in wanted)), None)
+    return next(
+        (rank for rank, text in enumerate(places) if all(word in text for word in lowered_words)), None
+    )
 
 
 def _lines_of(

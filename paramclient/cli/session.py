@@ -126,11 +126,11 @@ class CommandSession:
             timeout=self.deadline.left(RECHECK_TIMEOUT),
         )
         if found is not component:
-            heard = f"{found.system}/{found.component} {found.autopilot}"
+            other_vehicle = f"{found.system}/{found.component} {found.autopilot}"
             raise AmbiguousVehicle(
-                f"{self.label} was chosen and is no longer heard; {heard} is heard instead. "
+                f"{self.label} was chosen and is no longer heard; {other_vehicle} is heard instead. "
                 "Nothing was written.",
-                vehicles=(self.label, heard),
+                vehicles=(self.label, other_vehicle),
                 choose_by=_difference(found, component),
             )
 

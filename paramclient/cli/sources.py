@@ -235,10 +235,10 @@ def tables_in(cache: ParamCache, vehicle: str | None, component: int | None) -> 
     component = component if address is None else address[1]
     chosen = [each for each in known if component in (None, each.component)]
     if not chosen and (known or vehicle is not None):
-        held = [f"{each.system}/{each.component} ({each.key})" for each in known]
+        addresses = [f"{each.system}/{each.component} ({each.key})" for each in known]
         raise UnknownVehicle(
-            f"component {component} is not in the cache {cache.place}, which has {', '.join(held)}",
-            vehicles=held,
+            f"component {component} is not in the cache {cache.place}, which has {', '.join(addresses)}",
+            vehicles=addresses,
         )
     return chosen
 

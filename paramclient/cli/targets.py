@@ -245,8 +245,8 @@ async def find_vehicles(
             await anyio.sleep(POLL_INTERVAL)
     found = _vehicles(client, component)
     if expect is not None and len(found) < expect:
-        heard = ", ".join(map(describe, found)) or "none"
-        raise NoReply(f"{expect} vehicles (received: {heard})", attempts=0, waited=timeout or 0.0)
+        labels = ", ".join(map(describe, found)) or "none"
+        raise NoReply(f"{expect} vehicles (received: {labels})", attempts=0, waited=timeout or 0.0)
     return found
 
 

@@ -44,7 +44,7 @@ async def print_changes_and_events(
     changes: Changes | ExtChanges,
     events: Events,
     known: set[str] | None,
-    wanted: NameChoice | None,
+    choice: NameChoice | None,
 ) -> None:
     """Print changes and events of the component until cancelled.
 
@@ -54,16 +54,16 @@ async def print_changes_and_events(
         events: the events of the client.
         known: names of the table at the start. The first value of any other parameter is not a change. None:
             the first value of every parameter is not a change.
-        wanted: the names to watch; None for all.
+        choice: the names to watch; None for all.
     """
-    async with aclosing(_merged(changes, events)) as news:
-        async for each in news:
+    async with aclosing(_merged(changes, events)) as merged:
+        async for each in merged:
             if isinstance(each, Change | ExtChange):
                 is_first = each.old is None and not _is_added(each)
                 if is_first and (known is None or each.name in known):
                     known = known and known - {each.name}
                     continue
-                if wanted is not None and not wanted.has(each.name):
+                if choice is not None and not choice.has(each.name):
                     continue
                 text = _change_text(each)
             elif isinstance(each, Heard) or each.component is not session.component:
@@ -102,15 +102,15 @@ async def _merged(
                 each.exception()  # both end with the link; one error is reported
 
 
-def _line(news: Change | ExtChange | _ComponentEvent, at: float) -> Document:
+def _line(item: Change | ExtChange | _ComponentEvent, at: float) -> Document:
     """Return the JSON document of a change or an event."""
-    if isinstance(news, ExtChange):
+    if isinstance(item, ExtChange):
         from paramclient.documents.extended_output import ExtChangeLineDoc  # only here: loads pydantic
 
-        return ExtChangeLineDoc.of(news, at)
+        return ExtChangeLineDoc.of(item, at)
     from paramclient.documents.command_output import ChangeLineDoc, EventLineDoc  # only here: loads pydantic
 
-    return ChangeLineDoc.of(news, at) if isinstance(news, Change) else EventLineDoc.of(news, at)
+    return ChangeLineDoc.of(item, at) if isinstance(item, Change) else EventLineDoc.of(item, at)
 
 
 def _change_text(change: Change | ExtChange) -> str:

@@ -65,10 +65,10 @@ async def wait_for_batch(
 
     with anyio.move_on_after(timeout):
         while not batch.done:
-            news = anyio.Event()
-            batch.on_outcome = news.set
+            new_outcome = anyio.Event()
+            batch.on_outcome = new_outcome.set
             report()
-            await news.wait()
+            await new_outcome.wait()
     now = anyio.current_time()
     if not batch.done:
         what = describe(batch.open_names)

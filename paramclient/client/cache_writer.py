@@ -22,7 +22,7 @@ from paramclient.cache import (
     CachedComponent,
     CachedExtTable,
     ExtTableUpdate,
-    HeardParams,
+    ObservedParams,
     ParamCache,
     StoredExtParam,
     StoredParam,
@@ -134,8 +134,8 @@ class CacheWriter:
             for each in await self._run(self._cache.components) or ():
                 address = (each.system, each.component)
                 self._tables[address] = self._tables.get(address, False) or each.hash is not None
-            told = partial(_pass_on, anyio.lowlevel.current_token(), self._record_other_write)
-            self._unsubscribe = await self._run(partial(self._cache.subscribe, told)) or _nothing
+            callback = partial(_pass_on, anyio.lowlevel.current_token(), self._record_other_write)
+            self._unsubscribe = await self._run(partial(self._cache.subscribe, callback)) or _nothing
 
     async def close(self) -> None:
         """Write all new values, log a warning for lost ones, and end the thread."""
@@ -351,16 +351,16 @@ class CacheWriter:
         began_at = fetch.first_value_at if fetch.first_value_at < math.inf else fetch.begun_at
         return anyio.current_time() < max(kept.written_at, began_at) + DOWNLOAD_INTERVAL
 
-    async def _write(self, news: list[_PendingUpdates]) -> bool:
+    async def _write(self, updates: list[_PendingUpdates]) -> bool:
         """Write the collected updates. Return False if the write failed."""
         cache = self._cache
-        if cache is None or not news:
+        if cache is None or not updates:
             return True
         is_written = False
         try:
-            is_written = await self._save(cache, [new.update for new in news])
+            is_written = await self._save(cache, [new.update for new in updates])
         finally:
-            for new in news:
+            for new in updates:
                 if not is_written and self._cached.get(new.kept.machine) is new.kept:
                     new.requeue()
             for kept in self._cached.values() if self._failure is not None else ():
@@ -369,7 +369,7 @@ class CacheWriter:
             self._failure = None
             for kept in self._cached.values():
                 kept.machine.table.keeps_all = False
-            logger.debug("written: %s values", sum(len(new.update.params) for new in news))
+            logger.debug("written: %s values", sum(len(new.update.params) for new in updates))
             self._requeue_if_replaced(cache.replacements)
         return is_written
 
@@ -378,15 +378,17 @@ class CacheWriter:
         cache = self._cache
         if cache is None:
             return True
-        news = [new for kept in self._cached.values() if (new := self._ext_news_of(kept, times)) is not None]
-        if not news:
+        pending = [
+            new for kept in self._cached.values() if (new := self._ext_updates_of(kept, times)) is not None
+        ]
+        if not pending:
             return True
         is_written = False
         try:
-            updates = [new.update for new in news]
+            updates = [new.update for new in pending]
             is_written = await self._save_extended(cache, updates)
         finally:
-            for new in news:
+            for new in pending:
                 if not is_written and self._cached.get(new.kept.machine) is new.kept:
                     new.requeue()
         if is_written:
@@ -394,14 +396,14 @@ class CacheWriter:
             self._requeue_if_replaced(cache.replacements)
         return is_written
 
-    def _ext_news_of(self, kept: _CachedComponent, times: UnixTimes) -> _PendingExtUpdate | None:
+    def _ext_updates_of(self, kept: _CachedComponent, times: UnixTimes) -> _PendingExtUpdate | None:
         """Return the update of a table of extended parameters since the last write, or None."""
         machine, table = kept.machine, kept.machine.ext.table
         state = (table.count, table.complete)
         if not table.complete and kept.ext_state is not None and table.count in (None, kept.ext_state[0]):
             state = kept.ext_state  # a part of a table that is complete in the cache
-        is_news = bool(table.dirty or table.gone) or (table.count is not None and state != kept.ext_state)
-        if not is_news or self._is_doubted(machine):
+        is_changed = bool(table.dirty or table.gone) or (table.count is not None and state != kept.ext_state)
+        if not is_changed or self._is_doubted(machine):
             return None
         before, kept.ext_state = kept.ext_state, state
         dirty, gone, overwritten = table.take_dirty(), table.take_removed_at(), table.take_overwritten()
@@ -429,10 +431,10 @@ class CacheWriter:
 
     async def _apply_other_writes(self) -> None:
         """Update cached values from the newer writes of other stations."""
-        news, self._other_writes = self._other_writes, set()
+        written, self._other_writes = self._other_writes, set()
         for kept in list(self._cached.values()):
             machine, identity = kept.machine, kept.identity
-            if CacheChange(identity.key, machine.component) in news and self._cache is not None:
+            if CacheChange(identity.key, machine.component) in written and self._cache is not None:
                 cached = await self._run(partial(self._cache.load, identity.key, machine.component))
                 if cached is not None and self._cached.get(machine) is kept:
                     machine.renew(cached.params, self._moments(cached))
@@ -595,7 +597,7 @@ class CacheWriter:
             autopilot=machine.identification.autopilot or 0,
             at=times.at,
             table=state,
-            params=HeardParams(
+            params=ObservedParams(
                 params,
                 times,
                 volatile=volatile,
@@ -790,11 +792,11 @@ def _of_firmware(cached: CachedComponent, identity: Identity) -> Mapping[str, Pa
 
 
 def _pass_on(
-    token: anyio.lowlevel.EventLoopToken, told: Callable[[CacheChange], None], change: CacheChange
+    token: anyio.lowlevel.EventLoopToken, callback: Callable[[CacheChange], None], change: CacheChange
 ) -> None:
     """Call a function in the event loop from another thread; do nothing if the event loop has ended."""
     with suppress(anyio.RunFinishedError):
-        anyio.from_thread.run_sync(told, change, token=token)
+        anyio.from_thread.run_sync(callback, change, token=token)
 
 
 def _nothing() -> None:

@@ -86,7 +86,7 @@ class FleetFetch:
         self._is_cache_awaited = False
         self._unanswered: dict[Address, Fetch] = {}
         self._longest_answer = 0.0
-        self._unheard_at: dict[Address, float] = {}  # last time at which heartbeats were overdue
+        self._overdue_at: dict[Address, float] = {}  # last time at which heartbeats were overdue
 
     async def run(
         self,
@@ -127,7 +127,7 @@ class FleetFetch:
                 is_worth_it = self.is_worth_waiting(now, listen_until=listen_until, hear_until=hear_until)
                 if now >= until or not is_worth_it:
                     return await self.outcome(now, waited=now - began)
-                await self.news(min(PROGRESS_CALL_INTERVAL, until - now))
+                await self.wait_for_change(min(PROGRESS_CALL_INTERVAL, until - now))
                 if progress is not None:
                     progress(self.progress(anyio.current_time()))
         finally:
@@ -190,7 +190,7 @@ class FleetFetch:
             for address, fetch in self._fetches.items()
         )
 
-    async def news(self, seconds: float) -> None:
+    async def wait_for_change(self, seconds: float) -> None:
         """Wait until a fetch ends, for at most this many seconds."""
         ended = anyio.Event()
         under_way = [fetch for fetch in self._fetches.values() if not fetch.done]
@@ -283,11 +283,11 @@ class FleetFetch:
                 took = answered_at - fetch.begun_at - fetch.queue_wait(now)
                 self._longest_answer = max(self._longest_answer, took)
         elif presence.is_overdue(now):
-            self._unheard_at[address] = now
+            self._overdue_at[address] = now
 
     def _is_mute(self, address: Address, fetch: Fetch, now: float, timeout: float) -> bool:
         """Return whether a component sends messages, but no response to its fetch for this many seconds."""
         presence = self._station.components[address].presence
-        since = max(fetch.begun_at + fetch.queue_wait(now), self._unheard_at.get(address, -math.inf))
-        is_heard = presence.heard_at >= since or presence.is_lost or not presence.has_beaten
+        since = max(fetch.begun_at + fetch.queue_wait(now), self._overdue_at.get(address, -math.inf))
+        is_heard = presence.received_at >= since or presence.is_lost or not presence.has_beaten
         return is_heard and now - since >= timeout

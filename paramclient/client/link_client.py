@@ -180,8 +180,8 @@ class LinkClient(LocalClient):
     def autopilots(self) -> list[Component]:
         """See `ParamClient.autopilots`."""
         station = self.station
-        heard = dict.fromkeys(machine.vehicle for machine in station.components.values())
-        vehicles = sorted(heard, key=lambda vehicle: vehicle[0])
+        machines = dict.fromkeys(machine.vehicle for machine in station.components.values())
+        vehicles = sorted(machines, key=lambda vehicle: vehicle[0])
         found = [station.autopilot_of(*vehicle) for vehicle in vehicles]
         return [self._components[machine.address] for machine in found if machine is not None]
 
@@ -363,18 +363,18 @@ class LinkClient(LocalClient):
                 await self._components[machine.address].wait_for_cache()
         if machine is not None:
             return self._components[machine.address]
-        wanted = address_in_words(system, component, peer)
+        awaited = address_in_words(system, component, peer)
         if choice.due < math.inf:
-            wanted += f", then {LOOK_TIME} s without another vehicle"
-            raise NoReply(wanted, attempts=0, waited=anyio.current_time() - began)
-        raise self._not_received(wanted, began)
+            awaited += f", then {LOOK_TIME} s without another vehicle"
+            raise NoReply(awaited, attempts=0, waited=anyio.current_time() - began)
+        raise self._not_received(awaited, began)
 
-    def _not_received(self, wanted: str, began: float) -> NoReply:
+    def _not_received(self, awaited: str, began: float) -> NoReply:
         """Return the error of a component that was not received, with what was received instead."""
         refused = refused_in_words(self.signing_report())
         hint = "" if refused else silence_of_link(self.station, self._link.name)
         waited = anyio.current_time() - began
-        return NoReply(f"{wanted}{refused}", attempts=0, waited=waited, hint=hint)
+        return NoReply(f"{awaited}{refused}", attempts=0, waited=waited, hint=hint)
 
     async def successor(
         self, component: Component, system: int, *, timeout: float | None = COMPONENT_TIMEOUT
@@ -487,10 +487,10 @@ class LinkClient(LocalClient):
 
     def _announce(self, event: Event) -> None:
         """Push an event to all streams, if it has a public form."""
-        news = public_event(event, self._components[event.machine.address])
-        if news is not None:
+        public = public_event(event, self._components[event.machine.address])
+        if public is not None:
             for events in list(self._subscriptions):
-                events.push(news)
+                events.push(public)
 
     def _meet(self, machine: ComponentMachine) -> None:
         """Add a new component, load its cached table, and request its hash if that may confirm the table."""

@@ -95,13 +95,13 @@ class LinkComponent(LocalComponent):
     Args:
         client: the client that follows it.
         machine: its protocol state.
-        heard_at: time of its first message, by the clock of the event loop.
+        received_at: time of its first message, by the clock of the event loop.
     """
 
-    def __init__(self, client: LocalClient, machine: ComponentMachine, heard_at: float) -> None:
+    def __init__(self, client: LocalClient, machine: ComponentMachine, received_at: float) -> None:
         self.client = client
         self.machine = machine
-        self._heard_at = heard_at
+        self._received_at = received_at
         self._subscriptions: weakref.WeakSet[Changes] = weakref.WeakSet()
         machine.tells_changes = False  # until the first subscription
         self.system = machine.system
@@ -182,7 +182,7 @@ class LinkComponent(LocalComponent):
     @property
     def silence(self) -> float:
         """See `Component.silence`."""
-        return max(0.0, anyio.current_time() - self.machine.presence.heard_at)
+        return max(0.0, anyio.current_time() - self.machine.presence.received_at)
 
     @property
     def round_trip(self) -> float | None:
@@ -392,7 +392,7 @@ class LinkComponent(LocalComponent):
         return (
             self._cache_is_read.is_set()
             or not writer.may_have(self.system, self.component)
-            or now >= self._heard_at + timeout
+            or now >= self._received_at + timeout
         )
 
     async def wait_for_cache(self) -> None:
@@ -400,7 +400,7 @@ class LinkComponent(LocalComponent):
         for timeout in (IDENTITY_TIMEOUT, CACHE_TIMEOUT):
             now = anyio.current_time()
             if not self.is_cache_due(now):
-                with anyio.move_on_after(self._heard_at + timeout - now):
+                with anyio.move_on_after(self._received_at + timeout - now):
                     await self._cache_is_read.wait()
                 self.client.check_open()
 
@@ -459,7 +459,7 @@ class LinkComponent(LocalComponent):
     def forget(self) -> None:
         """End all streams with NoReply: the component is lost and no longer followed."""
         self.client.cache_writer.remove_component(self.machine)
-        silence = anyio.current_time() - self.machine.presence.heard_at
+        silence = anyio.current_time() - self.machine.presence.received_at
         awaited = f"{address_in_words(self.system, self.component)} (lost)"
         self.end(NoReply(awaited, attempts=0, waited=silence))
 

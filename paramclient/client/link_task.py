@@ -158,7 +158,7 @@ class LinkTask:
             self._detect_suspend(now)
             moments = self._moments(len(chunks), drained_at, asked_at, now)
             drained_at = now if len(chunks) < BACKLOG_DATAGRAMS_MIN else drained_at
-            is_news = not chunks
+            has_data = not chunks
             if not chunks:
                 self._station.over(now)
             loop.record_read(self, len(chunks))
@@ -169,12 +169,12 @@ class LinkTask:
             rest = zip(chunks, moments, strict=True)
             if loop.needs_turns(len(chunks), self._station.scheduler):
                 self._is_processing = True
-                is_news |= await self._take_turns(rest, loop)
+                has_data |= await self._take_turns(rest, loop)
                 self._is_processing = False
-            is_news |= self._take(rest, math.inf)
+            has_data |= self._take(rest, math.inf)
             now = self._read_at = anyio.current_time()
             loop.record_processed(self, now)
-            if is_news:
+            if has_data:
                 self._dispatch()
                 self.notify()
                 self._something_to_send.set()
@@ -210,15 +210,15 @@ class LinkTask:
         self, chunks: Iterator[tuple[tuple[Peer, bytes], float]], loop: LoopScheduler
     ) -> bool:
         """Process received data in turns with other tasks and links. Return whether there are new events."""
-        is_news = is_done = False
+        has_data = is_done = False
         while not is_done:
             async with loop.turn:
                 turn_ends = time.perf_counter() + TURN_MAX
-                is_news |= self._take(chunks, turn_ends)
+                has_data |= self._take(chunks, turn_ends)
                 is_done = time.perf_counter() < turn_ends
                 self._dispatch()
                 await anyio.lowlevel.checkpoint()  # other tasks run before the turn of another link
-        return is_news
+        return has_data
 
     def _take(self, chunks: Iterator[tuple[tuple[Peer, bytes], float]], until: float) -> bool:
         """Process received data until this time. Return whether there are new events.
@@ -227,15 +227,15 @@ class LinkTask:
             chunks: peer, data and arrival time of each chunk.
             until: time by `time.perf_counter`.
         """
-        is_news = False
+        has_data = False
         now = anyio.current_time()
         for (peer, data), moment in chunks:
-            is_news |= self._station.receive(data, peer, now, moment)
+            has_data |= self._station.receive(data, peer, now, moment)
             for tap in self._taps:
                 tap.received(data, peer)
             if time.perf_counter() >= until:
                 break
-        return is_news
+        return has_data
 
     async def send(self) -> None:
         """Send frames of the core and run its deadlines, until calls fail permanently or cancellation."""

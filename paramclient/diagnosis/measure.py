@@ -218,8 +218,8 @@ class _Diagnosis:
         count = component.count or 0
         # indices spread over the table, without those that were just read
         step = max((count - SINGLE_READ_COUNT) // CONCURRENT_READ_COUNT, 1)
-        wanted = range(SINGLE_READ_COUNT, count, step)[:CONCURRENT_READ_COUNT]
-        if not wanted:
+        indices = range(SINGLE_READ_COUNT, count, step)[:CONCURRENT_READ_COUNT]
+        if not indices:
             return ReadService(median(single), None, 0, 0, 0)
         reads = self._local.machine.reads
         requests = reads.retries
@@ -231,11 +231,11 @@ class _Diagnosis:
                 answered_at.append(anyio.current_time())
 
         async with anyio.create_task_group() as tasks:
-            for index in wanted:
+            for index in indices:
                 tasks.start_soon(read, index)
         rate = len(answered_at) / (max(answered_at) - began) if answered_at else None
-        requests = len(wanted) + reads.retries - requests
-        return ReadService(median(single), rate, len(wanted), len(answered_at), requests)
+        requests = len(indices) + reads.retries - requests
+        return ReadService(median(single), rate, len(indices), len(answered_at), requests)
 
     async def _is_answered(self, index: int) -> bool:
         try:

@@ -398,8 +398,10 @@ class SavedDoc(Document):
     @classmethod
     def of(cls, path: str, form: str, sets: Iterable[ParamSet]) -> SavedDoc:
         """Return the document of a file: its path, its format, and the sets in it."""
-        held = [SavedSetDoc(system=each.system, component=each.component, params=len(each)) for each in sets]
-        return cls(path=path, form=form, components=held)
+        components = [
+            SavedSetDoc(system=each.system, component=each.component, params=len(each)) for each in sets
+        ]
+        return cls(path=path, form=form, components=components)
 
 
 class SavedFilesDoc(Document):

@@ -121,7 +121,7 @@ class DiffDoc(Document):
     ) -> Iterator[tuple[str, DifferenceDoc]]:
         """Yield the members of `params`, each created when it is needed; see `of`."""
         for entry in outcome.entries:
-            if everything or entry.is_news:
+            if everything or entry.is_shown:
                 source = _source(entry) if has_defaults and entry.base is not None else None
                 yield entry.name, DifferenceDoc.of(entry, left, right, base, source)
 

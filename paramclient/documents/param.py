@@ -97,8 +97,8 @@ class InfoDoc(Document):
         """
         from paramclient.metadata.info import ParamInfo, number_of  # only here: loads the clients
 
-        def number(told: Scalar | None) -> int | float | None:
-            value = None if told is None else parse_number(told)
+        def number(given: Scalar | None) -> int | float | None:
+            value = None if given is None else parse_number(given)
             return None if isinstance(value, bytes) else value
 
         named = {

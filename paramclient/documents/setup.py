@@ -263,7 +263,8 @@ class ApplyResultDoc(Document):
             complete=result.complete,
             counts={status: result.counts.get(status, 0) for status in ApplyStatus},
             params={
-                row.name: AppliedRowDoc.of(row) for row in (result.rows.values() if full else result.news)
+                row.name: AppliedRowDoc.of(row)
+                for row in (result.rows.values() if full else result.shown_rows)
             },
             extra=len(result.extra),
             reboots=result.reboots,

@@ -106,8 +106,8 @@ def _bytes(sets: list[ParamSet], form: FileForm, around: ParamFile) -> bytes:
     if not sets:
         raise UsageError("there are no parameters to write")
     if len(sets) > 1 and form in (FileForm.PARM, FileForm.MISSION_PLANNER, FileForm.PCK):
-        held = ", ".join(map(address, sets))
-        raise UsageError(f"the format {form} holds one component, and there are {held}; choose one")
+        components = ", ".join(map(address, sets))
+        raise UsageError(f"the format {form} holds one component, and there are {components}; choose one")
     _check(sets)
     match form:
         case FileForm.PCK:
@@ -163,13 +163,13 @@ def _as_file(content: Content, form: FileForm) -> ParamFile:
 
 def _header_lines(params: ParamSet) -> Iterator[str]:
     """Generate a description of a set, for the header of a file."""
-    who = params.identity
-    kind = "" if who is None else f", {autopilot_name(who.autopilot)}"
+    identity = params.identity
+    kind = "" if identity is None else f", {autopilot_name(identity.autopilot)}"
     yield f"{counted(len(params), 'parameter')} of system/component {address(params)}{kind}"
-    if who is not None:
-        commit = f", commit {who.git_hash}" if who.git_hash else ""
-        firmware = f", firmware {version_text(who.firmware)}{commit}" if who.firmware else ""
-        yield f"of the vehicle {who.key}{firmware}"
+    if identity is not None:
+        commit = f", commit {identity.git_hash}" if identity.git_hash else ""
+        firmware = f", firmware {version_text(identity.firmware)}{commit}" if identity.firmware else ""
+        yield f"of the vehicle {identity.key}{firmware}"
     if params.at is not None:
         yield f"as of {time_of(params.at, 'seconds')}"
     if params.source:

@@ -125,8 +125,10 @@ class _Written:
             param = faults.checked(_Param, each, (*place, "params", name))
             if param is not None:
                 written[name] = param
-        who = None if identity is None else faults.checked(_Identity, identity, (*place, "identity"))
-        return cls(place, found, who, written)
+        parsed_identity = (
+            None if identity is None else faults.checked(_Identity, identity, (*place, "identity"))
+        )
+        return cls(place, found, parsed_identity, written)
 
     def params(self, source: str, faults: _Faults) -> ParamSet:
         """Return the parameter set; add a problem for each parameter with contradictory fields."""

@@ -259,10 +259,10 @@ def _read_commented_lines(
     """
     header: list[str] = []
     waiting: list[str] = []
-    at_top, parted = True, False
+    at_top, has_gap = True, False
     for line in lines_of(text):
         if line.text:
-            if at_top and not parted:
+            if at_top and not has_gap:
                 header, waiting = waiting, []
             at_top = False
             if line.comment:
@@ -272,7 +272,7 @@ def _read_commented_lines(
         elif line.comment is not None:
             waiting.append(line.comment)
         elif at_top:
-            parted = True
+            has_gap = True
             header += waiting
             waiting = []
     return tuple(header), tuple(waiting)

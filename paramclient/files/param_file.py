@@ -61,8 +61,8 @@ class ParamFile:
         raise FileError(f"{many} ({wanted}); the file contains {there}", source=self.source)
 
     def __repr__(self) -> str:
-        held = ", ".join(f"{address(each)}: {len(each)}" for each in self.sets)
-        return f"<ParamFile {self.source or 'unnamed'} {self.form} {held}>"
+        description = ", ".join(f"{address(each)}: {len(each)}" for each in self.sets)
+        return f"<ParamFile {self.source or 'unnamed'} {self.form} {description}>"
 
 
 class TooManyParams(FileError):

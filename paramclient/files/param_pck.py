@@ -31,10 +31,10 @@ def read_packed(data: bytes, source: str) -> ParamFile:
         try:
             entries = param_pck.decode_upload(data)
         except PackError:
-            held = param_pck.decode(data)
-            entries, with_defaults = held.entries, held.with_defaults
-            if held.total > len(entries):
-                notes.append(f"The file contains {len(entries)} of the vehicle's {held.total} parameters.")
+            pack = param_pck.decode(data)
+            entries, with_defaults = pack.entries, pack.with_defaults
+            if pack.total > len(entries):
+                notes.append(f"The file contains {len(entries)} of the vehicle's {pack.total} parameters.")
     except PackError as error:
         raise FileError(f"invalid packed parameter file: {error}", source=source) from error
     if not entries:

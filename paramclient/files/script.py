@@ -76,8 +76,8 @@ def read_script(text: str, source: str, params_max: int | None = None) -> ParamF
                 raise UsageError(f"{_EXPECTED}, not {obstacle}")
             param, is_default = _param(line, "\n".join(comments))
             if is_default and param.name in assigned:
-                held, place = builder.sets[None, None][param.name], builder.place_of(param.name)
-                builder.note_repeated(held, place, param, f"line {line.number}")
+                existing, place = builder.sets[None, None][param.name], builder.place_of(param.name)
+                builder.note_repeated(existing, place, param, f"line {line.number}")
                 continue
             builder.add(param)
             if not is_default:

@@ -48,7 +48,7 @@ _line_end: Final = re.compile(r"\r\n|\n|\r")
 _whole: Final = re.compile(r"[+-]?[0-9]+").fullmatch
 _hexadecimal: Final = re.compile(r"0[xX][0-9a-fA-F]+").fullmatch
 _fraction: Final = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?").fullmatch
-_word: Final = re.compile(r"([+-]?)(?:(nan)|inf(?:inity)?)", re.IGNORECASE).fullmatch
+_nan_or_infinity: Final = re.compile(r"([+-]?)(?:(nan)|inf(?:inity)?)", re.IGNORECASE).fullmatch
 COMMENT_START: Final = re.compile(r"(?<![0-9]\.)#|#(?!INF|IND|[QS]?NAN)|(?:(?<=[ \t])|^)(?://|;)")
 """Start of a comment in a parameter list: no name or value can begin with `//` or `;`. The `#` of `1.#INF`
 and `-1.#IND`, which older C libraries of Windows print for infinity and NaN, does not start a comment."""
@@ -252,7 +252,7 @@ def parse_number(text: str) -> int | float | None:
     if _fraction(text):
         value = float(text)
         return value if math.isfinite(value) else None
-    if word := _word(text):
+    if word := _nan_or_infinity(text):
         if word[2]:
             return None if word[1] == "-" else math.nan  # the bits of a negative NaN are not defined
         return -math.inf if word[1] == "-" else math.inf

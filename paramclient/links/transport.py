@@ -33,7 +33,7 @@ class Transport(asyncio.Protocol):
     def __init__(self) -> None:
         self._chunks: deque[bytes] = deque()
         self._unread = 0
-        self._news = anyio.Event()
+        self._changed = anyio.Event()
         self._may_write = anyio.Event()
         self._may_write.set()
         self._is_closed = False
@@ -57,8 +57,8 @@ class Transport(asyncio.Protocol):
     async def read(self) -> bytes:
         """Wait for bytes; return b"" if the port is closed meanwhile."""
         while not self._chunks and not self._is_closed:
-            self._news = anyio.Event()
-            await self._news.wait()
+            self._changed = anyio.Event()
+            await self._changed.wait()
         if not self._chunks and self._loss is not None:
             raise self._loss
         data = b"".join(self._chunks)
@@ -90,7 +90,7 @@ class Transport(asyncio.Protocol):
         self._unread += len(data)
         if self._unread >= UNREAD_BYTES_MAX:
             self._transport.pause_reading()
-        self._news.set()
+        self._changed.set()
 
     def pause_writing(self) -> None:
         self._may_write = anyio.Event()
@@ -105,5 +105,5 @@ class Transport(asyncio.Protocol):
         if not self._is_closed:
             self._is_closed = True
             self._loss = loss
-        self._news.set()
+        self._changed.set()
         self._may_write.set()

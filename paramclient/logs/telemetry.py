@@ -53,9 +53,9 @@ async def import_log(path: str | os.PathLike[str], cache: ParamCache) -> tuple[I
     """
     name = f"replay:{await anyio.Path(path).resolve()}"
     with closing(open_log(os.fspath(path), name)) as file:
-        said = await _first_introductions(read_records(file))
+        introductions = await _first_introductions(read_records(file))
         file.seek(0)
-        return await _Import(name, said, cache).read(read_records(file))
+        return await _Import(name, introductions, cache).read(read_records(file))
 
 
 async def _first_introductions(records: Iterator[Record]) -> dict[int, dict[Address, bytes]]:
@@ -75,14 +75,16 @@ class _Import:
 
     Args:
         name: the log's link name, part of an identity without a hardware id.
-        said: HEARTBEAT and AUTOPILOT_VERSION of the components, which define identity and encoding before
-            their time in the log.
+        introductions: HEARTBEAT and AUTOPILOT_VERSION of the components, which define identity and encoding
+            before their time in the log.
         cache: the cache to write to.
     """
 
-    def __init__(self, name: str, said: Mapping[int, Mapping[Address, bytes]], cache: ParamCache) -> None:
-        self._heartbeats = said[HEARTBEAT_ID]
-        self._versions = said[AUTOPILOT_VERSION_ID]
+    def __init__(
+        self, name: str, introductions: Mapping[int, Mapping[Address, bytes]], cache: ParamCache
+    ) -> None:
+        self._heartbeats = introductions[HEARTBEAT_ID]
+        self._versions = introductions[AUTOPILOT_VERSION_ID]
         self._at = 0.0
         self._station = Station(
             link=name, is_stream=False, sync_settings=SyncSettings.chosen(None, "auto", is_log=True)
@@ -116,8 +118,8 @@ class _Import:
             await writer.merge()
         finally:
             await writer.close()
-        heard = (machines[address] for address in sorted(machines))
-        return tuple(self._imported_table(each) for each in heard if _is_told(each))
+        machines_in_order = (machines[address] for address in sorted(machines))
+        return tuple(self._imported_table(each) for each in machines_in_order if _is_told(each))
 
     async def _follow(self) -> None:
         """Handle the station's events, as the client does."""
@@ -127,9 +129,11 @@ class _Import:
                 machine = event.machine
                 if isinstance(event, ComponentHeard):
                     address = (machine.system, machine.component)
-                    for said in (self._heartbeats, self._versions):
-                        if address in said:  # frames before the first introduction are of the same vehicle
-                            station.receive(said[address], LOG_PEER, self._at)
+                    for introductions in (self._heartbeats, self._versions):
+                        if (
+                            address in introductions
+                        ):  # frames before the first introduction are of the same vehicle
+                            station.receive(introductions[address], LOG_PEER, self._at)
                     await self._bring(machine)
                 elif isinstance(event, ComponentIdentified):
                     for each in station.components.values():

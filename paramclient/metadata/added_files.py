@@ -180,9 +180,9 @@ def _kind_of_file(metadata: Metadata) -> VehicleKind | None:
     return kinds.pop() if len(kinds) == 1 else None
 
 
-def _fits(wanted: str | None, version: str | None) -> bool:
+def _fits(required_version: str | None, version: str | None) -> bool:
     """Return whether a version is one of those that were given: 4.6.1 is one of 4.6."""
-    numbers = _numbers(wanted)
+    numbers = _numbers(required_version)
     return not numbers or (version is not None and _numbers(version)[: len(numbers)] == numbers)
 
 

@@ -72,12 +72,12 @@ async def metadata_of(
     if announced is None:
         return None
     general = await files.get(announced.uri, announced.file_crc or None)
-    places = await _in_thread(_places_of_parameters, general, f"{announced.uri} of {files.who}")
+    places = await _in_thread(_places_of_parameters, general, f"{announced.uri} of {files.label}")
     if not places:
         return None
     uri, crc = next((place for place in places if place[0].startswith(_SCHEME)), places[0])
     content = await files.get(uri, crc)
-    read = await _in_thread(_read_parameters, content, f"{uri} of {files.who}")
+    read = await _in_thread(_read_parameters, content, f"{uri} of {files.label}")
     now = component.identity
     if kept is not None and crc is not None and before.uid in (None, now.uid):
         await _in_thread(kept.remember, now, component.component, crc)
@@ -101,7 +101,7 @@ class _Files:
     progress: Callable[[int, int | None], None] | None
 
     @property
-    def who(self) -> str:
+    def label(self) -> str:
         return f"{self.component.system}/{self.component.component}"
 
     def left(self) -> float | None:
@@ -125,11 +125,13 @@ class _Files:
                 path, timeout=self.left(), progress=self.progress, limit=PACKED_SIZE_MAX
             )
         except UsageError as error:
-            raise MetadataError(f"{self.who} announces its metadata at {uri}: {error}", source=uri) from error
+            raise MetadataError(
+                f"{self.label} announces its metadata at {uri}: {error}", source=uri
+            ) from error
         if crc is not None:
             if not await _in_thread(has_checksum, content, crc):
                 raise MetadataError(
-                    f"{uri} of {self.who} does not have the announced checksum {crc:08x}", source=uri
+                    f"{uri} of {self.label} does not have the announced checksum {crc:08x}", source=uri
                 )
             if self.kept is not None:
                 await _in_thread(self.kept.put, content, crc)
@@ -140,7 +142,7 @@ class _Files:
         found = _ON_BOARD.fullmatch(uri)
         if found is None:
             raise MetadataError(
-                f"{self.who} announces its metadata at {uri}, which is not downloaded from "
+                f"{self.label} announces its metadata at {uri}, which is not downloaded from "
                 f"there: download the file, and pass it to read_metadata or --metadata",
                 source=uri,
             )
@@ -150,7 +152,7 @@ class _Files:
             other = self.component.client.components.get((self.component.system, int(number)))
         if other is None:
             raise MetadataError(
-                f"{self.who} announces its metadata at {uri}, but component {number} has not been received",
+                f"{self.label} announces its metadata at {uri}, but component {number} has not been received",
                 source=uri,
             )
         return Ftp(other), path

@@ -197,8 +197,8 @@ class ParamInfo:
         Raises:
             UsageError: several numbers have this name.
         """
-        wanted = _folded(text)
-        found = [number for number, name in named.items() if wanted and _folded(name) == wanted]
+        folded = _folded(text)
+        found = [number for number, name in named.items() if folded and _folded(name) == folded]
         if len(found) > 1:
             listed = " and ".join(map(str, found))
             raise UsageError(f"{self.name}: {text.strip()!r} is the name of {listed}; give the number")

@@ -77,7 +77,7 @@ class Difference:
         return self.standing is Standing.SAME
 
     @property
-    def is_news(self) -> bool:
+    def is_shown(self) -> bool:
         """Whether to report the entry: the values or types differ, or a side differs from the base."""
         return not self.is_same or self.types_differ or self.moved not in (None, Moved.NEITHER)
 

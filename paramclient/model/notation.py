@@ -46,27 +46,27 @@ def value_json(value: WireValue, number: ParamType | int) -> Scalar:
     return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
 
 
-def parse_number(told: object) -> WireValue:
+def parse_number(given: object) -> WireValue:
     """Return the value of a JSON number; NaN and infinities are text, raw bytes text of the form `0x…`.
 
     Raises:
         TypeError, ValueError: this is not a value.
     """
-    if isinstance(told, str):
-        return _WORDS[told] if told in _WORDS else int(told.removeprefix("0x"), 16).to_bytes(4, "little")
-    if isinstance(told, bool) or not isinstance(told, int | float):
-        raise TypeError(f"a value cannot be of type {type(told).__name__}")
-    return told
+    if isinstance(given, str):
+        return _WORDS[given] if given in _WORDS else int(given.removeprefix("0x"), 16).to_bytes(4, "little")
+    if isinstance(given, bool) or not isinstance(given, int | float):
+        raise TypeError(f"a value cannot be of type {type(given).__name__}")
+    return given
 
 
-def parse_value(told: object, number: ParamType | int) -> WireValue:
+def parse_value(given: object, number: ParamType | int) -> WireValue:
     """Return the value of a result of `value_json`, which may also be 2 for 2.0.
 
     Raises:
         TypeError, ValueError: this is not a value.
         OverflowError: it does not fit a REAL32.
     """
-    value = parse_number(told)
+    value = parse_number(given)
     if number == ParamType.REAL32 and not isinstance(value, bytes):
         rounded_value: float = _FLOAT32.unpack(_FLOAT32.pack(value))[0]
         return rounded_value

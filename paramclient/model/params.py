@@ -34,7 +34,7 @@ __all__ = [
     "param_of",
     "unpack_fields",
     "with_index",
-    "same_held",
+    "same_compact",
     "pack_fields",
     "trust_of",
     "with_trust_number",
@@ -73,47 +73,47 @@ class Params(MutableMapping[str, Param]):
     """Parameters by name, in the order of insertion. Each `Param` is made on access.
 
     Attributes:
-        held: the compact form, by name.
+        compact: the compact form, by name.
         defaults: the firmware's defaults that are known, by name.
         moments: when each value was last observed, by name, in seconds of the clock of the table's owner.
             Names without a known time are absent.
     """
 
-    __slots__ = ("defaults", "held", "moments")
+    __slots__ = ("compact", "defaults", "moments")
 
     def __init__(
         self,
-        held: dict[str, CompactParam] | None = None,
+        compact: dict[str, CompactParam] | None = None,
         defaults: dict[str, WireValue] | None = None,
         moments: dict[str, float] | None = None,
     ) -> None:
-        self.held: dict[str, CompactParam] = {} if held is None else held
+        self.compact: dict[str, CompactParam] = {} if compact is None else compact
         self.defaults: dict[str, WireValue] = {} if defaults is None else defaults
         self.moments: dict[str, float] = {} if moments is None else moments
 
     def __getitem__(self, name: str) -> Param:
-        return param_of(name, self.held[name], self.defaults.get(name))
+        return param_of(name, self.compact[name], self.defaults.get(name))
 
     def __setitem__(self, name: str, param: Param) -> None:
-        self.held[name] = compact_param(param)
+        self.compact[name] = compact_param(param)
         if param.default is None:
             self.defaults.pop(name, None)
         else:
             self.defaults[name] = param.default
 
     def __delitem__(self, name: str) -> None:
-        del self.held[name]
+        del self.compact[name]
         self.defaults.pop(name, None)
         self.moments.pop(name, None)
 
     def __contains__(self, name: object) -> bool:
-        return name in self.held
+        return name in self.compact
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self.held)
+        return iter(self.compact)
 
     def __len__(self) -> int:
-        return len(self.held)
+        return len(self.compact)
 
     def values(self) -> ValuesView[Param]:
         """Return a view of the parameters, each made when the iteration reaches it."""
@@ -125,14 +125,14 @@ class Params(MutableMapping[str, Param]):
 
     def copy(self) -> Params:
         """Return a copy of the table."""
-        return Params(self.held.copy(), self.defaults.copy(), self.moments.copy())
+        return Params(self.compact.copy(), self.defaults.copy(), self.moments.copy())
 
     def only(self, names: Iterable[str]) -> Params:
         """Return a copy with only those of these names that the table has."""
-        held, defaults, moments = self.held, self.defaults, self.moments
-        known = [name for name in names if name in held]
+        compact, defaults, moments = self.compact, self.defaults, self.moments
+        known = [name for name in names if name in compact]
         return Params(
-            {name: held[name] for name in known},
+            {name: compact[name] for name in known},
             {name: defaults[name] for name in known if name in defaults} if defaults else None,
             {name: moments[name] for name in known if name in moments},
         )
@@ -148,7 +148,7 @@ class _Values(ValuesView[Param]):
 
     def __iter__(self) -> Iterator[Param]:
         default_of = self._mapping.defaults.get
-        return (param_of(name, held, default_of(name)) for name, held in self._mapping.held.items())
+        return (param_of(name, compact, default_of(name)) for name, compact in self._mapping.compact.items())
 
 
 class _Items(ItemsView[str, Param]):
@@ -157,7 +157,7 @@ class _Items(ItemsView[str, Param]):
     _mapping: Params
 
     def __iter__(self) -> Iterator[tuple[str, Param]]:
-        return zip(self._mapping.held, self._mapping.values(), strict=True)
+        return zip(self._mapping.compact, self._mapping.values(), strict=True)
 
 
 def as_params(params: Mapping[str, Param]) -> Params:
@@ -187,35 +187,35 @@ def number_of(trust: Trust) -> int:
     return _NUMBERS[trust]
 
 
-def param_of(name: str, held: CompactParam, default: WireValue | None = None) -> Param:
+def param_of(name: str, compact: CompactParam, default: WireValue | None = None) -> Param:
     """Return the `Param` of a compact parameter."""
-    bits, number, is_raw, trust, place = unpack_fields(held)
+    bits, number, is_raw, trust, place = unpack_fields(compact)
     value = from_bits(bits, number, is_raw=is_raw)
     index = None if place == COMPACT_NO_INDEX else place
     return Param(name, value, _KNOWN_TYPES[number], index, bits, _TRUSTS[trust], default)
 
 
-def trust_of(held: CompactParam) -> int:
+def trust_of(compact: CompactParam) -> int:
     """Return the number of a compact parameter's trust."""
-    return held[_TRUST_AT]
+    return compact[_TRUST_AT]
 
 
-def with_trust_number(held: CompactParam, trust: int) -> CompactParam:
+def with_trust_number(compact: CompactParam, trust: int) -> CompactParam:
     """Return a compact parameter with another trust."""
-    return held[:_TRUST_AT] + bytes((trust,)) + held[_INDEX_AT:]
+    return compact[:_TRUST_AT] + bytes((trust,)) + compact[_INDEX_AT:]
 
 
-def is_listed(held: CompactParam) -> bool:
+def is_listed(compact: CompactParam) -> bool:
     """Return whether a compact parameter has an index."""
-    return held[_INDEX_AT:] != _NO_INDEX
+    return compact[_INDEX_AT:] != _NO_INDEX
 
 
-def with_index(held: CompactParam, place: int) -> CompactParam:
+def with_index(compact: CompactParam, place: int) -> CompactParam:
     """Return a compact parameter with another index."""
-    return held[:_INDEX_AT] + place.to_bytes(4, "little", signed=True)
+    return compact[:_INDEX_AT] + place.to_bytes(4, "little", signed=True)
 
 
-def same_held(one: CompactParam, other: CompactParam) -> bool:
+def same_compact(one: CompactParam, other: CompactParam) -> bool:
     """Return whether both have the same value in the same type, as `Param.same_value` defines it."""
     if one[:_TRUST_AT] == other[:_TRUST_AT]:
         return True

@@ -28,28 +28,28 @@ def nearest_names(name: str, names: Iterable[str]) -> tuple[str, ...]:
     more characters are compared. It takes less than 1 ms for the names of an autopilot, and 8 ms for 10,000
     names.
     """
-    wanted = name.upper()
+    upper_name = name.upper()
     matcher = difflib.SequenceMatcher(autojunk=False)
-    matcher.set_seq2(wanted)
+    matcher.set_seq2(upper_name)
     scored = []
-    for upper, other in _candidates(wanted, name, names):
+    for upper, other in _candidates(upper_name, name, names):
         matcher.set_seq1(upper)
         if matcher.real_quick_ratio() >= SIMILARITY_MIN and matcher.quick_ratio() >= SIMILARITY_MIN:
             scored.append((-matcher.ratio(), other))
     return tuple(other for score, other in sorted(scored)[:SIMILAR_NAMES_MAX] if -score >= SIMILARITY_MIN)
 
 
-def _candidates(wanted: str, name: str, names: Iterable[str]) -> list[tuple[str, str]]:
+def _candidates(upper_name: str, name: str, names: Iterable[str]) -> list[tuple[str, str]]:
     """Return the names to compare with `name`, each in upper case and as given."""
     found = [(other.upper(), other) for other in names if other != name]
     length = AFFIX_LENGTH
     while length == AFFIX_LENGTH or len(found) > COMPARED_NAMES_MAX:
-        head, tail = wanted[:length], wanted[-length:]
+        head, tail = upper_name[:length], upper_name[-length:]
         closer = [pair for pair in found if pair[0].startswith(head) or pair[0].endswith(tail)]
         if length > AFFIX_LENGTH and not closer:
             break
         found = closer
-        if length >= len(wanted):
+        if length >= len(upper_name):
             break
         length *= 2
     return sorted(found)[:COMPARED_NAMES_MAX]

@@ -267,7 +267,7 @@ class ComponentMachine:
         self.name_searches = NameSearches(context, self.reads, self.table, self.foreign_list)
         # without requests there are no reads: the lists of other stations take their place
         overheard = self.fetches.overheard
-        self._value_heard = self.reads.heard if overheard is None else overheard.heard
+        self._receive_read = self.reads.receive if overheard is None else overheard.receive
         self._own_address = own_address
         self._observer = observer
         self._transmit = send
@@ -445,7 +445,7 @@ class ComponentMachine:
         if isinstance(message, ParamValue):
             self.receive_value(message, now, version, moment)
             return
-        silent_since = self.presence.heard_at
+        silent_since = self.presence.received_at
         self._heard(now, version)
         if sequence is not None and self.presence.numbering_begins(sequence):
             self._numbering_began(silent_since, now)
@@ -487,15 +487,15 @@ class ComponentMachine:
         elif isinstance(message, SystemTime):
             self._clock_told(self.presence.system_time(message, now), now)
         elif isinstance(message, FileTransfer):
-            self.files.heard(message, now)
+            self.files.receive(message, now)
             if self.fetches.overheard is not None:
                 self.fetches.overheard.file.reply_heard(message, now)
         elif isinstance(message, ComponentMetadata):
-            self.metadata_requests.heard(message, now)
+            self.metadata_requests.receive(message, now)
         elif isinstance(message, HighLatency2):
             self._kind_told(message, now)
             self.presence.high_latency()
-        self.identification.heard(now)
+        self.identification.receive(now)
         self._follow_identity(now)
 
     def _kind_told(self, message: Heartbeat | HighLatency2, now: float) -> None:
@@ -525,7 +525,7 @@ class ComponentMachine:
         """
         self._heard(now, version)
         identification = self.identification
-        identification.heard(now)
+        identification.receive(now)
         name, _, number, count, index = message
         if not is_portable_name(name):
             if name:
@@ -537,7 +537,7 @@ class ComponentMachine:
                 self.fetch.announced(announced)
             if self.fetches.overheard is not None:
                 self.fetches.overheard.announced(announced, now)
-            self.reads.heard(message, now)
+            self.reads.receive(message, now)
             return
         table = self.table
         if identification.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA:
@@ -573,14 +573,14 @@ class ComponentMachine:
             return  # more names than the table may hold
         fetch = self.fetches.current
         if fetch is not None:
-            fetch.heard(message, now)
+            fetch.receive(message, now)
         elif not self.reads.awaits(message):
-            self.foreign_list.heard(message, now)
+            self.foreign_list.receive(message, now)
         if writes.queues:
-            writes.heard(message, now)
-        self._value_heard(message, now)
+            writes.receive(message, now)
+        self._receive_read(message, now)
         if self.name_searches:
-            self.name_searches.heard(message, now)
+            self.name_searches.receive(message, now)
 
     def boot_clock(self, message_id: int, boot_ms: int, now: float) -> None:
         """Process `time_boot_ms` of a telemetry message."""
@@ -621,12 +621,12 @@ class ComponentMachine:
         self._checks.ask(message.param_id, until)
         fetch = self.fetches.current
         if fetch is not None:
-            fetch.heard(message, now)
+            fetch.receive(message, now)
         elif not self.reads.awaits(message):
-            self.foreign_list.heard(message, now)
+            self.foreign_list.receive(message, now)
         self.writes.defer(message, until)
         if self.fetches.overheard is not None:
-            self.fetches.overheard.heard(message, now)
+            self.fetches.overheard.receive(message, now)
         self.reads.defer(message, until, now)
 
     def foreign_set(self, name: str, raw: bytes, station: str, now: float) -> None:
@@ -796,7 +796,7 @@ class ComponentMachine:
             cancel=self.writes.cancel,
             committed=self.writes.committed,
             unfile=self.writes.unfile,
-            heard=self.receive_value,
+            receive=self.receive_value,
             is_switch=is_switch,
             fileable=fileable,
             may_commit=lambda: self.may_be_written,
@@ -944,7 +944,7 @@ class ComponentMachine:
             )
         self.check_uncontested()
         if self.presence.is_lost:
-            silence = now - self.presence.heard_at
+            silence = now - self.presence.received_at
             raise NoReply(f"{what} (lost)", attempts=0, waited=silence)
 
     def check_uncontested(self) -> None:
@@ -1049,9 +1049,9 @@ class ComponentMachine:
     def resume(self, now: float) -> None:
         """Repeat all requests in flight: the link is back."""
         self.reschedule()
-        self.round_trip.heard_at = now
+        self.round_trip.received_at = now
         if not self.presence.is_lost:
-            if self.presence.was_away(silence := self.presence.heard(now)):
+            if self.presence.was_away(silence := self.presence.receive(now)):
                 self._doubt()
                 self.sync.check(now)
             elif self.identity.uid is not None:
@@ -1098,8 +1098,8 @@ class ComponentMachine:
         """Process the arrival of any message."""
         self.reschedule()
         presence = self.presence
-        silence = presence.heard(now)
-        self.round_trip.heard_at = now
+        silence = presence.receive(now)
+        self.round_trip.received_at = now
         if silence >= presence.gap or presence.is_lost:
             self._was_silent(silence, now)
         if version > self.version:
@@ -1125,7 +1125,7 @@ class ComponentMachine:
         """Mark the component as lost. A fetch goes on for a while: the component may only be rebooting."""
         presence = self.presence
         presence.is_lost = True
-        self._observer.lost(self, now - presence.heard_at)
+        self._observer.lost(self, now - presence.received_at)
         for machine in reversed(self._machines):
             machine.lose(now)
         self._doubt()
@@ -1194,9 +1194,9 @@ class ComponentMachine:
         """Continue the writes, or end them with an error where the identity of the vehicle, or of its
         autopilot, was requested without success."""
         self.reschedule()
-        if self.ext.writes.is_held and self.is_recipient_certain:
+        if self.ext.writes.is_awaiting_permission and self.is_recipient_certain:
             self.ext.writes.proceed(now)
-        if self.writes.is_held and self.may_be_written:
+        if self.writes.is_awaiting_permission and self.may_be_written:
             self.writes.proceed(now)
             return
         for each in (self, *self._autopilots()):

@@ -69,28 +69,28 @@ def silence_of_component(station: Station, machine: ComponentMachine, since: flo
     """
     if station.listens_only:
         return ""
-    who, presence = f"{machine.system}/{machine.component}", machine.presence
+    label, presence = f"{machine.system}/{machine.component}", machine.presence
     if station.listening_since == math.inf:
         return f"{station.link} is down at present."
     is_silent = presence.is_lost or presence.is_overdue(now)
-    if is_silent or (not presence.has_beaten and presence.heard_at < since):
-        silence = f"for {now - presence.heard_at:.1f} s"
+    if is_silent or (not presence.has_beaten and presence.received_at < since):
+        silence = f"for {now - presence.received_at:.1f} s"
         others = [
             each
             for each in station.components.values()
-            if each is not machine and each.presence.heard_at > max(since, presence.heard_at)
+            if each is not machine and each.presence.received_at > max(since, presence.received_at)
         ]
         if not others:
             return f"Nothing was received on {station.link} {silence}."
         words = [_in_words(each) for each in sorted(others, key=_order)]
         return (
-            f"{who} has sent nothing {silence}; received meanwhile on {station.link}: only "
+            f"{label} has sent nothing {silence}; received meanwhile on {station.link}: only "
             f"{first_of(words, LISTED_MAX)}."
         )
     if presence.has_beaten:
-        does = f"{who} sends heartbeats (the last one {now - presence.beat_at:.1f} s ago)"
+        does = f"{label} sends heartbeats (the last one {now - presence.beat_at:.1f} s ago)"
     else:
-        does = f"{who} sends messages (the last one {now - presence.heard_at:.1f} s ago)"
+        does = f"{label} sends messages (the last one {now - presence.received_at:.1f} s ago)"
     if machine.round_trip.smoothed is not None:
         return f"{does} and answered other requests: the link may lose packets, or the vehicle is busy."
     return (

@@ -221,7 +221,7 @@ class Station:
             if number == PARAM_VALUE_ID and machine is not None:  # fast path for the most frequent message
                 peers = machine.peers
                 if peer == peers.speaker:
-                    peers.heard_at = now
+                    peers.received_at = now
                 elif not self._accepts(machine, peer, now):
                     continue
                 machine.receive_value(decode_param_value(payload), now, version, moment)
@@ -411,8 +411,8 @@ class Station:
         machines = list(self.components.values())
         if peer is None:
             return machines
-        said = [(each, each.peer_in_words) for each in machines]
-        return [each for each, words in said if peer in (words, words.rpartition(":")[0])]
+        by_peer = [(each, each.peer_in_words) for each in machines]
+        return [each for each, words in by_peer if peer in (words, words.rpartition(":")[0])]
 
     def find(
         self, system: int | None, component: int | None, peer: str | None = None

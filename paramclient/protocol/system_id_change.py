@@ -53,7 +53,7 @@ class SystemIdSearch:
         found = components.get(self.address)
         if (
             found is None
-            or now - found.presence.heard_at > OLD_ID_SILENCE_MIN
+            or now - found.presence.received_at > OLD_ID_SILENCE_MIN
             or not found.presence.has_beaten
         ):
             return False
@@ -63,7 +63,7 @@ class SystemIdSearch:
             return False
         if not self._identity.is_same_vehicle(identity):
             raise AnotherVehicle(*self.address, str(self._identity), str(identity))
-        hush = found.presence.heard_at - self._before.presence.heard_at
+        hush = found.presence.received_at - self._before.presence.received_at
         return hush > 0.0 if self._identity.has_own_uid else hush >= OLD_ID_SILENCE_MIN
 
     def _ask_again(self, found: ComponentMachine, now: float) -> None:

@@ -91,7 +91,7 @@ class VehicleChoice:
     def _decided(
         self,
         found: Sequence[ComponentMachine],
-        heard: Sequence[ComponentMachine],
+        received: Sequence[ComponentMachine],
         now: float,
         listening_since: float,
         *,
@@ -101,9 +101,9 @@ class VehicleChoice:
 
         Args:
             found: the components that fit the address.
-            heard: the components of every vehicle that the address fits.
+            received: the components of every vehicle that the address fits.
         """
-        one_of_each = _one_of_each(heard)
+        one_of_each = _one_of_each(received)
         if len(one_of_each) > 1:
             raise self._ambiguous(one_of_each, "vehicles")
         if len(found) > 1:
@@ -111,8 +111,8 @@ class VehicleChoice:
         if not found:
             return None
         if needs_look:
-            first_heard = min(each.presence.since for each in heard)
-            self.due = max(first_heard, listening_since) + LOOK_TIME
+            first_received_at = min(each.presence.since for each in received)
+            self.due = max(first_received_at, listening_since) + LOOK_TIME
         return found[0] if not needs_look or now >= self.due else None
 
     def _ambiguous(self, machines: Sequence[ComponentMachine], what: str) -> AmbiguousVehicle:

@@ -603,8 +603,8 @@ class ApplyRun:
         return ApplyRow(step.wanted, status, before, actual, step.type, category, reason, (), renamed)
 
     def _before(self, name: str) -> WireValue | None:
-        held = None if self._first is None else self._first.table.get(name)
-        return None if held is None else held.settable
+        current = None if self._first is None else self._first.table.get(name)
+        return None if current is None else current.settable
 
     def _report(self, phase: str, row: ApplyRow | None = None) -> None:
         if self._options.progress is not None:

@@ -282,12 +282,14 @@ def plan_for(
     )
 
 
-def with_other_names(names: Iterable[str], held: Container[str], renames: Renames | None) -> tuple[str, ...]:
-    """Return names, each followed by its other names unless it is among `held`; each name once."""
+def with_other_names(
+    names: Iterable[str], present: Container[str], renames: Renames | None
+) -> tuple[str, ...]:
+    """Return names, each followed by its other names unless it is among `present`; each name once."""
     found: dict[str, None] = {}
     for name in names:
         found[name] = None
-        if renames is not None and name not in held:
+        if renames is not None and name not in present:
             found.update(dict.fromkeys(renames.other_names(name)))
     return tuple(found)
 

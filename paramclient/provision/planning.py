@@ -443,9 +443,9 @@ class _Planner:
         renamed = self._renamed.get(wanted.name)
         target = wanted if renamed is None else renamed
         name = target.name
-        held: Param | WrittenParam | None = self._current.get(name)
-        before = None if held is None else held.settable
-        kind = target.type_number if held is None or held.type_number is None else held.type_number
+        current: Param | WrittenParam | None = self._current.get(name)
+        before = None if current is None else current.settable
+        kind = target.type_number if current is None or current.type_number is None else current.type_number
         note = self._renames.missing_note(wanted.name) if before is None else ""
 
         def verdict(status: PlanStatus, category: str = "", reason: str = "") -> PlanRow:
@@ -595,16 +595,16 @@ def _pop_matching(steps: list[Step], fits: Callable[[Step], bool]) -> list[Step]
     return taken
 
 
-def _is_same(wanted: WireValue, held: WireValue, kind: ParamType | int | None) -> bool:
+def _is_same(wanted: WireValue, current: WireValue, kind: ParamType | int | None) -> bool:
     """Return whether two values are equal in the vehicle's type; as float32 if the type is unknown."""
-    if isinstance(wanted, bytes) or isinstance(held, bytes):
-        return wanted == held
+    if isinstance(wanted, bytes) or isinstance(current, bytes):
+        return wanted == current
     if kind is None:
-        if isinstance(wanted, int) and isinstance(held, int):
-            return wanted == held
+        if isinstance(wanted, int) and isinstance(current, int):
+            return wanted == current
         kind = ParamType.REAL32
     try:
-        return same_bits(kind, bits_of(wanted, kind), bits_of(held, kind))
+        return same_bits(kind, bits_of(wanted, kind), bits_of(current, kind))
     except UsageError:
         return False
 

@@ -154,11 +154,11 @@ class ApplyResult:
         return [row for row in self.rows.values() if row.status is status]
 
     @property
-    def news(self) -> list[ApplyRow]:
+    def shown_rows(self) -> list[ApplyRow]:
         """The rows to show: all except unchanged parameters and left-out ones that do not differ."""
-        return [row for row in self.rows.values() if self._is_news(row)]
+        return [row for row in self.rows.values() if self._is_shown(row)]
 
-    def _is_news(self, row: ApplyRow) -> bool:
+    def _is_shown(self, row: ApplyRow) -> bool:
         if row.status is ApplyStatus.SKIPPED:
             return not row.is_as_wanted or self.plan.rows[row.name].differs
         return row.status is not ApplyStatus.UNCHANGED

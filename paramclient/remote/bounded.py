@@ -40,7 +40,9 @@ def checked_document(data: bytes) -> Any:
         raise ValueError(f"a document deeper than {JSON_NESTING_MAX}") from None
     level = [document]
     for _ in range(JSON_NESTING_MAX):
-        level = [each for held in level for each in _held(held) if isinstance(each, dict | list)]
+        level = [
+            each for container in level for each in _children(container) if isinstance(each, dict | list)
+        ]
         if not level:
             return document
     raise ValueError(f"a document deeper than {JSON_NESTING_MAX}")
@@ -130,5 +132,5 @@ class EventReader:
         return events
 
 
-def _held(value: Any) -> Any:
+def _children(value: Any) -> Any:
     return value.values() if isinstance(value, Mapping) else value if isinstance(value, list) else ()

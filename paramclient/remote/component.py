@@ -148,10 +148,10 @@ class RemoteComponent(ServiceComponent):
     @property
     def contest(self) -> Contest | None:
         """See `Component.contest`."""
-        told: Document | None = self._mirrored.document["contest"]
-        if told is None:
+        contest: Document | None = self._mirrored.document["contest"]
+        if contest is None:
             return None
-        return Contest(self.system, self.component, tuple(told["claimants"]), str(told["difference"]))
+        return Contest(self.system, self.component, tuple(contest["claimants"]), str(contest["difference"]))
 
     @property
     def is_armed(self) -> bool | None:
@@ -323,8 +323,8 @@ class RemoteComponent(ServiceComponent):
     ) -> FetchResult:
         """See `Component.fetch_all`. Concurrent fetches of several programs share one download."""
         began = anyio.current_time()
-        told = self._mirrored.progress
-        before = told.count
+        download = self._mirrored.progress
+        before = download.count
         check_accepted(accept, sample)
         body: dict[str, Any] = {"refresh": refresh, "accept": accept, "sample": min(sample, PARAMETERS_MAX)}
         if seed is not None:
@@ -332,13 +332,13 @@ class RemoteComponent(ServiceComponent):
 
         def tell() -> None:
             assert progress is not None
-            progress(told.since(before))
+            progress(download.since(before))
 
         async def fetch() -> ServiceResponse:
             awaited = f"the parameters of {self.system}/{self.component}"
             answer = await self._service.ask(self._mirrored, "fetch", body, timeout, awaited)
             with decode_errors(self._service.name):
-                told.end(answer.document["received"], answer.document["count"])
+                download.end(answer.document["received"], answer.document["count"])
             return answer
 
         answer = await run_with_progress(fetch, None if progress is None else tell)

@@ -51,7 +51,7 @@ class Connection:
     """Follows the events of a service, and sends requests to it.
 
     A lost connection is reopened with backoff, as a link is. Calls wait for it for up to `LINK_TIMEOUT` (10
-    s, in `client.link_task`); then they and new calls raise LinkError until the reconnection.
+    s, in `client.reconnection`); then they and new calls raise LinkError until the reconnection.
 
     Args:
         requests: the HTTP requests.
@@ -63,7 +63,7 @@ class Connection:
         ended: the error that all calls raise permanently, or None.
         failed: the error of the first connection attempt, or None.
         place: position of the last received event, or None.
-        news: set, and replaced, when events have arrived or an attribute has changed.
+        changed: set, and replaced, when events have arrived or an attribute has changed.
     """
 
     def __init__(self, requests: Requests, follower: EventSink) -> None:
@@ -72,7 +72,7 @@ class Connection:
         self.ended: LinkError | None = None
         self.failed: ParamClientError | None = None
         self.place: StreamPosition | None = None
-        self.news = anyio.Event()
+        self.changed = anyio.Event()
         self._requests = requests
         self._follower = follower
         self._was_there = False
@@ -163,7 +163,7 @@ class Connection:
         while self.is_away:
             if self.failed is not None:
                 raise self.failed
-            await self.news.wait()
+            await self.changed.wait()
 
     def check_open(self) -> None:
         """Check that requests can be sent.
@@ -183,9 +183,9 @@ class Connection:
         self._fail_calls()
 
     def tell(self) -> None:
-        """Wake the tasks that wait for `news`."""
-        news, self.news = self.news, anyio.Event()
-        news.set()
+        """Wake the tasks that wait for `changed`."""
+        changed, self.changed = self.changed, anyio.Event()
+        changed.set()
 
     async def _listen(self) -> None:
         """Receive events until the stream ends.
@@ -240,7 +240,7 @@ class Connection:
         while self.is_away:
             self.check_open()
             with anyio.move_on_after(deadline - anyio.current_time()) as waiting:
-                await self.news.wait()
+                await self.changed.wait()
             if waiting.cancelled_caught:
                 return False
         self.check_open()

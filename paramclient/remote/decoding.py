@@ -122,17 +122,17 @@ def params_of(documents: Mapping[str, Document]) -> dict[str, Param]:
     return {name: param_of(document, name) for name, document in documents.items()}
 
 
-def hash_of(told: str | None) -> int | None:
+def hash_of(text: str | None) -> int | None:
     """Return a PX4 hash, or None."""
-    return None if told is None else int(told, 16)
+    return None if text is None else int(text, 16)
 
 
 def identity_of(document: Document) -> Identity:
     """Return the identity of a vehicle. Members unknown to this version are ignored."""
-    told = {each.name: document[each.name] for each in fields(Identity)}
-    for name, value in told.items():
+    known = {each.name: document[each.name] for each in fields(Identity)}
+    for name, value in known.items():
         check_kind(value, *_IDENTITY.get(name, (int,)))
-    return Identity(**told)
+    return Identity(**known)
 
 
 def check_kind(value: object, *kinds: type) -> None:
@@ -147,12 +147,12 @@ def check_kind(value: object, *kinds: type) -> None:
 
 def progress_of(document: Document) -> Progress:
     """Return the progress of a fetch."""
-    told = Progress(*(document[name] for name in ("received", "total", "rate", "seconds_left")))
-    check_kind(told.received, int)
-    check_kind(told.total, int, NoneType)
-    check_kind(told.rate, int, float)
-    check_kind(told.seconds_left, int, float, NoneType)
-    return told
+    progress = Progress(*(document[name] for name in ("received", "total", "rate", "seconds_left")))
+    check_kind(progress.received, int)
+    check_kind(progress.total, int, NoneType)
+    check_kind(progress.rate, int, float)
+    check_kind(progress.seconds_left, int, float, NoneType)
+    return progress
 
 
 def fetch_result_of(document: Document, params: Mapping[str, Param], elapsed: float) -> FetchResult:
@@ -294,8 +294,8 @@ def stats_of(documents: list[Document]) -> ClientStats:
     counted = [each.name for each in fields(ClientStats) if each.name != "round_trips"]
     sums: dict[str, Any] = {}
     for name in counted:
-        told = [each[name] for each in documents if each.get(name) is not None]  # older services have fewer
-        sums[name] = sum(told) if told or name not in ("lost", "repeated") else None
+        counts = [each[name] for each in documents if each.get(name) is not None]  # older services have fewer
+        sums[name] = sum(counts) if counts or name not in ("lost", "repeated") else None
     trips = {
         (int(system), int(component)): float(seconds)
         for each in documents

@@ -188,10 +188,10 @@ class Requests:
                 raise self._foreign()
             if not (response.is_success and kind.startswith("text/event-stream")):
                 raise self._error(response, self._document(response, await self._read(response)))
-            async with aclosing(self._heard(response)) as heard:
-                yield heard
+            async with aclosing(self._chunks(response)) as chunks:
+                yield chunks
 
-    async def _heard(self, response: httpx.Response) -> AsyncGenerator[list[Any], None]:
+    async def _chunks(self, response: httpx.Response) -> AsyncGenerator[list[Any], None]:
         chunks = _pieces(response)
         reader = EventReader()
         now = anyio.current_time()

@@ -130,10 +130,10 @@ class TableMirror(ABC, Generic[TableParam, TableChange]):
     def _show(self) -> None:
         self.params.update(self._shown(self._told))
 
-    def _shown(self, told: dict[str, TableParam]) -> dict[str, TableParam]:
+    def _shown(self, params: dict[str, TableParam]) -> dict[str, TableParam]:
         if self.is_loaded and self._is_reachable:
-            return told
-        return {name: param.with_trust(Trust.CACHED) for name, param in told.items()}
+            return params
+        return {name: param.with_trust(Trust.CACHED) for name, param in params.items()}
 
     def _differences(
         self, before: Mapping[str, TableParam], now: Mapping[str, TableParam]

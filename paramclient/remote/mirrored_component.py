@@ -79,7 +79,7 @@ class MirroredComponent:
         self._publish_event = publish
         self._subscriptions: weakref.WeakSet[Changes] = weakref.WeakSet()
         self._ext_subscriptions: weakref.WeakSet[ExtChanges] = weakref.WeakSet()
-        self._held: list[Event] = []
+        self._queued: list[Event] = []
         self._is_announced = False
         self._read(document)
         self.component = make(self)
@@ -166,7 +166,7 @@ class MirroredComponent:
 
     def announce(self, event: Event) -> None:
         """Publish an event as soon as the table includes its effect."""
-        self._held.append(event)
+        self._queued.append(event)
         if self.is_loaded:
             self.tables_were_loaded()
 
@@ -190,8 +190,8 @@ class MirroredComponent:
 
     def tables_were_loaded(self) -> None:
         """Publish the events that have waited for the tables."""
-        held, self._held = self._held, []
-        for event in held:
+        queued, self._queued = self._queued, []
+        for event in queued:
             self._publish_event(event)
 
     def doubt(self) -> None:
@@ -203,7 +203,7 @@ class MirroredComponent:
         """Mark the component as lost: the service no longer knows it."""
         self.doubt()
         if self.state != "lost":
-            self._held.append(Lost(self.component, self.silence))
+            self._queued.append(Lost(self.component, self.silence))
         self.tables_were_loaded()
         self.is_gone = True
 
@@ -279,10 +279,10 @@ class FetchProgress:
 
     def take(self, event: Document) -> None:
         """Process a report."""
-        told = progress_of(event)
+        progress = progress_of(event)
         if event.get("done"):  # a completed fetch has no rate
-            told = replace(told, rate=self._last.rate)
-        self._last = told
+            progress = replace(progress, rate=self._last.rate)
+        self._last = progress
         self.count += 1
 
     def end(self, received: int, count: int | None) -> None:

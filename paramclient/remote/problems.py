@@ -113,11 +113,11 @@ def _not_applied(detail: str, problem: Problem) -> ValueNotApplied:
     )
 
 
-def _value(told: object) -> WireValue | str:
+def _value(given: object) -> WireValue | str:
     """Return the value of a parameter in a problem: a number, text or bytes."""
-    if not isinstance(told, Mapping):
-        return parse_number(told)
-    return str(told["text"]) if "text" in told else bytes.fromhex(told["hex"])
+    if not isinstance(given, Mapping):
+        return parse_number(given)
+    return str(given["text"]) if "text" in given else bytes.fromhex(given["hex"])
 
 
 def _ext_refused(kind: type[ExtSetRefused]) -> Callable[[str, Problem], ExtSetRefused]:

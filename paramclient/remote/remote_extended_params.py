@@ -197,18 +197,18 @@ class RemoteExtParams(ExtParams):
     ) -> ExtFetchResult:
         """See `ExtParams.fetch_all`. Concurrent fetches of several programs share one download."""
         began = anyio.current_time()
-        told = self._mirrored.ext_progress
-        before = told.count
+        download = self._mirrored.ext_progress
+        before = download.count
 
         def tell() -> None:
             assert progress is not None
-            progress(told.since(before))
+            progress(download.since(before))
 
         async def fetch() -> ServiceResponse:
             awaited = f"extended parameters of {self._whose}"
             answer = await self._service.ask(self._mirrored, "extended/fetch", {}, timeout, awaited)
             with decode_errors(self._service.name):
-                told.end(answer.document["received"], answer.document["count"])
+                download.end(answer.document["received"], answer.document["count"])
             return answer
 
         answer = await run_with_progress(fetch, None if progress is None else tell)

@@ -91,8 +91,8 @@ class ServiceComponents:
                 mirrored.mirror.doubt()
                 self._stale[mirrored.key] = mirrored
             case "resynced":
-                told = tuple(event["changed"])
-                mirrored.announce(Resynced(mirrored.component, told, hash_of(event["hash"])))
+                names = tuple(event["changed"])
+                mirrored.announce(Resynced(mirrored.component, names, hash_of(event["hash"])))
             case "progress":
                 mirrored.progress.take(event)
             case "extended_change":
@@ -233,7 +233,7 @@ class ServiceComponents:
                     return
                 if mirrored.key in self._stale:  # load this table next
                     self._stale = {mirrored.key: mirrored, **self._stale}
-                await connection.news.wait()
+                await connection.changed.wait()
                 connection.check_open()
 
     async def component_of_response(self, answer: ServiceResponse) -> Component:
@@ -299,9 +299,9 @@ class ServiceComponents:
     async def run(self) -> None:
         """Load stale lists and tables, until cancelled."""
         while True:
-            news = self.connection.news
+            changed = self.connection.changed
             if self.connection.is_away or not (self._stale or self._is_list_stale):
-                await news.wait()
+                await changed.wait()
                 continue
             try:
                 if self._is_list_stale:

@@ -135,8 +135,8 @@ class ServiceClient:
         state = "closed" if self._tasks is None or connection.ended is not None else "open"
         if state == "open" and connection.is_away:
             state = "away"
-        heard = len(self._roster.components)
-        return f"<RemoteClient {self._service.name} {state}, {heard} component{'' if heard == 1 else 's'}>"
+        count = len(self._roster.components)
+        return f"<RemoteClient {self._service.name} {state}, {count} component{'' if count == 1 else 's'}>"
 
     # opening and closing
 
@@ -294,9 +294,9 @@ class ServiceClient:
         before = {key: each.progress.count for key, each in self._roster.components.items()}
 
         def tell() -> None:
-            told = self._roster.components.items()
+            components = self._roster.components.items()
             assert progress is not None
-            progress({key[1:]: each.progress.since(before.get(key, 0)) for key, each in told})
+            progress({key[1:]: each.progress.since(before.get(key, 0)) for key, each in components})
 
         async def fetch() -> ServiceResponse:
             whose = "any component" if system is None else f"any component of system {system}"

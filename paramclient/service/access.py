@@ -193,11 +193,11 @@ class AccessMiddleware:
             **request.scope,
             "headers": [each for each in request.headers if each[0] not in _SECRET_HEADERS],
         }
-        with self._bodies.hold(state["quota"]) as held:
+        with self._bodies.hold(state["quota"]) as reserved:
             if request.has_body:
                 request.check_content_type()
                 most = min(request.body_bytes_max, self._settings.max_body)
-                receive = _with_body(await self._read_body(request, receive, most, held), receive)
+                receive = _with_body(await self._read_body(request, receive, most, reserved), receive)
             if not request.has_large_response:
                 await self._app(scope, receive, response.send)
                 return
@@ -342,9 +342,9 @@ class AccessMiddleware:
                 self._sessions.end(request.cookie)
             await response.respond(204, b"", [(b"set-cookie", _set_cookie(request, "", 0))])
             return
-        with self._bodies.hold(_quota_holder(request, None)) as held:
+        with self._bodies.hold(_quota_holder(request, None)) as reserved:
             token = _parse_session_token(
-                await self._read_body(request, receive, SESSION_BODY_BYTES_MAX, held)
+                await self._read_body(request, receive, SESSION_BODY_BYTES_MAX, reserved)
             )
         headers = []
         if self._settings.tokens is not None:
@@ -357,12 +357,14 @@ class AccessMiddleware:
 
     # Body
 
-    async def _read_body(self, request: Request, receive: Receive, most: int, held: BodyReservation) -> bytes:
+    async def _read_body(
+        self, request: Request, receive: Receive, most: int, reserved: BodyReservation
+    ) -> bytes:
         """Return the whole body.
 
         Args:
             most: maximum size in bytes.
-            held: counts the bytes in memory.
+            reserved: counts the bytes in memory.
 
         Raises:
             RequestDenied: the body is too large or too slow, or too many bytes are in memory.
@@ -384,7 +386,7 @@ class AccessMiddleware:
                         )
                     piece = message.get("body", b"")
                     body += piece
-                    held.add(len(piece))
+                    reserved.add(len(piece))
                     if len(body) > most:
                         raise too_large
                     is_whole = not message.get("more_body", False)
@@ -482,10 +484,10 @@ class _Response:
 
 def _author_of(request: Request, holder: TokenHolder | None) -> str:
     """Return the author of changes for the history: `anna@10.0.0.2 (content of X-Author)`."""
-    who = "local" if holder is None else f"{holder.name}@{request.address}"
+    holder_name = "local" if holder is None else f"{holder.name}@{request.address}"
     given = request.header(b"x-author")
     if given is None:
-        return who
+        return holder_name
     client = given.decode("latin-1")
     if not 1 <= len(client) <= CLIENT_NAME_LENGTH_MAX or not (client.isascii() and client.isprintable()):
         raise RequestDenied(
@@ -493,7 +495,7 @@ def _author_of(request: Request, holder: TokenHolder | None) -> str:
             "bad-request",
             f"X-Author must have 1 to {CLIENT_NAME_LENGTH_MAX} printable ASCII characters.",
         )
-    return f"{who} ({client})"[:AUTHOR_LENGTH_MAX]
+    return f"{holder_name} ({client})"[:AUTHOR_LENGTH_MAX]
 
 
 def _quota_holder(request: Request, holder: TokenHolder | None) -> str:

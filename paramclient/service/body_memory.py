@@ -16,7 +16,7 @@ class BodyMemory:
     """Counts the bytes of bodies from their receipt until the end of their requests."""
 
     def __init__(self) -> None:
-        self._held: Counter[str] = Counter()
+        self._reserved: Counter[str] = Counter()
         self._total = 0
 
     def hold(self, holder: str) -> BodyReservation:
@@ -30,9 +30,9 @@ class BodyMemory:
             RequestDenied: 429, the holder has too many; 503, all holders together have. The bytes are counted
                 nevertheless.
         """
-        self._held[holder] += size
+        self._reserved[holder] += size
         self._total += size
-        if self._held[holder] > HOLDER_BODY_BYTES_MAX:
+        if self._reserved[holder] > HOLDER_BODY_BYTES_MAX:
             what = f"All bodies of your requests may have {HOLDER_BODY_BYTES_MAX} bytes. Try again later."
             raise RequestDenied(429, "too-many", what, _SOON)
         if self._total > TOTAL_BODY_BYTES_MAX:
@@ -46,9 +46,9 @@ class BodyMemory:
     def remove(self, holder: str, size: int) -> None:
         """Remove bytes from the count."""
         self._total -= size
-        self._held[holder] -= size
-        if self._held[holder] <= 0:
-            del self._held[holder]
+        self._reserved[holder] -= size
+        if self._reserved[holder] <= 0:
+            del self._reserved[holder]
 
 
 class BodyReservation:

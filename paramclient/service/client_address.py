@@ -84,19 +84,19 @@ def parse_forwarded(values: Iterable[str]) -> list[str]:
     return [_bare(entry) for entry in entries]
 
 
-def client_behind(proxies: Iterable[Network], peer: str, told: list[str]) -> str:
+def client_behind(proxies: Iterable[Network], peer: str, forwarded: list[str]) -> str:
     """Return the client behind proxies: the last address that is not a trusted proxy.
 
     Args:
         proxies: the trusted proxies.
         peer: address of the connection, a trusted proxy.
-        told: the forwarded addresses, the last one added by the peer.
+        forwarded: the forwarded addresses, the last one added by the peer.
 
     An invalid address ends the search: the client is then the proxy that added it.
     """
     proxies = tuple(proxies)
     client = peer
-    for entry in reversed(told):
+    for entry in reversed(forwarded):
         address = parse_address(entry)
         if address is None:
             break

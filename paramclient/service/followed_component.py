@@ -68,7 +68,7 @@ class FollowedComponent:
         self._described_firmware: tuple[object, ...] | None = None
         self._feed = feed
         self._published = as_params(component.params).copy()
-        self._heard_at: dict[str, float] = {}
+        self._received_at: dict[str, float] = {}
         self._texts: dict[str, str] = {}
         self._published_state: tuple[object, ...] | None = None
         self._is_fetching = False
@@ -144,38 +144,39 @@ class FollowedComponent:
         if not self._is_published(param):
             self._publish_value_changes()
             if not self._is_published(param):  # the table has a newer value than this response
-                return self._encode(param, self._heard_at.get(name))
+                return self._encode(param, self._received_at.get(name))
         text = self._texts.get(name)
         if text is None:
-            text = self._texts[name] = self._encode(param, self._heard_at.get(name))
+            text = self._texts[name] = self._encode(param, self._received_at.get(name))
         return text
 
-    def _encode(self, param: Param, heard_at: float | None) -> str:
-        return param_json(param, heard_at, self.described_default(param.name))
+    def _encode(self, param: Param, received_at: float | None) -> str:
+        return param_json(param, received_at, self.described_default(param.name))
 
     def _is_published(self, param: Param) -> bool:
         published, name = self._published, param.name
         return (
-            published.held.get(name) == compact_param(param) and published.defaults.get(name) == param.default
+            published.compact.get(name) == compact_param(param)
+            and published.defaults.get(name) == param.default
         )
 
     def object_of(self, params: Iterable[Param]) -> str:
         """Return parameters as one JSON object, by name."""
         return "{" + ",".join([f"{json.dumps(each.name)}:{self.json_of(each)}" for each in params]) + "}"
 
-    def heard_at(self, name: str) -> float | None:
+    def received_at(self, name: str) -> float | None:
         """Return when the vehicle last sent or confirmed a value, in unix seconds, or None."""
-        return self._heard_at.get(name)
+        return self._received_at.get(name)
 
     def record_received(self, name: str) -> None:
         """Record that the vehicle has sent this value now."""
-        self._heard_at[name] = _now()
+        self._received_at[name] = _now()
         self._texts.pop(name, None)
 
-    def add_cached_times(self, heard_at: Iterable[tuple[str, float]]) -> None:
+    def add_cached_times(self, received_at: Iterable[tuple[str, float]]) -> None:
         """Add cached times of values that the vehicle has not sent since."""
-        for name, at in heard_at:
-            if self._heard_at.setdefault(name, at) == at:
+        for name, at in received_at:
+            if self._received_at.setdefault(name, at) == at:
                 self._texts.pop(name, None)
 
     def publish(self, kind: str, members: dict[str, Any] | Callable[[], str]) -> None:
@@ -228,11 +229,11 @@ class FollowedComponent:
         name, old, new, by = change.name, change.old, change.new, change.by
         if new is None:
             self._published.pop(name, None)
-            self._heard_at.pop(name, None)
+            self._received_at.pop(name, None)
         else:
             self._published[name] = new
             if new.trust is not Trust.CACHED:
-                self._heard_at[name] = _now()
+                self._received_at[name] = _now()
         self._texts.pop(name, None)
         self._publish_change(old, new, by, is_added=isinstance(change, Added))
 
@@ -248,7 +249,7 @@ class FollowedComponent:
         if last is not self._last_fetch:
             self._last_fetch = last
             self._record_all_received()
-        names = [name for name, held in params.held.items() if published.held.get(name) != held]
+        names = [name for name, compact in params.compact.items() if published.compact.get(name) != compact]
         if params.defaults != published.defaults:
             current, known = params.defaults, published.defaults
             names += [name for name in current.keys() | known.keys() if current.get(name) != known.get(name)]
@@ -260,7 +261,7 @@ class FollowedComponent:
             self._texts.pop(param.name, None)
             before = published.get(param.name)
             if param.trust is not Trust.CACHED and (before is None or before.trust is not param.trust):
-                self._heard_at[param.name] = now
+                self._received_at[param.name] = now
         if len(differing) <= SINGLE_CHANGES_MAX:
             for param in differing:
                 before, published[param.name] = published.get(param.name), param
@@ -274,18 +275,18 @@ class FollowedComponent:
         now = _now()
         for name, param in self.component.params.items():
             if param.trust is not Trust.CACHED:
-                self._heard_at[name] = now
+                self._received_at[name] = now
         self._texts.clear()
 
     def _publish_change(
         self, old: Param | None, new: Param | None, by: str, *, is_added: bool = False
     ) -> None:
         kind = "removed" if new is None else "added" if is_added else "changed"
-        heard_at = None if new is None else self._heard_at.get(new.name)
+        received_at = None if new is None else self._received_at.get(new.name)
 
         def write() -> str:
             before = "null" if old is None else self._encode(old, None)
-            after = "null" if new is None else self._encode(new, heard_at)
+            after = "null" if new is None else self._encode(new, received_at)
             members = f'"name":{json.dumps(name)},"old":{before},"new":{after},"by":{json.dumps(by)}'
             return f'{members},"kind":"{kind}"'
 
@@ -328,9 +329,9 @@ class _ChangeForwarder(Changes):
         self._owner.handle_end(error)
 
 
-def param_json(param: Param, heard_at: float | None, described: int | float | None = None) -> str:
+def param_json(param: Param, received_at: float | None, described: int | float | None = None) -> str:
     """Return a parameter as JSON, with its default; see `default_of`."""
-    return ParamDoc.kept(param, heard_at=heard_at, described=described).model_dump_json()
+    return ParamDoc.kept(param, heard_at=received_at, described=described).model_dump_json()
 
 
 def _firmware_of(identity: Identity) -> tuple[object, ...] | None:

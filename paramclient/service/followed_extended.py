@@ -44,26 +44,26 @@ class FollowedExtended:
         self._machine = component.machine.ext
         self._publish = publish
         self._published = dict(component.ext.params)
-        self._heard_at: dict[str, tuple[float, float]] = {}
+        self._received_at: dict[str, tuple[float, float]] = {}
         self._is_fetching = False
         self._forwarder = _ExtChangeForwarder(self)
         self.ext.listen(self._forwarder)
 
-    def heard_at(self, name: str) -> float | None:
+    def received_at(self, name: str) -> float | None:
         """Return when the component last sent or confirmed a value, in unix seconds, or None."""
         moment = self._machine.table.moments.get(name, math.inf)
         if not math.isfinite(moment):
-            self._heard_at.pop(name, None)
+            self._received_at.pop(name, None)
             return None
-        known = self._heard_at.get(name)
+        known = self._received_at.get(name)
         if known is None or known[0] != moment:
             at = round(time.time() - anyio.current_time() + moment, 3)
-            known = self._heard_at[name] = (moment, at)
+            known = self._received_at[name] = (moment, at)
         return known[1]
 
     def json_of(self, param: ExtParam) -> str:
         """Return a parameter as JSON."""
-        return ext_param_json(param, self.heard_at(param.name))
+        return ext_param_json(param, self.received_at(param.name))
 
     def member_of(self, param: ExtParam) -> str:
         """Return a parameter as a member of a JSON object, by its name."""
@@ -111,7 +111,7 @@ class FollowedExtended:
         """Handle a change of a value."""
         if change.new is None:
             self._published.pop(change.name, None)
-            self._heard_at.pop(change.name, None)
+            self._received_at.pop(change.name, None)
             kind = "removed"
         else:
             self._published[change.name] = change.new
@@ -122,11 +122,11 @@ class FollowedExtended:
         known = new or old
         assert known is not None, "a change has an old or a new value"
         name = known.name
-        heard_at = None if new is None else self.heard_at(name)
+        received_at = None if new is None else self.received_at(name)
 
         def write() -> str:
             before = "null" if old is None else ext_param_json(old, None)
-            after = "null" if new is None else ext_param_json(new, heard_at)
+            after = "null" if new is None else ext_param_json(new, received_at)
             members = f'"name":{json.dumps(name)},"old":{before},"new":{after},"by":{json.dumps(by)}'
             return f'{members},"kind":"{kind}"'
 
@@ -144,6 +144,6 @@ class _ExtChangeForwarder(ExtChanges):
         self._owner.handle_change(item)
 
 
-def ext_param_json(param: ExtParam, heard_at: float | None) -> str:
+def ext_param_json(param: ExtParam, received_at: float | None) -> str:
     """Return an extended parameter as JSON."""
-    return ExtParamDoc.kept(param, heard_at=heard_at).model_dump_json()
+    return ExtParamDoc.kept(param, heard_at=received_at).model_dump_json()

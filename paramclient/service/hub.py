@@ -354,7 +354,7 @@ class Hub:
                 self._check_open()
                 now = anyio.current_time()
                 clients = [(each, local_client(each.client)) for each in chosen if each.client is not None]
-                news = [each.changed for each in chosen] + [
+                events = [each.changed for each in chosen] + [
                     client.link_task.activity for _, client in clients
                 ]
                 machines = {
@@ -374,7 +374,7 @@ class Hub:
                     for _, client in clients:
                         looking.enter_context(client.station.looking_for_others())
                     with anyio.move_on_after(None if choice.due == math.inf else choice.due - now):
-                        await _wait_for_any([*news, self._closing])
+                        await _wait_for_any([*events, self._closing])
                 for _, client in clients:
                     await client.link_task.wait_for_reader(choice.due)
         awaited, hint = address_in_words(system, component), _silence_of(chosen)

@@ -82,7 +82,7 @@ def _hub_metrics(hub: Hub) -> Iterator[Metric]:
 
 
 def _link_metrics(hub: Hub) -> Iterator[Metric]:
-    held = list(hub.links.values())
+    links = list(hub.links.values())
     states = GaugeMetricFamily(
         "paramclient_link_state", "1 for the current state of the link.", labels=["link", "state"]
     )
@@ -91,13 +91,13 @@ def _link_metrics(hub: Hub) -> Iterator[Metric]:
         "Clients opened for the link.",
         labels=["link"],
     )
-    for link in held:
+    for link in links:
         openings.add_metric([link.name], link.openings)
         for state in _STATES:
             states.add_metric([link.name, state], link.state == state)
     yield states
     yield openings
-    counted = [(link.name, link.client.stats) for link in held if link.client is not None]
+    counted = [(link.name, link.client.stats) for link in links if link.client is not None]
     for name, help_ in _COUNTERS.items():
         counter = CounterMetricFamily(f"paramclient_link_{name}_total", help_, labels=["link"])
         for link_name, stats in counted:

@@ -411,8 +411,8 @@ async def current_set(target: FollowedComponent, run: Runner) -> FetchedSet:
         unsure = sum(param.trust is Trust.CACHED for param in params)
         listed = sum(param.index is not None for param in params)
         if not params or unsure or count is None or listed < count:
-            told = f"{listed - unsure} of {'?' if count is None else count}"
-            what = f"{told} parameters were received or verified in this session. Fetch the table first."
+            received = f"{listed - unsure} of {'?' if count is None else count}"
+            what = f"{received} parameters were received or verified in this session. Fetch the table first."
             raise ServiceError(409, "incomplete", what)
         return FetchedSet(to_set(params), params, ())
 
@@ -441,8 +441,8 @@ async def read_file(hub: Hub, read: Callable[[], ParamFile]) -> ParamFile:
 def _choose(file: ParamFile, target: FollowedComponent, component: int | None) -> ParamSet:
     """Return the set of a file for a component; system ids count only in a file with several systems."""
     is_of_several = len({each.system for each in file.sets}) > 1
-    wanted = target.component.component if component is None else component
-    return file.choose(wanted, system=target.component.system if is_of_several else None)
+    component_id = target.component.component if component is None else component
+    return file.choose(component_id, system=target.component.system if is_of_several else None)
 
 
 async def _set_of_values(hub: Hub, target: FollowedComponent, values: dict[str, ValueInput]) -> ParamSet:

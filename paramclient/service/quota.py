@@ -78,9 +78,9 @@ class Quota:
         """
         with self._slots_of(holder) as own:
             most = self._most_of_holder
-            held = most - own.value
-            if self._leaves_room and held and held >= self._slots.value:
-                raise self._too_many(f"{held} {self._what} of yours", held)
+            used = most - own.value
+            if self._leaves_room and used and used >= self._slots.value:
+                raise self._too_many(f"{used} {self._what} of yours", used)
             self._take(own, f"{most} {self._what} of yours", most)
             try:
                 self._take(self._slots, f"{self._most} {self._what}", self._most)

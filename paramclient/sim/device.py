@@ -269,7 +269,7 @@ class Device(ABC):
         self._verifier = None
         if self._signer is not None:
             policy = wire.SigningPolicy.ACCEPT_ALL if self._usb else wire.SigningPolicy.UNSIGNED_RADIOS
-            self._verifier = wire.Verifier(self._signer, policy, most_streams=_MOST_STREAMS)
+            self._verifier = wire.Verifier(self._signer, policy, most_streams=_STREAMS_MAX)
         self._framer.guard = None if self._verifier is None else self._verifier.accepts
 
     def _send_heartbeat(self, now: float) -> None:
@@ -358,21 +358,21 @@ class Device(ABC):
         if request.command == wire.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN:
             self._on_restart_command(int(request.params[0]), sender)
             return
-        wanted: wire.Message | None = None
+        requested: wire.Message | None = None
         if request.command == wire.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES:
-            wanted = self._version
+            requested = self._version
         elif request.command == wire.MAV_CMD_REQUEST_MESSAGE:
             known: dict[float, wire.Message] = {
                 wire.AUTOPILOT_VERSION_ID: self._version,
                 wire.HEARTBEAT_ID: self._beat,
             }
-            wanted = known.get(request.params[0])  # a float, possibly NaN
+            requested = known.get(request.params[0])  # a float, possibly NaN
             if request.params[0] == wire.SYSTEM_TIME_ID:
                 self._on_clock_request(sender)
                 return
-        result = wire.MAV_RESULT_UNSUPPORTED if wanted is None else wire.MAV_RESULT_ACCEPTED
+        result = wire.MAV_RESULT_UNSUPPORTED if requested is None else wire.MAV_RESULT_ACCEPTED
         ack = wire.CommandAck(request.command, result, sender.system, sender.component)
-        answers: list[wire.Message] = [ack] if wanted is None else [ack, wanted]
+        answers: list[wire.Message] = [ack] if requested is None else [ack, requested]
         for answer in answers if self._ack_first else reversed(answers):
             self._send(answer)
 
@@ -409,5 +409,5 @@ _ATTITUDE = 30
 _LEVEL_FLIGHT = struct.pack("<6f", 0.0, 0.0, 0.5, 0.0, 0.0, 0.01)
 _HIGH_LATENCY_PAUSE = 5.0
 """Seconds between two HIGH_LATENCY2."""
-_MOST_STREAMS = 16
+_STREAMS_MAX = 16
 """MAVLINK_MAX_SIGNING_STREAMS of the C library, which both autopilots use."""

@@ -369,7 +369,7 @@ class _Call(Generic[Result]):
 
     def __init__(self) -> None:
         self.is_running = False
-        self._news: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self._reports: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._scope: anyio.CancelScope | None = None
         self._is_cancelled = False
         self._error: Exception | None = None
@@ -381,7 +381,7 @@ class _Call(Generic[Result]):
             return None
 
         def report(*args: Report.args, **kwargs: Report.kwargs) -> None:
-            self._news.put(partial(progress, *args, **kwargs))
+            self._reports.put(partial(progress, *args, **kwargs))
 
         return report
 
@@ -399,7 +399,7 @@ class _Call(Generic[Result]):
             raise
         finally:
             self.is_running = False
-            self._news.put(None)
+            self._reports.put(None)
 
     def run_at_once(self, function: Callable[[], Result]) -> None:
         """Run a function that does not wait in the event loop, and keep its result or error."""
@@ -409,7 +409,7 @@ class _Call(Generic[Result]):
             self._error = error
         finally:
             self.is_running = False
-            self._news.put(None)
+            self._reports.put(None)
 
     def wait(self, thread: EventLoopThread) -> Result:
         """Wait for the end, and call the progress callbacks meanwhile.
@@ -429,10 +429,10 @@ class _Call(Generic[Result]):
             _NoEventLoop: the event loop has ended first.
             Exception: that of the callback.
         """
-        news = self._next_news(thread, None)
-        if news is not None:
-            news()
-        return news is not None
+        report = self._next_report(thread, None)
+        if report is not None:
+            report()
+        return report is not None
 
     def outcome(self) -> Result:
         """Return the result of a call that has ended.
@@ -451,7 +451,7 @@ class _Call(Generic[Result]):
         thread.call_soon(self.cancel_scope)
         deadline = time.monotonic() + CANCEL_TIMEOUT
         with suppress(Empty, _NoEventLoop):
-            while self._next_news(thread, deadline) is not None:
+            while self._next_report(thread, deadline) is not None:
                 pass
 
     def cancel_scope(self) -> None:
@@ -459,7 +459,7 @@ class _Call(Generic[Result]):
         if self._scope is not None:
             self._scope.cancel()
 
-    def _next_news(self, thread: EventLoopThread, deadline: float | None) -> Callable[[], None] | None:
+    def _next_report(self, thread: EventLoopThread, deadline: float | None) -> Callable[[], None] | None:
         """Return the next progress call, or None after the end.
 
         Raises:
@@ -470,7 +470,7 @@ class _Call(Generic[Result]):
             is_running = thread.is_running
             left = WAIT_INTERVAL if deadline is None else min(WAIT_INTERVAL, deadline - time.monotonic())
             try:
-                return self._news.get(timeout=max(left, 0.0))
+                return self._reports.get(timeout=max(left, 0.0))
             except Empty:
                 if not is_running:
                     self.is_running = False

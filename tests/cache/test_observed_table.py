@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from paramclient.cache import HeardParams, StoredParam, UnixTimes
+from paramclient.cache import ObservedParams, StoredParam, UnixTimes
 from paramclient.cache.cells import Damaged
 from paramclient.cache.packed_table import Packed, pack
 from paramclient.cache.param_columns import StoredTable
@@ -45,7 +45,7 @@ def tables(draw: st.DrawFn) -> Params:
 def test_a_table_gives_the_same_rows_in_every_way(
     params: Params, volatile: frozenset[str] | None, by: dict[str, str]
 ) -> None:
-    heard = HeardParams(params, TIMES, volatile=volatile, by=by)
+    heard = ObservedParams(params, TIMES, volatile=volatile, by=by)
     stored = list(heard)
     times = {name: AT - 100.0 + params.moments.get(name, 100.0) for name in params}
     assert stored == [
@@ -82,7 +82,7 @@ def test_overwritten_values_come_before_the_present_ones() -> None:
     params = Params()
     params["A"] = Param("A", 2, ParamType.INT32, 0, 2)
     before = StoredParam(Param("A", 1, ParamType.INT32, 0, 1), AT, None, "us")
-    heard = HeardParams(params, TIMES, volatile=None, by={}, overwritten=[before])
+    heard = ObservedParams(params, TIMES, volatile=None, by={}, overwritten=[before])
     assert (len(heard), heard[0], [each.param.value for each in heard[-1:]]) == (2, before, [2])
     assert list(heard.heard_at()) == [("A", AT), ("A", AT)]
     rows = [(item.name, item.bits, item.by) for item in heard]

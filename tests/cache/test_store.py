@@ -48,7 +48,7 @@ from tests.service.test_cut_off import told_after_a_kill
 from tests.service.test_process import served
 from tests.shell import Tap, small_px4, swiftly
 
-PATIENCE = 60.0
+TIMEOUT = 60.0
 
 OF_A_FILE = {
     # what is said of a file, of its folder, or with SQLite's own words
@@ -167,7 +167,7 @@ def emptied(url: str) -> None:
 
 def until(condition: Callable[[], object]) -> None:
     """Wait until something is so, however slow the machine is."""
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + TIMEOUT
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.005)
@@ -520,7 +520,7 @@ def test_a_table_that_the_local_copy_cannot_store_is_in_the_database(
     assert values(cache) == {"A": 1}
     cache.save(update(stored("B", 2), component=2))
     until(lambda: (PX4.key, 2) in link_of(cache).local.revisions())
-    until(lambda: not link_of(cache)._wanted)
+    until(lambda: not link_of(cache)._stale_keys)
     assert not is_copied(cache)
     [record] = caplog.records
     assert record.message == (
@@ -988,7 +988,7 @@ async def test_a_service_shares_it_too(
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     async with served("sim:px4", "--cache", path):
-        with anyio.fail_after(PATIENCE):
+        with anyio.fail_after(TIMEOUT):
             while not await anyio.to_thread.run_sync(cache.components):  # noqa: ASYNC110 - it is in a database
                 await anyio.sleep(0.05)
 

@@ -36,11 +36,11 @@ from paramclient.protocol import wire
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam, px4_table
 from paramclient.sim.param_table import Entry
 from tests.commands import Command, Outcome, Put, behind, in_process, leaping, strict
-from tests.flying import flying
 from tests.shell import swiftly
+from tests.simulated_on_udp import flying
 
 ROOT = Path(__file__).parents[2]
-PATIENCE = 60.0  # seconds after which a test fails; a passing test never waits that long
+TIMEOUT = 60.0  # seconds after which a test fails; a passing test never waits that long
 ESCAPE = "\x1b"
 
 FETCH_KEYS = [
@@ -110,7 +110,7 @@ def process(*arguments: object, **options: Any) -> Iterator[subprocess.Popen[str
     words = [sys.executable, "-m", "paramclient", *map(str, arguments)]
     options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "env": PLAIN, **options}
     with subprocess.Popen(words, cwd=ROOT, text=True, **options) as started:
-        watchdog = threading.Timer(PATIENCE, started.kill)
+        watchdog = threading.Timer(TIMEOUT, started.kill)
         watchdog.start()
         try:
             yield started
@@ -122,7 +122,7 @@ def process(*arguments: object, **options: Any) -> Iterator[subprocess.Popen[str
 
 def ended(started: subprocess.Popen[str]) -> Outcome:
     """Wait for the end of a process."""
-    out, err = started.communicate(timeout=PATIENCE)
+    out, err = started.communicate(timeout=TIMEOUT)
     return Outcome(started.returncode, out or "", err or "")
 
 
@@ -924,7 +924,7 @@ def test_a_link_that_fails_during_link_is_exit_code_4(command: Command, put: Cal
         async def receive(self) -> list[tuple[Peer, bytes]]:
             raise LinkError(f"{self.name}: gone", link=self.name)
 
-    failed = command("link", put(Failing(PX4Vehicle())), "--seconds", PATIENCE)
+    failed = command("link", put(Failing(PX4Vehicle())), "--seconds", TIMEOUT)
     assert (failed.code, failed.out, failed.err) == (4, "", "paramclient: sim:custom: gone\n")
 
 
@@ -992,15 +992,15 @@ def test_a_live_link_ends_with_ctrl_c() -> None:
             os.close(theirs)
             printed = b""
             while b"1/1 standby" not in printed:
-                assert select.select([ours], [], [], PATIENCE)[0]
+                assert select.select([ours], [], [], TIMEOUT)[0]
                 printed += os.read(ours, 65536)
             looking.send_signal(signal.SIGINT)
-            while select.select([ours], [], [], PATIENCE)[0]:
+            while select.select([ours], [], [], TIMEOUT)[0]:
                 try:
                     printed += os.read(ours, 65536)
                 except OSError:
                     break
-            assert (looking.wait(PATIENCE), looking.stderr and looking.stderr.read()) == (130, "")
+            assert (looking.wait(TIMEOUT), looking.stderr and looking.stderr.read()) == (130, "")
         *_, last = printed.decode().split("heartbeat")
         assert "1/1 standby: " in last
     finally:
@@ -1240,7 +1240,7 @@ def test_signal_handlers_are_restored(command: Command, put: Callable[[Endpoint]
 def test_a_fetch_that_is_interrupted_ends_cleanly(number: int, code: int, tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
         listener.bind(("127.0.0.1", 0))
-        listener.settimeout(PATIENCE)
+        listener.settimeout(TIMEOUT)
         url = f"udpout:127.0.0.1:{listener.getsockname()[1]}"
         with process("fetch", url, "--cache", tmp_path / "cache.sqlite3") as fetching:
             listener.recv(100)  # the client has sent a request
@@ -1271,7 +1271,7 @@ def test_a_second_signal_does_not_wait(live_command: Command, warm: Path) -> Non
             other.execute("BEGIN IMMEDIATE")  # the client cannot write the change, so that its end waits
             assert live_command("set", url, "MC_ROLL_P", 6, "--no-cache").code == 0
             line_of(watching.stdout)
-            deadline = time.monotonic() + PATIENCE
+            deadline = time.monotonic() + TIMEOUT
             while watching.poll() is None and time.monotonic() < deadline:
                 watching.send_signal(signal.SIGINT)
                 time.sleep(0.05)
@@ -1294,7 +1294,7 @@ class RemoteEnd:
 
     def __init__(self, url: str) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.settimeout(PATIENCE)
+        self._socket.settimeout(TIMEOUT)
         self._socket.connect(("127.0.0.1", int(url.rpartition(":")[2])))
 
     def ask(self, *requests: wire.Message) -> None:
@@ -1392,7 +1392,7 @@ def test_without_the_extra_the_message_names_it() -> None:
         main()
     """
     outcome = subprocess.run(
-        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT
     )
     assert (outcome.returncode, outcome.stdout) == (2, "")
     assert outcome.stderr == (
@@ -1408,7 +1408,7 @@ def printed_by(program: str) -> str:
         capture_output=True,
         text=True,
         check=True,
-        timeout=PATIENCE,
+        timeout=TIMEOUT,
     ).stdout
 
 
@@ -1529,12 +1529,12 @@ def on_terminal(*arguments: object, **environment: str) -> Outcome:
         ) as started:
             os.close(theirs)
             # the terminal ends when the last process closes it
-            while select.select([ours], [], [], PATIENCE)[0]:
+            while select.select([ours], [], [], TIMEOUT)[0]:
                 try:
                     printed += os.read(ours, 65536)
                 except OSError:
                     break
-            return Outcome(started.wait(PATIENCE), printed.decode(), "")
+            return Outcome(started.wait(TIMEOUT), printed.decode(), "")
     finally:
         os.close(ours)
 
@@ -1607,7 +1607,7 @@ def test_sim_answers_with_param_error_if_requested(live_command: Command) -> Non
 def test_sim_sends_first_on_udpout() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
-        free.settimeout(PATIENCE)
+        free.settimeout(TIMEOUT)
         link = f"udpout:127.0.0.1:{free.getsockname()[1]}"
         with process("sim", "px4", "--link", link) as started:
             assert line_of(started.stdout) == f"px4 1/1 speaks to {link}; Ctrl-C ends it\n"
@@ -1622,7 +1622,7 @@ def test_sim_on_a_byte_stream_joins_split_frames() -> None:
     with process("sim", "px4", "--link", "tcpin:127.0.0.1:0") as started:
         found = re.search(r":([0-9]+);", line_of(started.stdout))
         assert found is not None
-        with socket.create_connection(("127.0.0.1", int(found[1])), PATIENCE) as connection:
+        with socket.create_connection(("127.0.0.1", int(found[1])), TIMEOUT) as connection:
 
             def receive(heartbeats: int) -> None:
                 while sum(isinstance(each, wire.Heartbeat) for each in messages) < heartbeats:
@@ -1654,7 +1654,7 @@ def test_a_command_loads_its_own_modules_only() -> None:
         "print([name for name in sys.modules if name.startswith('paramclient.cli.')])"
     )
     done = subprocess.run(
-        [sys.executable, "-c", program], cwd=ROOT, env=PLAIN, capture_output=True, text=True, timeout=PATIENCE
+        [sys.executable, "-c", program], cwd=ROOT, env=PLAIN, capture_output=True, text=True, timeout=TIMEOUT
     )
     loaded = set(strict(done.stdout.splitlines()[-1].replace("'", '"')))
     assert "paramclient.cli.ports" in loaded

@@ -14,9 +14,9 @@ from paramclient.links import SimLink
 from paramclient.model.values import ParamType
 from paramclient.protocol import wire
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam
+from tests.client_kinds import ServedClient
 from tests.commands import Command, Put, behind, in_process, leaping
 from tests.shell import Tap
-from tests.ways import ServedClient
 
 TABLE = {"COM_FLTMODE1": 0, "EKF2_GPS_CTRL": 7, "MC_PITCH_P": 6.5, "MC_ROLL_P": 4.0}
 """The defaults in the metadata of the simulated PX4."""

@@ -30,7 +30,7 @@ from tests.caches import NOW, PX4, update
 from tests.commands import Command, in_process
 
 ROOT = Path(__file__).parents[2]
-PATIENCE = 60.0  # seconds after which a test fails; a passing test never waits that long
+TIMEOUT = 60.0  # seconds after which a test fails; a passing test never waits that long
 
 INT32, REAL32 = ParamType.INT32, ParamType.REAL32
 AT = "2026-11-18T11:06:40.000Z"
@@ -506,9 +506,9 @@ def test_parameters_missing_from_a_link_are_named(command: Command, vehicles: di
 
 def test_a_failed_link_ends_the_comparison(command: Command) -> None:
     began = time.monotonic()
-    outcome = command("diff", "udpin:127.0.0.1:0", "tcp:127.0.0.1:1", "--timeout", PATIENCE)
+    outcome = command("diff", "udpin:127.0.0.1:0", "tcp:127.0.0.1:1", "--timeout", TIMEOUT)
     assert (outcome.code, outcome.out) == (4, "")
-    assert time.monotonic() - began < PATIENCE  # the silent link was not waited for
+    assert time.monotonic() - began < TIMEOUT  # the silent link was not waited for
 
 
 def test_a_link_provides_only_confirmed_values(
@@ -571,12 +571,12 @@ def test_a_terminal_gets_colours(cache: Path) -> None:
     try:
         with start(cache, theirs, "--base", "3") as started:
             os.close(theirs)
-            while select.select([ours], [], [], PATIENCE)[0]:
+            while select.select([ours], [], [], TIMEOUT)[0]:
                 try:
                     printed += os.read(ours, 65536)
                 except OSError:  # the terminal ends when the last process closes it
                     break
-            started.communicate(timeout=PATIENCE)
+            started.communicate(timeout=TIMEOUT)
     finally:
         os.close(ours)
     assert started.returncode == 1
@@ -595,5 +595,5 @@ def test_a_closed_output_ends_the_command(cache: Path) -> None:
     os.close(ours)
     with start(cache, theirs) as started:
         os.close(theirs)
-        _, told = started.communicate(timeout=PATIENCE)
+        _, told = started.communicate(timeout=TIMEOUT)
     assert (started.returncode, "Traceback" in told) == (141, False)

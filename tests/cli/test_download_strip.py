@@ -16,8 +16,8 @@ from paramclient.links import SimLink
 from paramclient.protocol.params.download_ranges import DownloadRange, DownloadRanges, split_indices
 from paramclient.protocol.params.fetch_result import Progress
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
+from tests.client_kinds import ServedClient
 from tests.commands import Command, Outcome, Put, behind, in_process, leaping
-from tests.ways import ServedClient
 
 
 @pytest.fixture

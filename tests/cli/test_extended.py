@@ -11,9 +11,9 @@ from paramclient import CacheError, ParamCache, ParamClient
 from paramclient.cli import session as cli_session
 from paramclient.links import SimLink
 from paramclient.sim import Air, Camera, Endpoint, GenericVehicle, PX4Vehicle
+from tests.client_kinds import ServedClient
 from tests.commands import Command, Put, behind, in_process, leaping, strict
 from tests.shell import PeersLink
-from tests.ways import ServedClient
 
 URL = "udpin:0.0.0.0:14550"
 SERVICE = "http://127.0.0.1:8765"

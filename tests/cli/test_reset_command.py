@@ -15,9 +15,9 @@ from paramclient.cli import session as cli_session
 from paramclient.links import SimLink
 from paramclient.protocol import wire
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam, Vehicle
+from tests.client_kinds import ServedClient
 from tests.commands import Command, Put, behind, in_process, leaping
 from tests.shell import Tap
-from tests.ways import ServedClient
 
 TABLE = [
     SimParam("MC_ENABLE", ParamType.INT8, 1, default=0),

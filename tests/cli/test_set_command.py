@@ -11,8 +11,8 @@ import pytest
 from paramclient.cli import session as cli_session
 from paramclient.links import SimLink
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
+from tests.client_kinds import ServedClient
 from tests.commands import Command, Outcome, Put, behind, in_process, leaping
-from tests.ways import ServedClient
 
 NAMES = [f"P_{number:02}" for number in range(60)]
 PAIRS = [word for name in NAMES for word in (name, "7")]

@@ -11,8 +11,8 @@ from paramclient.cli import session as cli_session
 from paramclient.links import SimLink
 from paramclient.sim import Air, Endpoint, GenericVehicle, PX4Vehicle
 from paramclient.sim.other import OtherStation
+from tests.client_kinds import ServedClient
 from tests.commands import Command, Put, behind, in_process, leaping
-from tests.ways import ServedClient
 
 
 @pytest.fixture

@@ -12,8 +12,8 @@ from paramclient.cache.nicknames import Nicknames, check_nickname
 from paramclient.cli import session as cli_session
 from paramclient.links import SimLink
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
+from tests.client_kinds import ServedClient
 from tests.commands import Command, Put, behind, in_process, leaping
-from tests.ways import ServedClient
 
 TABLE: dict[str, Any] = {"A": 1.0, "B": 2.0}
 

@@ -20,9 +20,9 @@ from paramclient.protocol import wire
 from paramclient.protocol.vehicle_selection import LOOK_TIME
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, Vehicle
 from tests.caches import NOW, update
+from tests.client_kinds import ServedClient
 from tests.commands import Command, Put, behind, in_process, leaping
 from tests.shell import Late, PeersLink, Tap
-from tests.ways import ServedClient
 
 URL = "udpin:0.0.0.0:14550"
 SOURCE = "udpin:0.0.0.0:14551"

@@ -118,7 +118,7 @@ async def test_an_unchanged_vehicle_is_not_downloaded_again(
         assert trusts(component, volatile) == {Trust.CACHED}
         result = await component.fetch_all()
         assert isinstance(component, LinkComponent)
-        assert anyio.current_time() - component._heard_at < 0.21, "one round trip after it was heard"
+        assert anyio.current_time() - component._received_at < 0.21, "one round trip after it was heard"
         assert (result.source, result.complete, result.hash) == ("cache", True, vehicle.announced_hash())
         assert bits(result.params) == bits(vehicle.params)
         assert trusts(component, component.params.keys() - volatile) == {Trust.VERIFIED}

@@ -41,10 +41,10 @@ from tests.shell import (
 
 Call = Callable[[ParamClient, Component], Coroutine[Any, Any, object]]
 
-FEW = {name: VALUES[name] for name in list(VALUES)[:8]}
+FEW_VALUES = {name: VALUES[name] for name in list(VALUES)[:8]}
 fresh = count(1000)
 
-MOST_POINTS = 1000
+POINTS_MAX = 1000
 """None of these calls has as many: whoever gets here cancels nothing."""
 
 
@@ -63,7 +63,7 @@ CALLS: dict[str, Call] = {
     "get": lambda client, component: component.get("PARAM_01"),
     "get by index": lambda client, component: component.get(5, timeout=9),
     "set": lambda client, component: component.set("PARAM_01", 77),
-    "set_many": lambda client, component: component.set_many(dict.fromkeys(FEW, 7), progress=seen),
+    "set_many": lambda client, component: component.set_many(dict.fromkeys(FEW_VALUES, 7), progress=seen),
     "set_many in order": lambda client, component: component.set_many([("PARAM_01", 1), ("PARAM_01", 2)]),
     "fetch_all": lambda client, component: component.fetch_all(),
     "fetch_all anew": lambda client, component: component.fetch_all(refresh=True, timeout=9, progress=seen),
@@ -125,10 +125,10 @@ class Struck(Coroutine[Any, Any, Any]):
 @asynccontextmanager
 async def a_session() -> AsyncIterator[tuple[ParamClient, Component]]:
     """A client that has just heard a vehicle with a camera, while another one comes a little later."""
-    late = generic(system=2, table=FEW)
+    late = generic(system=2, table=FEW_VALUES)
     late.reboot(swift_loop().time(), down=0.03)
-    camera = generic(component=100, table=FEW, autopilot=wire.MAV_AUTOPILOT_INVALID)
-    vehicle = PX4Vehicle(table={**FEW, "CAL_ACC0_XOFF": 0.5}, burst=3)
+    camera = generic(component=100, table=FEW_VALUES, autopilot=wire.MAV_AUTOPILOT_INVALID)
+    vehicle = PX4Vehicle(table={**FEW_VALUES, "CAL_ACC0_XOFF": 0.5}, burst=3)
     air = Air.symmetric([vehicle, camera, late], delay=0.004)
     async with a_client(air) as client:
         yield client, await client.component()
@@ -157,7 +157,7 @@ async def check_after(call: Call, client: ParamClient, component: Component) -> 
 @pytest.mark.parametrize("late", [False, True], ids=["before", "after"])
 @swiftly
 async def test_cancelled_at_each_suspension(call: Call, late: bool) -> None:
-    for number in range(1, MOST_POINTS):
+    for number in range(1, POINTS_MAX):
         async with a_session() as (client, component):
             before = tasks_beside()
             struck = Struck(call(client, component), number, late=late)
@@ -170,7 +170,7 @@ async def test_cancelled_at_each_suspension(call: Call, late: bool) -> None:
         assert not tasks_beside()
         if not struck.is_struck:
             break
-    assert 1 < number < MOST_POINTS - 1
+    assert 1 < number < POINTS_MAX - 1
 
 
 @EVERY_CALL
@@ -178,7 +178,7 @@ async def test_cancelled_at_each_suspension(call: Call, late: bool) -> None:
 @swiftly
 async def test_cancelled_after_each_round(call: Call, by: str) -> None:
     loop = swift_loop()
-    for number in range(1, MOST_POINTS):
+    for number in range(1, POINTS_MAX):
         async with a_session() as (client, component):
             scope = anyio.CancelScope()
 
@@ -187,17 +187,17 @@ async def test_cancelled_after_each_round(call: Call, by: str) -> None:
                     await call(client, component)
 
             task = asyncio.create_task(scoped())
-            loop.strike(task, task.cancel if by == "task" else scope.cancel, after=number)
+            loop.run_between_rounds(task, task.cancel if by == "task" else scope.cancel, after=number)
             await asyncio.wait([task])
             # a task that goes on already leaves its scope without another look at it
             was_cancelled = task.cancelled() or scope.cancelled_caught
-            assert was_cancelled == loop.has_struck or (by == "scope" and not was_cancelled)
+            assert was_cancelled == loop.has_run_action or (by == "scope" and not was_cancelled)
             await settled()
             await check_after(call, client, component)
         assert not tasks_beside()
-        if not loop.has_struck:
+        if not loop.has_run_action:
             break
-    assert 1 < number < MOST_POINTS - 1
+    assert 1 < number < POINTS_MAX - 1
 
 
 @EVERY_CALL
@@ -232,20 +232,20 @@ async def test_a_whole_session_cancelled_at_each_point(tmp_path: Path, point: st
             await component.set("PARAM_01", number)
             await asyncio.sleep(0.3)
 
-    for number in range(1, MOST_POINTS):
+    for number in range(1, POINTS_MAX):
         struck = Struck(session(), 0 if point == "round" else number, late=point == "after")
         task = asyncio.create_task(struck)
         if point == "round":
-            loop.strike(task, task.cancel, after=number)
+            loop.run_between_rounds(task, task.cancel, after=number)
         await asyncio.wait([task])
-        is_struck = struck.is_struck or loop.has_struck
+        is_struck = struck.is_struck or loop.has_run_action
         assert task.cancelled() == is_struck
         await settled()
         assert not tasks_beside()
         await until(lambda: not any(each.name == "paramclient cache" for each in threading.enumerate()))
         if not is_struck:
             break
-    assert 5 < number < MOST_POINTS - 1
+    assert 5 < number < POINTS_MAX - 1
     with ParamCache(path) as cache:
         cached = cache.component()
         assert bits(cached.params) == bits(vehicle.params)

@@ -43,8 +43,9 @@ from paramclient.links import Peer, create_link, serve_endpoint
 from paramclient.protocol import wire
 from paramclient.protocol.station import Station
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
+from tests.client_kinds import DIRECT, direct_only, listeners, looks, pytest_generate_tests, way
 from tests.shell import (
-    PATIENCE,
+    TIMEOUT,
     VALUES,
     FlakyLink,
     Radio,
@@ -61,7 +62,6 @@ from tests.shell import (
     tasks_beside,
     until,
 )
-from tests.ways import DIRECT, direct_only, listeners, looks, pytest_generate_tests, way
 
 __all__ = ["pytest_generate_tests", "way"]
 
@@ -1271,7 +1271,7 @@ async def test_a_link_that_cannot_come_back_ends_every_call() -> None:
 @pytest.mark.asyncio
 @pytest.mark.parametrize("kind", ["udpin", "tcpin"])
 async def test_a_vehicle_over_real_sockets(kind: str) -> None:
-    with anyio.fail_after(PATIENCE):
+    with anyio.fail_after(TIMEOUT):
         vehicle = PX4Vehicle(stream=kind == "tcpin")
         far = "udpout" if kind == "udpin" else "tcp"
         async with Served(vehicle, kind) as served, a_client(f"{far}:127.0.0.1:{served.port}") as client:
@@ -1288,7 +1288,7 @@ async def test_a_vehicle_over_real_sockets(kind: str) -> None:
 @pytest.mark.asyncio
 @pytest.mark.parametrize("kind", ["udpin", "tcpin"])
 async def test_a_client_that_listens(kind: str) -> None:
-    with anyio.fail_after(PATIENCE):
+    with anyio.fail_after(TIMEOUT):
         async with a_client(f"{kind}:127.0.0.1:0") as client, anyio.create_task_group() as tasks:
             port = client.link.address[1]  # type: ignore[attr-defined]  # only sockets have one
             far = f"{'udpout' if kind == 'udpin' else 'tcp'}:127.0.0.1:{port}"
@@ -1308,7 +1308,7 @@ async def test_a_client_that_listens(kind: str) -> None:
 async def test_a_tcp_connection_that_breaks_during_a_download() -> None:
     vehicle = generic(burst=1, period=0.03, stream=True)
     served = Served(vehicle, "tcpin")
-    async with asyncio.timeout(PATIENCE), served, a_client(f"tcp:127.0.0.1:{served.port}") as client:
+    async with asyncio.timeout(TIMEOUT), served, a_client(f"tcp:127.0.0.1:{served.port}") as client:
         component = await client.component()
         changes = component.changes()
         fetch = asyncio.create_task(component.fetch_all())
@@ -1328,7 +1328,7 @@ async def test_a_tcp_server_that_stays_away(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(reconnection, "RECONNECT_BACKOFF_MIN", 0.05)
     monkeypatch.setattr(reconnection, "RECONNECT_BACKOFF_MAX", 0.1)
     served = Served(generic(stream=True), "tcpin")
-    async with asyncio.timeout(PATIENCE), served, a_client(f"tcp:127.0.0.1:{served.port}") as client:
+    async with asyncio.timeout(TIMEOUT), served, a_client(f"tcp:127.0.0.1:{served.port}") as client:
         component = await client.component()
         await served.__aexit__()
         with pytest.raises(LinkError, match="refused") as caught:

@@ -27,11 +27,11 @@ from paramclient.links.udp import UdpIn
 from paramclient.protocol import wire
 from paramclient.protocol.vehicle.presence import LOST_AFTER
 from paramclient.sim import ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
+from tests.client_kinds import ServedClient
 from tests.commands import Command, behind, in_process, leaping
-from tests.served import C, met, problem, service
+from tests.service_hub import C, met, problem, service
 from tests.shell import Late, PeersLink, outcome, swiftly, until
 from tests.simulation import param_value
-from tests.ways import ServedClient
 
 TABLE: dict[str, Any] = {"SHARED_A": 1, "SHARED_B": 2, "PX4_ONLY": 3}
 OTHER: dict[str, Any] = {"SHARED_A": 100.0, "SHARED_B": 200.0, "APM_ONLY": 300.0}

@@ -18,7 +18,7 @@ from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.provision import apply
 from tests.caches import CACHE_ALONE, start, whole_table
 from tests.commands import behind, in_process, leaping
-from tests.served import C, met, problem, service
+from tests.service_hub import C, met, problem, service
 from tests.shell import small_px4, swiftly
 
 NAME = "PARAM_01"

@@ -31,8 +31,8 @@ from paramclient import (
 )
 from paramclient.sim import Air, Camera, PX4Vehicle
 from tests import shell
+from tests.client_kinds import direct_only, pytest_generate_tests, way
 from tests.shell import a_client, settled, swiftly
-from tests.ways import direct_only, pytest_generate_tests, way
 
 __all__ = ["pytest_generate_tests", "way"]
 

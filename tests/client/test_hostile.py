@@ -57,7 +57,7 @@ from paramclient.protocol.wire import (
 )
 from paramclient.protocol.wire.codec import TEXTS_MAX
 from paramclient.sim import Air
-from tests.liar import ESCAPE, LIES, LiarVehicle
+from tests.hostile_vehicle import ESCAPE, LIES, HostileVehicle
 from tests.shell import bits, generic, small_px4, swiftly
 from tests.simulation import PEER, Simulation, known, listing_ardupilot, param_value
 
@@ -124,7 +124,7 @@ def test_a_cached_count_above_what_can_be_asked_for_is_none() -> None:
 # More than there can be
 
 
-def heard(table: Table, name: str) -> None:
+def receive(table: Table, name: str) -> None:
     table.store_value(ParamValue(name, bytes(4), 9, 10, NO_INDEX), "vehicle")
 
 
@@ -132,14 +132,14 @@ def test_a_table_holds_so_many_names_and_no_more(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(table_room, "NAMES_MAX", 3)
     table = Table()
     for name in "ABCD":
-        heard(table, name)
+        receive(table, name)
     assert [*table.params] == ["A", "B", "C"]
     assert table.store_file_entry("E", 9, 0, 0, None, is_older=False) is None
     assert table.fill({"F": known("F")}) == []
     assert [*table.params] == ["A", "B", "C"]
     assert table.store_file_entry("C", 9, 1, 0, None, is_older=False) is not None
     table.remove(lambda param: param.name == "A")
-    heard(table, "D")
+    receive(table, "D")
     assert [*table.params] == ["B", "C", "D"]
 
 
@@ -150,15 +150,15 @@ def test_the_tables_of_a_link_share_a_room(monkeypatch: pytest.MonkeyPatch) -> N
     room = NameQuota()
     liar, honest = Table(name_quota=room), Table(name_quota=room)
     for name in "ABCDEFGH":
-        heard(liar, name)
+        receive(liar, name)
     assert [*liar.params] == [*"ABCDEF"]
     for name in "ABCD":
-        heard(honest, name)
+        receive(honest, name)
     assert [*honest.params] == [*"AB"]
     liar.forget()
     assert room.taken == 2
     for name in "CDEFGH":
-        heard(honest, name)
+        receive(honest, name)
     assert len(honest.params) == room.taken == 6
 
 
@@ -233,11 +233,11 @@ def test_names_that_go_are_told_to_the_cache_up_to_a_bound(monkeypatch: pytest.M
     monkeypatch.setattr(table_room, "REMOVED_NAMES_MAX", 4)
     table = Table()
     for name in "ABCDE":
-        heard(table, name)
+        receive(table, name)
     assert len(table.take_dirty()) == 5
     table.forget()
     assert [*table.dirty] == [*"ABCD"]
-    heard(table, "F")  # what is there is always told
+    receive(table, "F")  # what is there is always told
     assert "F" in table.dirty
 
 
@@ -277,7 +277,7 @@ def test_a_file_has_so_many_gaps_and_no_more(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_a_file_comes_in_so_many_pieces_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reading_room, "SPARE_PIECES", 10)
-    session = Simulation(LiarVehicle("crumbs", system=1))
+    session = Simulation(HostileVehicle("crumbs", system=1))
     job = session.meet().files.read("/crumbs", session.now, limit=10 * DATA_SIZE_MAX)
     session.until(lambda: job.done)
     assert isinstance(job.error, FileTransferError)
@@ -287,13 +287,13 @@ def test_a_file_comes_in_so_many_pieces_and_no_more(monkeypatch: pytest.MonkeyPa
 
 def test_a_directory_has_so_many_entries_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(transfers_room, "ENTRIES_MAX", 100)
-    session = Simulation(LiarVehicle("endless file", system=1))
+    session = Simulation(HostileVehicle("endless file", system=1))
     job = session.meet().files.list("/endless", session.now)
     assert len(session.outcome(job)) == 100
 
 
 def test_remembered_reads_of_a_file_are_bounded() -> None:
-    session = Simulation(LiarVehicle("crumbs", system=1))
+    session = Simulation(HostileVehicle("crumbs", system=1))
     job = session.meet().files.read("/crumbs", session.now)
     for number in range(2 * reading_room.LATE_READS_MAX):
         job._pending_reads[number] = reading_room._PendingRead(number, number, session.now, 0, False)
@@ -317,7 +317,7 @@ def test_a_resync_tells_of_so_many_names_and_no_more(monkeypatch: pytest.MonkeyP
 
 def test_one_head_after_the_other_keeps_no_turn() -> None:
     """Each `_HASH_CHECK` says that the list begins; without a list it is over with the usual time-out."""
-    honest, liar = listing_ardupilot(), LiarVehicle("endless hashes")
+    honest, liar = listing_ardupilot(), HostileVehicle("endless hashes")
     session = Simulation(honest, liar)
     session.meet()
     session.until(lambda: (66, 1) in session.station.components)
@@ -343,7 +343,7 @@ def test_no_lie_keeps_another_vehicle_from_being_fetched(
 ) -> None:
     """While the liar is fetched as well: its list is waited for once, and its values count for it alone."""
     monkeypatch.setattr(station_room, "COMPONENTS_MAX", 50)
-    honest, liar = listing_ardupilot(), LiarVehicle(lie)
+    honest, liar = listing_ardupilot(), HostileVehicle(lie)
     station = Station(link="sim:test", is_stream=False, sync_settings=SyncSettings(30.0))
     session = Simulation(honest, liar, station=station)
     session.meet()
@@ -360,7 +360,7 @@ def test_no_lie_keeps_another_vehicle_from_being_fetched(
     liars.end_fetch(fetch, session.now)
 
 
-MOST_GROWTH = 300_000
+GROWTH_MAX = 300_000
 """Bytes by which the memory may differ between two moments of one session, without anything that stays."""
 
 
@@ -380,7 +380,7 @@ def test_memory_is_bounded_under_all_kinds_of_lies_at_once() -> None:
         text_of.cache_clear()  # what it holds from before is not traced, and its next growth would be
         for number in range(TEXTS_MAX):
             text_of(b"%d" % number)  # what remembers names is full
-        liars = [LiarVehicle(*list(LIES)[start::3], system=66 + start, rate=150) for start in range(3)]
+        liars = [HostileVehicle(*list(LIES)[start::3], system=66 + start, rate=150) for start in range(3)]
         station = Station(
             link="sim:test", is_stream=False, sync_settings=SyncSettings(30.0), counts_traffic=True
         )
@@ -403,7 +403,7 @@ def test_memory_is_bounded_under_all_kinds_of_lies_at_once() -> None:
         tracemalloc.stop()
         assert len(station.components) == components
         assert max(len(machine.table.params) for machine in station.components.values()) <= names
-    assert held[-1] - held[-2] < MOST_GROWTH, held
+    assert held[-1] - held[-2] < GROWTH_MAX, held
 
 
 # The client, the cache, the terminal
@@ -419,7 +419,7 @@ async def test_a_vehicle_that_changes_its_identity_each_time_fills_no_cache(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     monkeypatch.setattr(cache_writer, "VEHICLES_MAX", 3)
-    liar = LiarVehicle(*lies, rate=1)
+    liar = HostileVehicle(*lies, rate=1)
     path = tmp_path / "cache" / "parameters.sqlite3"
     async with ParamClient(Air([liar, small_px4()]), cache=path) as client:
         await client.component(66, 1)
@@ -457,7 +457,7 @@ async def test_cached_tables_of_a_session_are_bounded(
 @swiftly
 async def test_a_component_that_is_forgotten_ends_what_listens_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(station_room, "COMPONENTS_MAX", 2)
-    liar = LiarVehicle("obedient")
+    liar = HostileVehicle("obedient")
     async with ParamClient(Air([generic(), liar]), cache=False) as client:
         await client.component(1, 1)
         other = await client.component(66, 1)
@@ -481,7 +481,7 @@ def test_no_escape_code_reaches_the_terminal(
     words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def client(url: str, **options: Any) -> ParamClient:
-        return ParamClient(SimLink(LiarVehicle("escape codes"), url), **options)
+        return ParamClient(SimLink(HostileVehicle("escape codes"), url), **options)
 
     monkeypatch.setattr(session_room, "ParamClient", client)
     verb, *options = words

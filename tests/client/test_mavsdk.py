@@ -37,7 +37,7 @@ from paramclient import (
 )
 from paramclient.client.local import local
 from paramclient.links import Peer
-from tests.shell import PATIENCE, bits, residue, until
+from tests.shell import TIMEOUT, bits, residue, until
 
 
 def float32(value: float) -> float:
@@ -158,7 +158,7 @@ async def connected(kind: str, **options: Any) -> AsyncIterator[tuple[ParamClien
             if kind == "udpin":
                 opened: Any = client.link
                 vehicle.connect(f"udpout://127.0.0.1:{opened.address[1]}")
-            with anyio.fail_after(PATIENCE):
+            with anyio.fail_after(TIMEOUT):
                 yield client, vehicle
 
 
@@ -294,7 +294,7 @@ async def test_its_files_are_read_to_the_last_byte(loss: float, tmp_path: Path) 
     with a_vehicle() as vehicle:
         FtpServer(vehicle.mavsdk.server_component()).set_root_dir(str(tmp_path))
         async with ParamClient(LossyLink(vehicle, loss, seed=1), cache=False) as client:
-            with anyio.fail_after(PATIENCE):
+            with anyio.fail_after(TIMEOUT):
                 files = client.ftp(await client.component())
                 assert {entry.name: entry.size for entry in await files.list("/")} == {
                     name: len(content) for name, content in contents.items()
@@ -322,7 +322,7 @@ async def with_extended(
             if kind is ComponentType.CAMERA:
                 CameraServer(mavsdk.server_component())
             async with ParamClient(LossyLink(vehicle, loss, seed=2), cache=False) as client:
-                with anyio.fail_after(PATIENCE):
+                with anyio.fail_after(TIMEOUT):
                     yield client, vehicle.server
     finally:
         configuration.destroy()

@@ -27,7 +27,7 @@ from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.params.table import Table
 from paramclient.protocol.station import Station
 from paramclient.protocol.wire import NO_INDEX, AutopilotVersion, Heartbeat, Message, ParamValue
-from tests.shell import PATIENCE, a_client, small_px4, swift_loop, swiftly, until
+from tests.shell import TIMEOUT, a_client, small_px4, swift_loop, swiftly, until
 from tests.simulation import param_value
 
 NOW = 1_795_000_000.0
@@ -37,25 +37,25 @@ NOW = 1_795_000_000.0
 # In the table
 
 
-def heard(table: Table, value: int, by: str, moment: float) -> None:
+def receive(table: Table, value: int, by: str, moment: float) -> None:
     table.store_value(param_value("A", value, index=0, kind=ParamType.INT32), by, moment)
 
 
 def test_a_value_that_is_heard_again_has_the_later_moment() -> None:
     table = Table()
-    heard(table, 1, "vehicle", 1.0)
-    heard(table, 1, "vehicle", 2.0)
+    receive(table, 1, "vehicle", 1.0)
+    receive(table, 1, "vehicle", 2.0)
     assert table.params.moments == {"A": 2.0}
     assert table.take_overwritten() == [], "it is no change"
 
 
 def test_overwritten_values_keep_their_observation_times() -> None:
     table = Table()
-    heard(table, 1, "vehicle", 1.0)
-    heard(table, 2, "us", 2.0)
-    heard(table, 2, "us", 2.5)
-    heard(table, 3, "us", 3.0)
-    heard(table, 3, "us", 3.5)
+    receive(table, 1, "vehicle", 1.0)
+    receive(table, 2, "us", 2.0)
+    receive(table, 2, "us", 2.5)
+    receive(table, 3, "us", 3.0)
+    receive(table, 3, "us", 3.5)
     assert [(each.param.value, each.by, each.moment) for each in table.take_overwritten()] == [
         (1, "vehicle", 1.0),
         (2, "us", 2.0),
@@ -68,37 +68,37 @@ def test_overwritten_values_keep_their_observation_times() -> None:
 
 def test_a_change_that_is_heard_again_keeps_the_moment_of_the_change() -> None:
     table = Table()
-    heard(table, 1, "vehicle", 1.0)
+    receive(table, 1, "vehicle", 1.0)
     table.take_dirty()
-    heard(table, 2, "station 254/190", 2.0)
-    heard(table, 2, "vehicle", 2.5)
+    receive(table, 2, "station 254/190", 2.0)
+    receive(table, 2, "vehicle", 2.5)
     [(param, by, moment)] = table.take_overwritten()
     assert (param.value, by, moment) == (2, "station 254/190", 2.0)
 
 
 def test_restored_unwritten_values_keep_their_observation_times() -> None:
     table = Table()
-    heard(table, 1, "vehicle", 1.0)
+    receive(table, 1, "vehicle", 1.0)
     table.take_dirty()
-    heard(table, 2, "vehicle", 2.0)
+    receive(table, 2, "vehicle", 2.0)
     for again in (2.5, 3.0, 3.5):
         changed, params = table.changed, table.params.copy()
         news = (table.take_dirty(), table.take_overwritten(), table.take_removed_at(), changed, params)
         table.restore_unwritten(*news)
         assert table.dirty == {"A": "vehicle"}
-        heard(table, 2, "vehicle", again)
+        receive(table, 2, "vehicle", again)
     assert [(each.param.value, each.moment) for each in table.take_overwritten()] == [(2, 2.0)]
 
 
 @pytest.mark.parametrize("by", ["vehicle", "us"])
 def test_a_value_replaced_during_a_failed_write_is_kept(by: str) -> None:
     table = Table()
-    heard(table, 1, "vehicle", 1.0)
+    receive(table, 1, "vehicle", 1.0)
     table.take_dirty()
-    heard(table, 2, "vehicle", 2.0)
+    receive(table, 2, "vehicle", 2.0)
     changed, params = table.changed, table.params.copy()
     news = (table.take_dirty(), table.take_overwritten(), table.take_removed_at(), changed, params)
-    heard(table, 3, by, 3.0)
+    receive(table, 3, by, 3.0)
     table.restore_unwritten(*news)
     assert [(each.param.value, each.moment) for each in table.take_overwritten()] == [(2, 2.0)]
     assert table.take_dirty() == {"A": by}
@@ -106,7 +106,7 @@ def test_a_value_replaced_during_a_failed_write_is_kept(by: str) -> None:
 
 def test_a_removed_name_has_the_time_of_the_last_value_of_the_download() -> None:
     table = Table()
-    heard(table, 1, "vehicle", 1.0)
+    receive(table, 1, "vehicle", 1.0)
     table.store_value(param_value("B", 1.0, index=0, count=1), "vehicle", 2.0)
     table.settle({0: "B"})
     assert table.take_removed_at() == {"A": 2.0}
@@ -115,10 +115,10 @@ def test_a_removed_name_has_the_time_of_the_last_value_of_the_download() -> None
 
 def test_a_file_counts_from_when_it_was_asked_for() -> None:
     table = Table()
-    heard(table, 1, "vehicle", 1.0)
+    receive(table, 1, "vehicle", 1.0)
     table.store_file_entry("A", ParamType.INT32, 2, 0, None, 1.5, is_older=False)
     assert table.params.moments == {"A": 1.5}
-    heard(table, 3, "vehicle", 2.0)
+    receive(table, 3, "vehicle", 2.0)
     for value in (2, 3):  # also where the file has what was heard since
         table.store_file_entry("A", ParamType.INT32, value, 0, None, 1.7, is_older=True)
         assert table.params.moments == {"A": 2.0}
@@ -136,7 +136,7 @@ def test_cached_values_keep_their_observation_times() -> None:
 def test_sleep_that_the_clock_leaves_out_makes_everything_older() -> None:
     table = Table()
     for number, moment in ((1, 1.0), (2, 2.0)):
-        heard(table, number, "us", moment)
+        receive(table, number, "us", moment)
     table.store_value(param_value("B", 1.0, index=1), "vehicle", 3.0)
     table.remove(lambda param: param.name == "B")
     table.age(1000.0)
@@ -408,7 +408,7 @@ async def test_datagrams_read_late_have_their_arrival_times() -> None:
     with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as sender:
         sender.connect(link.address)  # type: ignore[attr-defined]  # of a link over sockets
         is_told = False
-        with anyio.fail_after(PATIENCE):
+        with anyio.fail_after(TIMEOUT):
             while not is_told:  # the kernel begins to note arrivals a moment after it was asked to
                 sender.send(b"\xfd")
                 await anyio.sleep(0.02)

@@ -13,9 +13,9 @@ from paramclient.remote import RemoteClient, RemoteComponent
 from paramclient.service import Hub, create_app
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from tests.asgi import ASGITransport
-from tests.served import met, problem, service
+from tests.client_kinds import direct_only, pytest_generate_tests, way
+from tests.service_hub import met, problem, service
 from tests.shell import FlakyLink, Late, Tap, a_client, outcome, small_px4, swift_loop, swiftly, until
-from tests.ways import direct_only, pytest_generate_tests, way
 
 __all__ = ["pytest_generate_tests", "way"]
 

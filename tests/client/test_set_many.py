@@ -29,8 +29,8 @@ from paramclient.protocol import wire
 from paramclient.protocol.requests.write_window import WRITES_IN_FLIGHT_MAX
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam, Vehicle
 from tests import shell
+from tests.client_kinds import direct_only, pytest_generate_tests, way
 from tests.shell import VALUES, FlakyLink, Tap, a_client, generic, residue, small_px4, swiftly
-from tests.ways import direct_only, pytest_generate_tests, way
 
 __all__ = ["pytest_generate_tests", "way"]
 

@@ -140,14 +140,14 @@ def test_a_fetch_reads_what_a_stopped_list_of_another_station_lacks() -> None:
 def test_single_answers_to_others_are_no_list(ahead: int) -> None:
     following = ForeignList()
     for index in range(0, ahead * (LIST_VALUES_MIN - 1), ahead):
-        following.heard(param_value(f"P{index}", index=index, count=500), index * 0.01)
+        following.receive(param_value(f"P{index}", index=index, count=500), index * 0.01)
         assert not following.is_running(index * 0.01)
 
 
 def test_a_list_is_over_at_its_end_and_when_it_falls_quiet() -> None:
     following = ForeignList()
     for index in range(20):
-        following.heard(param_value(f"P{index}", index=index, count=21), index * 0.01)
+        following.receive(param_value(f"P{index}", index=index, count=21), index * 0.01)
     assert following.is_running(0.2)
     assert following.is_running(0.6)  # ArduPilot pauses for up to 400 ms while it answers reads (measured)
     assert not following.is_running(0.75)
@@ -155,15 +155,15 @@ def test_a_list_is_over_at_its_end_and_when_it_falls_quiet() -> None:
     names, count = following.hand_over(reads)
     assert (len(names), count) == (20, 21)
     assert reads.pace.gap == pytest.approx(0.01)
-    following.heard(param_value("P20", index=20, count=21), 0.2)
+    following.receive(param_value("P20", index=20, count=21), 0.2)
     assert not following.is_running(0.2)
 
 
 def test_a_list_of_another_count_begins_anew() -> None:
     following = ForeignList()
     for index in range(15):
-        following.heard(param_value(f"P{index}", index=index, count=100), index * 0.01)
-    following.heard(param_value("P15", index=15, count=101), 0.15)
+        following.receive(param_value(f"P{index}", index=index, count=100), index * 0.01)
+    following.receive(param_value("P15", index=15, count=101), 0.15)
     assert not following.is_running(0.15)
 
 

@@ -53,7 +53,7 @@ SECRET = bytes(range(101, 133))
 KEY = SigningKey(SECRET)
 OTHER_KEY = SigningKey(bytes(range(1, 33)))
 NOW = 36_000_000_000_000
-PATIENCE = 60.0
+TIMEOUT = 60.0
 
 FORMS = [SECRET, SECRET.hex().encode(), SECRET.hex().upper().encode(), base64.b64encode(SECRET)]
 FORMS += [repr(SECRET)[2:-1].encode(), ", ".join(map(str, SECRET[:8])).encode()]
@@ -703,7 +703,7 @@ class Terminal:
 
     def until(self, text: bytes) -> None:
         while text not in self.seen:
-            assert select.select([self.ours], [], [], PATIENCE)[0], self.seen
+            assert select.select([self.ours], [], [], TIMEOUT)[0], self.seen
             try:
                 self.seen += os.read(self.ours, 65536)
             except OSError:
@@ -715,7 +715,7 @@ class Terminal:
 
     def interrupt(self) -> None:
         """Ctrl-C until it is heeded: one between the prompt and the reading has to wait for a key."""
-        for _ in range(int(PATIENCE)):
+        for _ in range(int(TIMEOUT)):
             self.process.send_signal(signal.SIGINT)
             with suppress(subprocess.TimeoutExpired):
                 self.process.wait(1.0)
@@ -723,12 +723,12 @@ class Terminal:
 
     def close(self) -> int:
         try:
-            while select.select([self.ours], [], [], PATIENCE)[0]:
+            while select.select([self.ours], [], [], TIMEOUT)[0]:
                 self.seen += os.read(self.ours, 65536)
         except OSError:
             pass
         try:
-            return self.process.wait(PATIENCE)
+            return self.process.wait(TIMEOUT)
         finally:
             self.process.kill()
             os.close(self.ours)

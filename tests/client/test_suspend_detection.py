@@ -265,9 +265,9 @@ def test_time_asleep_is_finite_and_stands_still_while_awake() -> None:
 
 def test_time_that_the_clock_left_out_counts_for_a_vehicles_own_clock() -> None:
     presence = Presence()
-    presence.heard(10.0)
+    presence.receive(10.0)
     assert not presence.system_time(SystemTime(0, 100_000_000), 10.0)
     assert not presence.system_time(SystemTime(0, 3_600_000), 20.0), "an hour of ten seconds: an old message"
     presence.age(HOURS)
     assert presence.system_time(SystemTime(0, 3_600_000), 20.0)
-    assert presence.heard(20.0) == HOURS + 10.0
+    assert presence.receive(20.0) == HOURS + 10.0

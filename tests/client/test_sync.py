@@ -40,6 +40,7 @@ from paramclient.client.subscription import Changes
 from paramclient.protocol import wire
 from paramclient.protocol.wire import HASH_CHECK, ParamRequestList, ParamRequestRead, ParamSetMessage
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle
+from tests.client_kinds import drained, event_listeners, push, pytest_generate_tests, way
 from tests.shell import (
     VALUES,
     FlakyLink,
@@ -54,7 +55,6 @@ from tests.shell import (
     swiftly,
     until,
 )
-from tests.ways import drained, event_listeners, push, pytest_generate_tests, way
 
 __all__ = ["pytest_generate_tests", "way"]
 

@@ -26,8 +26,8 @@ from paramclient.provision import apply
 from paramclient.sim import PX4Vehicle
 from tests.caches import full_disk, whole_table
 from tests.commands import in_process
-from tests.served import C, met, problem, service
 from tests.service.test_process import ended, served
+from tests.service_hub import C, met, problem, service
 from tests.shell import small_px4, swiftly, until
 
 NAME = "PARAM_01"

@@ -40,7 +40,7 @@ from paramclient.model.values import Param, ParamType, Trust, WireValue, bits_of
 from paramclient.provision import ApplyResult, ApplyRow, ApplyStatus, plan
 from tests.caches import PX4
 from tests.commands import strict
-from tests.published import Published
+from tests.openapi_schema import Published
 
 ROOT = Path(__file__).parents[2]
 THIRD = struct.unpack("<f", struct.pack("<f", 1 / 3))[0]

@@ -709,7 +709,7 @@ async def apply_hidden(session: Session) -> Measured:
             await put_back(session, vehicle)
             for result in (done, back):
                 if not result.complete or result.counts[ApplyStatus.SET] != len(values):
-                    raise CheckFailed(f"{result}: {'; '.join(map(str, result.news))}")
+                    raise CheckFailed(f"{result}: {'; '.join(map(str, result.shown_rows))}")
             return Measured(f"{switch} and {member.name} in {done.elapsed:.2f} s", done.elapsed)
     raise Skip("no switch of a group with a float is off")
 
@@ -726,7 +726,7 @@ async def apply_under(session: Session, *, conditions: Conditions) -> Measured:
         done = await apply(vehicle, ParamSet(wanted), timeout=SLOWEST_FETCH)
         await put_back(session, vehicle)
     if not done.complete or done.counts[ApplyStatus.SET] != APPLIED:
-        raise CheckFailed(f"{done}: {'; '.join(map(str, done.news[:5]))}")
+        raise CheckFailed(f"{done}: {'; '.join(map(str, done.shown_rows[:5]))}")
     return Measured(f"{APPLIED} set in {done.elapsed:.2f} s", done.elapsed)
 
 
@@ -742,10 +742,10 @@ async def restore_before(session: Session) -> Measured:
         for name in names:
             await session.journal.set(vehicle, name, another_value(session.journal.before[name]))
         done = await restore(vehicle, state)
-        left_out = [row.name for row in done.news if row.status is ApplyStatus.SKIPPED]
+        left_out = [row.name for row in done.shown_rows if row.status is ApplyStatus.SKIPPED]
         await put_back(session, vehicle)
     if not done.complete or any(done.rows[name].status is not ApplyStatus.SET for name in names):
-        raise CheckFailed(f"{done}: {'; '.join(map(str, done.news[:5]))}")
+        raise CheckFailed(f"{done}: {'; '.join(map(str, done.shown_rows[:5]))}")
     told = f", left out {', '.join(left_out)}" if left_out else ""
     return Measured(f"{done.counts[ApplyStatus.SET]} set in {done.elapsed:.2f} s{told}", done.elapsed)
 

@@ -14,8 +14,8 @@ from paramclient.metadata import AddedFiles, MetadataStore
 from paramclient.model.identity import Identity
 from paramclient.model.px4_hash import crc32_px4
 from paramclient.sim import ArduPilotVehicle
+from tests.client_kinds import ServedClient
 from tests.commands import Command, Put, behind, in_process, leaping
-from tests.ways import ServedClient
 
 DATA = Path(__file__).parent.parent / "data"
 ARDUPILOT, PX4 = 3, 12

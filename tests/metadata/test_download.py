@@ -430,12 +430,12 @@ def test_the_request_and_its_responses() -> None:
     asked = Asked()
     ask = asked.machine.ask(0.0)
     assert asked.sent == [CommandLong(1, 1, 512, (397.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))]
-    asked.machine.heard(ComponentMetadata("mftp://a", 7), 0.1)
+    asked.machine.receive(ComponentMetadata("mftp://a", 7), 0.1)
     assert ask.result == ComponentMetadata("mftp://a", 7)
-    asked.machine.heard(ComponentMetadata("mftp://b", 8), 0.2)  # unsolicited
+    asked.machine.receive(ComponentMetadata("mftp://b", 8), 0.2)  # unsolicited
     assert asked.messages.next_deadline() == float("inf")
     ask = asked.machine.ask(1.0)
-    asked.machine.heard(ComponentMetadata("", 0), 1.1)
+    asked.machine.receive(ComponentMetadata("", 0), 1.1)
     assert ask.done
     assert ask.result is None
 

@@ -20,7 +20,7 @@ from paramclient.model.params import (
     is_listed,
     pack_fields,
     param_of,
-    same_held,
+    same_compact,
     with_index,
     with_trust_number,
 )
@@ -98,7 +98,7 @@ def test_the_compact_form_loses_nothing(
     assert repr(params) == f"Params({{'NAME': {param!r}}})"
     assert as_params(ParamMap(params)) is params
     assert as_params({"NAME": param}) == params
-    assert is_listed(params.held["NAME"]) == (index is not None)
+    assert is_listed(params.compact["NAME"]) == (index is not None)
 
 
 def test_params_can_be_changed_and_copied() -> None:
@@ -123,7 +123,7 @@ def test_setting_index_or_trust_changes_nothing_else() -> None:
     assert param_of("A", with_index(held, 7)) == Param("A", -5, ParamType.INT16, 7, 0xFFFB, Trust.VERIFIED)
     assert param_of("A", with_index(held, COMPACT_NO_INDEX)).index is None
     assert param_of("A", with_trust_number(held, CACHED)) == param.with_trust(Trust.CACHED)
-    assert same_held(held, with_trust_number(with_index(held, 9), CACHED))
+    assert same_compact(held, with_trust_number(with_index(held, 9), CACHED))
 
 
 @given(
@@ -137,14 +137,14 @@ def test_same_held_agrees_with_same_value_of_params(
 ) -> None:
     one, other = (each & ((1 << 8 * min(ParamType(number).size, 4)) - 1) for each in (one, other))
     first, second = pack_fields(one, number, raw[0], 0, 1), pack_fields(other, number, raw[1], 1, 2)
-    assert same_held(first, second) == param_of("A", first).same_value(param_of("A", second))
+    assert same_compact(first, second) == param_of("A", first).same_value(param_of("A", second))
 
 
 def test_the_garbage_collector_does_not_track_compact_params() -> None:
     params = Params()
     for at in range(100):
         params[f"P{at}"] = Param(f"P{at}", 1.5, ParamType.REAL32, at, 0x3FC00000, default=2.5)
-    assert not any(map(gc.is_tracked, (*params.held.values(), *params.defaults.values())))
+    assert not any(map(gc.is_tracked, (*params.compact.values(), *params.defaults.values())))
 
 
 def test_changes_compare_by_content_and_can_be_copied() -> None:

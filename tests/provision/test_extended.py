@@ -27,8 +27,8 @@ from paramclient.provision import (
     verify_extended,
 )
 from paramclient.sim import Camera
+from tests.client_kinds import direct_only, pytest_generate_tests, way
 from tests.shell import a_client, swiftly
-from tests.ways import direct_only, pytest_generate_tests, way
 
 __all__ = ["pytest_generate_tests", "way"]
 

@@ -797,7 +797,7 @@ async def test_restore_skips_measured_and_read_only_parameters() -> None:
         result = await restore(component, before)
         assert result.complete
         assert set(sets(tap)) == {"LOCKED", "TUNE_01"}
-        told = {row.name: (row.category, row.actual) for row in result.news}
+        told = {row.name: (row.category, row.actual) for row in result.shown_rows}
         assert told == {
             "TUNE_01": ("", 0.25),
             "BARO1_GND_PRESS": ("read-only", 9.0),

@@ -21,7 +21,7 @@ from paramclient.client import reconnection
 from paramclient.model.paramset import ParamSet
 from paramclient.service import Hub, Listening, serve
 from tests.commands import in_process
-from tests.shell import PATIENCE, small_px4, tasks_beside, until
+from tests.shell import TIMEOUT, small_px4, tasks_beside, until
 
 CERT, KEY = (Path(__file__).parents[1] / "data" / name for name in ("tls_station.pem", "tls_station.key"))
 
@@ -44,13 +44,13 @@ def running(vehicle: Any, port: int = 0, **tls: Path) -> Iterator[str]:
 
     thread = threading.Thread(target=asyncio.run, args=(run(),))
     thread.start()
-    assert started.wait(PATIENCE)
+    assert started.wait(TIMEOUT)
     url, loop, stop = told
     try:
         yield url
     finally:
         loop.call_soon_threadsafe(stop.set)
-        thread.join(PATIENCE)
+        thread.join(TIMEOUT)
         assert not thread.is_alive()
 
 
@@ -60,7 +60,7 @@ async def test_the_library_over_sockets_and_through_a_restart(monkeypatch: pytes
     monkeypatch.setattr(reconnection, "RECONNECT_BACKOFF_MIN", 0.05)
     monkeypatch.setattr(reconnection, "RECONNECT_BACKOFF_MAX", 0.1)
     vehicle = small_px4()
-    with anyio.fail_after(PATIENCE):
+    with anyio.fail_after(TIMEOUT):
         with running(vehicle) as url:
             client = ParamClient(url)
             await client.__aenter__()
@@ -190,7 +190,7 @@ async def test_a_service_ends_in_good_order_while_somebody_listens_over_tls(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv("SSL_CERT_FILE", str(CERT))
-    with anyio.fail_after(PATIENCE):
+    with anyio.fail_after(TIMEOUT):
         with running(small_px4(), tls_cert=CERT, tls_key=KEY) as url:
             client = ParamClient(url)
             await client.__aenter__()

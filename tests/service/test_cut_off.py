@@ -21,7 +21,7 @@ from paramclient.protocol import wire
 from tests.commands import in_process
 from tests.service.test_process import C, ended, served
 from tests.service.test_setup import HERE, TUNE, Checked, Quiet, px4, serving
-from tests.shell import PATIENCE, Clock, Tap, small_px4, swiftly
+from tests.shell import TIMEOUT, Clock, Tap, small_px4, swiftly
 
 # Notes
 
@@ -206,7 +206,7 @@ async def told_after_a_kill(cache: str) -> None:
             await browser.post(f"{C}/fetch", json={})
             body = {"wanted": {"values": {f"PARAM_{number:02}": 77 for number in range(20)}}, "wait": False}
             job = (await browser.post(f"{C}/apply", json=body)).json()["id"]
-            with anyio.fail_after(PATIENCE):
+            with anyio.fail_after(TIMEOUT):
                 told: dict[str, Any] = {}
                 while not (told.get("progress") or {}).get("done"):
                     await asyncio.sleep(0.02)

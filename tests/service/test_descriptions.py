@@ -21,7 +21,7 @@ from paramclient.protocol.wire import COMPONENT_METADATA_ID, CommandLong, FileTr
 from paramclient.service import Hub, create_app
 from paramclient.sim import ArduPilotVehicle, Endpoint, PX4Vehicle
 from tests.asgi import a_browser
-from tests.served import C
+from tests.service_hub import C
 from tests.shell import FlakyLink, Tap, swift_loop, swiftly, until
 
 CHANGED = "MC_ROLL_P"

@@ -18,7 +18,7 @@ from paramclient.service import Hub, create_app
 from paramclient.service.event_feed import BATCH_EVENTS_MAX, EventFeed, EventFilter, EventPosition, Listener
 from paramclient.service.routes import events
 from paramclient.sim import Air
-from tests.served import C, met, problem, service
+from tests.service_hub import C, met, problem, service
 from tests.shell import VALUES, Tap, generic, small_px4, swiftly, tasks_beside
 
 

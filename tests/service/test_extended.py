@@ -15,8 +15,8 @@ from paramclient.model.ext_params import ExtParam
 from paramclient.service import AccessSettings, Hub, Settings, Tokens, create_app
 from paramclient.sim import Air, Camera, PX4Vehicle, camera_table
 from tests.asgi import a_browser
-from tests.served import met, problem, service
 from tests.service.test_events import Heard, listening
+from tests.service_hub import met, problem, service
 from tests.shell import generic, swiftly
 
 E = "/api/v1/components/1/100/extended"

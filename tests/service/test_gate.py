@@ -22,7 +22,7 @@ from paramclient.service.connection_slots import (
 )
 from paramclient.service.log_limit import LOG_INTERVAL, LOG_KINDS_MAX, LogLimit
 from tests.service.test_attacks import Answer, Served, over_tls, served, taken, trusting
-from tests.shell import PATIENCE, Clock, until
+from tests.shell import TIMEOUT, Clock, until
 
 # Connection slots
 
@@ -252,7 +252,7 @@ async def test_silent_connections_keep_nobody_out(
     async with narrow(monkeypatch, over_tls()) as service:
         with silent(service.port, 200, source, data):
             for _ in range(3):
-                with anyio.fail_after(PATIENCE):
+                with anyio.fail_after(TIMEOUT):
                     assert (await asked_over_tls(service)).status == 200
     assert len([record for record in caplog.records if record.name != "asyncio"]) < 10
 

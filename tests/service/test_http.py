@@ -9,7 +9,7 @@ import pytest
 
 from paramclient.model.values import ParamType
 from paramclient.sim import GenericVehicle, SimParam
-from tests.served import C, met, problem, service
+from tests.service_hub import C, met, problem, service
 from tests.shell import FlakyLink, generic, small_px4, swiftly
 
 

@@ -28,13 +28,13 @@ FILES = Path(__file__).parents[2] / "paramclient/service/page"
 LARGEST_PAGE = 150_000
 DESKTOP = {"width": 1280, "height": 800}
 PHONE = {"width": 390, "height": 844}
-PATIENCE = 15_000.0
+TIMEOUT = 15_000.0
 EXPECTED = re.compile(
     r"the server responded with a status of (4\d\d|503)|ERR_(CONNECTION_(REFUSED|RESET)|INCOMPLETE)"
 )
 """What the browser itself says of answers that are problems, and of a service that is gone."""
 
-expect.set_options(timeout=PATIENCE)
+expect.set_options(timeout=TIMEOUT)
 
 needs_browser = pytest.mark.skipif(
     BROWSER is None, reason="no Chromium is here to look at the page with: apt install chromium"
@@ -119,7 +119,7 @@ def visit(browser: Browser) -> Iterator[Callable[..., Sight]]:
     def open_page(url: str, vehicle: str | None = "PX4 1/1", **options: Any) -> Sight:
         urls.add(urlsplit(url).netloc)
         context = browser.new_context(**{"viewport": DESKTOP, **options})
-        context.set_default_timeout(PATIENCE)
+        context.set_default_timeout(TIMEOUT)
         contexts.append(context)
         page = context.new_page()
         page.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)

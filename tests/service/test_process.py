@@ -25,7 +25,7 @@ from paramclient.links import create_link, serve_endpoint
 from paramclient.protocol import wire
 from paramclient.service import Listening
 from tests.commands import in_process
-from tests.shell import PATIENCE, VALUES, Tap, small_px4, until
+from tests.shell import TIMEOUT, VALUES, Tap, small_px4, until
 
 C = "/api/v1/components/1/1"
 
@@ -41,11 +41,11 @@ async def served(*words: str) -> AsyncIterator[tuple[asyncio.subprocess.Process,
     )
     try:
         assert process.stdout is not None
-        with anyio.fail_after(PATIENCE):
+        with anyio.fail_after(TIMEOUT):
             line = (await process.stdout.readline()).decode()
         found = re.fullmatch(r"serving on (http://127\.0\.0\.1:[1-9]\d*)\n", line)
         assert found, line
-        async with httpx.AsyncClient(base_url=found[1], timeout=PATIENCE) as browser:
+        async with httpx.AsyncClient(base_url=found[1], timeout=TIMEOUT) as browser:
             yield process, browser
     finally:
         if process.returncode is None:
@@ -55,7 +55,7 @@ async def served(*words: str) -> AsyncIterator[tuple[asyncio.subprocess.Process,
 
 async def ended(process: asyncio.subprocess.Process) -> tuple[int, str]:
     """How a process ends, and what it has said on stderr."""
-    with anyio.fail_after(PATIENCE):
+    with anyio.fail_after(TIMEOUT):
         _, err = await process.communicate()
     assert process.returncode is not None
     return process.returncode, err.decode()
@@ -76,7 +76,7 @@ async def test_serve_waits_for_a_vehicle_and_ends_cleanly(tmp_path: Path) -> Non
         async def state() -> str:
             return str((await browser.get("/health")).json()["links"][0]["state"])
 
-        with anyio.fail_after(PATIENCE):
+        with anyio.fail_after(TIMEOUT):
             while await state() != "failed":  # noqa: ASYNC110 - asked over HTTP
                 await asyncio.sleep(0.05)
         await tasks.start(serve_endpoint, vehicle, create_link(f"tcpin:127.0.0.1:{port}"))

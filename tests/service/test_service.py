@@ -21,7 +21,7 @@ from paramclient.service import Hub, create_app, followed_component
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, SimParam
 from tests.asgi import a_browser
 from tests.recordings import DATA
-from tests.served import C, met, problem, service
+from tests.service_hub import C, met, problem, service
 from tests.shell import VALUES, FlakyLink, Tap, generic, settled, small_px4, swiftly
 
 # links and components
@@ -171,7 +171,7 @@ async def test_the_fast_encoding_of_parameters_equals_the_documents(tmp_path: Pa
         assert everything["run"] == hub.feed.run
         assert list(everything["params"]) == list(followed.component.params)
         for name, param in followed.component.params.items():
-            told = ParamDoc.kept(param, heard_at=followed.heard_at(name)).as_json()
+            told = ParamDoc.kept(param, heard_at=followed.received_at(name)).as_json()
             assert everything["params"][name] == told
             assert told["heard_at"] > 1_700_000_000
         one = (await browser.get(f"{C}/params/RTL_ALT")).json()

@@ -33,7 +33,7 @@ from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
 from paramclient.sim.vehicle import Vehicle
 from tests.asgi import a_browser
 from tests.caches import NOW, PX4, stored
-from tests.published import Published
+from tests.openapi_schema import Published
 from tests.shell import Tap, swiftly, until
 
 HERE = "/api/v1/components/1/1"

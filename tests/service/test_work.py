@@ -80,7 +80,7 @@ from paramclient.service.routes import extended as extended_room
 from paramclient.service.routes import params as params_room
 from paramclient.sim import Camera, GenericVehicle
 from tests.asgi import a_browser
-from tests.served import C, met, problem, service
+from tests.service_hub import C, met, problem, service
 from tests.shell import Tap, swiftly, until
 
 TABLE = {f"ABC_{number % 5}_P{number:02}": float(number) for number in range(40)}

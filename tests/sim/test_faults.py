@@ -23,7 +23,7 @@ from paramclient.sim import (
     SimParam,
     Vehicle,
 )
-from tests.ground import LIST, PERIODIC_MESSAGES, SMALL, Station, cast, indices, names, read, write
+from tests.ground_station import LIST, PERIODIC_MESSAGES, SMALL, Station, cast, indices, names, read, write
 from tests.simulation import Simulation
 
 NO_INDEX = wire.NO_INDEX
@@ -72,7 +72,7 @@ class TestDead:
         dead = [read(index=3), read("P3"), read(index=7), read("P7")]
         assert not station.ask(*dead, seconds=0.5)
         station.send(*dead).wait(0.5)
-        assert not station.heard(wire.ParamError)
+        assert not station.receive(wire.ParamError)
         assert len(station.ask(read(index=2), read("P6"))) == 2
         assert len(vehicle.params) == 10
 
@@ -196,7 +196,7 @@ class TestWhenListed:
         vehicle.when_listed(6, lambda: vehicle.reboot(down=down))
         station = Station(vehicle).wait(1.5).send(LIST).wait(0.5)
         assert max(value.param_index for value in station.values() if value.param_index < 10) == 4
-        beats = station.wait(4.0).heard(wire.Heartbeat)
+        beats = station.wait(4.0).receive(wire.Heartbeat)
         assert len(beats) == {0.0: 4, 2.0: 3, math.inf: 0}[down]
         assert (len(listed(station)) == 10) == (down < math.inf)
 
@@ -206,22 +206,22 @@ class TestSwitchingOn:
     def test_the_heartbeat_starts_with_the_vehicle(self, kind: Callable[..., Vehicle]) -> None:
         vehicle = kind(table=TEN)
         station = Station(vehicle, start=100.0).wait(2.5)
-        assert len(station.heard(wire.Heartbeat)) == 3
+        assert len(station.receive(wire.Heartbeat)) == 3
         vehicle.reboot(station.now, down=0.7)
-        assert len(station.wait(2.0).heard(wire.Heartbeat)) == 2
+        assert len(station.wait(2.0).receive(wire.Heartbeat)) == 2
 
     def test_the_heartbeat_has_the_boot_state(self, kind: Callable[..., Vehicle]) -> None:
         vehicle = kind(table=TEN, boot_time=2.5)
         station = Station(vehicle).wait(4.5)
-        beats = station.heard(wire.Heartbeat)
+        beats = station.receive(wire.Heartbeat)
         ready = beats[-1].system_status
         assert ready in (3, 4)
         assert [beat.system_status for beat in beats] == [1, 1, 1, ready, ready]
         vehicle.reboot(station.now)
-        assert station.wait(0.5).heard(wire.Heartbeat)[0].system_status == 1
+        assert station.wait(0.5).receive(wire.Heartbeat)[0].system_status == 1
 
     def test_without_a_boot_time_the_vehicle_is_ready_immediately(self, kind: Callable[..., Vehicle]) -> None:
-        beats = Station(kind(table=TEN)).heard(wire.Heartbeat)
+        beats = Station(kind(table=TEN)).receive(wire.Heartbeat)
         assert beats[0].system_status != wire.MAV_STATE_BOOT
 
 
@@ -229,9 +229,9 @@ class TestClock:
     def test_system_time_starts_with_the_vehicle(self) -> None:
         vehicle = GenericVehicle(table=TEN)
         station = Station(vehicle, start=100.0).wait(2.5)
-        assert [time.time_boot_ms for time in station.heard(wire.SystemTime)] == [0, 1000, 2000]
+        assert [time.time_boot_ms for time in station.receive(wire.SystemTime)] == [0, 1000, 2000]
         vehicle.reboot(station.now, down=0.7)
-        times = station.wait(2.0).heard(wire.SystemTime)
+        times = station.wait(2.0).receive(wire.SystemTime)
         assert times == [wire.SystemTime(0, 0), wire.SystemTime(0, 1000)]
 
     @pytest.mark.parametrize("kind", [GenericVehicle, ArduPilotVehicle])
@@ -255,7 +255,7 @@ class TestClock:
     def test_the_time_since_boot_has_32_bits(self) -> None:
         station = Station(GenericVehicle(table=TEN, telemetry=1.0))
         station.now = 2.0**32 / 1000 + 5.0
-        (time,) = station.wait(0.0).heard(wire.SystemTime)[1:]
+        (time,) = station.wait(0.0).receive(wire.SystemTime)[1:]
         assert time.time_boot_ms == 5000
 
     @pytest.mark.parametrize(("kind", "asked"), [("copter", [True]), ("plane", []), ("rover", [])])
@@ -265,16 +265,16 @@ class TestClock:
         """A Copter only on request; an earlier request is acknowledged, and SYSTEM_TIME sent then."""
         vehicle = ArduPilotVehicle(table=TEN, kind=kind)
         station = Station(vehicle).wait(5.5)
-        unasked = [time.time_boot_ms for time in station.heard(wire.SystemTime)]
+        unasked = [time.time_boot_ms for time in station.receive(wire.SystemTime)]
         assert unasked == ([] if asked else [2000, 3000, 4000, 5000])
         vehicle.reboot(station.now, down=1.0)
         station.wait(1.2)
         station.log.clear()
         station.send(CLOCK_REQUEST).wait(1.1)
-        assert [message.result for message in station.heard(wire.CommandAck)] == [wire.MAV_RESULT_ACCEPTED]
-        assert [time.time_boot_ms for time in station.wait(0.2).heard(wire.SystemTime)] == [1400]
+        assert [message.result for message in station.receive(wire.CommandAck)] == [wire.MAV_RESULT_ACCEPTED]
+        assert [time.time_boot_ms for time in station.wait(0.2).receive(wire.SystemTime)] == [1400]
         station.send(CLOCK_REQUEST).wait(0.001)
-        assert [time.time_boot_ms for time in station.heard(wire.SystemTime)] == [1500]
+        assert [time.time_boot_ms for time in station.receive(wire.SystemTime)] == [1500]
 
     def test_px4_sends_the_time_since_boot_with_telemetry(self) -> None:
         vehicle = PX4Vehicle(table=TEN)
@@ -299,9 +299,9 @@ class TestClock:
     def test_the_state_after_a_reboot(self, make: Callable[..., Vehicle], first: int, then: int) -> None:
         vehicle = make(table=TEN)
         station = Station(vehicle).wait(3.5)
-        assert {beat.system_status for beat in station.heard(wire.Heartbeat)} == {then}
+        assert {beat.system_status for beat in station.receive(wire.Heartbeat)} == {then}
         vehicle.reboot(station.now)
-        states = [beat.system_status for beat in station.wait(5.0).heard(wire.Heartbeat)]
+        states = [beat.system_status for beat in station.wait(5.0).receive(wire.Heartbeat)]
         assert states[0] == first
         assert states[-1] == then
         assert states == sorted(states, key=[first, then].index)
@@ -380,8 +380,8 @@ class TestHighLatency:
     def test_one_message_every_5_s(self, kind: Callable[..., Vehicle]) -> None:
         station = Station(kind(table=TEN, high_latency=True, telemetry=50.0)).wait(12.0)
         assert [time for time, _, _ in station.log] == [0.0, 5.0, 10.0]
-        ours = Station(kind(table=TEN)).heard(wire.Heartbeat)[0]
-        assert station.heard(wire.HighLatency2) == [wire.HighLatency2(ours.type, ours.autopilot)] * 3
+        ours = Station(kind(table=TEN)).receive(wire.Heartbeat)[0]
+        assert station.receive(wire.HighLatency2) == [wire.HighLatency2(ours.type, ours.autopilot)] * 3
 
     @EVERY_KIND
     def test_high_latency_can_be_switched_at_any_time(self, kind: Callable[..., Vehicle]) -> None:

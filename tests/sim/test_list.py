@@ -13,7 +13,7 @@ import pytest
 from paramclient.protocol import wire
 from paramclient.protocol.ftp.packets import Opcode, Packet
 from paramclient.sim import ArduPilotVehicle
-from tests.ground import LIST, Station, cast, indices, read
+from tests.ground_station import LIST, Station, cast, indices, read
 
 SET = cast("RTL_ALT", 1234.0)
 LOOP = 0.006

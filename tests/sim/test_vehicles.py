@@ -29,7 +29,7 @@ from paramclient.sim import (
     ardupilot_table,
     px4_table,
 )
-from tests.ground import LIST, PERIODIC_MESSAGES, SMALL, Station, cast, indices, names, read, write
+from tests.ground_station import LIST, PERIODIC_MESSAGES, SMALL, Station, cast, indices, names, read, write
 
 NO_INDEX = wire.NO_INDEX
 
@@ -128,7 +128,7 @@ class TestEveryVehicle:
         vehicle = kind()
         station = Station(vehicle)
         station.now = 1000.0
-        assert len(station.wait(0.5).heard(wire.Heartbeat)) == 2
+        assert len(station.wait(0.5).receive(wire.Heartbeat)) == 2
         assert vehicle.next_deadline() == 1001.0
 
     @pytest.mark.parametrize(
@@ -143,7 +143,7 @@ class TestEveryVehicle:
     def test_other_commands_are_not_supported(self, kind: Callable[[], Vehicle]) -> None:
         requests = [wire.CommandLong(1, 1, 512, (math.nan,) * 7), wire.CommandLong(1, 1, 400)]
         station = Station(kind()).send(*requests)
-        assert [ack.result for ack in station.heard(wire.CommandAck)] == [3, 3]
+        assert [ack.result for ack in station.receive(wire.CommandAck)] == [3, 3]
 
     def test_messages_for_others_are_ignored(self, kind: Callable[[], Vehicle]) -> None:
         vehicle = kind()
@@ -332,7 +332,7 @@ class TestOptions:
         seen = set()
         for vehicle in [kind(system=n) for n in (1, 2, 255) for kind in (PX4Vehicle, ArduPilotVehicle)]:
             station = Station(vehicle).send(wire.CommandLong(vehicle.system, 1, 520))
-            (version,) = station.heard(wire.AutopilotVersion)
+            (version,) = station.receive(wire.AutopilotVersion)
             seen.add((version.uid, version.uid2))
         assert len(seen) == 6
 
@@ -343,7 +343,7 @@ class TestOptions:
             GenericVehicle(SMALL, uid=5, system=3, capabilities=8192, autopilot=8),
         ):
             station = Station(vehicle).send(wire.CommandLong(3, 1, 520))
-            (version,) = station.heard(wire.AutopilotVersion)
+            (version,) = station.receive(wire.AutopilotVersion)
             assert (version.uid, version.uid2, version.capabilities) in [
                 (99, bytes(18), 59647),
                 (0, b"hello".ljust(18, b"\0"), 64495),
@@ -409,7 +409,7 @@ class TestGeneric:
             write("NO_SUCH", 3.0, ParamType.REAL32),
             write("B_INT", 3.0, ParamType.REAL32),
         )
-        assert station.heard(wire.ParamError) == [
+        assert station.receive(wire.ParamError) == [
             wire.ParamError(255, 190, "NO_SUCH", -1, ParamErrorCode.DOES_NOT_EXIST),
             wire.ParamError(255, 190, "", 99, ParamErrorCode.DOES_NOT_EXIST),
             wire.ParamError(255, 190, "NO_SUCH", -1, ParamErrorCode.DOES_NOT_EXIST),
@@ -510,7 +510,7 @@ class TestPX4:
             wire.ParamRequestList(0, 0),
         )
         assert vehicle.values == before
-        assert not station.heard(wire.ParamError)
+        assert not station.receive(wire.ParamError)
 
     def test_errors_of_newer_firmware(self) -> None:
         station = Station(PX4Vehicle(param_error=True))
@@ -521,7 +521,7 @@ class TestPX4:
             write("SYS_AUTOSTART", 1.0, ParamType.REAL32),
         )
         assert [
-            (error.param_id, error.param_index, error.error) for error in station.heard(wire.ParamError)
+            (error.param_id, error.param_index, error.error) for error in station.receive(wire.ParamError)
         ] == [
             ("NO_SUCH", -1, 1),
             ("", 5000, 1),
@@ -661,7 +661,7 @@ class TestPX4:
         command = wire.CommandLong(1, 1, wire.MAV_CMD_PREFLIGHT_STORAGE, (2.0, *[0.0] * 6))
         station.send(command).wait(1.0)
         assert station.times() == []
-        assert [each.result for each in station.heard(wire.CommandAck)] == [wire.MAV_RESULT_ACCEPTED]
+        assert [each.result for each in station.receive(wire.CommandAck)] == [wire.MAV_RESULT_ACCEPTED]
         assert {name: each.bits for name, each in vehicle.params.items()} == bits
         assert vehicle.announced_hash() == before
         with pytest.raises(UsageError):
@@ -841,7 +841,7 @@ class TestArduPilot:
         unknown = [read("NO_SUCH"), read(index=1382), read("RTL_ALT", index=-2)]
         assert not station.ask(*unknown, seconds=1.0)
         assert indices(station.ask(*unknown, *(read(index=index) for index in range(5)))) == list(range(5))
-        assert not station.heard(wire.ParamError)
+        assert not station.receive(wire.ParamError)
 
     def test_a_read_may_return_the_value_before_a_set(self) -> None:
         station = Station(ArduPilotVehicle())
@@ -900,7 +900,7 @@ class TestArduPilot:
         station = Station(vehicle).send(cast("RTL_ALT", value), cast("NO_SUCH", 1.0)).wait(1.0)
         assert vehicle.values["RTL_ALT"] == 1500
         assert not station.times()
-        assert [error.error for error in station.heard(wire.ParamError)] == [2, 1] * error
+        assert [error.error for error in station.receive(wire.ParamError)] == [2, 1] * error
 
     @pytest.mark.parametrize("error", [False, True])
     def test_read_only(self, error: bool) -> None:
@@ -921,15 +921,17 @@ class TestArduPilot:
         vehicle = ArduPilotVehicle()
         unknown = [read(f"NO_SUCH_{number}") for number in range(19)]
         station = Station(vehicle).send(*unknown, *[read("RTL_ALT")] * 3).wait(0.5)
-        assert len(station.heard(wire.ParamValue)) == 2  # one in look-up, 20 waiting: the last one is dropped
+        assert (
+            len(station.receive(wire.ParamValue)) == 2
+        )  # one in look-up, 20 waiting: the last one is dropped
         station = Station(ArduPilotVehicle()).send(*unknown[:14], *[read("RTL_ALT")] * 5).wait(0.11)
-        assert len(station.heard(wire.ParamValue)) == 5
+        assert len(station.receive(wire.ParamValue)) == 5
 
     def test_errors_of_newer_firmware_for_reads(self) -> None:
         station = (
             Station(ArduPilotVehicle(param_error=True)).send(read("NO_SUCH"), read(index=5000)).wait(0.5)
         )
-        assert station.heard(wire.ParamError) == [
+        assert station.receive(wire.ParamError) == [
             wire.ParamError(255, 190, "NO_SUCH", -1, ParamErrorCode.DOES_NOT_EXIST),
             wire.ParamError(255, 190, "", 5000, ParamErrorCode.DOES_NOT_EXIST),
         ]
@@ -1209,7 +1211,7 @@ class TestAir:
     def test_faults_apply_in_each_direction(self) -> None:
         vehicle = GenericVehicle(SMALL)
         deaf = Station(Air([vehicle], uplink=FaultyLink(loss=1.0)))
-        assert deaf.wait(2.5).heard(wire.Heartbeat)
+        assert deaf.wait(2.5).receive(wire.Heartbeat)
         deaf.send(LIST)
         assert not vehicle.requests
         mute = Station(Air([vehicle], downlink=FaultyLink(loss=1.0)))

@@ -80,7 +80,7 @@ def is_waiting() -> bool:
     while frame is not None:
         names.add(frame.f_code.co_name)
         frame = frame.f_back
-    return "_next_news" in names or "sleep_in_callback" in names
+    return "_next_report" in names or "sleep_in_callback" in names
 
 
 def send(number: signal.Signals) -> None:
@@ -155,7 +155,7 @@ def test_params_are_a_live_view_that_may_change_during_an_iteration() -> None:
         component.fetch_all()
         assert len(params) == 25
         for name in params:
-            client_thread_of(client).client.components[1, 1].params._params.held.pop(name, None)  # type: ignore[attr-defined]  # as the event loop does
+            client_thread_of(client).client.components[1, 1].params._params.compact.pop(name, None)  # type: ignore[attr-defined]  # as the event loop does
         assert list(params.items()) == []
         assert params.get("PARAM_01") is None
         with pytest.raises(KeyError, match="PARAM_01"):

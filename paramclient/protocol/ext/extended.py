@@ -110,8 +110,8 @@ class ExtendedParams(Machine):
         self._store(param, by, now if moment is None else moment, now, message.param_index)
         if name not in self.table.params:
             return  # more names than the table may hold
-        self.fetches.heard(message, now)
-        self.reads.heard(message, now)
+        self.fetches.receive(message, now)
+        self.reads.receive(message, now)
 
     def receive_ack(self, message: ParamExtAck, now: float, moment: float | None = None) -> None:
         """Process a PARAM_EXT_ACK, also one for another station.
@@ -240,8 +240,8 @@ class ExtendedParams(Machine):
         change = replace(change, new=self.table.params[param.name], is_added=is_added)
         old = change.old
         if old is not None:
-            news = ParamExtValue(param.name, param.raw, param.type, 0, NO_INDEX)
-            self._checks.replaced(param.name, old.type, old.raw, news, now, self.reads.sent_at)
+            value = ParamExtValue(param.name, param.raw, param.type, 0, NO_INDEX)
+            self._checks.replaced(param.name, old.type, old.raw, value, now, self.reads.sent_at)
             self._checks.forget(now)
         self.report([change])
 

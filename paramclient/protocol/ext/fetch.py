@@ -158,7 +158,7 @@ class ExtFetches(Machine):
             fetch.drop_callbacks()
             self._leave(fetch)
 
-    def heard(self, message: ParamExtValue, now: float) -> None:
+    def receive(self, message: ParamExtValue, now: float) -> None:
         """Process a PARAM_EXT_VALUE, after the table has taken it."""
         self.is_spoken = True
         fetch = self.current

@@ -92,7 +92,7 @@ class ExtWrite(Operation[ExtSetResult]):
         self.wanted: ExtParam | None = None
         self.before: ExtParam | None = None
         self.made: ExtParam | None = None  # the value that an earlier PARAM_EXT_SET has led to
-        self.told: ExtParam | None = None  # the other value that the component has accepted instead
+        self.adjusted: ExtParam | None = None  # the other value that the component has accepted instead
         self.refusal: ExtSetRefused | None = None  # one that may belong to an earlier write
         self.is_answered = False  # an acknowledgement that proves nothing came after the last PARAM_EXT_SET
         self.is_sent = False
@@ -136,7 +136,7 @@ class ExtWrites(Machine):
 
     Attributes:
         queues: open writes by name, the active one first; no name has an empty queue.
-        is_held: whether a write waits for the permission.
+        is_awaiting_permission: whether a write waits for the permission.
         left_open: called with the name and the author of a write that ended with its outcome unknown.
     """
 
@@ -158,7 +158,7 @@ class ExtWrites(Machine):
         self._permission = permission
         self._stored = stored
         self._ended_at: dict[str, float] = {}
-        self.is_held = False
+        self.is_awaiting_permission = False
         self.queues: dict[str, deque[ExtWrite]] = {}
         self.left_open: Callable[[str, str, float], None] = _ignore
 
@@ -192,7 +192,7 @@ class ExtWrites(Machine):
 
     def proceed(self, now: float) -> None:
         """Begin the writes that waited for the permission."""
-        self.is_held = False
+        self.is_awaiting_permission = False
         for queue in list(self.queues.values()):
             if queue and not queue[0].is_sent and queue[0].read is None:
                 self._start(queue[0], now)
@@ -217,7 +217,7 @@ class ExtWrites(Machine):
                 self._succeed(write, actual, now)
             else:
                 if not self._may_be_late(write, now):
-                    write.told = actual
+                    write.adjusted = actual
                 self._verify_later(write, now)
         else:
             error = self._refusal(write, message.param_result)
@@ -309,7 +309,7 @@ class ExtWrites(Machine):
 
     def _start(self, write: ExtWrite, now: float) -> None:
         if not self._permission.is_recipient_certain:
-            self.is_held = True
+            self.is_awaiting_permission = True
             return
         known = self._table.params.get(write.name)
         if known is not None and known.trust is not Trust.CACHED:
@@ -333,7 +333,7 @@ class ExtWrites(Machine):
         write.verify_at = math.inf
         if not self._permission.is_recipient_certain:
             # the write is not meant for whichever vehicle is there now: it is overdue once that is known
-            self.is_held = True
+            self.is_awaiting_permission = True
             write.request.sent_at = -math.inf
             return
         wanted = write.wanted
@@ -370,7 +370,7 @@ class ExtWrites(Machine):
             return
         is_made_again = write.made is not None and write.made.same_value(actual)
         is_last = write.request.should_give_up(now)
-        is_told = write.is_answered or (write.told is not None and write.told.same_value(actual))
+        is_told = write.is_answered or (write.adjusted is not None and write.adjusted.same_value(actual))
         if (write.is_answered and is_made_again) or (is_last and is_told):
             self._succeed(write, actual, now)
         elif is_last:
@@ -400,7 +400,12 @@ class ExtWrites(Machine):
         """End a write without an acknowledgement: with an error that says what was read meanwhile."""
         actual = self._table.params.get(write.name)
         has_read = actual is not None and write.request.needs_read and actual.trust is not Trust.CACHED
-        if actual is not None and has_read and write.told is not None and write.told.same_value(actual):
+        if (
+            actual is not None
+            and has_read
+            and write.adjusted is not None
+            and write.adjusted.same_value(actual)
+        ):
             self._succeed(write, actual, now)
         elif actual is not None and has_read:
             self._fail(write, self._not_applied(write, actual), now)

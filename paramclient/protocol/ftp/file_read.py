@@ -422,7 +422,7 @@ class FileRead(FileTransferJob[bytes]):
             return
         attempts += 1
         self._asked[pending.offset] = attempts, now
-        is_silence = self._line.heard_at < pending.sent_at
+        is_silence = self._line.received_at < pending.sent_at
         if not (is_silence and self._is_silent):  # a silence that all reads share counts once
             self._retries.timed_out(attempts)
         self._is_silent = is_silence

@@ -216,7 +216,7 @@ class CommittedWrite(FileTransferJob[None]):
         flight = self._pending_reads.pop(sequence)
         lost = self._lost[flight.offset] = self._lost.get(flight.offset, 0) + 1
         self._retries.timed_out(lost)
-        is_silence = self._line.heard_at < flight.sent_at
+        is_silence = self._line.received_at < flight.sent_at
         if self._retries.should_give_up(lost, now, is_silence=is_silence):
             self.fail(self._no_reply(lost, now), now)
         elif flight.offset not in self._waiting:

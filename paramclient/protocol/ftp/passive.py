@@ -41,7 +41,7 @@ class ObservedRead:
         session: number of the session.
         opened_by: sequence number of the response that has opened it.
         began_at: when that response was received, in seconds.
-        heard_at: when the last response was received.
+        received_at: when the last response was received.
         blocks: the received pieces of the file.
     """
 
@@ -51,7 +51,7 @@ class ObservedRead:
         self.session = session
         self.opened_by = opened_by
         self.began_at = now
-        self.heard_at = now
+        self.received_at = now
         self.blocks = Blocks()
         self.offsets: dict[int, int] = {}
 
@@ -122,18 +122,18 @@ class ObservedReads:
         elif packet.requested in _DATA:
             for key, read in list(self._reads.items()):
                 if key[1] == packet.session and _is_for(addressee, key[0]):
-                    read.heard_at = now
+                    read.received_at = now
                     self._take(key, read, packet, now)
 
     def tick(self, now: float) -> None:
         """End the reads without a response for `IDLE_TIMEOUT` seconds."""
         for key, read in list(self._reads.items()):
-            if read.heard_at + IDLE_TIMEOUT <= now:
+            if read.received_at + IDLE_TIMEOUT <= now:
                 self._close(key, now)
 
     def next_deadline(self) -> float:
         """Return when `tick` is due, or infinity."""
-        return min((read.heard_at + IDLE_TIMEOUT for read in self._reads.values()), default=math.inf)
+        return min((read.received_at + IDLE_TIMEOUT for read in self._reads.values()), default=math.inf)
 
     def close_all(self, now: float) -> None:
         """End every read: nothing more is received."""

@@ -44,7 +44,7 @@ class FtpChannel:
     Attributes:
         target: system and component.
         retry: the component's policy, which decides when to repeat the requests.
-        heard_at: when the server's last message to us was received.
+        received_at: when the server's last message to us was received.
         byte_rate: bytes per second of the last file that was read in a burst, with the overhead of its
             frames; 0 before.
     """
@@ -56,7 +56,7 @@ class FtpChannel:
     ) -> None:
         self.target = context.target
         self.retry: RetryPolicy = context.retry
-        self.heard_at = -math.inf
+        self.received_at = -math.inf
         self.byte_rate = 0.0
         self._context = context
         self._send = context.send
@@ -124,7 +124,7 @@ class FileTransferJob(Operation[Result]):
         self._path_data = path_bytes(path)
         self._tell: Callable[[float], None] | None = None  # reports the end, once its session is closed
         self._request: Packet | None = None
-        self._then: Callable[[Packet, float], None] | None = None
+        self._on_response: Callable[[Packet, float], None] | None = None
         self._attempts = FileAttempts(line.retry, line)
         self._failures = 0
         self._openings = 1
@@ -212,7 +212,7 @@ class FileTransferJob(Operation[Result]):
         )
 
     def _closed(self, now: float) -> None:
-        self._request = self._then = self.session = self.asked_session = None
+        self._request = self._on_response = self.session = self.asked_session = None
         self.is_over = True
         assert self._tell is not None
         self._tell(now)
@@ -231,14 +231,14 @@ class FileTransferJob(Operation[Result]):
     def take(self, packet: Packet, now: float) -> None:
         """Process a response of the server to us."""
         request = self._request
-        if request is None or self._then is None:
+        if request is None or self._on_response is None:
             return
         is_answer = packet.sequence == (request.sequence + 1) & 0xFFFF and packet.requested == request.opcode
         if is_answer and packet.opcode in (Opcode.ACK, Opcode.NAK):
-            then = self._then
+            on_response = self._on_response
             self._attempts.answered(now)
-            self._request = self._then = None
-            then(packet, now)
+            self._request = self._on_response = None
+            on_response(packet, now)
 
     def tick(self, now: float) -> None:
         """Do what is due."""
@@ -269,7 +269,7 @@ class FileTransferJob(Operation[Result]):
     def _ask(
         self,
         opcode: Opcode,
-        then: Callable[[Packet, float], None],
+        on_response: Callable[[Packet, float], None],
         now: float,
         *,
         data: bytes = b"",
@@ -278,20 +278,20 @@ class FileTransferJob(Operation[Result]):
         copies: int = 1,
         is_slow: bool = False,
     ) -> None:
-        """Send a request and repeat it until its response, which is passed to `then`.
+        """Send a request and repeat it until its response, which is passed to `on_response`.
 
         With `is_slow`, the server works on it for a while, and the response tells nothing of the link.
         """
         sequence = self._line.next_sequence()
         self._request = Packet(sequence, session, opcode, data, offset=offset)
-        self._then = then
+        self._on_response = on_response
         self._attempts = FileAttempts(self._line.retry, self._line, is_slow=is_slow)
         self._transmit(self._request, now, copies=copies)
 
     def _open_file(
-        self, opcode: Opcode, then: Callable[[Packet, float], None], now: float, *, copies: int = 1
+        self, opcode: Opcode, on_response: Callable[[Packet, float], None], now: float, *, copies: int = 1
     ) -> None:
-        """Open the file in a session of its own, which `session` names when `then` is called.
+        """Open the file in a session of its own, which `session` names when `on_response` is called.
 
         If an open is in flight already, its number is used again.
         """
@@ -303,7 +303,7 @@ class FileTransferJob(Operation[Result]):
                 if self.is_ended:
                     self._terminate(packet.session, now)
                 else:
-                    then(packet, now)
+                    on_response(packet, now)
             elif self.is_ended and code == FileErrorCode.FAIL:
                 self._terminate(number, now)  # open already, by an open of ours whose response was lost
             elif self.is_ended:

@@ -306,7 +306,7 @@ class FileTransfers(Machine):
             (job.stop if is_served else job.abandon)(now)
             self._go_on(now)
 
-    def heard(self, message: FileTransfer, now: float) -> None:
+    def receive(self, message: FileTransfer, now: float) -> None:
         """Process a FILE_TRANSFER_PROTOCOL of the component."""
         system, component = self._own
         if self._job is not None:
@@ -315,7 +315,7 @@ class FileTransfers(Machine):
             self.foreign_at = now
             return
         if self._job is not None and self._line is not None:
-            self._line.heard_at = now
+            self._line.received_at = now
             self._job.take(Packet.unpack(message.payload), now)
             self._go_on(now)
 

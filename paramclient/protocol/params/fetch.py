@@ -188,18 +188,18 @@ class Fetch(Operation[FetchResult]):
             if self._proof.before is None:
                 self._proof.before = announcement
 
-    def heard(self, message: ParamValue, now: float) -> None:
+    def receive(self, message: ParamValue, now: float) -> None:
         """Process a PARAM_VALUE of the component, before the reads do."""
         if self.file is not None:
-            self.file.heard(message)
+            self.file.receive(message)
         download = self.download
         if download is None:
             if not self._reads.awaits(message):  # otherwise it is the response to our request
-                self._fetch_context.foreign_list.heard(message, now)
+                self._fetch_context.foreign_list.receive(message, now)
         elif not download.done:
             if self.first_value_at > now:
                 self.first_value_at = now
-            download.heard(message, now)
+            download.receive(message, now)
             is_unheard = self._proof.before is None and not self._was_asked_meanwhile
             if is_unheard and self._context.expects_hash and not self.done:
                 # the one at the head of the list was lost; requested now, it causes no delay later
@@ -387,13 +387,13 @@ class Fetch(Operation[FetchResult]):
 
         sampling.on_done.append(ended)
 
-    def _ask_hash(self, then: Callable[[Read], None], now: float) -> None:
+    def _ask_hash(self, on_read: Callable[[Read], None], now: float) -> None:
         read = self._hash_read = self._reads.ask(HASH_CHECK, now)
 
         def ended() -> None:
             if self._hash_read is read:
                 self._hash_read = None
-                then(read)
+                on_read(read)
 
         read.on_done.append(ended)
 

@@ -77,7 +77,7 @@ class FileDownload(Operation[None]):
         self._table = table
         self._changed = changed
         self._heard: set[str] = set()
-        self._heard_count: int | None = None
+        self._received_count: int | None = None
         self._attempts = 0
         self._query = WITH_DEFAULTS
         self._not_found: FileTransferError | None = None  # with the defaults
@@ -174,11 +174,11 @@ class FileDownload(Operation[None]):
         """Parameters of the component, as soon as the file's header was received."""
         return self._count if self._job is None else total_of(self._job.beginning)
 
-    def heard(self, message: ParamValue) -> None:
+    def receive(self, message: ParamValue) -> None:
         """Process a PARAM_VALUE of the component, after the table has stored it."""
         self._heard.add(message.param_id)
         if message.param_count <= PARAMETERS_MAX:
-            self._heard_count = message.param_count
+            self._received_count = message.param_count
 
     def look(self, now: float) -> None:
         """Check whether the component is known by now to have no file without defaults either."""
@@ -201,7 +201,7 @@ class FileDownload(Operation[None]):
         self._silent_at = now + FILE_SILENCE_TIMEOUT
         self._doubts = self._table.doubts
         self._heard.clear()
-        self._heard_count = None
+        self._received_count = None
         job = self._job = self._files.read(PARAMETER_FILE + self._query, now, limit=PACK_SIZE_MAX)
         job.yields = self._yields
         job.on_done.append(partial(self._came, job))
@@ -229,8 +229,10 @@ class FileDownload(Operation[None]):
         if self._doubts != self._table.doubts:
             self._is_none(PackError("the vehicle was away meanwhile", offset=0), now)
             return
-        if total is not None and self._heard_count not in (None, total):
-            self._is_none(PackError(f"the vehicle has {self._heard_count} parameters by now", offset=4), now)
+        if total is not None and self._received_count not in (None, total):
+            self._is_none(
+                PackError(f"the vehicle has {self._received_count} parameters by now", offset=4), now
+            )
             return
         try:
             pack = decode(job.result)

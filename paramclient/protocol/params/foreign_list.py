@@ -24,7 +24,7 @@ once, PX4 pushes these by rising index too: 200 of 905."""
 class ForeignList:
     """Follows received values while no list of ours runs."""
 
-    __slots__ = ("_began_at", "_count", "_front", "_heard_at", "_longest", "_names")
+    __slots__ = ("_began_at", "_count", "_front", "_longest", "_names", "_received_at")
 
     def __init__(self) -> None:
         self.forget()
@@ -34,15 +34,15 @@ class ForeignList:
         self._names: dict[int, str] = {}
         self._count = 0
         self._front = -1
-        self._began_at = self._heard_at = -math.inf
+        self._began_at = self._received_at = -math.inf
         self._longest = 0.0
 
-    def heard(self, message: ParamValue, now: float) -> None:
+    def receive(self, message: ParamValue, now: float) -> None:
         """Process a PARAM_VALUE."""
         name, _, _, count, index = message
         if index >= count or count == NO_INDEX:
             return
-        gap = now - self._heard_at
+        gap = now - self._received_at
         is_next = 0 < index - self._front <= JUMP_MAX and count == self._count
         if not is_next or gap > self._quiet:
             if index == self._front and count == self._count:
@@ -54,7 +54,7 @@ class ForeignList:
             self._longest = gap
         self._names[index] = name
         self._front = index
-        self._heard_at = now
+        self._received_at = now
 
     def is_running(self, now: float) -> bool:
         """Return whether a list is running."""
@@ -63,12 +63,12 @@ class ForeignList:
             return False
         passed = self._front - next(iter(self._names)) + 1
         is_list = came >= HEARD_SHARE_MIN * passed
-        return is_list and now - self._heard_at <= self._quiet
+        return is_list and now - self._received_at <= self._quiet
 
     def hand_over(self, reads: Reads) -> tuple[Mapping[int, str], int]:
         """Return its values by index and the param_count; the reads learn its pace and its end."""
-        gap = reads.pace.gap = (self._heard_at - self._began_at) / max(len(self._names) - 1, 1)
-        reads.list_until = self._heard_at + (self._count - self._front) * gap + self._quiet
+        gap = reads.pace.gap = (self._received_at - self._began_at) / max(len(self._names) - 1, 1)
+        reads.list_until = self._received_at + (self._count - self._front) * gap + self._quiet
         return self._names, self._count
 
     @property

@@ -134,7 +134,7 @@ class ListDownload(Operation[None]):
         self._silent_at = math.inf  # when an unanswered list no longer uses the link
         self._tries: dict[int, tuple[int, int]] = {}  # of unanswered reads: requests, answered controls
         self._places = {name: index for index, name in self.names.items()}  # of an earlier download
-        self._is_heard = self._is_checked = False  # a value was received; a present one was read to check
+        self._is_received = self._is_checked = False  # a value was received; a present one was read to check
         self._list_timeout = math.inf  # seconds in which another pass may stay without a value
         self._is_answered = False  # its first value measures the round trip
         self._ahead_at: float | None = None  # when the next pass was requested before the end of this one
@@ -207,12 +207,12 @@ class ListDownload(Operation[None]):
         if self.held_since is not None:
             self.queue_time += now - self.held_since
             self.held_since = None
-        self._request.patient_since = now
+        self._request.timeout_since = now
         is_running = self._stream.is_at_pace and now < self._quiet_at
         if self.lists == 0 and is_running:
             return  # another station has requested it meanwhile
         self._stream.rewind()
-        self._stream.heard_at = now
+        self._stream.received_at = now
         self._request.restart()
         self._ask_for_list(now)
         self._silent_at = now + self._request.wait
@@ -221,7 +221,7 @@ class ListDownload(Operation[None]):
         """Return the seconds for which it has waited for its turn."""
         return self.queue_time + (0.0 if self.held_since is None else now - self.held_since)
 
-    def heard(self, message: ParamValue, now: float) -> None:
+    def receive(self, message: ParamValue, now: float) -> None:
         """Process a PARAM_VALUE of the component, before the reads do."""
         name, _, _, count, index = message
         stream = self._stream
@@ -237,7 +237,7 @@ class ListDownload(Operation[None]):
             return
         if self.done:
             return
-        self._is_heard = True
+        self._is_received = True
         if self._ahead_at is not None and index <= JUMP_MAX < stream.front:
             self._stream_ends()  # the pass that was requested before the end of this one has begun
             self._ahead_at = now
@@ -299,7 +299,7 @@ class ListDownload(Operation[None]):
         if self.count is None:
             if self._request.due_at <= now and not self.gives_way:
                 if self._list_admission.is_parallel_to_others(self):
-                    self._request.patient_since = now  # the vehicle may have no bandwidth to answer
+                    self._request.timeout_since = now  # the vehicle may have no bandwidth to answer
                 if self._request.should_give_up(now):
                     self._end_unanswered(now)
                 else:
@@ -329,7 +329,7 @@ class ListDownload(Operation[None]):
     def resume(self, now: float) -> None:
         """Repeat what could not be sent: the link is back."""
         self._request.resume(now)
-        self._stream.heard_at = now
+        self._stream.received_at = now
         self._silent_at = now + self._retry_policy.timeout
 
     def cancel(self) -> None:
@@ -352,7 +352,7 @@ class ListDownload(Operation[None]):
         quiet_at = stream.quiet_at(timeout, (self.count or 0) - 1 - stream.front)
         if stream.is_bursty and self._list_admission.is_parallel_to_others(self):
             # on a link this fast, the cause of a pause is this program or the vehicle
-            return max(quiet_at, stream.heard_at + max(LIST_SILENCE_MIN, timeout))
+            return max(quiet_at, stream.received_at + max(LIST_SILENCE_MIN, timeout))
         return quiet_at
 
     def _note_answer(self, now: float) -> None:
@@ -425,7 +425,7 @@ class ListDownload(Operation[None]):
                 return
             if index > behind and not self._reads.pace.is_batched:
                 stream.pass_over(hole for hole in range(behind, index) if hole not in self.names)
-        stream.heard_at = now
+        stream.received_at = now
         count = self.count or 0
         if stream.front == count - 1 or len(self.names) >= count:
             self._stream_ends()
@@ -615,7 +615,7 @@ class ListDownload(Operation[None]):
                 self._ask_for_another_pass(now)
             else:
                 self._ask_for_gaps(now)
-        elif self.resumed and not self._is_heard:
+        elif self.resumed and not self._is_received:
             (self._end_unanswered if self._is_checked else self._check)(now)
         else:
             self.finish(None, now)  # every missing index was requested and given up

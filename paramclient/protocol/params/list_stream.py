@@ -26,20 +26,20 @@ class ListStream:
 
     Attributes:
         front: the highest index reached; -1 before the first.
-        heard_at: when the last value was received, also one that did not advance.
+        received_at: when the last value was received, also one that did not advance.
         gap: the mean time between two values in seconds, from `measure`; 0 before.
         is_awaited: whether nothing was received since the request.
         holes: skipped indices not received since: index -> number of advances by then.
     """
 
     __slots__ = (
-        *("_advances", "_began", "_came_before", "_front_at", "_jump", "_longest", "_together"),
-        *("front", "gap", "heard_at", "holes", "is_awaited"),
+        *("_advances", "_began", "_came_before", "_front_at", "_jump", "_longest", "_bursts"),
+        *("front", "gap", "received_at", "holes", "is_awaited"),
     )
 
     def __init__(self, now: float) -> None:
         self.front = -1
-        self.heard_at = now
+        self.received_at = now
         self.gap = 0.0
         self.is_awaited = True
         self.holes: dict[int, int] = {}
@@ -48,7 +48,7 @@ class ListStream:
         self._advances = 0  # how often it advanced
         self._began = (0, now)  # where and when
         self._came_before = 0  # how often other lists advanced before it
-        self._together = 0  # values received together with the one before
+        self._bursts = 0  # values received together with the one before
         self._longest = 0.0  # the longest recent gap
 
     @property
@@ -59,7 +59,7 @@ class ListStream:
     @property
     def is_bursty(self) -> bool:
         """Whether most of its values are received together."""
-        return self._together >= BURSTY_SHARE * (self._advances - self._came_before)
+        return self._bursts >= BURSTY_SHARE * (self._advances - self._came_before)
 
     def rewind(self) -> None:
         """Start at the beginning: the next value belongs to another pass, or to another count."""
@@ -75,10 +75,10 @@ class ListStream:
             self.is_awaited = False
             self._began = (index, now)
             self._came_before = self._advances
-            self._together = 0
+            self._bursts = 0
             self._advances += 1
             self.front = index
-            self.heard_at = self._front_at = now
+            self.received_at = self._front_at = now
         else:
             self.goes_on(index, now)
         return True
@@ -86,14 +86,14 @@ class ListStream:
     def goes_on(self, index: int, now: float) -> None:
         """Advance to an index that is known to be valid, not the first."""
         self._longest *= 0.99
-        gap = now - self.heard_at
+        gap = now - self.received_at
         if gap > self._longest:
             self._longest = gap
         elif gap < BURST_GAP_MAX:
-            self._together += 1
+            self._bursts += 1
         self._advances += 1
         self.front = index
-        self.heard_at = self._front_at = now
+        self.received_at = self._front_at = now
 
     def pass_over(self, indices: Iterable[int]) -> None:
         """Note skipped indices."""
@@ -116,9 +116,9 @@ class ListStream:
             left: the number of values behind its front.
         """
         if self.is_awaited:
-            return self.heard_at + max(LIST_SILENCE_MIN, timeout)
+            return self.received_at + max(LIST_SILENCE_MIN, timeout)
         longest = self._longest if self.is_at_pace else None
-        return self.heard_at + ListAttempts.silence_before_end(timeout, left, longest)
+        return self.received_at + ListAttempts.silence_before_end(timeout, left, longest)
 
     def ends_at(self, last: int) -> float:
         """Return when the value of this index is expected, at the measured pace."""

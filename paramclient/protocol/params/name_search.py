@@ -117,7 +117,7 @@ class NameSearches(Machine):
         if search in self._searches:
             self._leave(search, now)
 
-    def heard(self, message: ParamValue, now: float) -> None:
+    def receive(self, message: ParamValue, now: float) -> None:
         """Process a PARAM_VALUE of the component, after the table has stored it."""
         if not self._searches:
             return
@@ -141,7 +141,7 @@ class NameSearches(Machine):
         search = self._searches[0]
         if search.passes.pop(message.param_id, None) is not None:
             search.unknown.add(message.param_id)
-            self._retries.heard_at = now
+            self._retries.received_at = now
             self._window.discard(message.param_id)
             self._go_on(search, now)
 

@@ -49,7 +49,7 @@ class PassiveTable:
     Attributes:
         names: received names, by index under `count`.
         count: the param_count received with them, or None.
-        news_at: when the last new index was received.
+        new_index_at: when the last new index was received.
         is_log: as above.
         is_over: whether nothing more is received.
         file: the packed file, as other stations read it.
@@ -65,7 +65,7 @@ class PassiveTable:
     ) -> None:
         self.names: dict[int, str] = {}
         self.count: int | None = None
-        self.news_at = -math.inf
+        self.new_index_at = -math.inf
         self.is_log = is_log
         self.is_over = False
         self.file = FileObserver(self._file_came)
@@ -81,7 +81,7 @@ class PassiveTable:
         """Return the state of `number` parts of the indices; see `DownloadRanges.split`."""
         return split_indices(self.count or 0, number, self.names, ())
 
-    def heard(self, message: ParamValue, now: float) -> None:
+    def receive(self, message: ParamValue, now: float) -> None:
         """Process a PARAM_VALUE of the component, after the table has stored it."""
         name, _, _, count, index = message
         if self.file.is_reading:
@@ -95,7 +95,7 @@ class PassiveTable:
             self._began_at = now
         if index not in names:
             names[index] = name
-            self.news_at = now
+            self.new_index_at = now
             if len(names) == count:
                 self._complete("stream", now)
 
@@ -157,7 +157,7 @@ class PassiveTable:
             self._began_at = came.began_at
         was_whole = len(self.names) == total
         self.names |= names
-        self.news_at = now
+        self.new_index_at = now
         self._fetch_context.changed(table.take_pack(came.pack, came.began_at, came.newer, start=came.start))
         if len(self.names) == total and not was_whole:
             self._complete("ftp" if is_all else "stream", now)
@@ -245,7 +245,7 @@ class PassiveFetch(Fetch):
         overheard = self._overheard
         if overheard.is_log or overheard.file.is_reading or not overheard.names:
             return math.inf
-        return max(overheard.news_at, self.begun_at) + LIST_PAUSE_MAX
+        return max(overheard.new_index_at, self.begun_at) + LIST_PAUSE_MAX
 
     def partial(self, now: float, note: str) -> FetchResult:
         result = self._overheard.result(now, (note,))

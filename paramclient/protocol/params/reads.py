@@ -194,13 +194,13 @@ class ValueReads(Machine, Generic[Response]):
                 self._reschedule()
                 self._drop(read)
 
-    def heard(self, message: Response, now: float) -> None:
+    def receive(self, message: Response, now: float) -> None:
         """Process a PARAM_VALUE of the component, after the table has stored it."""
         name, _, _, count, index = message
-        wanted = self._open
+        open_reads = self._open
         is_answer = False
-        for read in (wanted.get(name), wanted.get(index)) if wanted else ():
-            if read is None or wanted.get(read.key) is not read:
+        for read in (open_reads.get(name), open_reads.get(index)) if open_reads else ():
+            if read is None or open_reads.get(read.key) is not read:
                 continue
             if read.attempts:
                 is_answer = True

@@ -20,7 +20,7 @@ from paramclient.model.params import (
     number_of,
     pack_fields,
     param_of,
-    same_held,
+    same_compact,
     trust_of,
     unpack_fields,
     with_index,
@@ -78,9 +78,9 @@ class NameQuota:
     def __init__(self) -> None:
         self.taken = 0
 
-    def has_capacity(self, held: int) -> bool:
+    def has_capacity(self, count: int) -> bool:
         """Return whether a table with this many names may add one."""
-        return held < NAMES_MAX and (held < NAMES_GUARANTEED or self.taken < LINK_NAMES_MAX)
+        return count < NAMES_MAX and (count < NAMES_GUARANTEED or self.taken < LINK_NAMES_MAX)
 
 
 class Observation(NamedTuple):
@@ -135,7 +135,7 @@ class Table:
     def __init__(self, encoding: Encoding = Encoding.BYTEWISE, name_quota: NameQuota | None = None) -> None:
         self._name_quota = NameQuota() if name_quota is None else name_quota
         self.params = Params()
-        self._held = self.params.held
+        self._compact = self.params.compact
         self._defaults = self.params.defaults
         self._moments = self.params.moments
         self._latest = -math.inf  # the moment of the newest observation
@@ -225,7 +225,7 @@ class Table:
         name, raw, number, count, given = message
         if self.duplicate_indices and given in self.duplicate_indices.get(name, ()):
             return None
-        everything = self._held
+        everything = self._compact
         old = everything.get(name)
         self._latest = moment
         if old is None:  # fast path for a first value
@@ -252,10 +252,10 @@ class Table:
         a known type, or if the number is not whole or out of its range, the message is returned unchanged.
         """
         name = message.param_id
-        held = self._held.get(name)
-        if held is None:
+        compact = self._compact.get(name)
+        if compact is None:
             return message
-        _, number, _, trust, _ = unpack_fields(held)
+        _, number, _, trust, _ = unpack_fields(compact)
         if trust == CACHED and name not in self._wire:
             return message
         known = known_type(number)
@@ -268,10 +268,10 @@ class Table:
     def hear_index(self, message: ParamValue) -> None:
         """Store the index of a PARAM_VALUE of a known parameter, without its value."""
         name, _, _, count, given = message
-        held = self._held[name]
+        compact = self._compact[name]
         is_index = given < count <= PARAMETERS_MAX and given not in self.duplicate_indices.get(name, ())
-        if is_index and with_index(held, given) != held:
-            self._held[name] = with_index(held, given)
+        if is_index and with_index(compact, given) != compact:
+            self._compact[name] = with_index(compact, given)
             self.dirty.setdefault(name, "vehicle")
 
     def _update(
@@ -287,7 +287,7 @@ class Table:
         is_same_type = old_number == number
         if is_same_type and self._wire.get(name) == raw and not is_exact:
             if with_index(old, place) != old:
-                self._held[name] = pack_fields(old_bits, number, old_is_raw, LIVE, place)
+                self._compact[name] = pack_fields(old_bits, number, old_is_raw, LIVE, place)
                 self.dirty.setdefault(name, by)
             return None
         if is_same_type and not is_exact and self._is_rounded(old, raw):
@@ -296,9 +296,9 @@ class Table:
             bits, is_raw = bits_of_wire(raw, number, self._encoding)
             self._filed.discard(name)
         before = self._defaults.get(name) if is_same_type else self._defaults.pop(name, None)
-        new = self._held[name] = pack_fields(bits, number, is_raw, LIVE, place)
+        new = self._compact[name] = pack_fields(bits, number, is_raw, LIVE, place)
         self._wire[name] = raw
-        if same_held(old, new):
+        if same_compact(old, new):
             if with_index(old, place) != old:
                 self.dirty.setdefault(name, by)
             return None
@@ -331,9 +331,9 @@ class Table:
                 value then wins, unless it is a rounded form of the file's.
         """
         initial = None if default is None else from_bits(default, number)
-        old = self._held.get(name)
+        old = self._compact.get(name)
         if old is None:
-            if not self._name_quota.has_capacity(len(self._held)):
+            if not self._name_quota.has_capacity(len(self._compact)):
                 return None
             self._name_quota.taken += 1
         raw = as_sent(bits, number, self._encoding)
@@ -342,7 +342,7 @@ class Table:
         if is_older and old is not None and not (is_same_type and self._wire.get(name) == raw):
             if is_same_type:  # otherwise the default belongs to another type
                 self._set_default(name, initial)
-            self._held[name] = with_index(old, index)
+            self._compact[name] = with_index(old, index)
             self.dirty.setdefault(name, "vehicle")
             return None
         self._set_default(name, initial)
@@ -350,12 +350,12 @@ class Table:
         seen_at = self._moments.get(name, moment)
         self._moments[name] = max(moment, seen_at)
         self._latest = max(self._latest, moment)
-        new = self._held[name] = pack_fields(bits, number, is_raw, LIVE, index)
+        new = self._compact[name] = pack_fields(bits, number, is_raw, LIVE, index)
         self._wire[name] = raw
         self._filed.add(name)
         if old is None or with_index(old, index) != old or initial != before:
             self.dirty.setdefault(name, "vehicle")
-        if old is not None and same_held(old, new):
+        if old is not None and same_compact(old, new):
             return None
         self._record_change(name, old, "vehicle", before, seen_at)
         self._invalidate_hash(name)
@@ -392,14 +392,14 @@ class Table:
         self._encoding = encoding
         changes = []
         for name, raw in self._wire.items():
-            old = self._held[name]
+            old = self._compact[name]
             bits, number, _, trust, place = unpack_fields(old)
             if name in self._filed:
                 self._wire[name] = as_sent(bits, number, encoding)
                 continue
             bits, is_raw = bits_of_wire(raw, number, encoding)
-            new = self._held[name] = pack_fields(bits, number, is_raw, trust, place)
-            if not same_held(old, new):
+            new = self._compact[name] = pack_fields(bits, number, is_raw, trust, place)
+            if not same_compact(old, new):
                 self.dirty.setdefault(name, "vehicle")
                 changes.append(self._change(name, old, new))
         return changes
@@ -430,7 +430,7 @@ class Table:
             moments: as in `fill`.
         """
         known = as_params(params)
-        if any(is_listed(held) and not is_portable_name(name) for name, held in known.held.items()):
+        if any(is_listed(compact) and not is_portable_name(name) for name, compact in known.compact.items()):
             complete = placed = False
         changes = self.fill(known, are_placed=placed and self.count in (None, count), moments=moments)
         if self.count not in (None, count):
@@ -442,8 +442,8 @@ class Table:
             if volatile_known:
                 self.rehash()  # the hash covers the table's values, not those stored with the hash
             elif any(
-                name not in self._held or not same_held(self._held[name], held)
-                for name, held in known.held.items()
+                name not in self._compact or not same_compact(self._compact[name], compact)
+                for name, compact in known.compact.items()
                 if name not in volatile
             ):
                 self.unconfirm()
@@ -469,18 +469,18 @@ class Table:
         seen = {} if moments is None else moments
         changes = []
         known = as_params(params)
-        for name, cached in known.held.items():
-            old = self._held.get(name)
+        for name, cached in known.compact.items():
+            old = self._compact.get(name)
             default = known.defaults.get(name)
             if old is not None:
                 if unpack_fields(old)[1] == unpack_fields(cached)[1] and name not in self._filed:
                     changes += self._merge_cached(name, old, cached, default)
-            elif is_portable_name(name) and self._name_quota.has_capacity(len(self._held)):
+            elif is_portable_name(name) and self._name_quota.has_capacity(len(self._compact)):
                 self._name_quota.taken += 1
                 new = with_trust_number(cached, CACHED)
                 if not are_placed and is_listed(new):
                     new = self._with_outdated_index(name, new)
-                self._held[name] = new
+                self._compact[name] = new
                 if name in seen:
                     self._moments[name] = seen[name]
                 if default is not None:
@@ -497,14 +497,14 @@ class Table:
         """
         seen = {} if moments is None else moments
         changes: list[Change] = []
-        for name, cached in as_params(params).held.items():
-            old = self._held.get(name)
-            if old is None or trust_of(old) != CACHED or name in self.dirty or same_held(old, cached):
+        for name, cached in as_params(params).compact.items():
+            old = self._compact.get(name)
+            if old is None or trust_of(old) != CACHED or name in self.dirty or same_compact(old, cached):
                 continue
             _, number, _, _, place = unpack_fields(old)
             is_same_type = unpack_fields(cached)[1] == number
             before = self._defaults.get(name) if is_same_type else self._defaults.pop(name, None)
-            new = self._held[name] = with_index(with_trust_number(cached, CACHED), place)
+            new = self._compact[name] = with_index(with_trust_number(cached, CACHED), place)
             if name in seen:
                 self._moments[name] = seen[name]
             self._wire.pop(name, None)  # the same value from the vehicle must then count as a change
@@ -524,36 +524,36 @@ class Table:
                     self.previous_order = ()
             self.complete = False
             self.duplicate_indices.clear()
-            for name, held in self._held.items():
-                if is_listed(held):
-                    self._held[name] = self._with_outdated_index(name, held)
+            for name, compact in self._compact.items():
+                if is_listed(compact):
+                    self._compact[name] = self._with_outdated_index(name, compact)
         self.count = count
 
     @property
     def has_outdated_indices(self) -> bool:
         """Whether some names have no valid index since the count changed."""
-        held = self._held
+        compact = self._compact
         self.outdated_indices = {
-            name for name in self.outdated_indices if name in held and not is_listed(held[name])
+            name for name in self.outdated_indices if name in compact and not is_listed(compact[name])
         }
         return bool(self.outdated_indices)
 
     @property
     def followed_order(self) -> tuple[str, ...]:
         """`previous_order`, if the present value of each of these parameters was received on this link."""
-        held = self._held
-        are_live = all(name in held and trust_of(held[name]) == LIVE for name in self.previous_order)
+        compact = self._compact
+        are_live = all(name in compact and trust_of(compact[name]) == LIVE for name in self.previous_order)
         return self.previous_order if are_live else ()
 
     def place(self, names: Mapping[int, str]) -> None:
         """Set the indices that a download has determined."""
-        everything, duplicate_indices = self._held, self.duplicate_indices
+        everything, duplicate_indices = self._compact, self.duplicate_indices
         for index, name in names.items():
-            held = everything.get(name)
-            if held is None or (duplicate_indices and index in duplicate_indices.get(name, ())):
+            compact = everything.get(name)
+            if compact is None or (duplicate_indices and index in duplicate_indices.get(name, ())):
                 continue
-            now = with_index(held, index)
-            if now != held:
+            now = with_index(compact, index)
+            if now != compact:
                 everything[name] = now
                 self.dirty.setdefault(name, "vehicle")
 
@@ -564,8 +564,8 @@ class Table:
         present = frozenset(names.values())
         removed = [
             name
-            for name, held in self._held.items()
-            if name not in present and (is_listed(held) or name in self.outdated_indices)
+            for name, compact in self._compact.items()
+            if name not in present and (is_listed(compact) or name in self.outdated_indices)
         ]
         self.outdated_indices.clear()
         return self._remove(removed)
@@ -574,8 +574,8 @@ class Table:
         """Return the names by index under the present count, without indices that two names claim."""
         names: dict[int, str] = {}
         twice = set()
-        for name, held in self._held.items():
-            index = unpack_fields(held)[4]
+        for name, compact in self._compact.items():
+            index = unpack_fields(compact)[4]
             if index != COMPACT_NO_INDEX and names.setdefault(index, name) != name:
                 twice.add(index)
         count = self.count or 0
@@ -585,25 +585,25 @@ class Table:
         """Mark cached values that the hash covers as *verified*: the vehicle's hash has confirmed them."""
         if not self.volatile_known:
             return  # the hash may cover none of them
-        for name, held in self._held.items():
-            if trust_of(held) == CACHED and is_listed(held) and name not in self.volatile:
-                self._held[name] = with_trust_number(held, VERIFIED)
+        for name, compact in self._compact.items():
+            if trust_of(compact) == CACHED and is_listed(compact) and name not in self.volatile:
+                self._compact[name] = with_trust_number(compact, VERIFIED)
 
     def doubt(self, *trusts: Trust) -> None:
         """Mark all values of these trust levels as *cached*: they may have changed unnoticed."""
         self.doubts += Trust.LIVE in trusts
         doubted = {number_of(trust) for trust in trusts}
-        for name, held in self._held.items():
-            if trust_of(held) in doubted:
+        for name, compact in self._compact.items():
+            if trust_of(compact) in doubted:
                 self._wire.pop(name, None)  # the next value counts, even if it is the same
-                self._held[name] = with_trust_number(held, CACHED)
+                self._compact[name] = with_trust_number(compact, CACHED)
 
     def doubt_value(self, name: str) -> None:
         """Mark one value as *cached*: it may have changed unnoticed."""
-        held = self._held.get(name)
-        if held is not None:
+        compact = self._compact.get(name)
+        if compact is not None:
             self._wire.pop(name, None)  # the next value counts, even if it is the same
-            self._held[name] = with_trust_number(held, CACHED)
+            self._compact[name] = with_trust_number(compact, CACHED)
 
     def remove(self, condition: Callable[[Param], bool]) -> list[Change]:
         """Remove the parameters that meet a condition."""
@@ -611,7 +611,7 @@ class Table:
 
     def forget(self) -> list[Change]:
         """Remove everything: another vehicle uses the address."""
-        changes = self._remove(list(self._held))
+        changes = self._remove(list(self._compact))
         self.unconfirm()
         self.volatile = frozenset()
         self.volatile_known = False
@@ -636,27 +636,29 @@ class Table:
 
     def is_hashed(self, name: str) -> bool:
         """Return whether the vehicle's hash is known to cover a parameter."""
-        held = self._held.get(name)
-        return held is not None and is_listed(held) and name not in self.volatile
+        compact = self._compact.get(name)
+        return compact is not None and is_listed(compact) and name not in self.volatile
 
     def listed_bits(self) -> dict[str, int]:
         """Return the bits of the listed parameters by name: those with an index, which count and hash
         cover."""
-        return {name: unpack_fields(held)[0] for name, held in self._held.items() if is_listed(held)}
+        return {
+            name: unpack_fields(compact)[0] for name, compact in self._compact.items() if is_listed(compact)
+        }
 
     @property
     def size(self) -> int:
         """The number of listed parameters."""
-        return sum(map(is_listed, self._held.values()))
+        return sum(map(is_listed, self._compact.values()))
 
     @property
     def only_cached(self) -> int:
         """The number of listed parameters that are only *cached*."""
-        return sum(trust_of(held) == CACHED and is_listed(held) for held in self._held.values())
+        return sum(trust_of(compact) == CACHED and is_listed(compact) for compact in self._compact.values())
 
     def gaps(self) -> tuple[int, tuple[int, ...]]:
         """Return the number of parameters that the table should have, and the missing indices."""
-        present = {unpack_fields(held)[4] for held in self._held.values()}
+        present = {unpack_fields(compact)[4] for compact in self._compact.values()}
         present.discard(COMPACT_NO_INDEX)
         count = len(present) if self.count is None else self.count
         return count, tuple(index for index in range(count) if index not in present)
@@ -679,7 +681,7 @@ class Table:
         overwritten, self.overwritten = self.overwritten, []
         changed, self._changed = self._changed, {}
         for name, (moment, by) in changed.items():
-            if name in self._held and moment < self._moments[name]:
+            if name in self._compact and moment < self._moments[name]:
                 overwritten.append(Observation(self.params[name], by, moment))
         return overwritten
 
@@ -706,12 +708,12 @@ class Table:
         """
         replaced = []
         for name, by in dirty.items():
-            heard_at = params.moments.get(name)
-            if heard_at is None or name not in params.held:
+            received_at = params.moments.get(name)
+            if received_at is None or name not in params.compact:
                 continue
-            if name in self._changed or name not in self._held:
-                replaced.append(Observation(params[name], by, heard_at))
-            elif changed.get(name, (math.inf, ""))[0] == heard_at:  # otherwise `overwritten` has it
+            if name in self._changed or name not in self._compact:
+                replaced.append(Observation(params[name], by, received_at))
+            elif changed.get(name, (math.inf, ""))[0] == received_at:  # otherwise `overwritten` has it
                 self._changed[name] = changed[name]
         self.dirty = {**dirty, **self.dirty}
         self.overwritten = [*overwritten, *replaced, *self.overwritten][-OVERWRITTEN_MAX:]
@@ -741,7 +743,7 @@ class Table:
         """Remove these names."""
         changes: list[Change] = []
         for name in names:
-            held = self._held.pop(name)
+            compact = self._compact.pop(name)
             default = self._defaults.pop(name, None)
             self._wire.pop(name, None)
             self._filed.discard(name)
@@ -753,7 +755,7 @@ class Table:
                     self.removed_at[name] = self._latest
             if self._hash is not None:
                 self._invalidate_hash(name)
-            changes.append(_new(Removed, (name, held, None, "vehicle", None, default)))
+            changes.append(_new(Removed, (name, compact, None, "vehicle", None, default)))
         self._name_quota.taken -= len(changes)
         return changes
 
@@ -794,20 +796,20 @@ class Table:
         self.dirty[name] = by
 
     def _merge_cached(
-        self, name: str, heard: CompactParam, cached: CompactParam, default: WireValue | None
+        self, name: str, live: CompactParam, cached: CompactParam, default: WireValue | None
     ) -> list[Change]:
         """Complete a received value with what its message lacks: the default and the exact integer."""
-        bits, number, is_raw, trust, place = unpack_fields(heard)
+        bits, number, is_raw, trust, place = unpack_fields(live)
         if self._is_rounded(cached, self._wire.get(name, b"")):
             bits, _, is_raw, *_ = unpack_fields(cached)
         if default is not None and name not in self._defaults:
             self._defaults[name] = default
             self.dirty.setdefault(name, "vehicle")
-        new = self._held[name] = pack_fields(bits, number, is_raw, trust, place)
-        if same_held(heard, new):
+        new = self._compact[name] = pack_fields(bits, number, is_raw, trust, place)
+        if same_compact(live, new):
             return []
         self.dirty.setdefault(name, "vehicle")
-        return [self._change(name, heard, new)]
+        return [self._change(name, live, new)]
 
     def _is_rounded(self, known: CompactParam, raw: bytes) -> bool:
         """Return whether a message is a rounded form of a known integer beyond the 24 bits of a float32."""
@@ -817,9 +819,9 @@ class Table:
         value = from_bits(bits, number, is_raw=is_raw)
         return isinstance(value, int) and abs(value) > _EXACT and as_sent(bits, number, self._encoding) == raw
 
-    def _with_outdated_index(self, name: str, held: CompactParam) -> CompactParam:
+    def _with_outdated_index(self, name: str, compact: CompactParam) -> CompactParam:
         self.outdated_indices.add(name)
-        return with_index(held, COMPACT_NO_INDEX)
+        return with_index(compact, COMPACT_NO_INDEX)
 
     def _invalidate_hash(self, name: str) -> None:
         if name in self.volatile:

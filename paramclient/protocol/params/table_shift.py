@@ -67,16 +67,16 @@ class ShiftedOrder:
     def first_indices(self, changes: Iterable[CountChange]) -> list[int]:
         """Return the indices that show everything if each group lies behind its switch."""
         last = self._count - 1
-        wanted = {last, *(last * number // (CONTROL_READS + 1) for number in range(1, CONTROL_READS + 1))}
+        indices = {last, *(last * number // (CONTROL_READS + 1) for number in range(1, CONTROL_READS + 1))}
         known = sorted(
             (self._places[each.switch], each.added) for each in changes if each.switch in self._places
         )
         shift = 0
         for place, added in known:
             at = place + shift
-            wanted.update(range(at, at + max(added, 0) + READS_AROUND))
+            indices.update(range(at, at + max(added, 0) + READS_AROUND))
             shift += added
-        return sorted(index for index in wanted if 0 <= index <= last)
+        return sorted(index for index in indices if 0 <= index <= last)
 
     def next_indices(self) -> list[int] | None:
         """Return indices whose names narrow the changes down, rising; none when the order is known.
@@ -85,7 +85,7 @@ class ShiftedOrder:
         """
         if len(set(self._names.values())) < len(self._names):
             return None
-        wanted: set[int] = set()
+        indices: set[int] = set()
         for (start, place), (end, next_place) in pairwise(self._kept()):
             added = (end - start) - (next_place - place)
             found = [index for index in self._added if start < index < end]
@@ -96,8 +96,8 @@ class ShiftedOrder:
             ):
                 return None
             if added > len(found) or (added < 0 and end - start > 1):
-                wanted.update(self._within(start, end, found, added))
-        return sorted(wanted)
+                indices.update(self._within(start, end, found, added))
+        return sorted(indices)
 
     def names(self) -> dict[int, str]:
         """Return the names by index, when `next_indices` returns none."""
@@ -193,10 +193,10 @@ class TableShift(Operation[Mapping[int, str] | None]):
         self._order.add(index, read.result.param_id)
         if self._open:
             return
-        wanted = self._order.next_indices()
-        if wanted is None:
+        indices = self._order.next_indices()
+        if indices is None:
             self.finish(None, now)
-        elif wanted:
-            self._ask(wanted, now)
+        elif indices:
+            self._ask(indices, now)
         else:
             self.finish(self._order.names(), now)

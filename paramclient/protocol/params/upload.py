@@ -173,14 +173,14 @@ class ParamUpload(Operation[None]):
             self._files.release(job, now)
 
     def _wait_for(
-        self, job: CommittedWrite | FileChecksums | FileRead, then: Callable[[float], None]
+        self, job: CommittedWrite | FileChecksums | FileRead, on_end: Callable[[float], None]
     ) -> None:
         self._job = job
 
         def ended() -> None:
             if self._job is job:
                 self._job = None
-                then(job.ended_at)
+                on_end(job.ended_at)
 
         job.on_done.append(ended)
 
@@ -243,8 +243,8 @@ class ParamUpload(Operation[None]):
             self.fail(error, now)
             return
         for row in pack.entries:
-            wanted = self._entries.get(row.name)
-            if wanted is not None and (wanted.type, wanted.bits) == (row.type, row.bits):
+            entry = self._entries.get(row.name)
+            if entry is not None and (entry.type, entry.bits) == (row.type, row.bits):
                 self._prove(row, pack.total, now)
         self._read_next(now)
 

@@ -61,7 +61,7 @@ class BatchRules:
         cancel: cancels a write.
         committed: records that the vehicle may take the parameter file with the value of a filed write.
         unfile: continues a filed write with PARAM_SET.
-        heard: processes a PARAM_VALUE of the component.
+        receive: processes a PARAM_VALUE of the component.
         is_switch: whether other parameters depend on one with this name.
         fileable: returns the parameter with this name if its value can be written with the parameter file;
             None otherwise.
@@ -73,7 +73,7 @@ class BatchRules:
     cancel: Callable[[Write, float], None]
     committed: Callable[[Write, float], None]
     unfile: Callable[[Write, float], None]
-    heard: Callable[[ParamValue, float], None]
+    receive: Callable[[ParamValue, float], None]
     is_switch: Callable[[str], bool]
     fileable: Callable[[str], Param | None]
     may_commit: Callable[[], bool]
@@ -163,7 +163,7 @@ class WriteBatch(BulkWrites[WireValue, Write, SetOutcome]):
             return
         uploads = self._rules.uploads
         assert uploads is not None
-        hooks = UploadHooks(self._commit, self._rules.heard)
+        hooks = UploadHooks(self._commit, self._rules.receive)
         upload = self._upload = uploads.begin(entries, hooks, now)
         if upload.done:
             self._upload_ended(upload)

@@ -172,7 +172,7 @@ class Writes(Machine):
 
     Attributes:
         queues: open writes by name, the active one first; no name has an empty queue.
-        is_held: whether a write waits for the permission.
+        is_awaiting_permission: whether a write waits for the permission.
         asked, retries: writes so far, and repeated PARAM_SETs.
         against_non_finite: why NaN and infinity must not be sent to the vehicle; "" where they may.
         on_outcome_unknown: called with the name and the author of a write that ended with its outcome
@@ -196,7 +196,7 @@ class Writes(Machine):
         self._permission = permission
         self._trace = context.trace
         self.asked = self.retries = 0
-        self.is_held = False
+        self.is_awaiting_permission = False
         self.against_non_finite = ""
         self.queues: dict[str, deque[Write]] = {}
         self.on_outcome_unknown: Callable[[str, str, float], None] = _ignore
@@ -274,7 +274,7 @@ class Writes(Machine):
 
     def proceed(self, now: float) -> None:
         """Begin the writes that waited for the permission."""
-        self.is_held = False
+        self.is_awaiting_permission = False
         for queue in list(self.queues.values()):
             if queue and not queue[0].attempts and queue[0].read is None and not queue[0].is_filed:
                 self._start(queue[0], now)
@@ -287,25 +287,25 @@ class Writes(Machine):
             return False
         return wanted.bits == decode_value(message.raw, message.param_type, self._table.encoding)[1]
 
-    def heard(self, message: ParamValue, now: float) -> None:
+    def receive(self, message: ParamValue, now: float) -> None:
         """Process a PARAM_VALUE of the component, after the table has stored it."""
         write = self._active(message.param_id)
         if write is None:
             return
         value, bits = decode_value(message.raw, message.param_type, self._table.encoding)
-        heard = Param(write.name, value, message.param_type, None, bits)
+        received = Param(write.name, value, message.param_type, None, bits)
         if write.is_filed:
-            if write.wanted is not None and write.wanted.same_value(heard):
+            if write.wanted is not None and write.wanted.same_value(received):
                 self._succeed(write, now)
         elif message.param_type != write.number:
             if write.was_retyped:
-                reported = type_name(heard.type_number)
+                reported = type_name(received.type_number)
                 words = f"it is written as {type_name(write.number)} and reported as {reported}"
                 self._fail(write, self._type_mismatch(write, words), now)
             else:
                 write.was_retyped = True
-                self._begin(write, heard, now)
-        elif write.wanted is not None and write.wanted.same_value(heard):
+                self._begin(write, received, now)
+        elif write.wanted is not None and write.wanted.same_value(received):
             is_sure = write.read is None and not write.is_answered
             write.request.answered(now, is_sure=is_sure)
             self._succeed(write, now)
@@ -413,7 +413,7 @@ class Writes(Machine):
     def _start(self, write: Write, now: float) -> None:
         known = self._params.get(write.name)
         if not self._permission.may_be_written:
-            self.is_held = True
+            self.is_awaiting_permission = True
             return
         if write.is_filed:
             assert known is not None
@@ -433,7 +433,7 @@ class Writes(Machine):
         if not self._permission.may_be_written:
             # the write is not meant for whichever vehicle is there now: it begins, or is overdue, once that
             # is known
-            self.is_held = True
+            self.is_awaiting_permission = True
             write.request.sent_at = -math.inf
             write.is_answered = False
             write.verify_at = math.inf

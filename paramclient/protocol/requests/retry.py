@@ -211,7 +211,7 @@ class RetryPolicy:
 
     def is_silent_too_long(self, now: float) -> bool:
         """Return whether nothing at all of the component was received for `SILENCE_MAX`."""
-        return now - self.round_trip.heard_at >= SILENCE_MAX
+        return now - self.round_trip.received_at >= SILENCE_MAX
 
     def should_give_up(self, attempts: int, now: float) -> bool:
         """Return whether a request was repeated often enough: `tries` times, or the component is gone."""
@@ -781,13 +781,13 @@ class NameRetries:
 
     Attributes:
         sent_at: when the present window was sent.
-        heard_at: when the last name of it was answered.
+        received_at: when the last name of it was answered.
     """
 
     def __init__(self, policy: RetryPolicy) -> None:
         self._policy = policy
         self._controls_lost = 0
-        self.sent_at = self.heard_at = -math.inf
+        self.sent_at = self.received_at = -math.inf
 
     def restart(self) -> None:
         """Begin again, with another search or another link."""
@@ -798,11 +798,11 @@ class NameRetries:
         for _ in range(passes):
             self._policy.timed_out(1)
         self._policy.answered(self.sent_at, now, 2)
-        self.heard_at = now
+        self.received_at = now
 
     def control_answered(self, now: float) -> None:
         """Record the response to a control read."""
-        is_sure = self.heard_at <= self.sent_at  # otherwise the vehicle may have served names first
+        is_sure = self.received_at <= self.sent_at  # otherwise the vehicle may have served names first
         self._policy.answered(self.sent_at, now, 1 if is_sure else 2)
         self._controls_lost = 0
 
@@ -836,7 +836,7 @@ class NameRetries:
             is_batched: whether the component serves reads in batches: the next one cannot begin before.
         """
         serving = BATCH_INTERVAL + LOOKUP_TIME * names if is_batched else 0.0
-        return max(self.sent_at, self.heard_at) + self._policy.timeout + serving
+        return max(self.sent_at, self.received_at) + self._policy.timeout + serving
 
 
 # PARAM_REQUEST_LIST
@@ -889,15 +889,15 @@ class ListAttempts(Attempts):
     """The requests for the list since its turn began, until its first value.
 
     Attributes:
-        patient_since: since when the component has had the time to answer.
+        timeout_since: since when the component has had the time to answer.
         wait: seconds from the last request until it counts as lost; it grows with the requests.
     """
 
-    __slots__ = ("patient_since", "wait")
+    __slots__ = ("timeout_since", "wait")
 
     def __init__(self, policy: RetryPolicy, now: float) -> None:
         super().__init__(policy)
-        self.sent_at = self.patient_since = now
+        self.sent_at = self.timeout_since = now
         self.wait = 0.0
 
     @property
@@ -938,11 +938,11 @@ class ListAttempts(Attempts):
     def resume(self, now: float) -> None:
         """Make the request due at once: the link is back."""
         self.sent_at = now - self.wait
-        self.patient_since = now
+        self.timeout_since = now
 
     def should_give_up(self, now: float) -> bool:
         is_enough = self._policy.is_silent_too_long(now) or self.count >= LIST_ATTEMPTS_MIN
-        return is_enough and now - self.patient_since >= LIST_TIMEOUT
+        return is_enough and now - self.timeout_since >= LIST_TIMEOUT
 
     @staticmethod
     def later_timeout(first: float) -> float:
@@ -1059,7 +1059,7 @@ class Server(Protocol):
     """The part of a MAVFTP server that the retry policy uses."""
 
     @property
-    def heard_at(self) -> float:
+    def received_at(self) -> float:
         """When the server's last message to us was received; minus infinity before the first."""
 
 
@@ -1086,7 +1086,7 @@ class FileAttempts(Attempts):
             doublings = min(max(self.count - SLOW_ATTEMPTS_WITHOUT_BACKOFF, 0), BACKOFF_DOUBLINGS_MAX)
             return policy.timeout * 2.0**doublings
         timeout = policy.repeat_timeout(self.count)
-        if self._server.heard_at == -math.inf and policy.round_trip.smoothed is not None:
+        if self._server.received_at == -math.inf and policy.round_trip.smoothed is not None:
             # the server may be busy with another station, whose burst nothing interrupts
             timeout *= 2.0 ** min(
                 max(self.count - UNHEARD_ATTEMPTS_WITHOUT_BACKOFF, 0), BACKOFF_DOUBLINGS_MAX
@@ -1096,7 +1096,7 @@ class FileAttempts(Attempts):
     @property
     def due_at(self) -> float:
         # during a burst the server does nothing else
-        since = min(max(self.sent_at, self._server.heard_at), self.sent_at + SILENCE_MAX)
+        since = min(max(self.sent_at, self._server.received_at), self.sent_at + SILENCE_MAX)
         return since + self.timeout
 
     @property
@@ -1121,7 +1121,7 @@ class FileAttempts(Attempts):
         self.count = min(self.count, 1)
 
     def should_give_up(self, now: float) -> bool:
-        is_unheard = self._server.heard_at == -math.inf  # the loss of requests is unknown
+        is_unheard = self._server.received_at == -math.inf  # the loss of requests is unknown
         if is_unheard and self.count < UNHEARD_ATTEMPTS_MAX and not self._policy.is_silent_too_long(now):
             return False
         if self._is_slow and self.count < SLOW_ATTEMPTS_MIN:
@@ -1210,8 +1210,8 @@ class BurstAttempts(Attempts):
         Args:
             begins_by: when the first block is late.
         """
-        heard_at = min(self._server.heard_at, self.sent_at + SILENCE_MAX)
-        return max(begins_by, max(self.sent_at, heard_at) + BURST_SILENCE)
+        received_at = min(self._server.received_at, self.sent_at + SILENCE_MAX)
+        return max(begins_by, max(self.sent_at, received_at) + BURST_SILENCE)
 
     def next_read_behind_at(self, read_at: float) -> float:
         """Return when another read is sent behind the burst, after the one at `read_at`."""

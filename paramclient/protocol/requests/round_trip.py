@@ -34,7 +34,7 @@ class RoundTrip:
         longest: the longest round trip in seconds that the responses to repeated requests are compatible
             with; infinity without any.
         list_loss: the expected share of lost exchanges, by the losses of a list; 0 before a list.
-        heard_at: when the last message of the component was received; its receiver keeps that up to date.
+        received_at: when the last message of the component was received; its receiver keeps that up to date.
     """
 
     __slots__ = (
@@ -42,9 +42,9 @@ class RoundTrip:
         "_early_waits",
         "_first_timeout",
         "_unanswered",
-        "heard_at",
         "list_loss",
         "longest",
+        "received_at",
         "response_time",
         "responses",
         "samples",
@@ -54,7 +54,7 @@ class RoundTrip:
     )
 
     def __init__(self, first_timeout: float = 0.0) -> None:
-        self.heard_at = math.inf
+        self.received_at = math.inf
         self.list_loss = 0.0
         self.smoothed: float | None = None
         self.shortest = math.inf

@@ -62,12 +62,12 @@ class SequenceCheck:
         self.repeated = 0
         self.late = 0
         self._numberings: list[_Numbering] = []  # the most recently used one first
-        self._heard_at = 0.0
+        self._received_at = 0.0
 
-    def heard(self, sequence: int, now: float) -> None:
+    def receive(self, sequence: int, now: float) -> None:
         """Record the number of a frame."""
-        silence = now - self._heard_at
-        self._heard_at = now
+        silence = now - self._received_at
+        self._received_at = now
         gap, nearest = min(
             (((sequence - each.last - 1) % 256, index) for index, each in enumerate(self._numberings)),
             default=(255, 0),

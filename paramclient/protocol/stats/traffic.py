@@ -230,7 +230,7 @@ class Traffic:
             if not seen.is_known or len(self._sources) >= COUNTED_COMPONENTS_MAX:
                 return  # an address that no checksum proves does not count
             source = self._sources[address] = _Source(address)
-        source.heard(seen, peer, now)
+        source.receive(seen, peer, now)
 
 
 class _Source:
@@ -246,14 +246,14 @@ class _Source:
         self._checks: dict[Hashable, SequenceCheck] = {}
         self._signed = 0
         self._version = 1
-        self._heard_at = 0.0
+        self._received_at = 0.0
         self._heartbeat: Heartbeat | None = None
         self._heartbeat_at = 0.0
         self._radio: RadioStatus | None = None
         self._late = 0  # of removed peers
 
-    def heard(self, seen: SeenFrame, peer: Hashable, now: float) -> None:
-        self._heard_at = now
+    def receive(self, seen: SeenFrame, peer: Hashable, now: float) -> None:
+        self._received_at = now
         self._version = seen.version
         self._signed += seen.is_signed
         self._bytes.add(now, seen.size)
@@ -265,7 +265,7 @@ class _Source:
             messages.add(now, 1)
         check = self._check(peer)
         lost, repeated = check.lost, check.repeated
-        check.heard(seen.sequence, now)
+        check.receive(seen.sequence, now)
         if (check.lost, check.repeated) != (lost, repeated):
             self._lost.add(now, check.lost - lost)
             self._repeated.add(now, check.repeated - repeated)
@@ -303,7 +303,7 @@ class _Source:
             version=self._version,
             heartbeat=self._heartbeat,
             heartbeat_age=None if self._heartbeat is None else now - self._heartbeat_at,
-            age=now - self._heard_at,
+            age=now - self._received_at,
             frames=self._frames.total,
             bytes=self._bytes.total,
             frame_rate=self._frames.rate(began, now),

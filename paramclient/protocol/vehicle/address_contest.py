@@ -123,7 +123,7 @@ class ComponentPeers:
         home: the peer with the address; NO_PEER before the first, or after the end of its connection.
         has_left: whether that connection has ended: nothing may be sent until another peer has the address.
         speaker: the peer whose messages count without a check: `home`, except during a contest.
-        heard_at: when the last message of `home` was received.
+        received_at: when the last message of `home` was received.
         contest: why the address is contested, or None.
         ignored_messages: messages of other peers that were ignored.
     """
@@ -135,7 +135,7 @@ class ComponentPeers:
         self.home: Peer = NO_PEER
         self.has_left = False
         self.speaker: Peer = NO_PEER
-        self.heard_at = -math.inf
+        self.received_at = -math.inf
         self.contest: Contest | None = None
         self.ignored_messages = 0
         self._home_claim: Claim | None = None
@@ -160,7 +160,7 @@ class ComponentPeers:
         """Return whether to accept a message that cannot tell vehicles apart, such as PARAM_VALUE."""
         self._home_claim_or(peer, now)
         if peer == self.home:
-            self.heard_at = now
+            self.received_at = now
             return self.contest is None
         if self._look_at <= now:
             self._review(now)
@@ -176,7 +176,7 @@ class ComponentPeers:
         if claim is not home_claim:
             self._review(now)
             return self._is_path(claim)
-        self.heard_at = claim.heard_at = now
+        self.received_at = claim.received_at = now
         if claim.is_unsettled or claim.is_mixed:
             self._review(now)
         return self.contest is None
@@ -219,7 +219,7 @@ class ComponentPeers:
 
     def age(self, seconds: float) -> None:
         """Move all moments back by time that the clock left out."""
-        self.heard_at -= seconds
+        self.received_at -= seconds
         for claim in (self._home_claim, *self._others.values()):
             if claim is not None:
                 claim.age(seconds)
@@ -256,7 +256,7 @@ class ComponentPeers:
             claim = self._others[peer] = Claim(peer, now)
             self._look_at = now
             self._host.reschedule()
-        claim.heard_at = now
+        claim.received_at = now
         return claim
 
     def _is_path(self, claim: Claim | None) -> bool:
@@ -269,7 +269,7 @@ class ComponentPeers:
     def _review(self, now: float) -> None:
         """Review the peers: active and silent ones, proven paths, contests."""
         timeout = self._heartbeat_timeout
-        self._others = {p: each for p, each in self._others.items() if now - each.heard_at < timeout}
+        self._others = {p: each for p, each in self._others.items() if now - each.received_at < timeout}
         home_claim = self._home_claim
         if home_claim is not None:
             home_claim.settle(now, timeout)
@@ -323,14 +323,14 @@ class ComponentPeers:
         home_claim = self._home_claim
         is_mixed = home_claim is not None and home_claim.is_mixed
         is_here = (
-            home_claim is not None and not self.has_left and now - self.heard_at < self._heartbeat_timeout
+            home_claim is not None and not self.has_left and now - self.received_at < self._heartbeat_timeout
         )
         rivals = [
             each
             for each in self._others.values()
             if each.verdict is PeerRelation.OTHER
             and is_here
-            and self.heard_at > each.first_at
+            and self.received_at > each.first_at
             and not (
                 each.is_by_satellite
                 and home_claim is not None
@@ -379,9 +379,9 @@ class ComponentPeers:
         home_claim = self._home_claim
         if home_claim is None:
             return
-        silence = math.inf if self.has_left and self.contest is None else now - self.heard_at
+        silence = math.inf if self.has_left and self.contest is None else now - self.received_at
         for claim in sorted(self._others.values(), key=_preference):
-            if claim.heard_at < self.heard_at:
+            if claim.received_at < self.received_at:
                 continue
             if claim.verdict is PeerRelation.SAME and self.contest is None:
                 if silence >= PATH_SILENCE:
@@ -415,7 +415,7 @@ class ComponentPeers:
         if self._host.is_rebooting:
             return COMMANDED_SILENCE
         uids = {claim.uid.current, self._home_claim.uid.current}
-        has_started = claim.started_at >= self.heard_at - RESTART_SLACK
+        has_started = claim.started_at >= self.received_at - RESTART_SLACK
         return RESTART_SILENCE if len(uids) == 1 and has_started and claim.uid.current else usual
 
     def _swap(self, claim: Claim, now: float, *, is_proven: bool = False) -> None:
@@ -424,7 +424,7 @@ class ComponentPeers:
         assert before is not None, "it has the address"
         del self._others[claim.peer]
         if is_proven and not self.has_left:
-            before.heard_at, before.verdict = self.heard_at, PeerRelation.SAME
+            before.received_at, before.verdict = self.received_at, PeerRelation.SAME
             self._others[before.peer] = before
         for each in self._others.values():
             each.verdict = each.verdict if is_proven else PeerRelation.OPEN
@@ -439,7 +439,7 @@ class ComponentPeers:
     def _settle_at(self, claim: Claim) -> None:
         self.home, self._home_claim = claim.peer, claim
         self.has_left = False
-        self.heard_at = claim.heard_at
+        self.received_at = claim.received_at
         self.speaker = self.home if self.contest is None else NO_PEER
 
     def _in_turn(self, before: Claim, claim: Claim) -> PeerRelation:
@@ -467,4 +467,4 @@ class ComponentPeers:
 
 def _preference(claim: Claim) -> tuple[bool, float]:
     """Return the sort key: proven paths first, then the latest message."""
-    return claim.verdict is not PeerRelation.SAME, -claim.heard_at
+    return claim.verdict is not PeerRelation.SAME, -claim.received_at

@@ -35,7 +35,7 @@ class BootTimeRequests(Machine):
         self._context = context
         self._messages = messages
         self._presence = presence
-        self._wanted_after = -math.inf  # wanted: a clock received after this
+        self._requested_after = -math.inf  # requested: a clock received after this
         self._schedule = ClockSchedule()
         self._request_at = math.inf
         self._is_following = False
@@ -76,11 +76,11 @@ class BootTimeRequests(Machine):
         """Send a request that is due."""
         if self.next_deadline() > now:
             return
-        is_told = self._presence.clock_at > self._wanted_after
+        is_told = self._presence.clock_at > self._requested_after
         if not self._is_following and (is_told or self._schedule.is_over(now)):
             self._request_at = math.inf
             return
-        is_baseline = self._wanted_after == -math.inf and not self._is_following
+        is_baseline = self._requested_after == -math.inf and not self._is_following
         pace = self._schedule.interval(now)
         self._request_at = now + pace
         if is_baseline and (self._presence.is_lost or self._presence.is_overdue(now)):
@@ -92,8 +92,8 @@ class BootTimeRequests(Machine):
         """Return when `tick` is due, or infinity."""
         return math.inf if self._context.is_requesting_message else self._request_at
 
-    def _begin(self, wanted_after: float, schedule: ClockSchedule) -> None:
+    def _begin(self, requested_after: float, schedule: ClockSchedule) -> None:
         if self._context.may_send:
-            self._wanted_after = wanted_after
+            self._requested_after = requested_after
             self._schedule = schedule
             self._request_at = schedule.begun_at

@@ -248,18 +248,18 @@ class MessageRequests(Machine):
             refusals: results of the command that end the request with CommandRefused. After other refusals it
                 is repeated with another command, where there is one.
         """
-        wanted = MessageRequest(message_id, request, refusals, now)
-        self._open[message_id] = wanted
+        message_request = MessageRequest(message_id, request, refusals, now)
+        self._open[message_id] = message_request
         self._context.is_requesting_message = True
-        self.repeat(wanted, now)
-        return wanted
+        self.repeat(message_request, now)
+        return message_request
 
-    def repeat(self, wanted: MessageRequest, now: float) -> None:
+    def repeat(self, message_request: MessageRequest, now: float) -> None:
         """Send a request in progress once more."""
-        ways = message_requests(self._target, wanted.message_id)
-        was_denied = wanted.request.is_denied
-        wanted.request.sent(now)
-        count = wanted.request.count
+        ways = message_requests(self._target, message_request.message_id)
+        was_denied = message_request.request.is_denied
+        message_request.request.sent(now)
+        count = message_request.request.count
         if was_denied:
             ways = (ways[(count + 1) % len(ways)],)
         elif count == 1:
@@ -272,56 +272,58 @@ class MessageRequests(Machine):
         for message in message_requests(self._target, message_id):
             self._send(message)
 
-    def end(self, wanted: MessageRequest) -> None:
+    def end(self, message_request: MessageRequest) -> None:
         """Request a message no longer."""
-        if self._open.get(wanted.message_id) is wanted:
-            del self._open[wanted.message_id]
+        if self._open.get(message_request.message_id) is message_request:
+            del self._open[message_request.message_id]
             self._context.is_requesting_message = bool(self._open)
             self._context.reschedule()  # clock requests wait for it, and no message follows
 
     def received(self, message_id: int, now: float) -> None:
         """Process the message: its request has succeeded."""
-        wanted = self._open.get(message_id)
-        if wanted is not None:
-            wanted.request.answered(now)
-            self.end(wanted)
-            wanted.finish(None, now)
+        message_request = self._open.get(message_id)
+        if message_request is not None:
+            message_request.request.answered(now)
+            self.end(message_request)
+            message_request.finish(None, now)
 
     def acknowledged(self, message: CommandAck, now: float) -> None:
         """Process a COMMAND_ACK."""
         if (message.target_system, message.target_component) not in self._addressees:
             return
         is_clear = len(self._open) == 1
-        for wanted in list(self._open.values()):
-            ways = message_requests(self._target, wanted.message_id)
+        for message_request in list(self._open.values()):
+            ways = message_requests(self._target, message_request.message_id)
             if message.command not in [way.command for way in ways]:
                 continue
-            if message.result in wanted.refusals and is_clear:
-                wanted.request.answered(now)
-                self.end(wanted)
-                wanted.fail(CommandRefused(*self._target, message.command, message.result), now)
+            if message.result in message_request.refusals and is_clear:
+                message_request.request.answered(now)
+                self.end(message_request)
+                message_request.fail(CommandRefused(*self._target, message.command, message.result), now)
             elif message.result == CommandResult.ACCEPTED:
-                wanted.request.accepted(now)
+                message_request.request.accepted(now)
             else:
-                wanted.request.denied(now)
+                message_request.request.denied(now)
 
     def tick(self, now: float) -> None:
         """Repeat or give up requests without a response."""
-        for wanted in list(self._open.values()):
-            if wanted.request.due_at > now:
+        for message_request in list(self._open.values()):
+            if message_request.request.due_at > now:
                 continue
-            wanted.request.timed_out()
-            if wanted.request.should_give_up(now):
-                self.end(wanted)
+            message_request.request.timed_out()
+            if message_request.request.should_give_up(now):
+                self.end(message_request)
                 system, component = self._target
-                what = f"{message_name(wanted.message_id)} of {system}/{component}"
-                waited = now - wanted.begun_at
-                wanted.fail(NoReply(what, attempts=wanted.request.count, waited=waited), now)
+                what = f"{message_name(message_request.message_id)} of {system}/{component}"
+                waited = now - message_request.begun_at
+                message_request.fail(
+                    NoReply(what, attempts=message_request.request.count, waited=waited), now
+                )
             else:
-                self.repeat(wanted, now)
+                self.repeat(message_request, now)
 
     def next_deadline(self) -> float:
         """Return when `tick` is due, or infinity."""
         if not self._open:
             return math.inf
-        return min(wanted.request.due_at for wanted in self._open.values())
+        return min(message_request.request.due_at for message_request in self._open.values())

@@ -107,7 +107,7 @@ class Identification(Machine):
         self.capabilities: int | None = None
         self.doubted_at = -math.inf
         self._beat_awaited_until = math.inf  # while a heartbeat may still tell the encoding
-        self._heard_at = -math.inf
+        self._received_at = -math.inf
         self._was_doubted = False  # since the last version
         self.encoding, self.encoding_reason = judge_encoding(chosen, None, None)
         self._derive()
@@ -196,9 +196,9 @@ class Identification(Machine):
             self._derive()
         return is_another_kind
 
-    def heard(self, now: float) -> None:
+    def receive(self, now: float) -> None:
         """Process any message: request the identity unless that was done."""
-        self._heard_at = now
+        self._received_at = now
         if not self.attempts and self.has_parameters:
             self._ask(now)
 
@@ -290,7 +290,7 @@ class Identification(Machine):
     @property
     def _later_at(self) -> float:
         """When to request the identity after it was requested without success, or infinity."""
-        is_due = self.is_unconfirmed and self._heard_at > self._attempts.sent_at
+        is_due = self.is_unconfirmed and self._received_at > self._attempts.sent_at
         return self._attempts.later_at if is_due else math.inf
 
     def _ask(self, now: float) -> None:

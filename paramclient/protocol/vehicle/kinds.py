@@ -31,13 +31,13 @@ def kind_in_words(autopilot: int | None, kind: int | None) -> str:
     """
     words = []
     if autopilot not in (None, MAV_AUTOPILOT_GENERIC, MAV_AUTOPILOT_INVALID):
-        words.append(_AUTOPILOTS.get(autopilot) or _word("MAV_AUTOPILOT", "autopilot", autopilot))
+        words.append(_AUTOPILOTS.get(autopilot) or _name_or_number("MAV_AUTOPILOT", "autopilot", autopilot))
     if kind is not None and (kind != MAV_TYPE_GENERIC or not words):
-        words.append(_VEHICLES.get(kind) or _word("MAV_TYPE", "type", kind))
+        words.append(_VEHICLES.get(kind) or _name_or_number("MAV_TYPE", "type", kind))
     return " ".join(words)
 
 
-def _word(enum: str, what: str, number: int) -> str:
+def _name_or_number(enum: str, what: str, number: int) -> str:
     """Return the name of a number, or the number with the kind of number."""
     word = enum_word(enum, number)
     return f"{what} {word}" if word.isdecimal() else word

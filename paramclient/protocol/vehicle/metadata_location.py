@@ -77,7 +77,7 @@ class MetadataRequests(Machine):
             if not self._asks:
                 self._end()
 
-    def heard(self, message: ComponentMetadata, now: float) -> None:
+    def receive(self, message: ComponentMetadata, now: float) -> None:
         """Process COMPONENT_METADATA; an empty address means none."""
         self._messages.received(COMPONENT_METADATA_ID, now)
         for ask in self._end():

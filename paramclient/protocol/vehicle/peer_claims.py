@@ -111,7 +111,7 @@ class _Clock(NamedTuple):
     value."""
 
     started_at: float
-    told_at: float
+    received_at: float
     boot_ms: int
 
 
@@ -148,7 +148,7 @@ class Claim:
 
     Attributes:
         peer: the peer.
-        first_at, heard_at: when its first and last message were received.
+        first_at, received_at: when its first and last message were received.
         kind: autopilot and vehicle type of its heartbeats.
         uid: the hardware id of its AUTOPILOT_VERSION, "" where that has none.
         requests, requested_at: the number of identity requests to it, and the time of the last.
@@ -161,10 +161,10 @@ class Claim:
         "_clocks",
         "_starts",
         "first_at",
-        "heard_at",
         "heartbeat",
         "kind",
         "peer",
+        "received_at",
         "requested_at",
         "requests",
         "uid",
@@ -175,7 +175,7 @@ class Claim:
 
     def __init__(self, peer: Peer, now: float) -> None:
         self.peer = peer
-        self.first_at = self.heard_at = now
+        self.first_at = self.received_at = now
         self.kind: AlternatingValues[tuple[int, int]] = AlternatingValues()
         self.uid: AlternatingValues[str] = AlternatingValues()
         self._clocks: dict[int, _Clock] = {}
@@ -234,7 +234,7 @@ class Claim:
             and started_at <= clock.started_at + CLOCK_DELAY
         )
         if clock is not None and is_same_run:  # latency only ever makes it later
-            started_at = min(started_at, clock.started_at + CLOCK_DRIFT * (now - clock.told_at))
+            started_at = min(started_at, clock.started_at + CLOCK_DRIFT * (now - clock.received_at))
         self._clocks[message_id] = _Clock(started_at, now, boot_ms)
 
     @property
@@ -255,8 +255,8 @@ class Claim:
     @property
     def started_at(self) -> float:
         """The last boot time that it has implied; minus infinity before."""
-        told = max(self._clocks.values(), key=lambda clock: clock.told_at, default=None)
-        return -math.inf if told is None else told.started_at
+        newest_clock = max(self._clocks.values(), key=lambda clock: clock.received_at, default=None)
+        return -math.inf if newest_clock is None else newest_clock.started_at
 
     def has_one_start(self, other: Claim) -> bool | None:
         """Return whether another claim's vehicle booted at the same time; None while unknown.
@@ -274,12 +274,12 @@ class Claim:
     def age(self, seconds: float) -> None:
         """Move all moments back by time that the clock left out."""
         self.first_at -= seconds
-        self.heard_at -= seconds
+        self.received_at -= seconds
         self.version_at -= seconds
         for each in self._starts.values():
             each.age(seconds)
         self._clocks = {
-            number: _Clock(clock.started_at - seconds, clock.told_at - seconds, clock.boot_ms)
+            number: _Clock(clock.started_at - seconds, clock.received_at - seconds, clock.boot_ms)
             for number, clock in self._clocks.items()
         }
 
@@ -350,4 +350,4 @@ def _is_one_start(one: _Clock, another: _Clock) -> bool | None:
     if abs(one.started_at - another.started_at) <= BOOT_TOLERANCE:
         return True
     older, newer = sorted((one, another))
-    return None if older.told_at <= newer.started_at + CLOCK_DELAY else False
+    return None if older.received_at <= newer.started_at + CLOCK_DELAY else False

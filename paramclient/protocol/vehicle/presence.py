@@ -40,7 +40,7 @@ class Presence(RebootDetection):
         base_mode: MAV_MODE_FLAG bits of that heartbeat; None before the first, and while later ones are known
             to be lost.
         gap: seconds of silence after which a change may have been missed.
-        heard_at: when the last message was received.
+        received_at: when the last message was received.
         is_lost: whether it has been silent for the heartbeat timeout.
         since: when its first message was received, or the first after a loss.
         is_high_latency: whether HIGH_LATENCY2 was received, and no heartbeat since.
@@ -51,15 +51,15 @@ class Presence(RebootDetection):
         "base_mode",
         "beat_at",
         "gap",
-        "heard_at",
         "is_high_latency",
         "is_lost",
+        "received_at",
         "since",
     )
 
     def __init__(self) -> None:
         super().__init__()
-        self.heard_at = -math.inf
+        self.received_at = -math.inf
         self.is_lost = False
         self.since = math.inf
         self.is_high_latency = False
@@ -87,18 +87,18 @@ class Presence(RebootDetection):
     def is_overdue(self, now: float) -> bool:
         """Return whether a message is overdue though it is not lost: a missing response then says nothing."""
         late = OVERDUE_INTERVALS / GAP_INTERVALS * self.gap
-        return self.has_beaten and not self.is_lost and now - self.heard_at > late
+        return self.has_beaten and not self.is_lost and now - self.received_at > late
 
-    def heard(self, now: float) -> float:
+    def receive(self, now: float) -> float:
         """Process any message and return the seconds of silence before it: infinity for the first one."""
-        silence = now - self.heard_at
-        self.heard_at = now
+        silence = now - self.received_at
+        self.received_at = now
         return silence
 
     def age(self, seconds: float) -> None:
         """Move all moments back by time that the clock left out."""
         super().age(seconds)
-        self.heard_at -= seconds
+        self.received_at -= seconds
         self.beat_at -= seconds
 
     def heartbeat(self, message: Heartbeat, now: float) -> bool:
@@ -119,7 +119,7 @@ class Presence(RebootDetection):
 
     def lost_at(self) -> float:
         """Return when it will be lost without a message; infinity while it is lost."""
-        return math.inf if self.is_lost else self.heard_at + self.heartbeat_timeout
+        return math.inf if self.is_lost else self.received_at + self.heartbeat_timeout
 
     def was_away(self, silence: float) -> bool:
         """Return whether another vehicle may have taken its place in this many seconds."""

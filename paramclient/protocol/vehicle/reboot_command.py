@@ -194,7 +194,7 @@ class Reboot(Operation[None]):
         self._before: Identity | None = None
         self._started_before: float | None = None
         self._accepted_at: float | None = None
-        self._heard_again_at: float | None = None  # after a silence of unknown cause
+        self._received_again_at: float | None = None  # after a silence of unknown cause
         self._numbering_began_at = -math.inf  # where that proves nothing
         self._back_at: float | None = None
         self._ask_at = -math.inf
@@ -246,7 +246,7 @@ class Reboot(Operation[None]):
         if command is None or self._back_at is not None:
             return
         if min(silence, now - command.request.sent_at) >= self._presence.gap:
-            self._heard_again_at = now
+            self._received_again_at = now
 
     def vehicle_replaced(self, now: float) -> None:
         """End with an error: another vehicle uses the address."""
@@ -282,8 +282,8 @@ class Reboot(Operation[None]):
             return (math.inf if identification.is_asking else self._ask_at), self._ask
         if self._clock_shows_it(command.request.sent_at):
             return -math.inf, self._restarted
-        if self._heard_again_at is not None:
-            return self._heard_again_at + CLOCK_TIMEOUT, self._judge_silence
+        if self._received_again_at is not None:
+            return self._received_again_at + CLOCK_TIMEOUT, self._judge_silence
         if self._accepted_at is not None:
             due = max(self._accepted_at, presence.clock_at) + UNOBSERVED_TIMEOUT
             return (math.inf if presence.is_lost else due), self._restarted
@@ -323,7 +323,7 @@ class Reboot(Operation[None]):
 
     def _judge_silence(self, now: float) -> None:
         """Decide about the silence: the clock has had the time to show its cause."""
-        heard_again_at, self._heard_again_at = self._heard_again_at, None
+        heard_again_at, self._received_again_at = self._received_again_at, None
         assert heard_again_at is not None
         if self._presence.clock_at < heard_again_at:  # a clock that had gone back would have ended the wait
             self._restarted(now)

@@ -70,26 +70,26 @@ class Framer:
     signature without a check; the guard verifies them.
 
     Args:
-        wanted: the message ids to return; None for every known one. Frames with other ids are still checked
+        message_ids: those to return; None for every known one. Frames with other ids are still checked
             and skipped, but no object is made of them.
         occasional: further ids, returned only while `takes_occasional` is set.
         stream: whether a frame may be spread over several calls (TCP, serial). Datagrams are processed one by
             one and never joined.
 
     Attributes:
-        frames: whole frames, wanted or not.
+        frames: whole frames, of every id.
         skipped: bytes outside of these.
         damaged: candidates with a known id and a wrong checksum.
     """
 
     def __init__(
         self,
-        wanted: Collection[int] | None = None,
+        message_ids: Collection[int] | None = None,
         *,
         occasional: Collection[int] = (),
         stream: bool = True,
     ) -> None:
-        self._usual = _by_id_bytes(_CRC_EXTRA if wanted is None else wanted)
+        self._usual = _by_id_bytes(_CRC_EXTRA if message_ids is None else message_ids)
         self._all = self._usual | _by_id_bytes(occasional)
         self._numbers = self._usual
         self._number_of = self._numbers.get
@@ -102,7 +102,7 @@ class Framer:
 
     @property
     def guard(self) -> Callable[[bytes], bool] | None:
-        """Called with the bytes of every frame, wanted or not; returns whether to accept it. None: accept
+        """Called with the bytes of every frame, of every id; returns whether to accept it. None: accept
         all.
 
         Also called for a signed frame with a truncated signature, which is skipped in any case.

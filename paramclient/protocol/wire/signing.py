@@ -299,7 +299,7 @@ class Verifier:
             unsigned=self._unsigned,
             unproven=MappingProxyType(dict(self._unproven)),
             refused=MappingProxyType(dict(self._refused)),
-            streams=tuple(SigningStream(*who, last) for who, last in sorted(self._streams.items())),
+            streams=tuple(SigningStream(*key, last) for key, last in sorted(self._streams.items())),
         )
 
     def _flaw(self, frame: bytes) -> Refusal | None:

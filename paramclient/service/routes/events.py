@@ -101,13 +101,13 @@ class _EventStream(Response):
             if patience.cancelled_caught:
                 return
             try:
-                news = await listener.next(KEEPALIVE_INTERVAL)
+                item = await listener.next(KEEPALIVE_INTERVAL)
             except EOFError:
                 return
-            if news is None:
+            if item is None:
                 chunk = f": \nid: {listener.position}\n\n".encode()
                 continue
-            batch, chunk = news
+            batch, chunk = item
             if batch.missed:
                 chunk = _as_event(listener.position, listener.gap(batch.missed))
 
@@ -121,12 +121,12 @@ async def _send_texts(listener: Listener, send: Callable[[str], Awaitable[None]]
         if patience.cancelled_caught:
             return
         try:
-            news = await listener.next(KEEPALIVE_INTERVAL)
+            item = await listener.next(KEEPALIVE_INTERVAL)
         except EOFError:
             return
         texts = []
-        if news is not None:
-            batch = news[0]
+        if item is not None:
+            batch = item[0]
             texts = [listener.gap(batch.missed)] if batch.missed else [text for _, text in batch.texts]
 
 

@@ -133,7 +133,7 @@ async def known_params(
         texts = await _texts(target, table, chosen, changed=changed)
         return Response(f"{head}{texts}}}}}", media_type=JSON)
     entries = (
-        f"{json.dumps(each.name)}:{_described(each, described.get(each.name), target.heard_at(each.name))}"
+        f"{json.dumps(each.name)}:{_described(each, described.get(each.name), target.received_at(each.name))}"
         for each in _params_of(target, table, chosen, changed=changed)
     )
     return streamed_response(head, entries, "}}")
@@ -253,11 +253,11 @@ def _text_with_metadata(target: FollowedComponent, param: Param) -> str:
     info = None if target.metadata is None else target.metadata.get(param.name)
     if info is None:
         return target.json_of(param)
-    return _described(param, info, target.heard_at(param.name))
+    return _described(param, info, target.received_at(param.name))
 
 
-def _described(param: Param, info: ParamInfo | None, heard_at: float | None) -> str:
-    return ParamDoc.kept(param, info, heard_at=heard_at, whole=True).model_dump_json()
+def _described(param: Param, info: ParamInfo | None, received_at: float | None) -> str:
+    return ParamDoc.kept(param, info, heard_at=received_at, whole=True).model_dump_json()
 
 
 def _named(known: Iterable[str], names: list[str]) -> list[str]:

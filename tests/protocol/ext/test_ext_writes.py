@@ -317,11 +317,11 @@ def test_nothing_is_written_while_another_vehicle_may_have_the_address() -> None
     session.fetch_ext()
     session.camera.identification.doubt(session.now)
     write = session.camera.write_ext("CAM_MODE", 2, session.now)
-    assert session.camera.ext.writes.is_held
+    assert session.camera.ext.writes.is_awaiting_permission
     session.station.tick(session.now)
     assert not session.sent_of(ParamExtSet)
     assert session.outcome(write).actual == 2
-    assert not session.camera.ext.writes.is_held
+    assert not session.camera.ext.writes.is_awaiting_permission
 
 
 def test_without_reads_a_change_by_another_station_makes_a_value_cached() -> None:

@@ -91,7 +91,7 @@ class Desk:
         return first
 
     def hear(self, packet: Packet, *, to: tuple[int, int] = OWN) -> None:
-        self.transfers.heard(FileTransfer(0, *to, packet.pack().ljust(251, b"\0")), self.now)
+        self.transfers.receive(FileTransfer(0, *to, packet.pack().ljust(251, b"\0")), self.now)
 
     def answer(
         self,
@@ -1352,10 +1352,10 @@ class Ground:
         for _ in range(3000):
             for data in self.air.data_to_send():
                 for frame in self._framer.receive(data):
-                    self.round_trip.heard_at = self.now
+                    self.round_trip.received_at = self.now
                     message = wire.decode(frame)
                     if isinstance(message, FileTransfer):
-                        self.transfers.heard(message, self.now)
+                        self.transfers.receive(message, self.now)
             if self.transfers.next_deadline() <= self.now:
                 self.transfers.tick(self.now)
             outgoing, self._outbox[:] = self._outbox[:], []

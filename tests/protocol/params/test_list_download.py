@@ -62,8 +62,8 @@ class Desk:
 
     def hear(self, index: int, *, count: int = 100, name: str | None = None) -> None:
         message = param_value(f"P{index}" if name is None else name, index=index, count=count)
-        self.download.heard(message, self.now)
-        self.reads.heard(message, self.now)
+        self.download.receive(message, self.now)
+        self.reads.receive(message, self.now)
 
     def stream(self, indices: Iterable[int], *, count: int = 100) -> None:
         for index in indices:
@@ -186,7 +186,7 @@ def test_a_list_that_is_lost_often_is_asked_for_often_enough() -> None:
 
 def test_a_component_that_is_not_heard_either_is_given_up_sooner() -> None:
     desk = Desk(round_trip=3.0)
-    desk.trip.heard_at = 0.0
+    desk.trip.received_at = 0.0
     desk.pass_time()
     assert isinstance(desk.download.error, NoReply)
     assert desk.now < LIST_TIMEOUT + 5.0

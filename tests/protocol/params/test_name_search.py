@@ -55,7 +55,7 @@ class Desk:
         return sent
 
     def hear(self, name: str, index: int = 65535) -> None:
-        self.searches.heard(param_value(name, index=index), self.now)
+        self.searches.receive(param_value(name, index=index), self.now)
 
     def answer(self, *names: str) -> list[str | int]:
         """The vehicle answers what was requested, of names only these; what was requested is returned."""

@@ -124,14 +124,14 @@ def test_synthetic_values_alone_make_no_component(tmp_path: Path) -> None:
     log = FileLog().beat().made_up([("A", 1.0), ("B", 2.0)]).wait(1.0).beat()
     assert imported(log, tmp_path) == []
 
-    async def heard() -> None:
+    async def receive() -> None:
         async with ParamClient(f"replay:{tmp_path / 'flight.tlog'}?speed=0") as client:
             component = await client.component()
             await anyio.sleep(0.1)
             assert list(client.components) == [(1, 1)]
             assert not component.params
 
-    anyio.run(heard)
+    anyio.run(receive)
 
 
 def test_synthetic_values_of_a_station_with_the_vehicles_system_id_make_no_component(tmp_path: Path) -> None:

@@ -58,7 +58,7 @@ class Desk:
 
     def hear(self, name: str, *, index: int = 65535) -> ParamValue:
         message = param_value(name, index=index)
-        self.reads.heard(message, self.now)
+        self.reads.receive(message, self.now)
         return message
 
     def refuse(self, name: str = "", index: int = -1, code: int = 1) -> None:
@@ -488,7 +488,7 @@ def test_earlier_timeouts_do_not_count_against_later_reads() -> None:
 
 def test_a_component_that_is_gone_is_given_up_sooner() -> None:
     patient, gone = Desk("A"), Desk("A")
-    gone.round_trip.heard_at = 0.0
+    gone.round_trip.received_at = 0.0
     for desk in (patient, gone):
         read = desk.ask("A")
         desk.pass_time()
@@ -604,7 +604,7 @@ def test_failing_reads_may_take_others_with_them_and_ask_anew() -> None:
 
 def test_a_read_that_ends_may_take_others_with_it_while_time_passes() -> None:
     desk = Desk("A", "B")
-    desk.round_trip.heard_at = -100.0
+    desk.round_trip.received_at = -100.0
     reads = [desk.ask("A"), desk.ask("B")]
     reads[0].on_done.append(lambda: desk.reads.release(reads[1]))
     desk.pass_time()

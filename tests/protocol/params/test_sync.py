@@ -514,7 +514,7 @@ def test_a_component_with_a_slow_heartbeat_is_found_again_in_high_latency_mode()
 def test_after_five_seconds_without_a_word_it_is_lost() -> None:
     world, _ = fetched()
     machine = world.machine
-    last = machine.presence.heard_at
+    last = machine.presence.received_at
     world.tap.is_mute = True
     world.until(lambda: machine.presence.is_lost)
     assert world.now == last + LOST_AFTER

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from paramclient.cache import HeardParams, StoredParam, UnixTimes
+from paramclient.cache import ObservedParams, StoredParam, UnixTimes
 from paramclient.model.px4_hash import hash_params
 from paramclient.model.values import Encoding, Param, ParamType, Trust, as_sent
 from paramclient.protocol.params import table as room
@@ -397,7 +397,7 @@ def rows_of(table: Table) -> dict[str, int | None]:
     """The defaults that the cache makes of all that it is given of a table."""
     overwritten = [StoredParam(each.param, 1.0, by=each.by) for each in table.overwritten]
     times = UnixTimes(1.0)
-    heard = HeardParams(table.params.copy(), times, volatile=None, by={}, overwritten=overwritten)
+    heard = ObservedParams(table.params.copy(), times, volatile=None, by={}, overwritten=overwritten)
     return {f"{item.name} {item.type}": item.default_bits for item in heard}
 
 

@@ -58,8 +58,8 @@ class Desk:
 
     def take_in(self, message: ParamValue) -> None:
         self.table.store_value(message, "vehicle")
-        self.writes.heard(message, self.now)
-        self.reads.heard(message, self.now)
+        self.writes.receive(message, self.now)
+        self.reads.receive(message, self.now)
 
     def knows(self, name: str, value: WireValue, kind: int = ParamType.REAL32) -> None:
         """Let a value have been heard before."""
@@ -163,11 +163,11 @@ def test_held_writes_are_reported_until_they_begin(is_known: bool) -> None:
         desk.may_be_written = False
         desk.hear("A", 1.0, at=0.1)
     assert desk.take() == []
-    assert desk.writes.is_held
+    assert desk.writes.is_awaiting_permission
     desk.may_be_written = True
     desk.writes.proceed(0.2)
     assert desk.take() == ["set A 2.5 REAL32"]
-    assert not desk.writes.is_held
+    assert not desk.writes.is_awaiting_permission
 
 
 def test_a_value_that_comes_while_nothing_may_be_sent_again_leaves_the_time_outs_as_they_are() -> None:

@@ -168,14 +168,14 @@ def test_enough_is_enough() -> None:
     for _ in range(50):
         policy.timed_out(1)
     assert policy.tries > ATTEMPTS_MIN
-    assert not policy.should_give_up(ATTEMPTS_MIN, 1e9)  # nobody keeps its `heard_at`
+    assert not policy.should_give_up(ATTEMPTS_MIN, 1e9)  # nobody keeps its `received_at`
 
 
 def test_a_component_that_is_gone_is_not_asked_for_ever() -> None:
     policy = RetryPolicy()
     for _ in range(50):
         policy.timed_out(1)
-    policy.round_trip.heard_at = 100.0
+    policy.round_trip.received_at = 100.0
     assert not policy.should_give_up(ATTEMPTS_MIN, 99.0 + SILENCE_MAX)
     assert policy.should_give_up(ATTEMPTS_MIN, 100.0 + SILENCE_MAX)
     assert not policy.should_give_up(ATTEMPTS_MIN - 1, 100.0 + SILENCE_MAX)

@@ -160,7 +160,7 @@ def test_the_sniffer_finds_the_frames_of_the_framer_and_counts_every_byte(
 def check_of(sequence: Iterable[int], *, period: float = 0.02) -> SequenceCheck:
     check = SequenceCheck()
     for count, number in enumerate(sequence):
-        check.heard(number % 256, count * period)
+        check.receive(number % 256, count * period)
     return check
 
 
@@ -229,7 +229,7 @@ def test_after_a_silence_a_jump_tells_of_nothing(before: int, first: int, after:
     check = check_of(range(before + 1))
     now = before * 0.02 + NUMBERING_TIMEOUT + 0.1
     for count in range(after):
-        check.heard((first + count) % 256, now + count * 0.02)
+        check.receive((first + count) % 256, now + count * 0.02)
     assert check.lost <= CERTAIN_GAP
 
 
@@ -271,7 +271,7 @@ def test_two_numberings_side_by_side_have_lost_nothing(first: int, second: int, 
             heard.append(at[turn])
         check = SequenceCheck()
         for number in heard:
-            check.heard(number % 256, 0.0)
+            check.receive(number % 256, 0.0)
         assert check.lost == 0
 
 
@@ -283,7 +283,7 @@ def test_losses_are_counted_in_each_of_two_numberings() -> None:
 def test_many_numberings_are_forgotten_again() -> None:
     check = SequenceCheck()
     for number in range(5000):
-        check.heard(number * 67 % 256, 0.0)
+        check.receive(number * 67 % 256, 0.0)
         assert len(check._numberings) <= numbers.NUMBERINGS_MAX
 
 

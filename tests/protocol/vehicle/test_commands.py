@@ -25,7 +25,7 @@ class Desk:
         self.sent: list[CommandLong] = []
         self.retry = RetryPolicy()
         self.round_trip = self.retry.round_trip
-        self.round_trip.heard_at = 0.0
+        self.round_trip.received_at = 0.0
         self.commands = Commands(Context((1, 1), self.take, OWN, self.retry))
 
     def take(self, message: Message) -> None:

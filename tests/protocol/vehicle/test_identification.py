@@ -68,7 +68,7 @@ class Desk:
 
     def beat(self, heartbeat: Heartbeat, now: float = 0.0) -> None:
         self.who.heartbeat(heartbeat)
-        self.who.heard(now)
+        self.who.receive(now)
 
     def commands(self) -> list[int]:
         sent, self.sent[:] = list(self.sent), []
@@ -260,7 +260,7 @@ def test_a_version_that_tells_no_encoding_waits_for_a_heartbeat() -> None:
     """ArduPilot's version before its heartbeat: the standard's encoding would write a wrong value."""
     for heartbeat, encoding in ((ARDUPILOT, Encoding.C_CAST), (None, Encoding.BYTEWISE)):
         desk = Desk()
-        desk.who.heard(10.0)
+        desk.who.receive(10.0)
         desk.who.version(AutopilotVersion(ARDUPILOT_BITS), 10.1)
         assert is_so(not desk.who.may_be_written)
         if heartbeat is None:  # one that never sends any keeps to the standard
@@ -277,7 +277,7 @@ def test_a_version_that_tells_no_encoding_waits_for_a_heartbeat() -> None:
 
 def test_a_version_that_tells_the_encoding_waits_for_no_heartbeat() -> None:
     desk = Desk()
-    desk.who.heard(10.0)
+    desk.who.receive(10.0)
     desk.who.version(AutopilotVersion(CAPABILITY_PARAM_ENCODE_BYTEWISE), 10.1)
     assert desk.who.may_be_written
 

@@ -36,7 +36,7 @@ BOOT = Heartbeat(2, MAV_AUTOPILOT_PX4, system_status=MAV_STATE_BOOT)
 def beating(*times: float) -> Presence:
     presence = Presence()
     for now in times:
-        presence.heard(now)
+        presence.receive(now)
         assert not presence.heartbeat(ACTIVE, now)
     return presence
 
@@ -46,13 +46,13 @@ def beating(*times: float) -> Presence:
 
 def test_the_first_word_has_no_silence_before_it() -> None:
     presence = Presence()
-    assert presence.heard(7.0) == math.inf
-    assert presence.heard(9.5) == 2.5
+    assert presence.receive(7.0) == math.inf
+    assert presence.receive(9.5) == 2.5
 
 
 def test_a_component_without_heartbeats_is_never_lost() -> None:
     presence = Presence()
-    presence.heard(1.0)
+    presence.receive(1.0)
     assert not presence.has_beaten
     assert presence.heartbeat_timeout == math.inf
     assert presence.lost_at() == math.inf
@@ -63,7 +63,7 @@ def test_a_component_without_heartbeats_is_never_lost() -> None:
 def test_five_seconds_after_the_last_word_it_is_lost() -> None:
     presence = beating(1.0)
     assert presence.lost_at() == 1.0 + LOST_AFTER
-    presence.heard(3.5)
+    presence.receive(3.5)
     assert presence.lost_at() == 3.5 + LOST_AFTER, "whatever the word was"
     presence.is_lost = True
     assert presence.lost_at() == math.inf
@@ -99,11 +99,11 @@ def test_patience_has_an_end() -> None:
 
 def test_high_latency_needs_more_patience_until_the_next_heartbeat() -> None:
     presence = beating(0.0, 1.0)
-    presence.heard(2.0)
+    presence.receive(2.0)
     presence.high_latency()
     assert is_so(presence.is_high_latency)
     assert presence.lost_at() == 2.0 + LOST_AFTER_HIGH_LATENCY
-    presence.heard(30.0)
+    presence.receive(30.0)
     presence.heartbeat(ACTIVE, 30.0)
     assert not presence.is_high_latency
     assert presence.lost_at() == 30.0 + LOST_AFTER
@@ -111,7 +111,7 @@ def test_high_latency_needs_more_patience_until_the_next_heartbeat() -> None:
 
 def test_a_component_first_received_in_high_latency_mode_can_be_lost() -> None:
     presence = Presence()
-    presence.heard(2.0)
+    presence.receive(2.0)
     presence.high_latency()
     assert presence.lost_at() == 2.0 + LOST_AFTER_HIGH_LATENCY
 

@@ -64,7 +64,7 @@ RECORDINGS = {
 }
 """Each with the number of PARAM_VALUEs in it."""
 
-LONGEST = 280
+FRAME_SIZE_MAX = 280
 """Bytes of the longest frame: 10 of header, 255 of payload, 2 of checksum, 13 of signature."""
 
 thorough = settings(max_examples=300, deadline=None)
@@ -652,11 +652,11 @@ def test_work_and_memory_are_bounded_on_hostile_input(
     for at in range(0, size, chunk):
         framer.receive(data[at : at + chunk])
         calls += 1
-        assert len(framer._tail) < LONGEST
+        assert len(framer._tail) < FRAME_SIZE_MAX
     framer.flush()
     assert framer.skipped == size
     assert len(checked) <= size
-    assert max(checked, default=0) <= LONGEST
+    assert max(checked, default=0) <= FRAME_SIZE_MAX
     assert len(headers) <= size + calls + 1
 
 
@@ -673,7 +673,7 @@ def frames_to_be_found(data: bytes) -> dict[int, Frame]:
     found = {}
     at = 0
     while at < len(data):
-        frame, size = frame_at(data[at : at + LONGEST])
+        frame, size = frame_at(data[at : at + FRAME_SIZE_MAX])
         if frame:
             found[at] = frame
         at += size or 1
@@ -724,7 +724,7 @@ damaged = st.builds(
         frame[: at % len(frame)] + bytes((frame[at % len(frame)] ^ damage,)) + frame[at % len(frame) + 1 :]
     ),
     whole,
-    st.integers(0, LONGEST),
+    st.integers(0, FRAME_SIZE_MAX),
     st.integers(1, 255),
 )
 magic_rich = st.lists(
@@ -734,8 +734,8 @@ noise = (
     st.binary(min_size=1, max_size=30)
     | magic_rich
     | damaged
-    | st.builds(lambda frame, cut: frame[: cut % len(frame)], whole, st.integers(1, LONGEST))
-    | st.builds(lambda frame, cut: frame[cut % len(frame) :], whole, st.integers(1, LONGEST))
+    | st.builds(lambda frame, cut: frame[: cut % len(frame)], whole, st.integers(1, FRAME_SIZE_MAX))
+    | st.builds(lambda frame, cut: frame[cut % len(frame) :], whole, st.integers(1, FRAME_SIZE_MAX))
     | st.builds(lambda frame: bare_frame(410, frame[:255]), whole)
 )
 pieces = st.lists(
@@ -746,7 +746,9 @@ pieces = st.lists(
 def check_that_whole_frames_are_found(mix: list[Piece], found: dict[int, Frame]) -> None:
     """Each whole frame of the mix is among the found ones, but where chance made another valid frame of
     bytes before it, or a piece completed a cut-off frame."""
-    ends = {at: frame_at(b"".join(piece.data for piece in mix)[at : at + LONGEST])[1] + at for at in found}
+    ends = {
+        at: frame_at(b"".join(piece.data for piece in mix)[at : at + FRAME_SIZE_MAX])[1] + at for at in found
+    }
     at = 0
     for piece in mix:
         if piece.is_frame and at not in found:
@@ -767,7 +769,7 @@ def test_in_a_stream_every_whole_frame_is_found(mix: list[Piece], data: st.DataO
     found = []
     for chunk in chunks:
         found += framer.receive(chunk)
-        assert len(framer._tail) < LONGEST
+        assert len(framer._tail) < FRAME_SIZE_MAX
     found += framer.flush()
     assert found == list(expected.values())
     assert framer.frames == len(found)

@@ -72,14 +72,14 @@ class Station:
         self._collect()
         return self
 
-    def heard(self, kind: type[M]) -> list[M]:
+    def receive(self, kind: type[M]) -> list[M]:
         """Return the messages of a kind since the last call, and clear the log."""
         found: list[M] = [message for _, _, message in self.log if isinstance(message, kind)]
         self.log.clear()
         return found
 
     def values(self) -> list[wire.ParamValue]:
-        return self.heard(wire.ParamValue)
+        return self.receive(wire.ParamValue)
 
     def times(self) -> list[float]:
         """Return the times of the received PARAM_VALUEs."""

@@ -1,7 +1,7 @@
 """The blocking client, made awaitable: each call runs in a thread, the client in the event loop of the test.
 
-The tests of the asynchronous client run through it; see `tests/ways.py`. Time is that of the test's event
-loop: where that is a `SwiftLoop`, its clock stands still while a thread is at work, and leaps while all
+The tests of the asynchronous client run through it; see `tests/client_kinds.py`. Time is that of the test's
+event loop: where that is a `SwiftLoop`, its clock stands still while a thread is at work, and leaps while all
 threads wait for the client.
 """
 

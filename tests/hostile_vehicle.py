@@ -28,7 +28,7 @@ from paramclient.protocol.wire import (
     SystemTime,
 )
 
-__all__ = ["ESCAPE", "LIES", "LiarVehicle"]
+__all__ = ["ESCAPE", "LIES", "HostileVehicle"]
 
 STEP: Final = 0.01
 """Seconds between two times at which it says something unasked."""
@@ -37,7 +37,7 @@ ESCAPE: Final = "\x1b]0;\x07\x1b[2J"
 OWN: Final = (255, 190)
 
 
-class LiarVehicle:
+class HostileVehicle:
     """An endpoint that tells the lies whose names it is given, `rate` times in a hundredth of a second.
 
     Attributes:
@@ -100,7 +100,7 @@ class LiarVehicle:
         )
 
 
-Lie = Callable[[LiarVehicle, Message | None], Iterable[Message]]
+Lie = Callable[[HostileVehicle, Message | None], Iterable[Message]]
 """What is said to a request, or unasked where that is None."""
 
 
@@ -108,32 +108,32 @@ def _value(name: str, number: int, count: int, index: int) -> ParamValue:
     return ParamValue(name, number.to_bytes(4, "little"), 6, count, index)
 
 
-def _endless_names(liar: LiarVehicle, asked: Message | None) -> Iterable[Message]:
+def _endless_names(liar: HostileVehicle, asked: Message | None) -> Iterable[Message]:
     yield _value(f"N{next(liar.numbers)}", 1, NO_INDEX, NO_INDEX)
 
 
-def _jumping_counts(liar: LiarVehicle, asked: Message | None) -> Iterable[Message]:
+def _jumping_counts(liar: HostileVehicle, asked: Message | None) -> Iterable[Message]:
     """A list that never comes to its end, each value with another count."""
     number = next(liar.numbers)
     yield _value(f"P{number % 50}", 1, liar.random.choice((50, 51, 900, 32_768, 65_534)), number % 50)
 
 
-def _flipping_values(liar: LiarVehicle, asked: Message | None) -> Iterable[Message]:
+def _flipping_values(liar: HostileVehicle, asked: Message | None) -> Iterable[Message]:
     number = next(liar.numbers)
     yield _value(f"P{number % 50}", liar.random.getrandbits(8), 50, number % 50)
 
 
-def _giant_indices(liar: LiarVehicle, asked: Message | None) -> Iterable[Message]:
+def _giant_indices(liar: HostileVehicle, asked: Message | None) -> Iterable[Message]:
     yield _value(f"P{next(liar.numbers) % 50}", 1, 32_768, liar.random.choice((32_767, 65_534, 40_000, 100)))
 
 
-def _escape_codes(liar: LiarVehicle, asked: Message | None) -> Iterable[Message]:
+def _escape_codes(liar: HostileVehicle, asked: Message | None) -> Iterable[Message]:
     number = next(liar.numbers)
     yield _value(f"{ESCAPE}{number % 4}", 1, 4, number % 4)
     yield StatusText(3, f"Param write denied ({ESCAPE})"[:50])
 
 
-def _others_answers(liar: LiarVehicle, asked: Message | None) -> Iterable[Message]:
+def _others_answers(liar: HostileVehicle, asked: Message | None) -> Iterable[Message]:
     """Answers for system 1, under our own address."""
     if isinstance(asked, ParamRequestRead | ParamSetMessage):
         yield _value(asked.param_id or "P0", 0x7FFFFFFF, 4, NO_INDEX)
@@ -141,28 +141,28 @@ def _others_answers(liar: LiarVehicle, asked: Message | None) -> Iterable[Messag
     yield FileTransfer(0, *OWN, bytes((next(liar.numbers) % 256, 0, 1, 128, 4, 15, 1, 0)).ljust(251, b"\0"))
 
 
-def _endless_errors(liar: LiarVehicle, asked: Message | None) -> Iterable[Message]:
+def _endless_errors(liar: HostileVehicle, asked: Message | None) -> Iterable[Message]:
     number = next(liar.numbers)
     yield ParamError(*OWN, f"P{number}", liar.random.choice((-1, number % 32_768)), number % 256)
 
 
-def _restless_identity(liar: LiarVehicle, asked: Message | None) -> Iterable[Message]:
+def _restless_identity(liar: HostileVehicle, asked: Message | None) -> Iterable[Message]:
     """Another vehicle with each message, and each with a parameter."""
     number = next(liar.numbers)
     yield AutopilotVersion(16, uid=number + 1)
     yield _value(f"V{number}", 1, 1, 0)
 
 
-def _restless_clock(liar: LiarVehicle, asked: Message | None) -> Iterable[Message]:
+def _restless_clock(liar: HostileVehicle, asked: Message | None) -> Iterable[Message]:
     yield SystemTime(0, 1_000_000 if next(liar.numbers) % 2 else 0)
     yield _value(f"P{next(liar.numbers) % 50}", 1, 50, 0)
 
 
-def _endless_hashes(liar: LiarVehicle, asked: Message | None) -> Iterable[Message]:
+def _endless_hashes(liar: HostileVehicle, asked: Message | None) -> Iterable[Message]:
     yield ParamValue(HASH_CHECK, liar.random.randbytes(4), 5, liar.random.getrandbits(16), NO_INDEX)
 
 
-def _dripping_list(liar: LiarVehicle, asked: Message | None) -> Iterable[Message]:
+def _dripping_list(liar: HostileVehicle, asked: Message | None) -> Iterable[Message]:
     """A list of as many parameters as there can be, a value now and then; each read is answered."""
     number = next(liar.numbers)
     if isinstance(asked, ParamRequestRead) and asked.param_index >= 0:
@@ -171,7 +171,7 @@ def _dripping_list(liar: LiarVehicle, asked: Message | None) -> Iterable[Message
         yield _value(f"D{number // 100}", 1, 32_768, number // 100 % 32_768)
 
 
-def _endless_file(liar: LiarVehicle, asked: Message | None) -> Iterable[Message]:
+def _endless_file(liar: HostileVehicle, asked: Message | None) -> Iterable[Message]:
     """Opens every file, and answers each read with bytes from anywhere."""
     yield AutopilotVersion(16 | CAPABILITY_FTP, 0x01120000, uid=5)
     if isinstance(asked, FileTransfer):
@@ -185,7 +185,7 @@ def _endless_file(liar: LiarVehicle, asked: Message | None) -> Iterable[Message]
             yield FileTransfer(0, *OWN, (head + content).ljust(251, b"\0"))
 
 
-def _crumbs(liar: LiarVehicle, asked: Message | None) -> Iterable[Message]:
+def _crumbs(liar: HostileVehicle, asked: Message | None) -> Iterable[Message]:
     """Opens every file, and gives it byte by byte."""
     if isinstance(asked, FileTransfer):
         opcode, sequence = asked.payload[3], int.from_bytes(asked.payload[:2], "little") + 1
@@ -199,7 +199,7 @@ def _crumbs(liar: LiarVehicle, asked: Message | None) -> Iterable[Message]:
             yield FileTransfer(0, *OWN, (head + content).ljust(251, b"\0"))
 
 
-def _obedient(liar: LiarVehicle, asked: Message | None) -> Iterable[Message]:
+def _obedient(liar: HostileVehicle, asked: Message | None) -> Iterable[Message]:
     """Accepts every command, and does none; its list ends in the middle."""
     if isinstance(asked, CommandLong):
         yield CommandAck(asked.command, 0, *OWN)
@@ -208,7 +208,7 @@ def _obedient(liar: LiarVehicle, asked: Message | None) -> Iterable[Message]:
             yield _value(f"P{index}", 1, 1000, index)
 
 
-def _other_addresses(liar: LiarVehicle, asked: Message | None) -> Iterable[Message]:
+def _other_addresses(liar: HostileVehicle, asked: Message | None) -> Iterable[Message]:
     """Heartbeats, and now and then a value, from everywhere but system 1."""
     if asked is None:
         number = next(liar.numbers)

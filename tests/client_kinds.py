@@ -24,7 +24,7 @@ from paramclient.remote.service_client import ServiceClient
 from paramclient.service import Hub, create_app
 from tests import shell
 from tests.asgi import ASGITransport
-from tests.blocked import BlockedClient, BlockedStream, block, unblocked
+from tests.awaitable_blocking import BlockedClient, BlockedStream, block, unblocked
 
 __all__ = [
     "DIRECT",
