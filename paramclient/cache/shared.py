@@ -119,7 +119,7 @@ class _Connection:
         self._database = PostgresDatabase(address)
         self._writer = uuid4().hex
         self._number = 0
-        self._is_here = False
+        self._is_connected = False
         self._is_closed = False
         self._has_warned = False
         self._reaching = threading.Lock()  # held while connecting; always acquired before `_writing`
@@ -172,7 +172,7 @@ class _Connection:
 
     def follow(self, key: tuple[str, int]) -> None:
         with self._state:
-            if not self._is_here:
+            if not self._is_connected:
                 return
             self._stale_keys.add(key)
         self._wake_listener()
@@ -196,7 +196,7 @@ class _Connection:
         if thread is not None and thread is not threading.current_thread():
             thread.join()
         with self._writing:
-            self._is_here = False
+            self._is_connected = False
             if self._listener is not None:
                 self._listener.close()
             self._database.close()
@@ -215,9 +215,9 @@ class _Connection:
         if self._is_closed:
             raise CacheError(f"the cache {self._address.place} is closed")
         is_first = self._thread is None
-        if not self._is_here and (is_first or at_once) and self._reaching.acquire(blocking=is_first):
+        if not self._is_connected and (is_first or at_once) and self._reaching.acquire(blocking=is_first):
             try:
-                if not self._is_here:
+                if not self._is_connected:
                     self._reach()
                 if self._thread is None:
                     self._thread = threading.Thread(
@@ -226,11 +226,11 @@ class _Connection:
                     self._thread.start()
             finally:
                 self._reaching.release()
-        if not self._is_here and not self.local.exists:
+        if not self._is_connected and not self.local.exists:
             raise CacheError(
                 f"{self.away}; there is no local copy, as it was never reached from this computer"
             )
-        return self._is_here
+        return self._is_connected
 
     def _reach(self) -> None:
         """Connect to the database and execute queued operations. On failure, `away` has the reason.
@@ -261,7 +261,7 @@ class _Connection:
             old, self._listener = self._listener, listener
             self._stale_keys |= {key for key, revision in kept.items() if revisions.get(key) != revision}
             self.away = None
-            self._is_here = True
+            self._is_connected = True
         if old is not None:
             old.close()
         if before:
@@ -306,7 +306,7 @@ class _Connection:
         with self._state:
             is_new_failure = self.away is None
             self.away = str(error)
-            self._is_here = False
+            self._is_connected = False
         if is_new_failure:
             copy = self.local
             meanwhile = f"using the local copy {copy.path}" if copy.exists else "reconnecting"
@@ -345,7 +345,7 @@ class _Connection:
 
     def _mirror(self) -> None:
         """Copy every requested table from the database to the local copy."""
-        while self._is_here and not self._is_closed:
+        while self._is_connected and not self._is_closed:
             with self._state:
                 if not self._stale_keys:
                     return
@@ -381,14 +381,14 @@ class _Connection:
         with selectors.DefaultSelector() as selector:
             selector.register(self._wake_reader, selectors.EVENT_READ)
             while not self._is_closed:
-                if self._is_here and self._listener is not None:
+                if self._is_connected and self._listener is not None:
                     pause = RETRY_INTERVAL_MIN
                     self._mirror()
                     self._hear(selector, self._listener)
                     continue
                 self._wait(selector, pause)
                 pause = min(2 * pause, RETRY_INTERVAL_MAX)
-                if not self._is_closed and not self._is_here and self._reaching.acquire(blocking=False):
+                if not self._is_closed and not self._is_connected and self._reaching.acquire(blocking=False):
                     try:
                         self._reach()
                     except CacheError as error:
@@ -398,7 +398,7 @@ class _Connection:
 
     def _wait(self, selector: selectors.BaseSelector, pause: float) -> None:
         deadline = time.monotonic() + pause
-        while not self._is_closed and not self._is_here and (left := deadline - time.monotonic()) > 0:
+        while not self._is_closed and not self._is_connected and (left := deadline - time.monotonic()) > 0:
             selector.select(left)
             self._drain_wakeup()
 
@@ -408,14 +408,14 @@ class _Connection:
             file = listener.fileno()
             selector.register(file, selectors.EVENT_READ)
             try:
-                if self._is_here and not self._stale_keys:
+                if self._is_connected and not self._stale_keys:
                     selector.select()
             finally:
                 selector.unregister(file)
             self._drain_wakeup()
             notifications = [_notification(each.payload) for each in listener.notifies(timeout=0)]
         except Exception as error:  # after any error, the connection is unusable
-            if listener is self._listener and self._is_here and not self._is_closed:
+            if listener is self._listener and self._is_connected and not self._is_closed:
                 text = self._address.without_password(" ".join(str(error).split()))
                 self._lose(Unavailable(f"the connection to {self._address.place} is lost: {text}"))
             return

@@ -121,8 +121,8 @@ class Forwarder:
         logger.info("%s: reconnected", self._link.name)
 
     def _pass_on(self, frames: list[bytes]) -> None:
-        room = QUEUED_FRAMES_MAX - len(self._waiting) if self._is_there else 0
-        self.lost += max(0, len(frames) - room)
-        if frames[:room]:
-            self._waiting.extend(frames[:room])
+        free_frames = QUEUED_FRAMES_MAX - len(self._waiting) if self._is_there else 0
+        self.lost += max(0, len(frames) - free_frames)
+        if frames[:free_frames]:
+            self._waiting.extend(frames[:free_frames])
             self._something_waits.set()

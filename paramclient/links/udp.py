@@ -122,7 +122,7 @@ class UdpLink(SocketLink):
         self.arrived_at: list[float] = []
         self._tells_arrivals = False
         self._local_port = 0  # of the previous opening
-        self._room = memoryview(bytearray(_LARGEST_DATAGRAM))
+        self._buffer_size = memoryview(bytearray(_LARGEST_DATAGRAM))
         self._no_route_since: float | None = None
         # Addresses that have sent heartbeats, the latest sender last.
         self._peers: dict[Address, _PeerState] = {}
@@ -134,7 +134,7 @@ class UdpLink(SocketLink):
     async def receive(self) -> list[tuple[Peer, bytes]]:
         """See `Link.receive`. Returns at most `DATAGRAMS_PER_READ` datagrams; skips empty ones."""
         sock = self._open_socket()
-        into, room = sock.recvfrom_into, self._room
+        into, buffer_size = sock.recvfrom_into, self._buffer_size
         batch: list[tuple[Address, bytes]] = []
         arrivals: list[float] = []
         while not batch:
@@ -142,7 +142,7 @@ class UdpLink(SocketLink):
             asks = self._tells_arrivals
             for _ in range(DATAGRAMS_PER_READ):
                 try:
-                    size, address = into(room)
+                    size, address = into(buffer_size)
                 except BlockingIOError:
                     break
                 except OSError as error:
@@ -150,7 +150,7 @@ class UdpLink(SocketLink):
                         raise self._error(f"cannot receive: {reason(error)}") from error
                     continue  # an ICMP error for an earlier datagram
                 if size:
-                    batch.append((address, bytes(room[:size])))
+                    batch.append((address, bytes(buffer_size[:size])))
                     if asks:
                         arrivals.append(_arrived_at(sock))
                         asks = time.time() - arrivals[-1] > READ_DELAY_MAX

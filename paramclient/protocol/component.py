@@ -285,7 +285,7 @@ class ComponentMachine:
             context,
             self,
             share=scheduler.list_admission.bandwidth,
-            room=name_quota,
+            name_quota=name_quota,
             may_read=sync_settings.policy is Policy.AUTO,
         )
         self._authors = self.rereads.authors

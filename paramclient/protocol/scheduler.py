@@ -191,12 +191,12 @@ class ListAdmission:
         """Return when another list ran last."""
         return max(self._crowded_at, -math.inf if self._lone is queued else self._lone_at)
 
-    def tick(self, now: float, *, most: float = math.inf, is_crowded: bool = False) -> bool:
+    def tick(self, now: float, *, lists_max: float = math.inf, is_crowded: bool = False) -> bool:
         """Begin further lists if there is bandwidth; return whether any has begun.
 
         Args:
             now: the time.
-            most: the limit of parallel lists by the event-loop latency.
+            lists_max: the limit of parallel lists by the event-loop latency.
             is_crowded: whether lists of other links share the event loop.
         """
         self._now = now
@@ -214,7 +214,7 @@ class ListAdmission:
         if self._newest:
             self._judge_bandwidth(now)
         begins = min(self._free_slots(), len(self._waiting))
-        begins = int(min(begins, most - self._active()))
+        begins = int(min(begins, lists_max - self._active()))
         for _ in range(begins):
             queued = next(iter(self._waiting))
             del self._waiting[queued]
@@ -437,7 +437,7 @@ class Scheduler:
         for component in self._take_due(now):
             component.tick(now)
             self._changed[component] = None
-        if self.list_admission.tick(now, most=self.lists_max, is_crowded=self.is_crowded):
+        if self.list_admission.tick(now, lists_max=self.lists_max, is_crowded=self.is_crowded):
             self.reschedule_all()
 
     def next_deadline(self) -> float:

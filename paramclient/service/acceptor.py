@@ -106,8 +106,8 @@ class Acceptor:
         try:
             with anyio.CancelScope() as scope:
                 slot.close = scope.cancel
-                patience = connections.REQUEST_HEAD_TIMEOUT if self._tls is None else HANDSHAKE_TIMEOUT
-                with anyio.fail_after(patience):
+                timeout = connections.REQUEST_HEAD_TIMEOUT if self._tls is None else HANDSHAKE_TIMEOUT
+                with anyio.fail_after(timeout):
                     await anyio.wait_readable(connection)
                     if not connection.recv(1, socket.MSG_PEEK):
                         return  # closed without a request
@@ -118,7 +118,7 @@ class Acceptor:
                     await protocol.loop.connect_accepted_socket(lambda: protocol, connection, **options)
         except TimeoutError:
             what = "TLS handshake" if self._tls is not None else "request"
-            text = f"closed a connection from {address}: no {what} within {patience:.0f} s"
+            text = f"closed a connection from {address}: no {what} within {timeout:.0f} s"
             self._limit.log(logger, "silent", text, logging.INFO)
         except ssl.SSLError as error:
             reason = (error.reason or str(error)).replace("_", " ").lower()

@@ -152,10 +152,10 @@ class AccessMiddleware:
         self._log_limit = LogLimit(clock)
         self._bodies = BodyMemory()
         self._large_gets = Quota(
-            "large responses", most=LARGE_GETS_MAX, most_of_holder=LARGE_GETS_OF_HOLDER_MAX
+            "large responses", total_max=LARGE_GETS_MAX, holder_max=LARGE_GETS_OF_HOLDER_MAX
         )
         self._large_posts = Quota(
-            "large responses", most=LARGE_POSTS_MAX, most_of_holder=LARGE_POSTS_OF_HOLDER_MAX
+            "large responses", total_max=LARGE_POSTS_MAX, holder_max=LARGE_POSTS_OF_HOLDER_MAX
         )
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -196,8 +196,8 @@ class AccessMiddleware:
         with self._bodies.hold(state["quota"]) as reserved:
             if request.has_body:
                 request.check_content_type()
-                most = min(request.body_bytes_max, self._settings.max_body)
-                receive = _with_body(await self._read_body(request, receive, most, reserved), receive)
+                size_max = min(request.body_bytes_max, self._settings.max_body)
+                receive = _with_body(await self._read_body(request, receive, size_max, reserved), receive)
             if not request.has_large_response:
                 await self._app(scope, receive, response.send)
                 return
@@ -358,21 +358,21 @@ class AccessMiddleware:
     # Body
 
     async def _read_body(
-        self, request: Request, receive: Receive, most: int, reserved: BodyReservation
+        self, request: Request, receive: Receive, size_max: int, reserved: BodyReservation
     ) -> bytes:
         """Return the whole body.
 
         Args:
-            most: maximum size in bytes.
+            size_max: maximum size in bytes.
             reserved: counts the bytes in memory.
 
         Raises:
             RequestDenied: the body is too large or too slow, or too many bytes are in memory.
         """
         too_large = RequestDenied(
-            413, "too-large", f"The body of this request may have at most {most} bytes."
+            413, "too-large", f"The body of this request may have at most {size_max} bytes."
         )
-        if request.length is not None and request.length > most:
+        if request.length is not None and request.length > size_max:
             raise too_large
         body = bytearray()
         try:
@@ -387,7 +387,7 @@ class AccessMiddleware:
                     piece = message.get("body", b"")
                     body += piece
                     reserved.add(len(piece))
-                    if len(body) > most:
+                    if len(body) > size_max:
                         raise too_large
                     is_whole = not message.get("more_body", False)
         except TimeoutError:

@@ -110,14 +110,14 @@ class Hub:
         self._reader = Worker("paramclient files")
         self._encoder = Worker("paramclient responses")
         self.long_requests = Quota(
-            "long requests", most=LONG_REQUESTS_MAX, most_of_holder=LONG_REQUESTS_OF_HOLDER_MAX
+            "long requests", total_max=LONG_REQUESTS_MAX, holder_max=LONG_REQUESTS_OF_HOLDER_MAX
         )
         self.waiting_requests = {
             may_write: Quota(
                 "waiting requests",
-                most=WAITING_REQUESTS_MAX,
-                most_of_holder=WAITING_REQUESTS_OF_HOLDER_MAX,
-                leaves_room=True,
+                total_max=WAITING_REQUESTS_MAX,
+                holder_max=WAITING_REQUESTS_OF_HOLDER_MAX,
+                is_fair=True,
             )
             for may_write in (False, True)
         }

@@ -51,18 +51,18 @@ class Quota:
 
     Args:
         what: name of the counted requests in error messages, in the plural.
-        most: maximum of all holders together.
-        most_of_holder: maximum of one holder.
-        leaves_room: whether `hold` gives a holder no more slots than remain free, so that several holders
+        total_max: maximum of all holders together.
+        holder_max: maximum of one holder.
+        is_fair: whether `hold` gives a holder no more slots than remain free, so that several holders
             together cannot occupy all.
     """
 
-    def __init__(self, what: str, *, most: int, most_of_holder: int, leaves_room: bool = False) -> None:
+    def __init__(self, what: str, *, total_max: int, holder_max: int, is_fair: bool = False) -> None:
         self._what = what
-        self._leaves_room = leaves_room
-        self._most = most
-        self._most_of_holder = most_of_holder
-        self._slots = anyio.Semaphore(most)
+        self._is_fair = is_fair
+        self._total_max = total_max
+        self._holder_max = holder_max
+        self._slots = anyio.Semaphore(total_max)
         self._holders: dict[str, _HolderSlots] = {}
 
     def __len__(self) -> int:
@@ -77,13 +77,13 @@ class Quota:
             ServiceError: 429, the holder has no free slot, or all slots are occupied.
         """
         with self._slots_of(holder) as own:
-            most = self._most_of_holder
-            used = most - own.value
-            if self._leaves_room and used and used >= self._slots.value:
+            limit = self._holder_max
+            used = limit - own.value
+            if self._is_fair and used and used >= self._slots.value:
                 raise self._too_many(f"{used} {self._what} of yours", used)
-            self._take(own, f"{most} {self._what} of yours", most)
+            self._take(own, f"{limit} {self._what} of yours", limit)
             try:
-                self._take(self._slots, f"{self._most} {self._what}", self._most)
+                self._take(self._slots, f"{self._total_max} {self._what}", self._total_max)
                 try:
                     yield
                 finally:
@@ -100,7 +100,7 @@ class Quota:
 
     @contextmanager
     def _slots_of(self, holder: str) -> Iterator[anyio.Semaphore]:
-        own = self._holders.setdefault(holder, _HolderSlots(self._most_of_holder))
+        own = self._holders.setdefault(holder, _HolderSlots(self._holder_max))
         own.users += 1
         try:
             yield own.slots
@@ -110,16 +110,16 @@ class Quota:
                 del self._holders[holder]
 
     @classmethod
-    def _take(cls, slots: anyio.Semaphore, occupied: str, most: int) -> None:
+    def _take(cls, slots: anyio.Semaphore, occupied: str, limit: int) -> None:
         try:
             slots.acquire_nowait()
         except anyio.WouldBlock:
-            raise cls._too_many(occupied, most) from None
+            raise cls._too_many(occupied, limit) from None
 
     @staticmethod
-    def _too_many(occupied: str, most: int) -> ServiceError:
+    def _too_many(occupied: str, limit: int) -> ServiceError:
         what = f"{occupied} are already in progress. Try again later."
-        return ServiceError(429, "too-many", what, most=most)
+        return ServiceError(429, "too-many", what, most=limit)
 
 
 class _HolderSlots:
@@ -130,6 +130,6 @@ class _HolderSlots:
         users: number of requests that have a slot or wait for one.
     """
 
-    def __init__(self, most: int) -> None:
-        self.slots = anyio.Semaphore(most)
+    def __init__(self, count: int) -> None:
+        self.slots = anyio.Semaphore(count)
         self.users = 0

@@ -151,12 +151,12 @@ class FileServer:
             return request_at
         return min(request_at, self._burst.at) if self.is_px4 else self._free_at
 
-    def work(self, now: float, most: int | None = None) -> list[tuple[Packet, Address]]:
-        """Do the due work, limited to `most` responses; return the responses with their receivers."""
+    def work(self, now: float, packets_max: int | None = None) -> list[tuple[Packet, Address]]:
+        """Do the due work, limited to `packets_max` responses; return the responses with their receivers."""
         out: list[tuple[Packet, Address]] = []
         answer: Packet | None
         while (due := self.next_deadline()) <= now:
-            if most is not None and len(out) >= most:
+            if packets_max is not None and len(out) >= packets_max:
                 self._free_at = now
                 break
             burst = self._burst

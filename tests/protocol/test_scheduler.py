@@ -256,10 +256,10 @@ def test_no_list_begins_beside_others_while_unread_data_is_waiting() -> None:
         road.now += STEP
         road.lanes[0].received += 10
         road.lanes[0].covered += 10
-        assert not road.turns.tick(road.now, most=1)
+        assert not road.turns.tick(road.now, lists_max=1)
     assert road.running == 1
     road.end(road.lanes[0])
-    assert road.turns.tick(road.now, most=1), "else it would wait for nobody"
+    assert road.turns.tick(road.now, lists_max=1), "else it would wait for nobody"
     assert road.running == 1
     road.run()
     assert road.running == GROWTH_BURSTY
@@ -661,19 +661,19 @@ async def test_silent_lists_on_two_links_do_not_wait_for_each_other() -> None:
 def test_a_silent_list_delays_none_where_the_program_has_time_for_one() -> None:
     road = Road(2)
     road.now += TIMEOUT / 2
-    assert not road.turns.tick(road.now, most=1)
+    assert not road.turns.tick(road.now, lists_max=1)
     assert road.turns.awaited(road.now) == 1
     road.now += TIMEOUT
     assert road.turns.awaited(road.now) == 0
-    assert road.turns.tick(road.now, most=1)
+    assert road.turns.tick(road.now, lists_max=1)
 
 
 def test_only_lists_that_come_on_other_links_are_beside_it() -> None:
     road = Road(1)
     [lane] = road.lanes
-    road.turns.tick(road.now, most=1)
+    road.turns.tick(road.now, lists_max=1)
     assert not road.turns.is_parallel_to_others(lane), "those may be awaited for ever"
-    road.turns.tick(road.now, most=1, is_crowded=True)
+    road.turns.tick(road.now, lists_max=1, is_crowded=True)
     assert road.turns.is_parallel_to_others(lane)
     assert road.turns.parallel_to_others_at(lane) == road.now
 

@@ -574,7 +574,7 @@ async def test_plans_have_a_quota_for_each_holder_and_for_all(monkeypatch: pytes
             read = await other.post("/api/v1/files", content=b"A 1\n", headers=A_FILE)
             assert read.status_code == 200
             assert (await browser.get(f"{C}/params")).status_code == 200
-            monkeypatch.setattr(hub, "long_requests", Quota("requests", most=0, most_of_holder=1))
+            monkeypatch.setattr(hub, "long_requests", Quota("requests", total_max=0, holder_max=1))
             problem(await other.post("/api/v1/files", content=b"A 1\n", headers=A_FILE), 429, "too-many")
         assert answers == [504] * LONG_REQUESTS_OF_HOLDER_MAX
 
@@ -610,7 +610,7 @@ async def test_waiting_requests_have_a_quota_for_each_holder_and_for_all(
             assert told["most"] == WAITING_REQUESTS_OF_HOLDER_MAX
             assert (await browser.get(f"{C}/params")).status_code == 200
             assert (await other.post("/api/v1/find", json={})).status_code == 200
-            none_left = Quota("requests", most=0, most_of_holder=1)
+            none_left = Quota("requests", total_max=0, holder_max=1)
             monkeypatch.setattr(hub, "waiting_requests", {True: none_left, False: none_left})
             problem(await other.post("/api/v1/find", json={}), 429, "too-many")
         assert statuses == [status] * WAITING_REQUESTS_OF_HOLDER_MAX
@@ -934,7 +934,7 @@ async def test_many_components_are_looked_at_few_at_a_time() -> None:
         await anyio.sleep(9)
         return {"type": "http.disconnect"}
 
-    hub = SimpleNamespace(waiting_requests={True: Quota("requests", most=1, most_of_holder=1)})
+    hub = SimpleNamespace(waiting_requests={True: Quota("requests", total_max=1, holder_max=1)})
     app = SimpleNamespace(state=SimpleNamespace(hub=hub))
     state = {"quota": "anna", "role": "write", "read_only": False}
     request: Any = SimpleNamespace(receive=receive, app=app, scope={"state": state})
@@ -1094,7 +1094,7 @@ async def test_large_answers_wait_for_each_other_until_they_are_sent() -> None:
 
 @swiftly
 async def test_a_quota_limits_each_holder_and_all_together() -> None:
-    quota = Quota("requests", most=3, most_of_holder=2)
+    quota = Quota("requests", total_max=3, holder_max=2)
     held: list[str] = []
     may_leave = anyio.Event()
 

@@ -47,7 +47,7 @@ class ExtendedParams(Machine):
         context: the component's.
         host: the component.
         share: the bandwidth that all reads of the link may use together; None for a link with one component.
-        room: the name count shared by the tables of the link.
+        name_quota: the name count shared by the tables of the link.
 
     Attributes:
         table: the parameters.
@@ -61,13 +61,13 @@ class ExtendedParams(Machine):
         host: ExtHost,
         *,
         share: LinkBandwidth | None = None,
-        room: NameQuota | None = None,
+        name_quota: NameQuota | None = None,
         may_read: bool = True,
     ) -> None:
         self._context = context
         self._host = host
         self.may_read = may_read and context.may_send
-        self.table = ExtTable(room)
+        self.table = ExtTable(name_quota)
         self.reads = ExtReads(context, self.table, share)
         self.writes = ExtWrites(context, self.reads, self.table, host, self._store)
         self.batches = WriteBatches(context.target, "PARAM_EXT_SET")

@@ -22,7 +22,7 @@ class ExtTable:
     """The extended parameters of one component, apart from its plain ones.
 
     Args:
-        room: the name count shared by all tables of the link.
+        name_quota: the name count shared by all tables of the link.
 
     Attributes:
         params: by name, in the order of first reception. Shared with readers; never replaced.
@@ -34,8 +34,8 @@ class ExtTable:
             oldest are dropped above `EXT_OVERWRITTEN_MAX`.
     """
 
-    def __init__(self, room: NameQuota | None = None) -> None:
-        self._room = NameQuota() if room is None else room
+    def __init__(self, name_quota: NameQuota | None = None) -> None:
+        self._name_quota = NameQuota() if name_quota is None else name_quota
         self.params: dict[str, ExtParam] = {}
         self.count: int | None = None
         self.moments: dict[str, float] = {}
@@ -91,9 +91,9 @@ class ExtTable:
         name = param.name
         old = self.params.get(name)
         if old is None:
-            if not self._room.has_capacity(len(self.params)):
+            if not self._name_quota.has_capacity(len(self.params)):
                 return None
-            self._room.taken += 1
+            self._name_quota.taken += 1
         elif self.moments.get(name, moment) > moment and old.trust is not Trust.CACHED:
             return None
         is_known = old is not None and old.same_value(param)
@@ -162,9 +162,9 @@ class ExtTable:
         for name, param in params.items():
             known = self.params.get(name)
             if known is None:
-                if not self._room.has_capacity(len(self.params)):
+                if not self._name_quota.has_capacity(len(self.params)):
                     continue
-                self._room.taken += 1
+                self._name_quota.taken += 1
             elif known.trust is not Trust.CACHED:
                 continue
             index = None if known is None else known.index
@@ -204,7 +204,7 @@ class ExtTable:
         param = self.params.pop(name)
         self.moments.pop(name, None)
         self.dirty.pop(name, None)
-        self._room.taken -= 1
+        self._name_quota.taken -= 1
         if param.index is not None and self._names.get(param.index) == name:
             del self._names[param.index]
         return ExtChange(name, param, None)

@@ -258,5 +258,5 @@ def _append(out: bytearray, rows: list[PackedParam], with_defaults: bool, read_s
 
 def _shared(last: str, name: str) -> int:
     """Return how many characters to share; one of the name's own remains, as the file cannot encode none."""
-    most = min(len(last), len(name) - 1)
-    return next((at for at in range(most) if last[at] != name[at]), most)
+    shared_max = min(len(last), len(name) - 1)
+    return next((at for at in range(shared_max) if last[at] != name[at]), shared_max)

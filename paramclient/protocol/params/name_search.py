@@ -211,8 +211,8 @@ class NameSearches(Machine):
             self._waiting.extend(self._silent)
             self._silent = []
         controls = self._retries.controls
-        most = WINDOW_SIZE - 2 * (controls - 1)  # requests of the window before may still be queued
-        while self._waiting and len(self._window) < most:
+        window_size = WINDOW_SIZE - 2 * (controls - 1)  # requests of the window before may still be queued
+        while self._waiting and len(self._window) < window_size:
             name = self._waiting.popleft()
             if name in search.passes:
                 self._window.add(name)

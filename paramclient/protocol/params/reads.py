@@ -463,12 +463,12 @@ class ValueReads(Machine, Generic[Response]):
         """Return a read for which a copy is worthwhile while its response may be on the way."""
         if not self.is_idle or not self._in_flight:
             return None
-        most = self._retries.copies
-        if not most:
+        copies = self._retries.copies
+        if not copies:
             return None
         fewest = min(self._in_flight.values(), key=lambda read: read.request.copies)
         is_in_flight = fewest.request.sent_at < math.inf
-        return fewest if fewest.request.copies < most and is_in_flight else None
+        return fewest if fewest.request.copies < copies and is_in_flight else None
 
     def _drop(self, read: ValueRead[Response]) -> None:
         del self._open[read.key]

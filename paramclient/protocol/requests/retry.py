@@ -190,11 +190,11 @@ class RetryPolicy:
         base = max(base, TIMEOUT_MIN)
         return min(base * self._backoff, max(TIMEOUT_MAX, base))
 
-    def copies(self, risk: float, most: int) -> int:
+    def copies(self, risk: float, copies_max: int) -> int:
         """Return how many requests at once bring the probability of no response below a risk; 1 without
         loss."""
         loss = self.round_trip.seen_loss
-        return 1 if loss < risk else min(math.ceil(math.log(risk) / math.log(loss)), most)
+        return 1 if loss < risk else min(math.ceil(math.log(risk) / math.log(loss)), copies_max)
 
     @property
     def is_lossy(self) -> bool:

@@ -96,9 +96,9 @@ class _EventStream(Response):
         listener = self._listener
         chunk = _as_event(listener.position, listener.hello())
         while True:
-            with anyio.move_on_after(LISTENER_SEND_TIMEOUT) as patience:
+            with anyio.move_on_after(LISTENER_SEND_TIMEOUT) as deadline:
                 await send({"type": "http.response.body", "body": chunk, "more_body": True})
-            if patience.cancelled_caught:
+            if deadline.cancelled_caught:
                 return
             try:
                 item = await listener.next(KEEPALIVE_INTERVAL)
@@ -115,10 +115,10 @@ class _EventStream(Response):
 async def _send_texts(listener: Listener, send: Callable[[str], Awaitable[None]]) -> None:
     texts = [listener.hello()]
     while True:
-        with anyio.move_on_after(LISTENER_SEND_TIMEOUT) as patience:
+        with anyio.move_on_after(LISTENER_SEND_TIMEOUT) as deadline:
             for text in texts:
                 await send(text)
-        if patience.cancelled_caught:
+        if deadline.cancelled_caught:
             return
         try:
             item = await listener.next(KEEPALIVE_INTERVAL)
