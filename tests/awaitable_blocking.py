@@ -1,8 +1,8 @@
 """The blocking client, made awaitable: each call runs in a thread, the client in the event loop of the test.
 
 The tests of the asynchronous client run through it; see `tests/client_kinds.py`. Time is that of the test's
-event loop: where that is a `SwiftLoop`, its clock stands still while a thread is at work, and leaps while all
-threads wait for the client.
+event loop: where that is a `SimulatedTimeLoop`, its clock stands still while a thread is at work, and leaps
+while all threads wait for the client.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class Caller:
             raise
 
     def count(self, change: int) -> None:
-        """Tell a `SwiftLoop` that the thread begins or ends to work."""
+        """Tell a `SimulatedTimeLoop` that the thread begins or ends to work."""
         if hasattr(self.loop, "threads"):
             self.loop.threads += change
 

@@ -17,7 +17,7 @@ from paramclient.cli import session as cli_session
 from paramclient.client.worker_thread import Worker
 from paramclient.links import SimLink
 from paramclient.sim import Endpoint
-from tests.shell import PeersLink, SwiftLoop, swift_loop
+from tests.shell import PeersLink, SimulatedTimeLoop, simulated_time_loop
 
 
 def strict(text: str) -> Any:
@@ -93,11 +93,11 @@ def leaping(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def waits(call: Callable[..., Any]) -> Callable[..., Any]:
         async def counted(*arguments: Any, **options: Any) -> Any:
-            swift_loop().threads += 1
+            simulated_time_loop().threads += 1
             try:
                 return await call(*arguments, **options)
             finally:
-                swift_loop().threads -= 1
+                simulated_time_loop().threads -= 1
 
         return counted
 
@@ -105,5 +105,5 @@ def leaping(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Worker, "run", waits(in_worker))
     monkeypatch.setattr(anyio.to_thread, "run_sync", waits(in_thread))
     monkeypatch.setattr(
-        anyio, "run", lambda *call: really_run(*call, backend_options={"loop_factory": SwiftLoop})
+        anyio, "run", lambda *call: really_run(*call, backend_options={"loop_factory": SimulatedTimeLoop})
     )

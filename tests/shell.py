@@ -37,7 +37,7 @@ VALUES: dict[str, int | float] = {
 """A small table: whole numbers, and every third with a fraction."""
 
 
-class SwiftLoop(asyncio.SelectorEventLoop):
+class SimulatedTimeLoop(asyncio.SelectorEventLoop):
     """An event loop whose clock leaps to the next thing to do.
 
     A session with simulated vehicles takes no real time on it, and goes the same way on every machine. While
@@ -99,7 +99,7 @@ class SwiftLoop(asyncio.SelectorEventLoop):
 
 
 class _LeapingSelector(selectors.DefaultSelector):
-    def __init__(self, loop: SwiftLoop) -> None:
+    def __init__(self, loop: SimulatedTimeLoop) -> None:
         super().__init__()
         self._loop = loop
 
@@ -123,30 +123,30 @@ class _LeapingSelector(selectors.DefaultSelector):
         return []
 
 
-def swift_loop() -> SwiftLoop:
+def simulated_time_loop() -> SimulatedTimeLoop:
     """The loop that the caller runs on."""
     loop = asyncio.get_running_loop()
-    assert isinstance(loop, SwiftLoop)
+    assert isinstance(loop, SimulatedTimeLoop)
     return loop
 
 
-def swiftly(test: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, T]:
-    """Run an asynchronous test on a `SwiftLoop`."""
+def in_simulated_time(test: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, T]:
+    """Run an asynchronous test on a `SimulatedTimeLoop`."""
 
     @functools.wraps(test)
     def run(*args: P.args, **kwargs: P.kwargs) -> T:
         in_thread = Worker.run
 
         async def counted(worker: Any, work: Callable[[], Any]) -> Any:
-            swift_loop().threads += 1
+            simulated_time_loop().threads += 1
             try:
                 return await in_thread(worker, work)
             finally:
-                swift_loop().threads -= 1
+                simulated_time_loop().threads -= 1
 
-        with asyncio.Runner(loop_factory=SwiftLoop) as runner:
+        with asyncio.Runner(loop_factory=SimulatedTimeLoop) as runner:
             loop = runner.get_loop()
-            assert isinstance(loop, SwiftLoop)
+            assert isinstance(loop, SimulatedTimeLoop)
             clock = SimpleNamespace(time=lambda: loop.now + loop.ahead)
             with mock.patch.object(Worker, "run", counted), mock.patch.object(cache_writer, "time", clock):
                 return runner.run(test(*args, **kwargs))
@@ -401,7 +401,7 @@ async def until(condition: Callable[[], object], pause: float = 0.001) -> None:
 
 async def settled() -> None:
     """Let everything happen that happens now."""
-    await swift_loop().settled()
+    await simulated_time_loop().settled()
 
 
 def a_client(link: Any, **options: Any) -> ParamClient:

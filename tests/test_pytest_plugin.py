@@ -13,7 +13,7 @@ import pytest
 from paramclient import ParamClient, UsageError
 from paramclient.sim import Air, Endpoint, Vehicle
 from paramclient.testing import SimVehicle, sim_ardupilot, sim_px4
-from tests.shell import swiftly
+from tests.shell import in_simulated_time
 
 pytest_plugins = ("pytester",)
 
@@ -134,7 +134,7 @@ def test_the_package_loads_with_the_first_test_that_uses_a_fixture(suite: Suite)
 # the makers themselves
 
 
-@swiftly
+@in_simulated_time
 async def test_a_radio_loses_what_it_is_asked_to() -> None:
     px4 = sim_px4(table=TABLE, loss=0.3, seed=3)
     async with ParamClient(px4, cache=False) as client:
@@ -146,7 +146,7 @@ async def test_a_radio_loses_what_it_is_asked_to() -> None:
         assert 0.1 < direction.lost / direction.sent < 0.5
 
 
-@swiftly
+@in_simulated_time
 async def test_a_delay_is_that_of_each_way() -> None:
     async with ParamClient(sim_px4(table=TABLE, delay=0.1), cache=False) as client:
         vehicle = await client.component()
@@ -156,7 +156,7 @@ async def test_a_delay_is_that_of_each_way() -> None:
 
 @pytest.mark.parametrize("make", [sim_px4, partial(sim_ardupilot, ftp=False)])
 @pytest.mark.parametrize("pace", [40.0, 333.0, 5000.0])
-@swiftly
+@in_simulated_time
 async def test_a_pace_is_that_of_the_list(make: Callable[..., SimVehicle[Vehicle]], pace: float) -> None:
     vehicle = make(pace=pace, table={f"P{number:03}": number for number in range(400)})
     async with ParamClient(vehicle, cache=False) as client:
@@ -203,7 +203,7 @@ def test_repr_of_a_sim_vehicle() -> None:
     assert repr(sim_ardupilot(system=7, table={})) == "<SimVehicle ArduPilotVehicle 7/1>"
 
 
-@swiftly
+@in_simulated_time
 async def test_several_share_a_channel() -> None:
     """Each behind its own faulty link, and all of them endpoints of one `Air`."""
     vehicles: list[Endpoint] = [sim_px4(system=1, table=TABLE), sim_ardupilot(system=2, table={})]

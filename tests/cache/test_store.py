@@ -46,7 +46,7 @@ from tests.commands import in_process
 from tests.postgres import GIVEN, PROGRAMS, WHY_NONE, Server, database_on, server
 from tests.service.test_cut_off import told_after_a_kill
 from tests.service.test_process import served
-from tests.shell import Tap, small_px4, swiftly
+from tests.shell import Tap, in_simulated_time, small_px4
 
 TIMEOUT = 60.0
 
@@ -925,7 +925,7 @@ def test_the_command_copies_and_reads_it(
 # What a client makes of it
 
 
-@swiftly
+@in_simulated_time
 async def test_values_of_another_station_update_cached_values(tmp_path: Path) -> None:
     """Told by a cache that is told by a database: see above."""
     vehicle = small_px4()
@@ -956,7 +956,7 @@ async def test_values_of_another_station_update_cached_values(tmp_path: Path) ->
         assert not cache.listeners
 
 
-@swiftly
+@in_simulated_time
 async def test_values_of_another_station_are_announced_while_the_vehicle_is_silent_here(
     tmp_path: Path,
 ) -> None:

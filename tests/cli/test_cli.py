@@ -36,7 +36,7 @@ from paramclient.protocol import wire
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam, px4_table
 from paramclient.sim.param_table import Entry
 from tests.commands import Command, Outcome, Put, behind, in_process, leaping, strict
-from tests.shell import swiftly
+from tests.shell import in_simulated_time
 from tests.simulated_on_udp import flying
 
 ROOT = Path(__file__).parents[2]
@@ -750,7 +750,7 @@ def vehicle_lost_and_found() -> PX4Vehicle:
 
 
 @pytest.mark.parametrize("as_json", [True, False])
-@swiftly
+@in_simulated_time
 async def test_watch_prints_events_of_the_vehicle(
     put: Callable[[Endpoint], str], capsys: pytest.CaptureFixture[str], as_json: bool
 ) -> None:
@@ -783,7 +783,7 @@ async def test_watch_prints_events_of_the_vehicle(
     assert re.fullmatch("[0-9a-f]{8}", resynced["hash"])
 
 
-@swiftly
+@in_simulated_time
 async def test_watch_prints_only_events_of_its_own_vehicle(
     put: Callable[[Endpoint], str], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -794,7 +794,7 @@ async def test_watch_prints_only_events_of_its_own_vehicle(
     assert capsys.readouterr().out == ""
 
 
-@swiftly
+@in_simulated_time
 async def test_watch_can_only_listen(
     put: Callable[[Endpoint], str], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

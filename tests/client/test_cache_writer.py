@@ -48,12 +48,12 @@ from tests.shell import (
     Tap,
     bits,
     generic,
+    in_simulated_time,
     outcome,
     residue,
     settled,
+    simulated_time_loop,
     small_px4,
-    swift_loop,
-    swiftly,
     until,
 )
 
@@ -102,7 +102,7 @@ def trusts(component: Component, names: Collection[str] | None = None) -> set[Tr
 
 
 @pytest.mark.parametrize("make", [PX4Vehicle, small_px4], ids=["903 parameters", "25 parameters"])
-@swiftly
+@in_simulated_time
 async def test_an_unchanged_vehicle_is_not_downloaded_again(
     path: Path, make: Callable[[], PX4Vehicle]
 ) -> None:
@@ -134,7 +134,7 @@ async def test_an_unchanged_vehicle_is_not_downloaded_again(
     assert kept(path) == bits(vehicle.params)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_fetch_waits_for_the_cached_table(path: Path) -> None:
     vehicle = small_px4()
     await session(vehicle, path)
@@ -143,7 +143,7 @@ async def test_a_fetch_waits_for_the_cached_table(path: Path) -> None:
         assert (await client.components[1, 1].fetch_all()).source == "cache"
 
 
-@swiftly
+@in_simulated_time
 async def test_volatile_values_are_read_afresh_after_a_hit(path: Path) -> None:
     vehicle = small_px4()
     await session(vehicle, path)
@@ -156,7 +156,7 @@ async def test_volatile_values_are_read_afresh_after_a_hit(path: Path) -> None:
     assert kept(path) == bits(vehicle.params)
 
 
-@swiftly
+@in_simulated_time
 async def test_refreshed_returns_at_once_where_nothing_is_to_be_read(path: Path) -> None:
     async with ParamClient(small_px4(), cache=path) as client:
         component = await client.component()
@@ -167,7 +167,7 @@ async def test_refreshed_returns_at_once_where_nothing_is_to_be_read(path: Path)
         assert anyio.current_time() - began < 0.001
 
 
-@swiftly
+@in_simulated_time
 async def test_waiting_for_volatile_values_has_an_end(path: Path) -> None:
     vehicle = small_px4()
     await session(vehicle, path)
@@ -197,7 +197,7 @@ async def test_waiting_for_volatile_values_has_an_end(path: Path) -> None:
         assert Trust.CACHED in trusts(component), "what cannot be read is not made to look fresh"
 
 
-@swiftly
+@in_simulated_time
 async def test_a_download_can_be_asked_for_all_the_same(path: Path) -> None:
     vehicle = small_px4()
     await session(vehicle, path)
@@ -208,7 +208,7 @@ async def test_a_download_can_be_asked_for_all_the_same(path: Path) -> None:
         assert trusts(component) == {Trust.LIVE}
 
 
-@swiftly
+@in_simulated_time
 async def test_a_change_while_we_were_away_is_a_miss(path: Path) -> None:
     vehicle = small_px4()
     await session(vehicle, path)
@@ -231,7 +231,7 @@ async def test_a_change_while_we_were_away_is_a_miss(path: Path) -> None:
     assert (await session(vehicle, path)).source == "cache"
 
 
-@swiftly
+@in_simulated_time
 async def test_a_parameter_that_the_vehicle_no_longer_has_leaves_the_cache(path: Path) -> None:
     larger = PX4Vehicle(table=VALUES)
     await session(larger, path)
@@ -242,7 +242,7 @@ async def test_a_parameter_that_the_vehicle_no_longer_has_leaves_the_cache(path:
     assert (await session(smaller, path)).source == "cache"
 
 
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_without_a_hash_is_shown_from_the_cache_and_downloaded(path: Path) -> None:
     vehicle = ArduPilotVehicle(ftp=False, live=())
     await session(vehicle, path)
@@ -256,7 +256,7 @@ async def test_a_vehicle_without_a_hash_is_shown_from_the_cache_and_downloaded(p
     assert not [each for each in tap.messages(wire.ParamRequestRead) if each.param_id == wire.HASH_CHECK]
 
 
-@swiftly
+@in_simulated_time
 async def test_everyone_on_the_link_starts_from_the_cache(path: Path) -> None:
     vehicles = [small_px4(system=system) for system in (1, 2, 3)]
     camera = generic(system=1, component=100, autopilot=wire.MAV_AUTOPILOT_INVALID)
@@ -288,7 +288,7 @@ PARAMETER_REQUESTS = (wire.ParamRequestRead, wire.ParamRequestList)
 
 
 @pytest.mark.parametrize("unanswered", [PARAMETER_REQUESTS, (*PARAMETER_REQUESTS, wire.CommandLong)])
-@swiftly
+@in_simulated_time
 async def test_a_silent_component_with_a_cached_table_holds_nobody_up(path: Path, unanswered: Any) -> None:
     vehicle, silent = small_px4(), Reticent(system=2, table=VALUES)
     async with ParamClient(Air([vehicle, silent]), cache=path) as client:
@@ -305,7 +305,7 @@ async def test_a_silent_component_with_a_cached_table_holds_nobody_up(path: Path
 # Who it is
 
 
-@swiftly
+@in_simulated_time
 async def test_two_vehicles_with_one_system_id_keep_two_tables(path: Path) -> None:
     vehicles = small_px4(uid=0xA), small_px4(uid=0xB)
     vehicles[1].set_param("PARAM_01", 77)
@@ -320,14 +320,14 @@ async def test_two_vehicles_with_one_system_id_keep_two_tables(path: Path) -> No
 
 
 @pytest.mark.parametrize("known", [False, True])
-@swiftly
+@in_simulated_time
 async def test_another_vehicle_takes_the_place_within_a_session(path: Path, known: bool) -> None:
     first, second = small_px4(uid=0xA), small_px4(uid=0xB)
     second.set_param("PARAM_01", 77)
     if known:
         await session(second, path)
-    first.tick(swift_loop().time())
-    second.reboot(swift_loop().time(), down=math.inf)
+    first.tick(simulated_time_loop().time())
+    second.reboot(simulated_time_loop().time(), down=math.inf)
     async with ParamClient(Air([first, second]), cache=path) as client:
         component = await client.component()
         await component.fetch_all()
@@ -352,11 +352,11 @@ async def test_another_vehicle_takes_the_place_within_a_session(path: Path, know
         assert not any(cache.history(each.key) for each in cache.vehicles()), "nothing was changed"
 
 
-@swiftly
+@in_simulated_time
 async def test_the_end_of_a_table_is_no_news_of_the_vehicle_that_has_gone(path: Path) -> None:
     first, second = small_px4(uid=0xA), small_px4(uid=0xB)
-    first.tick(swift_loop().time())
-    second.reboot(swift_loop().time(), down=math.inf)
+    first.tick(simulated_time_loop().time())
+    second.reboot(simulated_time_loop().time(), down=math.inf)
     async with ParamClient(Air([first, second]), cache=path) as client:
         component = await client.component()
         await component.fetch_all()
@@ -371,7 +371,7 @@ async def test_the_end_of_a_table_is_no_news_of_the_vehicle_that_has_gone(path: 
         assert bits(table.params) == bits(first.params)
 
 
-@swiftly
+@in_simulated_time
 async def test_another_vehicle_takes_the_place_while_the_cache_is_read(path: Path) -> None:
     await session(small_px4(uid=0xA), path)
     tap = Tap(small_px4(uid=0xA))
@@ -399,7 +399,7 @@ async def test_another_vehicle_takes_the_place_while_the_cache_is_read(path: Pat
             assert not component.params, "the table that was read is not its own"
 
 
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_that_does_not_say_who_it_is(path: Path) -> None:
     vehicle = Reticent(table=VALUES)
     vehicle.unanswered = (wire.CommandLong,)
@@ -430,7 +430,7 @@ async def test_a_vehicle_that_does_not_say_who_it_is(path: Path) -> None:
 
 
 @pytest.mark.parametrize("fetched", [True, False])
-@swiftly
+@in_simulated_time
 async def test_an_identity_that_comes_long_after_the_values(path: Path, fetched: bool) -> None:
     await session(PX4Vehicle(table=VALUES), path)
     changed = Reticent(table={**VALUES, "PARAM_01": 99}, not_in_use=["PARAM_02"])
@@ -472,7 +472,7 @@ async def test_an_identity_that_comes_long_after_the_values(path: Path, fetched:
 
 @pytest.mark.parametrize("volatile", [("CAL_ACC0_XOFF",), ODD], ids=["proven", "not proven"])
 @pytest.mark.parametrize("fetched", [True, False])
-@swiftly
+@in_simulated_time
 async def test_after_our_own_set_the_next_session_hits_where_the_hash_is_computed(
     path: Path, volatile: Collection[str], fetched: bool
 ) -> None:
@@ -492,7 +492,7 @@ async def test_after_our_own_set_the_next_session_hits_where_the_hash_is_compute
         assert [(line.new and line.new.value, line.by) for line in lines] == [(100, "us"), (101, "us")]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_change_of_ours_tells_who_asked_for_it(path: Path) -> None:
     """And counts as ours: the hash is computed, and the next session hits."""
     vehicle = small_px4()
@@ -514,7 +514,7 @@ async def test_a_change_of_ours_tells_who_asked_for_it(path: Path) -> None:
     assert (await session(vehicle, path)).source == "cache"
 
 
-@swiftly
+@in_simulated_time
 async def test_every_own_write_is_in_the_history_however_briefly_it_was_valid(path: Path) -> None:
     vehicle = small_px4()
     await session(vehicle, path)
@@ -535,7 +535,7 @@ async def test_every_own_write_is_in_the_history_however_briefly_it_was_valid(pa
     assert [line.old.value for line in lines] == [before, 100, 101, before, 100]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_write_is_told_of_as_ours_also_where_nobody_waits_for_it_any_more(path: Path) -> None:
     vehicle = small_px4()
     await session(vehicle, path)
@@ -559,7 +559,7 @@ async def test_a_write_is_told_of_as_ours_also_where_nobody_waits_for_it_any_mor
     ]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_write_is_in_the_history_also_where_the_cache_knew_nothing_before(path: Path) -> None:
     vehicle = small_px4()
     before = vehicle.params["PARAM_01"].value
@@ -576,7 +576,7 @@ async def test_a_write_is_in_the_history_also_where_the_cache_knew_nothing_befor
 
 
 @pytest.mark.parametrize("author", ["", "x" * 129, "a\nb", "Änne", "\x7f"])
-@swiftly
+@in_simulated_time
 async def test_an_author_must_be_printable_ascii(path: Path, author: str) -> None:
     vehicle = small_px4()
     async with ParamClient(vehicle, cache=path) as client:
@@ -587,7 +587,7 @@ async def test_an_author_must_be_printable_ascii(path: Path, author: str) -> Non
             await apply(component, ParamSet({}), author=author)
 
 
-@swiftly
+@in_simulated_time
 async def test_after_many_sets_at_once_the_next_session_hits(path: Path) -> None:
     vehicle = PX4Vehicle()
     await session(vehicle, path)
@@ -598,7 +598,7 @@ async def test_after_many_sets_at_once_the_next_session_hits(path: Path) -> None
     assert (await session(vehicle, path)).source == "cache"
 
 
-@swiftly
+@in_simulated_time
 async def test_a_set_that_moves_the_count_leads_to_a_download_and_a_right_table(path: Path) -> None:
     vehicle = PX4Vehicle()
     await session(vehicle, path)
@@ -612,7 +612,7 @@ async def test_a_set_that_moves_the_count_leads_to_a_download_and_a_right_table(
     assert (await session(vehicle, path)).source == "cache"
 
 
-@swiftly
+@in_simulated_time
 async def test_a_change_by_another_station_is_in_the_history_with_its_address(path: Path) -> None:
     vehicle = small_px4()
     radio = Radio(vehicle)
@@ -634,7 +634,7 @@ async def test_a_change_by_another_station_is_in_the_history_with_its_address(pa
     assert (await session(vehicle, path)).source == "cache"
 
 
-@swiftly
+@in_simulated_time
 async def test_closing_writes_what_is_new(path: Path) -> None:
     vehicle = small_px4()
     async with ParamClient(vehicle, cache=path) as client:
@@ -662,7 +662,7 @@ async def test_closing_writes_what_is_new(path: Path) -> None:
     assert kept(path) == {"PARAM_01": 1, "PARAM_02": 2, "PARAM_04": 4}
 
 
-@swiftly
+@in_simulated_time
 async def test_a_parameter_removed_from_the_table_is_removed_from_the_cache(path: Path) -> None:
     await session(small_px4(), path)
     async with ParamClient(small_px4(), cache=path) as client:
@@ -671,7 +671,7 @@ async def test_a_parameter_removed_from_the_table_is_removed_from_the_cache(path
     assert "PARAM_01" not in kept(path)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_table_is_never_called_whole_that_is_not(path: Path) -> None:
     vehicle = PX4Vehicle(burst=1, period=0.05, table=VALUES)
     async with ParamClient(vehicle, cache=path) as client:
@@ -687,7 +687,7 @@ async def test_a_table_is_never_called_whole_that_is_not(path: Path) -> None:
     assert (result.source, result.complete) == ("stream", True)
 
 
-@swiftly
+@in_simulated_time
 async def test_an_index_that_never_comes(path: Path) -> None:
     class Holey(GenericVehicle):
         def _send_value(self, entry: Any, **how: Any) -> None:
@@ -707,7 +707,7 @@ async def test_an_index_that_never_comes(path: Path) -> None:
         assert "PARAM_05" not in cache.component().params
 
 
-@swiftly
+@in_simulated_time
 async def test_two_clients_share_one_cache(path: Path) -> None:
     one, two = small_px4(system=1), small_px4(system=2)
     await asyncio.gather(session(one, path), session(two, path))
@@ -722,7 +722,7 @@ async def test_two_clients_share_one_cache(path: Path) -> None:
 # With it, and without
 
 
-@swiftly
+@in_simulated_time
 async def test_a_cache_that_was_given_stays_open(path: Path) -> None:
     with ParamCache(path) as cache:
         async with ParamClient(small_px4(), cache=cache) as client:
@@ -736,7 +736,7 @@ async def test_a_cache_that_was_given_stays_open(path: Path) -> None:
         client.cache.components()
 
 
-@swiftly
+@in_simulated_time
 async def test_the_users_cache_is_used_unless_told_otherwise(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -772,13 +772,13 @@ async def goes_on_without(path: Path | ParamCache, caplog: pytest.LogCaptureFixt
     assert f"not written to the cache, and lost: {len(vehicle.params)} values and 2 earlier values" in lost
 
 
-@swiftly
+@in_simulated_time
 async def test_a_folder_that_cannot_be_written_to(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "file").write_text("in the way")
     await goes_on_without(tmp_path / "file" / "cache", caplog)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_folder_that_can_only_be_read(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     await session(small_px4(system=9), path)
     with read_only(path.parent):
@@ -787,7 +787,7 @@ async def test_a_folder_that_can_only_be_read(path: Path, caplog: pytest.LogCapt
         assert (await session(small_px4(system=9), path)).source == "cache", "what can be read is used"
 
 
-@swiftly
+@in_simulated_time
 async def test_a_full_disk(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     await session(small_px4(system=9), path)
     with full_disk(at=100):
@@ -797,14 +797,14 @@ async def test_a_full_disk(path: Path, caplog: pytest.LogCaptureFixture) -> None
     assert not caplog.records
 
 
-@swiftly
+@in_simulated_time
 async def test_a_cache_that_somebody_closed(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     cache = ParamCache(path)
     cache.close()
     await goes_on_without(cache, caplog)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_damaged_file_is_set_aside(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     vehicle = small_px4()
     await session(vehicle, path)
@@ -815,7 +815,7 @@ async def test_a_damaged_file_is_set_aside(path: Path, caplog: pytest.LogCapture
     assert (await session(vehicle, path)).source == "cache"
 
 
-@swiftly
+@in_simulated_time
 async def test_values_that_could_not_be_written_are_written_later(
     path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -899,7 +899,7 @@ def said(path: Path) -> tuple[int, bool | None]:
         return sum(param.default is not None for param in params), cache.components()[0].file_works
 
 
-@swiftly
+@in_simulated_time
 async def test_defaults_are_kept_over_sessions_and_go_with_the_firmware(path: Path) -> None:
     vehicle = ArduPilotVehicle(live_period=0)
     result = await session(vehicle, path)
@@ -922,7 +922,7 @@ async def test_defaults_are_kept_over_sessions_and_go_with_the_firmware(path: Pa
 
 
 @pytest.mark.parametrize("kind", ["no file", "silent"])
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_without_the_parameter_file_is_remembered_for_its_firmware(
     path: Path, kind: str
 ) -> None:
@@ -951,7 +951,7 @@ async def test_a_vehicle_without_the_parameter_file_is_remembered_for_its_firmwa
     assert said(path)[1] is True
 
 
-@swiftly
+@in_simulated_time
 async def test_the_first_fetch_waits_until_it_is_known_whether_there_is_a_file() -> None:
     air = Air.symmetric([ArduPilotVehicle(live_period=0)], delay=0.2)
     async with ParamClient(air, cache=False) as client:

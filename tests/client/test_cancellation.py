@@ -30,11 +30,11 @@ from tests.shell import (
     a_client,
     bits,
     generic,
+    in_simulated_time,
     residue,
     settled,
+    simulated_time_loop,
     small_px4,
-    swift_loop,
-    swiftly,
     tasks_beside,
     until,
 )
@@ -126,7 +126,7 @@ class Struck(Coroutine[Any, Any, Any]):
 async def a_session() -> AsyncIterator[tuple[ParamClient, Component]]:
     """A client that has just heard a vehicle with a camera, while another one comes a little later."""
     late = generic(system=2, table=FEW_VALUES)
-    late.reboot(swift_loop().time(), down=0.03)
+    late.reboot(simulated_time_loop().time(), down=0.03)
     camera = generic(component=100, table=FEW_VALUES, autopilot=wire.MAV_AUTOPILOT_INVALID)
     vehicle = PX4Vehicle(table={**FEW_VALUES, "CAL_ACC0_XOFF": 0.5}, burst=3)
     air = Air.symmetric([vehicle, camera, late], delay=0.004)
@@ -155,7 +155,7 @@ async def check_after(call: Call, client: ParamClient, component: Component) -> 
 
 @EVERY_CALL
 @pytest.mark.parametrize("late", [False, True], ids=["before", "after"])
-@swiftly
+@in_simulated_time
 async def test_cancelled_at_each_suspension(call: Call, late: bool) -> None:
     for number in range(1, POINTS_MAX):
         async with a_session() as (client, component):
@@ -175,9 +175,9 @@ async def test_cancelled_at_each_suspension(call: Call, late: bool) -> None:
 
 @EVERY_CALL
 @pytest.mark.parametrize("by", ["task", "scope"])
-@swiftly
+@in_simulated_time
 async def test_cancelled_after_each_round(call: Call, by: str) -> None:
-    loop = swift_loop()
+    loop = simulated_time_loop()
     for number in range(1, POINTS_MAX):
         async with a_session() as (client, component):
             scope = anyio.CancelScope()
@@ -201,7 +201,7 @@ async def test_cancelled_after_each_round(call: Call, by: str) -> None:
 
 
 @EVERY_CALL
-@swiftly
+@in_simulated_time
 async def test_cancelled_while_the_link_is_away(call: Call) -> None:
     link = FlakyLink(Air([small_px4(), generic(system=2)]))
     async with a_client(link) as client:
@@ -218,11 +218,11 @@ async def test_cancelled_while_the_link_is_away(call: Call) -> None:
 
 
 @pytest.mark.parametrize("point", ["before", "after", "round"])
-@swiftly
+@in_simulated_time
 async def test_a_whole_session_cancelled_at_each_point(tmp_path: Path, point: str) -> None:
     path = tmp_path / "cache"
     vehicle = small_px4()
-    loop = swift_loop()
+    loop = simulated_time_loop()
 
     async def session() -> None:
         async with ParamClient(vehicle, cache=path) as client:

@@ -53,12 +53,12 @@ from tests.shell import (
     a_client,
     bits,
     generic,
+    in_simulated_time,
     outcome,
     residue,
     settled,
+    simulated_time_loop,
     small_px4,
-    swift_loop,
-    swiftly,
     tasks_beside,
     until,
 )
@@ -87,7 +87,7 @@ async def changes_of(component: Component, count: int = 1) -> list[Change]:
 # Life and death
 
 
-@swiftly
+@in_simulated_time
 async def test_an_exception_of_the_body_is_raised_unchanged() -> None:
     class Stop(BaseException):
         pass
@@ -110,7 +110,7 @@ async def test_an_exception_of_the_body_is_raised_unchanged() -> None:
         assert not tasks_beside()
 
 
-@swiftly
+@in_simulated_time
 async def test_an_error_of_a_call_comes_out_as_it_is() -> None:
     async def session() -> None:
         async with a_client(generic(param_error=True)) as client:
@@ -120,7 +120,7 @@ async def test_an_error_of_a_call_comes_out_as_it_is() -> None:
         await session()
 
 
-@swiftly
+@in_simulated_time
 async def test_the_task_of_a_client_can_be_cancelled() -> None:
     entered = asyncio.Event()
 
@@ -139,7 +139,7 @@ async def test_the_task_of_a_client_can_be_cancelled() -> None:
     assert not tasks_beside()
 
 
-@swiftly
+@in_simulated_time
 async def test_a_time_limit_around_the_client_ends_it() -> None:
     task = asyncio.current_task()
     assert task is not None
@@ -156,7 +156,7 @@ async def test_a_time_limit_around_the_client_ends_it() -> None:
     assert not tasks_beside()
 
 
-@swiftly
+@in_simulated_time
 async def test_a_time_limit_inside_the_client_leaves_it_open() -> None:
     async with a_client(generic()) as client:
         component = await client.component()
@@ -169,7 +169,7 @@ async def test_a_time_limit_inside_the_client_leaves_it_open() -> None:
         assert (await component.get("PARAM_01")).value == 1
 
 
-@swiftly
+@in_simulated_time
 async def test_a_client_is_opened_once() -> None:
     client = a_client(generic())
     async with client:
@@ -196,7 +196,7 @@ def test_a_client_can_be_made_before_the_event_loop() -> None:
     asyncio.run(use())
 
 
-@swiftly
+@in_simulated_time
 async def test_calls_on_a_client_that_is_not_open() -> None:
     client = a_client(small_px4())
     for before in (client.component(), client.fetch_all()):
@@ -215,7 +215,7 @@ async def test_calls_on_a_client_that_is_not_open() -> None:
     assert not residue(component)
 
 
-@swiftly
+@in_simulated_time
 async def test_closing_ends_everyone_who_waits() -> None:
     tap = Tap(generic())
     async with a_client(tap) as client:
@@ -234,7 +234,7 @@ async def test_closing_ends_everyone_who_waits() -> None:
     assert not tasks_beside()
 
 
-@swiftly
+@in_simulated_time
 async def test_closing_while_the_link_is_away() -> None:
     tap = Tap(generic())
     link = FlakyLink(tap)
@@ -334,7 +334,7 @@ class Served:
 # On the link
 
 
-@swiftly
+@in_simulated_time
 async def test_the_heartbeat_of_a_ground_station_goes_out_every_second() -> None:
     tap = Tap(generic())
     async with a_client(tap, system=200, component=25):
@@ -348,7 +348,7 @@ async def test_the_heartbeat_of_a_ground_station_goes_out_every_second() -> None
         assert (message.type, message.autopilot) == (wire.MAV_TYPE_GCS, wire.MAV_AUTOPILOT_INVALID)
 
 
-@swiftly
+@in_simulated_time
 async def test_our_ids_are_those_of_a_ground_station_unless_told() -> None:
     tap = Tap(generic())
     async with a_client(tap) as client:
@@ -361,7 +361,7 @@ async def test_our_ids_are_those_of_a_ground_station_unless_told() -> None:
             a_client(tap, component=bad)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_component_is_asked_who_it_is() -> None:
     async with a_client(ArduPilotVehicle()) as client:
         component = await client.component()
@@ -373,7 +373,7 @@ async def test_a_component_is_asked_who_it_is() -> None:
         assert "ArduPilot" in component.encoding_reason
 
 
-@swiftly
+@in_simulated_time
 async def test_the_user_knows_better_how_values_are_laid_out() -> None:
     async with a_client(generic(), encoding=Encoding.C_CAST) as client:
         component = await client.component()
@@ -383,7 +383,7 @@ async def test_the_user_knows_better_how_values_are_laid_out() -> None:
 
 
 @direct_only("the numbers of a service are those of a moment ago")
-@swiftly
+@in_simulated_time
 async def test_bytes_are_counted_both_ways() -> None:
     tap = Tap(generic())
     async with a_client(tap) as client:
@@ -396,7 +396,7 @@ async def test_bytes_are_counted_both_ways() -> None:
 # Finding a component
 
 
-@swiftly
+@in_simulated_time
 async def test_the_first_autopilot_is_the_component() -> None:
     camera = generic(component=100, autopilot=wire.MAV_AUTOPILOT_INVALID)
     async with a_client(Air([camera, generic(system=7, component=1), generic(system=9)])) as client:
@@ -411,7 +411,7 @@ async def test_the_first_autopilot_is_the_component() -> None:
             client.components[1, 1] = component  # type: ignore[index]  # that it is read-only is the point
 
 
-@swiftly
+@in_simulated_time
 async def test_a_component_is_waited_for() -> None:
     vehicle = generic()
     vehicle.reboot(1000.0, down=3.0)
@@ -421,7 +421,7 @@ async def test_a_component_is_waited_for() -> None:
         assert 2.9 < anyio.current_time() - began < 3.1
 
 
-@swiftly
+@in_simulated_time
 async def test_a_component_that_is_heard_before_its_heartbeat(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a firmware that does not send its heartbeat on request; others are known at once."""
     vehicle = small_px4()
@@ -446,7 +446,7 @@ async def test_a_component_that_is_heard_before_its_heartbeat(monkeypatch: pytes
         assert [task.result().autopilot for task in waiting] == ["px4", "px4"]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_component_that_never_says_what_it_is_is_given_in_the_end() -> None:
     async with a_client(Mute()) as client:
         began = anyio.current_time()
@@ -476,7 +476,7 @@ class Mute:
         return out
 
 
-@swiftly
+@in_simulated_time
 @pytest.mark.parametrize(
     ("wanted", "words"),
     [
@@ -499,7 +499,7 @@ async def test_a_component_that_is_not_there(wanted: dict[str, Any], words: str)
 
 
 @direct_only("a service reports the states of its links")
-@swiftly
+@in_simulated_time
 async def test_a_component_that_is_not_there_and_what_was_received_instead() -> None:
     async with a_client(generic(autopilot=wire.MAV_AUTOPILOT_INVALID)) as client:
         with pytest.raises(
@@ -511,7 +511,7 @@ async def test_a_component_that_is_not_there_and_what_was_received_instead() -> 
 # Reading and writing
 
 
-@swiftly
+@in_simulated_time
 async def test_a_read_gives_the_value_the_vehicle_has_now() -> None:
     vehicle = small_px4()
     async with a_client(vehicle) as client:
@@ -524,7 +524,7 @@ async def test_a_read_gives_the_value_the_vehicle_has_now() -> None:
         assert component.params["PARAM_05"].value == 1234
 
 
-@swiftly
+@in_simulated_time
 async def test_the_hash_can_be_read_like_a_parameter_and_is_none() -> None:
     vehicle = small_px4()
     async with a_client(vehicle) as client:
@@ -536,7 +536,7 @@ async def test_the_hash_can_be_read_like_a_parameter_and_is_none() -> None:
             await component.set("_HASH_CHECK", 0)
 
 
-@swiftly
+@in_simulated_time
 async def test_equal_reads_share_one_request_and_others_run_beside() -> None:
     vehicle = generic()
     air = Air.symmetric([vehicle], delay=0.2)
@@ -553,7 +553,7 @@ async def test_equal_reads_share_one_request_and_others_run_beside() -> None:
         assert anyio.current_time() - began < 0.45, "all in one round trip"
 
 
-@swiftly
+@in_simulated_time
 async def test_a_cancelled_read_leaves_the_others_their_request() -> None:
     vehicle = generic()
     async with a_client(Air.symmetric([vehicle], delay=0.2)) as client:
@@ -569,7 +569,7 @@ async def test_a_cancelled_read_leaves_the_others_their_request() -> None:
         assert first.cancelled()
 
 
-@swiftly
+@in_simulated_time
 async def test_writes_to_one_name_are_done_in_order_and_others_beside() -> None:
     vehicle = generic()
     tap = Tap(vehicle)
@@ -592,7 +592,7 @@ async def test_writes_to_one_name_are_done_in_order_and_others_beside() -> None:
     assert vehicle.param("PARAM_01").value == 12
 
 
-@swiftly
+@in_simulated_time
 async def test_a_write_learns_the_type_first() -> None:
     tap = Tap(small_px4())
     async with a_client(tap) as client:
@@ -611,7 +611,7 @@ def reads_of_hash(tap: Tap) -> list[wire.ParamRequestRead]:
     return [each for each in tap.messages(wire.ParamRequestRead) if each.param_id == wire.HASH_CHECK]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_write_that_the_vehicle_adjusts() -> None:
     async with a_client(ArduPilotVehicle()) as client:
         component = await client.component()
@@ -626,7 +626,7 @@ async def test_a_write_that_the_vehicle_adjusts() -> None:
         assert (await component.set("rtl_alt", 1000)).param.name == "RTL_ALT"
 
 
-@swiftly
+@in_simulated_time
 async def test_a_write_that_is_refused_says_why() -> None:
     vehicle = ArduPilotVehicle(read_only=["RTL_ALT"], param_error=True)
     async with a_client(vehicle) as client:
@@ -641,7 +641,7 @@ async def test_a_write_that_is_refused_says_why() -> None:
             await component.get(5000)
 
 
-@swiftly
+@in_simulated_time
 async def test_an_unknown_name_is_told_from_silence() -> None:
     async with a_client(small_px4()) as client:
         component = await client.component()
@@ -667,7 +667,7 @@ class Retyping(GenericVehicle):
         self._send(wire.ParamValue(request.param_id, request.raw, kind, 24, 1))
 
 
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_that_keeps_its_value_without_a_reason() -> None:
     async with a_client(Stubborn(VALUES)) as client:
         component = await client.component()
@@ -677,7 +677,7 @@ async def test_a_vehicle_that_keeps_its_value_without_a_reason() -> None:
         assert not residue(component)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_that_changes_the_type() -> None:
     async with a_client(Retyping(VALUES)) as client:
         component = await client.component()
@@ -686,7 +686,7 @@ async def test_a_vehicle_that_changes_the_type() -> None:
         assert not residue(component)
 
 
-@swiftly
+@in_simulated_time
 async def test_invalid_values_and_names_are_not_sent() -> None:
     table: dict[str, Any] = {"SMALL": (ParamType.UINT8, 1), "WHOLE": 1}
     tap = Tap(GenericVehicle(table))
@@ -721,7 +721,7 @@ async def test_invalid_values_and_names_are_not_sent() -> None:
         assert not residue(component)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_value_that_turns_out_not_to_fit_is_not_written() -> None:
     tap = Tap(generic())
     async with a_client(tap) as client:
@@ -734,7 +734,7 @@ async def test_a_value_that_turns_out_not_to_fit_is_not_written() -> None:
 # Time-outs
 
 
-@swiftly
+@in_simulated_time
 async def test_every_call_has_a_time_limit_of_its_own() -> None:
     tap = Tap(generic())
     async with a_client(tap) as client:
@@ -759,7 +759,7 @@ async def test_every_call_has_a_time_limit_of_its_own() -> None:
             assert not residue(component)
 
 
-@swiftly
+@in_simulated_time
 async def test_calls_without_a_time_limit_end_by_themselves() -> None:
     tap = Tap(generic())
     async with a_client(tap) as client:
@@ -774,7 +774,7 @@ async def test_calls_without_a_time_limit_end_by_themselves() -> None:
             assert not residue(component)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_fetch_whose_time_is_over_gives_what_came() -> None:
     slow = generic(burst=1, period=0.1)
     async with a_client(slow) as client:
@@ -799,7 +799,7 @@ async def test_a_fetch_whose_time_is_over_gives_what_came() -> None:
 # Fetching
 
 
-@swiftly
+@in_simulated_time
 async def test_a_fetch_brings_every_parameter() -> None:
     by_list = (small_px4(), generic(), ArduPilotVehicle(ftp=False))
     for vehicle in (*by_list, ArduPilotVehicle()):
@@ -820,7 +820,7 @@ async def test_a_fetch_brings_every_parameter() -> None:
             assert component.round_trip is not None
 
 
-@swiftly
+@in_simulated_time
 @pytest.mark.parametrize("refresh", [False, True])
 async def test_a_first_fetch_waits_to_hear_whether_there_is_a_file(refresh: bool) -> None:
     """The list of ArduPilot takes several times longer, on a radio ten times."""
@@ -835,7 +835,7 @@ async def test_a_first_fetch_waits_to_hear_whether_there_is_a_file(refresh: bool
                 assert (await component.fetch_all(refresh=refresh)).source == "ftp"
 
 
-@swiftly
+@in_simulated_time
 async def test_a_first_fetch_does_not_wait_for_long_to_hear_that() -> None:
     class Unknown(ArduPilotVehicle):
         def _on_command(self, request: wire.CommandLong, sender: wire.Frame) -> None:
@@ -850,7 +850,7 @@ async def test_a_first_fetch_does_not_wait_for_long_to_hear_that() -> None:
         assert anyio.current_time() - began < IDENTITY_TIMEOUT + 2.0  # simulated seconds
 
 
-@swiftly
+@in_simulated_time
 async def test_fetches_at_the_same_time_are_one() -> None:
     vehicle = generic(period=0.1)
     async with a_client(vehicle) as client:
@@ -862,7 +862,7 @@ async def test_fetches_at_the_same_time_are_one() -> None:
         assert first.params == second.params == third.params
 
 
-@swiftly
+@in_simulated_time
 async def test_progress_is_told() -> None:
     async with a_client(generic(burst=1, period=0.05)) as client:
         component = await client.component()
@@ -889,7 +889,7 @@ async def test_progress_is_told() -> None:
 # Several vehicles
 
 
-@swiftly
+@in_simulated_time
 async def test_several_vehicles_are_fetched_side_by_side() -> None:
     vehicles: dict[tuple[int, int], Any] = {
         (1, 1): small_px4(period=0.1, burst=1),
@@ -911,7 +911,7 @@ async def test_several_vehicles_are_fetched_side_by_side() -> None:
         assert one_system.results.keys() == {(1, 1), (1, 100)}
 
 
-@swiftly
+@in_simulated_time
 async def test_one_request_is_enough_for_all_components_of_a_system() -> None:
     camera = generic(component=100, autopilot=wire.MAV_AUTOPILOT_INVALID)
     tap = Tap(Air([generic(), camera]))
@@ -925,7 +925,7 @@ async def test_one_request_is_enough_for_all_components_of_a_system() -> None:
     ]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_fetch_under_way_is_not_begun_again_for_all_components() -> None:
     vehicle = generic(burst=1, period=0.1)
     camera = generic(component=100, autopilot=wire.MAV_AUTOPILOT_INVALID)
@@ -946,7 +946,7 @@ class Silent(GenericVehicle):
         return
 
 
-@swiftly
+@in_simulated_time
 @pytest.mark.parametrize("autopilot", [wire.MAV_AUTOPILOT_GENERIC, wire.MAV_AUTOPILOT_INVALID])
 async def test_a_silent_component_holds_nobody_up(autopilot: int) -> None:
     silent = Silent(VALUES, component=100, autopilot=autopilot), Silent(VALUES, system=2, autopilot=autopilot)
@@ -968,7 +968,7 @@ async def test_a_silent_component_holds_nobody_up(autopilot: int) -> None:
         assert not any(residue(each) for each in client.components.values())
 
 
-@swiftly
+@in_simulated_time
 async def test_fetch_all_includes_a_vehicle_that_is_heard_late() -> None:
     late = generic(system=2)
     late.reboot(1000.0, down=0.9)
@@ -976,7 +976,7 @@ async def test_fetch_all_includes_a_vehicle_that_is_heard_late() -> None:
         assert (await client.fetch_all()).results.keys() == {(1, 1), (2, 1)}
 
 
-@swiftly
+@in_simulated_time
 async def test_a_link_without_an_autopilot_can_be_fetched() -> None:
     async with a_client(generic(component=100, autopilot=wire.MAV_AUTOPILOT_INVALID)) as client:
         assert (await client.fetch_all()).results.keys() == {(1, 100)}
@@ -985,7 +985,7 @@ async def test_a_link_without_an_autopilot_can_be_fetched() -> None:
             await client.fetch_all(2)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_ground_station_is_not_asked_for_parameters() -> None:
     class Station(Silent):
         def __init__(self) -> None:
@@ -1000,7 +1000,7 @@ async def test_a_ground_station_is_not_asked_for_parameters() -> None:
     assert not [each for each in tap.messages(wire.ParamRequestList) if each.target_system == 254]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_lossy_link_to_one_vehicle_is_not_given_up_early() -> None:
     tap = Tap(generic())
     async with a_client(tap) as client:
@@ -1015,7 +1015,7 @@ async def test_a_lossy_link_to_one_vehicle_is_not_given_up_early() -> None:
 # Changes
 
 
-@swiftly
+@in_simulated_time
 async def test_changes_tell_what_was_and_what_is() -> None:
     vehicle = small_px4()
     async with a_client(vehicle) as client:
@@ -1039,7 +1039,7 @@ async def test_changes_tell_what_was_and_what_is() -> None:
         assert change.new.value == 41
 
 
-@swiftly
+@in_simulated_time
 async def test_a_change_that_is_taken_back_is_none() -> None:
     async with a_client(small_px4()) as client:
         component = await client.component()
@@ -1051,7 +1051,7 @@ async def test_a_change_that_is_taken_back_is_none() -> None:
         assert (await anext(changes)).name == "PARAM_02"
 
 
-@swiftly
+@in_simulated_time
 async def test_queued_changes_of_one_parameter_are_merged() -> None:
     vehicle = small_px4()
     async with a_client(vehicle) as client:
@@ -1067,7 +1067,7 @@ async def test_queued_changes_of_one_parameter_are_merged() -> None:
             await asyncio.wait_for(anext(changes), 1.0)
 
 
-@swiftly
+@in_simulated_time
 async def test_several_tasks_may_wait_for_the_changes_of_one_subscription() -> None:
     async with a_client(small_px4()) as client:
         component = await client.component()
@@ -1083,7 +1083,7 @@ async def test_several_tasks_may_wait_for_the_changes_of_one_subscription() -> N
     assert names == ["ClientClosed", "PARAM_01", "PARAM_02"]
 
 
-@swiftly
+@in_simulated_time
 async def test_changes_begin_when_they_are_requested() -> None:
     async with a_client(small_px4()) as client:
         component = await client.component()
@@ -1097,7 +1097,7 @@ async def test_changes_begin_when_they_are_requested() -> None:
             await component.set("PARAM_06", 78)
 
 
-@swiftly
+@in_simulated_time
 async def test_changes_end_with_the_client_and_what_waits_comes_first() -> None:
     async with a_client(small_px4()) as client:
         component = await client.component()
@@ -1112,7 +1112,7 @@ async def test_changes_end_with_the_client_and_what_waits_comes_first() -> None:
             pass
 
 
-@swiftly
+@in_simulated_time
 async def test_a_dropped_changes_object_is_no_listener_any_more() -> None:
     async with a_client(small_px4()) as client:
         component = await client.component()
@@ -1123,7 +1123,7 @@ async def test_a_dropped_changes_object_is_no_listener_any_more() -> None:
         assert not listeners(component)
 
 
-@swiftly
+@in_simulated_time
 async def test_changes_by_other_stations_are_told_from_the_vehicles_own() -> None:
     vehicle = small_px4()
     radio = Radio(vehicle)
@@ -1143,7 +1143,7 @@ async def test_changes_by_other_stations_are_told_from_the_vehicles_own() -> Non
 # Links that drop
 
 
-@swiftly
+@in_simulated_time
 async def test_calls_go_on_when_the_link_is_back(way: str) -> None:
     vehicle = generic(burst=1, period=0.1)
     link = FlakyLink(vehicle)
@@ -1170,7 +1170,7 @@ async def test_calls_go_on_when_the_link_is_back(way: str) -> None:
         assert not residue(component)
 
 
-@swiftly
+@in_simulated_time
 async def test_waiting_reads_are_sent_at_once_when_the_link_is_back() -> None:
     link = FlakyLink(Air.symmetric([generic()], delay=0.5))
     async with a_client(link) as client:
@@ -1186,7 +1186,7 @@ async def test_waiting_reads_are_sent_at_once_when_the_link_is_back() -> None:
 
 
 @direct_only("a service waits for its links, so client.component() goes on")
-@swiftly
+@in_simulated_time
 async def test_a_link_that_stays_away_fails_the_calls_and_not_the_client(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -1229,7 +1229,7 @@ async def test_a_link_that_stays_away_fails_the_calls_and_not_the_client(
 
 
 @direct_only("the errors are made anew from what the service says")
-@swiftly
+@in_simulated_time
 async def test_the_errors_of_a_long_absence_do_not_grow() -> None:
     link = FlakyLink(generic())
     async with a_client(link) as client:
@@ -1245,7 +1245,7 @@ async def test_the_errors_of_a_long_absence_do_not_grow() -> None:
 
 
 @direct_only("a service opens it again")
-@swiftly
+@in_simulated_time
 async def test_a_link_that_cannot_come_back_ends_every_call() -> None:
     tap = Tap(generic())
     link = FlakyLink(tap)
@@ -1390,7 +1390,7 @@ async def known_component(client: ParamClient) -> Component:
 
 
 @direct_only("it is about the reader of a link")
-@swiftly
+@in_simulated_time
 async def test_telemetry_alone_lets_the_reader_rest() -> None:
     vehicle = Chatter(generic(), 1 / 2000)
     async with a_client(vehicle) as client:
@@ -1402,7 +1402,7 @@ async def test_telemetry_alone_lets_the_reader_rest() -> None:
 
 
 @direct_only("it is about the reader of a link")
-@swiftly
+@in_simulated_time
 async def test_nothing_rests_while_an_answer_is_awaited() -> None:
     vehicle = Chatter(generic(), 1 / 2000)
     async with a_client(vehicle) as client:
@@ -1418,7 +1418,7 @@ async def test_nothing_rests_while_an_answer_is_awaited() -> None:
 
 
 @direct_only("it is about the reader of a link")
-@swiftly
+@in_simulated_time
 async def test_datagrams_that_arrive_during_a_pause_are_processed_in_order(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -1446,7 +1446,7 @@ async def test_datagrams_that_arrive_during_a_pause_are_processed_in_order(
 
 
 @direct_only("it is about the reader of a link")
-@swiftly
+@in_simulated_time
 async def test_a_change_waits_for_the_end_of_a_rest_at_the_most() -> None:
     vehicle = Chatter(generic(), 1 / 2000)
     async with a_client(vehicle) as client:
@@ -1463,7 +1463,7 @@ async def test_a_change_waits_for_the_end_of_a_rest_at_the_most() -> None:
 
 
 @direct_only("it is about the reader of a link")
-@swiftly
+@in_simulated_time
 async def test_a_busy_link_shortens_the_rests() -> None:
     vehicle = Chatter(generic(), 1 / 20_000)
     async with a_client(vehicle) as client:
@@ -1477,7 +1477,7 @@ async def test_a_busy_link_shortens_the_rests() -> None:
 
 @direct_only("it is about the reader of a link")
 @pytest.mark.parametrize("call", ["get", "set", "fetch_all", "client.fetch_all"])
-@swiftly
+@in_simulated_time
 async def test_a_call_ends_a_rest_at_once(call: str, monkeypatch: pytest.MonkeyPatch) -> None:
     async def seconds(rest: float) -> float:
         """How long the call takes where a rest, once begun, would last until our next heartbeat."""
@@ -1498,7 +1498,7 @@ async def test_a_call_ends_a_rest_at_once(call: str, monkeypatch: pytest.MonkeyP
 
 
 @direct_only("it is about the reader of a link")
-@swiftly
+@in_simulated_time
 async def test_closing_does_not_wait_for_the_end_of_a_rest(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(link_task, "READ_PAUSE", 60.0)
     monkeypatch.setattr(link_task, "PAUSE_DATAGRAMS_MAX", math.inf)
@@ -1514,7 +1514,7 @@ async def test_closing_does_not_wait_for_the_end_of_a_rest(monkeypatch: pytest.M
 
 
 @direct_only("the words name the link")
-@swiftly
+@in_simulated_time
 async def test_their_looks_tell_how_they_stand() -> None:
     client = a_client(Air([small_px4(burst=1, period=0.05), generic(system=2)]))
     assert repr(client) == "<ParamClient sim:custom closed, 0 components>"
@@ -1534,10 +1534,10 @@ async def test_their_looks_tell_how_they_stand() -> None:
     assert repr(client) == "<ParamClient sim:custom closed, 2 components>"
 
 
-@swiftly
+@in_simulated_time
 async def test_a_program_that_is_held_up_takes_what_has_come_before_it_counts_as_lost() -> None:
     """As by a call that blocks the event loop for half a second, in the middle of a list."""
-    loop = swift_loop()
+    loop = simulated_time_loop()
     px4 = PX4Vehicle()
     async with a_client(px4) as client:
         vehicle = await client.component()
@@ -1548,7 +1548,7 @@ async def test_a_program_that_is_held_up_takes_what_has_come_before_it_counts_as
     assert (result.lost, result.repeated, px4.requests["PARAM_REQUEST_READ"]) == (0, 0, hash_reads)
 
 
-@swiftly
+@in_simulated_time
 async def test_the_autopilots_are_the_vehicles_without_what_they_carry(way: str) -> None:
     camera = generic(system=1, component=100)
     vehicles = [generic(system=3), small_px4(), camera, generic(system=2, component=7)]
@@ -1560,7 +1560,7 @@ async def test_the_autopilots_are_the_vehicles_without_what_they_carry(way: str)
         assert len(client.components) == 4
 
 
-@swiftly
+@in_simulated_time
 @pytest.mark.parametrize("index", [-1, 32_768, 1.5])
 async def test_an_invalid_index_is_refused_and_later_reads_work(index: Any) -> None:
     async with a_client(generic()) as client:
@@ -1570,7 +1570,7 @@ async def test_an_invalid_index_is_refused_and_later_reads_work(index: Any) -> N
         assert (await component.get(0)).index == 0
 
 
-@swiftly
+@in_simulated_time
 async def test_invalid_options_of_accept_and_sample_are_refused() -> None:
     async with a_client(generic()) as client:
         component = await client.component()

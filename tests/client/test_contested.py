@@ -30,7 +30,7 @@ from paramclient.sim import ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehic
 from tests.client_kinds import ServedClient
 from tests.commands import Command, behind, in_process, leaping
 from tests.service_hub import C, met, problem, service
-from tests.shell import Late, PeersLink, outcome, swiftly, until
+from tests.shell import Late, PeersLink, in_simulated_time, outcome, until
 from tests.simulation import param_value
 
 TABLE: dict[str, Any] = {"SHARED_A": 1, "SHARED_B": 2, "PX4_ONLY": 3}
@@ -62,7 +62,7 @@ def lines(path: Path) -> list[Any]:
         return [line for each in cache.vehicles() for line in cache.history(vehicle=each.identity.key)]
 
 
-@swiftly
+@in_simulated_time
 async def test_no_mixed_table_and_no_false_line_reaches_the_cache(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -101,7 +101,7 @@ async def test_no_mixed_table_and_no_false_line_reaches_the_cache(
         assert said in text
 
 
-@swiftly
+@in_simulated_time
 async def test_values_received_in_a_contest_through_one_peer_are_not_cached(tmp_path: Path) -> None:
     """Both vehicles behind one radio, with values of both in the table before they are told apart."""
     path = tmp_path / "cache.sqlite3"
@@ -132,7 +132,7 @@ async def test_values_received_in_a_contest_through_one_peer_are_not_cached(tmp_
     assert len(lines(path)) == written
 
 
-@swiftly
+@in_simulated_time
 async def test_when_one_is_silent_the_other_is_identified_anew_and_written_again(tmp_path: Path) -> None:
     path = tmp_path / "cache.sqlite3"
     async with ParamClient(two(by=2.0, until=8.0), cache=path) as client:
@@ -151,7 +151,7 @@ async def test_when_one_is_silent_the_other_is_identified_anew_and_written_again
     assert table == {"SHARED_A": 9.0, "SHARED_B": 2.0, "PX4_ONLY": 3.0}
 
 
-@swiftly
+@in_simulated_time
 async def test_closing_in_a_contest_writes_nothing(tmp_path: Path) -> None:
     path = tmp_path / "cache.sqlite3"
     for table in (TABLE, {**TABLE, "SHARED_A": 50}):
@@ -161,7 +161,7 @@ async def test_closing_in_a_contest_writes_nothing(tmp_path: Path) -> None:
     assert lines(path) == []
 
 
-@swiftly
+@in_simulated_time
 async def test_the_service_tells_it_and_answers_409() -> None:
     async with service(two()) as (_, browser):
         await met(browser)
@@ -190,7 +190,7 @@ def test_the_command_says_so_on_stderr(
         assert peer in done.err
 
 
-@swiftly
+@in_simulated_time
 async def test_a_fetch_of_all_vehicles_goes_on_without_the_contested_one() -> None:
     link = two()
     link.endpoints["10.0.0.3", 14550] = px4(system=3)
@@ -230,7 +230,7 @@ class Telling(Late):
         return super().data_to_send() + out
 
 
-@swiftly
+@in_simulated_time
 @pytest.mark.parametrize("stays", [4.0, 40.0])
 async def test_one_without_a_hardware_id_in_place_of_a_vehicle_leaves_nothing_with_it(
     tmp_path: Path, stays: float
@@ -267,7 +267,7 @@ async def test_one_without_a_hardware_id_in_place_of_a_vehicle_leaves_nothing_wi
 # Kept apart
 
 
-@swiftly
+@in_simulated_time
 async def test_split_peers_have_components_of_their_own(tmp_path: Path) -> None:
     path = tmp_path / "cache.sqlite3"
     first, second = px4(), ardupilot()
@@ -300,7 +300,7 @@ async def test_split_peers_have_components_of_their_own(tmp_path: Path) -> None:
     assert {frozenset(table) for table in cached(path).values()} == {frozenset(TABLE), frozenset(OTHER)}
 
 
-@swiftly
+@in_simulated_time
 async def test_split_vehicles_without_a_hardware_id_are_cached_by_their_peer(tmp_path: Path) -> None:
     path = tmp_path / "cache.sqlite3"
     tables: list[dict[str, Any]] = [{"A": 1.0, "B": 2.0}, {"A": 5.0, "B": 6.0}]
@@ -314,7 +314,7 @@ async def test_split_vehicles_without_a_hardware_id_are_cached_by_their_peer(tmp
     assert lines(path) == []
 
 
-@swiftly
+@in_simulated_time
 async def test_of_split_vehicles_that_say_to_be_one_the_first_is_cached(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -337,7 +337,7 @@ async def test_of_split_vehicles_that_say_to_be_one_the_first_is_cached(
         assert table["SHARED_A"] == 50.0
 
 
-@swiftly
+@in_simulated_time
 async def test_a_split_vehicle_is_followed_to_its_new_system_id() -> None:
     plane = ArduPilotVehicle(kind="plane", ftp=False)
     link = PeersLink({("10.0.0.1", 1): plane, ("10.0.0.2", 1): ArduPilotVehicle(system=7, ftp=False)})
@@ -395,7 +395,7 @@ def test_two_autopilots_on_one_udp_port(tmp_path: Path) -> None:
     assert lines(path) == []
 
 
-@swiftly
+@in_simulated_time
 async def test_a_client_of_the_service_is_told_as_well() -> None:
     async with ServedClient(two(by=2.0, until=8.0), cache=False) as client:
         events = client.events()

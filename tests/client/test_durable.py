@@ -19,7 +19,7 @@ from paramclient.provision import apply
 from tests.caches import CACHE_ALONE, start, whole_table
 from tests.commands import behind, in_process, leaping
 from tests.service_hub import C, met, problem, service
-from tests.shell import small_px4, swiftly
+from tests.shell import in_simulated_time, small_px4
 
 NAME = "PARAM_01"
 
@@ -79,7 +79,7 @@ def test_sync_writes_everything_and_later_writes_are_not_synced(tmp_path: Path) 
     assert levels == [(1,), (1,), (2,)]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_durable_set_is_on_the_disk_with_its_line_when_it_returns(tmp_path: Path) -> None:
     path = tmp_path / "cache"
     async with ParamClient(small_px4(), cache=path) as client:
@@ -92,7 +92,7 @@ async def test_a_durable_set_is_on_the_disk_with_its_line_when_it_returns(tmp_pa
                 assert cache.component().params[NAME].value == value
 
 
-@swiftly
+@in_simulated_time
 async def test_durable_sets_at_the_same_time_share_the_work(tmp_path: Path) -> None:
     with ParamCache(tmp_path / "cache") as cache:
         async with ParamClient(small_px4(), cache=cache) as client:
@@ -107,7 +107,7 @@ async def test_durable_sets_at_the_same_time_share_the_work(tmp_path: Path) -> N
             assert {values[f"PARAM_{number}"].value for number in range(10, 20)} == {7}
 
 
-@swiftly
+@in_simulated_time
 async def test_without_a_disk_nothing_is_sent_or_it_is_said_what_the_vehicle_has(tmp_path: Path) -> None:
     vehicle = small_px4()
     async with ParamClient(vehicle, cache=False) as client:
@@ -137,7 +137,7 @@ async def test_without_a_disk_nothing_is_sent_or_it_is_said_what_the_vehicle_has
             assert vehicle.values[NAME] == 11.0
 
 
-@swiftly
+@in_simulated_time
 async def test_a_durable_apply_ends_on_the_disk(tmp_path: Path) -> None:
     with ParamCache(tmp_path / "cache") as cache:
         async with ParamClient(vehicle := small_px4(), cache=cache) as client:
@@ -153,7 +153,7 @@ async def test_a_durable_apply_ends_on_the_disk(tmp_path: Path) -> None:
             assert vehicle.values[NAME] == 6.0
 
 
-@swiftly
+@in_simulated_time
 async def test_the_service_answers_when_it_is_on_the_disk(tmp_path: Path) -> None:
     with ParamCache(tmp_path / "cache") as cache:
         async with service(small_px4(), cache=cache) as (_, browser):

@@ -15,7 +15,7 @@ from paramclient.client.local import local
 from paramclient.errors import CacheError
 from paramclient.logs.telemetry import import_log
 from paramclient.sim import Air, Camera, PX4Vehicle
-from tests.shell import swiftly
+from tests.shell import in_simulated_time
 
 TABLE: dict[str, int | float | str | bytes] = {"CAM_MODE": 1, "CAM_NAME": "Front", "CAM_ISO": 100}
 
@@ -32,7 +32,7 @@ def history(path: Path) -> list[tuple[str, object, object, str]]:
         return [(each.name, each.old.value, each.new and each.new.value, each.by) for each in found]
 
 
-@swiftly
+@in_simulated_time
 async def test_the_next_session_knows_the_table(tmp_path: Path) -> None:
     path = tmp_path / "cache"
     camera = Camera(TABLE)
@@ -65,7 +65,7 @@ async def test_the_next_session_knows_the_table(tmp_path: Path) -> None:
     assert kept(path).complete
 
 
-@swiftly
+@in_simulated_time
 async def test_a_removed_parameter_leaves_the_cache(tmp_path: Path) -> None:
     path = tmp_path / "cache"
     camera = Camera(TABLE)
@@ -79,7 +79,7 @@ async def test_a_removed_parameter_leaves_the_cache(tmp_path: Path) -> None:
     assert history(path) == [("CAM_NAME", "Front", None, "vehicle")]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_part_of_a_table_does_not_make_it_partial(tmp_path: Path) -> None:
     path = tmp_path / "cache"
     camera = Camera(TABLE)
@@ -90,7 +90,7 @@ async def test_a_part_of_a_table_does_not_make_it_partial(tmp_path: Path) -> Non
     assert (len(kept(path).params), kept(path).complete) == (3, True)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_policy_without_downloads_gives_the_cached_table(tmp_path: Path) -> None:
     camera = Camera(TABLE)
     async with ParamClient(camera, cache=tmp_path / "cache") as client:
@@ -100,7 +100,7 @@ async def test_a_policy_without_downloads_gives_the_cached_table(tmp_path: Path)
         assert (result.source, len(result.params)) == ("cache", 3)
 
 
-@swiftly
+@in_simulated_time
 async def test_plain_and_extended_tables_of_one_system_are_kept_apart(tmp_path: Path) -> None:
     camera = Camera(TABLE, plain={"CAM_MODE": 0.5})
     air = Air.symmetric([PX4Vehicle(table={"A": 1, "B": 2.0}), camera])
@@ -117,7 +117,7 @@ async def test_plain_and_extended_tables_of_one_system_are_kept_apart(tmp_path: 
         assert vehicle.components == (1, 100)
 
 
-@swiftly
+@in_simulated_time
 async def test_values_that_could_not_be_written_are_written_later(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -141,7 +141,7 @@ async def test_values_that_could_not_be_written_are_written_later(
     ]
 
 
-@swiftly
+@in_simulated_time
 async def test_values_that_were_never_written_are_logged_at_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -154,7 +154,7 @@ async def test_values_that_were_never_written_are_logged_at_the_end(
     assert "3 values and 0 earlier values" in caplog.records[-1].message
 
 
-@swiftly
+@in_simulated_time
 async def test_another_vehicle_gets_a_table_of_its_own(tmp_path: Path) -> None:
     path = tmp_path / "cache"
     async with ParamClient(Camera(TABLE), cache=path) as client:

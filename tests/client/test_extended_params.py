@@ -32,14 +32,14 @@ from paramclient import (
 from paramclient.sim import Air, Camera, PX4Vehicle
 from tests import shell
 from tests.client_kinds import direct_only, pytest_generate_tests, way
-from tests.shell import a_client, settled, swiftly
+from tests.shell import a_client, in_simulated_time, settled
 
 __all__ = ["pytest_generate_tests", "way"]
 
 MANY = {f"PARAM_{number:03}": number for number in range(120)}
 
 
-@swiftly
+@in_simulated_time
 async def test_the_calls_of_a_camera() -> None:
     camera = Camera()
     async with a_client(camera) as client:
@@ -61,7 +61,7 @@ async def test_the_calls_of_a_camera() -> None:
             ext.params["A"] = done.param  # type: ignore[index]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_with_a_camera_on_one_link_that_loses_packets() -> None:
     camera = Camera(MANY, slow={"PARAM_001": 2.0})
     air = Air.symmetric([PX4Vehicle(table={"A": 1, "B": 2.0}), camera], loss=0.1, delay=0.03, seed=3)
@@ -78,7 +78,7 @@ async def test_a_vehicle_with_a_camera_on_one_link_that_loses_packets() -> None:
         assert not shell.machine_of(component).is_busy
 
 
-@swiftly
+@in_simulated_time
 async def test_outcomes_of_many_values() -> None:
     camera = Camera(
         {"A": 1, "B": 2, "C": 3, "D": "text"},
@@ -120,7 +120,7 @@ async def test_outcomes_of_many_values() -> None:
             result["E"]
 
 
-@swiftly
+@in_simulated_time
 async def test_timeouts() -> None:
     camera = Camera(MANY, slow={"PARAM_001": 100.0})
     async with a_client(camera) as client:
@@ -145,7 +145,7 @@ async def test_timeouts() -> None:
         assert not shell.machine_of(component).is_busy
 
 
-@swiftly
+@in_simulated_time
 async def test_progress() -> None:
     seen: list[Progress] = []
     async with a_client(Camera(MANY, burst=1, period=0.02)) as client:
@@ -156,7 +156,7 @@ async def test_progress() -> None:
     assert seen[-1].total == 120
 
 
-@swiftly
+@in_simulated_time
 async def test_changes() -> None:
     camera = Camera({"A": 1, "B": "text"})
     async with a_client(camera) as client:
@@ -183,7 +183,7 @@ async def test_changes() -> None:
 
 
 @direct_only("a service names the authors")
-@swiftly
+@in_simulated_time
 async def test_a_change_on_behalf_of_another() -> None:
     async with a_client(Camera({"A": 1})) as client:
         ext = (await client.component(1, 100)).ext
@@ -192,7 +192,7 @@ async def test_a_change_on_behalf_of_another() -> None:
         assert (await anext(changes)).by == "us for anna"
 
 
-@swiftly
+@in_simulated_time
 async def test_a_parameter_that_the_component_has_anew_is_added() -> None:
     camera = Camera({"A": 1, "B": 2})
     async with a_client(camera) as client:
@@ -208,7 +208,7 @@ async def test_a_parameter_that_the_component_has_anew_is_added() -> None:
         assert (second.name, second.new and second.new.index, second.is_added) == ("C", 1, True)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_cancelled_call_leaves_nothing_behind() -> None:
     async with a_client(Camera(MANY, slow={"PARAM_001": 100.0})) as client:
         component = await client.component(1, 100)
@@ -227,7 +227,7 @@ async def test_a_cancelled_call_leaves_nothing_behind() -> None:
             assert len(shell.machine_of(component).ext.batches) == 0
 
 
-@swiftly
+@in_simulated_time
 async def test_arguments_that_are_rejected() -> None:
     async with a_client(Camera()) as client:
         ext = (await client.component(1, 100)).ext
@@ -243,7 +243,7 @@ async def test_arguments_that_are_rejected() -> None:
             await ext.set("CAM_MODE", 1, author="")
 
 
-@swiftly
+@in_simulated_time
 async def test_policies_that_allow_no_download() -> None:
     async with a_client(Camera(), policy=Policy.CACHE_ONLY) as client:
         ext = (await client.component(1, 100)).ext
@@ -254,7 +254,7 @@ async def test_policies_that_allow_no_download() -> None:
         assert (list(result.params), result.source) == (["CAM_MODE"], "cache")
 
 
-@swiftly
+@in_simulated_time
 async def test_a_client_that_only_listens() -> None:
     async with a_client(Camera(), listen_only=True) as client:
         ext = (await client.component(1, 100)).ext
@@ -264,7 +264,7 @@ async def test_a_client_that_only_listens() -> None:
             await ext.set("CAM_MODE", 1)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_closed_client() -> None:
     async with a_client(Camera()) as client:
         ext = (await client.component(1, 100)).ext
@@ -283,7 +283,7 @@ async def test_the_link_of_a_camera_with_loss() -> None:
         assert (await component.ext.set("CAM_NAME", "Rear")).actual == "Rear"
 
 
-@swiftly
+@in_simulated_time
 async def test_a_durable_set_is_on_the_disk_with_its_line_when_it_returns(tmp_path: Path) -> None:
     path = tmp_path / "cache"
     async with a_client(Camera({"A": 1, "B": "text"}), cache=path) as client:
@@ -302,7 +302,7 @@ async def test_a_durable_set_is_on_the_disk_with_its_line_when_it_returns(tmp_pa
             }
 
 
-@swiftly
+@in_simulated_time
 async def test_without_a_disk_nothing_is_sent_or_it_is_said_what_the_component_has(tmp_path: Path) -> None:
     camera = Camera({"A": 1, "B": 2, "C": 3}, supported={"C": [3]})
     async with a_client(camera) as client:

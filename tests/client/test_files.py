@@ -19,7 +19,7 @@ from paramclient.model.px4_hash import crc32_px4
 from paramclient.model.values import ParamType
 from paramclient.protocol.ftp import DirectoryEntry
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, SimParam
-from tests.shell import FlakyLink, Tap, a_client, outcome, swiftly, tasks_beside
+from tests.shell import FlakyLink, Tap, a_client, in_simulated_time, outcome, tasks_beside
 
 LOG = bytes(range(256)) * 200
 """A file of 51,200 bytes, which takes a second."""
@@ -37,7 +37,7 @@ async def files_of(client: ParamClient) -> Ftp:
 
 
 @pytest.mark.parametrize("make", [ArduPilotVehicle, PX4Vehicle])
-@swiftly
+@in_simulated_time
 async def test_files_are_read_written_listed_and_checked(make: Any) -> None:
     vehicle = make()
     vehicle.files.update(FILES)
@@ -61,7 +61,7 @@ async def test_files_are_read_written_listed_and_checked(make: Any) -> None:
         assert not vehicle.open_files
 
 
-@swiftly
+@in_simulated_time
 async def test_the_progress_of_a_read_is_told() -> None:
     told: list[tuple[int, int | None]] = []
     async with a_client(with_files()) as client:
@@ -74,7 +74,7 @@ async def test_the_progress_of_a_read_is_told() -> None:
     assert {state[1] for state in told} <= {None, len(LOG)}
 
 
-@swiftly
+@in_simulated_time
 async def test_a_file_that_is_too_long_is_not_taken() -> None:
     vehicle = with_files()
     async with a_client(vehicle) as client:
@@ -86,7 +86,7 @@ async def test_a_file_that_is_too_long_is_not_taken() -> None:
         assert await files.read("/APM/a.txt", limit=5) == b"hello"
 
 
-@swiftly
+@in_simulated_time
 async def test_a_refusal_comes_in_words() -> None:
     async with a_client(with_files()) as client:
         files = await files_of(client)
@@ -105,7 +105,7 @@ async def test_a_refusal_comes_in_words() -> None:
             await files.write("/" * 240, b"")
 
 
-@swiftly
+@in_simulated_time
 async def test_a_time_limit_ends_a_read_and_closes_the_file() -> None:
     vehicle = with_files()
     async with a_client(vehicle) as client:
@@ -118,7 +118,7 @@ async def test_a_time_limit_ends_a_read_and_closes_the_file() -> None:
         assert not vehicle.open_files
 
 
-@swiftly
+@in_simulated_time
 async def test_cancellation_closes_the_file() -> None:
     vehicle = with_files()
     async with a_client(vehicle) as client:
@@ -135,7 +135,7 @@ async def test_cancellation_closes_the_file() -> None:
 
 
 @pytest.mark.parametrize("how", ["timeout", "error", "cancelled", "scope"])
-@swiftly
+@in_simulated_time
 async def test_a_client_leaves_no_file_open_at_whatever_moment_it_ends(how: str) -> None:
     requests = 0
     for step in range(1, 40):
@@ -183,7 +183,7 @@ async def test_a_client_leaves_no_file_open_at_whatever_moment_it_ends(how: str)
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-@swiftly
+@in_simulated_time
 async def test_a_scope_around_a_client_ends_it_whatever_the_link_does(fault: str, longest: float) -> None:
     vehicle = with_files()
     tap = Tap(Air.symmetric([vehicle], delay=0.05))
@@ -220,7 +220,7 @@ async def test_a_scope_around_a_client_ends_it_whatever_the_link_does(fault: str
     assert not tasks_beside()
 
 
-@swiftly
+@in_simulated_time
 async def test_tasks_that_are_cancelled_each_for_itself_leave_no_file_open() -> None:
     """As `asyncio.run` does with all that remain when its main task has ended."""
     vehicle = with_files()
@@ -242,7 +242,7 @@ async def test_tasks_that_are_cancelled_each_for_itself_leave_no_file_open() -> 
     assert not tasks_beside()
 
 
-@swiftly
+@in_simulated_time
 async def test_the_file_is_closed_when_its_content_is_given() -> None:
     vehicle = with_files()
     async with a_client(Air.symmetric([vehicle], delay=0.02)) as client:
@@ -256,7 +256,7 @@ async def test_the_file_is_closed_when_its_content_is_given() -> None:
         assert not vehicle.open_files
 
 
-@swiftly
+@in_simulated_time
 async def test_reads_are_done_in_order() -> None:
     ended: list[str] = []
     async with a_client(with_files()) as client:
@@ -277,7 +277,7 @@ async def test_reads_are_done_in_order() -> None:
         assert last.source == "ftp"
 
 
-@swiftly
+@in_simulated_time
 async def test_nothing_is_asked_of_a_component_that_is_lost() -> None:
     tap = Tap(with_files())
     async with a_client(tap) as client:
@@ -307,7 +307,7 @@ async def test_nothing_is_asked_of_a_component_that_is_lost() -> None:
         assert local(component).machine.files.is_idle
 
 
-@swiftly
+@in_simulated_time
 async def test_a_read_goes_on_when_the_link_is_back() -> None:
     link = FlakyLink(with_files())
     async with a_client(link) as client:
@@ -318,7 +318,7 @@ async def test_a_read_goes_on_when_the_link_is_back() -> None:
         assert await reading == LOG
 
 
-@swiftly
+@in_simulated_time
 async def test_a_link_that_stays_away_ends_it() -> None:
     link = FlakyLink(with_files())
     async with a_client(link) as client:
@@ -331,7 +331,7 @@ async def test_a_link_that_stays_away_ends_it() -> None:
             await files.read("/APM/a.txt")
 
 
-@swiftly
+@in_simulated_time
 async def test_the_client_s_end_ends_it() -> None:
     async with a_client(with_files()) as client:
         files = await files_of(client)
@@ -343,7 +343,7 @@ async def test_the_client_s_end_ends_it() -> None:
     assert not tasks_beside()
 
 
-@swiftly
+@in_simulated_time
 async def test_a_bad_link_only_takes_longer() -> None:
     vehicle = with_files()
     async with a_client(Air.symmetric([vehicle], loss=0.2, delay=0.02, seed=4)) as client:
@@ -353,7 +353,7 @@ async def test_a_bad_link_only_takes_longer() -> None:
         assert vehicle.files["/APM/new"] == LOG[:3000]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_neighbour_of_a_large_integer_can_be_set() -> None:
     big = (1 << 24) + 1
     vehicle = ArduPilotVehicle(table=[SimParam("BIG", ParamType.INT32, big)], live_period=0)

@@ -21,7 +21,7 @@ from paramclient.links import Peer, create_link
 from paramclient.links.tlog import read_records
 from paramclient.model.values import Encoding, encode_value
 from paramclient.protocol import wire
-from tests.shell import FlakyLink, Tap, a_client, bits, generic, small_px4, swiftly, tasks_beside
+from tests.shell import FlakyLink, Tap, a_client, bits, generic, in_simulated_time, small_px4, tasks_beside
 
 
 class Program:
@@ -99,7 +99,7 @@ def a_set(name: str, value: int) -> wire.ParamSetMessage:
     )
 
 
-@swiftly
+@in_simulated_time
 async def test_every_frame_of_the_vehicle_is_passed_on_and_none_of_ours() -> None:
     vehicle, program = Recorded(small_px4()), Program()
     async with a_client(vehicle, forward=program) as client:
@@ -110,7 +110,7 @@ async def test_every_frame_of_the_vehicle_is_passed_on_and_none_of_ours() -> Non
     assert not any(isinstance(each, wire.ParamRequestList) for each in program.messages())
 
 
-@swiftly
+@in_simulated_time
 async def test_requests_of_the_program_reach_the_vehicle_and_responses_the_program() -> None:
     vehicle, program = Tap(generic()), Program()
     async with a_client(vehicle, forward=program) as client:
@@ -130,7 +130,7 @@ async def test_requests_of_the_program_reach_the_vehicle_and_responses_the_progr
         assert data not in program.heard
 
 
-@swiftly
+@in_simulated_time
 async def test_a_key_is_never_passed_on() -> None:
     """Neither way: the guide to message signing asks that it stays on the link on which it was sent."""
     vehicle, program = Tap(generic()), Program()
@@ -144,7 +144,7 @@ async def test_a_key_is_never_passed_on() -> None:
     assert ids == [20]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_write_of_the_program_is_a_change_by_its_station() -> None:
     """Also where it has the ids that a client has."""
     program = Program()
@@ -161,7 +161,7 @@ async def test_a_write_of_the_program_is_a_change_by_its_station() -> None:
         assert (await anext(changes)).by == "us"
 
 
-@swiftly
+@in_simulated_time
 async def test_a_program_that_reads_nothing_holds_nothing_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(forwarding, "QUEUED_FRAMES_MAX", 10)
     vehicle, program = small_px4(), Program()
@@ -186,7 +186,7 @@ async def test_a_program_that_reads_nothing_holds_nothing_up(monkeypatch: pytest
     assert len(program.heard) >= 11
 
 
-@swiftly
+@in_simulated_time
 async def test_a_program_that_floods_takes_turns_with_us(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(link_task, "FORWARDED_QUEUE_MAX", 100)
     vehicle, program = Tap(generic()), Program()
@@ -205,7 +205,7 @@ async def test_a_program_that_floods_takes_turns_with_us(monkeypatch: pytest.Mon
         assert kinds.index(255) < 60
 
 
-@swiftly
+@in_simulated_time
 async def test_frames_of_the_program_are_not_sent_with_listen_only() -> None:
     vehicle, program = Tap(generic()), Program()
     async with a_client(vehicle, forward=program, listen_only=True) as client:
@@ -226,7 +226,7 @@ class Stream(FlakyLink):
         return [(peer, data[at : at + 7]) for peer, data in chunks for at in range(0, len(data), 7)]
 
 
-@swiftly
+@in_simulated_time
 async def test_frames_of_a_stream_are_passed_on_whole_also_after_it_dropped() -> None:
     vehicle, program = Recorded(generic()), Program()
     link = Stream(vehicle)
@@ -244,7 +244,7 @@ async def test_frames_of_a_stream_are_passed_on_whole_also_after_it_dropped() ->
         assert component.params["PARAM_01"].value == 3
 
 
-@swiftly
+@in_simulated_time
 async def test_forwarded_frames_are_in_the_telemetry_log(tmp_path: Path) -> None:
     path = tmp_path / "flight.tlog"
     program = Program()
@@ -257,7 +257,7 @@ async def test_forwarded_frames_are_in_the_telemetry_log(tmp_path: Path) -> None
     assert wire.encode(message, system=77, component=190, sequence=0) in frames
 
 
-@swiftly
+@in_simulated_time
 async def test_a_link_to_the_program_that_fails_for_good(caplog: pytest.LogCaptureFixture) -> None:
     program = Program()
     async with a_client(generic(), forward=program) as client:

@@ -58,7 +58,7 @@ from paramclient.protocol.wire import (
 from paramclient.protocol.wire.codec import TEXTS_MAX
 from paramclient.sim import Air
 from tests.hostile_vehicle import ESCAPE, LIES, HostileVehicle
-from tests.shell import bits, generic, small_px4, swiftly
+from tests.shell import bits, generic, in_simulated_time, small_px4
 from tests.simulation import PEER, Simulation, known, listing_ardupilot, param_value
 
 ROOT = Path(__file__).parents[2]
@@ -410,7 +410,7 @@ def test_memory_is_bounded_under_all_kinds_of_lies_at_once() -> None:
 
 
 @pytest.mark.parametrize(("lies", "kept"), [((), 3), (("restless identity",), 0)], ids=["slowly", "at once"])
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_that_changes_its_identity_each_time_fills_no_cache(
     lies: tuple[str, ...],
     kept: int,
@@ -441,7 +441,7 @@ async def test_a_vehicle_that_changes_its_identity_each_time_fills_no_cache(
     ]
 
 
-@swiftly
+@in_simulated_time
 async def test_cached_tables_of_a_session_are_bounded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -454,7 +454,7 @@ async def test_cached_tables_of_a_session_are_bounded(
         assert len(cache.components()) == 2
 
 
-@swiftly
+@in_simulated_time
 async def test_a_component_that_is_forgotten_ends_what_listens_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(station_room, "COMPONENTS_MAX", 2)
     liar = HostileVehicle("obedient")

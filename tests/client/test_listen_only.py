@@ -28,7 +28,7 @@ from paramclient.protocol.params.passive import LIST_PAUSE_MAX, PASSIVE_TIMEOUT
 from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.station import Station
 from paramclient.sim import Endpoint
-from tests.shell import Radio, bits, generic, residue, small_px4, swiftly
+from tests.shell import Radio, bits, generic, in_simulated_time, residue, small_px4
 from tests.simulation import is_so, param_value
 
 LIST = wire.ParamRequestList(1, 1)
@@ -62,7 +62,7 @@ def listener(link: Endpoint, **options: object) -> ParamClient:
     return ParamClient(link, **{"cache": False, "listen_only": True} | options)  # type: ignore[arg-type]  # any
 
 
-@swiftly
+@in_simulated_time
 async def test_not_a_byte_is_sent() -> None:
     channel = Channel(small_px4())
     async with listener(channel) as client:
@@ -83,7 +83,7 @@ async def test_not_a_byte_is_sent() -> None:
     assert channel.heard == []
 
 
-@swiftly
+@in_simulated_time
 async def test_the_list_that_another_station_asks_for_fills_the_table() -> None:
     vehicle = small_px4()
     channel = Channel(vehicle)
@@ -106,7 +106,7 @@ async def test_the_list_that_another_station_asks_for_fills_the_table() -> None:
     assert channel.heard == []
 
 
-@swiftly
+@in_simulated_time
 async def test_a_write_of_another_station_is_a_change_with_its_author() -> None:
     channel = Channel(generic())
     async with listener(channel) as client:
@@ -123,7 +123,7 @@ async def test_a_write_of_another_station_is_a_change_with_its_author() -> None:
         assert component.sync_state is SyncState.SYNCED
 
 
-@swiftly
+@in_simulated_time
 async def test_calls_that_send_are_refused_at_once() -> None:
     channel = Channel(small_px4())
     async with listener(channel) as client:
@@ -154,7 +154,7 @@ def test_policy_and_watch_interval_are_refused_with_listen_only() -> None:
 
 
 @pytest.mark.parametrize("timeout", [None, 3.0])
-@swiftly
+@in_simulated_time
 async def test_fetch_all_without_any_request_of_others_ends_with_no_reply(timeout: float | None) -> None:
     async with listener(Channel(generic())) as client:
         component = await client.component()
@@ -168,7 +168,7 @@ async def test_fetch_all_without_any_request_of_others_ends_with_no_reply(timeou
         assert residue(component) == []
 
 
-@swiftly
+@in_simulated_time
 async def test_a_list_with_gaps_ends_when_it_pauses_and_goes_on_with_what_others_read() -> None:
     vehicle = small_px4()
     channel = Channel(vehicle)
@@ -195,7 +195,7 @@ async def test_a_list_with_gaps_ends_when_it_pauses_and_goes_on_with_what_others
         assert (result.missing, result.hash) == ((), vehicle.announced_hash())
 
 
-@swiftly
+@in_simulated_time
 async def test_time_that_is_over_gives_what_has_come() -> None:
     channel = Channel(small_px4())
     channel.loses = lambda each: isinstance(each, wire.ParamValue) and each.param_index == 24
@@ -207,7 +207,7 @@ async def test_time_that_is_over_gives_what_has_come() -> None:
         assert "ended at its timeout" in result.notes[0]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_cached_table_is_confirmed_by_a_hash_that_others_ask_for(tmp_path: Path) -> None:
     vehicle = small_px4()
     path = tmp_path / "cache"

@@ -18,7 +18,7 @@ from paramclient.protocol import wire
 from paramclient.protocol.station import Station
 from paramclient.protocol.stats.trace import LazyMessageText
 from paramclient.sim import Air
-from tests.shell import FlakyLink, Tap, a_client, generic, small_px4, swiftly
+from tests.shell import FlakyLink, Tap, a_client, generic, in_simulated_time, small_px4
 
 WATCHED = "paramclient"
 
@@ -27,7 +27,7 @@ def told(caplog: pytest.LogCaptureFixture, room: str = "protocol") -> list[str]:
     return [each.getMessage() for each in caplog.records if each.name == f"{WATCHED}.{room}"]
 
 
-@swiftly
+@in_simulated_time
 async def test_each_step_is_told_in_one_line(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
     vehicle, path = small_px4(), tmp_path / "cache"
     with caplog.at_level(logging.DEBUG, WATCHED):
@@ -61,7 +61,7 @@ async def test_each_step_is_told_in_one_line(caplog: pytest.LogCaptureFixture, t
     assert any("<CachedComponent 1/1 px4 25 params" in each for each in told(caplog, "client.cache_writer"))
 
 
-@swiftly
+@in_simulated_time
 async def test_unanswered_requests_are_logged(caplog: pytest.LogCaptureFixture) -> None:
     vehicle = Tap(generic())
     with caplog.at_level(logging.DEBUG, WATCHED):
@@ -77,7 +77,7 @@ async def test_unanswered_requests_are_logged(caplog: pytest.LogCaptureFixture) 
     assert stats.retries > 0
 
 
-@swiftly
+@in_simulated_time
 async def test_a_link_that_drops_and_returns_is_told(caplog: pytest.LogCaptureFixture) -> None:
     link = FlakyLink(generic())
     with caplog.at_level(logging.DEBUG, WATCHED):
@@ -151,7 +151,7 @@ def test_control_characters_are_not_printed(capsys: pytest.CaptureFixture[str]) 
 # numbers
 
 
-@swiftly
+@in_simulated_time
 async def test_numbers_tell_what_was_done(tmp_path: Path) -> None:
     vehicle, path = small_px4(), tmp_path / "cache"
     async with a_client(vehicle, cache=path) as client:
@@ -178,7 +178,7 @@ async def test_numbers_tell_what_was_done(tmp_path: Path) -> None:
     assert (client.stats.downloads, client.stats.cache_hits) == (0, 1)
 
 
-@swiftly
+@in_simulated_time
 async def test_losses_are_counted_where_that_was_asked_for() -> None:
     air = Air.symmetric([generic()], seed=1, loss=0.2)
     async with a_client(air, traffic=True) as client:

@@ -27,7 +27,7 @@ from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.params.table import Table
 from paramclient.protocol.station import Station
 from paramclient.protocol.wire import NO_INDEX, AutopilotVersion, Heartbeat, Message, ParamValue
-from tests.shell import TIMEOUT, a_client, small_px4, swift_loop, swiftly, until
+from tests.shell import TIMEOUT, a_client, in_simulated_time, simulated_time_loop, small_px4, until
 from tests.simulation import param_value
 
 NOW = 1_795_000_000.0
@@ -497,7 +497,7 @@ async def carried(link: Scripted) -> AsyncIterator[dict[bytes, float]]:
         tasks.cancel_scope.cancel()
 
 
-@swiftly
+@in_simulated_time
 async def test_the_arrival_time_of_the_system_is_used() -> None:
     async with carried(link := Telling()) as came:
         link.arrive(b"0")
@@ -513,7 +513,7 @@ async def test_the_arrival_time_of_the_system_is_used() -> None:
         assert came[b"3"] == pytest.approx(now, abs=0.001), "the clock was set: it came after the last read"
 
 
-@swiftly
+@in_simulated_time
 async def test_bytes_read_at_once_have_the_present_time() -> None:
     async with carried(link := Scripted()) as came:
         await anyio.sleep(5.0)
@@ -523,14 +523,14 @@ async def test_bytes_read_at_once_have_the_present_time() -> None:
         assert came[b"1"] == pytest.approx(now, abs=0.001)
 
 
-@swiftly
+@in_simulated_time
 async def test_bytes_read_late_have_the_time_of_the_last_read() -> None:
     async with carried(link := Scripted()) as came:
         link.arrive(b"1")
         now = anyio.current_time()
         await anyio.sleep(0.01)
         link.arrive(*[b"2"] * 128)
-        swift_loop().now += 0.5  # nothing is done here meanwhile
+        simulated_time_loop().now += 0.5  # nothing is done here meanwhile
         link.arrive(b"3")
         await anyio.sleep(0.01)
         assert [came[b"2"], came[b"3"]] == pytest.approx([now] * 2, abs=0.001), "the buffer was full"
@@ -545,7 +545,7 @@ async def test_bytes_read_late_have_the_time_of_the_last_read() -> None:
         assert came[b"5"] == pytest.approx(late + 0.2, abs=0.001)
 
 
-@swiftly
+@in_simulated_time
 async def test_datagrams_from_before_a_suspend_are_as_old_as_the_suspend(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -562,7 +562,7 @@ async def test_datagrams_from_before_a_suspend_are_as_old_as_the_suspend(
         assert came[b"1"] == pytest.approx(now - 3600.04, abs=0.001)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_station_that_slept_writes_when_things_were_observed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -577,10 +577,10 @@ async def test_a_station_that_slept_writes_when_things_were_observed(
             await anyio.sleep(2.0)
             vehicle.set_param("PARAM_01", 5)  # and it tells so
             await until(lambda: component.params["PARAM_01"].value == 5)
-            observed_at = swift_loop().now + swift_loop().ahead
+            observed_at = simulated_time_loop().now + simulated_time_loop().ahead
             assert not other.history(other.component(system=1).key), "it is not written yet"
             asleep = 3600.0
-            swift_loop().ahead += 3600.0
+            simulated_time_loop().ahead += 3600.0
             await anyio.sleep(2.0)
         [line] = other.history(other.component(system=1).key, name="PARAM_01")
     assert line.new is not None

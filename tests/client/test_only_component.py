@@ -15,7 +15,17 @@ from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from tests.asgi import ASGITransport
 from tests.client_kinds import direct_only, pytest_generate_tests, way
 from tests.service_hub import met, problem, service
-from tests.shell import FlakyLink, Late, Tap, a_client, outcome, small_px4, swift_loop, swiftly, until
+from tests.shell import (
+    FlakyLink,
+    Late,
+    Tap,
+    a_client,
+    in_simulated_time,
+    outcome,
+    simulated_time_loop,
+    small_px4,
+    until,
+)
 
 __all__ = ["pytest_generate_tests", "way"]
 
@@ -34,14 +44,14 @@ def address(component: Component) -> tuple[int, int]:
     return component.system, component.component
 
 
-@swiftly
+@in_simulated_time
 async def test_the_only_vehicle_is_given_when_it_is_certain_and_at_once_from_then_on() -> None:
-    began = swift_loop().now
+    began = simulated_time_loop().now
     async with a_client(Tap(Air([Late(px4(), 0.5)]))) as client:
         found = await client.only_component()
         assert address(found) == (1, 1)
-        assert 0.5 + LOOK_TIME <= swift_loop().now - began < 0.5 + LOOK_TIME + 0.1
-        before = swift_loop().now
+        assert 0.5 + LOOK_TIME <= simulated_time_loop().now - began < 0.5 + LOOK_TIME + 0.1
+        before = simulated_time_loop().now
         for again in (
             await client.only_component(),
             await client.only_component(1),
@@ -49,18 +59,18 @@ async def test_the_only_vehicle_is_given_when_it_is_certain_and_at_once_from_the
             await client.only_component(component=1),
         ):
             assert again is found
-        assert swift_loop().now - before < 0.05
+        assert simulated_time_loop().now - before < 0.05
 
 
 @pytest.mark.parametrize("phase", [0.0, 0.4, 0.99])
-@swiftly
+@in_simulated_time
 async def test_several_are_refused_with_the_list_as_soon_as_they_are_heard(phase: float) -> None:
-    began = swift_loop().now
+    began = simulated_time_loop().now
     tap = Tap(Air([Late(copter(), phase), px4()]))
     async with a_client(tap) as client:
         with pytest.raises(AmbiguousVehicle) as caught:
             await client.only_component()
-        assert swift_loop().now - began < phase + 0.1
+        assert simulated_time_loop().now - began < phase + 0.1
     error = caught.value
     assert str(error) == f"{TEXT} Choose one with the argument system."
     assert error.vehicles == ("1/1 PX4 quadrotor", "2/1 ArduPilot quadrotor")
@@ -82,7 +92,7 @@ class Unheard(Tap):
         ]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_that_sends_telemetry_is_found_although_its_heartbeats_are_lost() -> None:
     other = Unheard(small_px4(system=2, telemetry=10))
     async with a_client(Tap(Air([px4(), other]))) as client:
@@ -90,7 +100,7 @@ async def test_a_vehicle_that_sends_telemetry_is_found_although_its_heartbeats_a
             await client.only_component()
 
 
-@swiftly
+@in_simulated_time
 async def test_a_named_system_is_returned_although_there_are_several() -> None:
     async with a_client(Air([px4(), copter(), px4(3)])) as client:
         assert address(await client.only_component(2)) == (2, 1)
@@ -99,14 +109,14 @@ async def test_a_named_system_is_returned_although_there_are_several() -> None:
             await client.only_component(component=1)
 
 
-@swiftly
+@in_simulated_time
 async def test_the_first_one_is_still_given_by_the_other_call() -> None:
     async with a_client(Air([px4(), Late(copter(), 0.3)])) as client:
         assert address(await client.component()) == (1, 1)
         assert address(await client.component(2)) == (2, 1)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_time_limit_holds_for_everything() -> None:
     async with a_client(Tap(Air([Late(px4(), 0.5)]))) as client:
         with pytest.raises(NoReply, match="an autopilot") as caught:
@@ -119,7 +129,7 @@ async def test_a_time_limit_holds_for_everything() -> None:
         assert address(await client.only_component()) == (1, 1)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_call_may_be_cancelled_and_made_again() -> None:
     async with a_client(Tap(Air([px4()]))) as client:
         for _ in range(3):
@@ -129,7 +139,7 @@ async def test_a_call_may_be_cancelled_and_made_again() -> None:
         assert address(await client.only_component()) == (1, 1)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_that_was_lost_is_waited_for() -> None:
     async with a_client(Air([px4(), Late(copter(), 0.0, until=2.0)])) as client:
         assert isinstance(await outcome(client.only_component()), AmbiguousVehicle)
@@ -141,7 +151,7 @@ async def test_a_vehicle_that_was_lost_is_waited_for() -> None:
 
 
 @direct_only("the link is at hand")
-@swiftly
+@in_simulated_time
 async def test_after_an_absence_of_the_link_a_second_one_is_looked_for_again() -> None:
     link = FlakyLink(Air([px4(), copter()]))
     tap = link.endpoint = Tap(Air([px4(), Late(copter(), 4.0)]))
@@ -149,14 +159,14 @@ async def test_after_an_absence_of_the_link_a_second_one_is_looked_for_again() -
         await client.only_component()
         await link.drop()
         await until(lambda: local_client(client).link_task.is_disconnected)
-        began = swift_loop().now
+        began = simulated_time_loop().now
         found = await client.only_component()
-        assert swift_loop().now - began >= LOOK_TIME
+        assert simulated_time_loop().now - began >= LOOK_TIME
         assert address(found) == (1, 1)
         assert not tap.messages(wire.ParamSetMessage)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_client_that_is_closed_says_so() -> None:
     async with a_client(Tap(Air([px4()]))) as client:
         pass
@@ -168,7 +178,7 @@ async def test_a_client_that_is_closed_says_so() -> None:
 
 
 @direct_only("it has services of its own")
-@swiftly
+@in_simulated_time
 async def test_the_vehicles_on_all_links_of_a_service_count() -> None:
     other = FlakyLink(Air([copter()]))
     async with service(px4(), other) as (hub, browser):
@@ -189,7 +199,7 @@ async def test_the_vehicles_on_all_links_of_a_service_count() -> None:
 
 
 @direct_only("it has services of its own")
-@swiftly
+@in_simulated_time
 async def test_one_address_on_two_links_of_a_service_is_chosen_by_the_link() -> None:
     async with Hub([px4(), FlakyLink(Late(small_px4(uid=77), 0.9))], cache=False, fetches=False) as hub:
         app = create_app(hub)
@@ -205,7 +215,7 @@ async def test_one_address_on_two_links_of_a_service_is_chosen_by_the_link() -> 
 
 
 @direct_only("it has services of its own")
-@swiftly
+@in_simulated_time
 async def test_a_link_that_cannot_be_opened_has_no_vehicle() -> None:
     away = FlakyLink(Air([copter()]))
     away.is_away = True

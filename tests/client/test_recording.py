@@ -26,7 +26,7 @@ from paramclient.protocol import wire
 from paramclient.protocol.stats.sniffer import UNFINISHED_PEERS_MAX, FrameCutter
 from paramclient.sim import ArduPilotVehicle
 from tests.recordings import DATA, NAMES, read
-from tests.shell import VALUES, FlakyLink, Tap, a_client, settled, small_px4, swiftly
+from tests.shell import VALUES, FlakyLink, Tap, a_client, in_simulated_time, settled, small_px4
 
 NOW = 1_700_000_000.0
 
@@ -127,7 +127,7 @@ def test_a_file_that_is_no_log_has_no_records() -> None:
 # writing
 
 
-@swiftly
+@in_simulated_time
 async def test_frames_of_both_directions_are_written(tmp_path: Path) -> None:
     vehicle = Tap(small_px4())
     path = tmp_path / "flight.tlog"
@@ -159,7 +159,7 @@ def wire_frame(heard: tuple[float, wire.Frame, wire.Message]) -> bytes:
 def test_pymavlink_reads_what_was_written(tmp_path: Path) -> None:
     path = tmp_path / "flight.tlog"
 
-    @swiftly
+    @in_simulated_time
     async def session() -> None:
         async with a_client(ArduPilotVehicle(ftp=False), tlog=path) as client:
             await (await client.component()).fetch_all()
@@ -196,7 +196,7 @@ def test_the_command_writes_logs_too(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.parametrize("now", [-86400.0, 30.0])
-@swiftly
+@in_simulated_time
 async def test_a_clock_that_was_never_set_ends_nothing(
     now: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -208,7 +208,7 @@ async def test_a_clock_that_was_never_set_ends_nothing(
     assert any(isinstance(each, wire.ParamValue) for each in messages(path))
 
 
-@swiftly
+@in_simulated_time
 async def test_no_key_and_no_signature_is_in_the_log(tmp_path: Path) -> None:
     """As the guide to message signing asks: a log is passed on, and a key is not."""
     key = wire.SigningKey(bytes(range(32)))
@@ -237,7 +237,7 @@ def test_a_signature_is_taken_off_and_nothing_else() -> None:
     assert wire.unsign_frame(old) == old
 
 
-@swiftly
+@in_simulated_time
 async def test_a_log_that_exists_is_not_written_over(tmp_path: Path) -> None:
     path = tmp_path / "flight.tlog"
     path.write_bytes(b"precious")
@@ -251,7 +251,7 @@ async def test_a_log_that_exists_is_not_written_over(tmp_path: Path) -> None:
             raise AssertionError("it was opened")
 
 
-@swiftly
+@in_simulated_time
 async def test_a_full_disk_ends_the_log_and_nothing_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -279,7 +279,7 @@ async def test_a_full_disk_ends_the_log_and_nothing_else(
     assert messages(path)  # whole frames, and nothing behind them
 
 
-@swiftly
+@in_simulated_time
 async def test_memory_does_not_follow_a_disk_that_falls_behind(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -318,7 +318,7 @@ class Stream(FlakyLink):
     is_stream = True
 
 
-@swiftly
+@in_simulated_time
 async def test_a_stream_that_drops_is_not_continued(tmp_path: Path) -> None:
     path = tmp_path / "flight.tlog"
     link = Stream(Pieces([frame(1)[:9], frame(2)]))

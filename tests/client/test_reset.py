@@ -9,7 +9,7 @@ from paramclient.metadata import Metadata, ParamInfo
 from paramclient.protocol import wire
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, SimParam
 from tests.client_kinds import pytest_generate_tests, way
-from tests.shell import Tap, a_client, swiftly
+from tests.shell import Tap, a_client, in_simulated_time
 
 __all__ = ["pytest_generate_tests", "way"]
 
@@ -25,7 +25,7 @@ def with_defaults(**others: object) -> ArduPilotVehicle:
     return ArduPilotVehicle(table=table, live=(), read_only=["FIXED"], param_error=True, **others)  # type: ignore[arg-type]
 
 
-@swiftly
+@in_simulated_time
 async def test_defaults_of_the_vehicle_are_written_and_verified() -> None:
     vehicle = with_defaults()
     tap = Tap(vehicle)
@@ -42,7 +42,7 @@ async def test_defaults_of_the_vehicle_are_written_and_verified() -> None:
     assert [each.param_id for each in tap.messages(wire.ParamSetMessage)] == ["COUNT", "CHANGED"]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_refused_default_does_not_stop_the_others() -> None:
     async with a_client(with_defaults()) as client:
         component = await client.component()
@@ -52,7 +52,7 @@ async def test_a_refused_default_does_not_stop_the_others() -> None:
         assert result.written["COUNT"].status is SetStatus.ACCEPTED
 
 
-@swiftly
+@in_simulated_time
 async def test_a_parameter_without_a_known_default_is_listed_and_not_written() -> None:
     vehicle = GenericVehicle(table={"A": 5.0, "B": 6.0, "C": 7})
     tap = Tap(vehicle)
@@ -68,7 +68,7 @@ async def test_a_parameter_without_a_known_default_is_listed_and_not_written() -
     assert {each.param_id for each in tap.messages(wire.ParamSetMessage)} == {"A"}
 
 
-@swiftly
+@in_simulated_time
 async def test_an_unknown_name_is_an_error_and_nothing_is_written() -> None:
     tap = Tap(with_defaults())
     async with a_client(tap) as client:
@@ -81,7 +81,7 @@ async def test_an_unknown_name_is_an_error_and_nothing_is_written() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-@swiftly
+@in_simulated_time
 async def test_a_reset_on_a_link_that_loses_packets(seed: int) -> None:
     vehicle = with_defaults()
     async with a_client(Air.symmetric([vehicle], delay=0.05, loss=0.1, seed=seed)) as client:

@@ -37,7 +37,7 @@ from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.station import Station
 from paramclient.protocol.wire import MAV_AUTOPILOT_PX4, Heartbeat
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle, SimParam, Vehicle
-from tests.shell import Tap, swift_loop, swiftly
+from tests.shell import Tap, in_simulated_time, simulated_time_loop
 
 MANY = 250
 PX4 = Heartbeat(2, MAV_AUTOPILOT_PX4)
@@ -168,7 +168,7 @@ def test_a_fetch_that_is_given_back_is_freed_without_a_garbage_collection() -> N
         gc.enable()
 
 
-@swiftly
+@in_simulated_time
 async def test_the_errors_of_silent_components_hold_no_calls() -> None:
     station: Any = SimpleNamespace(components={})
     together = FleetFetch(station, {}, system=None, refresh=False)
@@ -357,7 +357,7 @@ async def carry(link: Flood, station: Watched, seconds: float, dispatch: Callabl
         tasks.cancel_scope.cancel()
 
 
-@swiftly
+@in_simulated_time
 async def test_time_outs_wait_until_what_has_come_is_read() -> None:
     link, station = Flood(), Watched()
     link.size = loop_scheduler.BACKLOG_DATAGRAMS_MIN
@@ -374,7 +374,7 @@ async def test_time_outs_wait_until_what_has_come_is_read() -> None:
         assert station.scheduler.lists_max > 1
 
 
-@swiftly
+@in_simulated_time
 async def test_time_outs_do_not_wait_for_ever() -> None:
     link, station = Flood(), Watched()
     link.size = loop_scheduler.BACKLOG_DATAGRAMS_MIN
@@ -390,14 +390,14 @@ class Starved(Watched):
     """Other programs have the processor whenever it has said until when to wait."""
 
     def next_deadline(self) -> float:
-        swift_loop().call_later(0.001, self._starve)
+        simulated_time_loop().call_later(0.001, self._starve)
         return super().next_deadline()
 
     def _starve(self) -> None:
-        swift_loop().now += LOOP_LATENCY_MIN + 0.002
+        simulated_time_loop().now += LOOP_LATENCY_MIN + 0.002
 
 
-@swiftly
+@in_simulated_time
 async def test_time_outs_wait_while_other_programs_have_the_processor() -> None:
     """What has come is there, but the reader had no turn meanwhile."""
     link, station = Flood(), Starved()
@@ -408,7 +408,7 @@ async def test_time_outs_wait_while_other_programs_have_the_processor() -> None:
     assert not [at for at in station.ticks if at > began + link.interval + LOOP_LATENCY_MIN]
 
 
-@swiftly
+@in_simulated_time
 async def test_time_outs_wait_for_nothing_that_does_not_come() -> None:
     """The last reading brought many, and then the link falls silent."""
     link, station = Flood(), Watched()
@@ -422,7 +422,7 @@ async def test_time_outs_wait_for_nothing_that_does_not_come() -> None:
     assert next(at for at in station.ticks if at > silent_at) < silent_at + LOOP_LATENCY_MIN + 2 * TURN_MAX
 
 
-@swiftly
+@in_simulated_time
 async def test_time_outs_wait_for_what_waits_for_its_turn() -> None:
     """Few datagrams were read, among them perhaps the answers, and another link has the turn."""
     link, station = Flood(), Watched()
@@ -441,7 +441,7 @@ async def test_time_outs_wait_for_what_waits_for_its_turn() -> None:
         tasks.cancel_scope.cancel()
 
 
-@swiftly
+@in_simulated_time
 async def test_many_datagrams_at_once_give_way_to_other_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each datagram takes a millisecond; so do others that are told of what has happened by then."""
 
@@ -527,7 +527,7 @@ def test_links_of_two_event_loops_share_nothing() -> None:
     assert anyio.run(find) is not anyio.run(find)
 
 
-@swiftly
+@in_simulated_time
 async def test_no_list_begins_while_another_link_brings_more_than_is_read() -> None:
     busy, quiet, station = Flood(), Flood(), Watched()
     busy.size, quiet.size = loop_scheduler.BACKLOG_DATAGRAMS_MIN, 1
@@ -549,7 +549,7 @@ async def test_no_list_begins_while_another_link_brings_more_than_is_read() -> N
         tasks.cancel_scope.cancel()
 
 
-@swiftly
+@in_simulated_time
 async def test_a_link_that_was_closed_leaves_nothing_behind_whichever_of_its_tasks_ends_last(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -583,7 +583,7 @@ class Portions(ParamCache):
         super().save(updates, clock=clock)
 
 
-@swiftly
+@in_simulated_time
 async def test_new_tables_are_written_in_portions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No transaction begins another table when it has enough: to gather one takes the loop's time."""
     monkeypatch.setattr(cache_writer, "TRANSACTION_PARAMS", 200)
@@ -640,7 +640,7 @@ class Busy(Tap):
         return min(self._until + 0.5, math.inf if deadline is None else deadline)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_component_that_is_as_slow_as_another_is_waited_for() -> None:
     """Where another one took a while as well, an answer that is late says nothing."""
     vehicles = [Busy(small(1), 0.3, beats=True), Busy(small(2), 2.3, beats=True)]
@@ -650,7 +650,7 @@ async def test_a_component_that_is_as_slow_as_another_is_waited_for() -> None:
         assert everything.results.keys() == {(1, 1), (2, 1)}
 
 
-@swiftly
+@in_simulated_time
 async def test_a_component_without_heartbeats_is_waited_for_until_it_is_lost() -> None:
     """It owes its heartbeats as well, and is not lost."""
     vehicles: list[Endpoint] = [small(1), *(Busy(small(system), 3.5, beats=False) for system in (2, 3))]
@@ -662,7 +662,7 @@ async def test_a_component_without_heartbeats_is_waited_for_until_it_is_lost() -
 
 @pytest.mark.parametrize("few", [0, 8])
 @pytest.mark.parametrize("seconds", [5, 40])
-@swiftly
+@in_simulated_time
 async def test_tables_that_are_fetched_in_numbers_are_written_once_or_in_growing_parts(
     tmp_path: Path, seconds: int, few: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

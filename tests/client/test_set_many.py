@@ -30,7 +30,7 @@ from paramclient.protocol.requests.write_window import WRITES_IN_FLIGHT_MAX
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam, Vehicle
 from tests import shell
 from tests.client_kinds import direct_only, pytest_generate_tests, way
-from tests.shell import VALUES, FlakyLink, Tap, a_client, generic, residue, small_px4, swiftly
+from tests.shell import VALUES, FlakyLink, Tap, a_client, generic, in_simulated_time, residue, small_px4
 
 __all__ = ["pytest_generate_tests", "way"]
 
@@ -58,7 +58,7 @@ def left_of(component: Component) -> list[object]:
 
 @pytest.mark.parametrize("kind", [PX4Vehicle, ArduPilotVehicle])
 @pytest.mark.parametrize("seed", range(3))
-@swiftly
+@in_simulated_time
 async def test_all_values_are_set_on_a_link_that_loses_packets(
     kind: Callable[..., Vehicle], seed: int
 ) -> None:
@@ -78,7 +78,7 @@ async def test_all_values_are_set_on_a_link_that_loses_packets(
         assert not left_of(component)
 
 
-@swiftly
+@in_simulated_time
 async def test_each_value_has_an_outcome_of_its_own() -> None:
     vehicle = ArduPilotVehicle(
         table={**{name: float(value) for name, value in VALUES.items()}, "COUNT": 3},
@@ -115,7 +115,7 @@ async def test_each_value_has_an_outcome_of_its_own() -> None:
             result["PARAM_02"]
 
 
-@swiftly
+@in_simulated_time
 async def test_values_of_one_name_are_set_in_order() -> None:
     tap = Tap(generic())
     async with a_client(tap) as client:
@@ -132,7 +132,7 @@ async def test_values_of_one_name_are_set_in_order() -> None:
         assert sent == [5, 6, 4]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_switch_of_a_group_is_a_barrier() -> None:
     vehicle = with_group()
     tap = Tap(Air.symmetric([vehicle], delay=0.05))
@@ -152,7 +152,7 @@ async def test_a_switch_of_a_group_is_a_barrier() -> None:
 
 
 @direct_only("counts the writes in flight")
-@swiftly
+@in_simulated_time
 async def test_as_many_writes_are_in_flight_as_the_vehicle_serves() -> None:
     tap = Tap(Air.symmetric([PX4Vehicle(table=MANY)], delay=0.2))
     async with a_client(tap) as client:
@@ -172,7 +172,7 @@ async def test_as_many_writes_are_in_flight_as_the_vehicle_serves() -> None:
     assert max(bursts) == WRITES_IN_FLIGHT_MAX
 
 
-@swiftly
+@in_simulated_time
 async def test_a_lost_vehicle_ends_the_call_and_nothing_is_lost() -> None:
     tap = Tap(Air.symmetric([PX4Vehicle(table=MANY)], delay=0.05))
     seen: list[SetOutcome] = []
@@ -206,7 +206,7 @@ async def test_a_lost_vehicle_ends_the_call_and_nothing_is_lost() -> None:
             await component.set_many(NEW)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_link_that_fails_ends_the_call_and_nothing_is_lost() -> None:
     link = FlakyLink(Air.symmetric([PX4Vehicle(table=MANY)], delay=0.05))
     async with a_client(link) as client:
@@ -226,7 +226,7 @@ async def drop(link: FlakyLink) -> None:
     await link.drop(stays_away=True)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_that_answers_no_write_ends_the_call() -> None:
     class Unwilling(GenericVehicle):
         def _on_set(self, request: wire.ParamSetMessage, sender: wire.Frame) -> None:
@@ -244,7 +244,7 @@ async def test_a_vehicle_that_answers_no_write_ends_the_call() -> None:
         assert result.counts[SetStatus.NOT_TRIED] == 188
 
 
-@swiftly
+@in_simulated_time
 async def test_the_timeout_is_that_of_the_whole_call() -> None:
     tap = Tap(Air.symmetric([PX4Vehicle(table=MANY)], delay=0.05))
     async with a_client(tap) as client:
@@ -271,7 +271,7 @@ async def test_the_timeout_is_that_of_the_whole_call() -> None:
         ({"PARAM_01": 1, "_HASH_CHECK": 1}, "read-only"),
     ],
 )
-@swiftly
+@in_simulated_time
 async def test_nothing_is_sent_if_an_argument_is_wrong(values: dict[str, int], message: str) -> None:
     tap = Tap(small_px4())
     async with a_client(tap) as client:
@@ -284,7 +284,7 @@ async def test_nothing_is_sent_if_an_argument_is_wrong(values: dict[str, int], m
         assert not tap.messages(wire.ParamSetMessage)
 
 
-@swiftly
+@in_simulated_time
 async def test_no_values_are_no_writes() -> None:
     async with a_client(small_px4()) as client:
         component = await client.component()
@@ -293,7 +293,7 @@ async def test_no_values_are_no_writes() -> None:
         assert result.is_complete
 
 
-@swiftly
+@in_simulated_time
 async def test_values_are_watched_while_others_are_written() -> None:
     vehicle = PX4Vehicle(table=MANY)
     async with a_client(Air.symmetric([vehicle], delay=0.05)) as client:
@@ -306,7 +306,7 @@ async def test_values_are_watched_while_others_are_written() -> None:
 
 
 @direct_only("a service reports the outcomes together")
-@swiftly
+@in_simulated_time
 async def test_an_error_of_progress_cancels_the_call() -> None:
     tap = Tap(Air.symmetric([PX4Vehicle(table=MANY)], delay=0.05))
 
@@ -326,7 +326,7 @@ async def test_an_error_of_progress_cancels_the_call() -> None:
 
 
 @direct_only("the cache is that of the client")
-@swiftly
+@in_simulated_time
 async def test_values_that_are_not_on_the_disk_are_reported_as_such(tmp_path: Path) -> None:
     async with a_client(small_px4(), cache=tmp_path / "cache") as client:
         component = await client.component()
@@ -347,7 +347,7 @@ async def test_values_that_are_not_on_the_disk_are_reported_as_such(tmp_path: Pa
 
 
 @direct_only("the outcome of a request that the client gave up is not told")
-@swiftly
+@in_simulated_time
 async def test_two_calls_at_once_both_end() -> None:
     vehicle = PX4Vehicle(table=MANY)
     async with a_client(Air.symmetric([vehicle], delay=0.05, loss=0.1)) as client:
@@ -365,7 +365,7 @@ async def test_two_calls_at_once_both_end() -> None:
         assert values_of(vehicle.params, NEW) == values_of(component.params, NEW)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_closed_client_writes_nothing() -> None:
     async with a_client(generic()) as client:
         component = await client.component()

@@ -47,7 +47,7 @@ from paramclient.client.signing_timestamps import (
 )
 from paramclient.links import SimLink
 from paramclient.sim import ArduPilotVehicle, Vehicle
-from tests.shell import VALUES, Tap, small_px4, swift_loop, swiftly
+from tests.shell import VALUES, Tap, in_simulated_time, simulated_time_loop, small_px4
 
 SECRET = bytes(range(101, 133))
 KEY = SigningKey(SECRET)
@@ -320,7 +320,7 @@ def test_after_a_crash_at_most_a_minute_is_skipped(clock: Clock) -> None:
     assert NOW + 5 < last[0] <= NOW + 5 + TIMESTAMP_RESERVE
 
 
-@swiftly
+@in_simulated_time
 async def test_timestamps_are_written_ahead_and_seldom(
     state: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -355,7 +355,7 @@ async def test_timestamps_are_written_ahead_and_seldom(
     assert (state / f"{KEY.fingerprint}-0.timestamp").read_text() == f"{written[-1]}\n"
 
 
-@swiftly
+@in_simulated_time
 async def test_a_folder_that_cannot_be_used_is_told_and_costs_no_session(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -368,7 +368,7 @@ async def test_a_folder_that_cannot_be_used_is_told_and_costs_no_session(
     assert "cannot store signature timestamps (Not a directory)" in caplog.text
 
 
-@swiftly
+@in_simulated_time
 async def test_a_disk_that_fails_later_is_told_once(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -388,7 +388,7 @@ async def test_a_disk_that_fails_later_is_told_once(
 # Clients
 
 
-@swiftly
+@in_simulated_time
 async def test_a_signed_client(state: Path) -> None:
     vehicle = signed_vehicle()
     async with a_client(vehicle) as client, a_client(signed_vehicle()) as other:
@@ -408,7 +408,7 @@ async def test_a_signed_client(state: Path) -> None:
         assert unsigned.signing_report() is None
 
 
-@swiftly
+@in_simulated_time
 async def test_a_link_id_of_ones_own_is_taken_once() -> None:
     mine = Signing(KEY, link_id=9)
     async with a_client(signed_vehicle(), signing=mine) as client:
@@ -422,7 +422,7 @@ async def test_a_link_id_of_ones_own_is_taken_once() -> None:
         await client.component()
 
 
-@swiftly
+@in_simulated_time
 async def test_no_reply_says_that_frames_were_refused() -> None:
     async with a_client(signed_vehicle(), signing=OTHER_KEY) as client:
         with pytest.raises(NoReply, match=r"an autopilot \(frames were refused, [0-9]+ for: bad signature\)"):
@@ -435,7 +435,7 @@ async def test_no_reply_says_that_frames_were_refused() -> None:
         assert report.refused.keys() == {Refusal.UNSIGNED}
 
 
-@swiftly
+@in_simulated_time
 async def test_a_key_is_given_only_where_somebody_says_that_the_link_is_safe() -> None:
     vehicle = ArduPilotVehicle(table=VALUES)
     async with a_client(vehicle, signing=None) as client:
@@ -452,7 +452,7 @@ async def test_a_key_is_given_only_where_somebody_says_that_the_link_is_safe() -
     assert vehicle.signing_key is None
 
 
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_of_mavlink_1_is_given_no_key() -> None:
     vehicle = small_px4(mavlink_version=1)
     async with a_client(vehicle, signing=None) as client:
@@ -460,7 +460,7 @@ async def test_a_vehicle_of_mavlink_1_is_given_no_key() -> None:
             await (await client.component()).setup_signing(KEY, link_is_safe=True)
 
 
-@swiftly
+@in_simulated_time
 async def test_accept_all_answers_a_mavlink_1_vehicle_unsigned() -> None:
     vehicle = small_px4(mavlink_version=1)
     async with a_client(vehicle, signing=Signing(KEY, SigningPolicy.ACCEPT_ALL)) as client:
@@ -482,7 +482,7 @@ def test_the_key_shows_nowhere(
     shown: list[str] = []
     cache = tmp_path / "cache.sqlite3"
 
-    @swiftly
+    @in_simulated_time
     async def live() -> None:
         vehicle = small_px4()
         async with a_client(vehicle, signing=None, cache=cache) as client:
@@ -546,19 +546,19 @@ def command(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str,
     """Runs commands in this process, one after the other, in one simulated time."""
     now = 1000.0
 
-    def run_swiftly(work: Callable[..., Any], *given: Any) -> Any:
+    def run_in_simulated_time(work: Callable[..., Any], *given: Any) -> Any:
         async def go_on() -> Any:
             nonlocal now
-            swift_loop().now = now
+            simulated_time_loop().now = now
             try:
                 return await work(*given)
             finally:
-                now = swift_loop().now
+                now = simulated_time_loop().now
 
-        return swiftly(go_on)()
+        return in_simulated_time(go_on)()
 
     def call(*arguments: object) -> tuple[int, str, str]:
-        with mock.patch.object(anyio, "run", run_swiftly):
+        with mock.patch.object(anyio, "run", run_in_simulated_time):
             code = run([str(argument) for argument in arguments])
         printed = capsys.readouterr()
         return code, printed.out, printed.err

@@ -15,7 +15,17 @@ from paramclient.client.suspend_detection import SUSPEND_MIN, SuspendDetector, t
 from paramclient.protocol.vehicle.presence import Presence
 from paramclient.protocol.wire import ParamSetMessage, SystemTime
 from paramclient.sim import Air, Endpoint
-from tests.shell import FlakyLink, Tap, a_client, bits, generic, small_px4, swift_loop, swiftly, until
+from tests.shell import (
+    FlakyLink,
+    Tap,
+    a_client,
+    bits,
+    generic,
+    in_simulated_time,
+    simulated_time_loop,
+    small_px4,
+    until,
+)
 
 HOURS = 3 * 3600.0
 
@@ -31,7 +41,7 @@ def sleep(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Sl
     def fall_asleep(seconds: float) -> None:
         nonlocal asleep
         if request.param == "the clock goes on":
-            swift_loop().now += seconds
+            simulated_time_loop().now += seconds
         else:
             asleep += seconds
 
@@ -55,7 +65,7 @@ def trusts(component: Component) -> set[Trust]:
     return {param.trust for param in component.params.values()}
 
 
-@swiftly
+@in_simulated_time
 async def test_a_change_during_a_suspend_is_found_and_no_component_is_lost(sleep: Sleep) -> None:
     tap = Tap(vehicle := small_px4())
     async with a_client(tap) as client:
@@ -76,7 +86,7 @@ async def test_a_change_during_a_suspend_is_found_and_no_component_is_lost(sleep
         assert Trust.CACHED not in trusts(component)
 
 
-@swiftly
+@in_simulated_time
 async def test_calls_that_wait_are_asked_again(sleep: Sleep) -> None:
     tap = Tap(vehicle := small_px4())
     async with a_client(tap) as client, asyncio.TaskGroup() as tasks:
@@ -98,7 +108,7 @@ async def test_calls_that_wait_are_asked_again(sleep: Sleep) -> None:
 
 
 @pytest.mark.parametrize("at", [0.0, 0.2, 0.5])
-@swiftly
+@in_simulated_time
 async def test_a_fetch_that_is_under_way_goes_on(sleep: Sleep, at: float) -> None:
     """The hash at the head of the list was announced before: it says nothing of what has moved since."""
     tap = Tap(vehicle := small_px4(burst=1, period=0.04))
@@ -121,7 +131,7 @@ async def test_a_fetch_that_is_under_way_goes_on(sleep: Sleep, at: float) -> Non
         assert bits(component.params) == bits(vehicle.params)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_write_does_not_reach_the_one_who_has_come_in_its_place(sleep: Sleep) -> None:
     berth = Berth(small_px4(uid=1))
     stranger = small_px4(uid=2)
@@ -140,7 +150,7 @@ async def test_a_write_does_not_reach_the_one_who_has_come_in_its_place(sleep: S
         assert stranger.params["PARAM_02"].value == 2
 
 
-@swiftly
+@in_simulated_time
 async def test_nor_does_one_that_is_asked_for_before_anybody_has_noticed(sleep: Sleep) -> None:
     berth = Berth(small_px4(uid=1))
     async with a_client(berth) as client:
@@ -152,7 +162,7 @@ async def test_nor_does_one_that_is_asked_for_before_anybody_has_noticed(sleep: 
         assert berth.messages(ParamSetMessage) == []
 
 
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_gone_during_a_suspend_is_lost_soon_with_few_requests(sleep: Sleep) -> None:
     tap = Tap(small_px4())
     async with a_client(tap) as client, asyncio.TaskGroup() as tasks:
@@ -178,7 +188,7 @@ async def test_a_vehicle_gone_during_a_suspend_is_lost_soon_with_few_requests(sl
         assert len(tap.heard) < 65, "our heartbeat, and nothing else"
 
 
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_that_started_again_meanwhile(sleep: Sleep) -> None:
     """Its clock tells less than before, and more than the seconds in which ours went."""
     berth = Berth(small_px4(uid=1))
@@ -197,7 +207,7 @@ async def test_a_vehicle_that_started_again_meanwhile(sleep: Sleep) -> None:
         assert Rebooted(component) in told
 
 
-@swiftly
+@in_simulated_time
 async def test_a_link_that_is_away_when_the_computer_falls_asleep(sleep: Sleep) -> None:
     """What it comes back to was away for hours, though our clock may know of a second."""
     vehicle = small_px4()
@@ -216,7 +226,7 @@ async def test_a_link_that_is_away_when_the_computer_falls_asleep(sleep: Sleep) 
         assert drained(events) == [Resynced(component, ("PARAM_01",), vehicle.announced_hash())]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_short_nap_is_none(sleep: Sleep) -> None:
     tap = Tap(generic())
     async with a_client(tap) as client:

@@ -48,11 +48,11 @@ from tests.shell import (
     a_client,
     bits,
     generic,
+    in_simulated_time,
     outcome,
     residue,
     settled,
     small_px4,
-    swiftly,
     until,
 )
 
@@ -106,7 +106,7 @@ async def away(tap: Tap, seconds: float) -> None:
 # the watch
 
 
-@swiftly
+@in_simulated_time
 async def test_an_update_that_was_lost_is_told_within_one_interval() -> None:
     vehicle = small_px4()
     tap = Tap(vehicle)
@@ -133,7 +133,7 @@ async def test_an_update_that_was_lost_is_told_within_one_interval() -> None:
         assert not residue(component)
 
 
-@swiftly
+@in_simulated_time
 async def test_by_default_a_hash_is_watched_and_a_list_is_not() -> None:
     px4, ardupilot = Tap(small_px4()), Tap(ArduPilotVehicle(table=VALUES, system=2))
     async with a_client(Air([px4, ardupilot])) as client:
@@ -148,7 +148,7 @@ async def test_by_default_a_hash_is_watched_and_a_list_is_not() -> None:
         assert not px4.messages(ParamRequestList), "nor one for the other vehicle"
 
 
-@swiftly
+@in_simulated_time
 async def test_an_interval_that_is_given_goes_for_lists_too() -> None:
     vehicle = ArduPilotVehicle(ftp=False, table=VALUES)
     tap = Tap(vehicle)
@@ -162,7 +162,7 @@ async def test_an_interval_that_is_given_goes_for_lists_too() -> None:
             assert await anext(events) == Resynced(component, ("PARAM_01",), None)
 
 
-@swiftly
+@in_simulated_time
 @pytest.mark.parametrize("source", ["file", "list", "reads"])
 async def test_parameters_that_appear_are_added_and_can_be_set(path: Path, source: str) -> None:
     group = {f"GRIP_{number}": number for number in range(5)}
@@ -209,7 +209,7 @@ async def test_parameters_that_appear_are_added_and_can_be_set(path: Path, sourc
     assert vehicle.requests["PARAM_REQUEST_LIST"] == {"file": 0, "list": 3, "reads": 1}[source]
 
 
-@swiftly
+@in_simulated_time
 async def test_an_interval_of_zero_ends_the_watch() -> None:
     tap = Tap(small_px4())
     async with a_client(tap, watch_interval=0) as client:
@@ -230,7 +230,7 @@ def test_an_interval_that_cannot_be(wrong: float) -> None:
 # lost and found
 
 
-@swiftly
+@in_simulated_time
 async def test_lost_and_found() -> None:
     vehicle = small_px4()
     tap = Tap(vehicle)
@@ -263,7 +263,7 @@ async def test_lost_and_found() -> None:
             assert param.trust is (Trust.LIVE if name in VOLATILE else Trust.VERIFIED)
 
 
-@swiftly
+@in_simulated_time
 async def test_calls_end_at_once_when_it_is_lost() -> None:
     tap = Tap(small_px4())
     async with a_client(tap) as client:
@@ -298,7 +298,7 @@ async def test_calls_end_at_once_when_it_is_lost() -> None:
         assert not residue(component)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_fetch_survives_a_vehicle_that_starts_again() -> None:
     vehicle = small_px4(burst=1, period=0.2)
     async with a_client(vehicle) as client:
@@ -319,7 +319,7 @@ async def test_a_fetch_survives_a_vehicle_that_starts_again() -> None:
         assert state(component) is SyncState.SYNCED
 
 
-@swiftly
+@in_simulated_time
 async def test_a_reboot_is_told() -> None:
     vehicle = small_px4()
     async with a_client(vehicle) as client:
@@ -332,7 +332,7 @@ async def test_a_reboot_is_told() -> None:
         assert drained(events) == [Rebooted(component), Resynced(component, (), vehicle.announced_hash())]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_write_waits_until_it_is_known_who_it_is() -> None:
     vehicle = small_px4()
     tap = Tap(vehicle)
@@ -349,7 +349,7 @@ async def test_a_write_waits_until_it_is_known_who_it_is() -> None:
         assert times[ParamSetMessage] - times[wire.CommandLong] > 0.5, "a round trip"
 
 
-@swiftly
+@in_simulated_time
 async def test_a_link_that_was_away_is_checked_like_a_loss() -> None:
     vehicle = small_px4()
     link = FlakyLink(Air.symmetric([vehicle], delay=0.05))
@@ -391,7 +391,7 @@ def kept(path: Path) -> dict[tuple[str, int], dict[str, object]]:
 
 
 @pytest.mark.parametrize("answers", [True, False], ids=["says who it is late", "never says who it is"])
-@swiftly
+@in_simulated_time
 async def test_a_strangers_values_never_reach_the_other_ones_cache(path: Path, answers: bool) -> None:
     berth, camera = Berth(small_px4(uid=1)), Berth(generic(component=100))
     async with a_client(Air([berth, camera]), cache=path) as client:
@@ -443,7 +443,7 @@ async def learn(vehicle: PX4Vehicle, path: Path) -> None:
         await (await client.component()).fetch_all()
 
 
-@swiftly
+@in_simulated_time
 async def test_cache_only_sends_nothing(path: Path) -> None:
     vehicle = small_px4()
     await learn(vehicle, path)
@@ -465,7 +465,7 @@ async def test_cache_only_sends_nothing(path: Path) -> None:
         assert (await component.get("PARAM_01")).trust is Trust.LIVE, "what is asked for by name is asked"
 
 
-@swiftly
+@in_simulated_time
 async def test_cache_only_where_nothing_is_cached(path: Path) -> None:
     tap = Tap(Air([small_px4(), generic(component=100)]))
     async with a_client(tap, cache=path, policy=Policy.CACHE_ONLY) as client:
@@ -478,7 +478,7 @@ async def test_cache_only_where_nothing_is_cached(path: Path) -> None:
         assert not residue(component)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_component_without_a_cached_table_does_not_delay_the_others(path: Path) -> None:
     vehicle = small_px4()
     await learn(vehicle, path)
@@ -489,7 +489,7 @@ async def test_a_component_without_a_cached_table_does_not_delay_the_others(path
         assert isinstance(everything.silent[1, 100], CacheError)
 
 
-@swiftly
+@in_simulated_time
 async def test_hash_only_asks_for_the_hash_alone(path: Path) -> None:
     vehicle = small_px4()
     await learn(vehicle, path)
@@ -513,7 +513,7 @@ async def test_hash_only_asks_for_the_hash_alone(path: Path) -> None:
 
 
 @pytest.mark.parametrize("policy", [Policy.CACHE_ONLY, Policy.HASH_ONLY])
-@swiftly
+@in_simulated_time
 async def test_refresh_is_refused_with_a_policy_that_forbids_downloads(policy: Policy) -> None:
     tap = Tap(small_px4())
     async with a_client(tap, policy=policy) as client:
@@ -532,7 +532,7 @@ def test_a_policy_that_does_not_exist() -> None:
 # events
 
 
-@swiftly
+@in_simulated_time
 async def test_several_listeners_hear_the_same() -> None:
     vehicle = small_px4()
     client = a_client(vehicle)
@@ -548,7 +548,7 @@ async def test_several_listeners_hear_the_same() -> None:
         assert kinds(late) == [Rebooted, Resynced]
 
 
-@swiftly
+@in_simulated_time
 async def test_events_end_with_the_client() -> None:
     async with a_client(small_px4()) as client:
         component = await client.component()
@@ -563,7 +563,7 @@ async def test_events_end_with_the_client() -> None:
             await anext(each)
 
 
-@swiftly
+@in_simulated_time
 async def test_cancelled_a_listener_loses_nothing() -> None:
     async with a_client(small_px4()) as client:
         component = await client.component()
@@ -574,7 +574,7 @@ async def test_cancelled_a_listener_loses_nothing() -> None:
         assert await anext(events) == Lost(component, 5.0)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_slow_listener_misses_the_oldest_and_holds_no_more() -> None:
     async with a_client(small_px4()) as client:
         component = await client.component()
@@ -586,7 +586,7 @@ async def test_a_slow_listener_misses_the_oldest_and_holds_no_more() -> None:
         assert waiting[0] == Lost(component, 10.0)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_dropped_events_object_is_unsubscribed() -> None:
     async with a_client(small_px4()) as client:
         await client.component()
@@ -597,7 +597,7 @@ async def test_a_dropped_events_object_is_unsubscribed() -> None:
         assert not event_listeners(client)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_listener_may_stop_in_the_middle() -> None:
     vehicle = small_px4()
     async with a_client(vehicle) as client:

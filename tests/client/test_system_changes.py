@@ -17,7 +17,7 @@ from paramclient import ParamCache, ParamClient, Trust, UnknownVehicle
 from paramclient.cache import TableUpdate
 from paramclient.client import cache_writer
 from tests.caches import PX4, full_disk, rubbish, set_aside, stored, update
-from tests.shell import Tap, bits, small_px4, swift_loop, swiftly
+from tests.shell import Tap, bits, in_simulated_time, simulated_time_loop, small_px4
 from tests.test_design import MODULES
 
 HOUR = 3600.0
@@ -35,11 +35,11 @@ class Wall:
 
     @property
     def now(self) -> float:
-        return swift_loop().now + swift_loop().ahead
+        return simulated_time_loop().now + simulated_time_loop().ahead
 
     @now.setter
     def now(self, at: float) -> None:
-        swift_loop().ahead = at - swift_loop().now
+        simulated_time_loop().ahead = at - simulated_time_loop().now
 
 
 @pytest.fixture
@@ -64,7 +64,7 @@ def test_only_the_keeping_of_things_knows_the_time_of_day() -> None:
 
 
 @pytest.mark.parametrize("step", [-HOUR, -DAY, HOUR, 400 * DAY])
-@swiftly
+@in_simulated_time
 async def test_a_step_of_the_clock_moves_nothing_but_what_is_written_down(
     path: Path, wall: Wall, step: float
 ) -> None:
@@ -107,7 +107,7 @@ async def test_a_step_of_the_clock_moves_nothing_but_what_is_written_down(
 
 
 @pytest.mark.parametrize("wrong", [-DAY, 1e12, math.nan])
-@swiftly
+@in_simulated_time
 async def test_a_clock_that_cannot_be_costs_a_warning_and_nothing_is_lost(
     path: Path, wall: Wall, wrong: float, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -155,7 +155,7 @@ def of_another_vehicle() -> TableUpdate:
 
 @pytest.mark.parametrize("happens", [delete, move, damage, put_another_in_its_place])
 @pytest.mark.parametrize("known", [False, True], ids=["new", "known from before"])
-@swiftly
+@in_simulated_time
 async def test_a_file_that_goes_is_followed_by_one_that_holds_everything(
     path: Path, happens: Callable[[Path], None], known: bool
 ) -> None:
@@ -182,7 +182,7 @@ async def test_a_file_that_goes_is_followed_by_one_that_holds_everything(
         assert (await (await client.component()).fetch_all()).source == "cache"
 
 
-@swiftly
+@in_simulated_time
 async def test_a_file_that_goes_just_before_the_end(path: Path) -> None:
     vehicle = small_px4()
     async with ParamClient(vehicle, cache=path) as client:
@@ -195,7 +195,7 @@ async def test_a_file_that_goes_just_before_the_end(path: Path) -> None:
         assert bits(cache.component(system=1).params) == bits(vehicle.params)
 
 
-@swiftly
+@in_simulated_time
 async def test_half_a_table_takes_nothing_away_from_a_file_that_others_made(path: Path) -> None:
     """Another program has fetched all of it into the file that it found gone; we know a part."""
     vehicle = small_px4()
@@ -213,7 +213,7 @@ async def test_half_a_table_takes_nothing_away_from_a_file_that_others_made(path
         assert len(cache.component(system=1).params) == len(vehicle.params)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_disk_that_is_full_for_a_while(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     vehicle = small_px4()
     async with ParamClient(vehicle, cache=path) as client:

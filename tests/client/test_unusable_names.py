@@ -18,7 +18,7 @@ from paramclient.protocol.wire import NO_INDEX, ParamError, ParamSetMessage, Par
 from paramclient.sim import ArduPilotVehicle, GenericVehicle
 from tests.caches import stored, update
 from tests.commands import Command, Put, behind, in_process, leaping
-from tests.shell import swiftly
+from tests.shell import in_simulated_time
 from tests.simulation import PEER, Simulation, known, param_value
 
 UNUSABLE = [
@@ -124,7 +124,7 @@ def test_a_cached_list_with_such_a_name_is_downloaded_anew() -> None:
     assert (result.complete, result.resumed, [*result.params]) == (True, 0, ["A", "B"])
 
 
-@swiftly
+@in_simulated_time
 async def test_no_such_name_can_be_asked_for_or_set() -> None:
     async with ParamClient(GenericVehicle({"A": (ParamType.REAL32, 1.0)}), cache=False) as client:
         vehicle = await client.component()

@@ -28,7 +28,7 @@ from tests.caches import full_disk, whole_table
 from tests.commands import in_process
 from tests.service.test_process import ended, served
 from tests.service_hub import C, met, problem, service
-from tests.shell import small_px4, swiftly, until
+from tests.shell import in_simulated_time, small_px4, until
 
 NAME = "PARAM_01"
 
@@ -89,7 +89,7 @@ ANSWERS = (
 
 
 @UNWRITABLE
-@swiftly
+@in_simulated_time
 async def test_the_service_answers_nothing_from_a_cache_that_lacks_what_was_heard(
     unwritable: Holding, path: Path
 ) -> None:
@@ -120,7 +120,7 @@ async def test_the_service_answers_nothing_from_a_cache_that_lacks_what_was_hear
         assert not [status for status in await ask() if status not in (200, 201)]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_cache_that_cannot_be_read_is_no_unknown_state(path: Path) -> None:
     async with service(small_px4(), cache=path, fetches=True) as (hub, browser):
         await met(browser)
@@ -132,7 +132,7 @@ async def test_a_cache_that_cannot_be_read_is_no_unknown_state(path: Path) -> No
 
 
 @UNWRITABLE
-@swiftly
+@in_simulated_time
 async def test_values_written_late_keep_their_observation_times_and_the_whole_history(
     unwritable: Holding, path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -159,7 +159,7 @@ async def test_values_written_late_keep_their_observation_times_and_the_whole_hi
 
 
 @UNWRITABLE
-@swiftly
+@in_simulated_time
 async def test_a_client_that_ends_says_what_is_lost(
     unwritable: Holding, path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -182,7 +182,7 @@ async def test_a_client_that_ends_says_what_is_lost(
     assert re.fullmatch(told, lost), lost
 
 
-@swiftly
+@in_simulated_time
 async def test_nothing_is_applied_where_the_state_before_cannot_be_kept(path: Path) -> None:
     vehicle = small_px4()
     async with ParamClient(vehicle, cache=path) as client:

@@ -32,7 +32,7 @@ from paramclient.model.identity import Identity
 from paramclient.model.values import Param
 from paramclient.protocol import wire
 from tests.recordings import DATA, from_vehicle, param_values, read
-from tests.shell import swiftly
+from tests.shell import in_simulated_time
 from tests.simulation import known
 from tests.telemetry import KEY, NOW, UID, Log
 
@@ -72,7 +72,7 @@ def test_invalid_link_names_of_logs(text: str) -> None:
         parse_link(text)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_file_that_is_not_a_log(tmp_path: Path) -> None:
     with pytest.raises(LinkError, match=r"cannot open .*nowhere\.tlog: No such file"):
         async with a_replay(tmp_path / "nowhere.tlog"):
@@ -93,7 +93,7 @@ async def test_a_file_that_is_not_a_log(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("before", [FIRST_FRAME_OFFSET_MAX - 100, FIRST_FRAME_OFFSET_MAX])
-@swiftly
+@in_simulated_time
 async def test_the_first_frame_must_be_near_the_start(before: int, tmp_path: Path) -> None:
     """For all bytes before the first frame; a file without a frame there may be a disk image."""
     path = tmp_path / "flight.tlog"
@@ -116,7 +116,7 @@ async def test_the_first_frame_must_be_near_the_start(before: int, tmp_path: Pat
 @pytest.mark.parametrize(
     ("name", "crc"), [("px4_full_download", 0xCF579589), ("ardupilot_full_download", None)]
 )
-@swiftly
+@in_simulated_time
 async def test_a_recording_gives_a_complete_table(name: str, crc: int | None, speed: str) -> None:
     async with a_replay(f"{DATA / name}.tlog{speed}") as client:
         assert client.cache is None
@@ -134,7 +134,7 @@ async def test_a_recording_gives_a_complete_table(name: str, crc: int | None, sp
 
 
 @pytest.mark.parametrize(("speed", "expected"), [("", 20.0), ("?speed=4", 5.0), ("?speed=0", 0.0)])
-@swiftly
+@in_simulated_time
 async def test_frames_have_the_times_of_the_log(speed: str, expected: float, tmp_path: Path) -> None:
     path = whole(A=1).wait(19.0).beat().write(tmp_path / "flight.tlog")
     began = anyio.current_time()
@@ -143,7 +143,7 @@ async def test_frames_have_the_times_of_the_log(speed: str, expected: float, tmp
         assert anyio.current_time() - began == pytest.approx(expected, abs=0.1)
 
 
-@swiftly
+@in_simulated_time
 async def test_long_pauses_and_clocks_that_go_back(tmp_path: Path) -> None:
     path = Log().beat().wait(86400.0).beat().wait(-1e6).beat().write(tmp_path / "flight.tlog")
     began = anyio.current_time()
@@ -154,7 +154,7 @@ async def test_long_pauses_and_clocks_that_go_back(tmp_path: Path) -> None:
         assert anyio.current_time() - began == pytest.approx(PAUSE_MAX, abs=0.1)
 
 
-@swiftly
+@in_simulated_time
 async def test_missing_parameters_are_reported_at_the_end_of_the_log(tmp_path: Path) -> None:
     log = Log().beat().tell("A", 0, A=1, B=2, C=3).tell("C", 2)
     async with a_replay(log.write(tmp_path / "flight.tlog")) as client:
@@ -170,7 +170,7 @@ async def test_missing_parameters_are_reported_at_the_end_of_the_log(tmp_path: P
         assert component.params["A"].trust is Trust.LIVE
 
 
-@swiftly
+@in_simulated_time
 async def test_the_last_value_is_used(tmp_path: Path) -> None:
     log = whole(A=1, B=2).wait(5.0).set("A", 7).wait(5.0)
     async with a_replay(log.write(tmp_path / "flight.tlog")) as client:
@@ -184,7 +184,7 @@ async def test_the_last_value_is_used(tmp_path: Path) -> None:
         assert [each async for each in client.events()] == []
 
 
-@swiftly
+@in_simulated_time
 async def test_requests_to_a_log_fail(tmp_path: Path) -> None:
     path = whole(A=1).write(tmp_path / "flight.tlog")
     async with a_replay(path) as client:
@@ -205,7 +205,7 @@ async def test_requests_to_a_log_fail(tmp_path: Path) -> None:
         a_replay(path, cache=tmp_path / "cache")
 
 
-@swiftly
+@in_simulated_time
 async def test_a_replay_can_be_closed_at_any_moment(tmp_path: Path) -> None:
     path = Log().beat().wait(1000.0).beat().write(tmp_path / "flight.tlog")
     link = create_link(f"replay:{path}")

@@ -41,11 +41,11 @@ from tests.shell import (
     Tap,
     a_client,
     generic,
+    in_simulated_time,
     outcome,
     residue,
+    simulated_time_loop,
     small_px4,
-    swift_loop,
-    swiftly,
     tasks_beside,
 )
 
@@ -54,15 +54,15 @@ IDENTITY = Identity(1, "link", "abcd", 12, 2, 0x01110000, "0123abcd", 1)
 
 @pytest.fixture(autouse=True)
 def _threads_are_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stop the clock of a `SwiftLoop` while a worker thread reads files."""
+    """Stop the clock of a `SimulatedTimeLoop` while a worker thread reads files."""
     in_thread = download._in_thread
 
     async def counted(*args: Any, **kwargs: Any) -> Any:
-        swift_loop().threads += 1
+        simulated_time_loop().threads += 1
         try:
             return await in_thread(*args, **kwargs)
         finally:
-            swift_loop().threads -= 1
+            simulated_time_loop().threads -= 1
 
     monkeypatch.setattr(download, "_in_thread", counted)
 
@@ -97,7 +97,7 @@ async def files_in(folder: Path) -> list[Path]:
 # Complete downloads
 
 
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_describes_its_parameters() -> None:
     vehicle = PX4Vehicle(metadata=True)
     async with a_client(vehicle) as client:
@@ -116,7 +116,7 @@ async def test_a_vehicle_describes_its_parameters() -> None:
         assert not vehicle.open_files
 
 
-@swiftly
+@in_simulated_time
 async def test_download_with_packet_loss() -> None:
     vehicle = describing(ftp_rate=10_000)
     link = Air([vehicle], uplink=FaultyLink(loss=0.3, seed=5), downlink=FaultyLink(loss=0.3, seed=6))
@@ -126,7 +126,7 @@ async def test_download_with_packet_loss() -> None:
         assert "PARAM_03" in read
 
 
-@swiftly
+@in_simulated_time
 async def test_a_cached_file_is_not_downloaded_again(tmp_path: Path) -> None:
     cache = tmp_path / "cache.sqlite3"
     for expected in (True, False):
@@ -147,7 +147,7 @@ async def test_a_cached_file_is_not_downloaded_again(tmp_path: Path) -> None:
             assert known.params == read.params
 
 
-@swiftly
+@in_simulated_time
 async def test_metadata_of_another_firmware_is_downloaded(tmp_path: Path) -> None:
     kept = MetadataStore(tmp_path)
     for units in ("m", "s"):
@@ -162,7 +162,7 @@ async def test_metadata_of_another_firmware_is_downloaded(tmp_path: Path) -> Non
             assert read["PARAM_03"].units == units
 
 
-@swiftly
+@in_simulated_time
 async def test_without_a_cache_nothing_is_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def forbidden(*_: object) -> None:
         raise AssertionError
@@ -174,7 +174,7 @@ async def test_without_a_cache_nothing_is_stored(tmp_path: Path, monkeypatch: py
         assert await metadata_of(await client.component(), store=False) is not None
 
 
-@swiftly
+@in_simulated_time
 async def test_a_file_without_a_checksum_is_not_cached(tmp_path: Path) -> None:
     vehicle = describing()
     publish(vehicle)  # without a checksum
@@ -186,7 +186,7 @@ async def test_a_file_without_a_checksum_is_not_cached(tmp_path: Path) -> None:
         assert [path.suffix for path in await files_in(tmp_path)] == [".metadata"]  # the general file
 
 
-@swiftly
+@in_simulated_time
 async def test_the_checksum_may_be_that_of_the_unpacked_file(tmp_path: Path) -> None:
     """PX4 announces this checksum for its general file."""
     vehicle = describing()
@@ -206,7 +206,7 @@ async def test_the_checksum_may_be_that_of_the_unpacked_file(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle, generic])
-@swiftly
+@in_simulated_time
 async def test_vehicles_without_metadata(make: Any) -> None:
     async with a_client(make()) as client:
         component = await client.component()
@@ -216,7 +216,7 @@ async def test_vehicles_without_metadata(make: Any) -> None:
         assert not local(component).machine.metadata_requests.is_asking
 
 
-@swiftly
+@in_simulated_time
 async def test_a_general_file_without_parameters() -> None:
     vehicle = describing()
     vehicle.files[GENERAL_FILE] = file_of({"version": 1, "metadataTypes": [{"type": 4, "uri": "mftp://e"}]})
@@ -224,7 +224,7 @@ async def test_a_general_file_without_parameters() -> None:
         assert await metadata_of(await client.component()) is None
 
 
-@swiftly
+@in_simulated_time
 async def test_nothing_is_downloaded_from_the_internet() -> None:
     vehicle = describing()
     publish(vehicle, uri="https://example.invalid/parameters.json.xz")
@@ -236,7 +236,7 @@ async def test_nothing_is_downloaded_from_the_internet() -> None:
     assert caught.value.source == "https://example.invalid/parameters.json.xz"
 
 
-@swiftly
+@in_simulated_time
 async def test_a_file_on_board_is_preferred_to_the_internet() -> None:
     vehicle = describing()
     publish(vehicle, uri="https://example.invalid/p", uriFallback=f"mftp://{METADATA_FILE}")
@@ -244,7 +244,7 @@ async def test_a_file_on_board_is_preferred_to_the_internet() -> None:
         assert await metadata_of(await client.component()) is not None
 
 
-@swiftly
+@in_simulated_time
 async def test_a_file_on_another_component() -> None:
     vehicle, camera = describing(), PX4Vehicle(component=100, table={"CAM_MODE": 1})
     camera.files["/p.json"] = json.dumps({"version": 1, "parameters": [{"name": "CAM_MODE"}]}).encode()
@@ -257,7 +257,7 @@ async def test_a_file_on_another_component() -> None:
 
 
 @pytest.mark.parametrize("wrong", ["checksum", "missing", "damaged", "long"])
-@swiftly
+@in_simulated_time
 async def test_files_that_are_not_as_announced(wrong: str, tmp_path: Path) -> None:
     vehicle = describing()
     content = vehicle.files[METADATA_FILE]
@@ -289,7 +289,7 @@ async def test_files_that_are_not_as_announced(wrong: str, tmp_path: Path) -> No
         assert not vehicle.open_files
 
 
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_that_does_not_respond() -> None:
     tap = Tap(describing())
     async with a_client(tap) as client:
@@ -316,7 +316,7 @@ async def test_a_vehicle_that_does_not_respond() -> None:
         assert await metadata_of(component) is not None
 
 
-@swiftly
+@in_simulated_time
 async def test_closing_the_client_during_a_download() -> None:
     tap = Tap(describing())
     async with anyio.create_task_group() as tasks:
@@ -335,7 +335,7 @@ async def test_closing_the_client_during_a_download() -> None:
     assert isinstance(await outcome(metadata_of(component)), ClientClosed)
 
 
-@swiftly
+@in_simulated_time
 async def test_cancellation_closes_files_and_sessions(tmp_path: Path) -> None:
     """At every point of the download."""
     for moment in (0.001, 0.012, 0.03, 0.05, 0.1, 0.2):
@@ -350,7 +350,7 @@ async def test_cancellation_closes_files_and_sessions(tmp_path: Path) -> None:
             assert await metadata_of(component) is not None
 
 
-@swiftly
+@in_simulated_time
 async def test_concurrent_requests_share_a_response() -> None:
     tap = Tap(describing())
     async with a_client(tap) as client:
@@ -361,7 +361,7 @@ async def test_concurrent_requests_share_a_response() -> None:
         assert [message.params[0] for message in tap.messages(CommandLong)].count(397.0) == 1
 
 
-@swiftly
+@in_simulated_time
 async def test_a_link_that_drops_during_a_download() -> None:
     tap = Tap(describing())
     link = FlakyLink(tap)
@@ -383,7 +383,7 @@ async def test_a_link_that_drops_during_a_download() -> None:
         assert waited == [False, True]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_too_large_file_is_not_downloaded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(download, "PACKED_SIZE_MAX", 400)
     vehicle = describing()
@@ -393,7 +393,7 @@ async def test_a_too_large_file_is_not_downloaded(monkeypatch: pytest.MonkeyPatc
             await metadata_of(await client.component())
 
 
-@swiftly
+@in_simulated_time
 async def test_nothing_is_stored_after_the_vehicle_was_replaced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -14,25 +14,25 @@ from paramclient.metadata import MetadataStore, download, load_if_quick
 from paramclient.metadata.quick_download import QUICK_TIMEOUT
 from paramclient.protocol.wire import CommandLong, FileTransfer
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, GenericVehicle, PX4Vehicle
-from tests.shell import Tap, a_client, residue, swift_loop, swiftly
+from tests.shell import Tap, a_client, in_simulated_time, residue, simulated_time_loop
 
 
 @pytest.fixture(autouse=True)
 def _threads_are_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stop the clock of a `SwiftLoop` while a worker thread reads files."""
+    """Stop the clock of a `SimulatedTimeLoop` while a worker thread reads files."""
     in_thread = download._in_thread
 
     async def counted(*args: Any, **kwargs: Any) -> Any:
-        swift_loop().threads += 1
+        simulated_time_loop().threads += 1
         try:
             return await in_thread(*args, **kwargs)
         finally:
-            swift_loop().threads -= 1
+            simulated_time_loop().threads -= 1
 
     monkeypatch.setattr(download, "_in_thread", counted)
 
 
-@swiftly
+@in_simulated_time
 async def test_on_a_quick_link_the_metadata_is_loaded_and_remembered(tmp_path: Path) -> None:
     store = MetadataStore(tmp_path)
     async with a_client(PX4Vehicle(metadata=True)) as client:
@@ -45,7 +45,7 @@ async def test_on_a_quick_link_the_metadata_is_loaded_and_remembered(tmp_path: P
         assert await anyio.to_thread.run_sync(store.known, component.identity, 1) is not None
 
 
-@swiftly
+@in_simulated_time
 async def test_a_slow_transfer_is_given_up_without_residue() -> None:
     vehicle = PX4Vehicle(metadata=True, ftp_rate=2_000.0)
     async with a_client(vehicle) as client:
@@ -60,7 +60,7 @@ async def test_a_slow_transfer_is_given_up_without_residue() -> None:
         assert not vehicle.open_files
 
 
-@swiftly
+@in_simulated_time
 async def test_less_time_is_taken_where_less_is_left() -> None:
     async with a_client(PX4Vehicle(metadata=True, ftp_rate=2_000.0)) as client:
         component = await client.component()
@@ -82,7 +82,7 @@ async def test_less_time_is_taken_where_less_is_left() -> None:
         (GenericVehicle(table={"A": 1}), "the vehicle does not announce MAVFTP"),
     ],
 )
-@swiftly
+@in_simulated_time
 async def test_where_it_cannot_be_quick_nothing_is_requested(vehicle: Any, note: str) -> None:
     tap = Tap(vehicle)
     async with a_client(tap) as client:
@@ -94,7 +94,7 @@ async def test_where_it_cannot_be_quick_nothing_is_requested(vehicle: Any, note:
         assert (len(tap.messages(CommandLong)), len(tap.messages(FileTransfer))) == before
 
 
-@swiftly
+@in_simulated_time
 async def test_a_listening_client_requests_nothing() -> None:
     tap = Tap(PX4Vehicle(metadata=True))
     async with a_client(tap, listen_only=True) as client:
@@ -103,7 +103,7 @@ async def test_a_listening_client_requests_nothing() -> None:
     assert not tap.heard
 
 
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_without_metadata_is_told_apart() -> None:
     async with a_client(PX4Vehicle()) as client:
         component = await client.component()
@@ -111,7 +111,7 @@ async def test_a_vehicle_without_metadata_is_told_apart() -> None:
         assert (await load_if_quick(component)).note == "the vehicle serves no metadata"
 
 
-@swiftly
+@in_simulated_time
 async def test_lost_packets_do_not_prevent_it() -> None:
     air = Air(
         [PX4Vehicle(metadata=True)],
@@ -125,7 +125,7 @@ async def test_lost_packets_do_not_prevent_it() -> None:
         assert found.metadata is not None, found.note
 
 
-@swiftly
+@in_simulated_time
 async def test_the_end_of_the_client_is_an_error() -> None:
     async with a_client(PX4Vehicle(metadata=True)) as client:
         component = await client.component()

@@ -33,7 +33,7 @@ from paramclient.protocol.scheduler import (
 )
 from paramclient.protocol.wire import ParamRequestList, ParamRequestRead
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, Vehicle
-from tests.shell import Tap, swiftly
+from tests.shell import Tap, in_simulated_time
 from tests.simulation import Simulation
 
 TIMEOUT = 0.2
@@ -598,7 +598,7 @@ def test_a_starved_vehicle_is_not_given_up_while_the_lists_of_others_fill_the_li
     assert len(world.sent_of(ParamRequestRead)) > 0
 
 
-@swiftly
+@in_simulated_time
 async def test_the_time_limit_of_a_fetch_holds_while_it_waits_for_its_turn() -> None:
     slow, quick = (
         PX4Vehicle(system=1, table=table(40), burst=1, period=0.1),
@@ -619,7 +619,7 @@ async def test_the_time_limit_of_a_fetch_holds_while_it_waits_for_its_turn() -> 
         assert (await running).complete
 
 
-@swiftly
+@in_simulated_time
 async def test_a_cancelled_fetch_makes_room_at_once() -> None:
     vehicles = [MAKES["ArduPilot"](system) for system in (1, 2)]
     async with ParamClient(Air.symmetric(vehicles, delay=0.02, rate=5760.0), cache=False) as client:
@@ -650,7 +650,7 @@ async def is_given_up(system: int) -> float:
         return anyio.current_time() - began
 
 
-@swiftly
+@in_simulated_time
 async def test_silent_lists_on_two_links_do_not_wait_for_each_other() -> None:
     alone = await is_given_up(1)
     with anyio.fail_after(2 * alone):

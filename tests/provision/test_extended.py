@@ -28,7 +28,7 @@ from paramclient.provision import (
 )
 from paramclient.sim import Camera
 from tests.client_kinds import direct_only, pytest_generate_tests, way
-from tests.shell import a_client, swiftly
+from tests.shell import a_client, in_simulated_time
 
 __all__ = ["pytest_generate_tests", "way"]
 
@@ -59,7 +59,7 @@ async def the_camera(client: object, number: int = 100) -> Component:
     return component
 
 
-@swiftly
+@in_simulated_time
 async def test_a_set_is_compared_and_nothing_is_written() -> None:
     camera = small()
     async with a_client(camera) as client:
@@ -75,7 +75,7 @@ async def test_a_set_is_compared_and_nothing_is_written() -> None:
             await verify_extended(component, ExtParamSet({}, component=101))
 
 
-@swiftly
+@in_simulated_time
 async def test_what_differs_is_written_and_read_back(tmp_path: Path, path: Path) -> None:
     camera = small()
     with ParamCache(path) as cache:
@@ -108,7 +108,7 @@ async def test_what_differs_is_written_and_read_back(tmp_path: Path, path: Path)
             assert (again.complete, again.outcomes, again.snapshot) == (True, (), None)
 
 
-@swiftly
+@in_simulated_time
 async def test_what_the_component_changes_or_refuses_is_told(path: Path) -> None:
     camera = small()
     async with a_client(camera, cache=path) as client:
@@ -122,7 +122,7 @@ async def test_what_the_component_changes_or_refuses_is_told(path: Path) -> None
         assert (result.complete, result.different, result.error) == (False, ("MODE", "EV"), None)
 
 
-@swiftly
+@in_simulated_time
 async def test_the_state_before_the_last_apply_is_restored(path: Path) -> None:
     camera = small()
     before = camera.ext_values
@@ -142,7 +142,7 @@ async def test_the_state_before_the_last_apply_is_restored(path: Path) -> None:
         assert (undone.complete, camera.ext_values["NAME"]) == (True, "Top")
 
 
-@swiftly
+@in_simulated_time
 async def test_a_state_at_a_time_is_restored(path: Path) -> None:
     camera = small()
     async with a_client(camera, cache=path) as client:
@@ -163,7 +163,7 @@ async def test_a_state_at_a_time_is_restored(path: Path) -> None:
             await component.ext.load_state(5.0)
 
 
-@swiftly
+@in_simulated_time
 async def test_without_a_cache_there_are_no_earlier_states() -> None:
     camera = small()
     async with a_client(camera) as client:
@@ -174,7 +174,7 @@ async def test_without_a_cache_there_are_no_earlier_states() -> None:
             await load_extended_state(component)
 
 
-@swiftly
+@in_simulated_time
 async def test_what_is_done_before_writing_may_end_the_call(path: Path) -> None:
     camera = small()
     asked = []
@@ -191,7 +191,7 @@ async def test_what_is_done_before_writing_may_end_the_call(path: Path) -> None:
         assert (await apply_extended(component, wanted(camera, MODE=1), before_writing=refuse)).complete
 
 
-@swiftly
+@in_simulated_time
 @direct_only("the link is cut during the call")
 async def test_a_lost_component_ends_the_run_with_the_outcomes_so_far(path: Path) -> None:
     camera = Camera({"A": 1, "B": 2}, slow={"B": 3.0})

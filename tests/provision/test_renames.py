@@ -24,7 +24,7 @@ from paramclient.provision import (
 )
 from paramclient.provision.inspection import wait_for_identity
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
-from tests.shell import a_client, swiftly
+from tests.shell import a_client, in_simulated_time
 
 RENAMES = Renames(
     [
@@ -178,7 +178,7 @@ def test_the_type_of_a_firmware_is_part_of_its_version(firmware: int, text: str)
 # Vehicles
 
 
-@swiftly
+@in_simulated_time
 async def test_apply_writes_and_verifies_under_the_name_of_the_vehicle() -> None:
     vehicle = copter()
     wanted = written({"WPNAV_SPEED": 750, "RTL_ALT": 2500, "OTHER": 2, "NO_SUCH": 1})
@@ -204,7 +204,7 @@ async def test_apply_writes_and_verifies_under_the_name_of_the_vehicle() -> None
     assert vehicle.values["RTL_ALT_M"] == 25
 
 
-@swiftly
+@in_simulated_time
 async def test_names_are_looked_up_again_after_a_stage_that_reveals_parameters() -> None:
     vehicle = copter()
     wanted = written({"EK1_ENABLE": 1, "EK1_TYPE": 3})
@@ -221,7 +221,7 @@ async def test_names_are_looked_up_again_after_a_stage_that_reveals_parameters()
     assert vehicle.values["EK2_GPS_TYPE"] == 3
 
 
-@swiftly
+@in_simulated_time
 async def test_apply_refuses_a_converted_value_that_is_invalid_under_the_name_of_the_file() -> None:
     vehicle = copter()
     async with a_client(vehicle) as client:
@@ -236,7 +236,7 @@ async def test_apply_refuses_a_converted_value_that_is_invalid_under_the_name_of
     assert vehicle.requests["PARAM_SET"] == 0
 
 
-@swiftly
+@in_simulated_time
 async def test_fleets_are_set_up_with_renames() -> None:
     vehicle = copter()
     wanted = written({"WPNAV_SPEED": 750})
@@ -248,7 +248,7 @@ async def test_fleets_are_set_up_with_renames() -> None:
         assert not (await verify_all(vehicles, wanted)).is_met
 
 
-@swiftly
+@in_simulated_time
 async def test_the_plan_of_a_vehicle_names_its_firmware_if_the_file_has_another_one() -> None:
     async with a_client(copter()) as client:
         component = await client.component()
@@ -260,7 +260,7 @@ async def test_the_plan_of_a_vehicle_names_its_firmware_if_the_file_has_another_
         assert (await verify(component, written({"OTHER": 1}, own))).firmware_note == ""
 
 
-@swiftly
+@in_simulated_time
 async def test_the_other_name_is_read_although_the_vehicle_does_not_list_it() -> None:
     """PX4 lists no parameters that it does not use yet, and takes them by name."""
     rows = [SimParam(name, ParamType.INT32, 1) for name in ("LISTED", "NEW_NAME")]

@@ -52,7 +52,7 @@ from paramclient.provision import (
 from paramclient.provision.execution import VERIFY_DELAY, ApplyRun
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, GenericVehicle, PX4Vehicle, SimParam
 from paramclient.sim.param_table import Entry
-from tests.shell import FlakyLink, Tap, a_client, residue, swiftly
+from tests.shell import FlakyLink, Tap, a_client, in_simulated_time, residue
 
 SETTINGS: dict[str, WireValue | tuple[ParamType, WireValue]] = {
     f"TUNE_{number:02}": number / 4 if number % 3 else number for number in range(30)
@@ -171,7 +171,7 @@ def sets(tap: Tap) -> list[str]:
 
 @EVERY_KIND
 @pytest.mark.parametrize("loss", [0.0, 0.15])
-@swiftly
+@in_simulated_time
 async def test_all_values_are_written_and_verified(make: Callable[[], Any], loss: float) -> None:
     vehicle = make()
     air = Air([vehicle], uplink=FaultyLink(loss=loss, seed=1), downlink=FaultyLink(loss=loss, seed=2))
@@ -194,7 +194,7 @@ async def test_all_values_are_written_and_verified(make: Callable[[], Any], loss
 
 
 @EVERY_KIND
-@swiftly
+@in_simulated_time
 async def test_prepare_lists_exactly_the_values_that_apply_sends(
     make: Callable[[], Any],
 ) -> None:
@@ -215,7 +215,7 @@ async def test_prepare_lists_exactly_the_values_that_apply_sends(
 
 
 @EVERY_KIND
-@swiftly
+@in_simulated_time
 async def test_the_verification_is_requested_after_the_last_write(make: Callable[[], Any]) -> None:
     tap = Tap(make())
     async with a_client(tap) as client:
@@ -230,7 +230,7 @@ async def test_the_verification_is_requested_after_the_last_write(make: Callable
         assert {message.param_id for message in hashes} == {wire.HASH_CHECK}
 
 
-@swiftly
+@in_simulated_time
 async def test_a_value_missing_from_the_last_list_is_unproven() -> None:
     vehicle = ardupilot(ftp=False)
 
@@ -246,7 +246,7 @@ async def test_a_value_missing_from_the_last_list_is_unproven() -> None:
     assert not result.complete
 
 
-@swiftly
+@in_simulated_time
 async def test_values_that_no_hash_covers_are_read_again_for_verification() -> None:
     vehicle = px4()
 
@@ -266,7 +266,7 @@ async def test_values_that_no_hash_covers_are_read_again_for_verification() -> N
 
 @EVERY_KIND
 @pytest.mark.parametrize("policy", ["hash-only", "cache-only"])
-@swiftly
+@in_simulated_time
 async def test_the_verification_reads_the_values_with_every_cache_policy(
     make: Callable[[], Any], policy: str, tmp_path: Path
 ) -> None:
@@ -288,7 +288,7 @@ async def test_the_verification_reads_the_values_with_every_cache_policy(
 
 
 @EVERY_KIND
-@swiftly
+@in_simulated_time
 async def test_a_plan_without_steps_writes_and_rereads_nothing(make: Callable[[], Any]) -> None:
     vehicle = make()
     tap = Tap(vehicle)
@@ -312,7 +312,7 @@ def downloads(tap: Tap) -> int:
 
 
 @pytest.mark.parametrize("ftp", [True, False])
-@swiftly
+@in_simulated_time
 async def test_two_downloads_suffice_for_any_file(ftp: bool) -> None:
     switch: dict[str, WireValue | tuple[ParamType, WireValue]] = {"GRIP_ENABLE": (ParamType.INT8, 1)}
     grip: dict[str, WireValue | tuple[ParamType, WireValue]] = {
@@ -368,7 +368,7 @@ def whole_tables(tap: Tap) -> int:
 
 
 @pytest.mark.parametrize("seed", range(6))
-@swiftly
+@in_simulated_time
 async def test_with_packet_loss_four_groups_take_two_downloads_and_six_seconds(seed: int) -> None:
     """30 values, of which 4 show groups of the real quad, with 100 ms and 5 % loss in each direction."""
     switches = ("GRIP_ENABLE", "SCR_ENABLE", "FOLL_ENABLE", "SPRAY_ENABLE")
@@ -404,7 +404,7 @@ async def test_with_packet_loss_four_groups_take_two_downloads_and_six_seconds(s
     [(6, True, True), (7, True, False), (6, False, False)],
     ids=["few", "too many", "a list, which reads slow down"],
 )
-@swiftly
+@in_simulated_time
 async def test_members_of_a_group_to_reveal_are_requested_during_the_file_download(
     listed: int, ftp: bool, is_beside: bool
 ) -> None:
@@ -437,7 +437,7 @@ async def test_members_of_a_group_to_reveal_are_requested_during_the_file_downlo
     assert {each.param_id for each in reads} >= hidden.keys()
 
 
-@swiftly
+@in_simulated_time
 async def test_a_group_that_cannot_be_read_by_name_is_set_once_it_is_revealed() -> None:
     vehicle = ardupilot(HidingGroup)
     wanted = written({"EK2_GPS_TYPE": 3, "TUNE_01": 9.0, "EK2_ENABLE": 1, "EK2_NO_SUCH": 1})
@@ -469,7 +469,7 @@ async def test_a_group_that_cannot_be_read_by_name_is_set_once_it_is_revealed() 
     assert not result.complete
 
 
-@swiftly
+@in_simulated_time
 async def test_a_missing_parameter_is_reported_and_not_written() -> None:
     tap = Tap(ardupilot())
     async with a_client(tap) as client:
@@ -485,7 +485,7 @@ async def test_a_missing_parameter_is_reported_and_not_written() -> None:
     assert not result.complete
 
 
-@swiftly
+@in_simulated_time
 async def test_a_refused_or_adjusted_value_does_not_stop_the_others() -> None:
     vehicle = ardupilot(ClampingVehicle, read_only=["TUNE_02", "TUNE_04"], param_error=True)
     wanted = written(another() | {"TUNE_01": 99.0})
@@ -512,7 +512,7 @@ async def test_a_refused_or_adjusted_value_does_not_stop_the_others() -> None:
 
 
 @pytest.mark.parametrize("bring", [apply, restore])
-@swiftly
+@in_simulated_time
 async def test_every_written_value_records_its_author(bring: Callable[..., Any]) -> None:
     async with a_client(px4()) as client:
         component = await client.component()
@@ -537,7 +537,7 @@ async def test_every_written_value_records_its_author(bring: Callable[..., Any])
                     break
 
 
-@swiftly
+@in_simulated_time
 async def test_invalid_values_are_raised_before_anything_is_sent() -> None:
     tap = Tap(ardupilot())
     wanted = written({"TUNE_01": 7.0, "SMALL": 300, "TUNE_03": 2**24 + 1})
@@ -553,7 +553,7 @@ async def test_invalid_values_are_raised_before_anything_is_sent() -> None:
     assert not result.complete
 
 
-@swiftly
+@in_simulated_time
 async def test_a_wrong_include_is_raised_before_the_vehicle_is_read() -> None:
     tap = Tap(ardupilot())
     async with a_client(tap) as client:
@@ -567,7 +567,7 @@ async def test_a_wrong_include_is_raised_before_the_vehicle_is_read() -> None:
         assert len(tap.messages(wire.ParamRequestRead)) == asked
 
 
-@swiftly
+@in_simulated_time
 async def test_left_out_parameters_can_be_included() -> None:
     vehicle = ardupilot()
     async with a_client(vehicle) as client:
@@ -580,7 +580,7 @@ async def test_left_out_parameters_can_be_included() -> None:
         assert not (await verify(component, wanted, include=["STAT_*"])).is_met
 
 
-@swiftly
+@in_simulated_time
 async def test_a_value_changed_by_a_later_write_is_written_again() -> None:
     for quarrels in (False, True):
         vehicle = px4(RevertingVehicle)
@@ -596,7 +596,7 @@ async def test_a_value_changed_by_a_later_write_is_written_again() -> None:
         assert len(tap.messages(wire.ParamSetMessage)) <= 5
 
 
-@swiftly
+@in_simulated_time
 async def test_the_state_is_stored_before_anything_is_sent(tmp_path: Path) -> None:
     cache = ParamCache(tmp_path / "cache.sqlite3")
     vehicle = ardupilot()
@@ -623,7 +623,7 @@ async def test_the_state_is_stored_before_anything_is_sent(tmp_path: Path) -> No
     assert dict(first.before) == dict(state)
 
 
-@swiftly
+@in_simulated_time
 async def test_nothing_is_sent_if_the_state_cannot_be_stored(tmp_path: Path) -> None:
     tap = Tap(ardupilot())
     broken = mock.Mock(side_effect=CacheError("disk full"))
@@ -635,7 +635,7 @@ async def test_nothing_is_sent_if_the_state_cannot_be_stored(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("bring", [apply, restore])
-@swiftly
+@in_simulated_time
 async def test_before_writing_may_end_the_call(bring: Callable[..., Any], tmp_path: Path) -> None:
     cache = ParamCache(tmp_path / "cache.sqlite3")
     tap = Tap(ardupilot())
@@ -657,7 +657,7 @@ async def test_before_writing_may_end_the_call(bring: Callable[..., Any], tmp_pa
     assert cache.snapshots(key) == []
 
 
-@swiftly
+@in_simulated_time
 async def test_before_writing_may_end_the_call_for_one_of_several_vehicles() -> None:
     one, two = ardupilot(system=1), ardupilot(system=2)
 
@@ -673,7 +673,7 @@ async def test_before_writing_may_end_the_call_for_one_of_several_vehicles() -> 
     assert (one.requests["PARAM_SET"], two.requests["PARAM_SET"]) == (1, 0)
 
 
-@swiftly
+@in_simulated_time
 async def test_progress_is_reported() -> None:
     told: list[ApplyProgress] = []
     async with a_client(ardupilot()) as client:
@@ -686,7 +686,7 @@ async def test_progress_is_reported() -> None:
     assert {each.row.name for each in told if each.row is not None} == set(SETTINGS)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_silent_vehicle_ends_the_run_and_the_next_run_continues() -> None:
     vehicle = ardupilot()
     tap = Tap(vehicle)
@@ -715,7 +715,7 @@ async def test_a_silent_vehicle_ends_the_run_and_the_next_run_continues() -> Non
     assert all(vehicle.param(name).value == value for name, value in another().items())
 
 
-@swiftly
+@in_simulated_time
 async def test_a_failed_link_ends_the_run_with_the_rows_so_far() -> None:
     vehicle = ardupilot()
     link = FlakyLink(vehicle)
@@ -737,7 +737,7 @@ async def test_a_failed_link_ends_the_run_with_the_rows_so_far() -> None:
         assert (await apply(component, written(another()))).complete
 
 
-@swiftly
+@in_simulated_time
 async def test_the_timeout_ends_the_run() -> None:
     vehicle = ardupilot()
     async with a_client(Air.symmetric([vehicle], rate=1000.0)) as client:
@@ -754,7 +754,7 @@ async def test_the_timeout_ends_the_run() -> None:
         assert residue(component) == []
 
 
-@swiftly
+@in_simulated_time
 async def test_restore_writes_an_earlier_state_of_the_vehicle() -> None:
     vehicle = ardupilot()
     original = vehicle.values
@@ -776,7 +776,7 @@ async def test_restore_writes_an_earlier_state_of_the_vehicle() -> None:
     assert undone.extra == ()
 
 
-@swiftly
+@in_simulated_time
 async def test_restore_skips_measured_and_read_only_parameters() -> None:
     own: dict[str, WireValue | tuple[ParamType, WireValue]]
     own = {"BARO1_GND_PRESS": 94500.0, "BARO1_DEVID": 65540, "INS_GYROFFS_X": 0.25, "LOCKED": 1.0}
@@ -810,7 +810,7 @@ async def test_restore_skips_measured_and_read_only_parameters() -> None:
         assert statuses(await apply(component, written({"LOCKED": 1.0}))) == {"LOCKED": "refused"}
 
 
-@swiftly
+@in_simulated_time
 async def test_restore_reports_parameters_that_the_state_does_not_have() -> None:
     vehicle = ardupilot()
     state = {name: param for name, param in vehicle.params.items() if name != "TUNE_05"}
@@ -830,7 +830,7 @@ async def test_restore_reports_parameters_that_the_state_does_not_have() -> None
         assert (await restore(component, kept)).rows["COMPASS_OFS_X"].status is ApplyStatus.SET
 
 
-@swiftly
+@in_simulated_time
 async def test_the_state_or_plan_of_another_vehicle_is_refused() -> None:
     async with a_client(ardupilot(uid2=b"another")) as client:
         component = await client.component()
@@ -847,7 +847,7 @@ async def test_the_state_or_plan_of_another_vehicle_is_refused() -> None:
             await restore(component, state)
 
 
-@swiftly
+@in_simulated_time
 async def test_several_vehicles_are_set_up_concurrently() -> None:
     vehicles = [ardupilot(), px4(system=2), ardupilot(system=3, read_only=["TUNE_01"])]
     base = written(another())
@@ -878,7 +878,7 @@ async def test_several_vehicles_are_set_up_concurrently() -> None:
 
 
 @EVERY_KIND
-@swiftly
+@in_simulated_time
 async def test_an_armed_vehicle_is_refused_unless_allowed(make: Callable[..., Any]) -> None:
     vehicle = make(armed=True)
     tap = Tap(vehicle)
@@ -896,7 +896,7 @@ async def test_an_armed_vehicle_is_refused_unless_allowed(make: Callable[..., An
             assert statuses(result) == {"FRAME_CLASS": "set"}
 
 
-@swiftly
+@in_simulated_time
 async def test_another_component_of_an_armed_vehicle_is_refused() -> None:
     for system in (1, 2):
         camera = GenericVehicle({"TUNE_01": 0.25}, system=1, component=100)
@@ -910,7 +910,7 @@ async def test_another_component_of_an_armed_vehicle_is_refused() -> None:
             assert (await apply(component, written({"TUNE_01": 1.5}), allow_armed=system == 1)).complete
 
 
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_with_unknown_armed_state_is_refused() -> None:
     vehicle = ardupilot()
     async with a_client(vehicle) as client:
@@ -923,7 +923,7 @@ async def test_a_vehicle_with_unknown_armed_state_is_refused() -> None:
         assert vehicle.requests["PARAM_SET"] == 0
 
 
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_armed_during_the_run_ends_it() -> None:
     vehicle = ardupilot()
 
@@ -941,7 +941,7 @@ async def test_a_vehicle_armed_during_the_run_ends_it() -> None:
             await apply(component, written(another()))
 
 
-@swiftly
+@in_simulated_time
 async def test_a_reboot_follows_values_that_take_effect_after_it() -> None:
     vehicle = ardupilot(reboot_groups=["EK2_ENABLE"], make=HidingGroup)
     tap = Tap(vehicle)
@@ -962,7 +962,7 @@ async def test_a_reboot_follows_values_that_take_effect_after_it() -> None:
     assert vehicle.param("EK2_ALT_M_NSE").value == 1.5
 
 
-@swiftly
+@in_simulated_time
 async def test_a_change_too_small_for_px4_is_reported_with_the_value_after_the_reboot() -> None:
     vehicle = px4(table=SETTINGS | {"SYS_HITL": 0}, not_in_use=(), late_use={})
     near = from_bits(bits_of(0.25, ParamType.REAL32) + 1, ParamType.REAL32)
@@ -988,7 +988,7 @@ async def test_a_change_too_small_for_px4_is_reported_with_the_value_after_the_r
     assert vehicle.requests["PARAM_SET"] == 3  # a value that a reboot reverts is not written again
 
 
-@swiftly
+@in_simulated_time
 async def test_a_group_revealed_by_a_reboot_is_set_after_it() -> None:
     vehicle = ardupilot(reboot_groups=["EK2_ENABLE"], make=HidingGroup)
     tap = Tap(vehicle)
@@ -1003,7 +1003,7 @@ async def test_a_group_revealed_by_a_reboot_is_set_after_it() -> None:
     assert sets(tap) == ["EK2_ENABLE", "TUNE_01", "EK2_ALT_M_NSE"]
 
 
-@swiftly
+@in_simulated_time
 async def test_names_that_no_reboot_reveals_cost_at_most_one_reboot() -> None:
     async with a_client(ardupilot(make=HidingGroup)) as client:
         component = await client.component()
@@ -1013,7 +1013,7 @@ async def test_names_that_no_reboot_reveals_cost_at_most_one_reboot() -> None:
         assert (await apply(component, written({"TUNE_X": 1, "EK2_ENABLE": 1}), reboot=True)).reboots == 0
 
 
-@swiftly
+@in_simulated_time
 async def test_px4_reboots_before_parameters_that_the_frame_resets() -> None:
     vehicle = px4(uid=77)
     vehicle.set_param("TUNE_05", 9.0)
@@ -1035,7 +1035,7 @@ async def test_px4_reboots_before_parameters_that_the_frame_resets() -> None:
     assert [vehicle.param(name).value for name in ("TUNE_01", "TUNE_05", "SYS_AUTOCONFIG")] == [1.25, 9.0, 0]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_reset_that_changes_the_system_id_is_followed() -> None:
     vehicle = px4(uid=77, system=5)
     vehicle.set_param("MAV_SYS_ID", 5)
@@ -1050,7 +1050,7 @@ async def test_a_reset_that_changes_the_system_id_is_followed() -> None:
 
 
 @EVERY_KIND
-@swiftly
+@in_simulated_time
 async def test_a_changed_system_id_is_followed(make: Callable[..., Any]) -> None:
     vehicle = make() if make is ardupilot else make(uid=77)
     name = "SYSID_THISMAV" if make is ardupilot else "MAV_SYS_ID"
@@ -1073,7 +1073,7 @@ async def test_a_changed_system_id_is_followed(make: Callable[..., Any]) -> None
     assert (undone.system, vehicle.system) == (1, 1)
 
 
-@swiftly
+@in_simulated_time
 async def test_plane_and_rover_take_their_system_id_without_a_reboot() -> None:
     vehicle = ardupilot(kind="plane")
     async with a_client(vehicle) as client:
@@ -1085,7 +1085,7 @@ async def test_plane_and_rover_take_their_system_id_without_a_reboot() -> None:
     assert (result.system, vehicle.system) == (7, 7)
 
 
-@swiftly
+@in_simulated_time
 async def test_copter_keeps_its_system_id_until_it_reboots() -> None:
     """The list says so, and the heartbeats show it: another firmware may change the id immediately."""
     vehicle = ardupilot()
@@ -1099,7 +1099,7 @@ async def test_copter_keeps_its_system_id_until_it_reboots() -> None:
     assert (started.reboots, started.system, vehicle.system) == (1, 7, 7)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_copter_that_changes_its_system_id_immediately_is_followed() -> None:
     vehicle = ardupilot(kind="plane")
     vehicle._heartbeat = dataclasses.replace(vehicle._heartbeat, type=2)
@@ -1111,7 +1111,7 @@ async def test_a_copter_that_changes_its_system_id_immediately_is_followed() -> 
     assert (result.system, vehicle.system) == (7, 7)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_system_id_of_another_vehicle_is_not_set() -> None:
     vehicles = [ardupilot(), ardupilot(system=7)]
     async with a_client(Air(vehicles)) as client:
@@ -1124,7 +1124,7 @@ async def test_a_system_id_of_another_vehicle_is_not_set() -> None:
     assert [vehicle.system for vehicle in vehicles] == [1, 7]
 
 
-@swiftly
+@in_simulated_time
 async def test_without_a_reboot_a_px4_keeps_its_system_id_for_now() -> None:
     vehicle = px4(uid=77)
     async with a_client(vehicle) as client:
@@ -1139,7 +1139,7 @@ async def test_without_a_reboot_a_px4_keeps_its_system_id_for_now() -> None:
     assert (started.reboots, started.system, vehicle.system) == (1, 7, 7)
 
 
-@swiftly
+@in_simulated_time
 async def test_the_backup_file_restores_every_parameter(tmp_path: Path) -> None:
     vehicle = ardupilot()
     original = vehicle.values
@@ -1156,7 +1156,7 @@ async def test_the_backup_file_restores_every_parameter(tmp_path: Path) -> None:
     assert vehicle.values == original
 
 
-@swiftly
+@in_simulated_time
 async def test_parameters_that_may_end_the_connection_are_written_one_by_one() -> None:
     tap = Tap(ardupilot())
     async with a_client(tap) as client:
@@ -1167,7 +1167,7 @@ async def test_parameters_that_may_end_the_connection_are_written_one_by_one() -
     assert times["SYSID_ENFORCE"] + 0.001 < times["SYSID_THISMAV"]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_link_that_fails_during_the_system_id_change_ends_the_run() -> None:
     broken = mock.AsyncMock(side_effect=LinkError("gone", link="x"))
     async with a_client(ardupilot()) as client:
@@ -1179,7 +1179,7 @@ async def test_a_link_that_fails_during_the_system_id_change_ends_the_run() -> N
         assert residue(component) == []
 
 
-@swiftly
+@in_simulated_time
 async def test_cached_values_do_not_count_as_values_of_the_vehicle(tmp_path: Path) -> None:
     wanted = written({"EK2_ALT_M_NSE": 3.0, "TUNE_01": 0.25})
     for vehicle in (ardupilot(), px4(uid=77)):
@@ -1194,7 +1194,7 @@ async def test_cached_values_do_not_count_as_values_of_the_vehicle(tmp_path: Pat
         assert {row.before for row in result.rows.values()} == {9.0}
 
 
-@swiftly
+@in_simulated_time
 async def test_the_stored_state_includes_values_that_no_hash_covers(tmp_path: Path) -> None:
     vehicle = px4(uid=77)
     path = tmp_path / "cache.sqlite3"
@@ -1208,7 +1208,7 @@ async def test_the_stored_state_includes_values_that_no_hash_covers(tmp_path: Pa
     assert result.before["CAL_ACC0_XOFF"].value == 0.75
 
 
-@swiftly
+@in_simulated_time
 async def test_the_run_ends_after_three_unanswered_writes() -> None:
     many = {f"TUNE_{number:02}": float(number) for number in range(60)}
     tap = Tap(ardupilot(table=many, groups={}))
@@ -1225,7 +1225,7 @@ async def test_the_run_ends_after_three_unanswered_writes() -> None:
     assert [row.reason for row in result.rows.values()].count("not reached") >= 5
 
 
-@swiftly
+@in_simulated_time
 async def test_another_vehicle_at_the_same_address_ends_the_run() -> None:
     vehicle = ardupilot()
     tap = Tap(vehicle)
@@ -1238,7 +1238,7 @@ async def test_another_vehicle_at_the_same_address_ends_the_run() -> None:
     assert len(tap.messages(wire.ParamSetMessage)) == len(SETTINGS)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_failure_before_anything_is_sent_is_raised() -> None:
     vehicle = ardupilot()
     tap = Tap(vehicle)
@@ -1335,7 +1335,7 @@ def test_the_next_run_completes_after_an_interruption_anywhere(
 ) -> None:
     path = tmp_path_factory.mktemp("cache") / "cache.sqlite3"
 
-    @swiftly
+    @in_simulated_time
     async def told() -> None:
         story = Scenario(kind)
         before = story.truth()
@@ -1368,7 +1368,7 @@ def test_the_next_run_completes_after_an_interruption_anywhere(
 
 
 @EVERY_KIND
-@swiftly
+@in_simulated_time
 async def test_a_file_of_another_autopilot_is_refused_before_the_vehicle_is_read(
     make: Callable[[], Any],
 ) -> None:
@@ -1388,7 +1388,7 @@ async def test_a_file_of_another_autopilot_is_refused_before_the_vehicle_is_read
 
 
 @pytest.mark.parametrize("delay", [0.02, 0.8, 1.1])
-@swiftly
+@in_simulated_time
 async def test_a_value_clamped_within_a_second_is_adjusted(delay: float) -> None:
     vehicle = PX4Vehicle(table=SETTINGS | CLAMPED, clamp_delay=delay)
     wanted = {"MPC_TILTMAX_LND": 80.0, "TUNE_01": 9.5, "MPC_XY_CRUISE": 6.0}
@@ -1402,7 +1402,7 @@ async def test_a_value_clamped_within_a_second_is_adjusted(delay: float) -> None
     assert vehicle.requests["PARAM_SET"] == 4  # once more: a later write may have changed it
 
 
-@swiftly
+@in_simulated_time
 async def test_a_clamp_to_the_old_value_is_adjusted_and_not_failed() -> None:
     vehicle = PX4Vehicle(table=SETTINGS | CLAMPED | {"MPC_TILTMAX_LND": 45.0}, clamp_delay=0.5)
     async with a_client(vehicle) as client:
@@ -1411,7 +1411,7 @@ async def test_a_clamp_to_the_old_value_is_adjusted_and_not_failed() -> None:
     assert result.rows["MPC_TILTMAX_LND"].actual == 45.0
 
 
-@swiftly
+@in_simulated_time
 async def test_a_value_clamped_by_another_wanted_value_is_set_with_the_second_attempt() -> None:
     vehicle = PX4Vehicle(table=SETTINGS | CLAMPED, clamp_delay=0.0)
     async with a_client(vehicle) as client:
@@ -1419,7 +1419,7 @@ async def test_a_value_clamped_by_another_wanted_value_is_set_with_the_second_at
         assert (await apply(await client.component(), written(wanted))).complete
 
 
-@swiftly
+@in_simulated_time
 async def test_an_unchanged_value_that_another_write_changes_is_detected() -> None:
     vehicle = PX4Vehicle(table=SETTINGS | CLAMPED, clamp_delay=1.0)
     async with a_client(vehicle) as client:
@@ -1428,7 +1428,7 @@ async def test_an_unchanged_value_that_another_write_changes_is_detected() -> No
     assert statuses(result) == {"MPC_XY_VEL_MAX": "set", "MPC_VEL_MANUAL": "adjusted"}
 
 
-@swiftly
+@in_simulated_time
 async def test_the_verification_begins_after_the_verify_delay() -> None:
     tap = Tap(px4())
     async with a_client(tap) as client:
@@ -1442,7 +1442,7 @@ async def test_the_verification_begins_after_the_verify_delay() -> None:
     assert hashes[-1] - sets[-1] >= VERIFY_DELAY
 
 
-@swiftly
+@in_simulated_time
 async def test_a_run_without_writes_has_no_verify_delay() -> None:
     async with a_client(px4()) as client:
         result = await apply(await client.component(), written({"TUNE_01": 0.25}))
@@ -1451,7 +1451,7 @@ async def test_a_run_without_writes_has_no_verify_delay() -> None:
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("-inf")])
-@swiftly
+@in_simulated_time
 async def test_a_value_that_px4_cannot_save_is_set_only_if_forced(value: float) -> None:
     vehicle = px4()
     async with a_client(vehicle) as client:
@@ -1499,7 +1499,7 @@ def reads_after_the_last_set(tap: Tap) -> list[str]:
     return [each.param_id for each in messages[last + 1 :] if isinstance(each, wire.ParamRequestRead)]
 
 
-@swiftly
+@in_simulated_time
 async def test_twenty_values_over_a_radio_take_one_download_and_are_verified_by_name() -> None:
     tap = on_a_radio(vehicle := ardupilot_on_a_serial_port())
     wanted = tuned(vehicle, 21)
@@ -1517,7 +1517,7 @@ async def test_twenty_values_over_a_radio_take_one_download_and_are_verified_by_
     assert sorted(reads_after_the_last_set(tap)) == sorted(wanted)
 
 
-@swiftly
+@in_simulated_time
 async def test_switches_of_groups_take_one_download_over_a_radio_too() -> None:
     tap = on_a_radio(vehicle := ardupilot_on_a_serial_port())
     hidden = {"EK2_ENABLE": 1, "EK2_ALT_M_NSE": 4.0, "EK2_GPS_TYPE": 2}
@@ -1529,7 +1529,7 @@ async def test_switches_of_groups_take_one_download_over_a_radio_too() -> None:
     assert downloads(tap) == 1
 
 
-@swiftly
+@in_simulated_time
 async def test_a_value_that_changes_after_its_acknowledgement_is_detected_over_a_radio() -> None:
     tap = on_a_radio(vehicle := ardupilot_on_a_serial_port())
     wanted = tuned(vehicle, 4)
@@ -1550,7 +1550,7 @@ async def test_a_value_that_changes_after_its_acknowledgement_is_detected_over_a
     assert downloads(tap) == 1
 
 
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_that_falls_silent_before_verification_over_a_radio_ends_the_run() -> None:
     tap = on_a_radio(vehicle := ardupilot_on_a_serial_port())
     wanted = tuned(vehicle, 3)
@@ -1564,7 +1564,7 @@ async def test_a_vehicle_that_falls_silent_before_verification_over_a_radio_ends
     assert set(statuses(result).values()) == {"unproven"}
 
 
-@swiftly
+@in_simulated_time
 async def test_a_large_file_is_verified_by_a_download_over_a_radio_too() -> None:
     tap = on_a_radio(vehicle := ardupilot_on_a_serial_port())
     wanted = ParamSet.of(vehicle.params.values())
@@ -1576,7 +1576,7 @@ async def test_a_large_file_is_verified_by_a_download_over_a_radio_too() -> None
     assert reads_after_the_last_set(tap) == []
 
 
-@swiftly
+@in_simulated_time
 async def test_a_hash_verifies_all_values_over_a_radio_too() -> None:
     tap = on_a_radio(PX4Vehicle(burst=3, period=0.025))
     async with a_client(tap) as client:

@@ -47,7 +47,17 @@ from paramclient.service.access import AccessSettings
 from paramclient.service.tokens import TokenHolder, Tokens
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from tests.asgi import ASGITransport
-from tests.shell import FlakyLink, Tap, a_client, generic, outcome, settled, small_px4, swiftly, until
+from tests.shell import (
+    FlakyLink,
+    Tap,
+    a_client,
+    generic,
+    in_simulated_time,
+    outcome,
+    settled,
+    small_px4,
+    until,
+)
 
 URL = "http://127.0.0.1:8765"
 TOKENS = {"anna": "write", "ben": "read"}
@@ -202,7 +212,7 @@ def values(component: Any) -> dict[str, Any]:
 # Several programs
 
 
-@swiftly
+@in_simulated_time
 async def test_two_programs_that_fetch_at_once_cause_one_download() -> None:
     vehicle = generic(period=0.1)
     async with a_service(vehicle) as network, a_program(network) as one, a_program(network) as other:
@@ -217,7 +227,7 @@ async def test_two_programs_that_fetch_at_once_cause_one_download() -> None:
             assert dict(result.params) == vehicle.params
 
 
-@swiftly
+@in_simulated_time
 async def test_a_program_that_leaves_ends_the_download_of_nobody_else() -> None:
     vehicle = generic(burst=1, period=0.1)
     async with a_service(vehicle) as network, a_program(network) as one, a_program(network) as other:
@@ -229,7 +239,7 @@ async def test_a_program_that_leaves_ends_the_download_of_nobody_else() -> None:
         assert vehicle.requests["PARAM_REQUEST_LIST"] == 1
 
 
-@swiftly
+@in_simulated_time
 async def test_a_write_is_watched_and_forced_over_a_service() -> None:
     async with a_service(PX4Vehicle()) as network, a_program(network) as client:
         component = await client.component()
@@ -242,7 +252,7 @@ async def test_a_write_is_watched_and_forced_over_a_service() -> None:
             await component.set("MC_ROLL_P", 1.0, settle=math.nan)
 
 
-@swiftly
+@in_simulated_time
 async def test_two_that_set_one_name_are_put_in_order_and_each_learns_what_happened() -> None:
     tap = Tap(generic())
     slow = Air.symmetric([tap], delay=0.1)
@@ -259,7 +269,7 @@ async def test_two_that_set_one_name_are_put_in_order_and_each_learns_what_happe
         assert (told.name, told.new and told.new.value, told.by) == ("PARAM_01", 11, "us")
 
 
-@swiftly
+@in_simulated_time
 async def test_other_clients_receive_the_author_of_a_change() -> None:
     access = AccessSettings(tokens=tokens())
     async with a_hub(small_px4()) as hub:
@@ -292,7 +302,7 @@ def tokens() -> Tokens:
 # What is known
 
 
-@swiftly
+@in_simulated_time
 async def test_a_program_sees_what_the_service_knows_at_once() -> None:
     vehicle = PX4Vehicle()
     async with a_service(vehicle) as network:
@@ -313,7 +323,7 @@ async def test_a_program_sees_what_the_service_knows_at_once() -> None:
         assert vehicle.requests == requests, "and asks the vehicle for nothing"
 
 
-@swiftly
+@in_simulated_time
 async def test_the_numbers_are_those_of_the_links() -> None:
     async with a_service(generic()) as network, a_program(network) as client:
         component = await client.component()
@@ -329,7 +339,7 @@ async def test_the_numbers_are_those_of_the_links() -> None:
         assert not client.listens_only
 
 
-@swiftly
+@in_simulated_time
 async def test_components_on_several_links() -> None:
     links = [
         ("one", lambda: a_client(Air([generic(), generic(system=2)]))),
@@ -357,7 +367,7 @@ async def test_components_on_several_links() -> None:
                 pass
 
 
-@swiftly
+@in_simulated_time
 async def test_calls_that_a_service_lacks_raise_usage_errors() -> None:
     async with a_service(small_px4()) as network, a_program(network) as client:
         component = await client.component()
@@ -382,7 +392,7 @@ async def test_calls_that_a_service_lacks_raise_usage_errors() -> None:
         assert not hasattr(client, "nothing_such")
 
 
-@swiftly
+@in_simulated_time
 async def test_a_restart_of_a_vehicle_goes_over_the_service() -> None:
     vehicle = PX4Vehicle(table={"MAV_SYS_ID": 1, "PARAM_01": 1}, reboot_down=2.0)
     async with a_service(vehicle) as network, a_program(network) as client:
@@ -405,7 +415,7 @@ async def test_a_restart_of_a_vehicle_goes_over_the_service() -> None:
 # Services that go and come
 
 
-@swiftly
+@in_simulated_time
 async def test_a_service_that_starts_again_in_the_middle() -> None:
     vehicle = small_px4()
     async with Station(vehicle) as station:
@@ -457,7 +467,7 @@ async def _waiting(changes: Any) -> AsyncIterator[Change]:
             yield await asyncio.wait_for(anext(changes), 0.5)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_connection_that_breaks_loses_nothing_and_loads_nothing_anew() -> None:
     vehicle = small_px4()
     async with a_service(vehicle) as network, a_program(network) as client:
@@ -484,7 +494,7 @@ async def test_a_connection_that_breaks_loses_nothing_and_loads_nothing_anew() -
         assert not [asked for asked in network.asked if asked.endswith("/params")]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_network_that_falls_silent_is_noticed() -> None:
     async with a_service(small_px4()) as network, a_program(network) as client:
         component = await client.component()
@@ -499,7 +509,7 @@ async def test_a_network_that_falls_silent_is_noticed() -> None:
         assert trusts(component) == {Trust.LIVE}
 
 
-@swiftly
+@in_simulated_time
 async def test_a_service_that_stays_away(caplog: pytest.LogCaptureFixture) -> None:
     async with a_service(small_px4()) as network, a_program(network) as client:
         component = await client.component()
@@ -532,7 +542,7 @@ async def test_a_service_that_stays_away(caplog: pytest.LogCaptureFixture) -> No
     assert len([text for text in told if "reconnecting" in text]) == 1
 
 
-@swiftly
+@in_simulated_time
 async def test_a_write_whose_answer_is_lost_is_not_sent_again() -> None:
     tap = Tap(generic())
     async with a_service(tap) as network, a_program(network) as client:
@@ -551,7 +561,7 @@ async def test_a_write_whose_answer_is_lost_is_not_sent_again() -> None:
         assert (await component.get("PARAM_01")).value == 5
 
 
-@swiftly
+@in_simulated_time
 async def test_a_slow_listener_that_has_missed_events_loads_anew() -> None:
     vehicle = generic()
     async with a_hub(vehicle) as hub:
@@ -575,7 +585,7 @@ async def test_a_slow_listener_that_has_missed_events_loads_anew() -> None:
             assert values(component) == values(own)
 
 
-@swiftly
+@in_simulated_time
 async def test_the_links_of_a_service_may_be_away() -> None:
     link = FlakyLink(small_px4())
     async with a_service(("tcp:flaky:5760", lambda: a_client(link))) as network, a_program(network) as client:
@@ -631,7 +641,7 @@ def answering(status: int, body: bytes, kind: str = "text/html", **headers: str)
     ],
     ids=["page", "nothing", "elsewhere", "json", "problem", "number", "noise", "end", "proxy", "nobody"],
 )
-@swiftly
+@in_simulated_time
 async def test_an_address_that_is_no_service_is_a_link_error(app: ASGIApp | None, words: str) -> None:
     with pytest.raises(LinkError, match=words) as caught:
         async with a_program(Network(app)):
@@ -639,7 +649,7 @@ async def test_an_address_that_is_no_service_is_a_link_error(app: ASGIApp | None
     assert caught.value.link == URL
 
 
-@swiftly
+@in_simulated_time
 async def test_a_service_that_does_not_respond_is_given_up() -> None:
     async def silent(scope: Scope, receive: Receive, send: Send) -> None:
         while (await receive())["type"] != "http.disconnect":
@@ -652,7 +662,7 @@ async def test_a_service_that_does_not_respond_is_given_up() -> None:
     assert anyio.current_time() - began < 11.0
 
 
-@swiftly
+@in_simulated_time
 async def test_a_wrong_token_is_told_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("PARAMCLIENT_TOKEN", raising=False)
     async with a_hub(generic()) as hub:
@@ -697,7 +707,7 @@ STEPS = ["change", "change", "set", "get", "fetch", "cut", "down", "up", "restar
     241,
 )
 def test_a_mirror_equals_the_table_of_the_service_after_anything(steps: list[str], seed: int) -> None:
-    swiftly(follow)(steps, random.Random(seed))
+    in_simulated_time(follow)(steps, random.Random(seed))
 
 
 async def follow(steps: list[str], draw: random.Random) -> None:

@@ -31,7 +31,7 @@ from paramclient.model.ext_params import own_bytes
 from paramclient.remote.decoding import ext_param_of
 from paramclient.sim import Camera
 from tests.remote.test_client import Network, Station, a_program, a_service
-from tests.shell import Tap, outcome, settled, swiftly, until
+from tests.shell import Tap, in_simulated_time, outcome, settled, until
 
 T = TypeVar("T")
 MANY = {f"PARAM_{number:02}": number for number in range(40)}
@@ -53,7 +53,7 @@ def test_a_parameter_loses_no_bit_on_the_way(kind: int, data: bytes, trust: Trus
     assert (repr(came.value), came.type) == (repr(param.value), param.type)
 
 
-@swiftly
+@in_simulated_time
 async def test_every_value_is_written_as_it_is() -> None:
     kinds = ExtParamType
     camera = Camera(
@@ -90,7 +90,7 @@ async def test_every_value_is_written_as_it_is() -> None:
             assert camera.ext_values[name] == before
 
 
-@swiftly
+@in_simulated_time
 async def test_many_values_go_out_in_several_requests() -> None:
     camera = Camera({f"T{number:04}": "old" for number in range(1000)})
     async with a_service(camera) as network, a_program(network) as client:
@@ -103,7 +103,7 @@ async def test_many_values_go_out_in_several_requests() -> None:
         assert network.asked.count("PATCH /api/v1/components/1/100/extended/params") == 3
 
 
-@swiftly
+@in_simulated_time
 async def test_programs_see_the_changes_of_each_other() -> None:
     camera = Camera({"A": 1, "B": "text", "C": 3}, supported={"C": [3]})
     async with a_service(camera) as network, a_program(network) as one, a_program(network) as two:
@@ -129,7 +129,7 @@ async def test_programs_see_the_changes_of_each_other() -> None:
         assert (refused.value.name, refused.value.code, refused.value.system) == ("C", 1, 1)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_program_has_what_the_service_knows_at_once() -> None:
     async with a_service(Camera()) as network, a_program(network) as first:
         await (await first.component(1, 100)).ext.fetch_all()
@@ -138,7 +138,7 @@ async def test_a_program_has_what_the_service_knows_at_once() -> None:
             assert (len(ext.params), ext.is_complete, ext.count, ext.is_spoken) == (16, True, 16, True)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_connection_that_breaks_loses_nothing_and_loads_nothing_anew() -> None:
     camera = Camera(MANY)
     async with a_service(camera) as network, a_program(network) as other, a_program(network) as client:
@@ -161,7 +161,7 @@ async def test_a_connection_that_breaks_loses_nothing_and_loads_nothing_anew() -
         assert other.components
 
 
-@swiftly
+@in_simulated_time
 async def test_a_write_whose_answer_is_lost_is_not_sent_again() -> None:
     tap = Tap(Camera(MANY))
     async with a_service(tap) as network, a_program(network) as client:
@@ -194,7 +194,7 @@ STEPS = ["change", "change", "set", "get", "fetch", "remove", "cut", "down", "up
 @settings(max_examples=15, deadline=None, phases=[Phase.explicit, Phase.reuse, Phase.generate])
 @given(st.lists(st.sampled_from(STEPS), min_size=3, max_size=25), st.integers(0, 2**32))
 def test_a_mirror_equals_the_table_of_the_service_after_anything(steps: list[str], seed: int) -> None:
-    swiftly(follow)(steps, random.Random(seed))
+    in_simulated_time(follow)(steps, random.Random(seed))
 
 
 async def follow(steps: list[str], draw: random.Random) -> None:
@@ -275,7 +275,7 @@ def without_extended(document: Any) -> Any:
     return [without_extended(each) for each in document] if isinstance(document, list) else document
 
 
-@swiftly
+@in_simulated_time
 async def test_a_service_of_an_earlier_version() -> None:
     camera = Camera(plain={"A": 1})
     async with a_service(camera) as network:

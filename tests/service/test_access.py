@@ -36,7 +36,7 @@ from paramclient.service.tokens import (
     token_line,
     tokens_from,
 )
-from tests.shell import swiftly, until
+from tests.shell import in_simulated_time, until
 
 ANNA = "anna-may-write-0123456789"
 BEN = "ben-may-read-0123456789ab"
@@ -369,7 +369,7 @@ def test_hosts_are_named_one_by_one(host: str) -> None:
 # Who asks
 
 
-@swiftly
+@in_simulated_time
 async def test_without_tokens_whoever_is_on_this_machine_may_write() -> None:
     door = Door()
     assert (await door.request("POST", WRITE, body=b"{}")).status == 200
@@ -380,7 +380,7 @@ async def test_without_tokens_whoever_is_on_this_machine_may_write() -> None:
     assert door.state["author"] == "local (calibrate.py)"
 
 
-@swiftly
+@in_simulated_time
 async def test_with_tokens_nothing_is_done_for_nobody() -> None:
     door = Door(GUARDED)
     public = ["/", "/health", "/page/app.js", "/favicon.ico"]
@@ -408,7 +408,7 @@ async def test_with_tokens_nothing_is_done_for_nobody() -> None:
     assert not door.seen
 
 
-@swiftly
+@in_simulated_time
 async def test_a_token_says_who_asks_and_goes_no_further() -> None:
     door = Door(GUARDED)
     cookie = (b"cookie", b"other=1; paramclient-8765=nonsense")
@@ -432,7 +432,7 @@ async def test_a_token_says_who_asks_and_goes_no_further() -> None:
         assert (await door.request(token=ANNA, raw=[(b"x-author", wrong)])).problem == "bad-request"
 
 
-@swiftly
+@in_simulated_time
 async def test_an_author_has_at_most_128_characters() -> None:
     text = f"{'n' * 32} write {ANNA}"
     door = Door(AccessSettings(tokens=Tokens.of_text(text)))
@@ -443,7 +443,7 @@ async def test_an_author_has_at_most_128_characters() -> None:
 
 
 @pytest.mark.parametrize("given", ["Basic YTpi", "Bearer", "Bearer  ", "Token x", BEN])
-@swiftly
+@in_simulated_time
 async def test_malformed_authorization_is_refused(given: str) -> None:
     door = Door(GUARDED)
     assert (await door.request(raw=[(b"authorization", given.encode())])).status == 401
@@ -463,14 +463,14 @@ WRITES = [
 
 
 @pytest.mark.parametrize(("method", "path"), READS)
-@swiftly
+@in_simulated_time
 async def test_those_who_read_may_ask_for_everything(method: str, path: str) -> None:
     for settings in (GUARDED, AccessSettings(tokens=TOKENS, read_only=True)):
         assert (await Door(settings).request(method, path, token=BEN)).status == 200
 
 
 @pytest.mark.parametrize(("method", "path"), WRITES)
-@swiftly
+@in_simulated_time
 async def test_changes_need_a_token_that_may_write(method: str, path: str) -> None:
     door = Door(GUARDED)
     assert (await door.request(method, path, token=BEN)).problem == "forbidden"
@@ -491,7 +491,7 @@ def cookie_of(answer: Answer) -> tuple[bytes, bytes]:
     return (b"cookie", answer.headers["set-cookie"].partition(";")[0].encode())
 
 
-@swiftly
+@in_simulated_time
 async def test_a_browser_shows_its_token_once() -> None:
     door = Door(GUARDED)
     begun = await door.request("POST", SESSION_PATH, body=json.dumps({"token": BEN}).encode())
@@ -513,7 +513,7 @@ async def test_a_browser_shows_its_token_once() -> None:
     assert (await door.request(path="/", raw=[cookie])).status == 200, "or nobody could show another token"
 
 
-@swiftly
+@in_simulated_time
 async def test_a_session_ends_when_the_browser_says_so() -> None:
     door = Door(GUARDED)
     body = json.dumps({"token": ANNA}).encode()
@@ -525,7 +525,7 @@ async def test_a_session_ends_when_the_browser_says_so() -> None:
     assert (await door.request(raw=[cookie_of(begun[1])])).status == 200
 
 
-@swiftly
+@in_simulated_time
 async def test_under_tls_the_cookie_goes_nowhere_else() -> None:
     door = Door(GUARDED)
     body = json.dumps({"token": ANNA}).encode()
@@ -547,7 +547,7 @@ async def test_under_tls_the_cookie_goes_nowhere_else() -> None:
         (None, "", "content-type"),
     ],
 )
-@swiftly
+@in_simulated_time
 async def test_no_session_begins_without_a_token(body: bytes | None, kind: str, problem: str) -> None:
     door = Door(GUARDED)
     answer = await door.request("POST", SESSION_PATH, body=body, kind=kind)
@@ -555,7 +555,7 @@ async def test_no_session_begins_without_a_token(body: bytes | None, kind: str, 
     assert "set-cookie" not in answer.headers
 
 
-@swiftly
+@in_simulated_time
 async def test_a_session_without_tokens_sets_no_cookie() -> None:
     answer = await Door().request("POST", SESSION_PATH, body=b'{"token": "any"}')
     assert json.loads(answer.body) == {"role": "write", "name": "local", "read_only": False}
@@ -580,7 +580,7 @@ def test_sessions_are_few() -> None:
 # Guessing
 
 
-@swiftly
+@in_simulated_time
 async def test_guesses_are_answered_late_and_a_right_token_is_not_refused(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -634,7 +634,7 @@ PROXY = AccessSettings(listen="0.0.0.0", tokens=TOKENS, proxies=["10.0.0.2", "19
         ([("forwarded", "for=198.51.100.7"), ("x-forwarded-for", "198.51.100.7")], "198.51.100.7"),
     ],
 )
-@swiftly
+@in_simulated_time
 async def test_a_proxy_that_is_trusted_says_who_asks(raw: list[tuple[str, str]], client: str) -> None:
     door = Door(PROXY)
     headers = [(name.encode(), value.encode()) for name, value in raw]
@@ -642,7 +642,7 @@ async def test_a_proxy_that_is_trusted_says_who_asks(raw: list[tuple[str, str]],
     assert door.state["author"] == f"anna@{client}"
 
 
-@swiftly
+@in_simulated_time
 async def test_forwarded_headers_count_only_from_trusted_proxies() -> None:
     told = [(b"x-forwarded-for", b"198.51.100.7"), (b"forwarded", b"for=198.51.100.8")]
     door = Door(PROXY)
@@ -656,7 +656,7 @@ async def test_forwarded_headers_count_only_from_trusted_proxies() -> None:
     assert door.state["author"] == "anna@10.0.0.2"
 
 
-@swiftly
+@in_simulated_time
 async def test_guesses_slow_down_one_client_of_a_proxy_that_is_trusted() -> None:
     door = Door(PROXY)
     for number in range(2 * WRONG_TOKENS_MAX):
@@ -679,7 +679,7 @@ def test_behind_a_proxy_it_does_not_start_without_a_token() -> None:
         AccessSettings(proxies=["127.0.0.1"])
 
 
-@swiftly
+@in_simulated_time
 async def test_a_program_with_an_old_token_slows_nobody_down() -> None:
     door = Door(GUARDED)
     asked = anyio.current_time()
@@ -706,7 +706,7 @@ def test_those_who_guess_are_remembered_in_bounds() -> None:
 
 
 @pytest.mark.parametrize("host", [HERE, "localhost", "LOCALHOST:1", "localhost.", "[::1]:8765", "127.9.9.9"])
-@swiftly
+@in_simulated_time
 async def test_loopback_host_names_are_accepted(host: str) -> None:
     for settings in (OPEN, GUARDED):
         assert (await Door(settings).request(host=host, token=ANNA)).status == 200
@@ -722,7 +722,7 @@ async def test_loopback_host_names_are_accepted(host: str) -> None:
         "127-0-0-1.local",
     ],
 )
-@swiftly
+@in_simulated_time
 async def test_a_name_that_is_not_its_own_is_refused(host: str) -> None:
     """A page of somebody else's may have its name led here by DNS, and is of the same origin then."""
     for settings in (OPEN, GUARDED):
@@ -735,7 +735,7 @@ async def test_a_name_that_is_not_its_own_is_refused(host: str) -> None:
         assert not door.seen
 
 
-@swiftly
+@in_simulated_time
 async def test_addresses_are_names_of_one_that_listens_beyond_this_machine() -> None:
     for host in ("10.0.0.1:8765", "[2001:db8::1]", "companion.local", "Companion.Local:80"):
         assert (await Door(GUARDED).request(host=host, token=ANNA)).status == 200
@@ -747,7 +747,7 @@ async def test_addresses_are_names_of_one_that_listens_beyond_this_machine() -> 
 @pytest.mark.parametrize(
     "host", [None, "", "user@localhost", "localhost:", "localhost:x", "[::1", "local host", "localhost/x"]
 )
-@swiftly
+@in_simulated_time
 async def test_a_host_that_is_none_is_refused(host: str | None) -> None:
     assert (await Door().request(host=host)).problem == "bad-request"
 
@@ -758,7 +758,7 @@ async def test_a_host_that_is_none_is_refused(host: str | None) -> None:
 BROWSER_READS = [(b"sec-fetch-mode", b"cors"), (b"sec-fetch-dest", b"empty")]
 
 
-@swiftly
+@in_simulated_time
 async def test_the_page_of_the_service_may_do_everything() -> None:
     door = Door()
     own = [(b"origin", b"http://127.0.0.1:8765"), (b"sec-fetch-site", b"same-origin"), *BROWSER_READS]
@@ -783,7 +783,7 @@ async def test_the_page_of_the_service_may_do_everything() -> None:
         *("http://127.0.0.1:8765.evil.example", "", "http://127.0.0.1:8765/"),
     ],
 )
-@swiftly
+@in_simulated_time
 async def test_pages_from_elsewhere_may_do_nothing(origin: str) -> None:
     door = Door()
     for method in ("GET", "POST", "OPTIONS", "DELETE"):
@@ -795,7 +795,7 @@ async def test_pages_from_elsewhere_may_do_nothing(origin: str) -> None:
 
 
 @pytest.mark.parametrize("site", ["cross-site", "same-site", "anything"])
-@swiftly
+@in_simulated_time
 async def test_a_page_from_elsewhere_may_lead_here_and_no_more(site: str) -> None:
     door = Door()
     fetched = [(b"sec-fetch-site", site.encode())]
@@ -808,7 +808,7 @@ async def test_a_page_from_elsewhere_may_lead_here_and_no_more(site: str) -> Non
     assert (await door.request(path="/", raw=followed)).status == 200
 
 
-@swiftly
+@in_simulated_time
 async def test_a_page_that_is_named_may_use_it_from_elsewhere() -> None:
     settings = AccessSettings(tokens=TOKENS, origins=["https://Station.example:8443"])
     door = Door(settings)
@@ -834,7 +834,7 @@ async def test_a_page_that_is_named_may_use_it_from_elsewhere() -> None:
     assert (await door.request(raw=[(b"origin", b"https://other.example")])).problem == "foreign-origin"
 
 
-@swiftly
+@in_simulated_time
 async def test_without_tokens_a_page_that_is_named_may_read_only() -> None:
     """It is in the browser of somebody on this computer, who may do everything."""
     door = Door(AccessSettings(origins=["https://station.example"]))
@@ -857,7 +857,7 @@ async def test_without_tokens_a_page_that_is_named_may_read_only() -> None:
 @pytest.mark.parametrize(
     "kind", ["", "text/plain", "application/x-www-form-urlencoded", "multipart/form-data"]
 )
-@swiftly
+@in_simulated_time
 async def test_a_body_is_of_a_kind_that_no_form_can_send(kind: str) -> None:
     door = Door()
     answer = await door.request("POST", WRITE, body=b"{}", kind=kind)
@@ -886,7 +886,7 @@ def handshake(door: Door, **options: Any) -> Any:
     )
 
 
-@swiftly
+@in_simulated_time
 async def test_a_websocket_is_let_in_like_everything_else() -> None:
     door = Door(GUARDED)
     assert (await handshake(door, token=BEN)).status == 101
@@ -926,14 +926,14 @@ async def test_a_websocket_is_let_in_like_everything_else() -> None:
         ),
     ],
 )
-@swiftly
+@in_simulated_time
 async def test_a_path_is_plain(path: str) -> None:
     door = Door()
     assert (await door.request(path=path)).problem == "bad-path"
     assert not door.seen
 
 
-@swiftly
+@in_simulated_time
 async def test_a_slash_in_a_name_is_a_part_of_it() -> None:
     door = Door()
     for path, raw in (
@@ -966,7 +966,7 @@ async def test_a_slash_in_a_name_is_a_part_of_it() -> None:
         [(b"x-author", b"x"), (b"x-author", b"y")],
     ],
 )
-@swiftly
+@in_simulated_time
 async def test_a_header_that_counts_comes_once(raw: list[tuple[bytes, bytes]]) -> None:
     for settings in (OPEN, GUARDED):
         door = Door(settings)
@@ -976,7 +976,7 @@ async def test_a_header_that_counts_comes_once(raw: list[tuple[bytes, bytes]]) -
         assert not door.seen
 
 
-@swiftly
+@in_simulated_time
 async def test_requests_are_short() -> None:
     door = Door()
     many = [(b"x-%d" % number, b"") for number in range(70)]
@@ -993,7 +993,7 @@ async def test_requests_are_short() -> None:
 SMALL = AccessSettings(max_body=100)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_body_comes_in_one_piece() -> None:
     door = Door(SMALL)
     answer = await door.request("POST", WRITE, body=[b"12", b"", b"3" * 98])
@@ -1001,7 +1001,7 @@ async def test_a_body_comes_in_one_piece() -> None:
     assert (await door.request("POST", WRITE, body=b"x" * 100)).status == 200
 
 
-@swiftly
+@in_simulated_time
 async def test_a_body_that_is_too_long_is_not_waited_for() -> None:
     door = Door(SMALL)
     said = await door.request("POST", WRITE, body=b"x" * 101)
@@ -1013,7 +1013,7 @@ async def test_a_body_that_is_too_long_is_not_waited_for() -> None:
     assert (await door.request("POST", WRITE, body=b"x" * 100)).status == 200
 
 
-@swiftly
+@in_simulated_time
 async def test_a_body_that_takes_for_ever_is_not_waited_for() -> None:
     door = Door(SMALL)
     slow = await door.request("POST", WRITE, body=[b"x"] * 90, pause=1.0)
@@ -1023,7 +1023,7 @@ async def test_a_body_that_takes_for_ever_is_not_waited_for() -> None:
     assert not door.seen
 
 
-@swiftly
+@in_simulated_time
 async def test_bodies_are_not_many_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(body_memory, "TOTAL_BODY_BYTES_MAX", 250)
     door = Door(SMALL)
@@ -1051,7 +1051,7 @@ class Pending(Door):
         await super().app(scope, receive, send)
 
 
-@swiftly
+@in_simulated_time
 async def test_bodies_count_until_their_requests_are_answered(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(body_memory, "TOTAL_BODY_BYTES_MAX", 250)
     door = Pending(SMALL)
@@ -1070,7 +1070,7 @@ async def test_bodies_count_until_their_requests_are_answered(monkeypatch: pytes
     assert (await door.request("POST", WRITE, body=b"x" * 90)).status == 200, "and then there is room again"
 
 
-@swiftly
+@in_simulated_time
 async def test_one_holder_takes_no_room_from_others() -> None:
     """Sixty bodies of a megabyte, none of them whole: as many are read as fit into the quota of one."""
     door = Door(GUARDED)
@@ -1104,7 +1104,7 @@ async def test_one_holder_takes_no_room_from_others() -> None:
         ("2001:db8::1", "2001:db8:0:1::1", [200, 200]),
     ],
 )
-@swiftly
+@in_simulated_time
 async def test_without_tokens_the_address_is_the_holder(
     first: str, second: str, statuses: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -1142,7 +1142,7 @@ async def test_without_tokens_the_address_is_the_holder(
         ("PUT", f"{READ}/1/1/metadata", 8 << 20),
     ],
 )
-@swiftly
+@in_simulated_time
 async def test_only_values_and_files_may_be_long(method: str, path: str, most: int) -> None:
     door = Door()
     long = await door.request(method, path, raw=[(b"content-length", b"%d" % (most + 1)), _JSON])
@@ -1153,7 +1153,7 @@ async def test_only_values_and_files_may_be_long(method: str, path: str, most: i
 
 
 @pytest.mark.parametrize("method", ["GET", "HEAD", "DELETE", "OPTIONS"])
-@swiftly
+@in_simulated_time
 async def test_only_what_has_a_body_may_bring_one(method: str) -> None:
     for settings, token in ((OPEN, None), (GUARDED, ANNA)):
         answer = await Door(settings).request(method, path="/", body=b"{}", token=token)
@@ -1161,7 +1161,7 @@ async def test_only_what_has_a_body_may_bring_one(method: str) -> None:
         assert not answer.asked
 
 
-@swiftly
+@in_simulated_time
 async def test_those_without_a_token_send_nothing() -> None:
     door = Door(GUARDED)
     answer = await door.request("POST", WRITE, body=[b"x"] * 10)
@@ -1174,7 +1174,7 @@ async def test_those_without_a_token_send_nothing() -> None:
 
 
 @pytest.mark.parametrize("path", ["/", "/page/app.js", "/docs", "/health", READ])
-@swiftly
+@in_simulated_time
 async def test_every_answer_has_what_keeps_a_browser_from_running_it(path: str) -> None:
     door = Door(
         headers=[(b"content-security-policy", b"default-src *"), (b"X-Content-Type-Options", b"sniff")]
@@ -1199,7 +1199,7 @@ async def test_every_answer_has_what_keeps_a_browser_from_running_it(path: str) 
         assert not [name for name in headers if name.startswith("access-control")]
 
 
-@swiftly
+@in_simulated_time
 async def test_the_end_of_the_application_is_passed_on() -> None:
     seen = []
 

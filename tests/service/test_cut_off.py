@@ -21,7 +21,7 @@ from paramclient.protocol import wire
 from tests.commands import in_process
 from tests.service.test_process import C, ended, served
 from tests.service.test_setup import HERE, TUNE, Checked, Quiet, px4, serving
-from tests.shell import TIMEOUT, Clock, Tap, small_px4, swiftly
+from tests.shell import TIMEOUT, Clock, Tap, in_simulated_time, small_px4
 
 # Notes
 
@@ -131,7 +131,7 @@ async def set_ups(service: Checked) -> list[dict[str, Any]]:
 BODY = {"wanted": {"values": dict.fromkeys(TUNE, 7.5)}, "wait": False}
 
 
-@swiftly
+@in_simulated_time
 async def test_an_apply_that_the_end_of_the_service_cuts_off_is_told_at_the_next_start(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -170,7 +170,7 @@ async def test_an_apply_that_the_end_of_the_service_cuts_off_is_told_at_the_next
     assert line.endswith("local")
 
 
-@swiftly
+@in_simulated_time
 async def test_a_cancelled_set_up_is_not_cut_off(tmp_path: Path) -> None:
     async with serving(Quiet(px4()), place=tmp_path) as service:
         job = (await service.client.post(f"{HERE}/apply", json=BODY)).json()["id"]

@@ -22,7 +22,7 @@ from paramclient.service import Hub, create_app
 from paramclient.sim import ArduPilotVehicle, Endpoint, PX4Vehicle
 from tests.asgi import a_browser
 from tests.service_hub import C
-from tests.shell import FlakyLink, Tap, swift_loop, swiftly, until
+from tests.shell import FlakyLink, Tap, in_simulated_time, simulated_time_loop, until
 
 CHANGED = "MC_ROLL_P"
 """A parameter whose default in the metadata of the simulated PX4 is 4."""
@@ -32,15 +32,15 @@ SMALL = {f"P_{number:02}": number for number in range(40)}
 
 @pytest.fixture(autouse=True)
 def _threads_are_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stop the clock of a `SwiftLoop` while a worker thread reads files."""
+    """Stop the clock of a `SimulatedTimeLoop` while a worker thread reads files."""
     in_thread = download._in_thread
 
     async def counted(*args: Any, **kwargs: Any) -> Any:
-        swift_loop().threads += 1
+        simulated_time_loop().threads += 1
         try:
             return await in_thread(*args, **kwargs)
         finally:
-            swift_loop().threads -= 1
+            simulated_time_loop().threads -= 1
 
     monkeypatch.setattr(download, "_in_thread", counted)
 
@@ -83,7 +83,7 @@ def changed(vehicle: PX4Vehicle, value: float = 6.5) -> PX4Vehicle:
 # Loading
 
 
-@swiftly
+@in_simulated_time
 async def test_descriptions_are_loaded_after_the_table_and_give_the_defaults() -> None:
     async with serving(changed(PX4Vehicle(metadata=True))) as (hub, browser):
         assert await described(hub)
@@ -98,7 +98,7 @@ async def test_descriptions_are_loaded_after_the_table_and_give_the_defaults() -
         assert "metadata_note" not in (await browser.get(C)).json()
 
 
-@swiftly
+@in_simulated_time
 async def test_defaults_of_the_metadata_count_in_filters_files_and_comparisons() -> None:
     async with serving(changed(PX4Vehicle(metadata=True))) as (hub, browser):
         assert await described(hub)
@@ -122,7 +122,7 @@ async def test_defaults_of_the_metadata_count_in_filters_files_and_comparisons()
         assert "from the metadata" in compared["base"]["source"]
 
 
-@swiftly
+@in_simulated_time
 async def test_an_event_of_a_change_has_the_default_too() -> None:
     async with serving(PX4Vehicle(metadata=True)) as (hub, browser):
         assert await described(hub)
@@ -132,7 +132,7 @@ async def test_an_event_of_a_change_has_the_default_too() -> None:
         assert (param["default"], param["is_default"]) == (4, False)
 
 
-@swiftly
+@in_simulated_time
 async def test_they_are_remembered_for_the_firmware(tmp_path: Path) -> None:
     for is_first in (True, False):
         tap = Tap(PX4Vehicle(metadata=True))
@@ -144,7 +144,7 @@ async def test_they_are_remembered_for_the_firmware(tmp_path: Path) -> None:
 # Where they are not loaded
 
 
-@swiftly
+@in_simulated_time
 async def test_a_slow_transfer_is_given_up_once_with_a_note(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "paramclient.service")
     vehicle = PX4Vehicle(metadata=True, ftp_rate=2_000.0)
@@ -166,7 +166,7 @@ async def test_a_slow_transfer_is_given_up_once_with_a_note(caplog: pytest.LogCa
         assert "metadata_note" not in (await browser.get(C)).json()
 
 
-@swiftly
+@in_simulated_time
 async def test_they_are_loaded_when_the_vehicle_is_disarmed() -> None:
     vehicle = PX4Vehicle(metadata=True, armed=True)
     tap = Tap(vehicle)
@@ -186,7 +186,7 @@ async def test_they_are_loaded_when_the_vehicle_is_disarmed() -> None:
         (ArduPilotVehicle(ftp=False, live=()), {}),
     ],
 )
-@swiftly
+@in_simulated_time
 async def test_where_it_cannot_be_quick_nothing_is_requested(vehicle: Any, options: dict[str, Any]) -> None:
     tap = Tap(vehicle)
     async with Hub([SimLink(tap, "sim:one")], cache=False, **options) as hub:
@@ -195,7 +195,7 @@ async def test_where_it_cannot_be_quick_nothing_is_requested(vehicle: Any, optio
     assert not locations_requested(tap)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_listening_service_and_one_without_fetches_request_nothing() -> None:
     for options in ({"listen_only": True}, {"fetches": False}):
         tap = Tap(PX4Vehicle(metadata=True))
@@ -207,7 +207,7 @@ async def test_a_listening_service_and_one_without_fetches_request_nothing() -> 
             assert not requests_of(tap)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_without_descriptions_is_asked_once() -> None:
     tap = Tap(PX4Vehicle())
     async with serving(tap) as (hub, browser):
@@ -216,7 +216,7 @@ async def test_a_vehicle_without_descriptions_is_asked_once() -> None:
         assert locations_requested(tap) == 1
 
 
-@swiftly
+@in_simulated_time
 async def test_a_link_that_drops_meanwhile_does_not_prevent_it_later() -> None:
     link = FlakyLink(PX4Vehicle(metadata=True, ftp_rate=8_000.0))
     async with serving(link) as (hub, _):
@@ -225,7 +225,7 @@ async def test_a_link_that_drops_meanwhile_does_not_prevent_it_later() -> None:
         assert await described(hub, 60.0)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_file_of_a_user_stays_when_the_vehicle_is_found_again() -> None:
     content = b'{"version": 1, "parameters": [{"name": "MC_ROLL_P", "type": "Float", "default": 2.0}]}'
     tap = Tap(PX4Vehicle())
@@ -242,7 +242,7 @@ async def test_a_file_of_a_user_stays_when_the_vehicle_is_found_again() -> None:
         assert (await browser.get(f"{C}/params/{CHANGED}")).json()["default"] == 2
 
 
-@swiftly
+@in_simulated_time
 async def test_another_firmware_has_descriptions_of_its_own(tmp_path: Path) -> None:
     vehicle = PX4Vehicle(metadata=True)
     tap = Tap(vehicle)
@@ -258,7 +258,7 @@ async def test_another_firmware_has_descriptions_of_its_own(tmp_path: Path) -> N
         assert (await browser.get(f"{C}/params/{CHANGED}")).json()["default_source"] == "metadata"
 
 
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_in_the_cache_has_its_defaults_and_descriptions(tmp_path: Path) -> None:
     async with serving(changed(PX4Vehicle(metadata=True)), tmp_path) as (hub, browser):
         assert await described(hub)

@@ -19,7 +19,7 @@ from paramclient.service.event_feed import BATCH_EVENTS_MAX, EventFeed, EventFil
 from paramclient.service.routes import events
 from paramclient.sim import Air
 from tests.service_hub import C, met, problem, service
-from tests.shell import VALUES, Tap, generic, small_px4, swiftly, tasks_beside
+from tests.shell import VALUES, Tap, generic, in_simulated_time, small_px4, tasks_beside
 
 
 def events_of(text: str) -> list[tuple[str, dict[str, Any]]]:
@@ -115,7 +115,7 @@ async def a_feed(**options: Any) -> AsyncIterator[EventFeed]:
     gathering.cancel()
 
 
-@swiftly
+@in_simulated_time
 async def test_a_listener_receives_every_event_once_and_in_order() -> None:
     async with a_feed() as feed:
         publish(feed, 3)
@@ -130,7 +130,7 @@ async def test_a_listener_receives_every_event_once_and_in_order() -> None:
         assert (await taken(again))[0] == 6
 
 
-@swiftly
+@in_simulated_time
 async def test_a_place_that_is_gone_or_never_was_is_not_gone_on_from() -> None:
     async with a_feed(kept=10) as feed:
         publish(feed, 30)
@@ -153,7 +153,7 @@ def test_a_place_is_read_as_it_is_written() -> None:
     assert EventPosition.read(str(place)) == place
 
 
-@swiftly
+@in_simulated_time
 async def test_a_slow_listener_learns_how_much_it_has_lost_and_goes_on() -> None:
     async with a_feed(kept=10) as feed:
         listener = feed.listen()
@@ -166,7 +166,7 @@ async def test_a_slow_listener_learns_how_much_it_has_lost_and_goes_on() -> None
         assert await taken(listener) == [26, 27]
 
 
-@swiftly
+@in_simulated_time
 async def test_listeners_get_what_they_want_and_move_on_past_the_rest() -> None:
     async with a_feed() as feed:
         of_two = feed.listen(event_filter=EventFilter(system=2))
@@ -181,7 +181,7 @@ async def test_listeners_get_what_they_want_and_move_on_past_the_rest() -> None:
         assert of_two.position.seq == 4
 
 
-@swiftly
+@in_simulated_time
 async def test_many_listeners_are_woken_seldom_and_one_at_once() -> None:
     """What many are told is gathered: else a download would be told value by value to each of them."""
 
@@ -207,7 +207,7 @@ async def test_many_listeners_are_woken_seldom_and_one_at_once() -> None:
     assert await count(200) <= 200 * 12
 
 
-@swiftly
+@in_simulated_time
 async def test_an_event_that_was_sent_releases_what_it_was_written_from() -> None:
     class Members:
         def __call__(self) -> str:
@@ -227,7 +227,7 @@ async def test_an_event_that_was_sent_releases_what_it_was_written_from() -> Non
         assert released() is None
 
 
-@swiftly
+@in_simulated_time
 async def test_an_event_is_encoded_once_for_all_listeners() -> None:
     written = 0
 
@@ -247,7 +247,7 @@ async def test_an_event_is_encoded_once_for_all_listeners() -> None:
 # server-sent events
 
 
-@swiftly
+@in_simulated_time
 async def test_a_listener_hears_of_a_vehicle_its_values_and_its_fetch() -> None:
     vehicle = small_px4(burst=1, period=0.1)
     async with service(vehicle) as (hub, browser), listening(browser) as heard:
@@ -278,7 +278,7 @@ async def test_a_listener_hears_of_a_vehicle_its_values_and_its_fetch() -> None:
         assert numbers == sorted(set(numbers))
 
 
-@swiftly
+@in_simulated_time
 async def test_a_client_that_reconnects_misses_no_event_and_gets_none_twice() -> None:
     async with service(generic(burst=1, period=0.05)) as (hub, browser):
         await met(browser)
@@ -298,7 +298,7 @@ async def test_a_client_that_reconnects_misses_no_event_and_gets_none_twice() ->
         assert len(whole) > len(VALUES)
 
 
-@swiftly
+@in_simulated_time
 async def test_after_another_run_everything_is_to_be_loaded_anew() -> None:
     async with (
         service(generic()) as (hub, browser),
@@ -309,7 +309,7 @@ async def test_after_another_run_everything_is_to_be_loaded_anew() -> None:
         assert [each.all[0]["resumed"] for each in (heard, other, by_query)] == [False, False, True]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_listener_hears_of_what_it_has_asked_for() -> None:
     two = Air.symmetric([generic(system=1), generic(system=2)])
     async with (
@@ -324,7 +324,7 @@ async def test_a_listener_hears_of_what_it_has_asked_for() -> None:
         assert {each["system"] for each in told} == {2}
 
 
-@swiftly
+@in_simulated_time
 async def test_a_stream_in_which_nothing_happens_says_that_it_lives() -> None:
     async with service() as (_, browser), listening(browser) as heard:
         await asyncio.sleep(10 * events.KEEPALIVE_INTERVAL)
@@ -332,7 +332,7 @@ async def test_a_stream_in_which_nothing_happens_says_that_it_lives() -> None:
         assert len(heard.all) == 1
 
 
-@swiftly
+@in_simulated_time
 async def test_filtered_events_advance_the_position() -> None:
     async with service(generic()) as (hub, browser), listening(browser, types="link") as heard:
         await met(browser)
@@ -341,7 +341,7 @@ async def test_filtered_events_advance_the_position() -> None:
         assert heard.last_id == str(hub.feed.position)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_listener_that_does_not_read_is_told_of_the_gap(monkeypatch: pytest.MonkeyPatch) -> None:
     vehicle = small_px4()
     hub = Hub([vehicle], cache=False, fetches=False)
@@ -371,7 +371,7 @@ async def test_a_listener_that_does_not_read_is_told_of_the_gap(monkeypatch: pyt
     assert gap["missed"] == gap["seq"] - hello["seq"]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_listener_that_never_takes_what_it_is_sent_is_left() -> None:
     async def send(message: Message) -> None:
         if message.get("body"):
@@ -390,7 +390,7 @@ async def test_a_listener_that_never_takes_what_it_is_sent_is_left() -> None:
         assert tasks_beside() <= before | {listener.get_name()}
 
 
-@swiftly
+@in_simulated_time
 async def test_streams_are_bounded_and_end_with_the_service(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(events, "LISTENERS_MAX", 2)
     async with service() as (hub, browser):
@@ -403,7 +403,7 @@ async def test_streams_are_bounded_and_end_with_the_service(monkeypatch: pytest.
         assert hub.feed.listeners == 0
 
 
-@swiftly
+@in_simulated_time
 async def test_of_a_listener_that_leaves_nothing_is_left() -> None:
     async with service() as (hub, browser):
         before = tasks_beside()
@@ -414,7 +414,7 @@ async def test_of_a_listener_that_leaves_nothing_is_left() -> None:
         assert tasks_beside() == before
 
 
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_that_is_lost_and_comes_back_is_told_of() -> None:
     vehicle = Tap(generic())
     async with service(vehicle) as (_, browser), listening(browser) as heard:
@@ -469,7 +469,7 @@ async def call_app(
     await create_app(hub)(scope, inbox.get, send)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_websocket_carries_the_same_events_and_resumes() -> None:
     sent: list[Message] = []
 
@@ -501,7 +501,7 @@ async def test_a_websocket_carries_the_same_events_and_resumes() -> None:
             assert (sent[-1]["type"], sent[-1]["code"]) == ("websocket.close", 1001)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_websocket_that_cannot_be_opened_is_a_problem_too(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(events, "LISTENERS_MAX", 0)
     for path, query, status in (

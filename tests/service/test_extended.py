@@ -17,7 +17,7 @@ from paramclient.sim import Air, Camera, PX4Vehicle, camera_table
 from tests.asgi import a_browser
 from tests.service.test_events import Heard, listening
 from tests.service_hub import met, problem, service
-from tests.shell import generic, swiftly
+from tests.shell import generic, in_simulated_time
 
 E = "/api/v1/components/1/100/extended"
 
@@ -29,7 +29,7 @@ async def put(browser: httpx.AsyncClient, name: str, value: Any) -> dict[str, An
     return done
 
 
-@swiftly
+@in_simulated_time
 async def test_the_known_table() -> None:
     camera = Camera()
     async with service(camera) as (hub, browser):
@@ -65,7 +65,7 @@ async def test_the_known_table() -> None:
         assert told["nearest"][0] == "CAM_NAME"
 
 
-@swiftly
+@in_simulated_time
 async def test_one_is_read_by_name_and_by_index() -> None:
     async with service(Camera()) as (_, browser):
         await met(browser, system=1, component=100)
@@ -78,7 +78,7 @@ async def test_one_is_read_by_name_and_by_index() -> None:
         assert problem(answer, 504, "no-reply")["error"] == "NoReply"
 
 
-@swiftly
+@in_simulated_time
 async def test_values_of_every_kind_are_written_exactly() -> None:
     camera = Camera()
     async with service(camera) as (_, browser):
@@ -125,7 +125,7 @@ async def test_values_of_every_kind_are_written_exactly() -> None:
         ("CAM_MODE", [1], "invalid-request"),
     ],
 )
-@swiftly
+@in_simulated_time
 async def test_a_value_that_does_not_fit_is_refused_and_nothing_is_sent(
     name: str, value: Any, kind: str
 ) -> None:
@@ -142,7 +142,7 @@ async def test_a_value_that_does_not_fit_is_refused_and_nothing_is_sent(
         assert camera.ext_values == Camera().ext_values
 
 
-@swiftly
+@in_simulated_time
 async def test_many_are_written_in_one_request() -> None:
     camera = Camera(
         {"A": 1, "B": 2, "C": 3, "D": "text", "E": b"\xff"},
@@ -171,7 +171,7 @@ async def test_many_are_written_in_one_request() -> None:
         problem(await browser.put(f"{E}/params/A", json={"value": 9}), 409, "value-unsupported")
 
 
-@swiftly
+@in_simulated_time
 async def test_a_timeout_leaves_the_rest_open() -> None:
     camera = Camera({"A": 1, "B": 2}, slow={"A": 100.0})
     async with service(camera) as (hub, browser):
@@ -183,7 +183,7 @@ async def test_a_timeout_leaves_the_rest_open() -> None:
         assert not local(hub.followed[0].component).machine.is_busy
 
 
-@swiftly
+@in_simulated_time
 async def test_a_fetch_is_a_job_that_readers_may_cancel() -> None:
     camera = Camera({f"P{number:03}": number for number in range(200)}, burst=1, period=0.05)
     tokens = Tokens.of_text("anna write anna-may-write-0123456789\nben read ben-may-read-0123456789ab\n")
@@ -213,7 +213,7 @@ async def test_a_fetch_is_a_job_that_readers_may_cancel() -> None:
         assert camera.ext_values["P000"] == 0
 
 
-@swiftly
+@in_simulated_time
 async def test_a_write_has_the_name_of_its_author() -> None:
     async with service(Camera()) as (hub, browser):
         await met(browser, system=1, component=100)
@@ -224,7 +224,7 @@ async def test_a_write_has_the_name_of_its_author() -> None:
         assert (change.new and change.new.value, change.by) == (400, "us for local")
 
 
-@swiftly
+@in_simulated_time
 async def test_a_component_without_extended_parameters() -> None:
     async with service(generic()) as (_, browser):
         found = await met(browser)
@@ -233,7 +233,7 @@ async def test_a_component_without_extended_parameters() -> None:
         assert problem(answer, 504, "no-reply")["error"] == "NoReply"
 
 
-@swiftly
+@in_simulated_time
 async def test_the_history_of_a_component(tmp_path: Path) -> None:
     async with service(Camera(), cache=tmp_path / "cache") as (_, browser):
         await met(browser, system=1, component=100)
@@ -261,7 +261,7 @@ async def test_the_history_of_a_component(tmp_path: Path) -> None:
 # events
 
 
-@swiftly
+@in_simulated_time
 async def test_a_listener_hears_of_values_and_of_their_fetch() -> None:
     camera = Camera(burst=1, period=0.1)
     async with service(camera) as (hub, browser), listening(browser) as heard:
@@ -289,7 +289,7 @@ async def test_a_listener_hears_of_values_and_of_their_fetch() -> None:
         assert [each["job"]["kind"] for each in heard.of("job")] == ["extended-fetch"] * 2
 
 
-@swiftly
+@in_simulated_time
 async def test_a_listener_may_ask_for_extended_parameters_alone() -> None:
     air = Air.symmetric([Camera(), PX4Vehicle(table={"A": 1}), Camera(system=2)])
     async with (
@@ -309,7 +309,7 @@ async def test_a_listener_may_ask_for_extended_parameters_alone() -> None:
         assert other.all[1:] == []
 
 
-@swiftly
+@in_simulated_time
 async def test_parameters_that_come_and_go() -> None:
     camera = Camera({"A": 1, "B": 2})
     async with service(camera) as (_, browser), listening(browser) as heard:
@@ -325,7 +325,7 @@ async def test_parameters_that_come_and_go() -> None:
         assert (added["name"], added["old"], added["new"]["value"]) == ("C", None, 7)
 
 
-@swiftly
+@in_simulated_time
 async def test_the_trust_of_many_is_told_at_once_and_that_of_few_singly() -> None:
     for count, singly in ((32, True), (33, False)):
         camera = Camera({f"P{number:02}": number for number in range(count)})
@@ -357,7 +357,7 @@ def done_param(hub: Hub, name: str) -> ExtParam:
     return hub.followed[0].extended.ext.params[name]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_set_up_over_http(tmp_path: Path) -> None:
     camera = Camera({"MODE": 1, "NAME": "Front", "KEY": b"\xff\0\xfe", "EV": 0.5}, failing=["EV"])
     before = camera.ext_values
@@ -401,7 +401,7 @@ async def test_a_set_up_over_http(tmp_path: Path) -> None:
         problem(await browser.post(f"{E}/apply", json=bad), 422, "usage")
 
 
-@swiftly
+@in_simulated_time
 async def test_a_service_without_a_cache_has_no_earlier_states() -> None:
     async with service(Camera({"A": 1})) as (_, browser):
         await met(browser, system=1, component=100)
@@ -411,7 +411,7 @@ async def test_a_service_without_a_cache_has_no_earlier_states() -> None:
         assert (done["complete"], done["snapshot"]) == (True, None)
 
 
-@swiftly
+@in_simulated_time
 async def test_only_writers_may_restore(tmp_path: Path) -> None:
     async with Hub([Camera({"A": 1})], cache=tmp_path / "cache", fetches=False) as hub:
         app = create_app(hub, Settings(access=AccessSettings(read_only=True)))

@@ -10,10 +10,10 @@ import pytest
 from paramclient.model.values import ParamType
 from paramclient.sim import GenericVehicle, SimParam
 from tests.service_hub import C, met, problem, service
-from tests.shell import FlakyLink, generic, small_px4, swiftly
+from tests.shell import FlakyLink, generic, in_simulated_time, small_px4
 
 
-@swiftly
+@in_simulated_time
 async def test_head_answers_what_get_does_without_a_body() -> None:
     async with service(generic()) as (hub, browser):
         await met(browser)
@@ -31,7 +31,7 @@ async def test_head_answers_what_get_does_without_a_body() -> None:
         assert (await browser.head(f"{C}/fetch")).status_code == 405
 
 
-@swiftly
+@in_simulated_time
 async def test_an_address_says_all_the_methods_that_it_knows() -> None:
     async with service(generic()) as (_, browser):
         await met(browser)
@@ -52,7 +52,7 @@ async def test_an_address_says_all_the_methods_that_it_knows() -> None:
 # what others rely on
 
 
-@swiftly
+@in_simulated_time
 async def test_a_component_behind_a_link_that_is_away_is_not_up() -> None:
     link = FlakyLink(small_px4())
     async with service(link, fetches=True) as (_, browser):
@@ -69,7 +69,7 @@ async def test_a_component_behind_a_link_that_is_away_is_not_up() -> None:
                 assert f"{sample} {float(is_here)}\n" in told
 
 
-@swiftly
+@in_simulated_time
 async def test_the_document_of_the_api_has_the_body_of_everything_that_takes_one() -> None:
     async with service() as (_, browser):
         paths = (await browser.get("/openapi.json")).json()["paths"]
@@ -83,7 +83,7 @@ async def test_the_document_of_the_api_has_the_body_of_everything_that_takes_one
         assert list(paths[path][method]["requestBody"]["content"]) == ["application/octet-stream"]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_name_that_no_vehicle_has_is_no_failure_of_the_cache(tmp_path: Path) -> None:
     async with service(small_px4(), cache=tmp_path / "cache.sqlite3", fetches=True) as (_, browser):
         told = await browser.post("/api/v1/fleet/diff", json={"names": ["PARAM_01"]})
@@ -98,7 +98,7 @@ async def test_a_name_that_no_vehicle_has_is_no_failure_of_the_cache(tmp_path: P
 # names and numbers
 
 
-@swiftly
+@in_simulated_time
 async def test_a_name_with_a_slash_can_stand_in_an_address() -> None:
     vehicle = GenericVehicle([SimParam("A/B", ParamType.REAL32, 1.0), SimParam("A", ParamType.REAL32, 2.0)])
     async with service(vehicle) as (_, browser):
@@ -110,7 +110,7 @@ async def test_a_name_with_a_slash_can_stand_in_an_address() -> None:
         assert (await browser.post(f"{C}/params/A/read", json={})).json()["value"] == 2.0
 
 
-@swiftly
+@in_simulated_time
 async def test_an_index_is_written_in_plain_digits() -> None:
     async with service(generic()) as (_, browser):
         await met(browser)
@@ -119,7 +119,7 @@ async def test_an_index_is_written_in_plain_digits() -> None:
 
 
 @pytest.mark.parametrize("number", ["1e400", "-1e400", "NaN", "Infinity"])
-@swiftly
+@in_simulated_time
 async def test_a_number_beyond_all_floats_is_not_written_as_an_infinity(number: str) -> None:
     vehicle = GenericVehicle([SimParam("A", ParamType.REAL32, 1.0)])
     headers = {"content-type": "application/json"}

@@ -22,12 +22,12 @@ from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, SimParam
 from tests.asgi import a_browser
 from tests.recordings import DATA
 from tests.service_hub import C, met, problem, service
-from tests.shell import VALUES, FlakyLink, Tap, generic, settled, small_px4, swiftly
+from tests.shell import VALUES, FlakyLink, Tap, generic, in_simulated_time, settled, small_px4
 
 # links and components
 
 
-@swiftly
+@in_simulated_time
 async def test_the_service_starts_without_a_vehicle_and_without_its_link() -> None:
     link = FlakyLink(generic())
     link.is_away = True
@@ -52,7 +52,7 @@ async def test_the_service_starts_without_a_vehicle_and_without_its_link() -> No
         assert told["stats"]["round_trips"]["1/1"] > 0
 
 
-@swiftly
+@in_simulated_time
 async def test_requests_to_the_cache_of_a_closing_service_get_closing(tmp_path: Path) -> None:
     with ParamCache(tmp_path / "cache.sqlite3") as cache:
         async with Hub([small_px4()], cache=cache) as hub, a_browser(create_app(hub)) as browser:
@@ -64,7 +64,7 @@ async def test_requests_to_the_cache_of_a_closing_service_get_closing(tmp_path: 
             problem(answer, 503, "closing")
 
 
-@swiftly
+@in_simulated_time
 async def test_a_link_that_drops_is_away_until_it_is_back() -> None:
     link = FlakyLink(generic())
     async with service(link) as (hub, browser):
@@ -78,7 +78,7 @@ async def test_a_link_that_drops_is_away_until_it_is_back() -> None:
         assert [each.state for each in hub.links.values()] == ["open"]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_link_that_fails_for_good_is_opened_with_a_fresh_client() -> None:
     link = FlakyLink(generic())
     link.reconnects = False
@@ -92,7 +92,7 @@ async def test_a_link_that_fails_for_good_is_opened_with_a_fresh_client() -> Non
         assert hub.links[link.name].openings == 2
 
 
-@swiftly
+@in_simulated_time
 async def test_a_log_is_followed_to_its_end_and_stays_to_be_looked_at() -> None:
     name = f"replay:{DATA / 'px4_full_download.tlog'}?speed=0"
     async with service(name, cache=None, fetches=True) as (hub, browser):
@@ -106,7 +106,7 @@ async def test_a_log_is_followed_to_its_end_and_stays_to_be_looked_at() -> None:
         assert hub.jobs.all == []
 
 
-@swiftly
+@in_simulated_time
 async def test_ids_that_two_links_carry_need_the_link_beside_them() -> None:
     async with service(SimLink(generic(), "sim:a"), SimLink(generic(), "sim:b")) as (_, browser):
         await met(browser)
@@ -118,7 +118,7 @@ async def test_ids_that_two_links_carry_need_the_link_beside_them() -> None:
         problem(await browser.post("/api/v1/find", json={}, params={"link": "sim:c"}), 404, "unknown-link")
 
 
-@swiftly
+@in_simulated_time
 async def test_find_without_a_vehicle_is_a_no_reply_problem() -> None:
     async with service(SimLink(generic())) as (_, browser):
         told = problem(
@@ -132,7 +132,7 @@ async def test_find_without_a_vehicle_is_a_no_reply_problem() -> None:
         problem(await browser.get("/api/v1/components/7/1"), 404, "unknown-component")
 
 
-@swiftly
+@in_simulated_time
 async def test_everybody_is_fetched_on_all_links() -> None:
     two = Air.symmetric([generic(system=1), generic(system=2)])
     async with service(SimLink(two, "sim:two"), SimLink(generic(system=3), "sim:one")) as (_, browser):
@@ -148,7 +148,7 @@ async def test_everybody_is_fetched_on_all_links() -> None:
         assert [each["system"] for each in only["results"]] == [3]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_starts_again() -> None:
     async with service(SimLink(small_px4())) as (_, browser):
         await met(browser)
@@ -160,7 +160,7 @@ async def test_a_vehicle_starts_again() -> None:
 # parameters
 
 
-@swiftly
+@in_simulated_time
 async def test_the_fast_encoding_of_parameters_equals_the_documents(tmp_path: Path) -> None:
     """The quick way of writing them says to the letter what the documents would."""
     async with service(SimLink(ArduPilotVehicle()), cache=tmp_path / "cache") as (hub, browser):
@@ -184,7 +184,7 @@ async def test_the_fast_encoding_of_parameters_equals_the_documents(tmp_path: Pa
         assert changed
 
 
-@swiftly
+@in_simulated_time
 async def test_one_is_asked_for_by_name_and_by_index() -> None:
     vehicle = generic()
     async with service(SimLink(vehicle)) as (_, browser):
@@ -202,7 +202,7 @@ async def test_one_is_asked_for_by_name_and_by_index() -> None:
         assert vehicle.requests["PARAM_REQUEST_LIST"] == 0
 
 
-@swiftly
+@in_simulated_time
 async def test_values_of_every_kind_are_written() -> None:
     table = [
         SimParam("F", ParamType.REAL32, 1.0),
@@ -241,7 +241,7 @@ async def test_values_of_every_kind_are_written() -> None:
         assert known["F"].value == 2.0
 
 
-@swiftly
+@in_simulated_time
 async def test_of_many_values_each_is_tried_and_told_of() -> None:
     vehicle = small_px4(param_error=True)
     async with service(SimLink(vehicle)) as (hub, browser):
@@ -257,7 +257,7 @@ async def test_of_many_values_each_is_tried_and_told_of() -> None:
         problem(await browser.patch(f"{C}/params", json={"values": {}}), 422, "invalid-request")
 
 
-@swiftly
+@in_simulated_time
 async def test_a_write_may_be_watched_or_forced() -> None:
     async with service(SimLink(PX4Vehicle())) as (_, browser):
         await met(browser)
@@ -277,7 +277,7 @@ async def test_a_write_may_be_watched_or_forced() -> None:
             problem(await browser.put(f"{C}/params/MC_ROLL_P", json=wrong), 422, "invalid-request")
 
 
-@swiftly
+@in_simulated_time
 async def test_events_of_a_call_precede_its_response() -> None:
     async with service(SimLink(small_px4())) as (hub, browser):
         await met(browser)
@@ -298,7 +298,7 @@ async def test_events_of_a_call_precede_its_response() -> None:
         assert params["seq"] >= number
 
 
-@swiftly
+@in_simulated_time
 async def test_the_component_event_of_a_call_precedes_its_response() -> None:
     """Also where it was told a moment before, and would else wait for its turn."""
     async with service(SimLink(small_px4())) as (hub, browser):
@@ -320,7 +320,7 @@ async def test_the_component_event_of_a_call_precedes_its_response() -> None:
 def test_a_value_that_comes_again_is_as_young_as_that(monkeypatch: pytest.MonkeyPatch) -> None:
     times = iter(range(2_000_000_000, 2_000_000_100))
 
-    @swiftly
+    @in_simulated_time
     async def ask() -> None:
         async with service(SimLink(generic())) as (_, browser):
             await met(browser)
@@ -345,7 +345,7 @@ def test_values_of_before_are_cached_with_their_age_until_the_hash_confirms_them
 ) -> None:
     """That their trust has moved is told one by one where they are few, else at once for all."""
     monkeypatch.setattr(followed_component, "SINGLE_CHANGES_MAX", most_told_singly)
-    swiftly(confirm)(most_told_singly, tmp_path)
+    in_simulated_time(confirm)(most_told_singly, tmp_path)
 
 
 async def confirm(most_told_singly: int, tmp_path: Path) -> None:
@@ -384,7 +384,7 @@ async def confirm(most_told_singly: int, tmp_path: Path) -> None:
 # fetches and jobs
 
 
-@swiftly
+@in_simulated_time
 async def test_two_who_fetch_at_once_cause_one_download_and_one_may_leave() -> None:
     vehicle = generic(burst=1, period=0.1)
     async with service(SimLink(vehicle)) as (hub, browser):
@@ -400,7 +400,7 @@ async def test_two_who_fetch_at_once_cause_one_download_and_one_may_leave() -> N
         assert vehicle.requests["PARAM_REQUEST_LIST"] == 1
 
 
-@swiftly
+@in_simulated_time
 async def test_a_download_that_nobody_waits_for_any_more_stops() -> None:
     vehicle = generic(burst=1, period=0.2)
     async with service(SimLink(vehicle)) as (hub, browser):
@@ -414,7 +414,7 @@ async def test_a_download_that_nobody_waits_for_any_more_stops() -> None:
         assert [job.state for job in hub.jobs.all] == ["cancelled"]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_fetch_is_a_job_that_can_be_looked_at_and_cancelled() -> None:
     async with service(SimLink(generic(burst=1, period=0.1))) as (_, browser):
         await met(browser)
@@ -446,7 +446,7 @@ async def test_a_fetch_is_a_job_that_can_be_looked_at_and_cancelled() -> None:
         problem(await browser.delete("/api/v1/jobs/nonesuch"), 404, "unknown-job")
 
 
-@swiftly
+@in_simulated_time
 async def test_a_fetch_that_fails_says_why() -> None:
     vehicle = Tap(generic())
     async with service(SimLink(vehicle)) as (_, browser):
@@ -458,7 +458,7 @@ async def test_a_fetch_that_fails_says_why() -> None:
         problem(answer, 422, "invalid-request")
 
 
-@swiftly
+@in_simulated_time
 async def test_a_call_whose_client_leaves_is_given_up() -> None:
     vehicle = Tap(generic())
     async with service(SimLink(vehicle)) as (hub, browser):
@@ -476,7 +476,7 @@ async def test_a_call_whose_client_leaves_is_given_up() -> None:
 # the end
 
 
-@swiftly
+@in_simulated_time
 async def test_at_the_end_whoever_waits_is_answered() -> None:
     vehicle = Tap(generic())
     hub = Hub([SimLink(vehicle)], cache=False, fetches=False)
@@ -517,7 +517,7 @@ async def test_at_the_end_whoever_waits_is_answered() -> None:
 def test_every_invalid_request_is_a_problem_document(
     method: str, path: str, body: str | None, status: int, kind: str
 ) -> None:
-    @swiftly
+    @in_simulated_time
     async def ask() -> None:
         async with service() as (_, browser):
             headers = {"content-type": "application/json"}
@@ -526,7 +526,7 @@ def test_every_invalid_request_is_a_problem_document(
     ask()
 
 
-@swiftly
+@in_simulated_time
 async def test_an_internal_error_reveals_no_details(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -548,7 +548,7 @@ def test_links_that_cannot_be_are_refused_at_once() -> None:
 # the service itself
 
 
-@swiftly
+@in_simulated_time
 async def test_its_numbers_are_in_the_format_of_prometheus() -> None:
     async with service(SimLink(small_px4(), 'sim:"odd\\one"')) as (_, browser):
         await met(browser)
@@ -571,7 +571,7 @@ async def test_its_numbers_are_in_the_format_of_prometheus() -> None:
         assert numbers[f"paramclient_component_parameters{{{labels}}}"] == 25
 
 
-@swiftly
+@in_simulated_time
 async def test_health_says_what_may_be_known() -> None:
     async with service(SimLink(generic(), "sim:a")) as (_, browser):
         await met(browser)
@@ -580,7 +580,7 @@ async def test_health_says_what_may_be_known() -> None:
         assert told["links"] == [{"name": "sim:a", "state": "open"}]
 
 
-@swiftly
+@in_simulated_time
 async def test_the_document_of_the_api_names_everything() -> None:
     async with service() as (_, browser):
         document = (await browser.get("/openapi.json")).json()
@@ -592,7 +592,7 @@ async def test_the_document_of_the_api_names_everything() -> None:
             assert "application/problem+json" in each["responses"]["default"]["content"]
 
 
-@swiftly
+@in_simulated_time
 async def test_the_page_of_the_api_needs_nothing_from_elsewhere() -> None:
     async with service() as (_, browser):
         page = await browser.get("/docs")
@@ -616,7 +616,7 @@ async def test_the_page_of_the_api_needs_nothing_from_elsewhere() -> None:
         assert " on" not in re.sub(r">[^<]*<", "><", page.text)
 
 
-@swiftly
+@in_simulated_time
 async def test_every_answer_forbids_a_browser_to_make_a_program_of_it() -> None:
     async with service() as (hub, browser):
         for path in ("/health", "/api/v1/components", "/nothing", "/docs", "/metrics"):

@@ -34,7 +34,7 @@ from paramclient.sim.vehicle import Vehicle
 from tests.asgi import a_browser
 from tests.caches import NOW, PX4, stored
 from tests.openapi_schema import Published
-from tests.shell import Tap, swiftly, until
+from tests.shell import Tap, in_simulated_time, until
 
 HERE = "/api/v1/components/1/1"
 TUNE = {f"TUNE_{number:02}": number / 4 + 0.1 for number in range(20)}
@@ -122,7 +122,7 @@ async def serving(
 
 
 @BOTH
-@swiftly
+@in_simulated_time
 async def test_a_file_is_planned_applied_and_verified(
     vehicle: Callable[..., Vehicle], tmp_path: Path
 ) -> None:
@@ -176,7 +176,7 @@ RULES = """- {old: OLD_TUNE, new: TUNE_01, factor: 0.01}
 
 
 @BOTH
-@swiftly
+@in_simulated_time
 async def test_names_that_changed_with_the_firmware_are_compared_planned_and_applied(
     vehicle: Callable[..., Vehicle], tmp_path: Path
 ) -> None:
@@ -210,7 +210,7 @@ async def test_names_that_changed_with_the_firmware_are_compared_planned_and_app
         ("x" * (LINE_BYTES_MAX + 1), 413, "bytes"),
     ],
 )
-@swiftly
+@in_simulated_time
 async def test_a_wrong_file_of_changed_names_is_rejected(
     text: str, status: int, told: str, tmp_path: Path
 ) -> None:
@@ -221,7 +221,7 @@ async def test_a_wrong_file_of_changed_names_is_rejected(
 
 
 @BOTH
-@swiftly
+@in_simulated_time
 async def test_an_apply_without_waiting_is_a_job_with_progress(
     vehicle: Callable[..., Vehicle], tmp_path: Path
 ) -> None:
@@ -242,7 +242,7 @@ async def test_an_apply_without_waiting_is_a_job_with_progress(
         assert told["problem"] is None
 
 
-@swiftly
+@in_simulated_time
 async def test_progress_of_a_set_up_is_among_the_events(tmp_path: Path) -> None:
     async with serving(px4(), place=tmp_path) as service:
         place = (await service.get("/api/v1/components"))["seq"]
@@ -263,7 +263,7 @@ async def test_progress_of_a_set_up_is_among_the_events(tmp_path: Path) -> None:
 
 
 @BOTH
-@swiftly
+@in_simulated_time
 async def test_an_earlier_state_comes_back(vehicle: Callable[..., Vehicle], tmp_path: Path) -> None:
     on_board = vehicle()
     async with serving(on_board, place=tmp_path) as service:
@@ -286,7 +286,7 @@ async def test_an_earlier_state_comes_back(vehicle: Callable[..., Vehicle], tmp_
         assert "exclude each other" in both["detail"]
 
 
-@swiftly
+@in_simulated_time
 async def test_two_set_ups_do_not_mix_and_one_can_be_ended(tmp_path: Path) -> None:
     on_board = px4()
     tap = Tap(on_board)
@@ -314,7 +314,7 @@ class Quiet(Tap):
         self.is_mute = len(self.messages(wire.ParamSetMessage)) > 12
 
 
-@swiftly
+@in_simulated_time
 async def test_a_cancelled_apply_reports_the_values_written_so_far(tmp_path: Path) -> None:
     """Values that were acknowledged and will not be read back are said to be unproven."""
     async with serving(Quiet(px4()), place=tmp_path) as service:
@@ -328,7 +328,7 @@ async def test_a_cancelled_apply_reports_the_values_written_so_far(tmp_path: Pat
         assert {row["status"] for row in told["result"]["params"].values()} == {"unproven"}
 
 
-@swiftly
+@in_simulated_time
 async def test_the_service_ends_in_the_middle_of_a_set_up(tmp_path: Path) -> None:
     tap = Tap(px4())
     async with serving(tap, place=tmp_path) as service:
@@ -337,7 +337,7 @@ async def test_the_service_ends_in_the_middle_of_a_set_up(tmp_path: Path) -> Non
         assert (await service.client.post(f"{HERE}/apply", json=body)).status_code == 202
 
 
-@swiftly
+@in_simulated_time
 async def test_an_apply_that_cannot_succeed_is_refused_before_the_first_write(tmp_path: Path) -> None:
     on_board = px4(armed=True)
     async with serving(on_board, place=tmp_path) as service:
@@ -355,7 +355,7 @@ async def test_an_apply_that_cannot_succeed_is_refused_before_the_first_write(tm
         assert on_board.values["TUNE_00"] == 1
 
 
-@swiftly
+@in_simulated_time
 async def test_the_vehicle_starts_again_where_values_count_only_then(tmp_path: Path) -> None:
     rows = [SimParam("SYS_AUTOSTART", ParamType.INT32, 4001), SimParam("MAV_SYS_ID", ParamType.INT32, 1)]
     on_board = px4(table=[*rows, SimParam("TUNE_00", ParamType.REAL32, 0.5)])
@@ -371,7 +371,7 @@ async def test_the_vehicle_starts_again_where_values_count_only_then(tmp_path: P
         assert done["now"] == {"system": 7, "component": 1}
 
 
-@swiftly
+@in_simulated_time
 async def test_only_what_is_named_is_wanted_and_one_file_lies_over_another() -> None:
     on_board = px4()
     async with serving(on_board) as service:
@@ -411,7 +411,7 @@ FAULTS: list[tuple[Any, str]] = [
 """What cannot be meant, and words of what is said of it."""
 
 
-@swiftly
+@in_simulated_time
 async def test_invalid_bodies_of_plan_are_refused() -> None:
     async with serving(px4()) as service:
         for body, words in FAULTS:
@@ -423,7 +423,7 @@ async def test_invalid_bodies_of_plan_are_refused() -> None:
 
 
 @BOTH
-@swiftly
+@in_simulated_time
 async def test_a_component_is_compared_with_anything(vehicle: Callable[..., Vehicle], tmp_path: Path) -> None:
     on_board, other = vehicle(), vehicle(system=2)
     async with serving(on_board, other, place=tmp_path) as service:
@@ -461,7 +461,7 @@ async def test_a_component_is_compared_with_anything(vehicle: Callable[..., Vehi
         }
 
 
-@swiftly
+@in_simulated_time
 async def test_defaults_are_a_base_where_they_are_known() -> None:
     async with serving(ardupilot(), px4(system=2)) as service:
         file = {"file": {"name": "a.param", "text": "TUNE_02,8\n"}}
@@ -476,7 +476,7 @@ async def test_defaults_are_a_base_where_they_are_known() -> None:
 
 
 @BOTH
-@swiftly
+@in_simulated_time
 async def test_a_table_comes_as_a_file_of_every_form_and_goes_back(vehicle: Callable[..., Vehicle]) -> None:
     on_board = vehicle()
     async with serving(on_board) as service:
@@ -505,7 +505,7 @@ async def test_a_table_comes_as_a_file_of_every_form_and_goes_back(vehicle: Call
             assert on_board.values["TUNE_01"] == pytest.approx(0.35)
 
 
-@swiftly
+@in_simulated_time
 async def test_the_name_of_a_file_is_safe_whoever_the_vehicle_is() -> None:
     whose = replace(PX4, autopilot=200, system=9)
     params = ParamSet(
@@ -517,7 +517,7 @@ async def test_the_name_of_a_file_is_safe_whoever_the_vehicle_is() -> None:
     assert answer.headers["content-disposition"] == f'attachment; filename="{name}"'
 
 
-@swiftly
+@in_simulated_time
 async def test_an_earlier_state_comes_as_a_file_too(tmp_path: Path) -> None:
     async with serving(px4(), place=tmp_path) as service:
         kept = await service.ask("POST", f"{HERE}/snapshots", 201, json={"reason": "as it came"})
@@ -534,7 +534,7 @@ async def test_an_earlier_state_comes_as_a_file_too(tmp_path: Path) -> None:
         assert (await service.get(f"{HERE}/file", 422, form="xlsx"))["status"] == 422
 
 
-@swiftly
+@in_simulated_time
 async def test_an_incomplete_table_is_no_file() -> None:
     on_board = px4(dead=[4])
     async with serving(on_board) as service:
@@ -543,7 +543,7 @@ async def test_an_incomplete_table_is_no_file() -> None:
             assert "did not come" in problem["detail"] or problem["type"] == "urn:paramclient:incomplete"
 
 
-@swiftly
+@in_simulated_time
 async def test_only_what_differs_from_the_defaults_is_a_file_too() -> None:
     on_board = ardupilot()
     async with serving(on_board, px4(system=2)) as service:
@@ -554,7 +554,7 @@ async def test_only_what_differs_from_the_defaults_is_a_file_too() -> None:
         assert "defaults are not known" in unknown["detail"]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_file_is_read_and_its_faults_are_told_by_line() -> None:
     async with serving(px4()) as service:
 
@@ -588,7 +588,7 @@ async def test_a_file_is_read_and_its_faults_are_told_by_line() -> None:
         assert (await upload(several, 422, component=9))["error"] == "FileError"
 
 
-@swiftly
+@in_simulated_time
 async def test_files_are_read_one_after_the_other_and_not_without_end() -> None:
     async with serving(px4()) as service:
         answers = []
@@ -603,7 +603,7 @@ async def test_files_are_read_one_after_the_other_and_not_without_end() -> None:
         assert sorted(answers) == [200] * LONG_REQUESTS_OF_HOLDER_MAX + [429] * 3
 
 
-@swiftly
+@in_simulated_time
 async def test_forms_are_told() -> None:
     async with serving(px4()) as service:
         forms = (await service.get("/api/v1/forms"))["forms"]
@@ -614,7 +614,7 @@ async def test_forms_are_told() -> None:
 # the past
 
 
-@swiftly
+@in_simulated_time
 async def test_history_comes_in_pages_without_a_loss(tmp_path: Path) -> None:
     """Also where many changes were heard at one moment."""
     cache = ParamCache(tmp_path / "cache.sqlite3")
@@ -654,7 +654,7 @@ async def test_history_comes_in_pages_without_a_loss(tmp_path: Path) -> None:
 
 
 @BOTH
-@swiftly
+@in_simulated_time
 async def test_cached_data_of_a_vehicle_is_the_same_with_and_without_its_link(
     vehicle: Callable[..., Vehicle], tmp_path: Path
 ) -> None:
@@ -689,7 +689,7 @@ async def test_cached_data_of_a_vehicle_is_the_same_with_and_without_its_link(
                 assert problem["type"] == "urn:paramclient:unknown-vehicle"
 
 
-@swiftly
+@in_simulated_time
 async def test_without_a_cache_nothing_is_known_of_earlier_times() -> None:
     async with serving(px4()) as service:
         for path in (f"{HERE}/history", f"{HERE}/snapshots", f"{HERE}/state?at=5", "/api/v1/vehicles"):
@@ -697,7 +697,7 @@ async def test_without_a_cache_nothing_is_known_of_earlier_times() -> None:
         assert (await service.post(f"{HERE}/restore", {}, 409))["type"] == "urn:paramclient:no-cache"
 
 
-@swiftly
+@in_simulated_time
 async def test_vehicles_are_compared_with_each_other(tmp_path: Path) -> None:
     async with serving(px4(), px4(system=2), px4(system=3), place=tmp_path) as service:
         await service.ask("PUT", f"{HERE}/params/MODE", json={"value": 5})
@@ -715,7 +715,7 @@ async def test_vehicles_are_compared_with_each_other(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "asked", [{"names": ["TUNE_0?", "MODE", "T*_02"]}, {"values": {"TUNE_03": 1, "MODE": 5, "NO_SUCH": 2}}]
 )
-@swiftly
+@in_simulated_time
 async def test_vehicles_are_compared_in_parts(
     asked: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -754,7 +754,7 @@ async def test_vehicles_are_compared_in_parts(
 # descriptions
 
 
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_describes_its_parameters_when_it_is_asked_to(tmp_path: Path) -> None:
     async with serving(PX4Vehicle(metadata=True), place=tmp_path) as service:
         assert (await service.get(f"{HERE}/metadata", 404))["type"] == "urn:paramclient:not-described"
@@ -771,7 +771,7 @@ async def test_a_vehicle_describes_its_parameters_when_it_is_asked_to(tmp_path: 
         assert outside["params"]["MC_ROLL_P"]["category"] == "out-of-range"
 
 
-@swiftly
+@in_simulated_time
 async def test_a_file_describes_parameters_too(tmp_path: Path) -> None:
     content = json.dumps(
         {"parameters": [{"name": "TUNE_00", "type": "Float", "max": 2.0, "units": "m"}], "version": 1}
@@ -785,7 +785,7 @@ async def test_a_file_describes_parameters_too(tmp_path: Path) -> None:
         assert (await service.post(f"{HERE}/metadata", {}, 404))["type"] == "urn:paramclient:not-described"
 
 
-@swiftly
+@in_simulated_time
 async def test_a_token_that_may_only_read_changes_nothing(tmp_path: Path) -> None:
     on_board = px4()
     async with Hub([on_board], cache=False) as hub:

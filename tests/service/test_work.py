@@ -81,7 +81,7 @@ from paramclient.service.routes import params as params_room
 from paramclient.sim import Camera, GenericVehicle
 from tests.asgi import a_browser
 from tests.service_hub import C, met, problem, service
-from tests.shell import Tap, swiftly, until
+from tests.shell import Tap, in_simulated_time, until
 
 TABLE = {f"ABC_{number % 5}_P{number:02}": float(number) for number in range(40)}
 VALUES = {name: value + 1 for name, value in TABLE.items()}
@@ -159,7 +159,7 @@ def test_names_and_patterns_choose_as_the_shell_does() -> None:
         wanted.only(["MC_ROL", "MC_PITCH_P"])
 
 
-@swiftly
+@in_simulated_time
 async def test_a_request_has_few_patterns_and_many_names(monkeypatch: pytest.MonkeyPatch) -> None:
     many = [f"A*{number}" for number in range(10_000)]
     few = ["ABC_*", *[f"*{number % 40:02}" for number in range(PATTERNS_MAX - 1)]]
@@ -202,7 +202,7 @@ BODIES: list[tuple[str, bytes]] = [
 
 
 @pytest.mark.parametrize(("_", "body"), BODIES, ids=[name for name, _ in BODIES])
-@swiftly
+@in_simulated_time
 async def test_a_body_with_too_many_values_is_not_parsed(
     _: str, body: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -223,7 +223,7 @@ FILES: list[tuple[str, bytes]] = [
 
 
 @pytest.mark.parametrize(("name", "data"), FILES)
-@swiftly
+@in_simulated_time
 async def test_a_file_with_too_many_values_is_not_read(name: str, data: bytes) -> None:
     """As it is, and in a body: with line ends and brackets it is the file that has too many."""
     assert len(data) <= PARAM_FILE_BYTES_MAX
@@ -238,7 +238,7 @@ async def test_a_file_with_too_many_values_is_not_read(name: str, data: bytes) -
             assert used() < 40
 
 
-@swiftly
+@in_simulated_time
 async def test_a_request_with_more_values_than_a_vehicle_has_is_refused() -> None:
     unknown = {f"U{number}": number for number in range(60_000)}
     text = "".join(f"U{number} 1\n" for number in range(REQUEST_VALUES_MAX + 1))
@@ -259,7 +259,7 @@ async def test_a_request_with_more_values_than_a_vehicle_has_is_refused() -> Non
         assert not vehicle.heard, "the vehicle is asked for none of them"
 
 
-@swiftly
+@in_simulated_time
 async def test_a_whole_table_is_within_all_limits() -> None:
     """The page sends a whole file in base64, with the names that were chosen; programs send values."""
     text = "".join(f"{name},{value + 1}\n" for name, value in LARGE.items())
@@ -274,7 +274,7 @@ async def test_a_whole_table_is_within_all_limits() -> None:
         assert len(compared.json()["params"]) == len(LARGE)
 
 
-@swiftly
+@in_simulated_time
 async def test_the_rows_of_a_comparison_are_written_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """Thousands at once make full garbage collections long, in which no thread runs."""
     most, made = 0, weakref.WeakSet[DifferenceDoc]()
@@ -300,7 +300,7 @@ async def test_the_rows_of_a_comparison_are_written_one_by_one(monkeypatch: pyte
 # The first requests
 
 
-@swiftly
+@in_simulated_time
 async def test_the_first_requests_build_neither_handlers_nor_models(monkeypatch: pytest.MonkeyPatch) -> None:
     """To build those of one router takes 30 ms and more, in which nobody else is served."""
     built: list[str] = []
@@ -337,7 +337,7 @@ async def test_the_first_requests_build_neither_handlers_nor_models(monkeypatch:
         ("restore", {"include": [[]] * 9_000}, "body.include.0"),
     ],
 )
-@swiftly
+@in_simulated_time
 async def test_of_many_faults_of_one_kind_the_first_is_told(
     path: str, body: dict[str, Any], where: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -350,7 +350,7 @@ async def test_of_many_faults_of_one_kind_the_first_is_told(
         assert READER in seen["loads"]
 
 
-@swiftly
+@in_simulated_time
 async def test_of_many_wrong_values_a_part_is_looked_at() -> None:
     body = json.dumps({"wanted": {"values": {f"A{number}": [] for number in range(5_000)}}}).encode()
     async with service(GenericVehicle(table=TABLE)) as (_, browser):
@@ -407,7 +407,7 @@ def test_a_document_in_yaml_takes_as_much_memory_as_its_values() -> None:
 # Threads
 
 
-@swiftly
+@in_simulated_time
 async def test_names_and_patterns_of_a_query_are_short() -> None:
     async with service(GenericVehicle(table=TABLE)) as (_, browser):
         await fetched(browser)
@@ -417,7 +417,7 @@ async def test_names_and_patterns_of_a_query_are_short() -> None:
         assert (await browser.get(f"{C}/params", params={"names": "[" * 64})).status_code == 200
 
 
-@swiftly
+@in_simulated_time
 async def test_long_work_is_done_in_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     text = f"# {'long ' * 1_000}\n" + "".join(f"{name},{value}\n" for name, value in VALUES.items())
     calls = (
@@ -434,7 +434,7 @@ async def test_long_work_is_done_in_a_thread(monkeypatch: pytest.MonkeyPatch) ->
         assert {name: threads for name, threads in seen.items() if threads != {READER}} == {}
 
 
-@swiftly
+@in_simulated_time
 async def test_a_table_is_copied_out_in_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     """A table may have thousands of names; each takes 5 µs."""
     asked: list[tuple[str, str, dict[str, Any] | None]] = [
@@ -478,7 +478,7 @@ async def test_metrics_components_and_fetches_are_encoded_in_a_thread_of_their_o
         assert seen == {name: {"paramclient responses"} for _, name in calls}
 
 
-@swiftly
+@in_simulated_time
 async def test_the_document_of_the_api_is_made_once_and_in_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     async with service() as (_, browser):
         with threads_of(monkeypatch, (FastAPI, "openapi")) as seen:
@@ -518,7 +518,7 @@ ANNA = bearer("anna-may-write-0123456789")
 BEN = bearer("ben-may-read-0123456789ab")
 
 
-@swiftly
+@in_simulated_time
 async def test_jobs_have_a_quota_for_each_holder() -> None:
     vehicle = Tap(GenericVehicle(table=TABLE))
     settings = Settings(access=AccessSettings(tokens=TOKENS))
@@ -546,7 +546,7 @@ async def test_jobs_have_a_quota_for_each_holder() -> None:
         assert (await browser.post(f"{C}/fetch", json=body, headers=BEN)).status_code == 202
 
 
-@swiftly
+@in_simulated_time
 async def test_plans_have_a_quota_for_each_holder_and_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without tokens an address is the holder."""
     vehicle = Tap(GenericVehicle(table=TABLE))
@@ -588,7 +588,7 @@ async def test_plans_have_a_quota_for_each_holder_and_for_all(monkeypatch: pytes
         (f"{C}/params/ABC_1_P01/read", {"timeout_s": 20}, 504),
     ],
 )
-@swiftly
+@in_simulated_time
 async def test_waiting_requests_have_a_quota_for_each_holder_and_for_all(
     path: str, body: dict[str, Any], status: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -616,7 +616,7 @@ async def test_waiting_requests_have_a_quota_for_each_holder_and_for_all(
         assert statuses == [status] * WAITING_REQUESTS_OF_HOLDER_MAX
 
 
-@swiftly
+@in_simulated_time
 async def test_waiting_readers_keep_no_writer_and_no_other_reader_out() -> None:
     vehicle = Tap(GenericVehicle(table=TABLE))
     readers = [f"reader{number}-0123456789abcdef" for number in range(4)]
@@ -648,7 +648,7 @@ async def test_waiting_readers_keep_no_writer_and_no_other_reader_out() -> None:
         assert statuses.count(429) == 3 * WAITING_REQUESTS_MAX - (64 + 32 + 16)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_list_of_jobs_has_their_results() -> None:
     async with service(GenericVehicle(table=TABLE)) as (_, browser):
         await fetched(browser)
@@ -660,7 +660,7 @@ async def test_a_list_of_jobs_has_their_results() -> None:
         assert (await browser.get(f"/api/v1/jobs/{last['id']}")).json() == last
 
 
-@swiftly
+@in_simulated_time
 async def test_a_list_of_jobs_has_no_long_results() -> None:
     async with service(GenericVehicle(table=LARGE)) as (_, browser):
         await fetched(browser)
@@ -691,7 +691,7 @@ class Turns:
         asyncio.get_running_loop().call_soon(self._next)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_table_is_read_a_part_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     table = {f"ABC_P{number:04}": float(number) for number in range(3 * params_room.PARAMS_PER_TURN)}
     async with service(GenericVehicle(table=table)) as (_, browser):
@@ -714,7 +714,7 @@ async def test_a_table_is_read_a_part_at_a_time(monkeypatch: pytest.MonkeyPatch)
         assert params_room.PARAMS_PER_TURN / 2 < turns.most <= params_room.PARAMS_PER_TURN
 
 
-@swiftly
+@in_simulated_time
 async def test_extended_parameters_are_chosen_in_a_thread_and_encoded_as_they_are_sent(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -741,7 +741,7 @@ async def test_extended_parameters_are_chosen_in_a_thread_and_encoded_as_they_ar
         assert (await browser.get(f"{extended}/params?names=NONE")).json()["params"] == {}
 
 
-@swiftly
+@in_simulated_time
 async def test_descriptions_are_encoded_as_they_are_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     table = {f"ABC_P{number:03}": 1.0 for number in range(200)}
     bits = [{"index": 0, "description": "b" * 500}]
@@ -773,7 +773,7 @@ async def test_descriptions_are_encoded_as_they_are_sent(monkeypatch: pytest.Mon
         assert not {"text", "units"} & {*compared, *compared["left"], *compared["right"]}
 
 
-@swiftly
+@in_simulated_time
 async def test_extended_parameters_of_a_second_list_are_compared_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -824,7 +824,7 @@ async def test_of_a_streamed_response_nothing_is_made_before_it_can_be_sent() ->
         assert max(sizes) < STREAMED_CHUNK_LENGTH + length + 20
 
 
-@swiftly
+@in_simulated_time
 async def test_events_are_written_out_few_at_a_time() -> None:
     async with service() as (hub, browser):
         turns = Turns()
@@ -842,7 +842,7 @@ async def test_events_are_written_out_few_at_a_time() -> None:
         assert turns.most == BATCH_EVENTS_MAX
 
 
-@swiftly
+@in_simulated_time
 async def test_fetches_of_many_are_begun_and_ended_few_at_a_time() -> None:
     class Station:
         def begin_fetches(self, machines: list[Any], now: float, *, refresh: bool) -> list[Any]:
@@ -892,7 +892,7 @@ async def test_fetches_of_many_are_begun_and_ended_few_at_a_time() -> None:
     assert checks == 1 + math.ceil(250 / STARTED_FETCHES_MAX)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_component_that_the_link_has_forgotten_does_not_break_the_end_of_a_fetch() -> None:
     ended: list[int] = []
     machines = {
@@ -906,7 +906,7 @@ async def test_a_component_that_the_link_has_forgotten_does_not_break_the_end_of
     assert ended == [3, 1]
 
 
-@swiftly
+@in_simulated_time
 async def test_metrics_are_collected_a_part_at_a_time() -> None:
     turns = Turns()
 
@@ -925,7 +925,7 @@ async def test_metrics_are_collected_a_part_at_a_time() -> None:
     assert turns.most == COMPONENTS_PER_TURN
 
 
-@swiftly
+@in_simulated_time
 async def test_many_components_are_looked_at_few_at_a_time() -> None:
     turns = Turns()
     looked: Any = SimpleNamespace(publish_changes=turns.note)
@@ -958,14 +958,14 @@ ESCAPES = b'a: "' + b"\\x41" * 20_000 + b'"\n'
         ("a.params", b"1\t1\tA\t1\t9\r" * 60_001, SEPARATORS_MAX),
     ],
 )
-@swiftly
+@in_simulated_time
 async def test_a_file_with_long_lines_is_not_parsed(name: str, data: bytes, most: int) -> None:
     async with service() as (_, browser):
         answer = await browser.post(f"/api/v1/files?name={name}", content=data, headers=A_FILE)
         assert problem(answer, 413, "too-large")["most"] == most
 
 
-@swiftly
+@in_simulated_time
 async def test_a_file_without_lines_may_be_long() -> None:
     wanted = ParamSet({name: WrittenParam(name, value) for name, value in LARGE.items()})
     document = json.dumps(json.loads(dumps(wanted, form="json"))).encode()
@@ -994,7 +994,7 @@ def test_in_a_document_of_one_line_no_comment_is_sought(monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("number", ["9" * 4_300, "9" * (DIGITS_MAX + 1), "0." + "3" * (DIGITS_MAX + 1)])
-@swiftly
+@in_simulated_time
 async def test_a_body_with_endless_numbers_is_not_parsed(
     number: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -1066,7 +1066,7 @@ async def test_the_end_of_the_service_waits_for_nothing_that_is_read(monkeypatch
     may_end.set()
 
 
-@swiftly
+@in_simulated_time
 async def test_large_answers_wait_for_each_other_until_they_are_sent() -> None:
     async with service(GenericVehicle(table=LARGE)) as (_, browser):
         await fetched(browser)
@@ -1092,7 +1092,7 @@ async def test_large_answers_wait_for_each_other_until_they_are_sent() -> None:
             assert sorted(each.status_code for each in answers) == [200, 200, 200, 409]
 
 
-@swiftly
+@in_simulated_time
 async def test_a_quota_limits_each_holder_and_all_together() -> None:
     quota = Quota("requests", total_max=3, holder_max=2)
     held: list[str] = []

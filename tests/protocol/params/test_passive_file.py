@@ -25,7 +25,7 @@ from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.station import Station
 from paramclient.sim import ArduPilotVehicle, Endpoint
 from tests.recordings import DATA
-from tests.shell import Tap, swiftly
+from tests.shell import Tap, in_simulated_time
 from tests.simulation import param_value
 from tests.telemetry import BLOCK, STATION, FileLog
 
@@ -185,7 +185,7 @@ def test_a_recording_gives_the_file_that_was_read(speed: str, tmp_path: Path) ->
             if each.default is not None
         ]
 
-    @swiftly
+    @in_simulated_time
     async def replay() -> None:
         async with ParamClient(f"replay:{path}?speed={speed}") as client:
             component = await client.component(1, 1)
@@ -250,7 +250,7 @@ class LossyFiles(Tap):
 
 
 @pytest.mark.parametrize("way", [Tap, LossyFiles])
-@swiftly
+@in_simulated_time
 async def test_our_own_log_gives_the_table_that_was_fetched(way: type[Tap], tmp_path: Path) -> None:
     path = tmp_path / "flight.tlog"
     vehicle = ArduPilotVehicle(table={f"NAME_{each:03}": each for each in range(300)})

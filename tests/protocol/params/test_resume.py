@@ -16,7 +16,7 @@ from paramclient.protocol.params.fetch_result import FetchResult
 from paramclient.protocol.wire import ParamRequestList, ParamRequestRead
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
 from tests.caches import start
-from tests.shell import bits, swiftly
+from tests.shell import bits, in_simulated_time
 from tests.simulation import Simulation, listed, listing_ardupilot
 
 SIZE = 200
@@ -381,7 +381,7 @@ def test_after_a_killed_process_only_what_is_missing_is_fetched(
     process.communicate()
     there = len(on_disk(path))
 
-    @swiftly
+    @in_simulated_time
     async def next_session() -> None:
         async with ParamClient(vehicle, cache=path) as client:
             component = await client.component()
@@ -414,7 +414,7 @@ async def fetched(vehicle: Vehicle, path: Path) -> FetchResult:
         return await component.fetch_all()
 
 
-@swiftly
+@in_simulated_time
 async def test_another_firmware_does_not_go_on_with_the_old_ones_table(path: Path) -> None:
     old = MAKES["ArduPilot"]()
     await left_unfinished(old, path)
@@ -431,7 +431,7 @@ async def test_another_firmware_does_not_go_on_with_the_old_ones_table(path: Pat
         assert cache.component().identity.firmware == new._version.flight_sw_version
 
 
-@swiftly
+@in_simulated_time
 async def test_a_download_begun_under_another_count_is_no_mixture(path: Path) -> None:
     """The first table is whole, the download of a grown one breaks off: old indices count for nothing."""
     await fetched(MAKES["ArduPilot"](), path)

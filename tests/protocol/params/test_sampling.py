@@ -20,7 +20,7 @@ from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.station import Station
 from paramclient.protocol.wire import ParamRequestList, ParamRequestRead
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle
-from tests.shell import Tap, bits, swiftly
+from tests.shell import Tap, bits, in_simulated_time
 from tests.simulation import Memory, Simulation
 
 TABLE: dict[str, Any] = {f"PARAM_{number:03}": number for number in range(200)}
@@ -230,7 +230,7 @@ async def session_with(
         return await component.fetch_all(accept=accept, **options), component
 
 
-@swiftly
+@in_simulated_time
 async def test_the_same_vehicle_with_the_same_firmware_may_be_believed(tmp_path: Path) -> None:
     path = tmp_path / "cache"
     vehicle = ArduPilotVehicle(live_period=0)
@@ -248,7 +248,7 @@ async def test_the_same_vehicle_with_the_same_firmware_may_be_believed(tmp_path:
 
 
 @pytest.mark.parametrize("what", ["firmware", "git hash", "hardware"])
-@swiftly
+@in_simulated_time
 async def test_another_one_may_not(tmp_path: Path, what: str) -> None:
     path = tmp_path / "cache"
     await session_with(ArduPilotVehicle(live_period=0), path)
@@ -261,7 +261,7 @@ async def test_another_one_may_not(tmp_path: Path, what: str) -> None:
     assert (result.source, result.sample) == ("ftp", None)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_cached_table_that_is_not_whole_is_not_sampled(tmp_path: Path) -> None:
     path = tmp_path / "cache"
     vehicle = ArduPilotVehicle(live_period=0)
@@ -274,7 +274,7 @@ async def test_a_cached_table_that_is_not_whole_is_not_sampled(tmp_path: Path) -
     assert (result.source, result.sample) == ("ftp", None)
 
 
-@swiftly
+@in_simulated_time
 async def test_invalid_sampling_options_are_refused() -> None:
     async with ParamClient(ArduPilotVehicle(), cache=False) as client:
         component = await client.component()

@@ -28,7 +28,7 @@ from paramclient.protocol.requests.retry import REBOOT_COMMANDS_MAX
 from paramclient.protocol.system_id_change import OLD_ID_SILENCE_MIN
 from paramclient.protocol.vehicle.reboot_command import SAVING_TIME, UNOBSERVED_TIMEOUT
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle, Vehicle
-from tests.shell import FlakyLink, Tap, a_client, generic, outcome, residue, swiftly, tasks_beside
+from tests.shell import FlakyLink, Tap, a_client, generic, in_simulated_time, outcome, residue, tasks_beside
 from tests.simulation import is_so
 
 Make: TypeAlias = Callable[..., Vehicle]
@@ -127,7 +127,7 @@ class LateClock(Tap):
 @pytest.mark.parametrize("uptime", [0.0, 0.7, 30.0])
 @pytest.mark.parametrize("down", [0.0, 1.0, 3.0, 20.0])
 @pytest.mark.parametrize("ack", [True, False])
-@swiftly
+@in_simulated_time
 async def test_reboot_returns_when_the_vehicle_is_back(
     make: Make, uptime: float, down: float, ack: bool
 ) -> None:
@@ -152,7 +152,7 @@ async def test_reboot_returns_when_the_vehicle_is_back(
 
 
 @MAKES
-@swiftly
+@in_simulated_time
 async def test_reboot_waits_until_the_vehicle_has_booted(make: Make) -> None:
     vehicle = make(boot_time=7.0)
     starts = counted(vehicle)
@@ -164,7 +164,7 @@ async def test_reboot_waits_until_the_vehicle_has_booted(make: Make) -> None:
 
 
 @MAKES
-@swiftly
+@in_simulated_time
 async def test_a_command_that_is_lost_is_sent_again(make: Make) -> None:
     vehicle = make()
     starts = counted(vehicle)
@@ -180,7 +180,7 @@ async def test_a_command_that_is_lost_is_sent_again(make: Make) -> None:
         assert len(commands) > 1
 
 
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_that_hears_nothing_is_given_up() -> None:
     tap = Tap(generic())
     async with a_client(tap) as client:
@@ -195,7 +195,7 @@ async def test_a_vehicle_that_hears_nothing_is_given_up() -> None:
 
 @pytest.mark.parametrize("seed", range(12))
 @MAKES
-@swiftly
+@in_simulated_time
 async def test_a_bad_link_starts_it_once(make: Make, seed: int) -> None:
     vehicle = make(reboot_down=3.0)
     starts = counted(vehicle)
@@ -209,7 +209,7 @@ async def test_a_bad_link_starts_it_once(make: Make, seed: int) -> None:
 
 @pytest.mark.parametrize(("down", "longest"), [(1.0, UNOBSERVED_TIMEOUT + 2.0), (4.0, 8.0), (12.0, 16.0)])
 @MAKES
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_without_a_clock(make: Make, down: float, longest: float) -> None:
     vehicle = make(reboot_down=down)
     starts = counted(vehicle)
@@ -223,7 +223,7 @@ async def test_a_vehicle_without_a_clock(make: Make, down: float, longest: float
 
 @pytest.mark.parametrize("down", [0.8, 1.0, 1.3, 2.0])
 @MAKES
-@swiftly
+@in_simulated_time
 async def test_a_clock_that_is_heard_after_the_heartbeat(make: Make, down: float) -> None:
     """The first heartbeat of the new start is no reason to tell it again."""
     vehicle = make(reboot_down=down, reboot_ack=False)
@@ -235,7 +235,7 @@ async def test_a_clock_that_is_heard_after_the_heartbeat(make: Make, down: float
         assert len(starts) == 1
 
 
-@swiftly
+@in_simulated_time
 async def test_a_silence_alone_is_no_restart() -> None:
     """The command is lost, and so is everything for a while; the clock goes on, so it is told again."""
     vehicle = generic()
@@ -251,7 +251,7 @@ async def test_a_silence_alone_is_no_restart() -> None:
         assert starts[0] <= anyio.current_time()
 
 
-@swiftly
+@in_simulated_time
 async def test_a_reboot_waits_until_px4_has_saved_the_last_write() -> None:
     tap = Tap(px4())
     async with a_client(tap) as client:
@@ -266,7 +266,7 @@ async def test_a_reboot_waits_until_px4_has_saved_the_last_write() -> None:
         assert (await component.get("A")).value == 2
 
 
-@swiftly
+@in_simulated_time
 async def test_a_connection_that_drops_with_it() -> None:
     vehicle = generic(stream=True)
     starts = counted(vehicle)
@@ -285,7 +285,7 @@ async def test_a_connection_that_drops_with_it() -> None:
 @pytest.mark.parametrize(
     ("make", "code"), [(px4, CommandResult.DENIED), (ardupilot, CommandResult.FAILED), (generic, 2)]
 )
-@swiftly
+@in_simulated_time
 async def test_an_armed_vehicle_refuses(make: Make, code: int) -> None:
     vehicle = make(armed=True)
     starts = counted(vehicle)
@@ -307,7 +307,7 @@ async def test_an_armed_vehicle_refuses(make: Make, code: int) -> None:
 
 @pytest.mark.parametrize(("timeout", "patience"), [(None, REBOOT_TIMEOUT), (10.0, 10.0), (1.0, 1.0)])
 @pytest.mark.parametrize("ack", [True, False])
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_that_does_not_return_is_no_reply(
     ack: bool, timeout: float | None, patience: float
 ) -> None:
@@ -335,7 +335,7 @@ async def test_a_vehicle_that_does_not_return_is_no_reply(
     ],
     ids=["uid", "kind", "both"],
 )
-@swiftly
+@in_simulated_time
 async def test_another_vehicle_after_the_reboot_raises_another_vehicle(
     before: Make, after: Make, ack: bool
 ) -> None:
@@ -354,7 +354,7 @@ async def test_another_vehicle_after_the_reboot_raises_another_vehicle(
         assert await component.reboot() is component
 
 
-@swiftly
+@in_simulated_time
 async def test_another_hardware_id_after_the_reboot_raises_at_once() -> None:
     place = Exchanged(generic(uid=1, reboot_down=math.inf))
     async with a_client(place) as client:
@@ -365,7 +365,7 @@ async def test_another_hardware_id_after_the_reboot_raises_at_once() -> None:
         assert anyio.current_time() - began < 11.5
 
 
-@swiftly
+@in_simulated_time
 async def test_another_vehicle_type_after_the_reboot_raises_despite_a_lost_heartbeat() -> None:
     class Beatless(Tap):
         def data_to_send(self) -> list[bytes]:
@@ -382,7 +382,7 @@ async def test_another_vehicle_type_after_the_reboot_raises_despite_a_lost_heart
         assert isinstance(await outcome(component.reboot()), AnotherVehicle)
 
 
-@swiftly
+@in_simulated_time
 async def test_calls_at_the_same_time_share_one_restart() -> None:
     vehicle = generic()
     starts = counted(vehicle)
@@ -397,7 +397,7 @@ async def test_calls_at_the_same_time_share_one_restart() -> None:
 
 @pytest.mark.parametrize("after", [0.0, 0.1, 0.5, 1.2, 2.0])
 @MAKES
-@swiftly
+@in_simulated_time
 async def test_cancelling_leaves_nothing(make: Make, after: float) -> None:
     vehicle = make(reboot_ack=False)
     async with a_client(vehicle) as client:
@@ -416,7 +416,7 @@ async def test_cancelling_leaves_nothing(make: Make, after: float) -> None:
         assert await component.reboot() is component
 
 
-@swiftly
+@in_simulated_time
 async def test_a_client_that_is_closed_ends_it() -> None:
     vehicle = generic(reboot_down=math.inf)
     async with a_client(vehicle) as client:
@@ -428,7 +428,7 @@ async def test_a_client_that_is_closed_ends_it() -> None:
     assert isinstance(await outcome(client.successor(component, 2)), ClientClosed)
 
 
-@swiftly
+@in_simulated_time
 async def test_whether_it_is_armed_follows_the_heartbeat() -> None:
     vehicle = px4()
     async with a_client(vehicle) as client:
@@ -445,7 +445,7 @@ async def test_whether_it_is_armed_follows_the_heartbeat() -> None:
 # another system id
 
 
-@swiftly
+@in_simulated_time
 async def test_px4_takes_its_system_id_with_the_start() -> None:
     vehicle = px4(uid=7)
     async with a_client(vehicle) as client:
@@ -464,7 +464,7 @@ async def test_px4_takes_its_system_id_with_the_start() -> None:
 
 @pytest.mark.parametrize("ack", [True, False])
 @pytest.mark.parametrize("uid", [7, None])  # None: what all simulated PX4 have
-@swiftly
+@in_simulated_time
 async def test_there_and_back_again(uid: int | None, ack: bool) -> None:
     vehicle = px4(uid=uid, reboot_ack=ack)
     async with a_client(vehicle) as client:
@@ -476,7 +476,7 @@ async def test_there_and_back_again(uid: int | None, ack: bool) -> None:
             assert (await component.get("MAV_SYS_ID")).value == system
 
 
-@swiftly
+@in_simulated_time
 async def test_a_vehicle_that_keeps_its_old_system_id_is_no_reply() -> None:
     vehicle = px4()
     async with a_client(vehicle) as client:
@@ -490,7 +490,7 @@ async def test_a_vehicle_that_keeps_its_old_system_id_is_no_reply() -> None:
         assert isinstance(await outcome(component.reboot(system=9)), CommandRefused)
 
 
-@swiftly
+@in_simulated_time
 async def test_plane_and_rover_take_it_at_once() -> None:
     vehicle = ardupilot(kind="plane")
     async with a_client(vehicle) as client:
@@ -506,7 +506,7 @@ async def test_plane_and_rover_take_it_at_once() -> None:
         assert result.complete
 
 
-@swiftly
+@in_simulated_time
 async def test_copter_takes_it_with_the_next_start() -> None:
     vehicle = ardupilot()
     async with a_client(vehicle) as client:
@@ -520,7 +520,7 @@ async def test_copter_takes_it_with_the_next_start() -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-@swiftly
+@in_simulated_time
 async def test_a_copter_whose_acknowledgement_is_lost_starts_once(seed: int) -> None:
     """It is heard again 1.2 s later, and tells its clock 1.4 s after that: it is not told again meanwhile."""
     vehicle = ardupilot(reboot_down=0.8 + 0.1 * seed, reboot_ack=False)
@@ -532,7 +532,7 @@ async def test_a_copter_whose_acknowledgement_is_lost_starts_once(seed: int) -> 
         assert len(starts) == 1
 
 
-@swiftly
+@in_simulated_time
 async def test_a_copter_is_back_as_soon_as_it_is_heard() -> None:
     """Its first frame has number 0; its clock comes 1.4 s later."""
     vehicle = ardupilot()
@@ -544,7 +544,7 @@ async def test_a_copter_is_back_as_soon_as_it_is_heard() -> None:
 
 
 @MAKES
-@swiftly
+@in_simulated_time
 async def test_a_reboot_by_another_station_is_detected(make: Make) -> None:
     vehicle = make()
     async with a_client(vehicle) as client:
@@ -557,7 +557,7 @@ async def test_a_reboot_by_another_station_is_detected(make: Make) -> None:
         assert len(events._waiting) == 1
 
 
-@swiftly
+@in_simulated_time
 async def test_without_a_hardware_id_the_silence_of_the_old_one_tells() -> None:
     first, second = generic(uid=0), generic(uid=0, system=9)
     air = Air.symmetric([first, second])
@@ -573,7 +573,7 @@ async def test_without_a_hardware_id_the_silence_of_the_old_one_tells() -> None:
         assert OLD_ID_SILENCE_MIN - 1.1 <= anyio.current_time() - silent_from <= OLD_ID_SILENCE_MIN + 1.0
 
 
-@swiftly
+@in_simulated_time
 async def test_successor_raises_if_another_vehicle_has_the_new_id() -> None:
     air = Air.symmetric([generic(), generic(system=9)])
     async with a_client(air) as client:
@@ -583,7 +583,7 @@ async def test_successor_raises_if_another_vehicle_has_the_new_id() -> None:
         assert (error.system, error.component) == (9, 1)
 
 
-@swiftly
+@in_simulated_time
 async def test_a_successor_that_never_speaks() -> None:
     async with a_client(generic()) as client:
         component = await client.component()
@@ -595,7 +595,7 @@ async def test_a_successor_that_never_speaks() -> None:
         assert math.isclose(anyio.current_time() - began, 4.0, abs_tol=0.01)
 
 
-@swiftly
+@in_simulated_time
 async def test_an_unidentified_successor_is_asked_again() -> None:
     vehicle = ardupilot(kind="plane")
     tap = Tap(vehicle)
