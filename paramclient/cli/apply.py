@@ -431,7 +431,7 @@ async def _confirm(
     reboot: bool,
     full: bool,
 ) -> bool:
-    """Show the changes and ask for confirmation. Return true without a question if there are none."""
+    """Show the changes and ask for confirmation. Return True without a prompt if there are none."""
     for vehicle, error in errors.items():
         report(f"{vehicle.label}: {error}")
     if not any(plan.steps or (reboot and plan.awaiting_reboot) for plan in plans.values()):

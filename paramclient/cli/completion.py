@@ -271,7 +271,7 @@ class _OpenCache:
 
 
 def read_table() -> Table:
-    """Return what is known of the subcommands, from its file; written anew after a change of the command."""
+    """Return the table of the subcommands from its file, which is rewritten after a change of the command."""
     from platformdirs import user_cache_path
 
     path = user_cache_path("paramclient", appauthor=False) / "completion.json"

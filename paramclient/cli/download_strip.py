@@ -32,7 +32,7 @@ def strip_lines(title: str, state: Progress, marks: Marks, width: int) -> list[l
     No item is broken in two. Without the parts of the download, only the figures are shown.
 
     Args:
-        title: what is downloaded.
+        title: the table that is downloaded.
         state: the progress.
         marks: the characters of the strip.
         width: columns of the terminal.
@@ -67,7 +67,7 @@ def _cell(part: DownloadRange, marks: Marks) -> Piece:
 
 
 def _key(parts: Sequence[DownloadRange], marks: Marks, unit: str) -> list[list[Piece]]:
-    """Return the characters with what they mean, and how many values or bytes that are."""
+    """Return the characters with their meanings, and the numbers of values or bytes."""
     counts = (
         (marks.full, RECEIVED_STYLE, sum(part.received for part in parts), "received"),
         (

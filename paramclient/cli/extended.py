@@ -101,7 +101,7 @@ def may_be_extended(options: LinkOptions, *, extended: bool, plain: bool) -> boo
 async def is_extended_session(session: CommandSession, *, extended: bool, plain: bool) -> bool:
     """Return whether to use the extended parameters of the component.
 
-    Without a choice of the user, a component that usually has them is asked for its first one.
+    Without a choice of the user, a component that usually has extended parameters is asked for its first one.
     """
     if extended or plain or session.client.listens_only:
         return extended
@@ -466,7 +466,7 @@ async def _write_set(
     dry_run: bool,
     yes: bool,
 ) -> ExitCode:
-    """Write a set of extended parameters, after the question of a terminal, and print the result."""
+    """Write a set of extended parameters, after confirmation on a terminal, and print the result."""
     if dry_run or (not yes and can_confirm(session.options)):
         plan = await verify_extended_set(session.component, content, timeout=session.deadline.left())
         _report_impossible(session, plan, content)

@@ -73,7 +73,7 @@ def _chosen(wanted: tuple[str, ...], component: int | None) -> ParamSet | tuple[
 
 
 def _spelled(cache: ParamCache, wanted: Sequence[str], component: int) -> list[str]:
-    """Return the names in the cache that names and patterns choose, whatever their upper and lower case.
+    """Return the names in the cache that names and patterns choose, in upper or lower case.
 
     Raises:
         NotInCache: one chooses none. The message suggests similar names.

@@ -70,7 +70,7 @@ class LinkHistory:
         A late sample counts for all seconds that it covers.
 
         Args:
-            report: the present counts of the link.
+            report: the current counts of the link.
             round_trips: the round trips by system and component, of those that have any.
             now: the time.
         """

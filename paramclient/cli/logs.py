@@ -28,7 +28,7 @@ from paramclient.model.notation import hash_text
 __all__ = ["cache_of_log", "import_"]
 
 KIND_BYTES: Final = 4096
-"""Bytes at the beginning of a file that tell what it is."""
+"""Bytes at the beginning of a file that identify its format."""
 SQLITE_MAGIC: Final = b"SQLite format 3\0"
 """The first bytes of an SQLite database (its file format, section 1.3)."""
 
@@ -90,7 +90,7 @@ async def _import(path: Path, cache: ParamCache) -> tuple[ImportedTable, ...]:
 
 
 def _kind_of(path: Path) -> str | None:
-    """Return in words what a file that is no log is; None if it cannot be read."""
+    """Return the kind of a file that is no log, in words; None if it cannot be read."""
     try:
         if not path.is_file():
             return None

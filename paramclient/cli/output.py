@@ -59,7 +59,7 @@ WIDTH_UNLIMITED: Final = 10_000
 """Width in columns of an output that is not a terminal, so that nothing is wrapped or cut."""
 
 NOTICE_DELAY: Final = 0.5
-"""Seconds after which a terminal shows what is awaited: most responses arrive earlier."""
+"""Seconds after which a terminal shows the awaited response: most responses arrive earlier."""
 ERASE: Final = "\r\x1b[K"
 """Moves the cursor of a terminal to the start of the line, and erases the line."""
 ELLIPSIS: Final = "..."

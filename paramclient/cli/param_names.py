@@ -29,7 +29,8 @@ __all__ = [
 ]
 
 CACHED_TABLES_MAX: Final = 20
-"""Tables of the cache whose names are suggested, those of the vehicles heard last: few firmwares differ."""
+"""Tables of the cache whose names are suggested, those of the vehicles received last: few firmwares
+differ."""
 _CAPITALS: Final = ("px4", "ardupilot")
 """Autopilots whose parameters all have names in capitals."""
 
@@ -140,7 +141,7 @@ def unmatched_text(
 
 
 def spelling(name: str, component: Component) -> str:
-    """Return the vehicle's spelling of a name, whatever its upper and lower case.
+    """Return the vehicle's spelling of a name in upper or lower case.
 
     A name that fits several parameters in upper and lower case, and is none of them, is returned unchanged:
     the vehicle has no such parameter.

@@ -434,7 +434,7 @@ def _show_fleet(
     *,
     changed: bool,
 ) -> int:
-    """Print the tables of several vehicles, and what failed; return the exit code."""
+    """Print the tables of several vehicles, and the failures; return the exit code."""
     found = [each.result for each in fleet if each.result is not None]
     has_defaults = any(each.has_defaults for each in found)
     if only:
@@ -530,7 +530,7 @@ def _show_read(
     read: Sequence[Done[CommandSession, tuple[list[Param], dict[str, ParamClientError], Metadata | None]]],
     options: LinkOptions,
 ) -> int:
-    """Print the parameters of several vehicles, and what failed; return the exit code."""
+    """Print the parameters of several vehicles, and the failures; return the exit code."""
     found = [(each.vehicle, *each.result) for each in read if each.result is not None]
     if options.json:
         from paramclient.documents.command_output import FleetReadDoc  # only here: loads pydantic
@@ -625,7 +625,7 @@ def _report_all(errors: Iterable[ParamClientError]) -> int:
 async def _check_watched(session: CommandSession, name_patterns: Sequence[str]) -> int:
     """Read the watched parameters, and report those that the vehicle does not have; return the exit code.
 
-    A name or pattern of a group that the vehicle hides at present may appear later, and is no error.
+    A name or pattern of a group that the vehicle currently hides may appear later, and is no error.
     """
     _, errors = await _get_chosen(session, [text for text in name_patterns if not is_pattern(text)])
     patterns = [text for text in name_patterns if is_pattern(text)]

@@ -220,7 +220,7 @@ async def _known(session: CommandSession, choice: str | None, params: Sequence[P
 
 @dataclass(frozen=True, slots=True)
 class _ResetPlan:
-    """What a reset writes, and how it is printed.
+    """The values that a reset writes, and their output.
 
     Attributes:
         session: the session.

@@ -213,7 +213,7 @@ async def wait_for_vehicle(
     timeout: float | None,
     only: bool = False,
 ) -> Component:
-    """Wait for a component; meanwhile, say on a terminal what is awaited and what was received.
+    """Wait for a component; meanwhile, show on a terminal the awaited component and the received ones.
 
     Args:
         client: an open client.

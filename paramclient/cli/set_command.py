@@ -165,10 +165,10 @@ async def _prepare(
 
 
 async def _check_values(jobs: Sequence[_Job], *, force: bool) -> None:
-    """Report values that are probably wrong; go on if the user confirms them, or with `force`.
+    """Report values that are probably wrong; continue if the user confirms them, or with `force`.
 
     Raises:
-        UsageError: the user does not, or cannot be asked. Nothing was written.
+        UsageError: the user does not confirm, or there is no terminal. Nothing was written.
     """
     found = [problem for job in jobs for problem in problems(job.writes, job.described)]
     for job in jobs:

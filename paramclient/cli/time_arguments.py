@@ -44,7 +44,7 @@ def parse_when(text: str, now: float, zone: tzinfo | None = None) -> float | int
 
     Args:
         text: a number alone is the id of a snapshot; for all other texts see `parse_time`.
-        now: the present time in unix seconds.
+        now: the current time in unix seconds.
         zone: the time zone of times that name none; None for that of this computer.
 
     Raises:
@@ -63,7 +63,7 @@ def parse_time(text: str, now: float, zone: tzinfo | None = None) -> float:
 
     Args:
         text: see `WHEN`.
-        now: the present time in unix seconds.
+        now: the current time in unix seconds.
         zone: the time zone of times that name none; None for that of this computer.
 
     Raises:

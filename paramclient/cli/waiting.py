@@ -23,7 +23,7 @@ async def while_waiting(
     awaited: str,
     received: Callable[[], str] = lambda: "",
 ) -> Result:
-    """Await `work`; meanwhile, say on a terminal what is awaited. The line is erased at the end.
+    """Await `work`; meanwhile, name the awaited response on a terminal. The line is erased at the end.
 
     Args:
         work: the function to await. Its argument is a function that erases the line for good, to call before

@@ -293,7 +293,7 @@ class CacheWriter:
         raise CacheError(f"the last received values could not be written: {self._failure}") from self._failure
 
     def obstacle(self, machine: ComponentMachine) -> str | None:
-        """Return why values of a component cannot be written at present; None if they can."""
+        """Return why values of a component cannot be written now; None if they can."""
         if self._cache is None:
             return "the client has no cache"
         if machine not in self._cached or self._is_doubted(machine):
@@ -672,7 +672,7 @@ class _CachedComponent:
         synced_at: time of the last verification, in unix seconds, or None.
         proven_at: time of a verification since the last write, in component time with `Table.suspended`, or
             None.
-        whole_at: time of a full download since the last write, likewise.
+        whole_at: time of a full download since the last write, as `proven_at`.
         written_at: time of the last write, by the clock of the event loop.
         ext_state: count and completeness of the extended parameters, as written last, or None.
     """

@@ -377,7 +377,7 @@ class LinkTask:
     def fail_calls(self, error: LinkError) -> None:
         """End waiting calls with this error, and new ones until the link reconnects.
 
-        Open file sessions are closed on board nevertheless.
+        Open file sessions are still closed on board.
         """
         self.broken = error
         self._station.fail_all(error, anyio.current_time())

@@ -986,7 +986,7 @@ class ExtParams(Wrapper[AsyncExtParams]):
     def fetch_all(
         self, *, timeout: float | None = None, progress: Callable[[Progress], None] | None = None
     ) -> ExtFetchResult:
-        """Download all parameters with PARAM_EXT_REQUEST_LIST, and read what the list lacks.
+        """Download all parameters with PARAM_EXT_REQUEST_LIST, and read the values that the list lacks.
 
         The protocol has no hash, so a cached table cannot be confirmed without a download. A client whose
         policy allows no download returns the known table.

@@ -480,14 +480,14 @@ class _Call(Generic[Result]):
 
 
 class ReportingCall(Iterator[Item], Generic[Item, Result]):
-    """A running call as an iterator of what it reports.
+    """A running call as an iterator of its reports.
 
     Ctrl-C while an item is awaited cancels the call, and so does dropping the last reference to this object.
 
     Args:
         call: the call, which runs.
         thread: its event loop.
-        reports: what it has reported, and the iterator has not yet given.
+        reports: the reports that the iterator has not yet yielded.
         link: name of the link, for errors.
     """
 
