@@ -1164,7 +1164,8 @@ class ComponentMachine:
         self.foreign_list.forget()
         self.ext.restart(now)
         self.rereads.clear()
-        self.sync.check(now)
+        if self.sync.expects_hash or self.fetch is not None or not is_of_this_run:
+            self.sync.check(now)  # otherwise it would only repeat the download
         self.identification.doubt(now)
         self.reboots.rebooted(now)
         if not by_clock:

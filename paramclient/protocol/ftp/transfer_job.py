@@ -106,7 +106,8 @@ class FileTransferJob(Operation[Result]):
         is_over: whether the job needs the server no longer: nothing was begun, or its session is closed.
         is_of_caller: whether a caller waits that gets an error when the component is lost.
         yields: whether it ends with the server's refusal while another station has a file open, instead of
-            waiting; to be set before any response.
+            waiting, and after few requests to a server that has never responded; to be set before any
+            response.
         session: the number of its open session, or None.
         asked_session: the requested session while it is unknown whether that is open, or None.
     """
@@ -250,7 +251,7 @@ class FileTransferJob(Operation[Result]):
             if self.is_ended and self._attempts.is_close_hopeless:
                 self._send_blind_close()
                 self._closed(now)
-            elif self._attempts.should_give_up(now):
+            elif self._attempts.should_give_up(now, yields=self.yields):
                 self._request = None
                 self.fail(self._no_reply(self.attempts, now), now)
             else:

@@ -47,7 +47,8 @@ class FileDownload(Operation[None]):
         changed: called with the changes.
         now: the time.
         context: the component's. Without support for defaults, the file is requested without them.
-        yields: whether to end at once when another station has a file open.
+        yields: whether to end at once when another station has a file open, and early where no server
+            responds.
 
     Attributes:
         queue_time: seconds for which it has waited for its turn.

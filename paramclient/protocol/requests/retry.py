@@ -1066,6 +1066,9 @@ class Server(Protocol):
 class FileAttempts(Attempts):
     """The attempts of one MAVFTP request, except for single reads of a file's blocks.
 
+    Many components have no server, and do not say so: a server that has never responded is given up after
+    `UNHEARD_ATTEMPTS_MAX` requests, and its silence tells nothing of the link.
+
     Args:
         policy: the component's.
         server: its server.
@@ -1086,11 +1089,10 @@ class FileAttempts(Attempts):
             doublings = min(max(self.count - SLOW_ATTEMPTS_WITHOUT_BACKOFF, 0), BACKOFF_DOUBLINGS_MAX)
             return policy.timeout * 2.0**doublings
         timeout = policy.repeat_timeout(self.count)
-        if self._server.received_at == -math.inf and policy.round_trip.smoothed is not None:
+        if self._is_unheard and policy.round_trip.smoothed is not None:
             # the server may be busy with another station, whose burst nothing interrupts
-            timeout *= 2.0 ** min(
-                max(self.count - UNHEARD_ATTEMPTS_WITHOUT_BACKOFF, 0), BACKOFF_DOUBLINGS_MAX
-            )
+            doublings = min(max(self.count - UNHEARD_ATTEMPTS_WITHOUT_BACKOFF, 0), BACKOFF_DOUBLINGS_MAX)
+            return min(timeout * 2.0**doublings, max(TIMEOUT_MAX, timeout))
         return timeout
 
     @property
@@ -1120,13 +1122,27 @@ class FileAttempts(Attempts):
         """Count anew for a request to open a file whose response is only needed to close it."""
         self.count = min(self.count, 1)
 
-    def should_give_up(self, now: float) -> bool:
-        is_unheard = self._server.received_at == -math.inf  # the loss of requests is unknown
-        if is_unheard and self.count < UNHEARD_ATTEMPTS_MAX and not self._policy.is_silent_too_long(now):
-            return False
+    def timed_out(self) -> None:
+        if not self._is_unheard:
+            super().timed_out()
+
+    def should_give_up(self, now: float, *, yields: bool = False) -> bool:
+        """See `Attempts.should_give_up`.
+
+        Args:
+            now: the time.
+            yields: whether no caller waits, and the request is made again later.
+        """
+        if self._is_unheard and not self._policy.is_silent_too_long(now):
+            return self.count >= (UNANSWERED_OPENS_MAX if yields else UNHEARD_ATTEMPTS_MAX)
         if self._is_slow and self.count < SLOW_ATTEMPTS_MIN:
             return False
         return super().should_give_up(now)
+
+    @property
+    def _is_unheard(self) -> bool:
+        """Whether the server has never responded: nothing tells that there is one."""
+        return self._server.received_at == -math.inf
 
     @property
     def is_close_hopeless(self) -> bool:

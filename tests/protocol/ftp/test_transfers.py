@@ -28,6 +28,9 @@ from paramclient.protocol.requests.retry import (
     OPENS_MAX,
     REOPENS_MAX,
     SESSION_IDLE_TIME,
+    TIMEOUT_MAX,
+    UNANSWERED_OPENS_MAX,
+    UNHEARD_ATTEMPTS_MAX,
     RetryPolicy,
 )
 from paramclient.protocol.wire import FileTransfer, Message
@@ -801,6 +804,58 @@ class TestSilence:
         desk.answer(asked, code=FileErrorCode.EOF)
         desk.closed()
         assert read.result == b"x" * 717
+
+
+class TestNoServer:
+    """Many vehicles have none, and say nothing when it is asked."""
+
+    @staticmethod
+    def desk_on_a_bad_link() -> Desk:
+        """The round trip is 0.2 s; since it was measured, most requests were lost."""
+        desk = Desk()
+        desk.retry.answered(0.0, 0.2, 1)
+        for _ in range(60):
+            desk.retry.timed_out(1)
+        assert desk.retry.tries == ATTEMPTS_MAX
+        assert desk.retry.timeout > 1.0
+        return desk
+
+    def test_a_caller_is_told_so_in_a_bounded_time_however_bad_the_link(self) -> None:
+        desk = self.desk_on_a_bad_link()
+        began = desk.now
+        read = desk.transfers.read("a.txt", desk.now)
+        desk.pass_time()
+        assert isinstance(read.error, NoReply)
+        assert read.error.attempts == UNHEARD_ATTEMPTS_MAX
+        assert read.ended_at - began <= UNHEARD_ATTEMPTS_MAX * TIMEOUT_MAX
+        assert desk.transfers.is_idle
+
+    def test_a_check_for_which_no_caller_waits_ends_sooner(self) -> None:
+        desk = self.desk_on_a_bad_link()
+        read = desk.transfers.read("a.txt", desk.now)
+        read.yields = True
+        desk.pass_time()
+        assert isinstance(read.error, NoReply)
+        assert read.error.attempts == UNANSWERED_OPENS_MAX
+
+    def test_its_silence_is_no_sign_of_a_bad_link(self) -> None:
+        """Otherwise reads of parameters would wait for seconds, and the next file for an hour."""
+        desk = Desk()
+        for _ in range(20):
+            desk.retry.answered(0.0, 0.02, 1)
+        before = desk.retry.timeout, desk.retry.tries, desk.round_trip.seen_loss
+        for _ in range(10):
+            read = desk.transfers.read("a.txt", desk.now)
+            desk.pass_time()
+            assert isinstance(read.error, NoReply)
+        assert (desk.retry.timeout, desk.retry.tries, desk.round_trip.seen_loss) == before
+
+    def test_the_silence_of_one_that_has_responded_is_a_sign(self) -> None:
+        desk = Desk()
+        desk.opened()
+        before = desk.round_trip.seen_loss
+        desk.pass_time()
+        assert desk.round_trip.seen_loss > before
 
 
 class TestTurns:

@@ -285,7 +285,7 @@ class TestArduPilotStartsAgainInAFetch:
         world = world_of(vehicle, loss=0.0)
         self.check_then_and_later(world, vehicle, world.fetch(limit=4.0))
 
-    @pytest.mark.parametrize("after", [0.03, 0.2, 0.4])
+    @pytest.mark.parametrize("after", [0.03, 0.06, 0.2, 0.4])
     def test_in_mid_file(self, after: float) -> None:
         vehicle = ArduPilotVehicle(live_period=0.0)
         world = world_of(vehicle, loss=0.0)

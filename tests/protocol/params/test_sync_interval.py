@@ -21,8 +21,15 @@ from paramclient.protocol.params.sync import (
     SyncState,
 )
 from paramclient.protocol.params.sync_interval import FETCHES_KEPT, PAUSE_MIN, SyncInterval
-from paramclient.protocol.requests.retry import FILE_IN_USE_RETRY
-from paramclient.protocol.wire import CommandLong, FileTransfer, ParamRequestList, ParamRequestRead
+from paramclient.protocol.requests.retry import ATTEMPTS_MIN, FILE_IN_USE_RETRY
+from paramclient.protocol.wire import (
+    DECODED_IDS,
+    CommandLong,
+    FileTransfer,
+    Framer,
+    ParamRequestList,
+    ParamRequestRead,
+)
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, SimParam, px4_table
 from tests.protocol.params.test_sync import INTERVAL, NAMES, PLAIN, TABLE, World, fetched, resynced, state
 from tests.shell import Tap
@@ -76,6 +83,34 @@ class Other:
 
 
 # what checks cost
+
+
+class WithoutServer(Tap):
+    """An ArduPilot that says that it serves files, and is silent when it is asked for one."""
+
+    def receive(self, data: bytes, now: float) -> None:
+        if not any(frame.message_id == 110 for frame in Framer(DECODED_IDS, stream=False).receive(data)):
+            super().receive(data, now)
+
+
+def test_checks_of_a_vehicle_whose_server_never_responds_are_short_and_harm_nothing() -> None:
+    """Unanswered requests must not add up to a check of an hour, in which the table counts as fetching."""
+    vehicle = ArduPilotVehicle(table=PLAIN)
+    air = Air.symmetric([WithoutServer(vehicle)], delay=0.1)
+    world = World(air=air)
+    assert world.fetch().source == "stream"
+    world.run(10.0)
+    retry = world.machine.retry
+    timeout = retry.timeout
+    busy = 0.0
+    for _ in range(20):
+        world.until(lambda: world.machine.fetch is not None, INTERVAL + 1.0)
+        began = world.now
+        world.until(lambda: world.machine.fetch is None, 10.0)
+        busy += world.now - began
+    assert busy < 20 * 0.2 * INTERVAL
+    assert retry.timeout <= timeout
+    assert (retry.tries, retry.round_trip.seen_loss) == (ATTEMPTS_MIN, 0.0)
 
 
 def test_one_file_that_takes_long_does_not_end_the_watch() -> None:
