@@ -526,6 +526,14 @@ async def extended_params(rows: list[Row], quick: bool) -> None:
                 ]
                 statuses = [status for status, _ in await asyncio.gather(*answers)]
                 service.note("answered with 5xx or not", 0, sum(s >= 500 or not s for s in statuses), "times")
+        fetches = 4 if quick else 64
+        service.attack = f"{count:,} extended parameters: {fetches} fetches that end together"
+        with service.watched(late=LATE):
+            fetched = [
+                service.ask("POST", f"{extended}/fetch", b'{"timeout_s": 60}', token(READER))
+                for _ in range(fetches)
+            ]
+            await asyncio.gather(*fetched)
         await unread(service, 120, f"{extended}/params", f"{count:,} extended parameters", 4)
 
 

@@ -44,6 +44,7 @@ class FollowedExtended:
         self._machine = component.machine.ext
         self._publish = publish
         self._published = dict(component.ext.params)
+        self._published_revision = self._machine.table.revision
         self._received_at: dict[str, tuple[float, float]] = {}
         self._is_fetching = False
         self._forwarder = _ExtChangeForwarder(self)
@@ -71,6 +72,10 @@ class FollowedExtended:
 
     def publish_changes(self) -> None:
         """Publish parameters whose trust or index differs from the published one."""
+        revision = self._machine.table.revision
+        if revision == self._published_revision:  # many requests may end at once
+            return
+        self._published_revision = revision
         params, published = self.ext.params, self._published
         differing = []
         for name, param in params.items():

@@ -347,6 +347,33 @@ async def test_the_trust_of_many_is_told_at_once_and_that_of_few_singly() -> Non
             assert {each["trust"] for each in table.values()} == {"cached"}
 
 
+@swiftly
+async def test_a_published_table_is_not_compared_again_for_each_request() -> None:
+    """Many requests may end at once, and each publishes the changes before its response."""
+
+    class Counted(dict[str, ExtParam]):
+        looks = 0
+
+        def get(self, name: str, default: Any = None) -> Any:
+            self.looks += 1
+            return super().get(name, default)
+
+    camera = Camera({f"P{number:02}": number for number in range(40)})
+    async with service(camera) as (hub, browser), listening(browser) as heard:
+        await met(browser, system=1, component=100)
+        await browser.post(f"{E}/fetch", json={})
+        extended = hub.followed[0].extended
+        extended._published = counted = Counted(extended._published)
+        answers = await asyncio.gather(*[browser.get(f"{E}/params") for _ in range(10)])
+        assert {answer.status_code for answer in answers} == {200}
+        assert counted.looks == 0
+        local(hub.followed[0].component).machine.ext.table.doubt()
+        await asyncio.gather(*[browser.get(f"{E}/params") for _ in range(10)])
+        assert counted.looks == 40
+        await told(heard)
+        assert [each["count"] for each in heard.of("extended_params")][-1] == 40
+
+
 async def told(heard: Heard) -> list[dict[str, Any]]:
     """The changes of extended parameters so far."""
     await asyncio.sleep(2)

@@ -26,6 +26,7 @@ class ExtTable:
 
     Attributes:
         params: by name, in the order of first reception. Shared with readers; never replaced.
+        revision: changes whenever a parameter in `params` does.
         count: the latest param_count, or None. Indices are valid for this count only.
         moments: when each value was last observed, by name, in seconds of the core's clock.
         dirty: names whose value, type or index changed since the last `take_dirty`, with the author.
@@ -37,6 +38,7 @@ class ExtTable:
     def __init__(self, name_quota: NameQuota | None = None) -> None:
         self._name_quota = NameQuota() if name_quota is None else name_quota
         self.params: dict[str, ExtParam] = {}
+        self.revision = 0
         self.count: int | None = None
         self.moments: dict[str, float] = {}
         self.dirty: dict[str, str] = {}
@@ -57,10 +59,13 @@ class ExtTable:
         is_another = self.count is not None
         self.count = count
         if is_another:
+            params = self.params
             for name in self._names.values():  # at a count that alternates, few have an index
-                if name in self.params:
-                    self.params[name] = self.params[name].with_index(None)
+                param = params.get(name)
+                if param is not None:
+                    params[name] = param.with_index(None)
             self._names.clear()
+            self.revision += 1
         return is_another
 
     def use_index(self, name: str, index: int) -> None:
@@ -69,13 +74,13 @@ class ExtTable:
             return
         before = self._names.get(index)
         if before is not None and before != name and before in self.params:
-            self.params[before] = self.params[before].with_index(None)
+            self._put(self.params[before].with_index(None))
         old = self.params[name].index
         if old is not None and old != index and self._names.get(old) == name:
             del self._names[old]
         self._names[index] = name
         if old != index:
-            self.params[name] = self.params[name].with_index(index)
+            self._put(self.params[name].with_index(index))
             self.dirty.setdefault(name, "vehicle")
 
     def store(self, param: ExtParam, by: str, moment: float) -> ExtChange | None:
@@ -101,7 +106,7 @@ class ExtTable:
             self.overwritten.append((old, self.dirty[name], self.moments.get(name, moment)))
             del self.overwritten[:-EXT_OVERWRITTEN_MAX]
         self.moments[name] = moment
-        self.params[name] = param.with_index(None if old is None else old.index)
+        self._put(param.with_index(None if old is None else old.index))
         if is_known:
             return None
         self.dirty[name] = by
@@ -168,7 +173,7 @@ class ExtTable:
             elif known.trust is not Trust.CACHED:
                 continue
             index = None if known is None else known.index
-            self.params[name] = param.with_trust(Trust.CACHED).with_index(index)
+            self._put(param.with_trust(Trust.CACHED).with_index(index))
             if name in moments:
                 self.moments[name] = moments[name]
             if known is None or not known.same_value(param):
@@ -177,13 +182,13 @@ class ExtTable:
 
     def doubt(self) -> None:
         """Mark all values as cached: another vehicle may have the address, or this one has restarted."""
-        for name, param in self.params.items():
-            self.params[name] = param.with_trust(Trust.CACHED)
+        for param in self.params.values():
+            self._put(param.with_trust(Trust.CACHED))
 
     def doubt_value(self, name: str) -> None:
         """Mark one value as cached: it may be older than a change."""
         if name in self.params:
-            self.params[name] = self.params[name].with_trust(Trust.CACHED)
+            self._put(self.params[name].with_trust(Trust.CACHED))
 
     def age(self, unseen: float) -> None:
         """Move all moments back by the seconds of a system suspend that the core's clock does not have."""
@@ -200,8 +205,13 @@ class ExtTable:
         self.gone.clear()
         return [self._remove(name) for name in list(self.params)]
 
+    def _put(self, param: ExtParam) -> None:
+        self.params[param.name] = param
+        self.revision += 1
+
     def _remove(self, name: str) -> ExtChange:
         param = self.params.pop(name)
+        self.revision += 1
         self.moments.pop(name, None)
         self.dirty.pop(name, None)
         self._name_quota.taken -= 1
