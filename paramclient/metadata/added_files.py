@@ -6,7 +6,7 @@ import logging
 import os
 import re
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -146,7 +146,9 @@ class AddedFiles:
         known = ", ".join(map(str, self)) or "none"
         raise UsageError(f"no metadata was added for {kind} {firmware or 'any version'}; added: {known}")
 
-    def find(self, identity: Identity, component: int) -> Metadata | None:
+    def find(
+        self, identity: Identity, component: int, read: Callable[[Path], Metadata] = read_metadata
+    ) -> Metadata | None:
         """Return the added metadata of a firmware: that with the longest version that fits; None for none.
 
         A file for a version is not used while the version of the vehicle is unknown. A file that cannot be
@@ -159,7 +161,7 @@ class AddedFiles:
         fitting = [each for each in self if each.kind == kind and _fits(each.firmware, version)]
         for each in sorted(fitting, key=lambda one: len(_numbers(one.firmware)), reverse=True):
             try:
-                return read_metadata(each.path)
+                return read(each.path)
             except MetadataError as error:
                 logger.warning("%s", error)
         return None

@@ -14,7 +14,7 @@ from typing import Final
 
 from paramclient.errors import MetadataError
 from paramclient.metadata.added_files import AddedFiles
-from paramclient.metadata.formats import PACKED_SIZE_MAX, read_content, unpacked
+from paramclient.metadata.formats import PACKED_SIZE_MAX, read_content, read_metadata, unpacked
 from paramclient.metadata.info import Metadata
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet
@@ -24,6 +24,9 @@ __all__ = ["MetadataStore", "has_checksum"]
 
 CACHED_FILES_MAX: Final = 64
 """Most recently used files that are kept: three for a firmware, with about 0.1 million bytes for PX4."""
+PARSED_FILES_MAX: Final = 2
+"""Most recently used files that are kept parsed: a comparison has mostly one or two firmwares. The largest
+takes 50 MB."""
 
 logger = logging.getLogger(__name__)
 
@@ -33,7 +36,8 @@ class MetadataStore:
 
     A folder of small files, each replaced atomically and readable only by its owner. A file that no longer
     has its checksum is deleted and treated as missing. Several processes may use the folder at the same time.
-    Disk errors are logged as warnings, and nothing is cached. Every call blocks for a few milliseconds.
+    Disk errors are logged as warnings, and nothing is cached. Every call blocks for a few milliseconds, and
+    `known` for up to some seconds if it parses a large file. The parsed files are kept by this object.
 
     Args:
         folder: the folder; created when the first file is cached.
@@ -41,6 +45,7 @@ class MetadataStore:
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self.folder = Path(folder)
+        self._parsed: dict[object, Metadata] = {}  # the most recently used last
 
     @classmethod
     def beside(cls, cache: str | os.PathLike[str]) -> MetadataStore:
@@ -94,23 +99,47 @@ class MetadataStore:
         The cached metadata of a firmware with this version, commit and board, which the vehicle has provided;
         otherwise a file that was added for its vehicle type and version.
         """
-        return self._cached(identity, component) or self.added.find(identity, component)
+        return self._cached(identity, component) or self.added.find(identity, component, self._parse_added)
 
     def _cached(self, identity: Identity, component: int) -> Metadata | None:
         path = self._note(identity, component)
         noted = None if path is None else self._read(path)
         if path is None or noted is None:
             return None
-        content = self.get(int(noted, 16)) if _NOTE.fullmatch(noted) else None
+        crc = int(noted, 16) if _NOTE.fullmatch(noted) else None
+        parsed = None if crc is None else self._parsed.get(crc)
+        if crc is not None and parsed is not None and self._file(crc).exists():
+            with suppress(OSError):
+                os.utime(self._file(crc))
+            return self._keep(crc, parsed)
+        content = None if crc is None else self.get(crc)
         if content is None:
             self._remove(path)
             return None
         try:
-            return read_content(content, source=f"the cached metadata {noted.decode('ascii').strip()}")
+            source = f"the cached metadata {noted.decode('ascii').strip()}"
+            return self._keep(crc, read_content(content, source=source))
         except MetadataError as error:
             logger.warning("%s", error)
             self._remove(path)
             return None
+
+    def _parse_added(self, path: Path) -> Metadata:
+        """Return the content of an added file; that of an unchanged file is parsed once."""
+        try:
+            found = path.stat()
+        except OSError:
+            return read_metadata(path)  # raises the error
+        key = (path, found.st_mtime_ns, found.st_size, found.st_ino)
+        return self._keep(key, self._parsed.get(key) or read_metadata(path))
+
+    def _keep(self, key: object, metadata: Metadata) -> Metadata:
+        """Keep parsed metadata as the most recently used, and return it."""
+        self._parsed.pop(key, None)
+        self._parsed[key] = metadata
+        for each in list(self._parsed)[:-PARSED_FILES_MAX]:
+            self._parsed.pop(each, None)
+        return metadata
 
     def known_of_sets(self, sets: Sequence[ParamSet]) -> list[Metadata | None]:
         """Return the metadata of each set's firmware; for a set without identity, that of another set."""

@@ -81,6 +81,8 @@ class Hub:
         feed: the event feed.
         jobs: fetches and set-ups.
         links: the links, by name.
+        metadata_store: the metadata files beside the cache, used in the thread for files; None without a
+            cache.
         long_requests: quota of long requests.
         waiting_requests: quotas of requests that wait for a vehicle, the cache or a comparison, by whether
             the client may write: no number of readers can keep a writer out.
@@ -123,8 +125,8 @@ class Hub:
         }
         self.fleet_comparisons = anyio.Semaphore(1)
         self._closing = anyio.Event()
-        store = None if self.cache is None else MetadataStore.beside(self.cache.path)
-        self._descriptions = DescriptionLoader(store)
+        self.metadata_store = None if self.cache is None else MetadataStore.beside(self.cache.path)
+        self._descriptions = DescriptionLoader(self.metadata_store)
         self._setups = None if self.cache is None else SetupNotes.beside(self.cache.path)
         self._tasks: anyio.abc.TaskGroup | None = None
         self._link_tasks: anyio.abc.TaskGroup | None = None
@@ -460,9 +462,10 @@ class Hub:
         cached = await self.run_in_thread(lambda: cache.load(key, component.component))
         if cached is not None:
             followed.add_cached_times(cached.heard_at.items())
-        store = MetadataStore.beside(cache.path)
-        identity = component.identity
-        known = await self.run_in_thread(lambda: store.known(identity, component.component))
+        store, identity = self.metadata_store, component.identity
+        if store is None:
+            return
+        known = await self.run_in_file_thread(partial(store.known, identity, component.component))
         if known is not None and followed.metadata is None:
             followed.describe(known, identity)
 

@@ -12,6 +12,7 @@ import tracemalloc
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -30,6 +31,7 @@ from paramclient.documents.param import InfoDoc
 from paramclient.errors import FileError, UsageError
 from paramclient.files import conversion, document_schema, dumps, line_formats, loads, script
 from paramclient.files.param_file import TooManyParams
+from paramclient.metadata import Metadata, metadata_cache, read_content
 from paramclient.model import comparison as compare_room
 from paramclient.model import params as params_model
 from paramclient.model import patterns
@@ -78,7 +80,7 @@ from paramclient.service.route_context import run_until_disconnect
 from paramclient.service.routes import apply as setup_room
 from paramclient.service.routes import extended as extended_room
 from paramclient.service.routes import params as params_room
-from paramclient.sim import Camera, GenericVehicle
+from paramclient.sim import Camera, GenericVehicle, PX4Vehicle
 from tests.asgi import a_browser
 from tests.service_hub import C, met, problem, service
 from tests.shell import Tap, in_simulated_time, until
@@ -451,6 +453,34 @@ async def test_a_table_is_copied_out_in_a_thread(monkeypatch: pytest.MonkeyPatch
                 assert answer.status_code == 200, answer.text
             assert seen["of"], path
             assert seen["of"] <= {READER, "paramclient service"}, path
+
+
+@swiftly
+async def test_cached_metadata_is_parsed_once_and_not_in_the_thread_of_the_cache(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = tmp_path / "cache.sqlite3"
+    parsed: list[str] = []
+
+    def noting(content: bytes, *, source: str) -> Metadata:
+        parsed.append(threading.current_thread().name)
+        return read_content(content, source=source)
+
+    monkeypatch.setattr(metadata_cache, "read_content", noting)
+    async with service(PX4Vehicle(metadata=True), cache=place) as (_, browser):
+        await fetched(browser)
+        answer = await browser.post(f"{C}/metadata", json={})
+        assert answer.status_code == 200, answer.text
+        for path in ("diff", "plan", "verify", "diff"):
+            answer = await browser.post(f"{C}/{path}", json={"wanted": {"values": {"MC_ROLL_P": 5}}})
+            assert answer.status_code == 200, answer.text
+    assert parsed == [READER]
+    async with service(PX4Vehicle(metadata=True), cache=place) as (hub, browser):
+        await fetched(browser)
+        await until(lambda: hub.followed[0].metadata is not None)
+        answer = await browser.post(f"{C}/diff", json={"wanted": {"values": {"MC_ROLL_P": 5}}})
+        assert answer.status_code == 200, answer.text
+    assert parsed == [READER, READER]
 
 
 @pytest.mark.asyncio

@@ -16,7 +16,7 @@ from paramclient.documents.job import JobDoc
 from paramclient.documents.receiver import ReceiverDoc
 from paramclient.documents.setup import ApplyProgressDoc, ApplyResultDoc, InterruptedDoc, PlanDoc, VerifiedDoc
 from paramclient.errors import NoReply
-from paramclient.metadata import Metadata, MetadataStore
+from paramclient.metadata import Metadata
 from paramclient.model.comparison import compare
 from paramclient.model.paramset import ParamSet
 from paramclient.provision import ApplyProgress, ApplyResult, ApplyRow, Plan, apply, overlay, prepare, restore
@@ -275,11 +275,11 @@ async def _present(hub: Hub, target: FollowedComponent, body: DiffRequest) -> Pa
 
 async def _described(hub: Hub, target: FollowedComponent, sets: list[ParamSet]) -> list[Metadata | None]:
     """Return the descriptions for each set: those of its firmware, else of the component."""
-    cache = hub.cache
-    if cache is None:
+    store = hub.metadata_store
+    if store is None:
         return [target.metadata] * len(sets)
-    store = MetadataStore.beside(cache.path)
-    return [each or target.metadata for each in await hub.run_in_thread(lambda: store.known_of_sets(sets))]
+    known = await hub.run_in_file_thread(lambda: store.known_of_sets(sets))
+    return [each or target.metadata for each in known]
 
 
 async def _wanted(hub: Hub, target: FollowedComponent, body: PlanRequest) -> ParamSet:
