@@ -480,6 +480,9 @@ async def test_cached_metadata_is_parsed_once_and_not_in_the_thread_of_the_cache
         await until(lambda: hub.followed[0].metadata is not None)
         answer = await browser.post(f"{C}/diff", json={"wanted": {"values": {"MC_ROLL_P": 5}}})
         assert answer.status_code == 200, answer.text
+        [vehicle] = (await browser.get("/api/v1/vehicles")).json()["vehicles"]
+        kept = await browser.get(f"/api/v1/vehicles/{vehicle['key']}/1/params")
+        assert kept.status_code == 200, kept.text
     assert parsed == [READER, READER]
 
 

@@ -22,7 +22,6 @@ from paramclient.documents.paramset import SetDoc
 from paramclient.errors import UsageError
 from paramclient.files import FileForm
 from paramclient.files.param_file import AUTOPILOT
-from paramclient.metadata import MetadataStore
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import check_name
 from paramclient.service.followed_component import FollowedComponent
@@ -216,13 +215,15 @@ async def kept_params(
 ) -> Response:
     """Return the last known parameters of a vehicle."""
     table = await load_cached_table(hub, key, component)
-    store = MetadataStore.beside(require_cache(hub).path)
-
-    def document() -> CachedTableDoc:
-        known = store.known(table.identity, table.component)
-        return CachedTableDoc.of(table, metadata=known, whole=metadata, kept=True)
-
-    return await document_response(hub.run_in_thread, document)
+    store = hub.metadata_store
+    known = (
+        None
+        if store is None
+        else await hub.run_in_file_thread(partial(store.known, table.identity, table.component))
+    )
+    return await document_response(
+        hub.run_in_thread, lambda: CachedTableDoc.of(table, metadata=known, whole=metadata, kept=True)
+    )
 
 
 @router.get("/vehicles/{key:path}/{component}/history", response_model=HistoryDoc)
