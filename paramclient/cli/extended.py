@@ -15,6 +15,7 @@ import anyio.to_thread
 from paramclient.cache import CachedExtTable, ParamCache
 from paramclient.cli.confirmation import can_confirm, confirm
 from paramclient.cli.exit_codes import ExitCode, code_of
+from paramclient.cli.metadata import check_no_option
 from paramclient.cli.options import CacheOptions, LinkOptions
 from paramclient.cli.output import (
     local_time,
@@ -239,6 +240,7 @@ def text_pairs(words: Sequence[str]) -> list[tuple[str, str]]:
     pairs: list[tuple[str, str]] = []
     left = iter(words)
     for word in left:
+        check_no_option(word)
         name, equals, text = word.partition("=")
         value = text if equals else next(left, None)
         if value is None:

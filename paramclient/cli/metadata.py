@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Final, TypeAlias
 
@@ -25,7 +26,9 @@ from paramclient.model.values import Param, WireValue, check_name, format_value
 __all__ = [
     "DESCRIBED_COLUMNS",
     "MetadataChoice",
+    "check_no_option",
     "described_cells",
+    "files_of",
     "from_file",
     "info_of",
     "known_of_session",
@@ -46,6 +49,8 @@ MetadataChoice: TypeAlias = Annotated[str | None, Parameter(name="--metadata")]
 
 VEHICLE: Final = "vehicle"
 """The value of --metadata that downloads the metadata from the vehicle."""
+_ARDUPILOT_FILES: Final = "ArduPilot's files are at https://autotest.ardupilot.org/Parameters/"
+"""Where the files of firmware that does not provide its metadata are, for messages."""
 ANNOUNCED_SIZE_MIN: Final = 5_000
 """Bytes from which the download of a metadata file is announced: the first, general file is smaller."""
 
@@ -84,7 +89,7 @@ async def known_of_session(
         if found is None:
             raise refusal or UsageError(
                 f"{session.label} does not describe its parameters; --metadata takes a file that does, and "
-                "`paramclient metadata add` remembers one"
+                f"`paramclient metadata add` remembers one.{files_of([session.component.autopilot])}"
             )
         return found
     return await _stored(session)
@@ -175,6 +180,11 @@ def known_of_sets(sets: Sequence[ParamSet], options: LinkOptions) -> list[Metada
     return store.known_of_sets(sets)
 
 
+def files_of(autopilots: Collection[str]) -> str:
+    """Return where the metadata files of vehicles are, as a sentence that begins with a space; or ""."""
+    return f" {_ARDUPILOT_FILES}" if "ardupilot" in autopilots else ""
+
+
 # Values to write
 
 
@@ -189,6 +199,7 @@ def parse_pairs(words: Sequence[str]) -> list[tuple[str, int | float | str]]:
     pairs: list[tuple[str, int | float | str]] = []
     left = iter(words)
     for word in left:
+        check_no_option(word)
         name, equals, text = word.partition("=")
         if not equals:
             value = next(left, None)
@@ -204,6 +215,19 @@ def parse_pairs(words: Sequence[str]) -> list[tuple[str, int | float | str]]:
         if pairs:
             return pairs
     raise UsageError(f"set takes pairs of NAME and VALUE, or NAME=VALUE, not {len(words)} words")
+
+
+def check_no_option(word: str) -> None:
+    """Check that an argument in the place of a name is not an unknown option.
+
+    The arguments of `set` may begin with a hyphen, because values may be negative. An unknown option would be
+    a name, and the value before it would be written.
+
+    Raises:
+        UsageError: it begins with a hyphen, which no parameter name of a vehicle does.
+    """
+    if word.startswith("-"):
+        raise UsageError(f"Unknown option: {word.partition('=')[0]}. Nothing was written.")
 
 
 def resolved(
@@ -309,7 +333,10 @@ def _fields(info: ParamInfo) -> Iterator[tuple[str, str]]:
 def _number(name: str, text: str) -> int | float:
     number = _number_or_none(name, text)
     if number is None:
-        raise UsageError(f"{name}: {text!r} is not a number, such as 12, 0x1F, -1.5, 1e-3, nan or inf")
+        raise UsageError(
+            f"{name}: {text!r} is not a number, such as 12, 0x1F, -1.5, 1e-3, nan or inf. "
+            f"If it is the name of a value, write {shlex.quote(f'{name}={text}')}"
+        )
     return number
 
 

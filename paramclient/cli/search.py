@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final
 
@@ -11,12 +11,12 @@ from cyclopts.validators import Number
 
 from paramclient.cache import CachedComponent, HistoryEntry, ParamCache
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.metadata import MetadataChoice, from_file, known_of_table, print_descriptions
+from paramclient.cli.metadata import MetadataChoice, files_of, from_file, known_of_table, print_descriptions
 from paramclient.cli.options import CacheOptions
 from paramclient.cli.output import local_time, print_document, print_line, print_table, report, say
 from paramclient.cli.param_names import unmatched_text
 from paramclient.cli.sources import tables_in
-from paramclient.errors import NotInCache
+from paramclient.errors import NotInCache, UsageError
 from paramclient.metadata import Metadata, ParamInfo
 from paramclient.model.defaults import DefaultSource, default_of
 from paramclient.model.identity import autopilot_name
@@ -47,14 +47,16 @@ def search(
     Exit code 1: nothing was found.
 
     Args:
-        word: A word or a part of one.
+        word: A word or a part of one, or several words in quotes.
         words: Further words.
         vehicle: Search only this vehicle in the cache: 4, px4 or ardupilot, a nickname, its hardware id, or
             its key.
         limit: Print at most this number of parameters.
         metadata: A file that describes parameters. Default: the stored metadata of each vehicle's firmware.
     """
-    lowered_words = [each.casefold() for each in (word, *words)]
+    lowered_words = " ".join((word, *words)).casefold().split()
+    if not lowered_words:
+        raise UsageError("search takes one or more words")
     found = _Known.of(options, vehicle, from_file(metadata, offline=True))
     ranked = sorted(
         (rank, name)
@@ -73,6 +75,9 @@ def search(
             say(f"{len(names)} of {counted(len(ranked), 'parameter')} shown")
     if not names:
         report(f"nothing found; {counted(len(found.names), 'parameter')} searched")
+    if found.undescribed and not options.json:
+        say(f"only names were searched: {_how_to_describe(found.undescribed)}")
+    if not names:
         return ExitCode.INCOMPLETE
     return ExitCode.DONE
 
@@ -114,6 +119,8 @@ def info(
         print_document(ParamInfoDoc.of(spelled, described, tables, changes))
         return ExitCode.DONE
     print_descriptions([spelled], Metadata.of([described] if described is not None else []))
+    if described is None and found.undescribed:
+        say(_how_to_describe(found.undescribed))
     for table in tables:
         print_line("")
         for line in _lines_of(table, spelled, described, changes[table.key, table.component]):
@@ -128,22 +135,30 @@ class _Known:
     tables: Sequence[CachedComponent]
     metadata: Sequence[Metadata]
     names: frozenset[str]
+    undescribed: Sequence[str]
+    """Autopilots of the tables without metadata."""
 
     @classmethod
     def of(cls, options: CacheOptions, vehicle: str | None, described: Metadata | None) -> _Known:
         """Load the tables of all vehicles, or of one."""
         with ParamCache(options.cache) as cache:
             summaries = tables_in(cache, vehicle, None)
+            summaries.sort(key=lambda each: (each.system, each.component))
             loaded = (cache.load(each.key, each.component) for each in summaries)
             tables = [table for table in loaded if table is not None]
-            found = [described]
+            found = [described] * max(1, len(tables))
             if described is None:
                 found = [known_of_table(cache.path, table) for table in tables]
         metadata = list({id(each): each for each in found if each is not None}.values())
         names = {name for table in tables for name in table.params}
         if not tables or described is not None:
             names.update(name for each in metadata for name in each if "{" not in name)
-        return cls(tables, metadata, frozenset(names))
+        without = [
+            autopilot_name(table.autopilot)
+            for table, each in zip(tables, found, strict=False)
+            if each is None
+        ]
+        return cls(tables, metadata, frozenset(names), sorted(set(without)))
 
     def info(self, name: str) -> ParamInfo | None:
         """Return the description of a parameter, or None."""
@@ -164,6 +179,17 @@ class _Known:
             ", ".join(f"{each.system}/{each.component}" for each in tables),
             None if described is None else described.short_description,
         )
+
+
+def _how_to_describe(autopilots: Collection[str]) -> str:
+    """Return that no metadata is stored for autopilots, and how to store it."""
+    request = ""
+    if any(each != "ardupilot" for each in autopilots):
+        request = "`paramclient get LINK NAME --metadata vehicle` requests it from a vehicle that has it, "
+    return (
+        f"no metadata is stored for the firmware of {' and '.join(autopilots)}. {request}`paramclient "
+        f"metadata add FILE` adds a file.{files_of(autopilots)}"
+    )
 
 
 def _rank(name: str, described: ParamInfo | None, lowered_words: Iterable[str]) -> int | None:

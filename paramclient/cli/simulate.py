@@ -140,6 +140,7 @@ async def sim(
     param_error: bool = False,
     signing_key: Path | None = None,
     usb: bool = False,
+    metadata: bool = False,
     vehicle_faults: VehicleFaults = _NO_VEHICLE_FAULTS,
     faults: FaultOptions = _NO_FAULTS,
 ) -> None:
@@ -153,6 +154,7 @@ async def sim(
         param_error: Answer invalid requests with PARAM_ERROR, as newer firmware does.
         signing_key: A file with the signing key: the vehicle signs its frames and requires signed ones.
         usb: With a key, also accept unsigned frames, as ArduPilot does over USB.
+        metadata: px4: describe the parameters on request, as PX4 on a board with enough memory does.
     """
     from paramclient.sim import (  # only here: other subcommands need none
         Air,
@@ -161,6 +163,10 @@ async def sim(
         PX4Vehicle,
     )
 
+    if metadata and autopilot != "px4":
+        raise UsageError(
+            "--metadata is for px4; the other simulated vehicles do not describe their parameters"
+        )
     spec = parse_link(link)
     if spec.kind is LinkKind.SIM:
         raise UsageError(
@@ -174,7 +180,8 @@ async def sim(
     if signing_key is not None:
         options.update({"signing_key": read_key(signing_key), "signing_timestamp": timestamp_now()})
     chosen = (100 if autopilot == "camera" else 1) if component is None else component
-    vehicle = kinds[autopilot](system=system, component=chosen, **options)
+    make = partial(PX4Vehicle, metadata=True) if metadata else kinds[autopilot]
+    vehicle = make(system=system, component=chosen, **options)
     air = Air.symmetric([vehicle], others=vehicle_faults.apply_to(vehicle), **asdict(faults))
     announcement = _Announcement(f"{autopilot} {system}/{chosen}", spec)
     await serve_endpoint(air, real, task_status=announcement)

@@ -218,6 +218,8 @@ def _sim(rest: str) -> LinkSpec:
         if key in options:
             _fail(f"option {key} is given twice")
         options[key] = _SIM_OPTIONS[key](key, value)
+    if "metadata" in options and autopilot.lower() != "px4":
+        _fail("option metadata is for sim:px4; the other simulated vehicles do not describe their parameters")
     if "queue" in options and "rate" not in options:
         _fail("option queue needs a rate")
     return LinkSpec(LinkKind.SIM, autopilot.lower(), options=tuple(sorted(options.items())))
@@ -275,6 +277,7 @@ _SIM_OPTIONS: dict[str, Callable[[str, str], int | float]] = {
     "seed": _whole(0, 2**63),
     "system": _whole(1, 255),
     "param_error": _whole(0, 1),
+    "metadata": _whole(0, 1),
 }
 """Options of `sim:` links: probabilities, datagrams lost in a row, seconds one way, bytes per second, bytes
 in the queue, and numbers. The values are parsers with the option's range."""

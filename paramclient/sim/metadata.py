@@ -60,6 +60,18 @@ def _bits(*names: str) -> list[dict[str, Any]]:
     return [{"index": index, "description": name} for index, name in enumerate(names)]
 
 
+def _rate_limit(axis: str) -> dict[str, Any]:
+    return {
+        "shortDesc": f"Limit of the {axis} rate",
+        "longDesc": f"The highest {axis} rate that the attitude controller requests, except in acro mode.",
+        "units": "deg/s",
+        "min": 0,
+        "max": 1800,
+        "increment": 5,
+        "decimalPlaces": 1,
+    }
+
+
 _TYPES: Final[dict[int, str]] = {
     kind: "Float" if kind is ParamType.REAL32 else kind.name.capitalize()
     for kind in TYPES_BY_NAME.values()
@@ -93,6 +105,9 @@ _KNOWN: Final[dict[str, dict[str, Any]]] = {
         "rebootRequired": True,
         "category": "System",
     },
+    "MC_PITCHRATE_MAX": _rate_limit("pitch"),
+    "MC_ROLLRATE_MAX": _rate_limit("roll"),
+    "MC_YAWRATE_MAX": _rate_limit("yaw"),
     "MC_ROLL_P": {
         "shortDesc": "Gain from the error of the roll angle to the roll rate",
         "longDesc": "The rate per unit of error. Higher reacts quicker and swings sooner.",

@@ -101,6 +101,11 @@ def test_numbers_may_follow_an_equals_sign(command: Command, put: Any) -> None:
         (["TST_ALT=high"], "and its values have no names"),
         (["FLTMODE1="], "FLTMODE1: there is no value after the equals sign"),
         (["FLTMODE1", "Loiter"], "FLTMODE1: 'Loiter' is not a number, such as 12, 0x1F"),
+        (["FLTMODE1", "Loiter"], "If it is the name of a value, write FLTMODE1=Loiter"),
+        (["FLTMODE1", "5", "--expected", "4"], "Unknown option: --expected"),
+        (["FLTMODE1=5", "--sytem=3"], "Unknown option: --sytem"),
+        (["FLTMODE1=5", "-x", "3"], "Unknown option: -x"),
+        (["FLTMODE1=5", "--dry-run"], "Unknown option: --dry-run"),
         (["=5"], "a parameter name has at least one character"),
         (["FLTMODE1=1e999"], "FLTMODE1: 1e999 is beyond the range of a float"),
         (["FLTMODE1=5", "TST_LOG"], "set takes pairs of NAME and VALUE, or NAME=VALUE"),
@@ -120,6 +125,7 @@ def test_value_names_need_metadata(command: Command, put: Any) -> None:
     done = command("set", put(vehicle), "TST_LOG", 3, "FLTMODE1=Loiter", "--no-cache")
     assert (done.code, done.out) == (2, "")
     assert "1/1 ardupilot does not describe its parameters; --metadata takes a file that does" in done.err
+    assert "https://autotest.ardupilot.org/Parameters/" in done.err
     assert not vehicle.requests["PARAM_SET"]
 
 
@@ -385,3 +391,12 @@ def test_text_of_a_metadata_file_is_escaped(
         assert done.code == 0
         assert (done.out + done.err).replace("\n", "").isprintable()
         assert (done.out + done.err).isascii()
+
+
+def test_a_simulated_vehicle_describes_its_parameters(command: Command) -> None:
+    words = ("MC_ROLLRATE_MAX", "--metadata", "vehicle", "--no-cache")
+    assert "deg/s" in command("get", "sim:px4?metadata=1", *words).out
+    assert command("get", "sim:px4?metadata=0", *words).code == 2
+    refused = command("sim", "ardupilot", "--metadata", "--link", "udpin:127.0.0.1:0")
+    assert refused.code == 2
+    assert "--metadata is for px4" in refused.err

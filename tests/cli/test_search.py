@@ -35,6 +35,8 @@ def test_search_finds_names_descriptions_and_value_names(command: Command) -> No
     assert len(first["vehicles"]) == 1
     by_name = command("search", "mc_roll_p")
     assert by_name.rows[1][:3] == ["MC_ROLL_P", "7.5", "1/1"]
+    assert command("search", "ROLL gain", "--json").json == found.json  # words in quotes
+    assert command("search", " ").code == 2
     assert any("EKF2_GPS_CTRL" in row for row in command("search", "heading", "gps").rows)
     of_one = command("search", "rtl_alt", "--vehicle", 2, "--json").json["results"]
     assert "RTL_ALT" in [each["name"] for each in of_one]
@@ -48,6 +50,13 @@ def test_search_limits_and_reports_nothing(command: Command) -> None:
     nothing = command("search", "xyzzy")
     assert (nothing.code, nothing.out) == (1, "")
     assert nothing.err.startswith("paramclient: nothing found; ")
+    assert (
+        "only names were searched: no metadata is stored for the firmware of ardupilot. `paramclient"
+        in nothing.err
+    )
+    assert "https://autotest.ardupilot.org/Parameters/" in nothing.err
+    of_described = command("search", "xyzzy", "--vehicle", 1)
+    assert of_described.err == "paramclient: nothing found; 903 parameters searched\n"
     assert command("search", "xyzzy", "--json").json == {"results": []}
 
 
@@ -76,7 +85,9 @@ def test_info_of_an_unknown_name_suggests_others(command: Command) -> None:
     assert (wrong.code, wrong.out) == (5, "")
     assert "MC_ROLLP (did you mean MC_ROLL_P?)" in wrong.err
     assert command("info", "RTL_ALT", "--vehicle", 1).code == 5
-    assert "2/1 ardupilot" in command("info", "RTL_ALT").out
+    undescribed = command("info", "RTL_ALT")
+    assert "2/1 ardupilot" in undescribed.out
+    assert "no metadata is stored for the firmware of ardupilot" in undescribed.err
 
 
 def test_a_metadata_file_is_searched_without_a_table(

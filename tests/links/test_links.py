@@ -262,6 +262,7 @@ def answer_with(patch: pytest.MonkeyPatch, *addresses: tuple[socket.AddressFamil
         ("sim:px4", "sim:px4"),
         ("sim:px4?", "sim:px4"),
         ("sim://ArduPilot", "sim:ardupilot"),
+        ("sim:px4?metadata=1", "sim:px4?metadata=1"),
         ("sim:px4?seed=1&loss=.05&delay=0.05", "sim:px4?delay=0.05&loss=0.05&seed=1"),
         ("sim:px4?jitter=-0&rate=1e3&queue=0", "sim:px4?jitter=0.0&queue=0&rate=1000.0"),
         (
@@ -325,6 +326,7 @@ def test_a_spec_has_the_parts_of_the_name() -> None:
         ("sim:", "px4, ardupilot and camera"),
         ("sim:ardupilot4", "px4, ardupilot and camera"),
         ("sim:px4?loss", "NAME=VALUE"),
+        ("sim:ardupilot?metadata=1", "option metadata is for sim:px4"),
         ("sim:px4?colour=red", "'colour' is not an option"),
         ("sim:px4?loss=0.1&loss=0.2", "given twice"),
         ("sim:px4?loss=", "not a number"),
