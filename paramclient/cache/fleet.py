@@ -87,8 +87,9 @@ class NameSpread:
         name: param_id.
         wanted: the wanted value; None if the vehicles are compared with each other.
         values: the existing values, the most common first.
-        lacking: vehicles without the parameter.
-        unknown: vehicles with a partial table in which the parameter is missing.
+        lacking: vehicles without the parameter; without a wanted value, only those with the autopilot of a
+            vehicle that has it.
+        unknown: the same for vehicles with a partial table, which may have it.
     """
 
     name: str
@@ -172,11 +173,14 @@ def spread(
 def fleet_diff(
     transaction: Transaction, component: int, wanted: Mapping[str, WrittenParam | None]
 ) -> FleetDiff:
-    """Compare all vehicles with wanted values, by name; with None, compare them with each other."""
-    owners = {
-        owner: FleetVehicle(key, system, complete)
-        for owner, key, system, complete in transaction.tables_of(component)
-    }
+    """Compare all vehicles with wanted values, by name; with None, compare them with each other.
+
+    Compared with each other, a vehicle lacks only parameters that another one with its autopilot has: the
+    names of PX4 and ArduPilot have little in common.
+    """
+    tables = transaction.tables_of(component)
+    owners = {owner: FleetVehicle(key, system, complete) for owner, key, system, complete, _ in tables}
+    autopilots = {key: autopilot for _, key, _, _, autopilot in tables}
     places = {owner: place for place, owner in enumerate(owners)}
     holders = [Holder(vehicle) for vehicle in owners.values()]
     values: defaultdict[str, dict[Cells, list[Holder]]] = defaultdict(dict)
@@ -189,6 +193,9 @@ def fleet_diff(
         if sum(map(len, values[name].values())) < len(holders):
             having = {holder.vehicle.key for same in values[name].values() for holder in same}
             without = [holder for holder in holders if holder.vehicle.key not in having]
+            if written is None:
+                having_it = {autopilots[key] for key in having}
+                without = [each for each in without if autopilots[each.vehicle.key] in having_it]
         names.append(spread(name, written, values[name], without))
     return FleetDiff(component, tuple(owners.values()), tuple(_dated(transaction, owners, names)))
 

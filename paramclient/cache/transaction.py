@@ -619,15 +619,19 @@ class Transaction(ABC):
 
     # fleet comparison
 
-    def tables_of(self, component: int) -> list[tuple[int, str, int, bool]]:
-        """Return the tables of a component: id, key, system, complete; the last seen vehicle first."""
+    def tables_of(self, component: int) -> list[tuple[int, str, int, bool, int]]:
+        """Return the tables of a component: id, key, system, complete, the vehicle's MAV_AUTOPILOT.
+
+        The last seen vehicle is the first.
+        """
         found = self._all(
-            "SELECT c.id, key, system, complete FROM component c JOIN vehicle ON key = vehicle"
+            "SELECT c.id, key, system, complete, autopilot FROM component c JOIN vehicle ON key = vehicle"
             " WHERE component = ? ORDER BY last_seen DESC, key",
             (component,),
         )
         return [
-            (o, key, system, bool(done)) for o, key, system, done in (cells(row, "isii") for row in found)
+            (owner, key, system, bool(done), autopilot)
+            for owner, key, system, done, autopilot in (cells(row, "isiii") for row in found)
         ]
 
     @abstractmethod

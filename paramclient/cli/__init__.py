@@ -8,7 +8,7 @@
 - `completion`, `completion_table`, `completion_install`: shell completion.
 - `param_names`: names and patterns of parameters, and suggestions.
 - `extended`: extended parameters in these subcommands. `watch_lines`: the lines of watch.
-- `every_vehicle`: --all of fetch, get and set.
+- `every_vehicle`: --all of fetch, get and set. `both_vehicles`: the two vehicles on one link, for diff.
 - `vehicle_name`: the vehicle that --vehicle names.
 - `sources`, `targets`: the parameters and the vehicles that an argument names. `time_arguments`: times.
 - `session`, `options`: an open link with its vehicle; options that several subcommands share.

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Final, TypeAlias, TypeVar
 import anyio
 import anyio.to_thread
 from cyclopts import Parameter
-from cyclopts.validators import Number
 
 from paramclient.cache import ParamCache
 from paramclient.cli.confirmation import can_confirm, confirm
@@ -26,7 +25,7 @@ from paramclient.cli.extended import (
     verify_extended,
 )
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_session
-from paramclient.cli.options import LinkOptions
+from paramclient.cli.options import Count, LinkOptions
 from paramclient.cli.output import print_document, printable, progress_bar, report, say
 from paramclient.cli.param_rows import described
 from paramclient.cli.results import (
@@ -78,8 +77,6 @@ Include: TypeAlias = Annotated[tuple[str, ...], Parameter(show_default=False)]
 """Categories and globs of --include."""
 AllVehicles: TypeAlias = Annotated[bool, Parameter(name="--all")]
 """The option --all."""
-Count: TypeAlias = Annotated[int | None, Parameter(validator=Number(gte=1, lte=255))]
-"""A number of vehicles, at most as many as there are system ids."""
 Result = TypeVar("Result")
 Found = TypeVar("Found")
 

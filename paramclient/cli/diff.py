@@ -8,6 +8,7 @@ from typing import Annotated, Final
 
 from cyclopts import Parameter
 
+from paramclient.cli.both_vehicles import may_have_several, resolve_both
 from paramclient.cli.default_sources import STORED_DEFAULTS_HINT, defaults_in
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.extended import are_extended, diff_extended, is_extended_source
@@ -53,7 +54,8 @@ async def diff(
     Args:
         left: A parameter file; a vehicle in the cache, as 4, px4 or ardupilot, a nickname, its hardware id
             (in full, or uid: and at least 6 digits), its key, or cache:VEHICLE; or a link.
-        right: A file, a vehicle in the cache, or a link, like LEFT.
+        right: A file, a vehicle in the cache, or a link, like LEFT. With one link as LEFT and RIGHT, the two
+            vehicles on it are compared.
         base: A third source, or "defaults" for the firmware's defaults, to see which side differs from it.
         only: Compare only this name or pattern, such as "MC_*". May be given several times.
         partial: Leave out parameters that only the right side has; if the right side is a file and the left
@@ -72,7 +74,11 @@ async def diff(
     chosen = from_file(metadata, offline=True)
     rules = read_rules(renames)
     third_source = [] if base is None or base == DEFAULTS else [base]
-    first, second, *third = await resolve_all([left, right, *third_source], options)
+    if left == right and may_have_several(left, options):
+        first, second = await resolve_both(left, options)
+        third = await resolve_all(third_source, options)
+    else:
+        first, second, *third = await resolve_all([left, right, *third_source], options)
     is_right_partial = partial and is_file(right) and not is_file(left)
     if is_right_partial:
         named = second if rules is None else rules.apply_to(second, first)

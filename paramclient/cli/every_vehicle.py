@@ -21,6 +21,7 @@ __all__ = [
     "Done",
     "address_text",
     "check_all",
+    "check_expected",
     "every_vehicle",
     "failed_documents",
     "report_failures",
@@ -57,19 +58,35 @@ def check_all(options: LinkOptions, *, extended: bool) -> None:
         raise UsageError("--all is for the plain parameters of vehicles; without it, --extended is possible")
 
 
+def check_expected(expect: int | None, *, all_: bool) -> None:
+    """Check that --expect comes with --all.
+
+    Raises:
+        UsageError: it does not.
+    """
+    if expect is not None and not all_:
+        raise UsageError("--expect needs --all")
+
+
 @asynccontextmanager
 async def every_vehicle(
-    url: str, options: LinkOptions, *, policy: Policy = Policy.AUTO
+    url: str, options: LinkOptions, *, expect: int | None = None, policy: Policy = Policy.AUTO
 ) -> AsyncIterator[list[CommandSession]]:
     """Open a link, listen for 3 s, and yield a session for each vehicle that was received, by system id.
 
+    Args:
+        url: the link.
+        options: the options of the link.
+        expect: the number of vehicles to wait for instead, at most 10 s; or None.
+        policy: as in `ParamClient`.
+
     Raises:
         UsageError: no such link.
-        NoReply: no vehicle was received.
+        NoReply: no vehicle was received, or fewer than expected.
         LinkError: the link cannot be opened, or failed.
     """
     async with connect(url, options, policy=policy) as session:
-        vehicles = await find_vehicles(session.client, options.component, None, session.deadline)
+        vehicles = await find_vehicles(session.client, options.component, expect, session.deadline)
         yield [replace(session, component=each) for each in vehicles]
 
 

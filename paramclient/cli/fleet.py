@@ -30,15 +30,16 @@ def fleet_diff(
 ) -> ExitCode:
     """Compare parameters of all vehicles in the cache, with each other or with a parameter file.
 
-    Without a file, vehicles that differ from the most common value are printed. Exit code 1: some vehicles
-    differ.
+    Without a file, vehicles that differ from the most common value are printed, and those that lack a
+    parameter which another vehicle with the same autopilot has. Exit code 1: some vehicles differ.
 
     Args:
-        wanted: Names of parameters in upper or lower case, or patterns such as 'MC_*'; or one parameter file.
+        wanted: Names of parameters in upper or lower case, or patterns such as 'MC_*', and '*' for all; or
+            one parameter file.
         component: Compare this component instead of the autopilot.
     """
     if not wanted:
-        raise UsageError("name the parameters to compare, or a parameter file")
+        raise UsageError("name the parameters to compare, or a parameter file; '*' compares all parameters")
     chosen = _chosen(wanted, component)
     with ParamCache(options.cache) as cache:
         try:

@@ -18,7 +18,16 @@ from paramclient.errors import UsageError
 from paramclient.model.values import Encoding
 from paramclient.protocol.wire import SigningKey, SigningPolicy
 
-__all__ = ["CacheOptions", "Id", "KeyOptions", "LinkOptions", "Seconds", "SigningOptions", "TrafficOptions"]
+__all__ = [
+    "CacheOptions",
+    "Count",
+    "Id",
+    "KeyOptions",
+    "LinkOptions",
+    "Seconds",
+    "SigningOptions",
+    "TrafficOptions",
+]
 
 SOURCE_SYSTEM: Final = 255
 """The usual system id of ground stations, and the default of `ParamClient`."""
@@ -27,6 +36,8 @@ SOURCE_COMPONENT: Final = 190
 
 Id: TypeAlias = Annotated[int | None, Parameter(validator=Number(gte=1, lte=255))]
 """A system or component id."""
+Count: TypeAlias = Annotated[int | None, Parameter(validator=Number(gte=1, lte=255))]
+"""A number of vehicles, at most as many as there are system ids."""
 
 
 class SourceIds(TypedDict):

@@ -17,6 +17,7 @@ from paramclient.cli.every_vehicle import (
     Done,
     address_text,
     check_all,
+    check_expected,
     every_vehicle,
     failed_documents,
     report_failures,
@@ -37,7 +38,7 @@ from paramclient.cli.metadata import (
     from_file,
     known_of_session,
 )
-from paramclient.cli.options import LinkOptions
+from paramclient.cli.options import Count, LinkOptions
 from paramclient.cli.output import (
     by_index,
     default_text,
@@ -93,6 +94,7 @@ async def fetch(
     extended: bool = False,
     plain: bool = False,
     all_: Annotated[bool, Parameter(name="--all")] = False,
+    expect: Count = None,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
     """Fetch all parameters. Uses the cache if the vehicle's hash matches, otherwise downloads.
@@ -117,6 +119,7 @@ async def fetch(
             option, a camera, gimbal or other payload is asked whether it has extended parameters.
         plain: Use the plain parameters, even if the component has extended ones.
         all_: Fetch from every vehicle that is received within 3 s.
+        expect: With --all: wait up to 10 s for this number of vehicles, and fail with fewer.
     """
     if names:
         given = shlex.quote(names[0])
@@ -140,9 +143,10 @@ async def fetch(
     async def fetch_described(session: CommandSession) -> _Fetched:
         return await described(await fetching.fetch(session))
 
+    check_expected(expect, all_=all_)
     if all_:
         check_all(options, extended=extended)
-        async with every_vehicle(url, options, policy=policy) as sessions:
+        async with every_vehicle(url, options, expect=expect, policy=policy) as sessions:
             fleet = await run_on_all(sessions, fetch_described)
         return _show_fleet(fleet, only, options, changed=changed)
     async with connect(url, options, policy=policy) as session:
@@ -153,6 +157,7 @@ async def fetch(
         with progress_bar(f"fetching {session.label}") as progress:
             fetched = await fetching.fetch(session, progress)
         fetched = await described(fetched)
+        session.report_others(has_all=True)
     has_defaults = fetched.has_defaults
     if only:
         chosen, unmatched = NameChoice(only).choose({param.name for param in fetched.params})
@@ -192,6 +197,7 @@ async def get(
     extended: bool = False,
     plain: bool = False,
     all_: Annotated[bool, Parameter(name="--all")] = False,
+    expect: Count = None,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
     """Read parameters from the vehicle.
@@ -206,13 +212,15 @@ async def get(
             option, a camera, gimbal or other payload is asked whether it has extended parameters.
         plain: Use the plain parameters, even if the component has extended ones.
         all_: Read from every vehicle that is received within 3 s.
+        expect: With --all: wait up to 10 s for this number of vehicles, and fail with fewer.
     """
     check_choice(extended=extended, plain=plain)
     described = from_file(metadata)
     name_patterns = check_given((name, *names))
+    check_expected(expect, all_=all_)
     if all_:
         check_all(options, extended=extended)
-        async with every_vehicle(url, options) as sessions:
+        async with every_vehicle(url, options, expect=expect) as sessions:
             read = await run_on_all(
                 sessions, lambda each: _read(each, name_patterns, described, metadata, draws=False)
             )
@@ -221,6 +229,7 @@ async def get(
         if await is_extended_session(session, extended=extended, plain=plain):
             return await get_extended(session, name_patterns)
         params, errors, described = await _read(session, name_patterns, described, metadata)
+        session.report_others(has_all=True)
     if options.json:
         from paramclient.documents.param import ReadOutputDoc  # only here: loads pydantic
 
@@ -273,6 +282,7 @@ async def watch(
         known = None if listens else set(session.component.params)
         watched = ", ".join(name_patterns) if name_patterns else f"{len(session.component.params)} parameters"
         say(printable(f"watching {watched} of {session.label}"))
+        session.report_others()
         failure: Exception | None = None
         async with anyio.create_task_group() as tasks:
             if name_patterns and not has_pattern and not listens:

@@ -184,6 +184,8 @@ async def _from_link(
                     one = replace(session, component=component)
                     described = await find_defaults(one, changed.choice, changed.given, params)
                 faults += changed.add(sets, found.set, described)
+        if not all_:
+            session.report_others(has_all=True)
     return sets, faults
 
 

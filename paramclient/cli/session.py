@@ -11,7 +11,7 @@ from typing import Final
 import anyio
 
 from paramclient.cli.options import LinkOptions, TrafficOptions
-from paramclient.cli.output import printable, say
+from paramclient.cli.output import printable, report, say
 from paramclient.cli.vehicle_name import check_kind, check_uid, wait_for_kind
 from paramclient.cli.waiting import while_waiting
 from paramclient.client.arguments import address_in_words
@@ -22,6 +22,7 @@ from paramclient.errors import AmbiguousVehicle, NoReply, UsageError
 from paramclient.links import LinkKind, ReplayLink, parse_link
 from paramclient.links.names import names_service
 from paramclient.model.identity import version_text
+from paramclient.model.wording import first_of
 from paramclient.protocol.params.fetch_result import Policy
 from paramclient.protocol.silence import silence_of_link
 from paramclient.protocol.vehicle.kinds import kind_in_words
@@ -33,6 +34,7 @@ __all__ = [
     "listen",
     "received_in_words",
     "receiver_in_words",
+    "vehicle_in_words",
     "wait_for_firmware",
     "wait_for_vehicle",
 ]
@@ -42,6 +44,9 @@ VEHICLE_TIMEOUT: Final = 10.0
 RECHECK_TIMEOUT: Final = 2.5
 """Seconds to check that the vehicle is still the only one: no wait is needed unless the vehicle or the link
 was lost in between."""
+
+OTHERS_SHOWN_MAX: Final = 5
+"""Other vehicles that a line names, so that it stays readable; it gives the number of further ones."""
 
 FIRMWARE_TIMEOUT: Final = 0.5
 """Seconds to wait for the firmware version of the vehicle, to name it to the user or to find its metadata."""
@@ -94,6 +99,27 @@ class CommandSession:
         """The component with its kind and firmware, for a subcommand that writes; see `receiver_in_words`."""
         return receiver_in_words(self.component)
 
+    def report_others(self, *, has_all: bool = False) -> None:
+        """Report other vehicles that were received, if no option chose the one that was used.
+
+        For subcommands that only read: they use the first vehicle received, which may be another one next
+        time.
+
+        Args:
+            has_all: whether the subcommand has --all for every vehicle.
+        """
+        options = self.options
+        if options.system is not None or options.vehicle is not None or options.peer is not None:
+            return
+        others = [each for each in self.client.autopilots if each.system != self.component.system]
+        if others:
+            listed = first_of([vehicle_in_words(each) for each in others], OTHERS_SHOWN_MAX)
+            all_of_them = ", --all reads all of them" if has_all else ""
+            report(
+                f"{self.label} was used, the first vehicle received. Also on this link: {listed}. --system "
+                f"chooses one{all_of_them}"
+            )
+
     async def announce_write(self) -> None:
         """Print a line on stderr that says to which vehicle the subcommand writes, unless it prints JSON."""
         if not self.options.json:
@@ -144,10 +170,14 @@ async def wait_for_firmware(vehicles: Sequence[Component], deadline: Deadline) -
 
 def receiver_in_words(component: Component) -> str:
     """Return address, kind and firmware of a component: `1/1 PX4 quadrotor, firmware 1.16.0`."""
-    identity = component.identity
-    kind = kind_in_words(identity.autopilot, identity.vehicle_type)
-    firmware = f", firmware {version_text(identity.firmware)}" if identity.firmware else ""
-    return f"{component.system}/{component.component} {kind}".rstrip() + firmware
+    firmware = component.identity.firmware
+    return vehicle_in_words(component) + (f", firmware {version_text(firmware)}" if firmware else "")
+
+
+def vehicle_in_words(component: Component) -> str:
+    """Return address and kind of a component: `1/1 PX4 quadrotor`."""
+    kind = kind_in_words(component.identity.autopilot, component.identity.vehicle_type)
+    return f"{component.system}/{component.component} {kind}".rstrip()
 
 
 @asynccontextmanager

@@ -12,7 +12,13 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from paramclient.cli.confirmation import can_ask, confirm
-from paramclient.cli.every_vehicle import address_text, check_all, every_vehicle, run_on_all
+from paramclient.cli.every_vehicle import (
+    address_text,
+    check_all,
+    check_expected,
+    every_vehicle,
+    run_on_all,
+)
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.extended import (
     check_choice,
@@ -30,7 +36,7 @@ from paramclient.cli.metadata import (
     problems,
     resolved,
 )
-from paramclient.cli.options import LinkOptions
+from paramclient.cli.options import Count, LinkOptions
 from paramclient.cli.output import print_document, print_table, printable, report, say
 from paramclient.cli.param_names import spelling
 from paramclient.cli.session import CommandSession, connect, wait_for_firmware
@@ -69,6 +75,7 @@ async def set_(
     extended: bool = False,
     plain: bool = False,
     all_: Annotated[bool, Parameter(name="--all")] = False,
+    expect: Count = None,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
     """Write parameters in the order given, and verify each by the value that the vehicle reports.
@@ -95,7 +102,9 @@ async def set_(
             option, a camera, gimbal or other payload is asked whether it has extended parameters.
         plain: Use the plain parameters, even if the component has extended ones.
         all_: Write to every vehicle that is received within 3 s.
+        expect: With --all: wait up to 10 s for this number of vehicles, and write to none if there are fewer.
     """
+    check_expected(expect, all_=all_)
     if all_:
         check_all(options, extended=extended)
         plain = True
@@ -110,7 +119,7 @@ async def set_(
         if described is not None:
             wanted = [*resolved(wanted, described)]
     if all_:
-        async with every_vehicle(url, options) as sessions:
+        async with every_vehicle(url, options, expect=expect) as sessions:
             jobs = [await _prepare(each, wanted, described, metadata) for each in sessions]
             await _check_values(jobs, force=force)
             for each in sessions:

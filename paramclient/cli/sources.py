@@ -24,7 +24,7 @@ from paramclient.cache import CachedSummary, ParamCache
 from paramclient.cache.lookup import address_of, is_vehicle_name
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import progress_bar, report
-from paramclient.cli.session import Deadline, connect
+from paramclient.cli.session import CommandSession, Deadline, connect
 from paramclient.client.component import Component
 from paramclient.errors import UnknownVehicle, UsageError
 from paramclient.files import ParamFile, read_file, read_renames
@@ -50,6 +50,7 @@ __all__ = [
     "resolve",
     "resolve_all",
     "tables_in",
+    "whole_table",
 ]
 
 SOURCES: Final = f"""\
@@ -277,11 +278,28 @@ def _from_cache(vehicle: str, options: LinkOptions) -> ParamSet:
 async def _from_link(url: str, options: LinkOptions, *, is_alone: bool, only: bool) -> ParamSet:
     """Return the whole table of a component. Draws the progress only if `is_alone`: two bars would mix."""
     async with connect(url, options, only=only) as session:
-        component, deadline = session.component, session.deadline
-        link = session.client.link.name
-        with progress_bar(f"fetching {session.label}") if is_alone else nullcontext() as progress:
-            result = await component.fetch_all(timeout=deadline.left(), progress=progress)
-        found = await collect_confirmed(component, result, link, deadline)
-        if found.missing:
-            raise incomplete_error(component, found.missing)
-        return found.set
+        found = await whole_table(session, draws=is_alone)
+        if not only:
+            session.report_others()
+        return found
+
+
+async def whole_table(session: CommandSession, *, draws: bool) -> ParamSet:
+    """Fetch the table of a session's component; return it with the values confirmed in this session.
+
+    Args:
+        session: the session.
+        draws: whether the progress is drawn; two bars at a time would mix.
+
+    Raises:
+        VehicleError: some parameters were not received; the message names them.
+        NoReply, LinkError: as from `Component.fetch_all`.
+    """
+    component, deadline = session.component, session.deadline
+    link = session.client.link.name
+    with progress_bar(f"fetching {session.label}") if draws else nullcontext() as progress:
+        result = await component.fetch_all(timeout=deadline.left(), progress=progress)
+    found = await collect_confirmed(component, result, link, deadline)
+    if found.missing:
+        raise incomplete_error(component, found.missing)
+    return found.set

@@ -47,7 +47,8 @@ def port_in_use(port: int, *, is_tcp: bool) -> str:
         return f"port {port} is in use by {user}. Close that program, or choose another port"
     return (
         f"port {port} is in use by {user}. Close that program, or choose another port and let it, the "
-        "vehicle or a MAVLink router send there too"
+        "vehicle or a MAVLink router send there too. If it is the vehicle or its simulator, use "
+        f"udpout:127.0.0.1:{port}"
     )
 
 

@@ -246,7 +246,7 @@ class ParamMap(Mapping[str, Param]):
         try:
             return self._params[name]
         except KeyError:
-            raise unknown_name(name, self._params) from None
+            raise unknown_name(name, self._params, among=True) from None
 
     @overload
     def get(self, name: str, /) -> Param | None: ...

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Final
 
 __all__ = ["did_you_mean", "nearest_names", "unknown_name"]
@@ -63,7 +63,15 @@ def did_you_mean(nearest: Sequence[str]) -> str:
     return f" Did you mean {', '.join(others)} or {last}?" if others else f" Did you mean {last}?"
 
 
-def unknown_name(name: object, names: Iterable[str]) -> KeyError:
-    """Return the KeyError for a parameter that a mapping does not have, with the most similar names."""
+def unknown_name(name: object, names: Collection[str], *, among: bool = False) -> KeyError:
+    """Return the KeyError for a parameter that a mapping does not have, with the most similar names.
+
+    Args:
+        name: the name.
+        names: the names that the mapping has.
+        among: without similar names, give the number of names: the vehicle may have further parameters.
+    """
     nearest = nearest_names(name, names) if isinstance(name, str) else ()
-    return KeyError(f"no parameter {name}.{did_you_mean(nearest)}" if nearest else f"no parameter {name}")
+    if nearest:
+        return KeyError(f"no parameter {name}.{did_you_mean(nearest)}")
+    return KeyError(f"no parameter {name}{f' among the {len(names)} known ones' if among else ''}")

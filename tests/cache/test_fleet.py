@@ -79,6 +79,21 @@ def test_vehicles_are_compared_with_each_other_by_what_most_of_them_have(cache: 
     assert not cache.fleet_diff(["B"]).differs
 
 
+def test_a_vehicle_lacks_only_parameters_of_its_own_autopilot(cache: ParamCache) -> None:
+    other = [replace(PX4, autopilot=3, system=number, uid=f"{number:04x}") for number in (7, 8)]
+    for identity, name in zip([*VEHICLES[:2], *other], ("P", "Q", "A", "A"), strict=True):
+        cache.save(update(stored(name, 1), stored("BOTH", 2), identity=identity, table=DONE))
+    found = cache.fleet_diff(["*"])
+    assert {each.name: systems(each.lacking) for each in found.names} == {
+        "A": [],
+        "BOTH": [],
+        "P": [2],
+        "Q": [1],
+    }
+    [of_file] = cache.fleet_diff(wanted(A=1)).names
+    assert sorted(systems(of_file.lacking)) == [1, 2]
+
+
 def test_two_equally_common_values_are_both_listed_as_differing(cache: ParamCache) -> None:
     for number, identity in enumerate(VEHICLES[:4]):
         cache.save(update(stored("A", number % 2), identity=identity, table=DONE))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -187,3 +188,57 @@ def test_a_doubtful_value_is_written_only_after_a_question(
         command("set", url, name, value, *arguments)
         assert (vehicle.values != before) is takes
     assert answers == []
+
+
+def test_a_read_names_the_other_vehicles_on_the_link(
+    command: Command, put: Put, vehicles: tuple[PX4Vehicle, ArduPilotVehicle]
+) -> None:
+    """Without an option, the first vehicle received is read, which may be another one next time."""
+    url = put(Air(vehicles))
+    read = command("fetch", url)
+    assert read.code == 0
+    assert re.search(
+        r"[12]/1 \w+ was used, the first vehicle received\. Also on this link: [12]/1 \w+ quadrotor.*\. "
+        r"--system chooses one, --all reads all of them\n",
+        read.err,
+    )
+    for choice in (["--system", 1], ["--vehicle", "2/1"], ["--all"]):
+        assert "Also on this link" not in command("fetch", url, *choice).err
+
+
+@pytest.mark.parametrize("words", [("get", "GAIN"), ("fetch",), ("set", "GAIN", 5)])
+def test_fewer_vehicles_than_expected_are_an_error(
+    command: Command, put: Put, vehicles: tuple[PX4Vehicle, ArduPilotVehicle], words: tuple[str, ...]
+) -> None:
+    url, (name, *rest) = put(Air(vehicles)), words
+    assert command(name, url, *rest, "--all", "--expect", 2).code == 0
+    before = vehicles[0].requests.copy()
+    done = command(name, url, *rest, "--all", "--expect", 3)
+    assert (done.code, done.out) == (3, "")
+    assert "no reply: 3 vehicles (received: 1/1 px4, 2/1 ardupilot) in 10.0 s" in done.err
+    assert vehicles[0].requests["PARAM_SET"] == before["PARAM_SET"]
+    assert command(name, url, *rest, "--expect", 2).code == 2
+
+
+def test_diff_of_one_link_compares_the_two_vehicles_on_it(
+    command: Command, put: Put, vehicles: tuple[PX4Vehicle, ArduPilotVehicle]
+) -> None:
+    vehicles[1].set_param("GAIN", 5.0)
+    url = put(Air(vehicles))
+    found = command("diff", url, url, "--json")
+    assert found.code == 1
+    assert (found.json["left"]["system"], found.json["right"]["system"]) == (1, 2)
+    assert found.json["params"]["GAIN"]["left"]["value"] == 4.0
+    assert found.json["params"]["GAIN"]["right"]["value"] == 5.0
+    alone = command("diff", url, url, "--system", 2, "--json")
+    assert (alone.code, alone.json["right"]["system"]) == (0, 2)
+
+
+def test_diff_of_one_link_with_three_vehicles_says_how_to_compare_two(command: Command, put: Put) -> None:
+    url = put(Air([PX4Vehicle(system=number, table=SHARED) for number in (1, 2, 3)]))
+    refused = command("diff", url, url)
+    assert (refused.code, refused.out) == (2, "")
+    assert "3 vehicles on this link: 1/1 PX4 quadrotor" in refused.err
+    assert f"`paramclient fetch {url} --all` stores them all; then `paramclient diff 1 2`" in refused.err
+    assert command("fetch", url, "--all").code == 0
+    assert command("diff", 1, 2).code == 0
