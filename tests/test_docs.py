@@ -13,7 +13,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import ExitStack, contextmanager, redirect_stdout
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -263,7 +263,7 @@ def test_the_commands_of_the_recipes_print_what_the_page_shows(tmp_path: Path) -
     """In one folder, in the order of the page. A command without a text below it prints nothing."""
     page = (DOCS / "recipes.md").read_text(encoding="utf-8")
     found = RECIPE.findall(page)
-    assert len(found) + len(blocks(DOCS / "recipes.md", "python")) == 20
+    assert len(found) + len(blocks(DOCS / "recipes.md", "python")) == 23
     for command, output in found:
         done = run_command(command, tmp_path)
         assert (done.returncode, done.stdout) == (0, output), command + done.stderr
@@ -293,9 +293,9 @@ def test_the_commands_for_users_of_other_programs_run(program: str, tmp_path: Pa
 
 
 @contextmanager
-def simulating(autopilot: str, link: str, cwd: Path) -> Iterator[None]:
+def simulating(autopilot: str, link: str, cwd: Path, *options: str) -> Iterator[None]:
     """Run a simulated vehicle in a process of its own."""
-    words = ["-m", "paramclient", "sim", autopilot, "--link", link]
+    words = ["-m", "paramclient", "sim", autopilot, "--link", link, *options]
     with subprocess.Popen(
         [sys.executable, *words],
         cwd=cwd,
@@ -308,6 +308,7 @@ def simulating(autopilot: str, link: str, cwd: Path) -> Iterator[None]:
             process.terminate()
 
 
+TIME = re.compile(r"\d{4}-\d\d-\d\dT[\d:.]+(?:Z|[+-]\d\d:\d\d)")
 FILE_TO_WRITE = re.compile(r"Write this to `([\w.]+)`:\n\n```text\n(.*?)```", re.DOTALL)
 
 
@@ -347,6 +348,32 @@ def test_the_commands_for_sitl_print_what_the_page_shows(
                 cwd=tmp_path,
                 XDG_CACHE_HOME=str(tmp_path),
             )
+
+
+def test_the_first_steps_print_what_the_page_shows(tmp_path: Path) -> None:
+    """With the four simulated vehicles of the page, on another port; `diff` and `fleet diff` exit with 1."""
+    page = (DOCS / "first-steps.md").read_text(encoding="utf-8")
+    assert "sim px4 --metadata --link udpout:127.0.0.1:14550 --system $number" in page
+    for name, content in FILE_TO_WRITE.findall(page):
+        (tmp_path / name).write_text(content, encoding="utf-8")
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    found = RECIPE.findall(page)
+    assert len(found) == len(re.findall("^```sh$", page, re.MULTILINE)) - 1 == 11
+    with ExitStack() as vehicles:
+        for number in "1234":
+            options = ["--metadata", "--system", number]
+            vehicles.enter_context(simulating("px4", f"udpout:127.0.0.1:{port}", tmp_path, *options))
+        for command in blocks(DOCS / "first-steps.md", "sh")[0].splitlines():
+            done = run_command(command.replace("14550", port), tmp_path)
+            assert (done.returncode, "1/1" in done.stdout) == (0, True), command + done.stderr
+        for command, output in found:
+            done = run_command(command.replace("14550", port), tmp_path)
+            assert done.returncode == int("diff " in command), command + done.stderr
+            rows, shown_rows = (written(TIME.sub("TIME", text)) for text in (done.stdout, output))
+            assert rows == shown_rows, command + done.stderr
 
 
 def test_the_pages_show_the_output_of_their_programs() -> None:
