@@ -26,6 +26,7 @@ import resource
 import shutil
 import signal
 import socket
+import sqlite3
 import ssl
 import subprocess
 import sys
@@ -849,6 +850,27 @@ async def stuck_readers(service: Service, quick: bool) -> None:
         one.close()
 
 
+async def locked_cache(rows: list[Row], quick: bool) -> None:
+    """Clause 8: another program holds the lock of the cache."""
+    folder = Path(tempfile.mkdtemp())
+    place = folder / "cache.sqlite3"
+    try:
+        async with serving(rows, "sim:px4", "--cache", str(place), tokens=False, folder=folder) as service:
+            service.attack = "SIGTERM with a locked cache"
+            for path in ("/api/v1/find", f"{C}/fetch"):
+                await service.ask("POST", path, b'{"timeout_s": 60}')
+            await service.ask("GET", f"{C}/history")  # writes what was received
+            with contextlib.closing(sqlite3.connect(place, isolation_level=None)) as other:
+                other.execute("BEGIN IMMEDIATE")
+                await service.ask("PATCH", f"{C}/params", b'{"values": {"MC_ROLL_P": 4.5}}')
+                service.note("it ends", ENDED, await asyncio.to_thread(service.end), "s")
+            service.note("exit code", 0, abs(service.process.returncode or 0), "")
+            service.note("tracebacks", 0, service.log.count("Traceback"), "")
+            service.note("lost values are not reported", 0, "and lost: " not in service.log, "")
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 async def killed_apply(rows: list[Row], quick: bool) -> None:
     """Clause 8: `kill -9` during an apply, and the report of the next start."""
     folder = Path(tempfile.mkdtemp())
@@ -1021,6 +1043,7 @@ async def attack(quick: bool, only: str) -> list[Row]:
             origins, *bare, "--allow-origin", "https://station.example", tokens=False
         ),
         "stuck readers": lambda: on_service(stuck_readers, *sim),
+        "locked cache": lambda: locked_cache(rows, quick),
         "killed apply": lambda: killed_apply(rows, quick),
         "hostile service": lambda: hostile_service(rows, quick),
         "udp": lambda: udp(rows, quick),

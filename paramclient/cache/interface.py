@@ -72,6 +72,11 @@ class Store(Protocol):
         """
         ...
 
+    def limit_lock_waits(self, seconds: float) -> None:
+        """Wait for locks of other processes on files for at most these seconds from now in all. Does not
+        block."""
+        ...
+
     def close(self) -> None:
         """Close files, connections and threads; later calls raise CacheError."""
         ...

@@ -99,6 +99,10 @@ class SharedStore:
         """See `Store.subscribe`."""
         return self._connection.subscribe(callback)
 
+    def limit_lock_waits(self, seconds: float) -> None:
+        """See `Store.limit_lock_waits`. Of the local copy."""
+        self._connection.local.database.limit_lock_waits(seconds)
+
     def close(self) -> None:
         """End the thread, and close the database connections and the file."""
         self._finalizer()

@@ -77,6 +77,10 @@ class SqliteStore:
 
         return self._database.write(work, durable=operation.is_durable)
 
+    def limit_lock_waits(self, seconds: float) -> None:
+        """See `Store.limit_lock_waits`."""
+        self._database.limit_lock_waits(seconds)
+
     def close(self) -> None:
         """Close the file."""
         self._database.close()

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import errno
 import logging
+import math
 import os
 import sqlite3
 import stat
@@ -56,6 +57,10 @@ _LOG_MAGICS: Final = (b"\x37\x7f\x06\x82", b"\x37\x7f\x06\x83")
 _LOG_HEADER, _FRAME_HEADER = 32, 24
 _JOURNAL_MAGIC: Final = b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"
 """First bytes of a valid rollback journal of SQLite."""
+
+LOCK_WAIT_PART: Final = 0.25
+"""Timeout in seconds of one of the attempts to begin a write, which together take at most `LOCK_WAIT_MAX`.
+SQLite cannot be interrupted while it waits for a lock; `Database.limit_lock_waits` has effect after each."""
 
 _ATTEMPTS_MAX: Final = 3
 """Maximum number of attempts of one operation: another process may rename the file, and the file may be
@@ -135,6 +140,7 @@ class Database:
         self._file: tuple[int, int] | None = None
         self._for_once = False
         self._without_locks = False
+        self._lock_waits_end = math.inf  # by time.monotonic
         self._is_ours = False  # whether the open file has the application id of paramclient
 
     def read(self, work: Work[T]) -> T:
@@ -164,6 +170,13 @@ class Database:
                 locks it for more than `LOCK_WAIT_MAX`.
         """
         return self._run(work, writing=True, durable=durable)
+
+    def limit_lock_waits(self, seconds: float) -> None:
+        """Wait for locks of other processes for at most these seconds from now in all, in this and all later
+        writes. Returns immediately, also while another thread waits in a write. A write after that time is
+        still attempted once.
+        """
+        self._lock_waits_end = time.monotonic() + seconds
 
     def close(self) -> None:
         """Close the file; every later operation raises CacheError. Closing again does nothing."""
@@ -206,7 +219,10 @@ class Database:
             connection = self._connected(writing=writing)
             if durable:
                 connection.execute("PRAGMA synchronous = FULL")
-            connection.execute("BEGIN IMMEDIATE" if writing else "BEGIN")
+            if writing:
+                self._begin_write(connection)
+            else:
+                connection.execute("BEGIN")
             result = work(connection)
             if durable:  # a transaction without a write would not sync; this writes the unchanged version
                 connection.execute(f"PRAGMA user_version = {len(MIGRATIONS)}")
@@ -224,6 +240,28 @@ class Database:
         if self._for_once:
             self._drop()
         return result
+
+    def _begin_write(self, connection: sqlite3.Connection) -> None:
+        """Begin a transaction with the file's write lock.
+
+        Raises:
+            sqlite3.OperationalError: another process has locked it for `LOCK_WAIT_MAX`, or until the time of
+                `limit_lock_waits`.
+        """
+        begun = time.monotonic()
+        try:
+            while True:
+                left = min(begun + LOCK_WAIT_MAX, self._lock_waits_end) - time.monotonic()
+                wait = max(0.0, min(left, LOCK_WAIT_PART))
+                connection.execute(f"PRAGMA busy_timeout = {round(1000 * wait)}")
+                try:
+                    connection.execute("BEGIN IMMEDIATE")
+                    return
+                except sqlite3.OperationalError as error:
+                    if left <= LOCK_WAIT_PART or (_code(error) or 0) & 0xFF != sqlite3.SQLITE_BUSY:
+                        raise
+        finally:
+            connection.execute(f"PRAGMA busy_timeout = {round(1000 * LOCK_WAIT_MAX)}")
 
     def _connected(self, *, writing: bool) -> sqlite3.Connection:
         if self._connection is not None:

@@ -111,6 +111,12 @@ class ParamCache:
         """Close the cache; later calls raise CacheError. Garbage collection closes it too."""
         self._store.close()
 
+    def limit_lock_waits(self, seconds: float) -> None:
+        """Wait for locks of other processes for at most these seconds from now in all, before the end of a
+        program. Each later write is still attempted once. Does not block.
+        """
+        self._store.limit_lock_waits(seconds)
+
     @property
     def place(self) -> str:
         """The file, or the URL of the database without password, for messages."""

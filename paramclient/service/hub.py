@@ -56,6 +56,9 @@ SERVICE_AUTHOR: Final = "service"
 FILE_WORK_TIMEOUT: Final = 1.0
 """Timeout in seconds for running work of the threads for files and responses at shutdown. Queued work is
 dropped."""
+CLOSING_LOCK_WAIT: Final = 1.5
+"""Timeout in seconds for locks of other processes on the cache at shutdown, in all: with `FILE_WORK_TIMEOUT`,
+the service ends within 3 s."""
 
 Result = TypeVar("Result")
 
@@ -171,6 +174,8 @@ class Hub:
         assert link_tasks is not None
         self.feed.end()
         self._closing.set()
+        if self._owns_cache and self.cache is not None:
+            self.cache.limit_lock_waits(CLOSING_LOCK_WAIT)
         self._reader.drop(_closing)
         self._encoder.drop(_closing)
         try:

@@ -15,6 +15,7 @@ import sqlite3
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import closing
 from dataclasses import replace
 from functools import cache as cached
@@ -307,6 +308,38 @@ def test_a_program_that_holds_the_file_for_too_long_is_an_error_and_no_hindrance
         assert len(values(cache)) == 3
         other.execute("COMMIT")
         works(cache)
+
+
+def test_the_wait_for_a_lock_can_be_limited_while_it_lasts(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sqlite_file, "LOCK_WAIT_MAX", 120.0)
+    with ParamCache(path) as cache, connect(path) as other:
+        cache.save(whole_table(3))
+        other.execute("BEGIN IMMEDIATE")
+        with ThreadPoolExecutor(1) as threads:
+            saved = threads.submit(cache.save, update())
+            wait([saved], timeout=2 * sqlite_file.LOCK_WAIT_PART)
+            assert not saved.done()
+            cache.limit_lock_waits(0.0)
+            with pytest.raises(CacheError, match="locked"):
+                saved.result(30)
+        with pytest.raises(CacheError, match="locked"):
+            cache.save(update())
+        other.execute("COMMIT")
+        works(cache)
+
+
+def test_a_write_begins_as_soon_as_the_lock_is_released(path: Path) -> None:
+    with ParamCache(path) as cache, connect(path) as other:
+        cache.save(whole_table(3))
+        other.execute("BEGIN IMMEDIATE")
+        with ThreadPoolExecutor(1) as threads:
+            saved = threads.submit(cache.save, update())
+            wait([saved], timeout=2 * sqlite_file.LOCK_WAIT_PART)
+            assert not saved.done()
+            other.execute("COMMIT")
+            saved.result(30)
 
 
 def test_a_folder_that_another_program_holds_is_waited_for_but_not_for_ever(

@@ -235,8 +235,10 @@ async def test_a_service_that_is_ended_says_on_stderr_what_is_lost(path: Path) -
         with locked(path):
             done = await browser.patch(f"{C}/params", json={"values": {"MC_ROLL_P": 4.5}})
             assert done.status_code == 200, done.text
+            begun_at = time.monotonic()
             process.send_signal(signal.SIGTERM)
             code, err = await ended(process)
+            assert time.monotonic() - begun_at < 4.5  # one attempt alone waits 5 s for the lock
     assert code == 0
     assert re.search(
         r"warning: 1/1 \(uid:\w+/1\): not written to the cache, and lost: \d+ values? and", err
