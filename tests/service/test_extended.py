@@ -347,7 +347,7 @@ async def test_the_trust_of_many_is_told_at_once_and_that_of_few_singly() -> Non
             assert {each["trust"] for each in table.values()} == {"cached"}
 
 
-@swiftly
+@in_simulated_time
 async def test_a_published_table_is_not_compared_again_for_each_request() -> None:
     """Many requests may end at once, and each publishes the changes before its response."""
 

@@ -455,7 +455,7 @@ async def test_a_table_is_copied_out_in_a_thread(monkeypatch: pytest.MonkeyPatch
             assert seen["of"] <= {READER, "paramclient service"}, path
 
 
-@swiftly
+@in_simulated_time
 async def test_cached_metadata_is_parsed_once_and_not_in_the_thread_of_the_cache(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
