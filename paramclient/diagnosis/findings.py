@@ -9,7 +9,6 @@ from statistics import median
 from typing import Final
 
 from paramclient.diagnosis.report import LinkReport, VehicleReport
-from paramclient.model.identity import SHARED_UIDS
 
 __all__ = ["Finding", "Severity", "findings_of"]
 
@@ -163,13 +162,13 @@ def _about_vehicle(report: VehicleReport) -> Iterator[Finding]:
             "are unknown. Its cached table is kept by system id and link: another vehicle with that id would "
             "be taken for this one.",
         )
-    elif report.identity.uid is None or report.identity.uid in SHARED_UIDS:
+    elif not report.identity.has_own_uid:
         yield Finding(
             Severity.NOTE,
             "The vehicle has no hardware id: the cache identifies it by system id and link."
             if report.identity.uid is None
-            else "The vehicle has the hardware id that all simulated PX4 vehicles have: the cache identifies "
-            "it by hardware id and system id.",
+            else "The hardware id is one of simulated PX4 vehicles, and not of any hardware: "
+            "the cache identifies it by hardware id and system id.",
         )
     if report.encoding_reason.startswith("the standard's"):
         yield Finding(

@@ -6,18 +6,23 @@ from dataclasses import dataclass
 from typing import Final
 
 __all__ = [
-    "SHARED_UIDS",
+    "PX4_SITL_UID",
     "Identity",
     "autopilot_name",
     "hardware_id",
+    "is_sitl_uid",
     "reason_against_non_finite",
     "version_difference",
     "version_text",
 ]
 
-SHARED_UIDS: Final = frozenset({"4954414c44494e4f"})
-"""Hardware ids that several vehicles share: each `sim:px4`, and PX4's SITL with system id 1, reports this one
-(measured). The system id distinguishes the vehicles."""
+PX4_SITL_UID: Final = "4954414c44494e4f"
+"""The hardware id of PX4's SITL and of `sim:px4` with system id 1 (measured). With system id N, SITL adds
+N - 1 to it and to the first byte of `uid2`, whose other bytes are zero (measured; AUTOPILOT_VERSION in PX4's
+mavlink_main.cpp). It is not the id of any hardware: it follows the system id."""
+_SITL_SYSTEMS_MAX = 255
+_UID_DIGITS = 16
+_UID2_DIGITS = 36
 
 _AGAINST_NON_FINITE = {
     "px4": "PX4 cannot save NaN and infinity: its parameter file becomes invalid, it saves nothing any more, "
@@ -112,7 +117,7 @@ class Identity:
         Without a hardware id, `system:<n>@<link>`, which is unique only while no other vehicle uses the same
         system id on the same link.
         """
-        if self.uid in SHARED_UIDS:
+        if self.uid == PX4_SITL_UID:
             return f"uid:{self.uid}/{self.system}"
         if self.uid is not None:
             return f"uid:{self.uid}"
@@ -120,24 +125,33 @@ class Identity:
 
     @property
     def has_own_uid(self) -> bool:
-        """Whether the hardware id is known and unique to this vehicle."""
-        return self.uid is not None and self.uid not in SHARED_UIDS
+        """Whether the hardware id is known and unique to this vehicle, also under another system id."""
+        return self.uid is not None and not is_sitl_uid(self.uid)
 
     def is_same_vehicle(self, other: Identity) -> bool:
         """Return whether `other`, with the same or another system id, is this vehicle.
 
-        Compares the hardware ids. Without one, or with one that several vehicles share, compares link,
-        autopilot and vehicle type as well.
+        Compares the hardware ids. Without one, or with one of PX4's SITL, which follows the system id,
+        compares link, autopilot and vehicle type as well.
         """
         if self.has_own_uid:
             return other.uid == self.uid
         mine, others = ((each.link, each.autopilot, each.vehicle_type) for each in (self, other))
-        return mine == others and (self.uid is None or other.uid == self.uid)
+        return mine == others and (self.uid is None or is_sitl_uid(other.uid))
 
     def __str__(self) -> str:
         if self.uid is not None:
             return f"the {autopilot_name(self.autopilot)} {self.uid}"
         return f"a vehicle of type {self.vehicle_type} with {autopilot_name(self.autopilot)}"
+
+
+def is_sitl_uid(uid: str | None) -> bool:
+    """Return whether a hardware id is one that PX4's SITL makes of its system id; see `PX4_SITL_UID`."""
+    if uid is None:
+        return False
+    if len(uid) == _UID2_DIGITS:
+        return uid[2:].count("0") == _UID2_DIGITS - 2
+    return len(uid) == _UID_DIGITS and 0 <= int(uid, 16) - int(PX4_SITL_UID, 16) < _SITL_SYSTEMS_MAX
 
 
 def hardware_id(uid: int, uid2: bytes) -> str | None:

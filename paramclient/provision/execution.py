@@ -24,7 +24,7 @@ from paramclient.errors import (
     UsageError,
     VehicleArmed,
 )
-from paramclient.model.identity import SHARED_UIDS, Identity
+from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet
 from paramclient.model.renames import Renames
 from paramclient.model.values import WireValue
@@ -465,8 +465,8 @@ class ApplyRun:
 
         The same vehicle under an earlier id, and a lost vehicle, do not count.
         """
-        uid = self._component.identity.uid
-        is_ours = uid is not None and uid not in SHARED_UIDS and known.identity.uid == uid
+        own = self._component.identity
+        is_ours = own.has_own_uid and known.identity.uid == own.uid
         return known.system == system and known.state != "lost" and not is_ours
 
     async def _set_and_detect_kept_id(self, step: Step) -> None:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from paramclient.model.identity import SHARED_UIDS, Identity, autopilot_name
+from paramclient.model.identity import PX4_SITL_UID, Identity, autopilot_name, is_sitl_uid
 from paramclient.protocol.wire import AutopilotVersion
 from tests import recordings
 
@@ -88,7 +88,7 @@ def test_same_hardware_id_is_the_same_vehicle() -> None:
     assert mine.has_own_uid
 
 
-@pytest.mark.parametrize("uid", [None, *SHARED_UIDS])
+@pytest.mark.parametrize("uid", [None, PX4_SITL_UID])
 def test_without_a_unique_hardware_id_link_and_types_are_compared(uid: str | None) -> None:
     mine = Identity(1, "udp", uid=uid, autopilot=3, vehicle_type=2)
     assert mine.is_same_vehicle(replace(mine, system=9))
@@ -97,3 +97,32 @@ def test_without_a_unique_hardware_id_link_and_types_are_compared(uid: str | Non
     # A vehicle without a known hardware id may send it only later.
     assert mine.is_same_vehicle(replace(mine, uid="0a")) is (uid is None)
     assert not mine.has_own_uid
+
+
+def test_a_hardware_id_of_px4_sitl_follows_the_system_id() -> None:
+    """Measured: with system id 7, uid is 0x4954414c44494e4f + 6, and uid2 is 06 and zeros."""
+
+    def sitl(system: int) -> Identity:
+        uid2 = bytes([system - 1, *bytes(17)])
+        uid = int(PX4_SITL_UID, 16) + system - 1
+        return Identity.from_version(
+            system=system, link="udp", autopilot=12, vehicle_type=2, uid=uid, uid2=uid2
+        )
+
+    first, second = sitl(1), sitl(7)
+    assert (first.uid, second.uid) == (PX4_SITL_UID, "06" + "00" * 17)
+    assert not first.has_own_uid
+    assert not second.has_own_uid
+    assert first.is_same_vehicle(second)
+    assert second.is_same_vehicle(first)
+    assert not second.is_same_vehicle(replace(first, link="tcp"))
+    assert not second.is_same_vehicle(replace(first, uid="000200000000333138330001"))
+    assert (first.key, second.key) == (f"uid:{PX4_SITL_UID}/1", "uid:06" + "00" * 17)
+    assert is_sitl_uid(f"{int(PX4_SITL_UID, 16) + 6:x}")
+    for hardware in (
+        None,
+        "0002000000003331383300012345678901bc",
+        "336431323139633763346335343034616100",
+        "0a",
+    ):
+        assert not is_sitl_uid(hardware)

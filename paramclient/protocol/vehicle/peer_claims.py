@@ -7,7 +7,7 @@ from collections.abc import Hashable
 from enum import Enum
 from typing import Final, Generic, NamedTuple, TypeVar
 
-from paramclient.model.identity import SHARED_UIDS, hardware_id
+from paramclient.model.identity import hardware_id, is_sitl_uid
 from paramclient.protocol.addresses import Peer, peer_in_words
 from paramclient.protocol.vehicle.kinds import kind_in_words
 from paramclient.protocol.vehicle.reboot_detection import REORDERING_TIME
@@ -245,7 +245,7 @@ class Claim:
     @property
     def has_own_uid(self) -> bool:
         """Whether it has sent a hardware id that is unique to one vehicle."""
-        return bool(self.uid.current) and self.uid.current not in SHARED_UIDS
+        return bool(self.uid.current) and not is_sitl_uid(self.uid.current)
 
     @property
     def tells_clock(self) -> bool:
@@ -311,7 +311,7 @@ def compare(home: Claim, other: Claim, *, is_over: bool, may_ask: bool) -> tuple
     if have_one_start is False:
         return PeerRelation.OTHER, "the time since boot"
     uid = uids[0] if uids[0] == uids[1] else None
-    if kinds[0] == kinds[1] and uid and (have_one_start or (is_over and uid not in SHARED_UIDS)):
+    if kinds[0] == kinds[1] and uid and (have_one_start or (is_over and not is_sitl_uid(uid))):
         return PeerRelation.SAME, ""
     if not is_over:
         return PeerRelation.OPEN, ""
