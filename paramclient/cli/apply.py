@@ -49,6 +49,7 @@ from paramclient.cli.targets import (
     Source,
     Targets,
     check_new,
+    check_no_service,
     check_pattern,
     describe,
     fill_pattern,
@@ -152,6 +153,7 @@ async def apply(
         return await apply_extended(
             url, file, options, dry_run=dry_run, yes=yes, durable=durable, backup=backup
         )
+    check_no_service(url)
     check_pattern("--overlay", over, all_vehicles=all_vehicles)
     check_pattern("--backup", backup, all_vehicles=all_vehicles)
     chosen = from_file(metadata)
@@ -242,6 +244,7 @@ async def verify(
                 "for plain ones"
             )
         return await verify_extended(url, file, options)
+    check_no_service(url)
     check_pattern("--overlay", over, all_vehicles=all_vehicles)
     chosen = from_file(metadata)
     rules = read_rules(renames)
@@ -307,6 +310,7 @@ async def restore(
         if include or reboot or allow_armed or force:
             raise UsageError("--include, --reboot, --allow-armed and --force are for plain parameters")
         return await restore_extended(url, when, options, dry_run=dry_run, yes=yes, backup=backup)
+    check_no_service(url)
     async with targets(url, options, all_vehicles=False, expect=None, only=True) as found:
         [vehicle] = found.vehicles
         state = await _load_state(found, vehicle, when, options)

@@ -25,6 +25,7 @@ from paramclient.client.client import ParamClient, implementation_of
 from paramclient.client.component import Component
 from paramclient.errors import FileError, NoReply, UsageError
 from paramclient.files import ParamFile
+from paramclient.links.names import names_service
 from paramclient.model.paramset import ParamSet
 from paramclient.provision import overlay
 from paramclient.provision.inspection import wait_for_identity
@@ -34,6 +35,7 @@ __all__ = [
     "Source",
     "Targets",
     "check_new",
+    "check_no_service",
     "check_pattern",
     "describe",
     "fill_pattern",
@@ -86,6 +88,19 @@ class Targets:
         """See `CommandSession.check_only`; does nothing with --all, which names every vehicle."""
         if not self.all_vehicles:
             await self.session.check_only()
+
+
+def check_no_service(url: str) -> None:
+    """Check that a link, and not a service, is given for a set-up of plain parameters.
+
+    Raises:
+        UsageError: the URL of a service.
+    """
+    if names_service(url):
+        raise UsageError(
+            f"{url} is a service: apply, verify and restore of plain parameters need the link itself. The "
+            "service sets up a vehicle by POST /api/v1/components/SYSTEM/COMPONENT/apply, or with its page"
+        )
 
 
 @asynccontextmanager
