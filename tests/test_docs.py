@@ -24,6 +24,7 @@ from unittest import mock
 import pytest
 
 import paramclient
+import paramclient.diagnosis
 import paramclient.links
 import paramclient.metadata
 import paramclient.provision
@@ -47,7 +48,7 @@ def name_of(page: Path) -> str:
 EVERY_PAGE = pytest.mark.parametrize("page", PAGES, ids=name_of)
 
 PUBLIC = [
-    *(paramclient, paramclient.links, paramclient.metadata, paramclient.provision),
+    *(paramclient, paramclient.diagnosis, paramclient.links, paramclient.metadata, paramclient.provision),
     *(paramclient.remote, paramclient.sim, paramclient.sync, paramclient.testing),
 ]
 

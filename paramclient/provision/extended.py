@@ -6,7 +6,6 @@ All calls use the extended calls of a component, and therefore also work over a 
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -20,7 +19,7 @@ from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.protocol.ext.write_batch import ExtSetOutcome
 from paramclient.provision.apply_restore import BEFORE_RESTORE
 from paramclient.provision.runner import call_and_wait
-from paramclient.provision.vehicle_params import BEFORE_APPLY
+from paramclient.provision.vehicle_params import BEFORE_APPLY, extended_set
 
 __all__ = [
     "ExtApplyResult",
@@ -267,8 +266,7 @@ async def _write(
     if plan.changes and before_writing is not None:
         await call_and_wait(before_writing)
     source = f"{component.system}/{component.component} {reason}"
-    ids = plan.system, plan.component
-    before = ExtParamSet(plan.current, *ids, time.time(), source, component.identity)
+    before = extended_set(component, plan.current, source)
     if backup is not None:
         from paramclient.files.extended_document import write_extended_file
 

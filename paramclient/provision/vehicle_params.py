@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Final
 from paramclient.errors import NoReply, NotInCache, UnknownVehicle, UsageError, VehicleError
 from paramclient.model.comparison import defaults_of, non_defaults
 from paramclient.model.defaults import add_defaults
+from paramclient.model.ext_params import ExtParam
+from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.params import copy_params
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Param, Trust
@@ -29,6 +31,7 @@ __all__ = [
     "NO_DEFAULTS",
     "FetchedSet",
     "set_maker",
+    "extended_set",
     "load_state_before_apply",
     "load_cached_set",
     "collect_defaults",
@@ -86,6 +89,18 @@ def set_maker(component: Component, source: str) -> Callable[[Iterable[Param]], 
         at=time.time(),
         source=source,
     )
+
+
+def extended_set(component: Component, params: Mapping[str, ExtParam], source: str) -> ExtParamSet:
+    """Return extended parameters of a component as a set, with the identity and the time of this call.
+
+    Args:
+        component: the component.
+        params: its extended parameters by name.
+        source: the origin of the set, in words.
+    """
+    ids = component.system, component.component
+    return ExtParamSet(params, *ids, time.time(), source, component.identity)
 
 
 async def collect_set(
