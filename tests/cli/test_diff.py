@@ -450,7 +450,8 @@ def test_show_prints_comments_and_changed_parameters_of_a_file(
     assert (changed.code, changed.rows) == (0, [["name", "value", "default"], ["A", "1", "0"]])
     assert changed.err == "1 parameter from quad.json, those that differ from their default\n"
     [component] = command("show", full, "--changed", "--json").json["components"]
-    assert component["params"] == {"A": {"value": 1, "type": None, "bits": None, "default": 0}}
+    expected = {"value": 1, "type": None, "bits": None, "default": 0, "default_source": "vehicle"}
+    assert component["params"] == {"A": expected}
 
 
 @pytest.mark.usefixtures("two")
