@@ -218,7 +218,7 @@ def _multiplied(value: WireValue, kind: ParamType | int | None, ratio: Fraction)
     """
     if isinstance(value, bytes):
         raise UsageError("its value is raw bytes, which cannot be multiplied")
-    if not math.isfinite(value):
+    if isinstance(value, float) and not math.isfinite(value):
         return math.copysign(value, value * (1 if ratio > 0 else -1))
     if isinstance(value, float) and kind != ParamType.REAL64:
         value = shortest_float(value)  # the digits that a file or a user would write

@@ -69,6 +69,7 @@ def test_two_names_of_a_chain_that_would_become_a_third_one_are_an_error() -> No
         (0.07000000029802322, ParamType.REAL64, 0.0007000000029802322, 7.000000029802322),
         (math.inf, None, math.inf, math.inf),
         (1e307, ParamType.REAL64, 10**305, math.inf),
+        (10**400, None, math.inf, math.inf),
         (0, None, 0, 0),
     ],
 )

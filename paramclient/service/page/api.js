@@ -14,7 +14,7 @@ const KINDS = [
   ...["extended_change", "extended_params", "extended_progress"],
 ];
 
-/** An error of the service, with its text; `status` is 0 if the service cannot be reached. */
+/** An error of the service; `status` is 0 if it cannot be reached. */
 export class Problem extends Error {
   constructor(status, document) {
     super(
@@ -29,12 +29,12 @@ export class Problem extends Error {
 
 let askForToken = () => Promise.reject(new Problem(401, { detail: "A token is required." }));
 
-/** Sets the function that asks the user for a token; it resolves when the session has started. */
+/** Sets the function that asks for a token; it resolves when the session has started. */
 export function onToken(ask) {
   askForToken = ask;
 }
 
-/** Returns the path of a component's resource; for a component only in the cache (`is_kept`), that of its cached data. */
+/** Returns the path of a component's resource, or of its cached data (`is_kept`). */
 export function at(component, what = "", query = {}) {
   if (component.is_kept) {
     const search = new URLSearchParams(query);
@@ -144,7 +144,7 @@ export class Stream {
     else this.take(event);
   }
 
-  /** Handles the end of the browser's attempts: a token may be required, or the service is not running. */
+  /** The browser gives up: a token is required, or no service is running. */
   retryLater() {
     this.source?.close();
     this.waiting = setTimeout(async () => {
@@ -158,7 +158,7 @@ export class Stream {
     this.pause = Math.min(RETRY_INTERVAL_MAX, this.pause * 2);
   }
 
-  /** Reconnects after a silence: a lost network does not close the connection. */
+  /** Reconnects after silence: a lost network closes no connection. */
   async checkConnection() {
     if (document.hidden || this.source?.readyState !== EventSource.OPEN) return;
     try {

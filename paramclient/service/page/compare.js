@@ -8,9 +8,9 @@ import { Caution, OUTCOMES, nameOf, outcomesText } from "./review.js";
 import { keyOf, store } from "./store.js";
 import { many, moment, numberText } from "./values.js";
 
-/** Maximum size of a parameter file in bytes, which is also the limit of the service. */
+/** Maximum size of a parameter file in bytes, as in the service. */
 const FILE_BYTES_MAX = 2 * 2 ** 20;
-/** Maximum size of a file of changed names in bytes, which is also the limit of the service. */
+/** Maximum size of a file of changed names in bytes, as in the service. */
 const RENAMES_BYTES_MAX = 2 ** 20;
 /** Timeout of a plan in milliseconds. */
 const PLAN_TIMEOUT = 120_000;
@@ -171,7 +171,7 @@ export function drawBanner() {
   );
 }
 
-/** Plans the changes to the compared set, lets the user select values, and applies these. */
+/** Plans the changes to the compared set, and applies the values that the user selects. */
 export async function takeOver() {
   const { component, table } = store;
   const { other } = table;
@@ -351,7 +351,7 @@ const exactly = (name) => name.replace(/[*?[]/g, "[$&]");
 
 const PHASES = { reading: "Reading", writing: "Writing", rebooting: "Rebooting" };
 
-/** Returns the rows of a plan in their order of writing, then the skipped ones. */
+/** Returns the rows of a plan in the order of writing, then the skipped ones. */
 function linesOf(plan, table, other, refresh) {
   const staged = plan.stages.flatMap(({ purpose, steps }) =>
     steps.map(({ name }) => [name, purpose === "all other parameters" ? "" : purpose]),

@@ -6,7 +6,7 @@ import { button, byId, el } from "./dom.js";
 let asking = null;
 let end = () => {};
 
-/** Opens the dialog with this content; the promise resolves when it is closed. Esc closes it unless `isHeld()`. */
+/** Opens the dialog; the promise resolves when it is closed. Esc closes it unless `isHeld()`. */
 export function openDialog(title, content, buttons, { isHeld = () => false, kind = "", focus = null } = {}) {
   const dialog = byId("dialog");
   closeDialog();
@@ -35,7 +35,7 @@ export function openDialog(title, content, buttons, { isHeld = () => false, kind
   });
 }
 
-/** Closes it immediately: the close event of the browser comes later, when another dialog may be open. */
+/** Closes it at once: the browser's event comes when another dialog may be open. */
 export function closeDialog() {
   byId("dialog").close();
   end();

@@ -1,8 +1,8 @@
-/** DOM elements. Texts are inserted by `textContent`, so that no text becomes markup. */
+/** DOM elements. Texts are inserted as `textContent`, never as markup. */
 
 /**
- * Creates an element. `props` are attributes, except `class`, `text`, `on` (listeners) and `data`; attributes that are
- * false, null or undefined are omitted. Children are elements or texts; null and false are skipped.
+ * Creates an element. `props` are attributes, except `class`, `text`, `on` (listeners) and `data`. Attributes and
+ * children that are false, null or undefined are omitted.
  */
 export function el(tag, props = {}, ...children) {
   const made = document.createElement(tag);
@@ -34,7 +34,7 @@ export function icon(name) {
   return svg;
 }
 
-/** Creates a button with a text, an icon, or both; `label` names a button with only an icon. */
+/** Creates a button with a text, an icon, or both; `label` names one with only an icon. */
 export function button(text, onclick, { kind = "", drawing = null, label = null, ...more } = {}) {
   return el(
     "button",
@@ -51,7 +51,7 @@ export function button(text, onclick, { kind = "", drawing = null, label = null,
   );
 }
 
-/** Sets a text if it differs, which avoids rendering and screen reader announcements. */
+/** Sets a text if it differs: no rendering and no announcement otherwise. */
 export function setText(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }

@@ -6,8 +6,8 @@ import { defaultOf, isFloat, maskOf, parse, rangeOf, sameText, textOf, textOfMas
 const OTHER = "other";
 
 /**
- * Creates the form for one parameter. Calls `stage(text, send)` with a valid value and `leave()` at the end. In the
- * result, `first` receives the focus, and `refresh(row)` handles a changed value.
+ * Creates the form for one parameter. Calls `stage(text, send)` with a valid value, and `leave()` at the end.
+ * `first` receives the focus, and `refresh(row)` handles a changed value.
  */
 export function editorOf(row, pending, { stage, leave, isCompact = true }) {
   const { info, type } = row;
@@ -70,7 +70,7 @@ export function editorOf(row, pending, { stage, leave, isCompact = true }) {
   return form;
 }
 
-/** Opens the form over the value of a row, and returns a function that refreshes it. Only one form is open. */
+/** Opens the only form, over the value of a row; returns a function that refreshes it. */
 export class CellEditor {
   constructor({ grid, stage }) {
     this.grid = grid;
@@ -254,7 +254,7 @@ function boxes(row, value, report) {
   };
 }
 
-/** Returns the next number of a step, without rounding errors of added fractions. */
+/** Returns the next number of a step, without rounding errors. */
 function stepped(text, step, type) {
   if (!isFloat(type)) return String(BigInt(text) + BigInt(Math.round(step) || Math.sign(step)));
   const places = Math.max(decimals(text), decimals(String(step)));

@@ -1,4 +1,4 @@
-/** Extended parameters of a component: a dialog with their values, which are sent one by one. */
+/** The dialog of extended parameters, which are sent one by one. */
 
 import { at, get, request } from "./api.js";
 import { closeDialog, openDialog } from "./dialogs.js";
@@ -9,10 +9,10 @@ import { isFloat, isWhole, many, numberText, parse } from "./values.js";
 
 /** Prefix of a value that is given as bytes in hexadecimal digits. */
 const HEX = "hex:";
-/** Timeout in milliseconds for a list, and for a change that the component reports to be in progress. */
+/** Timeout in milliseconds for a list, and for a change in progress. */
 const EXTENDED_TIMEOUT = 180_000;
 
-/** Shows the button of the dialog for a component that has extended parameters, or usually has them. */
+/** Shows the button of the dialog for a component that has, or usually has, extended parameters. */
 export function offerExtended() {
   const offer = byId("extended");
   if (offer) offer.hidden = !hasExtended(store.component);
@@ -209,7 +209,7 @@ export async function showExtended() {
       }
       end(line, status, status === "adjusted" ? textOf(now) : problem?.detail);
     } catch (problem) {
-      // only a documented problem says that nothing was written
+      // only a documented problem: nothing was written
       end(line, problem.document?.type && problem.status !== 500 ? "not tried" : "unknown", problem.message);
     }
     line.isSending = false;

@@ -1,6 +1,5 @@
 /**
- * The table: a scrolling list with only its visible rows in the DOM. The grid has the focus and names the selected row,
- * so that changes of rows do not move the focus.
+ * The table: a scrolling list with only its visible rows in the DOM. The grid has the focus and names the selected row.
  */
 
 import { byId, el, isNarrow, setAttribute, setText } from "./dom.js";
@@ -12,7 +11,7 @@ const OVERSCAN_ROWS = 10;
 const SCROLL_END_DELAY = 120;
 
 export class Grid {
-  /** `open(row)` edits, `show(row)` opens the details, `moved(row)` reports the selected row; `table()` is the shown table. */
+  /** `open(row)` edits, `show(row)` opens the details, `moved(row)` reports the selection. */
   constructor({ table, open, show, moved }) {
     this.table = table;
     this.open = open;
@@ -48,7 +47,7 @@ export class Grid {
     this.draw();
   }
 
-  /** Shows these rows; the selection stays on its parameter, or near its position. */
+  /** Shows these rows; the selection stays on or near its parameter. */
   set(rows) {
     this.rows = rows;
     const place = this.name === null ? -1 : rows.findIndex((row) => row.name === this.name);
@@ -63,7 +62,7 @@ export class Grid {
     setAttribute(this.root, "aria-rowcount", this.rows.length + 1);
   }
 
-  /** Renders the rows that have become visible, in the elements of rows that are no longer visible. */
+  /** Renders rows that have become visible, in the elements of hidden ones. */
   draw(isAnew = true) {
     const top = Math.max(0, this.root.scrollTop - this.top);
     const from = Math.max(0, Math.floor(top / this.height) - OVERSCAN_ROWS);

@@ -9,9 +9,9 @@ import { defaultOf, many, meaningOf, sameText, warningOf } from "./values.js";
 
 /** Values in one request, fewer than the service accepts. */
 const VALUES_PER_REQUEST = 1000;
-/** Timeout of a request in milliseconds; on a lossy link the service retries for long and has its own timeout. */
+/** Timeout of a request in milliseconds; the service has its own for a lossy link. */
 const WRITE_TIMEOUT = 120_000;
-/** Milliseconds by which each value extends the timeout: four times what one takes on a radio of 9600 baud. */
+/** Milliseconds added for each value: four times its duration at 9600 baud. */
 const WRITE_TIMEOUT_PER_VALUE = 400;
 
 export const OUTCOMES = {
@@ -28,8 +28,7 @@ export const OUTCOMES = {
 };
 
 /**
- * The confirmation for writes to an armed vehicle: a sentence and a check box, shown while the vehicle is armed.
- * `change` is called after a change of either.
+ * The confirmation for writes to a vehicle, shown while it is armed. `change` is called after a change.
  */
 export class Caution {
   constructor(component, change) {
@@ -156,7 +155,7 @@ export async function review() {
   });
 }
 
-/** Stages the values from before the last write and shows the review. Nothing is written without confirmation. */
+/** Stages the values from before the last write and shows the review. */
 export function undo() {
   const { sent } = store.table;
   if (!sent) return;
@@ -232,7 +231,7 @@ function inWords(value, row) {
   return `${value} ${meaning || (row?.info?.units ?? "")}`.trim();
 }
 
-/** Writes changes in one request and shows the result of each in its row. Returns the outcomes. */
+/** Writes changes in one request, shows each result in its row, and returns the outcomes. */
 async function sendBatch(component, lines) {
   const parts = lines.map((line) => ({ line, outcome: outcomeBefore(line) }));
   const open = parts.filter(({ outcome }) => outcome.status !== "skipped");
@@ -278,7 +277,7 @@ async function writeValues(component, parts) {
     );
     for (const { line, outcome } of parts) complete(outcome, results[outcome.name], line.change.text);
   } catch (error) {
-    // only a documented problem says that nothing was written
+    // only a documented problem: nothing was written
     const status = error.document?.type && error.status !== 500 ? "not tried" : "unknown";
     for (const { outcome } of parts) {
       outcome.status = status;

@@ -1,4 +1,4 @@
-/** The state of the page: vehicles, tables, staged and written changes. Contains no rendering. */
+/** The state of the page: vehicles, tables, staged and written changes. */
 
 import { AUTHOR, at, get } from "./api.js";
 import { meaningOf, sameText, textOf } from "./values.js";
@@ -16,7 +16,7 @@ const CACHED_PREFIX = "kept:";
 
 export const keyOf = (component) => `${component.link} ${component.system}/${component.component}`;
 
-/** One parameter as shown: the document of the service, and values derived from it. */
+/** One parameter: the document of the service, and derived values. */
 class Row {
   constructor(document) {
     this.news = null;
@@ -98,7 +98,7 @@ class Table {
     for (const event of early) this.change(event);
   }
 
-  /** Applies a change to the table; returns the row if it was changed, added or removed, or null. */
+  /** Applies a change; returns the row that was changed, added or removed, or null. */
   change(event) {
     if (!this.isLoaded) {
       this.early?.push(event); // without a load in progress, the next one includes the event
@@ -138,7 +138,7 @@ class Table {
   }
 }
 
-/** The whole state. Views subscribe with `on(kind, listener)`, which returns a function that unsubscribes. */
+/** The whole state. `on(kind, listener)` returns a function that unsubscribes. */
 class Store {
   constructor() {
     this.me = { role: "read", name: "", read_only: true };
@@ -178,7 +178,7 @@ class Store {
     return this.components.get(this.selected) ?? this.kept.get(this.selected) ?? null;
   }
 
-  /** Components in the cache that are on no link, the last heard first. */
+  /** Cached components that are on no link, the last heard first. */
   get unheard() {
     const heard = new Set([...this.components.values()].map((each) => `${each.component} ${each.key}`));
     return [...this.kept.values()].filter((each) => !heard.has(`${each.component} ${each.key}`));
@@ -218,7 +218,7 @@ class Store {
     await Promise.all([this.selected && this.loadTable(this.selected), this.loadKept()]);
   }
 
-  /** Loads the vehicles in the cache; a service without a cache has only connected ones. */
+  /** Loads the vehicles in the cache, if there is one. */
   async loadKept() {
     let vehicles = [];
     try {
@@ -259,7 +259,7 @@ class Store {
     if (key === this.selected) this.tell("table");
   }
 
-  /** Handles a failed load: the table stays, with later events applied, and is loaded again. */
+  /** After a failed load, the table stays, with later events applied, and is loaded again. */
   keepTable(key, mayWork) {
     const table = this.tableOf(key);
     table.keep();
@@ -341,7 +341,7 @@ class Store {
     this.reloading = setTimeout(() => this.loadTable(key).catch(() => {}), 150);
   }
 
-  /** Stages a value; a value equal to the vehicle's is removed from the staged ones. */
+  /** Stages a value; one equal to the vehicle's is removed. */
   stage(name, text, send) {
     const row = this.table.rows.get(name);
     if (!row) return;
@@ -362,7 +362,7 @@ class Store {
 
 const NO_TABLE = new Table();
 
-/** A selected component that the service has removed: the selection does not change without a user action. */
+/** A selected component that the service has removed: only the user changes the selection. */
 const asLost = (component) => ({ ...component, is_lost: true, is_armed: null, state: "lost", silence_s: 0, fetch: null });
 
 /** A cached component in the shape of a connected one: it can be viewed, not changed. */

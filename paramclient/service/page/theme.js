@@ -1,4 +1,4 @@
-// Runs before rendering: sets the dark or light theme, chosen by the user or the system.
+// Runs before rendering: sets the theme of the user or the system.
 (() => {
   const system = matchMedia("(prefers-color-scheme: dark)");
   const kept = () => {

@@ -84,8 +84,8 @@ export function textOfMask(mask, type) {
 }
 
 /**
- * Parses an input as a value of this type: `{text, send}`, where `send` is the value for the service, or `{error}` with
- * a sentence. Integers may be hexadecimal; a comma is a decimal point, as on many keyboards.
+ * Parses an input as a value of this type: `{text, send}`, where `send` is the value for the service, or `{error}`.
+ * Integers may be hexadecimal; a comma is a decimal point.
  */
 export function parse(written, type) {
   const text = written.trim();
@@ -111,7 +111,7 @@ export function parse(written, type) {
   return { text: numberText(Number(plain), type), send: Number(plain) };
 }
 
-/** Returns a warning about a value from its metadata; the vehicle decides. */
+/** Returns a warning about a value from its metadata. */
 export function warningOf(text, info, type) {
   if (!info) return "";
   const units = info.units ? ` ${info.units}` : "";
@@ -126,7 +126,7 @@ export function warningOf(text, info, type) {
   return "";
 }
 
-/** Returns whether two texts are the same value of this type; REAL32 values are rounded to float32. */
+/** Returns whether two texts are the same value of this type, REAL32 as float32. */
 export function sameText(a, b, type) {
   if (a === b) return true;
   if (isWhole(type) && /^-?\d+$/.test(a) && /^-?\d+$/.test(b)) return BigInt(a) === BigInt(b);

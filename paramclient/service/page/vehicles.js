@@ -20,7 +20,7 @@ const STATES = {
 };
 /** Timeout in milliseconds for saving a table that must be fetched first. */
 const SAVE_TIMEOUT = 180_000;
-/** Timeout in milliseconds for metadata: a file may have 100 kB, and a radio 2 kB per second. */
+/** Timeout in milliseconds for metadata: 100 kB at 2 kB per second. */
 const DESCRIPTION_TIMEOUT = 300_000;
 const KINDS = { new: "idle", cached: "warn", partial: "warn", synced: "good", fetching: "busy", contested: "bad", lost: "bad" };
 /** Display names of MAV_TYPE values of vehicles with parameters. */
@@ -44,7 +44,7 @@ const TYPES = {
 };
 const LINK_PROBLEMS = { away: "link away", failed: "link failed", opening: "link opening" };
 
-/** Returns the state of a component in words and as the kind of its dot. */
+/** Returns the state of a component in words, and the kind of its dot. */
 export function stateOf(component) {
   if (component.is_kept) return { text: `in the cache, heard last ${moment(component.last_seen)}`, kind: "idle" };
   const link = store.links.get(component.link)?.state ?? component.link_state ?? "open";
@@ -73,7 +73,7 @@ export function drawVehicles() {
   drawVehicle(component);
 }
 
-/** Renders cached vehicles separately: there may be hundreds, and they do not change. */
+/** Renders cached vehicles apart: there may be hundreds, which do not change. */
 function drawCached(unheard) {
   const box = byId("kept-box");
   const key = JSON.stringify([store.selected, unheard.map((each) => [keyOf(each), each.last_seen])]);
@@ -165,7 +165,7 @@ function drawFetch(component) {
   setText(byId("meter-text"), `${progressText(fetch)}${pace}`);
 }
 
-/** Returns the actions of a vehicle, created once for each role and for connected and cached vehicles. */
+/** Returns the actions of a vehicle, created once for each role and kind. */
 export function drawActions() {
   const isHeard = !store.component?.is_kept;
   const actions = [
@@ -201,7 +201,7 @@ async function fetchAll() {
   }
 }
 
-/** Loads parameter metadata, from the vehicle, which is slow over a radio, or from a file. */
+/** Loads metadata from the vehicle, which is slow over a radio, or from a file. */
 async function describe() {
   const { component } = store;
   const fault = el("p", { class: "fault", role: "alert" });
