@@ -12,7 +12,7 @@ from typing import Final
 
 from paramclient.errors import CacheError
 
-__all__ = ["LOCK_WAIT_MAX", "locked", "try_to_lock"]
+__all__ = ["LOCK_WAIT_MAX", "locked", "preload", "try_to_lock"]
 
 LOCK_WAIT_MAX: Final = 5.0
 """Timeout in seconds for a lock of another process. Transactions take milliseconds; a process that holds a
@@ -52,6 +52,11 @@ def try_to_lock(descriptor: int) -> bool:
     from filelock import lock_descriptor  # only here: it adds 10 ms to the import of paramclient
 
     return lock_descriptor(descriptor, blocking=False)
+
+
+def preload() -> None:
+    """Import what a lock needs, which takes much longer later, beside a busy event loop."""
+    import filelock  # noqa: F401 - only here: it adds 10 ms to the import of paramclient
 
 
 if sys.platform == "win32":

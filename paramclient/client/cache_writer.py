@@ -44,9 +44,14 @@ __all__ = ["CacheWriter", "choose_cache"]
 
 CACHE_FLUSH_INTERVAL: Final = 0.25
 """Seconds from a change to its commit, unless the computer is overloaded: changes are collected for this
-time, less the duration of the last commit. A download takes several batches."""
+time, less the expected duration of the commit. A download takes several batches."""
 COMMIT_RESERVE: Final = 0.04
-"""Seconds of `CACHE_FLUSH_INTERVAL` reserved for a commit that takes longer than the last one."""
+"""Seconds of `CACHE_FLUSH_INTERVAL` reserved for a commit that takes longer than expected."""
+FIRST_COMMIT_TIME: Final = 0.1
+"""Seconds that the first commit is expected to take beside a busy event loop: it creates the file."""
+COMMIT_TIME_DECAY: Final = 0.8
+"""Factor by which the expected duration of a commit decreases after a quicker one: beside a busy event loop,
+durations vary."""
 DOWNLOAD_INTERVAL: Final = 10.0
 """Seconds for which the values of a running fetch are collected, if more than `UNBATCHED_FETCHES_MAX` run.
 Most fetches end sooner, so that each table is written once; writing it in parts takes several times as long.
@@ -117,7 +122,7 @@ class CacheWriter:
         self._tables: dict[tuple[int, int], bool] = {}
         self._something_to_write = anyio.Event()
         self._waiting_since = -math.inf  # time at which that was set
-        self._commit_time = 0.0
+        self._commit_time = FIRST_COMMIT_TIME  # expected seconds
         self._loading: set[ComponentMachine] = set()
         self._vehicles: dict[tuple[int, int], set[str]] = {}  # keys of identities cached in this session
         self._has_refused = self._has_refused_same_identity = False
@@ -264,7 +269,7 @@ class CacheWriter:
             self._something_to_write = anyio.Event()
             begun_at = anyio.current_time()
             is_written = await self.flush(is_last=False)
-            self._commit_time = anyio.current_time() - begun_at
+            self._commit_time = max(anyio.current_time() - begun_at, self._commit_time * COMMIT_TIME_DECAY)
             if not is_written:
                 await anyio.sleep(RETRY_INTERVAL)
             if self.is_held_back or not is_written:

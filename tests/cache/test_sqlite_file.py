@@ -16,9 +16,10 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from functools import cache as cached
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -328,6 +329,47 @@ def test_the_wait_for_a_lock_can_be_limited_while_it_lasts(
             cache.save(update())
         other.execute("COMMIT")
         works(cache)
+
+
+def test_a_new_file_is_created_with_few_statements(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside a busy event loop each statement may take 5 ms, and values wait for all of them."""
+    statements: list[str] = []
+
+    class Counting(sqlite3.Connection):
+        def execute(self, sql: str, *values: Any) -> sqlite3.Cursor:
+            statements.append(sql)
+            return super().execute(sql, *values)
+
+    monkeypatch.setattr(sqlite_file.sqlite3, "connect", partial(sqlite3.connect, factory=Counting))
+    with ParamCache(path) as cache:
+        cache.components()  # as a client does when it opens
+        statements.clear()
+        cache.save(whole_table(3))
+        created = len(statements)
+        statements.clear()
+        cache.save(whole_table(3))
+    assert created - len(statements) < 15
+
+
+def test_a_new_file_that_another_program_locks_is_an_error(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """SQLite's backup would wait for ever."""
+    template = Database._template
+    monkeypatch.setattr(sqlite_file, "LOCK_WAIT_MAX", 0.05)
+    with ParamCache(path) as cache:
+        with ExitStack() as locks:
+
+            def locked_first(database: Database) -> sqlite3.Connection:
+                locks.enter_context(connect(path)).execute("BEGIN IMMEDIATE")
+                return template(database)
+
+            monkeypatch.setattr(Database, "_template", locked_first)
+            with pytest.raises(CacheError, match=rf"{path}.*locked"):
+                cache.save(whole_table(3))
+            monkeypatch.setattr(Database, "_template", template)
+        works(cache)
+        assert not cache.notes
 
 
 def test_a_write_begins_as_soon_as_the_lock_is_released(path: Path) -> None:
