@@ -262,8 +262,12 @@ class LinkTask:
             to_send = station.data_to_send()
             if to_send:
                 self._sent.set()
+            turn_ends = time.perf_counter() + TURN_MAX
             for data, peer in to_send:
                 await self._transmit(data, peer)
+                if time.perf_counter() >= turn_ends:  # a datagram is sent without yielding
+                    await anyio.lowlevel.checkpoint()
+                    turn_ends = time.perf_counter() + TURN_MAX
             for _ in range(min(len(self._forwarded), FORWARDED_PER_TURN)):
                 await self._transmit(self._forwarded.popleft(), None)
             if self._forwarded:
@@ -273,7 +277,7 @@ class LinkTask:
             is_behind = self._is_behind(now)
             if is_behind:
                 due = now + TURN_MAX
-            self._suspend.expect(due)
+            self._suspend.expect(max(due, now))  # a deadline may have passed while the sender was blocked
             self._due = due
             wait = due - now
             with anyio.move_on_after(None if wait == math.inf else max(wait, 0.0)):

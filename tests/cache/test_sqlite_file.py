@@ -340,7 +340,7 @@ def test_a_new_file_is_created_with_few_statements(path: Path, monkeypatch: pyte
             statements.append(sql)
             return super().execute(sql, *values)
 
-    monkeypatch.setattr(sqlite_file.sqlite3, "connect", partial(sqlite3.connect, factory=Counting))
+    monkeypatch.setattr(sqlite3, "connect", partial(sqlite3.connect, factory=Counting))
     with ParamCache(path) as cache:
         cache.components()  # as a client does when it opens
         statements.clear()

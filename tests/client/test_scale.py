@@ -26,6 +26,7 @@ from paramclient.client.cache_writer import DOWNLOAD_INTERVAL, NEW_SHARE_MIN
 from paramclient.client.fetch_all import FleetFetch
 from paramclient.client.link_task import LOOP_LATENCY_MIN, TIMEOUT_DELAY_MAX, LinkTask
 from paramclient.client.loop_scheduler import TURN_MAX
+from paramclient.client.suspend_detection import SUSPEND_MIN
 from paramclient.errors import NoReply
 from paramclient.links import Peer
 from paramclient.model.values import ParamType
@@ -439,6 +440,77 @@ async def test_time_outs_wait_for_what_waits_for_its_turn() -> None:
         await anyio.sleep(0.1)
         assert len(station.ticks) > before
         tasks.cancel_scope.cancel()
+
+
+@in_simulated_time
+async def test_many_frames_at_once_give_way_to_other_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A datagram is sent without yielding, and a fetch of many components queues a frame for each."""
+
+    class Clock:
+        now = 0.0
+
+        def perf_counter(self) -> float:
+            return self.now
+
+    class Counted(Flood):
+        async def send(self, data: bytes, peer: Peer | None) -> None:
+            clock.now += 0.001
+            happened.append("sent")
+
+    async def beside() -> None:
+        while True:
+            await anyio.lowlevel.checkpoint()
+            happened.append("another")
+
+    clock = Clock()
+    monkeypatch.setattr(link_task, "time", clock)
+    happened: list[str] = []
+    station = Watched()
+    frames: list[tuple[bytes, Peer | None]] = [(b"x", None)] * 100
+    monkeypatch.setattr(station, "data_to_send", lambda: [frames.pop() for _ in range(len(frames))])
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(beside)
+        await carry(Counted(), station, 0.1, lambda: None)
+        tasks.cancel_scope.cancel()
+    assert happened.count("sent") == 100
+    rounds = "".join(each[0] for each in happened).split("a")
+    assert max(map(len, rounds)) == round(TURN_MAX / 0.001)
+
+
+@in_simulated_time
+async def test_a_deadline_that_passed_while_the_sender_was_blocked_is_no_suspend() -> None:
+    """A slow serial link takes seconds to send; every request was sent again then."""
+
+    class Slow(Flood):
+        async def send(self, data: bytes, peer: Peer | None) -> None:
+            await anyio.sleep(SUSPEND_MIN + 1.0)
+
+    class Resumed(Watched):
+        def __init__(self) -> None:
+            super().__init__()
+            self.frames: list[tuple[bytes, Peer | None]] = [(b"x", None)]
+            self.due = anyio.current_time() + 0.5
+            self.resumed = 0
+
+        def tick(self, now: float) -> None:
+            super().tick(now)
+            if now >= self.due:
+                self.due = math.inf
+
+        def data_to_send(self) -> list[tuple[bytes, Peer | None]]:
+            frames, self.frames = self.frames, []
+            return frames
+
+        def next_deadline(self) -> float:
+            return self.due
+
+        def handle_suspend(self, unseen: float, now: float) -> None:
+            self.resumed += 1
+
+    station = Resumed()
+    await carry(Slow(), station, 10.0, lambda: None)
+    assert station.due == math.inf, "the passed deadline was handled"
+    assert not station.resumed
 
 
 @in_simulated_time
