@@ -435,8 +435,8 @@ async def large_table(rows: list[Row], quick: bool) -> None:
     asked: list[tuple[str, str, bytes]] = [
         ("GET", f"{C}/params", b""),
         ("GET", f"{C}/params?names=A1*", b""),
-        ("GET", f"{C}/file?from=known&form=parm", b""),
-        ("GET", f"{C}/file?form=parm", b""),
+        ("GET", f"{C}/file?from=known&format=parm", b""),
+        ("GET", f"{C}/file?format=parm", b""),
         ("POST", f"{C}/diff", as_json(values, known=True)),
         ("POST", f"{C}/diff", as_json(values, partial=True)),
         ("POST", f"{C}/plan", as_json(values)),

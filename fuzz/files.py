@@ -6,7 +6,7 @@ from typing import Final
 
 from fuzz.draw import Draw
 from paramclient.errors import FileError
-from paramclient.files import FileForm, ParamFile, dumps, loads
+from paramclient.files import FileFormat, ParamFile, dumps, loads
 
 __all__ = ["INPUT_SIZE_MAX", "run"]
 
@@ -14,27 +14,27 @@ INPUT_SIZE_MAX: Final = 1024
 """Maximum bytes of an input: longer ones are slow and find nothing new."""
 
 NAMES: Final = ("", "a.params", "a.parm", "a.param", "a.pck", "a.json", "a.yaml", "a.txt")
-WRITABLE: Final = tuple(form for form in FileForm if form is not FileForm.PX4_SCRIPT)
+WRITABLE: Final = tuple(form for form in FileFormat if form is not FileFormat.PX4_SCRIPT)
 
 
 def run(data: bytes) -> None:
     """Read a file: the first byte chooses its name and file format, all other bytes are the content."""
     draw = Draw(data)
     how = draw.number()
-    form = None if how & 8 else list(FileForm)[how % 7]
+    form = None if how & 8 else list(FileFormat)[how % 7]
     try:
-        held = loads(draw.rest(), source=NAMES[how >> 4 & 7], form=form)
+        held = loads(draw.rest(), source=NAMES[how >> 4 & 7], file_format=form)
     except FileError as error:
         assert str(error)
         return
     assert any(held.sets)
     for form in WRITABLE:
-        is_exact = form in (held.form, FileForm.JSON, FileForm.YAML)
+        is_exact = form in (held.file_format, FileFormat.JSON, FileFormat.YAML)
         try:
-            written = dumps(held, form=form)
+            written = dumps(held, file_format=form)
         except FileError:
             continue  # not every file format can hold every value
-        again = loads(written, source=NAMES[how >> 4 & 7], form=form)
+        again = loads(written, source=NAMES[how >> 4 & 7], file_format=form)
         assert _names(again) == _names(held), f"{form} has other parameters"
         if is_exact:
             assert _told(again) == _told(held), f"{form} says something else"

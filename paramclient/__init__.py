@@ -90,8 +90,8 @@ if TYPE_CHECKING:
         VehicleArmed,
         VehicleError,
     )
-    from paramclient.files import FileForm, ParamFile, read_file, read_renames, write_file
-    from paramclient.files.formats import LogForm
+    from paramclient.files import FileFormat, ParamFile, read_file, read_renames, write_file
+    from paramclient.files.formats import LogFormat
     from paramclient.model.comparison import (
         Comparison,
         Difference,
@@ -193,7 +193,7 @@ __all__ = [
     "FetchedAll",
     "FileError",
     "FileErrorCode",
-    "FileForm",
+    "FileFormat",
     "FileTransferError",
     "FirstValue",
     "FleetDiff",
@@ -208,7 +208,7 @@ __all__ = [
     "Identity",
     "InvalidParameters",
     "LinkError",
-    "LogForm",
+    "LogFormat",
     "Lost",
     "MessageTraffic",
     "MetadataError",
@@ -363,13 +363,13 @@ _HOMES: Final = {
         "VehicleError",
     ),
     "paramclient.files": (
-        "FileForm",
+        "FileFormat",
         "ParamFile",
         "read_file",
         "read_renames",
         "write_file",
     ),
-    "paramclient.files.formats": ("LogForm",),
+    "paramclient.files.formats": ("LogFormat",),
     "paramclient.model.comparison": (
         "Comparison",
         "Difference",

@@ -32,7 +32,7 @@ from paramclient.cli.targets import check_new
 from paramclient.cli.time_arguments import parse_when
 from paramclient.cli.watch_lines import HEX, ext_value_text, print_changes_and_events
 from paramclient.errors import CacheError, NoReply, NotInCache, UnknownParameter, UsageError
-from paramclient.files import FileForm
+from paramclient.files import FileFormat
 from paramclient.files.extended_document import is_extended_file, read_extended_file, write_extended_file
 from paramclient.model.ext_params import (
     ExtParam,
@@ -356,17 +356,25 @@ def show_extended(
     return ExitCode.DONE
 
 
-async def save_extended(where: str, file: Path, form: FileForm | None, options: LinkOptions) -> ExitCode:
+async def save_extended(
+    where: str, file: Path, file_format: FileFormat | None, options: LinkOptions
+) -> ExitCode:
     """Write extended parameters to a file. An incomplete table is not written."""
     content = await _source(where, options)
-    form = await anyio.to_thread.run_sync(lambda: write_extended_file(file, content, form=form))
+    file_format = await anyio.to_thread.run_sync(
+        lambda: write_extended_file(file, content, file_format=file_format)
+    )
     if options.json:
         from paramclient.documents.extended_output import ExtSavedDoc  # only here: loads pydantic
 
-        print_document(ExtSavedDoc.of(str(file), form, content))
+        print_document(ExtSavedDoc.of(str(file), file_format, content))
     else:
         whose = f"{content.system}/{content.component}"
-        say(printable(f"{len(content.params)} extended parameters of {whose} written to {file} ({form})"))
+        say(
+            printable(
+                f"{len(content.params)} extended parameters of {whose} written to {file} ({file_format})"
+            )
+        )
     return ExitCode.DONE
 
 

@@ -103,8 +103,8 @@ def _kind_of(path: Path) -> str | None:
     if begin.startswith(SQLITE_MAGIC):
         return "an SQLite database, and no log. `paramclient cache copy` copies a cache"
     with suppress(ParamClientError):
-        form = read_file(path).form
-        return f"a parameter file ({form}), and no log. `paramclient cache add VEHICLE {path}` adds it"
+        file_format = read_file(path).file_format
+        return f"a parameter file ({file_format}), and no log. `paramclient cache add VEHICLE {path}` adds it"
     with suppress(UnicodeDecodeError):
         begin.decode()
         return "a text file, and no log"

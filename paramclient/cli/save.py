@@ -30,7 +30,7 @@ from paramclient.cli.sources import check_link, choose, collect_confirmed, is_fi
 from paramclient.cli.targets import find_vehicles
 from paramclient.client.component import Component
 from paramclient.errors import UsageError
-from paramclient.files import FileForm, write_file
+from paramclient.files import FileFormat, write_file
 from paramclient.files.formats import format_of_name
 from paramclient.files.param_file import AUTOPILOT, address
 from paramclient.metadata import Metadata
@@ -43,7 +43,7 @@ from paramclient.provision.vehicle_params import NO_DEFAULTS, cached_param_set, 
 
 __all__ = ["save"]
 
-SaveForm: TypeAlias = Literal["qgc", "parm", "mission-planner", "pck", "json", "yaml"]
+SaveFormat: TypeAlias = Literal["qgc", "parm", "mission-planner", "pck", "json", "yaml"]
 """The file formats that can be written: all but PX4's start scripts."""
 
 _DEFAULTS: Final = LinkOptions()
@@ -54,7 +54,7 @@ async def save(
     file: Path,
     /,
     *,
-    form: SaveForm | None = None,
+    file_format: Annotated[SaveFormat | None, Parameter(name="--format")] = None,
     changed: bool = False,
     only: Annotated[tuple[str, ...], Parameter(show_default=False)] = (),
     all_: Annotated[bool, Parameter(name="--all")] = False,
@@ -74,7 +74,7 @@ async def save(
             at its end, or another parameter file; or a vehicle in the cache: 4 or 4/1, px4 or ardupilot, a
             nickname, its hardware id (in full, or uid: and at least 6 digits), or its key.
         file: The file. Its extension determines the file format: .params, .parm, .param, .pck, .json, .yaml.
-        form: The file format, if the extension does not determine it.
+        file_format: The file format, if the extension does not determine it.
         changed: Write only parameters that differ from the firmware's defaults: those of the vehicle, else
             those of its metadata.
         only: Write only this name or pattern, such as "MC_*". May be given several times.
@@ -91,10 +91,12 @@ async def save(
     if extended or (not (changed or all_ or refresh or only) and await is_extended_link(where, options)):
         if changed or all_ or only:
             raise UsageError("--changed, --only and --all are for plain parameters")
-        return await save_extended(where, file, None if form is None else FileForm(form), options)
+        return await save_extended(
+            where, file, None if file_format is None else FileFormat(file_format), options
+        )
     if metadata is not None and not changed:
         raise UsageError("--metadata gives the defaults for --changed")
-    written = format_of_name(str(file)) if form is None else FileForm(form)
+    written = format_of_name(str(file)) if file_format is None else FileFormat(file_format)
     if all_ and options.component is not None:
         raise UsageError("--all and --component exclude each other")
     if is_file(where):
@@ -117,7 +119,7 @@ async def save(
     files = _by_file(str(file), sets) if all_ else {file: sets}
     if sets:
         for path, each in files.items():
-            await anyio.to_thread.run_sync(partial(write_file, path, each, form=written))
+            await anyio.to_thread.run_sync(partial(write_file, path, each, file_format=written))
         _show(files, written, as_json=options.json)
     else:
         report(f"nothing was written to {file}")
@@ -287,13 +289,13 @@ def _by_file(pattern: str, sets: Sequence[ParamSet]) -> dict[Path, list[ParamSet
     return files
 
 
-def _show(files: Mapping[Path, Sequence[ParamSet]], form: FileForm, *, as_json: bool) -> None:
+def _show(files: Mapping[Path, Sequence[ParamSet]], file_format: FileFormat, *, as_json: bool) -> None:
     if as_json:
         from paramclient.documents.command_output import SavedDoc, SavedFilesDoc  # only here: loads pydantic
 
-        documents = [SavedDoc.of(str(file), form, sets) for file, sets in files.items()]
+        documents = [SavedDoc.of(str(file), file_format, sets) for file, sets in files.items()]
         print_document(documents[0] if len(documents) == 1 else SavedFilesDoc(files=documents))
         return
     for file, sets in files.items():
         contents = ", ".join(f"{counted(len(each), 'parameter')} of {address(each)}" for each in sets)
-        say(printable(f"{contents} written to {file} ({form})"))
+        say(printable(f"{contents} written to {file} ({file_format})"))

@@ -186,7 +186,7 @@ def open_file(path: str) -> ParamFile:
     """
     if is_onboard_log(path):
         log = read_onboard_log(path)
-        file = ParamFile((log.at_end(),), log.form, path, notes=log.notes)
+        file = ParamFile((log.at_end(),), log.file_format, path, notes=log.notes)
     else:
         file = read_file(path)
     for note in file.notes:

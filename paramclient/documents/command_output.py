@@ -389,19 +389,19 @@ class SavedSetDoc(Document):
 
 
 class SavedDoc(Document):
-    """A parameter file that was written; `form` is the file format."""
+    """A parameter file that was written; `format` is the file format."""
 
     path: str
-    form: str
+    format: str
     components: list[SavedSetDoc]
 
     @classmethod
-    def of(cls, path: str, form: str, sets: Iterable[ParamSet]) -> SavedDoc:
+    def of(cls, path: str, file_format: str, sets: Iterable[ParamSet]) -> SavedDoc:
         """Return the document of a file: its path, its format, and the sets in it."""
         components = [
             SavedSetDoc(system=each.system, component=each.component, params=len(each)) for each in sets
         ]
-        return cls(path=path, form=form, components=components)
+        return cls(path=path, format=file_format, components=components)
 
 
 class SavedFilesDoc(Document):

@@ -12,7 +12,7 @@ from paramclient.model.notation import time_text
 
 if TYPE_CHECKING:
     from paramclient.cache import ExtHistoryEntry
-    from paramclient.files import FileForm
+    from paramclient.files import FileFormat
     from paramclient.model.ext_paramset import ExtParamSet
     from paramclient.protocol.ext.change import ExtChange
     from paramclient.protocol.ext.fetch import ExtFetchResult
@@ -212,9 +212,13 @@ class ExtSavedDoc(Document):
     count: int
 
     @classmethod
-    def of(cls, file: str, form: FileForm, content: ExtParamSet) -> ExtSavedDoc:
+    def of(cls, file: str, file_format: FileFormat, content: ExtParamSet) -> ExtSavedDoc:
         """Return the document of a written file."""
         count = len(content.params)
         return cls(
-            file=file, format=form.value, system=content.system, component=content.component, count=count
+            file=file,
+            format=file_format.value,
+            system=content.system,
+            component=content.component,
+            count=count,
         )

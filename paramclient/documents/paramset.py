@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from paramclient.documents.document import Document
 from paramclient.documents.param import WrittenParamDoc
-from paramclient.files.formats import ENDINGS, WRITABLE, FileForm
+from paramclient.files.formats import ENDINGS, WRITABLE, FileFormat
 from paramclient.model.identity import autopilot_name
 from paramclient.model.notation import time_or_none
 
@@ -65,10 +65,10 @@ class SetDoc(OriginDoc):
 
 
 class FileDoc(Document):
-    """The content of a parameter file: a set for each component. `form` is the file format."""
+    """The content of a parameter file: a set for each component. `format` is the file format."""
 
     file: str
-    form: str
+    format: str
     components: list[SetDoc]
 
     @classmethod
@@ -86,18 +86,18 @@ class FileDoc(Document):
             sources: of each set, the origins of its defaults by name, if they are to be included.
         """
         shown = zip_longest(file.sets if sets is None else sets, sources)
-        return cls(file=file.source, form=file.form, components=[SetDoc.of(*each) for each in shown])
+        return cls(file=file.source, format=file.file_format, components=[SetDoc.of(*each) for each in shown])
 
 
 class UploadedDoc(Document):
     """The content of an uploaded parameter file.
 
-    `form` is the file format, `notes` are remarks for the user, `components` the origins of the sets in the
+    `format` is the file format, `notes` are remarks for the user, `components` the origins of the sets in the
     file, `params` the parameters of the chosen set.
     """
 
     file: str
-    form: str
+    format: str
     notes: list[str]
     components: list[OriginDoc]
     params: dict[str, WrittenParamDoc]
@@ -107,7 +107,7 @@ class UploadedDoc(Document):
         """Return the document of a file and the set chosen from it."""
         return cls(
             file=file.source,
-            form=file.form,
+            format=file.file_format,
             notes=list(file.notes),
             components=[OriginDoc.of(each) for each in file.sets],
             params={name: WrittenParamDoc.of(param) for name, param in chosen.items()},
@@ -123,29 +123,29 @@ class FormatDoc(Document):
     writes: bool
 
     @classmethod
-    def of(cls, form: FileForm) -> FormatDoc:
+    def of(cls, file_format: FileFormat) -> FormatDoc:
         """Return the document of a file format."""
         return cls(
-            name=form.value,
-            title=_TITLES[form],
-            endings=[ending for ending, each in ENDINGS.items() if each is form],
-            writes=form in WRITABLE,
+            name=file_format.value,
+            title=_TITLES[file_format],
+            endings=[ending for ending, each in ENDINGS.items() if each is file_format],
+            writes=file_format in WRITABLE,
         )
 
 
 class FormatsDoc(Document):
     """The formats of parameter files."""
 
-    forms: list[FormatDoc]
+    formats: list[FormatDoc]
 
 
 _TITLES: Final = {
-    FileForm.QGC: "QGroundControl",
-    FileForm.PARM: "MAVProxy, ArduPilot",
-    FileForm.MISSION_PLANNER: "Mission Planner",
-    FileForm.PCK: "Packed file of a vehicle",
-    FileForm.PX4_SCRIPT: "Start script of PX4",
-    FileForm.JSON: "paramclient, JSON",
-    FileForm.YAML: "paramclient, YAML",
+    FileFormat.QGC: "QGroundControl",
+    FileFormat.PARM: "MAVProxy, ArduPilot",
+    FileFormat.MISSION_PLANNER: "Mission Planner",
+    FileFormat.PCK: "Packed file of a vehicle",
+    FileFormat.PX4_SCRIPT: "Start script of PX4",
+    FileFormat.JSON: "paramclient, JSON",
+    FileFormat.YAML: "paramclient, YAML",
 }
 """The title of each file format for users: the programs that use it."""

@@ -10,13 +10,13 @@
 
 from paramclient.files.conversion import LARGEST_FILE, dumps, loads
 from paramclient.files.disk import read_file, write_file
-from paramclient.files.formats import FileForm
+from paramclient.files.formats import FileFormat
 from paramclient.files.param_file import ParamFile
 from paramclient.files.rename_file import loads_renames, read_renames
 
 __all__ = [
     "LARGEST_FILE",
-    "FileForm",
+    "FileFormat",
     "ParamFile",
     "dumps",
     "loads",

@@ -8,7 +8,7 @@ from typing import Final, TypeAlias
 
 from paramclient.errors import FileError, UsageError
 from paramclient.files import document_format, line_formats, param_pck, script
-from paramclient.files.formats import ENDINGS, FileForm, parse_format
+from paramclient.files.formats import ENDINGS, FileFormat, parse_format
 from paramclient.files.includes import Includes
 from paramclient.files.param_file import AUTOPILOT, ParamFile, address
 from paramclient.files.text import decode_text, lines_of, time_of
@@ -31,7 +31,7 @@ def loads(
     data: bytes,
     *,
     source: str = "",
-    form: FileForm | str | None = None,
+    file_format: FileFormat | str | None = None,
     includes: Includes | None = None,
     params_max: int | None = None,
 ) -> ParamFile:
@@ -44,7 +44,7 @@ def loads(
     Args:
         data: the complete file.
         source: the file's name, for errors and `ParamSet.source`.
-        form: the format; None to detect it.
+        file_format: the format; None to detect it.
         includes: reads the files of `@include` lines; None rejects such lines, as bytes have no folder.
         params_max: maximum number of parameters; None for any. A longer file is not read to its end.
 
@@ -53,35 +53,35 @@ def loads(
         FileError: unknown format, damaged, or without parameters. The error names up to 20 bad lines.
         UsageError: unknown format name.
     """
-    form = None if form is None else parse_format(form)
+    file_format = None if file_format is None else parse_format(file_format)
     if len(data) > LARGEST_FILE:
         raise FileError(f"a parameter file has at most {LARGEST_FILE} bytes", source=source)
     if not data:
         raise FileError("the file is empty", source=source)
-    if form is FileForm.PCK or (form is None and param_pck.is_packed(data)):
+    if file_format is FileFormat.PCK or (file_format is None and param_pck.is_packed(data)):
         return param_pck.read_packed(data, source)
     text = decode_text(data, source)
-    form = form or _form_of(text, source)
-    match form:
-        case FileForm.QGC:
+    file_format = file_format or _format_of(text, source)
+    match file_format:
+        case FileFormat.QGC:
             return line_formats.read_qgc(text, source, params_max)
-        case FileForm.PX4_SCRIPT:
+        case FileFormat.PX4_SCRIPT:
             return script.read_script(text, source, params_max)
-        case FileForm.JSON:
+        case FileFormat.JSON:
             return document_format.read_json(text, source, params_max)
-        case FileForm.YAML:
+        case FileFormat.YAML:
             return document_format.read_yaml(text, source, params_max)
         case _:
-            return line_formats.read_pairs(text, form, source, includes, params_max)
+            return line_formats.read_pairs(text, file_format, source, includes, params_max)
 
 
-def dumps(content: Content, *, form: FileForm | str | None = None, target: str = "") -> bytes:
+def dumps(content: Content, *, file_format: FileFormat | str | None = None, target: str = "") -> bytes:
     """Return the bytes of a parameter file.
 
     Args:
         content: the content to write. A `ParamFile` keeps its header, footer and comments if the format
             supports them; other content gets a header that names the vehicle.
-        form: the format; None for that of a `ParamFile`.
+        file_format: the format; None for that of a `ParamFile`.
         target: the name of the target file, for errors.
 
     Raises:
@@ -89,76 +89,78 @@ def dumps(content: Content, *, form: FileForm | str | None = None, target: str =
             parameters.
         UsageError: unknown format, or none given.
     """
-    if form is None and isinstance(content, ParamFile):
-        form = content.form
-    if form is None:
+    if file_format is None and isinstance(content, ParamFile):
+        file_format = content.file_format
+    if file_format is None:
         raise UsageError("give the format in which to write the parameters")
-    form = parse_format(form)
+    file_format = parse_format(file_format)
     try:
-        around = _as_file(content, form)
+        around = _as_file(content, file_format)
         sets = [each for each in around.sets if each]
-        return _bytes(sets, form, around)
+        return _bytes(sets, file_format, around)
     except UsageError as error:
         raise FileError(str(error), source=target) from error
 
 
-def _bytes(sets: list[ParamSet], form: FileForm, around: ParamFile) -> bytes:
+def _bytes(sets: list[ParamSet], file_format: FileFormat, around: ParamFile) -> bytes:
     if not sets:
         raise UsageError("there are no parameters to write")
-    if len(sets) > 1 and form in (FileForm.PARM, FileForm.MISSION_PLANNER, FileForm.PCK):
+    if len(sets) > 1 and file_format in (FileFormat.PARM, FileFormat.MISSION_PLANNER, FileFormat.PCK):
         components = ", ".join(map(address, sets))
-        raise UsageError(f"the format {form} holds one component, and there are {components}; choose one")
+        raise UsageError(
+            f"the format {file_format} holds one component, and there are {components}; choose one"
+        )
     _check(sets)
-    match form:
-        case FileForm.PCK:
+    match file_format:
+        case FileFormat.PCK:
             return param_pck.write_packed(sets[0])
-        case FileForm.PX4_SCRIPT:
+        case FileFormat.PX4_SCRIPT:
             raise UsageError("PX4 start scripts can be read but not written")
-        case FileForm.QGC:
+        case FileFormat.QGC:
             lines = line_formats.write_qgc(sets, around)
-        case FileForm.JSON:
+        case FileFormat.JSON:
             lines = document_format.write_json(sets, around)
-        case FileForm.YAML:
+        case FileFormat.YAML:
             lines = document_format.write_yaml(sets, around)
         case _:
-            lines = line_formats.write_pairs(sets, form, around)
+            lines = line_formats.write_pairs(sets, file_format, around)
     return "".join(f"{line}\n" for line in lines).encode("utf-8", "backslashreplace")
 
 
-def _form_of(text: str, source: str) -> FileForm:
+def _format_of(text: str, source: str) -> FileFormat:
     """Return the format of a text.
 
     Raises:
         FileError: the text has no line with content.
     """
     if text.lstrip().startswith("{"):  # it may be one line of megabytes, in which no comment is sought
-        return FileForm.JSON
+        return FileFormat.JSON
     first = next((line for line in lines_of(text) if line.text), None)
     if first is None:
         raise FileError("the file contains no parameters", source=source)
     if first.text.startswith("{"):
-        return FileForm.JSON  # behind comments
+        return FileFormat.JSON  # behind comments
     if line_formats.is_qgc_row(first.text):
-        return FileForm.QGC
+        return FileFormat.QGC
     if any(script.is_script_line(line.text) for line in lines_of(text)):
-        return FileForm.PX4_SCRIPT
+        return FileFormat.PX4_SCRIPT
     if document_format.is_document(first.text):
-        return FileForm.YAML
+        return FileFormat.YAML
     named = ENDINGS.get(PurePath(source).suffix.lower())
-    if named in (FileForm.PARM, FileForm.MISSION_PLANNER):
+    if named in (FileFormat.PARM, FileFormat.MISSION_PLANNER):
         return named
-    if named in (FileForm.QGC, FileForm.JSON, FileForm.YAML) and not line_formats.is_pair(first.text):
+    if named in (FileFormat.QGC, FileFormat.JSON, FileFormat.YAML) and not line_formats.is_pair(first.text):
         return named  # no other format is possible, and reading gives the error for this one
-    return FileForm.MISSION_PLANNER if "," in first.text else FileForm.PARM
+    return FileFormat.MISSION_PLANNER if "," in first.text else FileFormat.PARM
 
 
-def _as_file(content: Content, form: FileForm) -> ParamFile:
+def _as_file(content: Content, file_format: FileFormat) -> ParamFile:
     if isinstance(content, ParamFile):
         return content
     sets = (content,) if isinstance(content, ParamSet) else tuple(content)
-    if form in (FileForm.JSON, FileForm.YAML):
-        return ParamFile(sets, form)  # the document has fields for the header's facts
-    return ParamFile(sets, form, header=tuple(line for each in sets for line in _header_lines(each)))
+    if file_format in (FileFormat.JSON, FileFormat.YAML):
+        return ParamFile(sets, file_format)  # the document has fields for the header's facts
+    return ParamFile(sets, file_format, header=tuple(line for each in sets for line in _header_lines(each)))
 
 
 def _header_lines(params: ParamSet) -> Iterator[str]:

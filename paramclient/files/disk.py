@@ -13,7 +13,7 @@ from typing import Final
 
 from paramclient.errors import FileError
 from paramclient.files.conversion import LARGEST_FILE, dumps, loads
-from paramclient.files.formats import FileForm, format_of_name, parse_format
+from paramclient.files.formats import FileFormat, format_of_name, parse_format
 from paramclient.files.includes import Includes
 from paramclient.files.param_file import ParamFile
 from paramclient.model.paramset import ParamSet
@@ -29,7 +29,7 @@ _NEW_FILE_MODE: Final = 0o666
 """Mode of a new file, before the user's umask."""
 
 
-def read_file(path: str | os.PathLike[str], *, form: FileForm | str | None = None) -> ParamFile:
+def read_file(path: str | os.PathLike[str], *, file_format: FileFormat | str | None = None) -> ParamFile:
     """Read a parameter file of any supported format. Blocks until the disk has delivered it.
 
     A list in MAVProxy's or Mission Planner's format may include others with `@include FILE`. The path is
@@ -38,7 +38,7 @@ def read_file(path: str | os.PathLike[str], *, form: FileForm | str | None = Non
 
     Args:
         path: the file.
-        form: the format; None to detect it from the content (see `loads`).
+        file_format: the format; None to detect it from the content (see `loads`).
 
     Raises:
         FileError: the file cannot be read, is too large, has no known format or is damaged. Nothing is
@@ -46,9 +46,14 @@ def read_file(path: str | os.PathLike[str], *, form: FileForm | str | None = Non
         UsageError: unknown format.
     """
     source = os.fspath(path)
-    form = None if form is None else parse_format(form)
+    file_format = None if file_format is None else parse_format(file_format)
     data = read_bytes(source)
-    return loads(data, source=source, form=form, includes=Includes.of(source, _read, size_max=LARGEST_FILE))
+    return loads(
+        data,
+        source=source,
+        file_format=file_format,
+        includes=Includes.of(source, _read, size_max=LARGEST_FILE),
+    )
 
 
 def read_bytes(source: str) -> bytes:
@@ -71,8 +76,8 @@ def write_file(
     path: str | os.PathLike[str],
     content: ParamFile | ParamSet | Iterable[ParamSet],
     *,
-    form: FileForm | str | None = None,
-) -> FileForm:
+    file_format: FileFormat | str | None = None,
+) -> FileFormat:
     """Write a parameter file, and replace an existing one atomically. Blocks until the file is on disk.
 
     The old file stays unchanged until the new one is completely on disk, and also if writing fails. The mode
@@ -81,7 +86,7 @@ def write_file(
     Args:
         path: the file.
         content: a file as read, the parameters of one component, or of several.
-        form: the format; None to choose it by the file extension.
+        file_format: the format; None to choose it by the file extension.
 
     Returns:
         The format of the written file.
@@ -91,10 +96,10 @@ def write_file(
         UsageError: unknown format.
     """
     source = os.fspath(path)
-    form = format_of_name(source) if form is None else parse_format(form)
-    data = dumps(content, form=form, target=source)
+    file_format = format_of_name(source) if file_format is None else parse_format(file_format)
+    data = dumps(content, file_format=file_format, target=source)
     replace_file(source, data)
-    return form
+    return file_format
 
 
 def replace_file(source: str, data: bytes) -> None:

@@ -20,7 +20,7 @@ from importlib.util import find_spec
 from typing import Any, Final, NoReturn
 
 from paramclient.errors import FileError, UsageError
-from paramclient.files.formats import FileForm
+from paramclient.files.formats import FileFormat
 from paramclient.files.param_file import ParamFile
 from paramclient.files.text import excerpt, is_plain, time_of
 from paramclient.model.paramset import ParamSet, WrittenParam
@@ -63,7 +63,7 @@ def read_json(text: str, source: str, params_max: int | None = None) -> ParamFil
     Raises:
         FileError: invalid JSON, a repeated key, or not a valid document.
     """
-    return _file(parse_json(text, source), FileForm.JSON, source, text, params_max)
+    return _file(parse_json(text, source), FileFormat.JSON, source, text, params_max)
 
 
 def parse_json(text: str, source: str) -> object:
@@ -104,7 +104,7 @@ def read_yaml(text: str, source: str, params_max: int | None = None) -> ParamFil
     Raises:
         FileError: invalid YAML, a repeated key, or not a valid document; or PyYAML is not installed.
     """
-    return _file(parse_yaml(text, source), FileForm.YAML, source, text, params_max)
+    return _file(parse_yaml(text, source), FileFormat.YAML, source, text, params_max)
 
 
 def parse_yaml(text: str, source: str) -> object:
@@ -172,7 +172,9 @@ def write_yaml(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
             yield f"      {yaml_key(param.name)}: {yaml_flow(_fields(param))}"
 
 
-def _file(content: object, form: FileForm, source: str, text: str, params_max: int | None) -> ParamFile:
+def _file(
+    content: object, file_format: FileFormat, source: str, text: str, params_max: int | None
+) -> ParamFile:
     from paramclient.files.document_schema import InvalidDocument, parse  # imported here: loads pydantic
 
     if isinstance(content, dict) and "paramclient_extended" in content:
@@ -188,7 +190,7 @@ def _file(content: object, form: FileForm, source: str, text: str, params_max: i
         raise FileError(what, source=source, line=line, more=tuple(more)) from None
     if not any(sets):
         raise FileError("the file contains no parameters", source=source)
-    return ParamFile(sets, form, source, header)
+    return ParamFile(sets, file_format, source, header)
 
 
 def _problem(place: Sequence[str | int], what: str, text: str) -> tuple[int | None, str]:

@@ -22,7 +22,7 @@ from paramclient.errors import FileError, UsageError
 from paramclient.files.conversion import LARGEST_FILE
 from paramclient.files.disk import read_bytes, replace_file
 from paramclient.files.document_format import parse_json, parse_yaml, yaml_flow, yaml_key
-from paramclient.files.formats import FileForm, format_of_name
+from paramclient.files.formats import FileFormat, format_of_name
 from paramclient.files.text import decode_text, time_of
 from paramclient.model.ext_params import (
     EXT_VALUE_SIZE,
@@ -43,7 +43,7 @@ VERSION_KEY: Final = "paramclient_extended"
 """The key that marks such a document; its value is the version of the format."""
 EXT_VERSION: Final = 1
 """Version of the format, written to documents and required in documents that are read."""
-EXT_FORMS: Final = (FileForm.JSON, FileForm.YAML)
+EXT_FORMATS: Final = (FileFormat.JSON, FileFormat.YAML)
 """The formats that can hold extended parameters."""
 
 _marked: Final = re.compile(rb"""\A\s*(?:---\s*)?\{?\s*["']?paramclient_extended["']?\s*:""").match
@@ -85,14 +85,14 @@ def read_extended_file(path: str | os.PathLike[str]) -> ExtParamSet:
 
 
 def write_extended_file(
-    path: str | os.PathLike[str], content: ExtParamSet, *, form: FileForm | None = None
-) -> FileForm:
+    path: str | os.PathLike[str], content: ExtParamSet, *, file_format: FileFormat | None = None
+) -> FileFormat:
     """Write a file of extended parameters, and replace an existing one atomically.
 
     Args:
         path: the file.
         content: the parameters.
-        form: the format; None to choose it by the file extension.
+        file_format: the format; None to choose it by the file extension.
 
     Returns:
         The format of the written file.
@@ -102,17 +102,17 @@ def write_extended_file(
             parameters, or writing failed.
     """
     source = os.fspath(path)
-    form = format_of_name(source) if form is None else form
-    if form not in EXT_FORMS:
+    file_format = format_of_name(source) if file_format is None else file_format
+    if file_format not in EXT_FORMATS:
         raise FileError(
-            f"the format {form} cannot hold extended parameters; write .json or .yaml", source=source
+            f"the format {file_format} cannot hold extended parameters; write .json or .yaml", source=source
         )
     if not content.params:
         raise FileError("there are no parameters to write", source=source)
-    lines = _json_lines(content) if form is FileForm.JSON else _yaml_lines(content)
+    lines = _json_lines(content) if file_format is FileFormat.JSON else _yaml_lines(content)
     data = "".join(f"{line}\n" for line in lines).encode()
     replace_file(source, data)
-    return form
+    return file_format
 
 
 def _head(content: ExtParamSet) -> dict[str, object]:

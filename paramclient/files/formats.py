@@ -1,4 +1,4 @@
-"""FileForm: the supported file formats, and their file extensions.
+"""FileFormat: the supported file formats, and their file extensions.
 
 `conversion` detects the format of a file, and calls its parser:
 
@@ -6,7 +6,7 @@
 - `param_pck`: PCK.
 - `script`: PX4_SCRIPT.
 - `document_format`: JSON and YAML. `extended_document` parses files of extended parameters.
-- `paramclient.logs.onboard`: on-board logs (`LogForm`).
+- `paramclient.logs.onboard`: on-board logs (`LogFormat`).
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from typing import Final
 
 from paramclient.errors import FileError, UsageError
 
-__all__ = ["ENDINGS", "FileForm", "LogForm", "WRITABLE", "format_of_name", "parse_format"]
+__all__ = ["ENDINGS", "FileFormat", "LogFormat", "WRITABLE", "format_of_name", "parse_format"]
 
 
-class FileForm(StrEnum):
+class FileFormat(StrEnum):
     """Formats in which ground stations and autopilots store parameters."""
 
     QGC = "qgc"
@@ -40,11 +40,11 @@ class FileForm(StrEnum):
     """paramclient's own format as YAML, for editing by hand. Reading it needs PyYAML."""
 
 
-WRITABLE: Final = tuple(form for form in FileForm if form is not FileForm.PX4_SCRIPT)
+WRITABLE: Final = tuple(file_format for file_format in FileFormat if file_format is not FileFormat.PX4_SCRIPT)
 """Formats that can be written."""
 
 
-class LogForm(StrEnum):
+class LogFormat(StrEnum):
     """Formats of on-board logs, which `paramclient.logs` reads. None of them can be written."""
 
     DATAFLASH = "dataflash"
@@ -54,44 +54,46 @@ class LogForm(StrEnum):
 
 
 ENDINGS: Final = {
-    ".params": FileForm.QGC,
-    ".parm": FileForm.PARM,
-    ".param": FileForm.MISSION_PLANNER,
-    ".pck": FileForm.PCK,
-    ".json": FileForm.JSON,
-    ".yaml": FileForm.YAML,
-    ".yml": FileForm.YAML,
+    ".params": FileFormat.QGC,
+    ".parm": FileFormat.PARM,
+    ".param": FileFormat.MISSION_PLANNER,
+    ".pck": FileFormat.PCK,
+    ".json": FileFormat.JSON,
+    ".yaml": FileFormat.YAML,
+    ".yml": FileFormat.YAML,
 }
 """Formats by file extension, in lower case."""
 
 
-def parse_format(form: FileForm | str) -> FileForm:
+def parse_format(file_format: FileFormat | str) -> FileFormat:
     """Return the format with this name.
 
     Raises:
         UsageError: there is no such format.
     """
     try:
-        return FileForm(form)
+        return FileFormat(file_format)
     except ValueError:
-        raise UsageError(f"unknown file format {form!r}; the formats are {_listed(FileForm)}") from None
+        raise UsageError(
+            f"unknown file format {file_format!r}; the formats are {_listed(FileFormat)}"
+        ) from None
 
 
-def format_of_name(name: str) -> FileForm:
+def format_of_name(name: str) -> FileFormat:
     """Return the format for the extension of a file's name.
 
     Raises:
         FileError: the extension is unknown.
     """
     ending = PurePath(name).suffix.lower()
-    form = ENDINGS.get(ending)
-    if form is None:
+    file_format = ENDINGS.get(ending)
+    if file_format is None:
         raise FileError(
             f"unknown file extension {ending!r}. Choose a format ({_listed(WRITABLE)}), or one of the "
             f"extensions {_listed(ENDINGS)}",
             source=name,
         )
-    return form
+    return file_format
 
 
 def _listed(names: Iterable[str]) -> str:

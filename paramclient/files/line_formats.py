@@ -17,7 +17,7 @@ from fnmatch import fnmatchcase
 from typing import Final
 
 from paramclient.errors import FileError, UsageError
-from paramclient.files.formats import FileForm
+from paramclient.files.formats import FileFormat
 from paramclient.files.includes import Includes
 from paramclient.files.param_file import AUTOPILOT, ParamFile, TooManyParams
 from paramclient.files.text import (
@@ -89,7 +89,7 @@ class _Lines:
 
 def read_pairs(
     text: str,
-    form: FileForm,
+    file_format: FileFormat,
     source: str,
     includes: Includes | None = None,
     params_max: int | None = None,
@@ -103,7 +103,7 @@ def read_pairs(
 
     Args:
         text: the content.
-        form: which of the two formats the file has.
+        file_format: which of the two formats the file has.
         source: the file's name, for errors.
         includes: reads the files of `@include` lines; None for bytes without a file on disk.
         params_max: as for `Builder`.
@@ -113,17 +113,17 @@ def read_pairs(
     """
     problems = Problems(source)
     lines = _Lines(params_max=params_max)
-    header, footer = _read_lines(text, form, lines, problems, includes, is_included=False)
+    header, footer = _read_lines(text, file_format, lines, problems, includes, is_included=False)
     builder = Builder(problems, params_max)
     for param, place in lines.params:
         builder.add(param, place=place)
     sets = builder.result()
-    return ParamFile(sets, form, source, header, footer, (*lines.notes, *builder.notes))
+    return ParamFile(sets, file_format, source, header, footer, (*lines.notes, *builder.notes))
 
 
 def _read_lines(
     text: str,
-    form: FileForm,
+    file_format: FileFormat,
     lines: _Lines,
     problems: Problems,
     includes: Includes | None,
@@ -131,7 +131,7 @@ def _read_lines(
     is_included: bool,
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Add the parameters of one file to `lines`, and its bad lines to `problems`."""
-    expected = "NAME,VALUE" if form is FileForm.MISSION_PLANNER else "NAME VALUE"
+    expected = "NAME,VALUE" if file_format is FileFormat.MISSION_PLANNER else "NAME VALUE"
 
     def include(line: TextLine, path: str) -> None:
         try:
@@ -140,7 +140,7 @@ def _read_lines(
             found = includes.follow(path)
             inner = _Lines(params_max=lines.params_max)
             problems_inside = Problems(found.source)
-            _read_lines(found.text, form, inner, problems_inside, found.includes, is_included=True)
+            _read_lines(found.text, file_format, inner, problems_inside, found.includes, is_included=True)
             problems_inside.raise_if_any()
             lines.params += inner.params
             lines.notes += inner.notes
@@ -181,18 +181,18 @@ def _read_lines(
     return _read_commented_lines(text, take)
 
 
-def write_pairs(sets: Sequence[ParamSet], form: FileForm, around: ParamFile) -> Iterator[str]:
+def write_pairs(sets: Sequence[ParamSet], file_format: FileFormat, around: ParamFile) -> Iterator[str]:
     """Generate the lines of a file with a name and a value on each line.
 
     Args:
         sets: one set, as the format has no components.
-        form: decides the separator: a comma for Mission Planner, else a space.
+        file_format: decides the separator: a comma for Mission Planner, else a space.
         around: for header and footer.
 
     Raises:
         UsageError: the format cannot express a name or a value.
     """
-    comma = "," if form is FileForm.MISSION_PLANNER else " "
+    comma = "," if file_format is FileFormat.MISSION_PLANNER else " "
     rows = ((param, f"{_pair_name(param)}{comma}{value_text(param)}") for param in sets[0].values())
     yield from _with_comments(around.header, rows, around.footer)
 
@@ -232,7 +232,7 @@ def read_qgc(text: str, source: str, params_max: int | None = None) -> ParamFile
         builder.add(param, system=system, component=component)
 
     header, footer = _read_commented_lines(text, take)
-    return ParamFile(builder.result(), FileForm.QGC, source, header, footer, tuple(builder.notes))
+    return ParamFile(builder.result(), FileFormat.QGC, source, header, footer, tuple(builder.notes))
 
 
 def write_qgc(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:

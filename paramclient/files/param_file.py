@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from paramclient.errors import FileError
-from paramclient.files.formats import FileForm, LogForm
+from paramclient.files.formats import FileFormat, LogFormat
 from paramclient.model.paramset import ParamSet
 
 __all__ = ["AUTOPILOT", "ParamFile", "TooManyParams", "address"]
@@ -21,7 +21,7 @@ class ParamFile:
 
     Attributes:
         sets: the parameters, one set per component, in the order of the file.
-        form: the format.
+        file_format: the format.
         source: the file's name, as given.
         header: the comment lines at the top, without comment characters.
         footer: the comment lines after the last parameter. All others belong to the parameter below them.
@@ -29,7 +29,7 @@ class ParamFile:
     """
 
     sets: tuple[ParamSet, ...]
-    form: FileForm | LogForm
+    file_format: FileFormat | LogFormat
     source: str = ""
     header: tuple[str, ...] = ()
     footer: tuple[str, ...] = ()
@@ -62,7 +62,7 @@ class ParamFile:
 
     def __repr__(self) -> str:
         description = ", ".join(f"{address(each)}: {len(each)}" for each in self.sets)
-        return f"<ParamFile {self.source or 'unnamed'} {self.form} {description}>"
+        return f"<ParamFile {self.source or 'unnamed'} {self.file_format} {description}>"
 
 
 class TooManyParams(FileError):

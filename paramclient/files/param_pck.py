@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from paramclient.errors import FileError, PackError, UsageError
-from paramclient.files.formats import FileForm
+from paramclient.files.formats import FileFormat
 from paramclient.files.param_file import ParamFile
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, bits_of, from_bits, same_bits, type_name
@@ -46,7 +46,7 @@ def read_packed(data: bytes, source: str) -> ParamFile:
         if default is not None:
             given = from_bits(default, kind)
         params[name] = WrittenParam(name, value, kind, given)
-    return ParamFile((ParamSet(params, source=source),), FileForm.PCK, source, notes=tuple(notes))
+    return ParamFile((ParamSet(params, source=source),), FileFormat.PCK, source, notes=tuple(notes))
 
 
 def write_packed(params: ParamSet) -> bytes:

@@ -12,7 +12,7 @@ import re
 from typing import Final
 
 from paramclient.errors import UsageError
-from paramclient.files.formats import FileForm
+from paramclient.files.formats import FileFormat
 from paramclient.files.param_file import ParamFile, TooManyParams
 from paramclient.files.text import Builder, Problems, TextLine, excerpt, lines_of, parse_number
 from paramclient.model.paramset import WrittenParam
@@ -89,7 +89,7 @@ def read_script(text: str, source: str, params_max: int | None = None) -> ParamF
     sets = builder.result()
     if skipped:
         builder.notes.append(_skipped_note(skipped, left_out))
-    return ParamFile(sets, FileForm.PX4_SCRIPT, source, tuple(header), tuple(waiting), tuple(builder.notes))
+    return ParamFile(sets, FileFormat.PX4_SCRIPT, source, tuple(header), tuple(waiting), tuple(builder.notes))
 
 
 class _Flow:

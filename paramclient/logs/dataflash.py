@@ -16,7 +16,7 @@ from typing import Any, Final
 from pymavlink.DFReader import DFReader_binary
 
 from paramclient.errors import FileError, UsageError
-from paramclient.files.formats import LogForm
+from paramclient.files.formats import LogFormat
 from paramclient.logs.logged_params import LoggedChange, OnboardLog, log_link
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import WrittenParam
@@ -140,7 +140,7 @@ class _Messages:
         notes = (f"{refused} PARM messages are damaged and left out",) if refused else ()
         return OnboardLog(
             path,
-            LogForm.DATAFLASH,
+            LogFormat.DATAFLASH,
             Identity(
                 system=system,
                 link=log_link(path),

@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from paramclient.files.formats import LogForm
+from paramclient.files.formats import LogFormat
 from paramclient.files.param_file import AUTOPILOT
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
@@ -36,7 +36,7 @@ class OnboardLog:
 
     Attributes:
         source: the file's name, as given.
-        form: the log format.
+        file_format: the log format.
         identity: the vehicle, as far as the log describes it.
         initial: the parameters at the beginning of the log, by name.
         changes: the later values, in the order of the log.
@@ -47,7 +47,7 @@ class OnboardLog:
     """
 
     source: str
-    form: LogForm
+    file_format: LogFormat
     identity: Identity
     initial: Mapping[str, WrittenParam]
     changes: tuple[LoggedChange, ...] = ()

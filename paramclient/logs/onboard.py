@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from paramclient.errors import FileError, UsageError
-from paramclient.files.formats import LogForm
+from paramclient.files.formats import LogFormat
 from paramclient.logs.logged_params import OnboardLog
 
 __all__ = ["is_onboard_log", "read_onboard_log"]
@@ -25,7 +25,7 @@ DATAFLASH_MAGIC: Final = b"\xa3\x95"
 def is_onboard_log(path: str | os.PathLike[str]) -> bool:
     """Return whether a regular file begins as an on-board log. False if it cannot be read."""
     try:
-        return _form_of(Path(path)) is not None
+        return _format_of(Path(path)) is not None
     except (OSError, ValueError):
         return False
 
@@ -42,12 +42,12 @@ def read_onboard_log(path: str | os.PathLike[str]) -> OnboardLog:
     """
     source = os.fspath(path)
     try:
-        form = _form_of(Path(source))
-        if form is None:
+        file_format = _format_of(Path(source))
+        if file_format is None:
             raise FileError("neither a dataflash log nor a ULog file", source=source)
         # Both libraries print remarks on damaged parts, which would mix with the output of a program.
         with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
-            return _reader_of(form, source)(source)
+            return _reader_of(file_format, source)(source)
     except UsageError:
         raise
     except OSError as error:
@@ -56,20 +56,20 @@ def read_onboard_log(path: str | os.PathLike[str]) -> OnboardLog:
         raise FileError(f"the log is damaged: {error}", source=source) from error
 
 
-def _form_of(path: Path) -> LogForm | None:
+def _format_of(path: Path) -> LogFormat | None:
     """Return the format of a log; None if it is not a regular file of a known format."""
     if not stat.S_ISREG(path.stat().st_mode):
         return None
     with path.open("rb") as file:
         begin = file.read(len(ULOG_MAGIC))
     if begin == ULOG_MAGIC:
-        return LogForm.ULOG
-    return LogForm.DATAFLASH if begin.startswith(DATAFLASH_MAGIC) else None
+        return LogFormat.ULOG
+    return LogFormat.DATAFLASH if begin.startswith(DATAFLASH_MAGIC) else None
 
 
-def _reader_of(form: LogForm, source: str) -> Callable[[str], OnboardLog]:
+def _reader_of(file_format: LogFormat, source: str) -> Callable[[str], OnboardLog]:
     """Return the reader of a format. Loads its library, which takes up to 0.3 s."""
-    if form is LogForm.DATAFLASH:
+    if file_format is LogFormat.DATAFLASH:
         from paramclient.logs.dataflash import read_dataflash
 
         return read_dataflash

@@ -15,7 +15,7 @@ from pyulog import ULog
 from pyulog.exceptions import ULogException
 
 from paramclient.errors import FileError, UsageError
-from paramclient.files.formats import LogForm
+from paramclient.files.formats import LogFormat
 from paramclient.logs.logged_params import LoggedChange, OnboardLog, log_link
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import WrittenParam
@@ -78,7 +78,7 @@ def read_ulog(path: str) -> OnboardLog:
         notes.append(f"{refused} parameters are damaged and left out")
     return OnboardLog(
         path,
-        LogForm.ULOG,
+        LogFormat.ULOG,
         _identity(log.msg_info_dict, initial, path),
         initial,
         tuple(changes),

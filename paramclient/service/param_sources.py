@@ -14,7 +14,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from paramclient.client.client import local_client
 from paramclient.documents.document import Body, InParts
 from paramclient.errors import NotInCache, UnknownVehicle, UsageError
-from paramclient.files import FileForm, ParamFile, loads, loads_renames
+from paramclient.files import FileFormat, ParamFile, loads, loads_renames
 from paramclient.files.param_file import TooManyParams
 from paramclient.files.param_pck import is_packed
 from paramclient.model.params import copy_params
@@ -142,7 +142,7 @@ class UploadedFile(Body):
     name: Annotated[str, Field(max_length=FILE_NAME_LENGTH_MAX)] = ""
     text: str | None = None
     base64: str | None = None
-    form: FileForm | None = None
+    format: FileFormat | None = None
     component: Id | None = None
 
     @model_validator(mode="after")
@@ -166,7 +166,7 @@ class UploadedFile(Body):
                 data = base64.b64decode(self.base64 or "", validate=True)
             except (binascii.Error, ValueError) as error:
                 raise UsageError(f"{self.name or 'the file'} is not valid base64: {error}") from None
-        return parse_upload(data, self.name, self.form)
+        return parse_upload(data, self.name, self.format)
 
 
 class UploadedRenames(Body):
@@ -241,7 +241,7 @@ class WantedParams(Body):
         return self
 
 
-def parse_upload(data: bytes, name: str, form: FileForm | None) -> ParamFile:
+def parse_upload(data: bytes, name: str, file_format: FileFormat | None) -> ParamFile:
     """Parse a received parameter file. Blocks for up to seconds.
 
     Raises:
@@ -250,10 +250,10 @@ def parse_upload(data: bytes, name: str, form: FileForm | None) -> ParamFile:
     """
     check_size(len(data), PARAM_FILE_BYTES_MAX)
     check_separators(data)
-    if not _has_no_lines(data, form):
+    if not _has_no_lines(data, file_format):
         check_line_lengths(data)
     try:
-        file = loads(data, source=name, form=form, params_max=REQUEST_VALUES_MAX)
+        file = loads(data, source=name, file_format=file_format, params_max=REQUEST_VALUES_MAX)
         TooManyParams.check(sum(map(len, file.sets)), REQUEST_VALUES_MAX, name)
     except TooManyParams:
         what = f"A file may have at most {REQUEST_VALUES_MAX:,} parameters."
@@ -261,10 +261,10 @@ def parse_upload(data: bytes, name: str, form: FileForm | None) -> ParamFile:
     return file
 
 
-def _has_no_lines(data: bytes, form: FileForm | None) -> bool:
+def _has_no_lines(data: bytes, file_format: FileFormat | None) -> bool:
     """Return whether a file is JSON or packed, and therefore not parsed by lines."""
-    if form is not None:
-        return form in (FileForm.JSON, FileForm.PCK)
+    if file_format is not None:
+        return file_format in (FileFormat.JSON, FileFormat.PCK)
     return is_packed(data) or data.removeprefix(BOM_UTF8).lstrip().startswith(b"{")
 
 

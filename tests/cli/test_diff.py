@@ -419,7 +419,7 @@ def test_show_prints_a_file(command: Command, write: Callable[..., str]) -> None
     assert (told.code, told.err) == (0, "")
     assert told.json == {
         "file": "both.params",
-        "form": "qgc",
+        "format": "qgc",
         "components": [
             {
                 "source": "both.params",

@@ -59,7 +59,7 @@ def test_show_prints_the_values_at_the_end_of_a_log(command: Command, copter: Pa
 
 def test_show_prints_types_and_the_format_as_json(command: Command, quad: Path) -> None:
     document = json.loads(command("show", quad, "--json").out)
-    assert document["form"] == "ulog"
+    assert document["format"] == "ulog"
     params = document["components"][0]["params"]
     assert (params["MC_ROLL_P"]["value"], params["MC_ROLL_P"]["default"]) == (7.5, 6.5)
     assert params["SYS_AUTOSTART"]["type"] == "INT32"

@@ -195,6 +195,6 @@ def test_import_says_what_a_file_is_that_is_no_log(
 def test_px4_scripts_are_not_offered_for_save(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     command = in_process(capsys)
     assert "px4-script" not in command("save", "--help").out
-    refused = command("save", "sim:px4", tmp_path / "rc.txt", "--form", "px4-script")
+    refused = command("save", "sim:px4", tmp_path / "rc.txt", "--format", "px4-script")
     assert refused.code == 2
     assert "mission-planner" in refused.err

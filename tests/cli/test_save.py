@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from paramclient import FileForm, ParamCache, ParamType, read_file
+from paramclient import FileFormat, ParamCache, ParamType, read_file
 from paramclient.cli.sources import names_vehicle
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam
 from tests.commands import Command, Put, behind, in_process, leaping
@@ -53,14 +53,14 @@ def test_save_writes_the_parameters_of_the_vehicle(
 
 def test_save_prints_json(command: Command, put: Callable[[Endpoint], str], tmp_path: Path) -> None:
     path = tmp_path / "quad.txt"
-    saved = command("save", put(GenericVehicle(ODD)), path, "--form", "qgc", "--json", "--no-cache")
+    saved = command("save", put(GenericVehicle(ODD)), path, "--format", "qgc", "--json", "--no-cache")
     assert (saved.code, saved.err) == (0, "")
     assert json.loads(saved.out) == {
         "path": str(path),
-        "form": "qgc",
+        "format": "qgc",
         "components": [{"system": 1, "component": 1, "params": 3}],
     }
-    assert read_file(path).form is FileForm.QGC
+    assert read_file(path).file_format is FileFormat.QGC
 
 
 def test_save_updates_a_cached_table(command: Command, tmp_path: Path) -> None:
@@ -105,8 +105,8 @@ def test_save_needs_no_link_for_a_vehicle_in_the_cache(command: Command, tmp_pat
         (["--encoding", "bytewise"], "need a link"),
         (["--refresh"], "--refresh needs a link"),
         (["--all", "--component", "1"], "--all and --component exclude each other"),
-        (["--form", "px4-script"], "px4-script"),
-        (["--form", "exe"], "exe"),
+        (["--format", "px4-script"], "px4-script"),
+        (["--format", "exe"], "exe"),
     ],
 )
 def test_useless_options_are_refused(

@@ -10,7 +10,7 @@ import pytest
 from paramclient import ParamCache, ParamClient, UsageError
 from paramclient.cache import TableState
 from paramclient.errors import FileError
-from paramclient.files import FileForm, dumps, loads
+from paramclient.files import FileFormat, dumps, loads
 from paramclient.model.paramset import ParamSet as Parameters
 from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import ParamType, is_portable_name
@@ -37,7 +37,7 @@ UNUSABLE = [
     "12",
     "\x7f",
 ]
-FORMS = [form for form in FileForm if form is not FileForm.PX4_SCRIPT]  # scripts are read only
+FORMS = [form for form in FileFormat if form is not FileFormat.PX4_SCRIPT]  # scripts are read only
 
 
 @pytest.fixture
@@ -58,11 +58,11 @@ def say(session: Simulation, message: ParamValue | ParamSetMessage | ParamError,
     session.station.receive(encode(message, system=system, component=1, sequence=0), PEER, session.now)
 
 
-def is_held(name: str, form: FileForm) -> bool:
+def is_held(name: str, form: FileFormat) -> bool:
     """Whether a file of this form keeps a name."""
     try:
-        data = dumps(Parameters({name: WrittenParam(name, 1.5, ParamType.REAL32)}, 1, 1), form=form)
-        return name in loads(data, form=form).sets[0]
+        data = dumps(Parameters({name: WrittenParam(name, 1.5, ParamType.REAL32)}, 1, 1), file_format=form)
+        return name in loads(data, file_format=form).sets[0]
     except FileError:
         return False
 
@@ -146,7 +146,7 @@ class _Forged(GenericVehicle):
 def test_a_forged_value_blocks_no_export(command: Command, put: Put, tmp_path: Path) -> None:
     vehicle = _Forged({"A": (ParamType.REAL32, 1.0), "B": (ParamType.REAL32, 2.0)})
     for form in ("qgc", "json"):
-        saved = command("save", put(vehicle), path := tmp_path / form, "--form", form, "--no-cache")
+        saved = command("save", put(vehicle), path := tmp_path / form, "--format", form, "--no-cache")
         assert saved.code == 0, saved.err
         assert [*loads(path.read_bytes()).sets[0]] == ["A", "B"]
 

@@ -78,7 +78,7 @@ ANSWERS = (
     ("GET", f"{C}/snapshots", ""),
     ("POST", f"{C}/snapshots", '{"reason": "test"}'),
     ("GET", f"{C}/state?at=NOW", ""),
-    ("GET", f"{C}/file?form=json&from=NOW", ""),
+    ("GET", f"{C}/file?format=json&from=NOW", ""),
     ("POST", f"{C}/diff", '{"wanted": {"at": NOW}}'),
     ("POST", f"{C}/restore", '{"at": NOW, "dry_run": true}'),
     ("GET", "/api/v1/vehicles", ""),

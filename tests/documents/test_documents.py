@@ -31,7 +31,7 @@ from paramclient.documents.param import InfoDoc, InfosDoc, ParamDoc, ReadOutputD
 from paramclient.documents.paramset import FileDoc, FormatDoc, SetDoc, UploadedDoc
 from paramclient.documents.setup import ApplyResultDoc, InterruptedDoc, PlanDoc, VerifiedDoc
 from paramclient.errors import NoReply, UnknownParameter
-from paramclient.files import FileForm, loads
+from paramclient.files import FileFormat, loads
 from paramclient.metadata import Metadata, ParamInfo
 from paramclient.model.comparison import compare, defaults_of
 from paramclient.model.notation import bits_written, typed, value_json
@@ -205,7 +205,7 @@ def documents() -> Iterator[Document]:
     file = loads(b"A,1\nA,1\nB,2\n", source="a.param")
     yield FileDoc.of(file)
     yield UploadedDoc.of(file, file.choose())
-    yield from map(FormatDoc.of, FileForm)
+    yield from map(FormatDoc.of, FileFormat)
     yield SnapshotDoc.of(SnapshotSummary(1, PX4.key, 1, 1.5, "<b>", 3, 0xABC, True), exact=True)
     yield HistoryDoc.of(
         [HistoryEntry(1.5, 1, "A", param("A", 1.0), param("A", b"\0\0\0\1", 99), "us")], exact=True

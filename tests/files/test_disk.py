@@ -15,7 +15,7 @@ import pytest
 
 from paramclient import (
     FileError,
-    FileForm,
+    FileFormat,
     ParamFile,
     ParamSet,
     ParamType,
@@ -45,24 +45,24 @@ def refused(call: Callable[[], object]) -> FileError:
 
 
 @pytest.mark.parametrize(("ending", "form"), ENDINGS.items())
-def test_the_extension_selects_the_format_to_write(ending: str, form: FileForm, tmp_path: Path) -> None:
+def test_the_extension_selects_the_format_to_write(ending: str, form: FileFormat, tmp_path: Path) -> None:
     path = tmp_path / f"quad{ending.upper()}"
     assert write_file(path, TYPED) is form
     file = read_file(path)
-    assert (file.form, file.source, file.choose().source) == (form, str(path), str(path))
+    assert (file.file_format, file.source, file.choose().source) == (form, str(path), str(path))
     assert file.choose()["A"].value == 5
     assert listed(tmp_path) == [path.name]
 
 
 def test_a_given_format_overrides_the_extension(tmp_path: Path) -> None:
     path = tmp_path / "quad.json"
-    assert write_file(str(path), PARAMS, form="mission-planner") is FileForm.MISSION_PLANNER
+    assert write_file(str(path), PARAMS, file_format="mission-planner") is FileFormat.MISSION_PLANNER
     assert path.read_bytes().endswith(b"\nA,5\nB,0.5\n")
-    assert read_file(str(path), form="parm").form is FileForm.PARM
+    assert read_file(str(path), file_format="parm").file_format is FileFormat.PARM
     with pytest.raises(UsageError, match="unknown file format 'exe'"):
-        write_file(path, PARAMS, form="exe")
+        write_file(path, PARAMS, file_format="exe")
     with pytest.raises(UsageError, match="unknown file format 'exe'"):
-        read_file(path, form="exe")
+        read_file(path, file_format="exe")
 
 
 def test_an_unknown_extension_is_rejected(tmp_path: Path) -> None:
@@ -261,7 +261,7 @@ def test_the_largest_table_fits_in_the_largest_file() -> None:
         1,
         1,
     )
-    assert len(dumps(params, form="json")) * 65.535 < LARGEST_FILE
+    assert len(dumps(params, file_format="json")) * 65.535 < LARGEST_FILE
 
 
 def test_several_sets_can_be_written_to_one_file(tmp_path: Path) -> None:
@@ -291,9 +291,9 @@ def test_yaml_and_pydantic_are_loaded_only_when_needed() -> None:
 import sys
 from paramclient.files import dumps, loads
 file = loads(b"A 1")
-dumps(file, form="yaml")
+dumps(file, file_format="yaml")
 assert not {"pydantic", "yaml"} & set(sys.modules)
-loads(dumps(file, form="json"))
+loads(dumps(file, file_format="json"))
 assert "yaml" not in sys.modules
 """
     subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=True, timeout=60)

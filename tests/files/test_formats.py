@@ -14,16 +14,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.mavparm import MAVParmDict
 
-from paramclient import FileError, FileForm, Identity, Param, ParamFile, ParamSet, ParamType, WrittenParam
+from paramclient import FileError, FileFormat, Identity, Param, ParamFile, ParamSet, ParamType, WrittenParam
 from paramclient.errors import UsageError
 from paramclient.files import dumps, line_formats, loads
 from paramclient.model.values import Encoding, WireValue, bits_of, decode_value, from_bits
 
 DATA = Path(__file__).parents[1] / "data"
 TABLES = Path(__file__).parents[2] / "paramclient/sim/tables"
-WRITTEN = [form for form in FileForm if form is not FileForm.PX4_SCRIPT]
-TYPED = [FileForm.QGC, FileForm.JSON, FileForm.YAML]
-PAIRS = [FileForm.PARM, FileForm.MISSION_PLANNER]
+WRITTEN = [form for form in FileFormat if form is not FileFormat.PX4_SCRIPT]
+TYPED = [FileFormat.QGC, FileFormat.JSON, FileFormat.YAML]
+PAIRS = [FileFormat.PARM, FileFormat.MISSION_PLANNER]
 
 finite_bits = st.integers(0, 0xFFFFFFFF).filter(lambda bits: bits & 0x7F800000 != 0x7F800000)
 
@@ -36,9 +36,9 @@ def numbered(values: list[WireValue], kind: ParamType) -> ParamSet:
     return params_of(*(WrittenParam(f"P{at}", value, kind) for at, value in enumerate(values)))
 
 
-def back(params: ParamSet, form: FileForm) -> ParamSet:
+def back(params: ParamSet, form: FileFormat) -> ParamSet:
     """Return a set after writing and reading it in a format."""
-    (only,) = loads(dumps(params, form=form), form=form).sets
+    (only,) = loads(dumps(params, file_format=form), file_format=form).sets
     return only
 
 
@@ -59,7 +59,7 @@ def failed(data: bytes | str, **options: object) -> FileError:
 @pytest.mark.parametrize("form", WRITTEN)
 @given(written=st.lists(finite_bits, min_size=1, max_size=60))
 @settings(max_examples=25, deadline=None)
-def test_finite_floats_round_trip(form: FileForm, written: list[int]) -> None:
+def test_finite_floats_round_trip(form: FileFormat, written: list[int]) -> None:
     floats: list[WireValue] = [from_bits(each, ParamType.REAL32) for each in written]
     assert bits(back(numbered(floats, ParamType.REAL32), form), ParamType.REAL32) == written
 
@@ -68,10 +68,10 @@ def test_finite_floats_round_trip(form: FileForm, written: list[int]) -> None:
 @pytest.mark.parametrize("kind", [kind for kind in ParamType if kind.is_integer])
 @given(data=st.data())
 @settings(max_examples=8, deadline=None)
-def test_integers_round_trip(form: FileForm, kind: ParamType, data: st.DataObject) -> None:
-    if form is FileForm.PCK and kind not in (ParamType.INT8, ParamType.INT16, ParamType.INT32):
+def test_integers_round_trip(form: FileFormat, kind: ParamType, data: st.DataObject) -> None:
+    if form is FileFormat.PCK and kind not in (ParamType.INT8, ParamType.INT16, ParamType.INT32):
         with pytest.raises(FileError, match=f"P0 has the type {kind.name}"):
-            dumps(numbered([1], kind), form=form)
+            dumps(numbered([1], kind), file_format=form)
         return
     low, high = kind.bounds
     whole: list[int] = data.draw(st.lists(st.integers(low, high), max_size=40))
@@ -81,10 +81,10 @@ def test_integers_round_trip(form: FileForm, kind: ParamType, data: st.DataObjec
     assert all(type(param.value) is int for param in read.values())
 
 
-@pytest.mark.parametrize("form", [FileForm.PARM, *TYPED])
+@pytest.mark.parametrize("form", [FileFormat.PARM, *TYPED])
 @given(values=st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1, max_size=20))
 @settings(max_examples=20, deadline=None)
-def test_doubles_round_trip(form: FileForm, values: list[WireValue]) -> None:
+def test_doubles_round_trip(form: FileFormat, values: list[WireValue]) -> None:
     expected = bits(numbered(values, ParamType.REAL64), ParamType.REAL64)
     assert bits(back(numbered(values, ParamType.REAL64), form), ParamType.REAL64) == expected
 
@@ -92,7 +92,7 @@ def test_doubles_round_trip(form: FileForm, values: list[WireValue]) -> None:
 @pytest.mark.parametrize("form", [*PAIRS, *TYPED[1:]])
 @given(value=st.floats(allow_nan=False) | st.integers(-(2**70), 2**70))
 @settings(max_examples=40, deadline=None)
-def test_a_number_without_a_type_round_trips(form: FileForm, value: float) -> None:
+def test_a_number_without_a_type_round_trips(form: FileFormat, value: float) -> None:
     read = back(params_of(WrittenParam("A", value)), form)["A"].value
     assert (type(read), repr(read)) == (type(value), repr(value))
 
@@ -102,16 +102,16 @@ def test_a_number_without_a_type_round_trips(form: FileForm, value: float) -> No
 def test_written_text_is_stable(name: str, written: int) -> None:
     """Text that was written in a format is unchanged after reading and writing it."""
     value = from_bits(written, ParamType.REAL32)
-    for form in (FileForm.QGC, *PAIRS, FileForm.PCK):
+    for form in (FileFormat.QGC, *PAIRS, FileFormat.PCK):
         if not name.strip("0189_"):
             continue
-        data = dumps(params_of(WrittenParam(name, value, ParamType.REAL32)), form=form)
-        assert dumps(loads(data, form=form)) == data
+        data = dumps(params_of(WrittenParam(name, value, ParamType.REAL32)), file_format=form)
+        assert dumps(loads(data, file_format=form)) == data
 
 
 @pytest.mark.parametrize("form", WRITTEN)
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_nan_and_infinities_round_trip(form: FileForm, value: float) -> None:
+def test_nan_and_infinities_round_trip(form: FileFormat, value: float) -> None:
     read = back(numbered([value], ParamType.REAL32), form)
     assert bits(read, ParamType.REAL32) == [bits_of(value, ParamType.REAL32)]
 
@@ -123,7 +123,7 @@ def test_nan_words_of_other_programs_are_parsed(word: str) -> None:
 
 
 @pytest.mark.parametrize("form", TYPED[1:])
-def test_a_document_keeps_raw_bytes_and_nan_payloads(form: FileForm) -> None:
+def test_a_document_keeps_raw_bytes_and_nan_payloads(form: FileFormat) -> None:
     quiet = from_bits(0x7FC12345, ParamType.REAL32)
     cast, _ = decode_value(struct.pack("<f", 1e20), ParamType.INT8, Encoding.C_CAST)
     params = params_of(
@@ -140,34 +140,34 @@ def test_a_document_keeps_raw_bytes_and_nan_payloads(form: FileForm) -> None:
     assert read["CAST"].is_held_by(Param("CAST", cast, ParamType.INT8, 0, int.from_bytes(cast, "little")))  # type: ignore[arg-type]  # bytes, as asserted above
 
 
-@pytest.mark.parametrize("form", [FileForm.QGC, FileForm.PCK, *PAIRS])
+@pytest.mark.parametrize("form", [FileFormat.QGC, FileFormat.PCK, *PAIRS])
 @pytest.mark.parametrize(
     ("value", "kind"),
     [(b"\x01\0\0\0", ParamType.INT32), (from_bits(0x7FC12345, ParamType.REAL32), ParamType.REAL32)],
 )
 def test_other_formats_reject_raw_bytes_and_payloads(
-    form: FileForm, value: WireValue, kind: ParamType
+    form: FileFormat, value: WireValue, kind: ParamType
 ) -> None:
-    if form is FileForm.PCK and kind is ParamType.REAL32:
+    if form is FileFormat.PCK and kind is ParamType.REAL32:
         assert bits(back(numbered([value], kind), form), kind) == [0x7FC12345]
         return
     with pytest.raises(FileError, match=r"P0 is .*json and yaml can keep"):
-        dumps(numbered([value], kind), form=form)
+        dumps(numbered([value], kind), file_format=form)
 
 
 def test_a_nan_payload_without_a_type_is_rejected() -> None:
     value = from_bits(0x7FC12345, ParamType.REAL32)
     with pytest.raises(FileError, match="A is a NaN with payload bits, and has no type"):
-        dumps(params_of(WrittenParam("A", value)), form="json")
+        dumps(params_of(WrittenParam("A", value)), file_format="json")
 
 
 @pytest.mark.parametrize("form", TYPED[1:])
-def test_a_document_has_identity_and_time(form: FileForm) -> None:
+def test_a_document_has_identity_and_time(form: FileFormat) -> None:
     who = Identity(3, 'udpin:"x"', "00ff", 12, 2, 0x01110000, "abc123", 5, 6, 7, 2**40)
     first = ParamSet({"A": WrittenParam("A", 1)}, 1, 3, who, 1_700_000_000.25)
     second = ParamSet({"yes": WrittenParam("yes", 1e-5), "NULL": WrittenParam("NULL", 1e30)}, 100, 3)
-    file = loads(dumps([first, second], form=form), source="fleet.x")
-    assert file.form is form
+    file = loads(dumps([first, second], file_format=form), source="fleet.x")
+    assert file.file_format is form
     assert [replace(each, source="") for each in file.sets] == [first, second]
     assert [each.source for each in file.sets] == ["fleet.x", "fleet.x"]
 
@@ -178,14 +178,14 @@ def test_a_yaml_document_means_the_same_to_other_parsers() -> None:
         *(WrittenParam(name, 1e-05, ParamType.REAL32) for name in ("no", "Y", "A-1", "null")),
         WrittenParam("B", -0.0, ParamType.REAL32, 1e30),
     )
-    plain = yaml.safe_load(dumps(params, form="yaml"))
+    plain = yaml.safe_load(dumps(params, file_format="yaml"))
     assert list(plain["sets"][0]["params"]) == list(params)
     assert plain["sets"][0]["params"]["no"] == {"value": 1e-05, "type": "REAL32", "bits": "3727c5ac"}
     assert plain["sets"][0]["params"]["B"]["default"] == 1e30
 
 
-@pytest.mark.parametrize("form", [FileForm.QGC, *PAIRS])
-def test_header_comments_and_footer_round_trip(form: FileForm) -> None:
+@pytest.mark.parametrize("form", [FileFormat.QGC, *PAIRS])
+def test_header_comments_and_footer_round_trip(form: FileFormat) -> None:
     plain = ParamSet({"A": WrittenParam("A", 1, ParamType.INT8, comment="first"), "B": WrittenParam("B", 2)})
     marked = WrittenParam("B", 2, ParamType.INT8, comment="two\n\n # lines\n#marked")
     params = ParamSet({"A": plain["A"], "B": marked, "C": WrittenParam("C", 3, ParamType.INT8)}, 1, 1)
@@ -214,13 +214,13 @@ def test_comments_of_mission_planner_are_kept() -> None:
     assert loads(written.encode(), source="quad.param").sets == file.sets
 
 
-@pytest.mark.parametrize("form", [FileForm.QGC, *PAIRS, *TYPED[1:]])
-def test_a_comment_never_becomes_a_parameter(form: FileForm) -> None:
+@pytest.mark.parametrize("form", [FileFormat.QGC, *PAIRS, *TYPED[1:]])
+def test_a_comment_never_becomes_a_parameter(form: FileFormat) -> None:
     params = params_of(
         WrittenParam("A", 1, ParamType.INT8, comment="x\nB,2\r\nB 2\rB,2\x0bB,2\u2028B,2\x00\x1b[31m")
     )
     around = ParamFile((params,), form, "", ("a\rB,2",), ("z\nB 2\udc80",))
-    file = loads(dumps(around), form=form)
+    file = loads(dumps(around), file_format=form)
     assert list(file.sets[0]) == ["A"]
     assert "\x1b" not in dumps(around).decode()
 
@@ -232,12 +232,12 @@ def test_a_comment_never_becomes_a_parameter(form: FileForm) -> None:
 @given(written=st.lists(finite_bits, min_size=1, max_size=50))
 @settings(max_examples=20, deadline=None)
 def test_mavproxy_reads_the_same_floats(
-    form: FileForm, written: list[int], tmp_path_factory: pytest.TempPathFactory
+    form: FileFormat, written: list[int], tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     params = numbered([from_bits(each, ParamType.REAL32) for each in written], ParamType.REAL32)
     first = replace(params["P0"], comment="a comment, 5")
     assert read_by_pymavlink(
-        dumps(replace(params, params={**params.params, "P0": first}), form=form), tmp_path_factory
+        dumps(replace(params, params={**params.params, "P0": first}), file_format=form), tmp_path_factory
     ) == dict(zip(params, written, strict=True))
 
 
@@ -255,7 +255,7 @@ def test_mavproxy_reads_a_whole_vehicle(
     params = loads((DATA / "ardupilot_param.pck").read_bytes()).choose()
     ours = {name: param.bits_as(ParamType.REAL32) for name, param in params.items()}
     for form in PAIRS:
-        assert read_by_pymavlink(dumps(params, form=form), tmp_path_factory) == ours
+        assert read_by_pymavlink(dumps(params, file_format=form), tmp_path_factory) == ours
         assert "Invalid" not in capsys.readouterr().out
 
 
@@ -264,7 +264,7 @@ def test_mission_planner_reads_every_parameter_line() -> None:
     params = params_of(
         WrittenParam("A", 1, comment="why"), WrittenParam("B", math.inf), WrittenParam("C", math.nan)
     )
-    lines = dumps(params, form="mission-planner").decode().splitlines()
+    lines = dumps(params, file_format="mission-planner").decode().splitlines()
     rows = [line.split(",") for line in lines if line and not line.startswith("#")]
     assert rows == [["A", "1"], ["B", "Infinity"], ["C", "NaN"]]
 
@@ -279,7 +279,7 @@ def test_qgroundcontrol_reads_every_parameter_line() -> None:
         component=None,
     )
     camera = params_of(WrittenParam("A", 255, ParamType.UINT8), component=100)
-    lines = dumps([pilot, camera], form="qgc").decode().splitlines()
+    lines = dumps([pilot, camera], file_format="qgc").decode().splitlines()
     assert lines[0] == "# Onboard parameters for Vehicle 1"
     assert "# Vehicle-Id Component-Id Name Value Type" in lines
     rows = [line.split("\t") for line in lines if line and not line.startswith("#")]
@@ -307,7 +307,7 @@ QGC_TEXT = """# Onboard parameters for Vehicle 1
 
 def test_a_qgroundcontrol_file_has_a_set_per_component() -> None:
     file = loads(QGC_TEXT.encode(), source="quad.params")
-    assert file.form is FileForm.QGC
+    assert file.file_format is FileFormat.QGC
     assert file.header[0] == "Onboard parameters for Vehicle 1"
     assert [(each.system, each.component, list(each)) for each in file.sets] == [
         (1, 1, ["MC_ROLL_P", "BAT1_CAPACITY", "SYS_AUTOSTART"]),
@@ -333,17 +333,17 @@ def test_a_set_without_ids_matches_every_component() -> None:
 @pytest.mark.parametrize("name", ["ardupilot_param.pck", "ardupilot_param_withdefaults.pck"])
 def test_packed_files_convert_to_other_formats(name: str) -> None:
     file = loads((DATA / name).read_bytes(), source=name)
-    assert (file.form, len(file.sets[0]), file.notes) == (FileForm.PCK, 1382, ())
+    assert (file.file_format, len(file.sets[0]), file.notes) == (FileFormat.PCK, 1382, ())
     with_defaults = "defaults" in name
     assert all((param.default is not None) is with_defaults for param in file.sets[0].values())
     params = replace(file.sets[0], system=1, component=1)
-    for form in (FileForm.QGC, FileForm.JSON, FileForm.PARM, FileForm.PCK):
+    for form in (FileFormat.QGC, FileFormat.JSON, FileFormat.PARM, FileFormat.PCK):
         read = back(params, form)
         assert [param.bits_as(params[name].type or 0) for name, param in read.items()] == [
             param.bits_as(param.type or 0) for param in params.values()
         ]
-    assert loads(dumps(params, form="pck"), source=name).sets == file.sets
-    assert with_defaults or dumps(params, form="pck") == (DATA / name).read_bytes()
+    assert loads(dumps(params, file_format="pck"), source=name).sets == file.sets
+    assert with_defaults or dumps(params, file_format="pck") == (DATA / name).read_bytes()
 
 
 def test_an_incomplete_packed_file_has_a_note() -> None:
@@ -369,7 +369,7 @@ def test_tables_of_real_vehicles_round_trip(table: str) -> None:
         )
     )
     assert len(params) > 900
-    for form in (FileForm.QGC, FileForm.MISSION_PLANNER, FileForm.YAML):
+    for form in (FileFormat.QGC, FileFormat.MISSION_PLANNER, FileFormat.YAML):
         assert all(
             param.bits_as(params[name].type or 0) == params[name].bits_as(params[name].type or 0)
             for name, param in back(params, form).items()
@@ -395,7 +395,7 @@ set MIXER quad_x
 
 def test_a_script_gives_the_parameters_set_in_every_case() -> None:
     file = loads(SCRIPT.encode(), source="4001_quad_x")
-    assert file.form is FileForm.PX4_SCRIPT
+    assert file.file_format is FileFormat.PX4_SCRIPT
     assert [(each.name, each.value, each.comment, each.line) for each in file.sets[0].values()] == [
         ("CA_ROTOR_COUNT", 4, "rotors", 5),
         ("MC_ROLL_P", 6.5, "", 6),
@@ -618,11 +618,11 @@ def test_other_files_are_rejected(data: bytes, problem: str, line: int | None) -
     assert (problem in str(error), error.line) == (True, line), str(error)
 
 
-@given(data=st.binary(max_size=200), form=st.sampled_from([None, *FileForm]))
+@given(data=st.binary(max_size=200), form=st.sampled_from([None, *FileFormat]))
 @settings(max_examples=300, deadline=None)
-def test_random_bytes_give_an_error_or_parameters(data: bytes, form: FileForm | None) -> None:
+def test_random_bytes_give_an_error_or_parameters(data: bytes, form: FileFormat | None) -> None:
     try:
-        file = loads(data, form=form)
+        file = loads(data, file_format=form)
     except FileError:
         return
     assert file.sets
@@ -630,12 +630,12 @@ def test_random_bytes_give_an_error_or_parameters(data: bytes, form: FileForm | 
 
 @given(
     text=st.text("{}[]:,-\"'&*!|>#%@\n\t A1e.0xparmclientsetvu", max_size=80),
-    form=st.sampled_from(list(FileForm)),
+    form=st.sampled_from(list(FileFormat)),
 )
 @settings(max_examples=400, deadline=None)
-def test_random_text_gives_an_error_or_parameters(text: str, form: FileForm) -> None:
+def test_random_text_gives_an_error_or_parameters(text: str, form: FileFormat) -> None:
     try:
-        loads(text.encode(), form=form)
+        loads(text.encode(), file_format=form)
     except FileError:
         return
 
@@ -665,14 +665,14 @@ def test_random_text_gives_an_error_or_parameters(text: str, form: FileForm) -> 
 )
 def test_the_content_selects_the_format(text: str, source: str, form: str) -> None:
     file = loads(text.encode(), source=source)
-    assert (file.form, file.sets[0]["A"].value, file.sets[0].source) == (form, 1, source)
+    assert (file.file_format, file.sets[0]["A"].value, file.sets[0].source) == (form, 1, source)
 
 
 def test_a_given_format_is_not_detected() -> None:
-    assert loads(b"A 1", form="mission-planner").form is FileForm.MISSION_PLANNER
-    assert "vehicle, component" in str(failed("A 1", form="qgc"))
+    assert loads(b"A 1", file_format="mission-planner").file_format is FileFormat.MISSION_PLANNER
+    assert "vehicle, component" in str(failed("A 1", file_format="qgc"))
     with pytest.raises(UsageError, match=r"unknown file format 'xml'; the formats are qgc, parm"):
-        loads(b"A 1", form="xml")
+        loads(b"A 1", file_format="xml")
     with pytest.raises(UsageError, match="give the format in which to write"):
         dumps(params_of(WrittenParam("A", 1)))
 
@@ -720,7 +720,7 @@ def test_the_extension_selects_the_error_for_unknown_content(text: str, problem:
 )
 def test_inexpressible_content_is_rejected(params: ParamSet, form: str, problem: str) -> None:
     with pytest.raises(FileError) as caught:
-        dumps(params, form=form, target="out.x")
+        dumps(params, file_format=form, target="out.x")
     assert str(caught.value).startswith("out.x: ")
     assert problem in str(caught.value)
 
@@ -739,20 +739,20 @@ def test_inexpressible_content_is_rejected(params: ParamSet, form: str, problem:
 @pytest.mark.parametrize("form", ["parm", "json", "yaml"])
 def test_unreadable_content_is_not_written(params: ParamSet, problem: str, form: str) -> None:
     with pytest.raises(FileError, match=problem):
-        dumps(params, form=form)
+        dumps(params, file_format=form)
 
 
-@pytest.mark.parametrize("form", [*PAIRS, FileForm.PCK])
-def test_a_single_component_format_rejects_two(form: FileForm) -> None:
+@pytest.mark.parametrize("form", [*PAIRS, FileFormat.PCK])
+def test_a_single_component_format_rejects_two(form: FileFormat) -> None:
     two = [params_of(WrittenParam("A", 1, ParamType.INT8), component=each) for each in (1, 100)]
     with pytest.raises(FileError, match=f"the format {form} holds one component, and there are 1/1, 1/100"):
-        dumps(two, form=form)
+        dumps(two, file_format=form)
 
 
 def test_two_sets_of_one_component_are_rejected() -> None:
     two = [params_of(WrittenParam("A", 1, ParamType.INT8), component=each) for each in (1, None)]
     with pytest.raises(FileError, match=r"two sets have the same component, 1/\?"):
-        dumps(two, form="qgc")
+        dumps(two, file_format="qgc")
 
 
 # paramclient's own format
@@ -869,7 +869,7 @@ def test_yaml_reads_numbers_as_json_does() -> None:
 
 def test_yaml_without_pyyaml_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("paramclient.files.document_format.find_spec", lambda _: None)
-    data = dumps(params_of(WrittenParam("A", 1)), form="yaml")
+    data = dumps(params_of(WrittenParam("A", 1)), file_format="yaml")
     with pytest.raises(FileError, match=r"pip install 'paramclient\[yaml\]'"):
         loads(data)
 
@@ -882,8 +882,8 @@ def test_repr_of_a_param_file() -> None:
 def test_non_bmp_characters_in_a_header_round_trip() -> None:
     """YAML has no surrogate pairs, with which JSON escapes such characters."""
     file = loads("# for the \N{HELICOPTER} of Jo \U0004f78d\n\nRC1_MIN,1100\n".encode())
-    for form in (FileForm.YAML, FileForm.JSON):
-        assert loads(dumps(file, form=form)).header == file.header
+    for form in (FileFormat.YAML, FileFormat.JSON):
+        assert loads(dumps(file, file_format=form)).header == file.header
 
 
 def test_comparisons_of_delete_lines_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -41,7 +41,7 @@ def written(folder: Path, data: bytes, name: str = "flight.bin") -> Path:
 
 def test_a_dataflash_log_has_values_defaults_and_the_vehicle(tmp_path: Path) -> None:
     log = read_onboard_log(written(tmp_path, dataflash([*COMMON, VERSION, FIX])))
-    assert log.form == "dataflash"
+    assert log.file_format == "dataflash"
     assert [(param.name, param.value, param.default, param.type) for param in log.initial.values()] == [
         ("SYSID_THISMAV", 7, 1, None),
         ("ATC_RAT_RLL_P", 0.135, 0.135, None),
@@ -126,7 +126,7 @@ def test_a_ulog_file_has_types_defaults_changes_and_the_vehicle(tmp_path: Path) 
     writer.param("MC_ROLL_P", 8.0)
     writer.status(4_000_000)
     log = read_onboard_log(written(tmp_path, bytes(writer.data), "flight.ulg"))
-    assert log.form == "ulog"
+    assert log.file_format == "ulog"
     assert {name: (param.value, param.type, param.default) for name, param in log.initial.items()} == {
         "MAV_SYS_ID": (3, ParamType.INT32, 3),
         "MAV_TYPE": (13, ParamType.INT32, 13),

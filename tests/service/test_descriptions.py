@@ -105,7 +105,7 @@ async def test_defaults_of_the_metadata_count_in_filters_files_and_comparisons()
         differing = (await browser.get(f"{C}/params", params={"changed": "true"})).json()["params"]
         assert CHANGED in differing
         assert "MC_PITCH_P" not in differing
-        query = {"changed": "true", "form": "parm", "from": "known"}
+        query = {"changed": "true", "format": "parm", "from": "known"}
         file = await browser.get(f"{C}/file", params=query)
         assert {line.split(",")[0].split()[0] for line in file.text.splitlines() if line[:1] != "#"} == set(
             differing

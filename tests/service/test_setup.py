@@ -19,7 +19,7 @@ import pytest
 from paramclient import ParamCache
 from paramclient.cache import FleetDiff, TableState, TableUpdate
 from paramclient.documents.fleet import FleetDiffDoc
-from paramclient.files import FileForm, dumps, loads
+from paramclient.files import FileFormat, dumps, loads
 from paramclient.links import SimLink
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType
@@ -42,7 +42,7 @@ TUNE = {f"TUNE_{number:02}": number / 4 + 0.1 for number in range(20)}
 FILE = "".join(f"{name},{value + 1}\n" for name, value in TUNE.items())
 """The same, each one more, as Mission Planner writes it."""
 PUBLISHED: list[Published] = []
-WRITABLE = [form for form in FileForm if form is not FileForm.PX4_SCRIPT]
+WRITABLE = [form for form in FileFormat if form is not FileFormat.PX4_SCRIPT]
 
 
 def px4(**options: Any) -> PX4Vehicle:
@@ -481,20 +481,20 @@ async def test_a_table_comes_as_a_file_of_every_form_and_goes_back(vehicle: Call
     on_board = vehicle()
     async with serving(on_board) as service:
         for form in WRITABLE:
-            answer = await service.file(f"{HERE}/file", form=form)
+            answer = await service.file(f"{HERE}/file", format=form)
             disposition = answer.headers["content-disposition"]
             assert re.fullmatch(r'attachment; filename="[A-Za-z0-9._-]+"', disposition)
             assert answer.headers["content-type"] == "application/octet-stream"
             assert answer.headers["x-content-type-options"] == "nosniff"
             name = disposition.split('"')[1]
             read = loads(answer.content, source=name)
-            assert read.form is form
+            assert read.file_format is form
             assert len(read.choose(1)) == 22
-            known = await service.file(f"{HERE}/file", **{"form": form, "from": "known"})
+            known = await service.file(f"{HERE}/file", **{"format": form, "from": "known"})
             assert loads(known.content, source=name).choose(1).params == read.choose(1).params
 
             uploaded = await service.ask("POST", f"/api/v1/files?name={name}", content=answer.content)
-            assert (uploaded["form"], uploaded["file"]) == (form, name)
+            assert (uploaded["format"], uploaded["file"]) == (form, name)
             assert uploaded["params"]["TUNE_01"]["value"] == 0.35
             on_board.set_param("TUNE_01", 9.0)
             await anyio.sleep(2)  # until a hash that was heard counts no more
@@ -512,7 +512,7 @@ async def test_the_name_of_a_file_is_safe_whoever_the_vehicle_is() -> None:
         {"A": WrittenParam("A", 1, ParamType.INT32)}, system=9, component=1, identity=whose, at=NOW
     )
     async with Hub([], cache=False) as hub:
-        answer = await file_response(hub, params, FileForm.QGC)
+        answer = await file_response(hub, params, FileFormat.QGC)
     name = "autopilot_200-9-1-20261118-110640.params"
     assert answer.headers["content-disposition"] == f'attachment; filename="{name}"'
 
@@ -523,15 +523,15 @@ async def test_an_earlier_state_comes_as_a_file_too(tmp_path: Path) -> None:
         kept = await service.ask("POST", f"{HERE}/snapshots", 201, json={"reason": "as it came"})
         await service.ask("PUT", f"{HERE}/params/TUNE_01", json={"value": 5})
         for source in (f"snapshot:{kept['id']}", repr(kept["at"]), kept["time"]):
-            answer = await service.file(f"{HERE}/file", **{"form": "parm", "from": source})
+            answer = await service.file(f"{HERE}/file", **{"format": "parm", "from": source})
             assert loads(answer.content).choose(1)["TUNE_01"].value == 0.35, source
         assert (await service.get(f"{HERE}/file", 422, **{"from": "soon"}))["type"] == "urn:paramclient:usage"
         assert (await service.get(f"{HERE}/file", 404, **{"from": "snapshot:77"}))["status"] == 404
         assert (await service.get(f"{HERE}/file", 404, **{"from": "5"}))[
             "type"
         ] == "urn:paramclient:unknown-state"
-        assert (await service.get(f"{HERE}/file", 422, form="px4-script"))["error"] == "FileError"
-        assert (await service.get(f"{HERE}/file", 422, form="xlsx"))["status"] == 422
+        assert (await service.get(f"{HERE}/file", 422, format="px4-script"))["error"] == "FileError"
+        assert (await service.get(f"{HERE}/file", 422, format="xlsx"))["status"] == 422
 
 
 @in_simulated_time
@@ -548,7 +548,7 @@ async def test_only_what_differs_from_the_defaults_is_a_file_too() -> None:
     on_board = ardupilot()
     async with serving(on_board, px4(system=2)) as service:
         await service.ask("PUT", f"{HERE}/params/TUNE_01", json={"value": 5})
-        answer = await service.file(f"{HERE}/file", form="parm", changed=True)
+        answer = await service.file(f"{HERE}/file", format="parm", changed=True)
         assert list(loads(answer.content).choose(1)) == ["TUNE_01"]
         unknown = await service.get("/api/v1/components/2/1/file", 422, changed=True)
         assert "defaults are not known" in unknown["detail"]
@@ -561,7 +561,7 @@ async def test_a_file_is_read_and_its_faults_are_told_by_line() -> None:
         async def upload(content: bytes, status: int = 200, **query: Any) -> Any:
             return await service.ask("POST", "/api/v1/files", status, content=content, params=query or None)
 
-        script = await upload(b"param set MC_ROLL_P 6.5\n", form="px4-script")
+        script = await upload(b"param set MC_ROLL_P 6.5\n", format="px4-script")
         assert script["params"]["MC_ROLL_P"] == {"value": 6.5, "type": None, "bits": None}
         twice = await upload(b"A,1\nA,1\n", name="twice.param")
         assert twice["notes"]
@@ -569,9 +569,9 @@ async def test_a_file_is_read_and_its_faults_are_told_by_line() -> None:
         assert (bad["error"], bad["source"], bad["line"]) == ("FileError", "bad.param", 2)
         assert "bad.param:3" in bad["detail"]
         assert (await upload(b"", 422))["error"] == "FileError"
-        assert (await upload(b"{" * 50_000, 422, form="json"))["error"] == "FileError"
-        assert (await upload(b"- " * 8_000, 422, form="yaml"))["error"] == "FileError"
-        assert (await upload(b"- " * 50_000, 413, form="yaml"))["most"] == LINE_BYTES_MAX
+        assert (await upload(b"{" * 50_000, 422, format="json"))["error"] == "FileError"
+        assert (await upload(b"- " * 8_000, 422, format="yaml"))["error"] == "FileError"
+        assert (await upload(b"- " * 50_000, 413, format="yaml"))["most"] == LINE_BYTES_MAX
         assert (await upload(b"A,1\n" * (PARAM_FILE_BYTES_MAX // 4 + 1), 413))[
             "type"
         ] == "urn:paramclient:too-large"
@@ -582,7 +582,7 @@ async def test_a_file_is_read_and_its_faults_are_told_by_line() -> None:
                 ParamSet({"A": WrittenParam("A", 1, ParamType.INT32)}, component=each, system=1)
                 for each in (1, 154)
             ],
-            form="qgc",
+            file_format="qgc",
         )
         assert (await upload(several))["components"][1]["component"] == 154
         assert (await upload(several, 422, component=9))["error"] == "FileError"
@@ -606,7 +606,7 @@ async def test_files_are_read_one_after_the_other_and_not_without_end() -> None:
 @in_simulated_time
 async def test_forms_are_told() -> None:
     async with serving(px4()) as service:
-        forms = (await service.get("/api/v1/forms"))["forms"]
+        forms = (await service.get("/api/v1/formats"))["formats"]
         assert [form["name"] for form in forms if form["writes"]] == WRITABLE
         assert {"name": "parm", "title": "MAVProxy, ArduPilot", "endings": [".parm"], "writes": True} in forms
 
@@ -680,8 +680,8 @@ async def test_cached_data_of_a_vehicle_is_the_same_with_and_without_its_link(
         table = await service.get(f"{there}/params")
         assert table["params"]["TUNE_01"]["value"] == 5
         assert table["params"]["TUNE_01"]["trust"] == "cached"
-        live = await service.file(f"{HERE}/file", form="parm")
-        cached = await service.file(f"{there}/file", form="parm")
+        live = await service.file(f"{HERE}/file", format="parm")
+        cached = await service.file(f"{there}/file", format="parm")
         assert loads(cached.content).choose(1).params == loads(live.content).choose(1).params
         for what in ("params", "history", "snapshots", "snapshots/1", "state?at=5", "file"):
             for key in ("uid:00", "system:1@serial:/dev/ttyACM0:57600", "%27%20OR%201", "%"):

@@ -440,7 +440,7 @@ async def test_long_work_is_done_in_a_thread(monkeypatch: pytest.MonkeyPatch) ->
 async def test_a_table_is_copied_out_in_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     """A table may have thousands of names; each takes 5 µs."""
     asked: list[tuple[str, str, dict[str, Any] | None]] = [
-        *(("GET", f"file?from={source}&form=parm", None) for source in ("known", "live")),
+        *(("GET", f"file?from={source}&format=parm", None) for source in ("known", "live")),
         *(("POST", "diff", {"wanted": {"values": VALUES}, "known": known}) for known in (True, False)),
         ("POST", "diff", {"wanted": {"component": {"system": 1, "component": 1}}, "known": True}),
         *(("POST", path, {"wanted": {"values": VALUES}}) for path in ("plan", "verify")),
@@ -1001,9 +1001,9 @@ async def test_a_file_with_long_lines_is_not_parsed(name: str, data: bytes, most
 @in_simulated_time
 async def test_a_file_without_lines_may_be_long() -> None:
     wanted = ParamSet({name: WrittenParam(name, value) for name, value in LARGE.items()})
-    document = json.dumps(json.loads(dumps(wanted, form="json"))).encode()
+    document = json.dumps(json.loads(dumps(wanted, file_format="json"))).encode()
     coarse = {name: WrittenParam(name, value, ParamType.REAL32) for name, value in LARGE.items()}
-    packed = dumps(ParamSet(coarse), form="pck")
+    packed = dumps(ParamSet(coarse), file_format="pck")
     assert b"\n" not in document
     assert min(len(document), len(packed)) > LINE_BYTES_MAX
     async with service() as (_, browser):

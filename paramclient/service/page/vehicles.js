@@ -284,9 +284,9 @@ async function keepState() {
 /** Asks for a file format and saves the table; shows an error. */
 async function save() {
   const { component } = store;
-  let forms;
+  let formats;
   try {
-    ({ forms } = await get("/forms"));
+    ({ formats } = await get("/formats"));
   } catch (error) {
     showError(error);
     return;
@@ -294,15 +294,15 @@ async function save() {
   const list = el(
     "ul",
     { class: "choices" },
-    forms
-      .filter((form) => form.writes !== false && form.is_written !== false)
-      .map((form) => {
-        const name = form.name ?? form.form ?? form;
+    formats
+      .filter((format) => format.writes)
+      .map((format) => {
+        const { name } = format;
         const choose = el(
           "button",
           { type: "button", class: "choice", on: { click: () => take(name) } },
-          el("b", { text: form.title ?? name }),
-          el("small", { text: form.endings?.join(", ") ?? name }),
+          el("b", { text: format.title }),
+          el("small", { text: format.endings.join(", ") }),
         );
         return el("li", {}, choose);
       }),
@@ -310,11 +310,11 @@ async function save() {
   const state = el("p", { role: "status" });
   const fault = el("p", { class: "fault", role: "alert" });
 
-  async function take(form) {
+  async function take(format) {
     fault.textContent = "";
     state.textContent = component.is_kept ? "Reading …" : "Fetching all parameters from the vehicle …";
     try {
-      const { name, content } = await download(at(component, "/file", { form }), SAVE_TIMEOUT);
+      const { name, content } = await download(at(component, "/file", { format }), SAVE_TIMEOUT);
       const address = URL.createObjectURL(content);
       el("a", { href: address, download: name }).click();
       setTimeout(() => URL.revokeObjectURL(address), SAVE_TIMEOUT);

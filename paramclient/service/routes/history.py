@@ -20,7 +20,7 @@ from paramclient.documents.fleet import FleetDiffDoc, NameSpreadDoc
 from paramclient.documents.history import HistoryDoc, SnapshotDoc, SnapshotsDoc, WholeSnapshotDoc
 from paramclient.documents.paramset import SetDoc
 from paramclient.errors import UsageError
-from paramclient.files import FileForm
+from paramclient.files import FileFormat
 from paramclient.files.param_file import AUTOPILOT
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import check_name
@@ -43,7 +43,7 @@ from paramclient.service.problems import ServiceError
 from paramclient.service.request_body import BodyRoute, long_request
 from paramclient.service.responses import document_response, pack_entries, packed_response
 from paramclient.service.route_context import HubArgument, Target, require_write, run_until_disconnect
-from paramclient.service.routes.param_files import Form, From, file_response, parse_state
+from paramclient.service.routes.param_files import Format, From, file_response, parse_state
 
 __all__ = ["router"]
 
@@ -264,12 +264,12 @@ async def kept_state(hub: HubArgument, key: Key, component: Id, at: At) -> Respo
 
 @router.get("/vehicles/{key:path}/{component}/file", responses=_FILE, response_class=Response)
 async def kept_file(
-    hub: HubArgument, key: Key, component: Id, form: Form = FileForm.QGC, source: From = "known"
+    hub: HubArgument, key: Key, component: Id, file_format: Format = FileFormat.QGC, source: From = "known"
 ) -> Response:
     """Return the parameters of a vehicle as a file: the last known ones if complete, a snapshot, or those at
     a time."""
     when = None if source == "known" else parse_state(source)
-    return await file_response(hub, await load_cached_state(hub, key, component, when), form)
+    return await file_response(hub, await load_cached_state(hub, key, component, when), file_format)
 
 
 @router.post("/fleet/diff", response_model=FleetDiffDoc)

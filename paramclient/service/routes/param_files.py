@@ -10,7 +10,7 @@ from fastapi import APIRouter, Query, Request, Response
 
 from paramclient.documents.paramset import FormatDoc, FormatsDoc, UploadedDoc
 from paramclient.errors import UsageError
-from paramclient.files import FileForm, dumps
+from paramclient.files import FileFormat, dumps
 from paramclient.files.formats import ENDINGS
 from paramclient.model.identity import autopilot_name
 from paramclient.model.paramset import ParamSet
@@ -36,7 +36,7 @@ router = APIRouter(prefix="/api/v1", tags=["files"])
 FILE_STEM_LENGTH_MAX: Final = 100
 """Maximum number of characters of the name of a sent file, without its extension."""
 
-Form = Annotated[FileForm, Query(description="A writable format of /forms.")]
+Format = Annotated[FileFormat, Query(alias="format", description="A writable format of /formats.")]
 From = Annotated[str, Query(alias="from", max_length=64, description="live, known, snapshot:ID, or a time.")]
 Id = Annotated[int | None, Query(ge=1, le=255)]
 
@@ -53,10 +53,10 @@ _FILE: Final[dict[int | str, dict[str, Any]]] = {
 }
 
 
-@router.get("/forms")
-async def forms() -> FormatsDoc:
+@router.get("/formats")
+async def formats() -> FormatsDoc:
     """Return the formats of parameter files. All can be read."""
-    return FormatsDoc(forms=[FormatDoc.of(form) for form in FileForm])
+    return FormatsDoc(formats=[FormatDoc.of(file_format) for file_format in FileFormat])
 
 
 @router.get("/components/{system}/{component}/file", responses=_FILE, response_class=Response)
@@ -64,7 +64,7 @@ async def file(
     request: Request,
     hub: HubArgument,
     target: Target,
-    form: Form = FileForm.QGC,
+    file_format: Format = FileFormat.QGC,
     source: From = "live",
     changed: Annotated[
         bool, Query(description="Only parameters that differ from the firmware's defaults.")
@@ -77,7 +77,7 @@ async def file(
         if source not in ("live", "known"):
             if changed:
                 raise UsageError("only the current table can be compared with the firmware's defaults")
-            return await file_response(hub, await load_state(hub, target, parse_state(source)), form)
+            return await file_response(hub, await load_state(hub, target, parse_state(source)), file_format)
         if source == "known":
             found = await current_set(target, hub.run_in_thread)
         else:
@@ -93,7 +93,7 @@ async def file(
                 return select_non_defaults(found.set, described)
 
             chosen = await hub.run_in_thread(differing)
-        return await file_response(hub, chosen, form)
+        return await file_response(hub, chosen, file_format)
 
     return await run_until_disconnect(request, work, target)
 
@@ -105,7 +105,7 @@ async def files(
     name: Annotated[
         str, Query(max_length=FILE_NAME_LENGTH_MAX, description="The extension can indicate the format.")
     ] = "",
-    form: Annotated[FileForm | None, Query()] = None,
+    file_format: Annotated[FileFormat | None, Query(alias="format")] = None,
     component: Id = None,
     system: Id = None,
 ) -> Response:
@@ -116,7 +116,7 @@ async def files(
     data = await read_body(request, PARAM_FILE_BYTES_MAX)
 
     def document() -> UploadedDoc:
-        found = parse_upload(data, name, form)
+        found = parse_upload(data, name, file_format)
         return UploadedDoc.of(found, found.choose(component, system=system))
 
     with long_request(request):
@@ -140,14 +140,14 @@ def parse_state(text: str) -> float | int:
     return at
 
 
-async def file_response(hub: Hub, params: ParamSet, form: FileForm) -> Response:
+async def file_response(hub: Hub, params: ParamSet, file_format: FileFormat) -> Response:
     """Return a response with a set as a file of this format.
 
     Raises:
         FileError: the format cannot represent the set.
     """
-    name = f"{_stem(params)}{_ending(form)}"
-    data = await hub.run_in_thread(lambda: dumps(params, form=form, target=name))
+    name = f"{_stem(params)}{_ending(file_format)}"
+    data = await hub.run_in_thread(lambda: dumps(params, file_format=file_format, target=name))
     headers = {"content-disposition": f'attachment; filename="{name}"'}
     return Response(data, media_type="application/octet-stream", headers=headers)
 
@@ -174,5 +174,5 @@ def _stem(params: ParamSet) -> str:
     return re.sub(r"[^A-Za-z0-9._-]", "_", "-".join([autopilot, *ids, at]))[:FILE_STEM_LENGTH_MAX]
 
 
-def _ending(form: FileForm) -> str:
-    return next((ending for ending, each in ENDINGS.items() if each is form), ".txt")
+def _ending(file_format: FileFormat) -> str:
+    return next((ending for ending, each in ENDINGS.items() if each is file_format), ".txt")
