@@ -18,7 +18,10 @@ __all__ = ["DuplicateNameReads", "repeated_names"]
 DUPLICATES_LISTED_MAX: Final = 5
 """Names that a note lists one by one."""
 READ_DELAY_MIN: Final = 0.3
-"""Seconds until the names are read, at least: late responses to reads by index carry them too."""
+"""Seconds without a PARAM_VALUE until the names are read, at least; the timeout of a read, if longer. Late
+responses to reads by index carry the names too."""
+READ_DELAY_MAX: Final = 3.0
+"""Seconds until the names are read, at most: another station may request one list after the other."""
 RESPONSE_PAUSE: Final = 0.15
 """Seconds from a response until the name is read again. Several late values of the name may arrive at one
 moment, and each would otherwise count as a response to the next read."""
@@ -69,14 +72,23 @@ class DuplicateNameReads(Operation[None]):
         self._table = table
         self._open: dict[str, Read] = {}
         self._answers: dict[str, list[int]] = {}
-        first_at = now + max(policy.timeout, READ_DELAY_MIN)
-        self._ask_at = dict.fromkeys(sorted(names.keys() | table.duplicate_indices.keys()), first_at)
+        self._policy = policy
+        self._names = sorted(names.keys() | table.duplicate_indices.keys())
+        self._ask_at: dict[str, float] = {}
+        self._is_reading = False
+        self._postpone(now)
         table.duplicate_indices.clear()
+
+    def receive(self, now: float) -> None:
+        """Process a PARAM_VALUE of the component: until the first read, it may be a late response."""
+        if not self._is_reading:
+            self._postpone(now)
 
     def tick(self, now: float) -> None:
         """Read, once earlier reads are over."""
         for name in [name for name, at in self._ask_at.items() if at <= now]:
             del self._ask_at[name]
+            self._is_reading = True
             self._ask(name, now)
 
     def next_deadline(self) -> float:
@@ -107,6 +119,10 @@ class DuplicateNameReads(Operation[None]):
         reads, self._open = self._open, {}
         for read in reads.values():
             self._reads.release(read)
+
+    def _postpone(self, now: float) -> None:
+        at = min(now + max(self._policy.timeout, READ_DELAY_MIN), self.begun_at + READ_DELAY_MAX)
+        self._ask_at = dict.fromkeys(self._names, at)
 
     def _ask(self, name: str, now: float) -> None:
         read = self._open[name] = self._reads.ask(name, now, urgent=False)

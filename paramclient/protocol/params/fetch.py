@@ -192,6 +192,8 @@ class Fetch(Operation[FetchResult]):
         """Process a PARAM_VALUE of the component, before the reads do."""
         if self.file is not None:
             self.file.receive(message)
+        if self._repeated is not None:
+            self._repeated.receive(now)
         download = self.download
         if download is None:
             if not self._reads.awaits(message):  # otherwise it is the response to our request

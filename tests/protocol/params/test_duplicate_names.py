@@ -58,6 +58,24 @@ def test_the_table_holds_what_the_vehicle_means_by_the_name(
             assert world.machine.sync_state is SyncState.UNSYNCED
 
 
+@pytest.mark.parametrize("seed", [0, 9, 34, 36, 62, 71])
+def test_late_responses_to_reads_by_index_decide_nothing(seed: int) -> None:
+    """On a slow radio the last values of a list are requested several times, and arrive seconds later."""
+    between = [SimParam(f"Z{number:03}", ParamType.INT32, number) for number in range(60)]
+    rows = [SimParam(CUT, ParamType.INT32, 1), *between, SimParam(CUT, ParamType.REAL32, 2.0)]
+    vehicle = GenericVehicle(rows, repeated_names=True)
+    world = Simulation(
+        air=Air.symmetric(
+            [vehicle], delay=0.02, jitter=0.3, loss=0.05, duplicate=0.2, reorder=0.2, rate=1200.0, queue=1024,
+            seed=seed,
+        )
+    )  # fmt: skip
+    world.run(12.0)
+    result = world.fetch(limit=120.0)
+    assert result.complete
+    assert result.params[CUT].value == 1
+
+
 @EVERY_KIND
 def test_values_of_the_other_parameter_with_the_name_are_ignored(kind: Callable[..., Vehicle]) -> None:
     vehicle = kind(table=ROWS, repeated_names=True)
