@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -167,22 +167,44 @@ class ApplyRun:
         planned, own = self._plan_identity, self._component.identity
         if planned is not None and not planned.is_same_vehicle(own):
             raise UsageError(f"the plan is for another vehicle: {planned}; this vehicle is {own}")
-        await self._check_armed()
-        await self._inspect()
-        self._first, self._first_plan = self.inspection, self.plan
-        self._first_identity = self._component.identity
+        with self._without_checks():
+            await self._check_armed()
+            await self._inspect()
+            self._first, self._first_plan = self.inspection, self.plan
+            self._first_identity = self._component.identity
+            self._check_plan()
+            if self._options.before_writing is None:
+                await self._store_state()
+        if self._options.before_writing is not None:
+            await call_and_wait(self._options.before_writing)
+            await self._store_state()
+
+    def _check_plan(self) -> None:
+        """Raise the error of a plan that must not be carried out."""
         invalid = {row.name: row.reason for row in self.plan.of(PlanStatus.INVALID)}
         if invalid and not self._options.skip_invalid:
             raise InvalidParameters(invalid)
         self._check_resets()
-        if self._options.before_writing is not None:
-            await call_and_wait(self._options.before_writing)
-        await self._store_state()
+
+    @contextmanager
+    def _without_checks(self) -> Iterator[None]:
+        """Let no check of the table begin: the run reads the table itself, and each download takes time."""
+        sync = local(self._component).machine.sync
+        sync.hold()
+        try:
+            yield
+        finally:
+            sync.release()
 
     async def write_and_verify(self) -> None:
         """Write and verify until no stage is pending. `result` reports a failure after the first write."""
-        sync = local(self._component).machine.sync
-        sync.holds += 1  # a changed count starts no download besides those of the run
+        with self._without_checks():  # a changed count starts no download besides those of the run
+            if self._pending_stages():
+                local(self._component).machine.sync.drop_check(anyio.current_time())
+            await self._write_and_verify()
+
+    async def _write_and_verify(self) -> None:
+        """Do what `write_and_verify` says, while no check of the table begins."""
         try:
             while True:
                 stages = self._pending_stages()
@@ -207,8 +229,6 @@ class ApplyRun:
             if not self.sent:
                 raise
             self._error = error
-        finally:
-            sync.holds -= 1
 
     def result(self) -> ApplyResult:
         """Return the result of the run."""

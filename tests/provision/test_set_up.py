@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -367,17 +367,17 @@ def whole_tables(tap: Tap) -> int:
     return files + len(tap.messages(wire.ParamRequestList))
 
 
-@pytest.mark.parametrize("seed", range(6))
-@in_simulated_time
-async def test_with_packet_loss_four_groups_take_two_downloads_and_six_seconds(seed: int) -> None:
-    """30 values, of which 4 show groups of the real quad, with 100 ms and 5 % loss in each direction."""
+@contextlib.asynccontextmanager
+async def four_groups(
+    ways: tuple[FaultyLink, FaultyLink], delay: float
+) -> AsyncIterator[tuple[Component, Tap, dict[str, WireValue]]]:
+    """A vehicle that has been up for a while, and 30 values, of which 4 show groups of the real quad."""
     switches = ("GRIP_ENABLE", "SCR_ENABLE", "FOLL_ENABLE", "SPRAY_ENABLE")
     groups: dict[str, dict[str, WireValue]] = {
         switch: {f"{switch.removesuffix('ENABLE')}{number}": 1.0 for number in range(7 + (at < 2))}
         for at, switch in enumerate(switches)
     }
     tap = Tap(vehicle := ArduPilotVehicle(groups=groups, live=()))
-    ways = [FaultyLink(loss=0.05, delay=0.05, seed=2 * seed + number) for number in (0, 1)]
     wanted: dict[str, WireValue] = dict.fromkeys(switches, 1)
     wanted |= {
         name: 2.0 for switch in switches for name in list(groups[switch])[: 6 + (switch in switches[:2])]
@@ -385,18 +385,54 @@ async def test_with_packet_loss_four_groups_take_two_downloads_and_six_seconds(s
     assert len(wanted) == 30
     async with a_client(Air([tap], uplink=ways[0], downlink=ways[1])) as client:
         component = await client.component()
-        await anyio.sleep(10.0)  # what it measures at its start has been read
+        await anyio.sleep(delay)
         tap.heard.clear()
+        yield component, tap, wanted
+        assert {name: vehicle.param(name).value for name in wanted} == wanted
+
+
+def lossy(seed: int) -> tuple[FaultyLink, FaultyLink]:
+    """100 ms round trip, and 5 % loss in each direction."""
+    uplink, downlink = (FaultyLink(loss=0.05, delay=0.05, seed=2 * seed + number) for number in (0, 1))
+    return uplink, downlink
+
+
+@pytest.mark.parametrize("delay", [10.0, 5.0], ids=["boot values were read", "while they are due"])
+@pytest.mark.parametrize("seed", [*range(6), 10])
+@in_simulated_time
+async def test_with_packet_loss_four_groups_take_two_downloads_and_six_seconds(
+    seed: int, delay: float
+) -> None:
+    """With seed 10 and after 10 s, the only response to an open is lost, and the burst behind it is received.
+
+    ArduPilot measures values at its boot, which are read again when the client has been connected for 5 s.
+    """
+    async with four_groups(lossy(seed), delay) as (component, tap, wanted):
         began = anyio.current_time()
         result = await apply(component, written(wanted))
         elapsed = anyio.current_time() - began
-        await anyio.sleep(5.0)  # the count that has moved is a reason for no more
+        await anyio.sleep(5.0)  # neither the count that has moved nor the boot is a reason for more
         downloaded = whole_tables(tap)
     assert result.complete, result
     assert set(statuses(result).values()) == {"set"}
-    assert {name: vehicle.param(name).value for name in wanted} == wanted
     assert downloaded <= 2
     assert elapsed <= 6.0
+
+
+@in_simulated_time
+async def test_a_check_in_progress_ends_where_writes_begin() -> None:
+    """The writes change the number of parameters, so that its file would be read again, and then the list."""
+
+    async def confirm() -> None:
+        await anyio.sleep(0.4)
+        assert whole_tables(tap) == 2
+
+    async with four_groups((FaultyLink(delay=0.05), FaultyLink(delay=0.05)), 5.0) as (component, tap, wanted):
+        result = await apply(component, written(wanted), before_writing=confirm)
+        await anyio.sleep(5.0)
+        assert result.complete
+        assert whole_tables(tap) == 3  # for the plan, the check of boot values, and the verification
+        assert tap.messages(wire.ParamRequestList) == []
 
 
 @pytest.mark.parametrize(

@@ -77,13 +77,23 @@ class FileRead(FileTransferJob[bytes]):
             param.pck. None at first.
     """
 
-    def __init__(self, line: FtpChannel, path: str, now: float, *, read_size: int, limit: int) -> None:
+    def __init__(
+        self,
+        line: FtpChannel,
+        path: str,
+        now: float,
+        *,
+        read_size: int,
+        limit: int,
+        magics: tuple[bytes, ...] = (),
+    ) -> None:
         if not 1 <= read_size <= DATA_SIZE_MAX:
             raise UsageError(f"a file is read by 1 to {DATA_SIZE_MAX} bytes, not {read_size}")
         super().__init__(line, path, now)
         self.size: int | None = None
         self._read_size = read_size
         self._limit = limit
+        self._magics = magics
         self._restarts = 0
         self._retries = BlockRetries(line.retry)
         self._has_bursts = True
@@ -111,7 +121,8 @@ class FileRead(FileTransferJob[bytes]):
         self._first_block: tuple[float, int] | None = None
         self._pending_reads: dict[int, _PendingRead] = {}  # by sequence number of the request
         self._late: dict[int, _PendingRead] = {}
-        self._unheard = 0  # blocks received before the response to the open
+        self._early_blocks: list[Packet] = []  # received before the response to the open
+        self._is_unproven = False  # whether that response was lost, so that the file may be another one
         self._is_silent = False  # silence since the last timed-out request was sent
         self._asked: dict[int, tuple[int, float]] = {}  # unanswered reads by offset: how often, and when last
 
@@ -181,8 +192,31 @@ class FileRead(FileTransferJob[bytes]):
         it."""
         if packet.session != self.asked_session or packet.requested != Opcode.BURST_READ_FILE:
             return False
-        self._unheard += packet.opcode == Opcode.ACK and self._is_of_a_burst(packet)
-        return self._unheard == OVERTAKING_READS and self._restarts < REOPENS_MAX
+        if self._restarts < REOPENS_MAX and packet.opcode == Opcode.ACK and self._is_of_a_burst(packet):
+            self._early_blocks.append(packet)
+        return len(self._early_blocks) >= OVERTAKING_READS
+
+    def _replace_lost_open_reply(self, session: int, now: float) -> None:
+        """Go on without the response to the open.
+
+        The burst may be of another station's file, whose session has our number: the refusal of our open may
+        be lost too. The first bytes of the file show that in the end. Where they are not known, the session
+        is closed, and the read starts again behind the burst: ArduPilot ends none early.
+        """
+        self._restarts += 1
+        early_blocks = self._early_blocks
+        self._early_blocks = []
+        if not self._magics:
+            self._line.close_session(session)
+            self._start_anew()
+            self._begin_early(now)
+            return
+        self._take_session()
+        self._is_unproven = True
+        self._opened_at = now
+        self._has_early_burst = True
+        for packet in early_blocks[:-1]:  # the last one is being processed
+            self._take_burst(packet, now)
 
     def take(self, packet: Packet, now: float) -> None:
         super().take(packet, now)
@@ -192,11 +226,7 @@ class FileRead(FileTransferJob[bytes]):
             self._restarts += 1
             self._begin_early(now)
         if self.session is None and self._shows_lost_open_reply(packet):
-            # whether the file is ours is unknown: close it, and start again at the end of the burst
-            self._restarts += 1
-            self._line.close_session(packet.session)
-            self._start_anew()
-            self._begin_early(now)
+            self._replace_lost_open_reply(packet.session, now)
         if self.is_ended or self.session is None or packet.session != self.session:
             return
         self._is_silent = False
@@ -554,7 +584,14 @@ class FileRead(FileTransferJob[bytes]):
         if self._blocks.end is None and not self._burst_runs and self._blocks.reached >= self._exact_size:
             self._ends_at(self._blocks.reached)
         if self._blocks.is_complete:
-            self.finish(self._blocks.content, now)
+            content = self._blocks.content
+            if self._is_unproven and not content.startswith(self._magics):
+                self._line.close_session(self.session)
+                self.session = None
+                self._start_anew()
+                self._begin_early(now)
+            else:
+                self.finish(content, now)
             return
         if self._may_burst and self._has_bursts and not self._burst_runs and self._is_worth_a_burst():
             self._burst(now)

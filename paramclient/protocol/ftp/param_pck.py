@@ -18,7 +18,16 @@ from typing import Final, NamedTuple
 from paramclient.errors import PackError, UsageError
 from paramclient.model.values import NAME_LENGTH, ParamType, check_name
 
-__all__ = ["Pack", "PackedParam", "decode", "decode_prefix", "decode_upload", "encode", "encode_upload"]
+__all__ = [
+    "MAGICS",
+    "Pack",
+    "PackedParam",
+    "decode",
+    "decode_prefix",
+    "decode_upload",
+    "encode",
+    "encode_upload",
+]
 
 READ_SIZE_DEFAULT: Final = 239
 """Bytes in one message of MAVFTP, at most, and the usual size of reads of the file."""
@@ -31,6 +40,8 @@ PACKABLE: Final = frozenset({ParamType.INT8, ParamType.INT16, ParamType.INT32, P
 
 _MAGIC = 0x671B
 _MAGIC_WITH_DEFAULTS = 0x671C
+MAGICS: Final = tuple(magic.to_bytes(2, "little") for magic in (_MAGIC, _MAGIC_WITH_DEFAULTS))
+"""The first two bytes of every such file, without and with defaults."""
 _HEADER = struct.Struct("<HHH")
 _TYPES = {1: ParamType.INT8, 2: ParamType.INT16, 3: ParamType.INT32, 4: ParamType.REAL32}
 _NUMBERS = {kind: number for number, kind in _TYPES.items()}

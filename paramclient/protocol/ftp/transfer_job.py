@@ -328,6 +328,11 @@ class FileTransferJob(Operation[Result]):
         self.asked_session = number
         self._ask(opcode, opened, now, data=self._path_data, session=number, copies=copies)
 
+    def _take_session(self) -> None:
+        """Take the requested session as open: the response to the open was lost, and is awaited no longer."""
+        self.session, self.asked_session = self.asked_session, None
+        self._request = self._on_response = None
+
     def _wait_or_refuse(self, packet: Packet, what: str, now: float) -> None:
         """Retry later while the server's session is in use; otherwise end with the error of a NAK."""
         self._busy_since = min(self._busy_since, now)

@@ -208,7 +208,13 @@ class FileTransfers(Machine):
         return self._job is not None and self._job.is_ended and self._job.session is not None
 
     def read(
-        self, path: str, now: float, *, read_size: int = DATA_SIZE_MAX, limit: int = FILE_SIZE_MAX
+        self,
+        path: str,
+        now: float,
+        *,
+        read_size: int = DATA_SIZE_MAX,
+        limit: int = FILE_SIZE_MAX,
+        magics: tuple[bytes, ...] = (),
     ) -> FileRead:
         """Read a whole file; `size` and `received` of the result tell the progress.
 
@@ -218,11 +224,14 @@ class FileTransfers(Machine):
             read_size: bytes of one read, 1 to 239: one size for all, as ArduPilot requires for param.pck.
                 Less than 239 is better on a radio that loses long frames.
             limit: bytes above which the file is rejected.
+            magics: the first bytes that the file may have; none where they are not known. They show that a
+                burst is of this file although the response to its open was lost.
 
         Raises:
             UsageError: the path or a size is invalid.
         """
-        return self._begin(FileRead(self._line_at(now), path, now, read_size=read_size, limit=limit), now)
+        job = FileRead(self._line_at(now), path, now, read_size=read_size, limit=limit, magics=magics)
+        return self._begin(job, now)
 
     def write(
         self, path: str, data: bytes, now: float, *, write_size: int = DATA_SIZE_MAX

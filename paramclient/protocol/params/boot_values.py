@@ -26,7 +26,7 @@ MEASURING_UPTIME_MAX: Final = 5.0
 BOOT_READS_MAX: Final = 5
 """Reads in flight: one batch of ArduPilot."""
 FETCH_CHECK_INTERVAL: Final = 0.1
-"""Seconds until the next look at whether a fetch has ended."""
+"""Seconds until the next look at whether a fetch or a set-up has ended."""
 
 _MEASURED = re.compile(
     r"INS\d?_(ACC\d?_ID|GYR\d?_ID|ACC\d?_CALTEMP|GYR\d?_CALTEMP|GYR\d?OFFS_[XYZ]|GYROFFS_[XYZ])"
@@ -40,8 +40,9 @@ and later boots), and the corresponding ones of other sensors."""
 class BootValues(Machine):
     """Reads again what a vehicle without a hash measures at each boot; see `MEASURING_TIME`.
 
-    If the file of the whole table is fast, it is fetched instead. A vehicle with a hash needs neither: its
-    hash shows the changes.
+    If the file of the whole table is fast, it is fetched instead. Neither is done during a set-up, which
+    reads the table itself, nor where the table was fetched since the measurements. A vehicle with a hash
+    needs neither: its hash shows the changes.
 
     Args:
         context, reads, table, sync: the component's.
@@ -59,13 +60,14 @@ class BootValues(Machine):
         self._table = table
         self._sync = sync
         self._read_at = math.inf
+        self._measured_at = math.inf  # when the measurements are done
         self._has_clock = False  # whether its clock was received since its boot, or since it was found
         self._waiting: deque[str] = deque()
         self._in_flight = 0
 
     def restarted(self, now: float, *, by_clock: bool) -> None:
         """Process a reboot of the vehicle; `by_clock` says that its clock has shown it."""
-        self._read_at = now + MEASURING_TIME
+        self._measured_at = self._read_at = now + MEASURING_TIME
         self._has_clock = by_clock
 
     def clock_told(self, uptime: float, now: float) -> None:
@@ -78,16 +80,18 @@ class BootValues(Machine):
         is_first = not self._has_clock
         self._has_clock = True
         if is_first and (self._read_at < math.inf or uptime <= MEASURING_UPTIME_MAX):
-            self._read_at = now + MEASURING_TIME
+            self._measured_at = self._read_at = now + MEASURING_TIME
 
     def tick(self, now: float) -> None:
         """Read the values that are due."""
         if self._read_at > now:
             return
-        if self._context.is_fetching:
+        if self._context.is_fetching or self._sync.holds:
             self._read_at = now + FETCH_CHECK_INTERVAL
             return
         self._read_at = math.inf
+        if self._sync.is_known_since(self._measured_at):
+            return
         if self._sync.wants_boot_values and not self._sync.fetch_quick_file(now):
             self._waiting = deque(name for name in self._table.params if _MEASURED.fullmatch(name))
             self._ask(now)

@@ -11,7 +11,7 @@ from paramclient.errors import FileErrorCode, FileTransferError, NoReply, PackEr
 from paramclient.model.values import is_portable_name
 from paramclient.protocol.ftp import BUSY, FileRead, FileTransfers
 from paramclient.protocol.ftp.packets import DATA_SIZE_MAX
-from paramclient.protocol.ftp.param_pck import PACK_SIZE_MAX, Pack, decode, total_of
+from paramclient.protocol.ftp.param_pck import MAGICS, PACK_SIZE_MAX, Pack, decode, total_of
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.download_ranges import DownloadRange, DownloadRanges, split_bytes
 from paramclient.protocol.params.fetch_result import Progress
@@ -203,7 +203,8 @@ class FileDownload(Operation[None]):
         self._doubts = self._table.doubts
         self._heard.clear()
         self._received_count = None
-        job = self._job = self._files.read(PARAMETER_FILE + self._query, now, limit=PACK_SIZE_MAX)
+        path = PARAMETER_FILE + self._query
+        job = self._job = self._files.read(path, now, limit=PACK_SIZE_MAX, magics=MAGICS)
         job.yields = self._yields
         job.on_done.append(partial(self._came, job))
 

@@ -208,7 +208,7 @@ class Sync(Machine):
         announced: the last hash received, or None.
         synced: whether the table was fetched on this link, without a sign of change since.
         refresh: the reads of values that a confirmed hash does not cover, or None.
-        holds: set-ups in progress, which read the table themselves: no check begins meanwhile.
+        holds: set-ups in progress, which read the table themselves: no check begins meanwhile, see `hold`.
     """
 
     def __init__(
@@ -426,6 +426,30 @@ class Sync(Machine):
         if self._sync_settings.policy is not Policy.CACHE_ONLY:
             read = self._reads.ask(HASH_CHECK, now)
             read.on_done.append(lambda: self._hash_came(read))
+
+    def hold(self) -> None:
+        """Begin no check until `release`: a set-up reads the table itself."""
+        self.holds += 1
+
+    def release(self) -> None:
+        """Let checks begin again: those that were due meanwhile at once, unless the table was fetched."""
+        self.holds -= 1
+
+    def drop_check(self, now: float) -> None:
+        """Cancel a check in progress for which no caller waits, and make it due again.
+
+        Values are about to be written: if they change the number of parameters, its file is stale, and is
+        read again.
+        """
+        fetch = self._resync
+        if fetch is not None and fetch.check is not None:
+            self._resync = None
+            self._host.end_fetch(fetch, now)
+            self._check_at = now
+
+    def is_known_since(self, at: float) -> bool:
+        """Return whether the whole table was fetched by requests after this moment, and has not changed."""
+        return self.synced and self._known_at >= at
 
     def fetch_quick_file(self, now: float) -> bool:
         """Fetch the table again if its file is fast; return False where it is not, or is not permitted."""

@@ -135,7 +135,7 @@ class Desk:
             self.transfers.tick(self.now)
         raise AssertionError("it does not come to an end")
 
-    def opened(self, path: str = "a.txt", *, size: int = 1000, **options: int) -> tuple[FileRead, Packet]:
+    def opened(self, path: str = "a.txt", *, size: int = 1000, **options: Any) -> tuple[FileRead, Packet]:
         """A read whose file is open in session 9, and the request for its burst."""
         read = self.transfers.read(path, self.now, **options)
         request = self.first(Opcode.OPEN_FILE_RO)
@@ -1035,6 +1035,55 @@ class TestHaste:
 
     def test_but_not_for_ever(self) -> None:
         desk = self.known_link()
+    def test_a_lost_response_to_the_open_of_a_file_with_known_first_bytes_restarts_nothing(self) -> None:
+        """ArduPilot ends no burst early: the whole file would be sent twice."""
+        desk = self.known_link()
+        read = desk.transfers.read("a", desk.now, magics=(b"up", b"xx"))
+        first, _, burst = desk.take()
+        desk.answer(burst, b"x" * 239)
+        desk.answer(burst, b"y" * 239, offset=239, nth=2)
+        desk.answer(burst, b"z", offset=478, nth=3)
+        assert desk.take() == []
+        assert read.received == 479
+        desk.answer(first, code=FileErrorCode.FAIL)  # to the copy of the open; too late
+        desk.answer(burst, code=FileErrorCode.EOF, offset=479, nth=4)
+        desk.closed(first.session)
+        assert desk.take() == []
+        assert read.result == b"x" * 239 + b"y" * 239 + b"z"
+
+    def test_the_first_bytes_show_that_the_burst_was_of_another_file(self) -> None:
+        """The refusal of the open was lost: another station's session has its number."""
+        desk = self.known_link()
+        read = desk.transfers.read("a", desk.now, magics=(b"up",))
+        first, _, burst = desk.take()
+        desk.answer(burst, b"x" * 239)
+        desk.answer(burst, b"x" * 239, offset=239, nth=2)
+        assert desk.take() == []
+        desk.answer(burst, code=FileErrorCode.EOF, offset=478, nth=3)
+        *closes, again, _, burst = desk.take()
+        assert {packet.opcode for packet in closes} == {Opcode.TERMINATE_SESSION}
+        assert (again.opcode, again.data) == (Opcode.OPEN_FILE_RO, b"a")
+        assert again.sequence != first.sequence
+        assert read.result is None
+        desk.answer(again, bytes(4))
+        desk.answer(burst, b"up")
+        desk.answer(burst, code=FileErrorCode.EOF, offset=2, nth=2)
+        desk.closed(again.session)
+        assert read.result == b"up"
+
+    def test_a_lost_beginning_of_a_burst_without_a_response_to_its_open_is_read_again(self) -> None:
+        desk = self.known_link()
+        read = desk.transfers.read("a", desk.now, magics=(b"up",))
+        first, _, burst = desk.take()
+        desk.answer(burst, b"x" * 239, offset=239, nth=2)
+        desk.answer(burst, b"y", offset=478, nth=3)
+        desk.answer(burst, code=FileErrorCode.EOF, offset=479, nth=4)
+        for request in [packet for packet in desk.take() if packet.opcode == Opcode.READ_FILE][:1]:
+            assert (request.session, request.offset) == (first.session, 0)
+            desk.answer(request, b"up".ljust(239, b"w"))
+        desk.closed(first.session)
+        assert read.result == b"up".ljust(239, b"w") + b"x" * 239 + b"y"
+
         desk.transfers.read("a", desk.now)
         opened = 1
         for _ in range(20):
@@ -1443,7 +1492,7 @@ class Ground:
             raise job.error
         return job.result
 
-    def read(self, path: str, limit: float = 120.0, **options: int) -> bytes:
+    def read(self, path: str, limit: float = 120.0, **options: Any) -> bytes:
         result = self.outcome(self.transfers.read(path, self.now, **options), limit)
         assert result is not None
         return result

@@ -342,6 +342,20 @@ def test_values_measured_at_each_start_are_read_again_after_a_reboot() -> None:
     assert desk.machine.table.params["BARO1_GND_PRESS"].value == 2.0
 
 
+def test_boot_values_are_read_after_a_set_up() -> None:
+    desk = Desk()
+    desk.value("BARO1_GND_PRESS")
+    desk.run_heard(100.0)
+    desk.hear(SystemTime(0, 2_000))
+    desk.hear(AutopilotVersion(0, uid=7))
+    desk.machine.sync.hold()
+    desk.run_heard(110.0)
+    assert desk.names_read() == set()
+    desk.machine.sync.release()
+    desk.run(110.2)
+    assert desk.names_read() == {"BARO1_GND_PRESS"}
+
+
 def test_measuring_counts_from_the_first_clock() -> None:
     """A restart that shows in the heartbeat is noticed before the main loop runs."""
     desk = Desk()
