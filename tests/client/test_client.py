@@ -62,6 +62,7 @@ from tests.shell import (
     tasks_beside,
     until,
 )
+from tests.simulation import is_so
 
 __all__ = ["pytest_generate_tests", "way"]
 
@@ -1579,3 +1580,17 @@ async def test_invalid_options_of_accept_and_sample_are_refused() -> None:
         with pytest.raises(UsageError, match="sample must be at least 1 parameter, not 0"):
             await component.fetch_all(accept="sampled", sample=0)
         assert (await component.fetch_all(accept="sampled", sample=10**9, seed=time.time_ns())).complete
+
+
+@in_simulated_time
+async def test_a_vehicle_that_receives_nothing_at_first_is_identified_later() -> None:
+    tap = Tap(PX4Vehicle())
+    tap.is_deaf = True
+    async with a_client(tap) as client:
+        component = await client.component()
+        await anyio.sleep(300.0)
+        assert component.identity.uid is None
+        tap.is_deaf = False
+        assert (await component.get("SYS_AUTOSTART")).value
+        await anyio.sleep(0.2)
+        assert is_so(component.identity.uid is not None)

@@ -461,7 +461,11 @@ DOUBT_REQUEST_INTERVAL: Final = 1.0
 """Seconds between two requests after the usual number of them."""
 LATER_REQUEST_INTERVAL: Final = 5.0
 """Seconds between two requests to a component that has sent its hardware id before and did not in that time,
-while it is not lost: its radio may have received nothing."""
+while it is not lost: its radio may have received nothing. The same, at first, to an autopilot that has never
+sent its version; the interval then doubles."""
+LATER_REQUEST_INTERVAL_MAX: Final = 60.0
+"""Seconds between two such requests to an autopilot that has never sent its version, at most: some have
+none."""
 
 
 class MessageAttempts(Attempts):
@@ -484,18 +488,20 @@ class MessageAttempts(Attempts):
 class VersionAttempts(MessageAttempts):
     """The requests for AUTOPILOT_VERSION since the identity was open."""
 
-    __slots__ = ("_denied_at", "_lost_at", "_until")
+    __slots__ = ("_denied_at", "_later_count", "_lost_at", "_until", "_was_blind")
 
     def __init__(self, policy: RetryPolicy) -> None:
         super().__init__(policy)
         self.sent_at = -math.inf
+        self._later_count = 0  # requests after the usual ones
+        self._was_blind = True  # whether the component had answered nothing when it was requested last
         self._until = -math.inf  # it is requested until then regardless of the number of requests
         self._denied_at = math.inf
         self._lost_at = math.inf  # when the acknowledged response counts as lost
 
     def restart(self) -> None:
         """Begin again: the identity is open."""
-        self.count = 0
+        self.count = self._later_count = 0
 
     def extend_requests(self, now: float) -> None:
         """Repeat the request for `DOUBT_TIME_MIN` at least."""
@@ -503,12 +509,22 @@ class VersionAttempts(MessageAttempts):
 
     def sent(self, now: float) -> None:
         super().sent(now)
-        self._denied_at = self._lost_at = math.inf
+        self._note_sent()
 
     def sent_later(self, now: float) -> None:
         """Record a request after the usual ones, which is not counted."""
+        self._later_count = 0 if self._has_link_answered else self._later_count + 1
         self.sent_at = now
+        self._note_sent()
+
+    def _note_sent(self) -> None:
         self._denied_at = self._lost_at = math.inf
+        self._was_blind = self._policy.round_trip.smoothed is None
+
+    @property
+    def _has_link_answered(self) -> bool:
+        """Whether the component has answered its first request of any kind since the last one of these."""
+        return self._was_blind and self._policy.round_trip.smoothed is not None
 
     def denied(self, now: float) -> None:
         """Record a refusal: the other command is due at once."""
@@ -536,6 +552,14 @@ class VersionAttempts(MessageAttempts):
     def later_at(self) -> float:
         """When to request it once more after the usual number of requests."""
         return self.sent_at + LATER_REQUEST_INTERVAL
+
+    @property
+    def first_later_at(self) -> float:
+        """The same for an autopilot that has never sent it: all requests may have been lost before the link
+        carried any, and it is due at once when the first response of any kind shows that it does now."""
+        if self._has_link_answered:
+            return self.sent_at
+        return self.sent_at + min(LATER_REQUEST_INTERVAL * 2.0**self._later_count, LATER_REQUEST_INTERVAL_MAX)
 
     def should_give_up(self, now: float) -> bool:
         return self.count >= self._tries and now >= self._until
@@ -1051,6 +1075,9 @@ SLOW_ATTEMPTS_WITHOUT_BACKOFF: Final = 4
 SLOW_ATTEMPTS_MIN: Final = 9
 """Attempts of such a request before it is given up, at least: with the backoff some seconds, in which a small
 board applies a file of parameters."""
+SLOW_TIME_MAX: Final = 60.0
+"""Seconds after which such a request is given up, however lossy the link is: no server works that long on a
+file of parameters, and one that has died answers none of `ATTEMPTS_MAX` requests either."""
 BACKOFF_DOUBLINGS_MAX: Final = 4
 """Doublings of the timeout after these."""
 
@@ -1075,19 +1102,20 @@ class FileAttempts(Attempts):
         is_slow: whether the server works on the request for long, which tells nothing of the link.
     """
 
-    __slots__ = ("_is_slow", "_server")
+    __slots__ = ("_begun_at", "_is_slow", "_server")
 
     def __init__(self, policy: RetryPolicy, server: Server, *, is_slow: bool = False) -> None:
         super().__init__(policy)
         self._server = server
         self._is_slow = is_slow
+        self._begun_at = math.inf  # when it was sent first
 
     @property
     def timeout(self) -> float:
         policy = self._policy
         if self._is_slow:
             doublings = min(max(self.count - SLOW_ATTEMPTS_WITHOUT_BACKOFF, 0), BACKOFF_DOUBLINGS_MAX)
-            return policy.timeout * 2.0**doublings
+            return min(policy.timeout * 2.0**doublings, max(TIMEOUT_MAX, policy.timeout))
         timeout = policy.repeat_timeout(self.count)
         if self._is_unheard and policy.round_trip.smoothed is not None:
             # the server may be busy with another station, whose burst nothing interrupts
@@ -1114,9 +1142,14 @@ class FileAttempts(Attempts):
     def answered(self, now: float, *, is_sure: bool = True) -> None:
         self._policy.answered(self.sent_at, now, 2 if self._is_slow else self.count)
 
+    def sent(self, now: float) -> None:
+        super().sent(now)
+        self._begun_at = min(self._begun_at, now)
+
     def restart(self) -> None:
         """Begin again: the link is back."""
         self.count = 0
+        self._begun_at = math.inf
 
     def await_open(self) -> None:
         """Count anew for a request to open a file whose response is only needed to close it."""
@@ -1135,6 +1168,8 @@ class FileAttempts(Attempts):
         """
         if self._is_unheard and not self._policy.is_silent_too_long(now):
             return self.count >= (UNANSWERED_OPENS_MAX if yields else UNHEARD_ATTEMPTS_MAX)
+        if self._is_slow and now - self._begun_at >= SLOW_TIME_MAX:
+            return self.count >= ATTEMPTS_MIN
         if self._is_slow and self.count < SLOW_ATTEMPTS_MIN:
             return False
         return super().should_give_up(now)

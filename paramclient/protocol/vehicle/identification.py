@@ -109,6 +109,7 @@ class Identification(Machine):
         self._beat_awaited_until = math.inf  # while a heartbeat may still tell the encoding
         self._received_at = -math.inf
         self._was_doubted = False  # since the last version
+        self._is_high_latency = False
         self.encoding, self.encoding_reason = judge_encoding(chosen, None, None)
         self._derive()
 
@@ -187,6 +188,7 @@ class Identification(Machine):
         """Process a heartbeat or HIGH_LATENCY2, and return whether the autopilot or vehicle type has
         changed."""
         self._beat_awaited_until = math.inf
+        self._is_high_latency = isinstance(message, HighLatency2)
         is_another_kind = False
         if (message.autopilot, message.type) != (self.autopilot, self.vehicle_type):
             is_another_kind = self.vehicle_type is not None
@@ -290,8 +292,21 @@ class Identification(Machine):
     @property
     def _later_at(self) -> float:
         """When to request the identity after it was requested without success, or infinity."""
-        is_due = self.is_unconfirmed and self._received_at > self._attempts.sent_at
-        return self._attempts.later_at if is_due else math.inf
+        if self._received_at <= self._attempts.sent_at:
+            return math.inf
+        if self.is_unconfirmed:
+            return self._attempts.later_at
+        return self._attempts.first_later_at if self._was_never_answered else math.inf
+
+    @property
+    def _was_never_answered(self) -> bool:
+        """Whether an autopilot was asked without any response, as where the link was dead in one direction.
+
+        Cameras and radios often have no version. Requests over a satellite link cost money.
+        """
+        is_asked = self.settled and self.known_at == -math.inf and not self._context.is_identifying
+        may_ask = self._may_ask and not self._is_high_latency and not self._attempts.is_denied
+        return is_asked and may_ask and self.is_autopilot
 
     def _ask(self, now: float) -> None:
         """Begin to request the identity, or begin again."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any, TypeVar
 
 import pytest
@@ -28,6 +29,7 @@ from paramclient.protocol.requests.retry import (
     OPENS_MAX,
     REOPENS_MAX,
     SESSION_IDLE_TIME,
+    SLOW_TIME_MAX,
     TIMEOUT_MAX,
     UNANSWERED_OPENS_MAX,
     UNHEARD_ATTEMPTS_MAX,
@@ -1033,8 +1035,6 @@ class TestHaste:
         desk.closed(first.session)
         assert read.result == b"abc"
 
-    def test_but_not_for_ever(self) -> None:
-        desk = self.known_link()
     def test_a_lost_response_to_the_open_of_a_file_with_known_first_bytes_restarts_nothing(self) -> None:
         """ArduPilot ends no burst early: the whole file would be sent twice."""
         desk = self.known_link()
@@ -1084,6 +1084,8 @@ class TestHaste:
         desk.closed(first.session)
         assert read.result == b"up".ljust(239, b"w") + b"x" * 239 + b"y"
 
+    def test_but_not_for_ever(self) -> None:
+        desk = self.known_link()
         desk.transfers.read("a", desk.now)
         opened = 1
         for _ in range(20):
@@ -1408,6 +1410,31 @@ class TestWritingAtOnce:
         desk.answer(later[0])
         assert job.error is None
         assert job.done
+
+
+@pytest.mark.parametrize("round_trip", [0.1, 3.0, 8.0])
+def test_a_server_that_has_died_at_work_is_given_up_after_a_minute(round_trip: float) -> None:
+    """The autopilot is still heard, and packet loss would explain 60 unanswered requests."""
+    desk = Desk()
+    list_file = desk.transfers.list("a", desk.now)
+    desk.answer(desk.first(Opcode.LIST_DIRECTORY), code=FileErrorCode.EOF)
+    assert list_file.result == ()
+    for _ in range(50):
+        desk.retry.answered(0.0, round_trip, 1)
+        desk.retry.timed_out(1)
+        desk.retry.timed_out(1)
+    assert desk.retry.tries > ATTEMPTS_MAX / 2
+    began = desk.now
+    checksum = desk.transfers.checksum("a", desk.now)
+    sent = []
+    while not checksum.done:
+        sent += [desk.now] * bool(desk.take())
+        desk.now = desk.transfers.next_deadline()
+        desk.transfers.tick(desk.now)
+    assert isinstance(checksum.error, NoReply)
+    assert SLOW_TIME_MAX <= desk.now - began <= SLOW_TIME_MAX + max(TIMEOUT_MAX, desk.retry.timeout)
+    assert ATTEMPTS_MIN <= len(sent) <= desk.retry.tries
+    assert max(after - before for before, after in pairwise(sent)) <= max(TIMEOUT_MAX, desk.retry.timeout)
 
 
 def test_checksums_are_requested_in_parallel() -> None:

@@ -13,6 +13,8 @@ from paramclient.protocol.requests.retry import (
     DOUBT_REQUEST_INTERVAL,
     DOUBT_TIME_MIN,
     FIRST_TIMEOUT,
+    LATER_REQUEST_INTERVAL,
+    LATER_REQUEST_INTERVAL_MAX,
     VERSION_ATTEMPTS,
     RetryPolicy,
 )
@@ -35,6 +37,7 @@ from paramclient.protocol.wire import (
     CommandAck,
     CommandLong,
     Heartbeat,
+    HighLatency2,
     Message,
 )
 from tests.simulation import is_so
@@ -76,6 +79,16 @@ class Desk:
             assert isinstance(message, CommandLong)
             assert (message.target_system, message.target_component) == (1, 1)
         return [message.command for message in sent if isinstance(message, CommandLong)]
+
+    def request_times(self, heartbeat: Heartbeat, since: int, until: int) -> list[float]:
+        """When requests are sent while a heartbeat is received each second and nothing is answered."""
+        times = []
+        for second in range(since, until):
+            self.beat(heartbeat, float(second))
+            while (deadline := self.next_deadline()) < second + 1:
+                self.tick(max(deadline, float(second)))
+                times.extend([max(deadline, float(second))] if self.commands() else [])
+        return times
 
     def let_it_be(self) -> None:
         """Let every request go unanswered."""
@@ -195,6 +208,62 @@ def test_both_version_requests_alternate_until_the_component_is_given_up() -> No
     assert desk.who.identity.key == "system:1@udpin:x"
     desk.beat(CAMERA, 10.0)
     assert desk.commands() == []
+
+
+def test_an_autopilot_that_has_answered_nothing_is_asked_again_less_and_less_often() -> None:
+    """The link may have carried nothing to it at first."""
+    desk = Desk()
+    desk.beat(PX4)
+    desk.let_it_be()
+    desk.commands()
+    last = FIRST_TIMEOUT * (2 ** (VERSION_ATTEMPTS - 1) - 1)
+    times = [last, *desk.request_times(PX4, 4, 400)]
+    pauses = [after - before for before, after in pairwise(times)]
+    assert pauses[:4] == [LATER_REQUEST_INTERVAL * 2**number for number in range(4)]
+    assert pauses[4:] == [LATER_REQUEST_INTERVAL_MAX] * len(pauses[4:])
+    assert len(pauses) > 6
+    assert desk.who.version(AutopilotVersion(0, uid=7), 401.0) is False
+    assert desk.who.identity.uid == "0000000000000007"
+    assert desk.request_times(PX4, 402, 600) == []
+
+
+def test_the_first_response_of_any_kind_has_the_identity_requested_at_once() -> None:
+    desk = Desk()
+    desk.beat(PX4)
+    desk.let_it_be()
+    desk.commands()
+    times = desk.request_times(PX4, 4, 301)
+    desk.beat(PX4, 301.0)
+    assert desk.next_deadline() == times[-1] + LATER_REQUEST_INTERVAL_MAX > 301.1
+    desk.retry.answered(301.0, 301.1, 1)  # a read, say
+    assert desk.next_deadline() <= 301.1
+    desk.tick(301.1)
+    assert desk.commands() == [MAV_CMD_REQUEST_MESSAGE, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES]
+    desk.beat(PX4, 302.0)
+    assert desk.next_deadline() == pytest.approx(301.1 + LATER_REQUEST_INTERVAL), "that may be lost too"
+
+
+@pytest.mark.parametrize("kind", ["camera", "high latency", "refuses"])
+def test_a_component_that_has_no_version_is_not_asked_again(kind: str) -> None:
+    desk = Desk()
+    heartbeat = CAMERA if kind == "camera" else PX4
+    desk.beat(heartbeat)
+    if kind == "refuses":
+        for number in range(VERSION_ATTEMPTS):
+            command = desk.commands()[-1]
+            desk.messages.acknowledged(CommandAck(command, MAV_RESULT_UNSUPPORTED), 0.1 * number)
+            desk.tick(0.1 * number)
+    else:
+        desk.let_it_be()
+    desk.commands()
+    assert desk.who.settled
+    for second in range(1, 300):
+        if kind == "high latency":
+            desk.who.heartbeat(HighLatency2(2, MAV_AUTOPILOT_PX4))
+            desk.who.receive(float(second))
+        else:
+            desk.beat(heartbeat, float(second))
+        assert desk.next_deadline() == math.inf
 
 
 def test_a_refusal_leads_to_the_other_way_at_once() -> None:
