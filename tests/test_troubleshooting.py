@@ -20,9 +20,9 @@ from paramclient.errors import NoReply, UsageError
 from paramclient.links import SerialPort, refusals
 from paramclient.links.port_users import THIS_PROGRAM
 from paramclient.protocol import wire
+from paramclient.protocol.no_reply_hint import hint_of_component, hint_of_link
 from paramclient.protocol.params.fetch_result import Policy
 from paramclient.protocol.params.sync import SyncSettings
-from paramclient.protocol.silence import silence_of_component, silence_of_link
 from paramclient.protocol.station import Station
 from paramclient.protocol.wire import (
     MAV_AUTOPILOT_INVALID,
@@ -73,11 +73,11 @@ def silences() -> list[str]:
     """Return every sentence about a silent link or component."""
     links = [LINK, "udpout:192.168.1.20:14550", "tcp:127.0.0.1:5760", "tcpin:0.0.0.0:5760"]
     links.append("serial:/dev/ttyUSB0:57600")
-    found = [silence_of_link(station_on(link), link) for link in links]
+    found = [hint_of_link(station_on(link), link) for link in links]
     for link in (links[0], links[-1]):
         noisy = station_on(link)
         noisy.receive(bytes(1500), "peer", 1.0)
-        found.append(silence_of_link(noisy, link))
+        found.append(hint_of_link(noisy, link))
     heard: list[list[tuple[Message, int, int]]] = [
         [(GCS, 252, 190)],
         [(GCS, 255, 190)],
@@ -88,14 +88,14 @@ def silences() -> list[str]:
         station = station_on()
         for message, system, component in frames:
             hear(station, message, system, component)
-        found.append(silence_of_link(station, LINK))
+        found.append(hint_of_link(station, LINK))
     settings = SyncSettings.chosen(None, Policy.AUTO, listen_only=True, is_log=False)
     listening = Station(link=LINK, is_stream=False, sync_settings=settings)
     hear(listening, TEXT, 7)
-    found.append(silence_of_link(listening, LINK))
+    found.append(hint_of_link(listening, LINK))
     interrupted = station_on(links[2])
     interrupted.pause()
-    return [*found, silence_of_link(interrupted, links[2]), *silences_of_components()]
+    return [*found, hint_of_link(interrupted, links[2]), *silences_of_components()]
 
 
 def silences_of_components() -> list[str]:
@@ -103,16 +103,16 @@ def silences_of_components() -> list[str]:
     for second in range(6):
         hear(station, PX4, 3, now=float(second))
     machine = station.components[3, 1]
-    found = [silence_of_component(station, machine, 1.0, 5.5)]
+    found = [hint_of_component(station, machine, 1.0, 5.5)]
     machine.round_trip.smoothed = 0.1
-    found.append(silence_of_component(station, machine, 1.0, 5.5))
-    found.append(silence_of_component(station, machine, 7.0, 12.0))
+    found.append(hint_of_component(station, machine, 1.0, 5.5))
+    found.append(hint_of_component(station, machine, 7.0, 12.0))
     hear(station, GCS, 252, 190, now=11.5)
-    found.append(silence_of_component(station, machine, 7.0, 12.0))
+    found.append(hint_of_component(station, machine, 7.0, 12.0))
     without_heartbeats = station_on()
     hear(without_heartbeats, wire.ParamValue("A", bytes(4), 9, 1, 0), 3, now=2.0)
     machine = without_heartbeats.components[3, 1]
-    return [*found, silence_of_component(without_heartbeats, machine, 1.0, 3.0)]
+    return [*found, hint_of_component(without_heartbeats, machine, 1.0, 3.0)]
 
 
 def refusals_of_sockets(monkeypatch: pytest.MonkeyPatch) -> list[str]:

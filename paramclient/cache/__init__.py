@@ -26,8 +26,8 @@
 - `snapshots`: snapshots, and tables at an earlier time.
 - `sqlite`: SQLite transactions.
 - `sqlite_file`: the SQLite file: opening, checks, replacement of a damaged one.
-- `store`: `ParamCache`, the public class.
-- `history_columns`: the stored form of a history line, and its columns.
+- `store`: `ParamCache`, the public class, and the default path of the file.
+- `history_columns`: the stored form of a history line, its columns, and how many lines are kept.
 - `param_columns`: the stored form of a parameter, and its columns in both databases.
 - `table_updates`: updates of tables, with their history lines.
 - `transaction`: `Transaction`, one transaction in SQL.
@@ -45,6 +45,7 @@ from paramclient.cache.ext_records import (
 )
 from paramclient.cache.file_table import AddedTable
 from paramclient.cache.fleet import FleetDiff, FleetValue, FleetVehicle, Holder, NameSpread
+from paramclient.cache.history_columns import HISTORY_ENTRIES_MAX
 from paramclient.cache.interrupted_setups import CutOff, RunningSetup, SetupNotes
 from paramclient.cache.observed_table import ObservedParams, UnixTimes
 from paramclient.cache.param_columns import BY_VEHICLE, StoredParam
@@ -63,7 +64,6 @@ from paramclient.cache.records import (
 )
 from paramclient.cache.snapshots import CLOCK_SLACK, SNAPSHOTS
 from paramclient.cache.store import ParamCache, default_path
-from paramclient.cache.table_updates import HISTORY_ENTRIES_MAX
 from paramclient.cache.transfer import CopyResult
 
 __all__ = [

@@ -19,11 +19,11 @@ from paramclient.cache.ext_records import (
     StoredExtParam,
     ext_checksum,
 )
+from paramclient.cache.history_columns import HISTORY_ENTRIES_MAX
 from paramclient.cache.param_columns import BY_VEHICLE
 from paramclient.cache.reconciliation import reconcile
 from paramclient.cache.records import TableUpdate
 from paramclient.cache.snapshots import CLOCK_SLACK
-from paramclient.cache.table_updates import HISTORY_ENTRIES_MAX
 from paramclient.cache.transaction import ExtState, Transaction
 from paramclient.model.ext_params import ExtParam
 

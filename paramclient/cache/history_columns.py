@@ -1,4 +1,4 @@
-"""`HistoryLine`: a line of history as the cache stores it, with the columns of it."""
+"""`HistoryLine`: a line of history as the cache stores it, its columns, and how many lines are kept."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from paramclient.cache.records import HistoryEntry
 
 __all__ = [
     "HISTORY_COLUMNS",
+    "HISTORY_ENTRIES_MAX",
     "HISTORY_MARKS",
     "NO_VALUE",
     "HistoryLine",
@@ -22,6 +23,10 @@ __all__ = [
 
 LineValue: TypeAlias = tuple[int, int, int] | tuple[None, None, None]
 """Type, bits and is_raw of a value, as in `StoredParam.value`; or `NO_VALUE`."""
+HISTORY_ENTRIES_MAX: Final = 10_000
+"""Maximum number of history lines of each table, the newest: about 1 MB, and years of tuning by hand. Each
+`save` writes a line for each changed value, so values that change many times a second should be collected
+first."""
 NO_VALUE: Final = (None, None, None)
 """The new value of a parameter that was removed."""
 

@@ -6,10 +6,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
-from paramclient.cache.history_columns import HistoryLine
+from paramclient.cache.history_columns import HISTORY_ENTRIES_MAX, HistoryLine
 from paramclient.cache.param_columns import BY_VEHICLE, StoredParam
 from paramclient.cache.records import CachedSummary, CachedVehicle, TableUpdate
-from paramclient.cache.table_updates import HISTORY_ENTRIES_MAX, apply_update, check_times, hashed, save
+from paramclient.cache.table_updates import apply_update, check_times, hashed, save
 from paramclient.cache.transaction import Transaction
 
 __all__ = ["merge"]

@@ -19,7 +19,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
 
-from paramclient.cache import table_updates
+from paramclient.cache import history_columns
 from paramclient.cache.cells import time_cell
 from paramclient.cache.history_columns import HistoryLine, NumberedLine
 from paramclient.cache.merge import SAME_CHANGE_MAX
@@ -346,7 +346,7 @@ def _write_past(
         transaction.add_lines(owner, [line for _, line in history.lines[len(kept) :]])
     else:
         transaction.replace_lines(owner, history.lines, start=kept[0][0])
-    at = transaction.trim_lines(owner, table_updates.HISTORY_ENTRIES_MAX)
+    at = transaction.trim_lines(owner, history_columns.HISTORY_ENTRIES_MAX)
     if at is not None:
         transaction.raise_known_since(owner, at)
 

@@ -9,9 +9,8 @@ which values count.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from typing import Final
 
-from paramclient.cache import snapshots
+from paramclient.cache import history_columns, snapshots
 from paramclient.cache.cells import are_times, time_cell
 from paramclient.cache.history_columns import NO_VALUE, HistoryLine
 from paramclient.cache.observed_table import ObservedParams
@@ -21,7 +20,6 @@ from paramclient.cache.transaction import Transaction
 from paramclient.model.identity import Identity
 
 __all__ = [
-    "HISTORY_ENTRIES_MAX",
     "apply_update",
     "check_times",
     "component",
@@ -32,11 +30,6 @@ __all__ = [
     "write_lines",
     "write_state",
 ]
-
-HISTORY_ENTRIES_MAX: Final = 10_000
-"""Maximum number of history lines of each table, the newest: about 1 MB, and years of tuning by hand. Each
-`save` writes a line for each changed value, so values that change many times a second should be collected
-first."""
 
 
 def save(transaction: Transaction, updates: Iterable[TableUpdate]) -> None:
@@ -150,7 +143,7 @@ def write_lines(transaction: Transaction, owner: int, lines: Sequence[HistoryLin
     if not lines:
         return
     transaction.add_lines(owner, lines)
-    at = transaction.trim_lines(owner, HISTORY_ENTRIES_MAX)
+    at = transaction.trim_lines(owner, history_columns.HISTORY_ENTRIES_MAX)
     if at is not None:
         transaction.raise_known_since(owner, at)
 

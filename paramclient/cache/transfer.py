@@ -9,12 +9,12 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
 from paramclient.cache.ext_tables import ExtDump, put_ext, take_ext
-from paramclient.cache.history_columns import NO_VALUE, HistoryLine
+from paramclient.cache.history_columns import HISTORY_ENTRIES_MAX, NO_VALUE, HistoryLine
 from paramclient.cache.operations import StoreOperation
 from paramclient.cache.param_columns import StoredParam
 from paramclient.cache.records import CachedSummary, CachedVehicle, SnapshotSummary, TableState, TableUpdate
 from paramclient.cache.snapshots import SNAPSHOTS
-from paramclient.cache.table_updates import HISTORY_ENTRIES_MAX, hashed, write_state
+from paramclient.cache.table_updates import hashed, write_state
 from paramclient.cache.transaction import Transaction
 from paramclient.errors import CacheError, UsageError
 

@@ -1,7 +1,7 @@
 """The command line: parses arguments, calls the client, and prints tables or JSON.
 
 - `app`: all subcommands, the main function, signals and errors.
-- Subcommands: `parameters` (fetch, get, watch), `set_command` (set), `reset_command` (reset), `offline`
+- Subcommands: `read_commands` (fetch, get, watch), `set_command` (set), `reset_command` (reset), `offline`
   (show, cache), `logs` (import), `apply` (apply, verify, restore), `save`, `diff`, `history`, `search`
   (search, info), `fleet`, `link`, `check`, `ports`, `signing`, `serve`, `token` and `simulate` (sim).
 - `metadata_files`: metadata (add, list, remove).

@@ -217,7 +217,7 @@ def _add(
 
 _add(
     _app,
-    "parameters:fetch",
+    "read_commands:fetch",
     "udpin:0.0.0.0:14550",
     "sim:px4 --json",
     "tcp:127.0.0.1:5760 --system 3",
@@ -226,7 +226,7 @@ _add(
 )
 _add(
     _app,
-    "parameters:get",
+    "read_commands:get",
     "udpin:0.0.0.0:14550 MC_ROLL_P MC_PITCH_P",
     "sim:ardupilot 'rtl_*'",
     arguments="URL NAME [NAME...]",
@@ -247,7 +247,7 @@ _add(
 )
 _add(
     _app,
-    "parameters:watch",
+    "read_commands:watch",
     "udpin:0.0.0.0:14550",
     "udpin:0.0.0.0:14550 MC_ROLL_P --json",
     arguments="URL [NAME...]",

@@ -114,7 +114,7 @@ async def apply(
 
     The previous state is stored in the cache, for `restore`. On a terminal, the changes are shown and must be
     confirmed. Exit code 0: the vehicle has all values of the file. Exit code 1: some values differ. After an
-    interruption, run the same command again to continue. If several vehicles are received, --system must
+    interruption, run the same command again to continue. If several vehicles are heard, --system must
     choose one, or --all must choose all.
 
     Args:

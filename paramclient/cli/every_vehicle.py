@@ -72,7 +72,7 @@ def check_expected(expect: int | None, *, all_: bool) -> None:
 async def every_vehicle(
     url: str, options: LinkOptions, *, expect: int | None = None, policy: Policy = Policy.AUTO
 ) -> AsyncIterator[list[CommandSession]]:
-    """Open a link, listen for 3 s, and yield a session for each vehicle that was received, by system id.
+    """Open a link, listen for 3 s, and yield a session for each vehicle that was heard, by system id.
 
     Args:
         url: the link.
@@ -82,7 +82,7 @@ async def every_vehicle(
 
     Raises:
         UsageError: no such link.
-        NoReply: no vehicle was received, or fewer than expected.
+        NoReply: no vehicle was heard, or fewer than expected.
         LinkError: the link cannot be opened, or failed.
     """
     async with connect(url, options, policy=policy) as session:

@@ -31,7 +31,7 @@ class ExitCode(IntEnum):
     USAGE = 2
     """The arguments are invalid."""
     NO_ANSWER = 3
-    """No vehicle was received, or it did not answer."""
+    """No vehicle was heard, or it did not answer."""
     LINK = 4
     """The link failed."""
     CACHE = 5

@@ -126,8 +126,12 @@ def is_extended_source(text: str) -> bool:
 # fetch, get, set
 
 
-async def fetch_extended(session: CommandSession) -> ExitCode:
-    """Fetch and print all extended parameters."""
+async def fetch_extended(session: CommandSession, only: Sequence[str] = ()) -> ExitCode:
+    """Fetch all extended parameters, and print them, or only those with these names or patterns.
+
+    Raises:
+        UsageError: a name or pattern fits no parameter.
+    """
     options = session.options
     component = session.component
     with progress_bar(f"fetching {session.label}") as progress:
@@ -135,6 +139,11 @@ async def fetch_extended(session: CommandSession) -> ExitCode:
     for note in result.notes:
         report(note)
     params = _by_index(result.params.values())
+    if only:
+        chosen, unmatched = NameChoice(only).choose(result.params)
+        if unmatched:
+            raise UsageError(f"no extended parameter of {session.label} is called {unmatched}")
+        params = [param for param in params if param.name in chosen]
     if options.json:
         from paramclient.documents.extended_output import ExtFetchOutputDoc  # only here: loads pydantic
 
@@ -144,7 +153,7 @@ async def fetch_extended(session: CommandSession) -> ExitCode:
         of = "" if result.count is None or not result.missing else f" of {result.count}"
         say(
             printable(
-                f"{len(params)}{of} extended parameters of {session.label} from {result.source} in "
+                f"{len(result.params)}{of} extended parameters of {session.label} from {result.source} in "
                 f"{result.elapsed:.2f} s"
             )
         )

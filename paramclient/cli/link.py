@@ -33,7 +33,7 @@ REFRESH_INTERVAL: Final = 0.25
 MESSAGES_SHOWN_MAX: Final = 5
 """Kinds of messages that a line names for each component, so that it stays short."""
 MEASURE_DELAY: Final = 2.0
-"""Seconds until the first read that measures the round trip: by then all components have been received."""
+"""Seconds until the first read that measures the round trip: by then all components have been heard."""
 MEASURE_INTERVAL: Final = 4.0
 """Seconds between two reads that measure the round trip: request and response together take less of the link
 than the heartbeats of this client."""
@@ -72,7 +72,9 @@ async def link(
         report = await _run_with_measurements(client, _show if is_live else _listen, limit)
         if not report.frames:
             hint = received_in_words(client)
-            raise NoReply(f"anything on {client.link.name}", attempts=0, waited=report.seconds, hint=hint)
+            raise NoReply(
+                f"a MAVLink frame on {client.link.name}", attempts=0, waited=report.seconds, hint=hint
+            )
     if options.json:
         from paramclient.documents.traffic import TrafficDoc  # only here: loads pydantic
 

@@ -170,7 +170,7 @@ def cache_add(
     """Make a parameter file the cached table of a vehicle, for example before using a slow link.
 
     The table is marked with the file until the vehicle confirms or replaces it. If PX4's hash matches the
-    table when the vehicle is received, nothing is downloaded; otherwise, and from a vehicle without a hash,
+    table when the vehicle is heard, nothing is downloaded; otherwise, and from a vehicle without a hash,
     the next fetch downloads the table. A table that was received later than the file was written is not
     replaced.
 
@@ -439,7 +439,7 @@ def _print_table(view: _View) -> None:
     )
     default = ["default"] if changed else []
     more = [] if metadata is None else DESCRIBED_COLUMNS
-    columns = ["name", "value", *default, "type", "index", "heard", *more]
+    columns = ["name", "value", *default, "type", "index", "received", *more]
     print_table(columns, rows, right="value default index")
     if metadata is not None:
         print_descriptions(view.names, metadata)

@@ -86,7 +86,7 @@ async def reset(
     Fetches the table first. ArduPilot, and PX4 from 1.18 on, give the defaults in the parameter file over
     MAVFTP; defaults that the vehicle does not give are taken from its metadata. Parameters without a known
     default are listed and not written. On a terminal, the changes are shown and must be confirmed. If several
-    vehicles are received, --system must choose one.
+    vehicles are heard, --system must choose one.
 
     Exit code 1: a value was refused, a name is unknown, a default is not known, or the changes were not
     confirmed.

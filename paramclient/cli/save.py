@@ -78,7 +78,7 @@ async def save(
         changed: Write only parameters that differ from the firmware's defaults: those of the vehicle, else
             those of its metadata.
         only: Write only this name or pattern, such as "MC_*". May be given several times.
-        all_: Write all components of every vehicle that is received within 3 s, or of the one with --system.
+        all_: Write all components of every vehicle heard within 3 s, or of the one with --system.
             A file with {system} or {uid} in its name becomes a file for each vehicle; otherwise the file
             format must be able to hold several components.
         refresh: Download all parameters even if the cache is up to date.

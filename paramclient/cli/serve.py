@@ -57,7 +57,7 @@ async def serve(
         listen: Address to listen on, HOST:PORT; with port 0, the system chooses the port.
         cache: The cache file, or the postgresql:// URL of a shared cache. Default: the user's own cache.
         no_cache: Neither read nor write a cache.
-        fetch: Fetch the parameters of all vehicles that are received.
+        fetch: Fetch the parameters of all vehicles that are heard.
         listen_only: Send nothing to vehicles; receive the parameters that other stations on the links
             request.
         token_file: A file with access tokens, see `paramclient token`. Without it, and without

@@ -23,8 +23,8 @@ from paramclient.links import LinkKind, ReplayLink, parse_link
 from paramclient.links.names import names_service
 from paramclient.model.identity import version_text
 from paramclient.model.wording import first_of
+from paramclient.protocol.no_reply_hint import hint_of_link
 from paramclient.protocol.params.fetch_result import Policy
-from paramclient.protocol.silence import silence_of_link
 from paramclient.protocol.vehicle.kinds import kind_in_words
 
 __all__ = [
@@ -100,9 +100,9 @@ class CommandSession:
         return receiver_in_words(self.component)
 
     def report_others(self, *, has_all: bool = False) -> None:
-        """Report other vehicles that were received, if no option chose the one that was used.
+        """Report other vehicles that were heard, if no option chose the one that was used.
 
-        For subcommands that only read: they use the first vehicle received, which may be another one next
+        For subcommands that only read: they use the first vehicle heard, which may be another one next
         time.
 
         Args:
@@ -116,7 +116,7 @@ class CommandSession:
             listed = first_of([vehicle_in_words(each) for each in others], OTHERS_SHOWN_MAX)
             all_of_them = ", --all reads all of them" if has_all else ""
             report(
-                f"{self.label} was used, the first vehicle received. Also on this link: {listed}. --system "
+                f"{self.label} was used, the first vehicle heard. Also on this link: {listed}. --system "
                 f"chooses one{all_of_them}"
             )
 
@@ -133,7 +133,7 @@ class CommandSession:
 
         Raises:
             AmbiguousVehicle: another vehicle is on the link, or has replaced the component.
-            NoReply: no vehicle is received.
+            NoReply: no vehicle is heard.
             LinkError: the link failed.
         """
         options, component = self.options, self.component
@@ -200,8 +200,8 @@ async def connect(
 
     Raises:
         UsageError: no such link, or options that exclude each other.
-        AmbiguousVehicle: with `only`, several vehicles were received.
-        NoReply: the component was not received.
+        AmbiguousVehicle: with `only`, several vehicles were heard.
+        NoReply: the component was not heard.
         LinkError: the link cannot be opened, or failed.
     """
     if options.peer is not None and not options.split_peers:
@@ -243,7 +243,7 @@ async def wait_for_vehicle(
     timeout: float | None,
     only: bool = False,
 ) -> Component:
-    """Wait for a component; meanwhile, show on a terminal the awaited component and the received ones.
+    """Wait for a component; meanwhile, show on a terminal the awaited component and those that were heard.
 
     Args:
         client: an open client.
@@ -296,7 +296,7 @@ def received_in_words(client: ParamClient) -> str:
     """Return what was received so far on the link, or the vehicles on the links of a service."""
     implementation = implementation_of(client)
     if isinstance(implementation, LinkClient):
-        return silence_of_link(implementation.station, client.link.name)
+        return hint_of_link(implementation.station, client.link.name)
     heard = implementation.autopilots_on_links
     vehicles = ", ".join(f"{receiver_in_words(each)} on {each.identity.link}" for each in heard)
     return f"The service has: {vehicles}." if vehicles else ""

@@ -84,7 +84,7 @@ async def set_(
     bytes as hex:00FF. As NAME=VALUE, it may also be the name of a value, or names of bits separated by |, if
     metadata describes the parameter: it is downloaded from the vehicle unless --metadata names a file. Many
     writes are in flight at a time; values of one name, and switches such as *_ENABLE, are written one after
-    the other. A refused value does not stop the others. If several vehicles are received, --system must
+    the other. A refused value does not stop the others. If several vehicles are heard, --system must
     choose one, or --all must choose all. A value outside the range in the metadata, or a fraction for an
     integer parameter, is written only after confirmation on a terminal, or with --force.
 
@@ -101,7 +101,7 @@ async def set_(
         extended: Use the extended parameters (PARAM_EXT_*) of the component, such as a camera. Without this
             option, a camera, gimbal or other payload is asked whether it has extended parameters.
         plain: Use the plain parameters, even if the component has extended ones.
-        all_: Write to every vehicle that is received within 3 s.
+        all_: Write to every vehicle heard within 3 s.
         expect: With --all: wait up to 10 s for this number of vehicles, and write to none if there are fewer.
     """
     check_expected(expect, all_=all_)

@@ -86,7 +86,7 @@ async def resolve(text: str, options: LinkOptions, *, only: bool = False) -> Par
         AmbiguousVehicle: several vehicles in the cache have this name; with `only`, several are on the link.
         CacheError: the cached table is incomplete.
         VehicleError: some parameters were not received; the message names them.
-        NoReply: no vehicle was received, or it did not answer.
+        NoReply: no vehicle was heard, or it did not answer.
         LinkError: the link cannot be opened, or failed.
     """
     (params,) = await resolve_all([text], options, only=only)

@@ -47,9 +47,9 @@ Address: TypeAlias = tuple[int, int]
 """System id and component id."""
 
 FLEET_LISTENING_TIME: Final = 3.0
-"""Seconds in which every vehicle is received, even on a link that loses two of three heartbeats."""
+"""Seconds in which every vehicle is heard, even on a link that loses two of three heartbeats."""
 POLL_INTERVAL: Final = 0.05
-"""Seconds between two checks whether all expected vehicles have been received."""
+"""Seconds between two checks whether all expected vehicles have been heard."""
 PLACEHOLDERS: Final = ("{uid}", "{system}")
 """Placeholders in file names, which are replaced by the ids of the vehicle."""
 
@@ -118,8 +118,8 @@ async def targets(
 
     Raises:
         UsageError: no such link, or options that exclude each other.
-        AmbiguousVehicle: with `only`, several vehicles were received, and the options name none.
-        NoReply: no vehicle was received, or fewer than expected.
+        AmbiguousVehicle: with `only`, several vehicles were heard, and the options name none.
+        NoReply: no vehicle was heard, or fewer than expected.
         LinkError: the link cannot be opened, or failed.
     """
     if all_vehicles and (options.system is not None or options.vehicle is not None):
@@ -241,7 +241,7 @@ def describe(vehicle: Component) -> str:
 async def find_vehicles(
     client: ParamClient, component: int | None, expect: int | None, deadline: Deadline
 ) -> list[Component]:
-    """Return the vehicles on a link, by system id: those received within 3 s, or as many as are expected.
+    """Return the vehicles on a link, by system id: those heard within 3 s, or as many as are expected.
 
     Args:
         client: the client.
@@ -261,7 +261,7 @@ async def find_vehicles(
     found = _vehicles(client, component)
     if expect is not None and len(found) < expect:
         labels = ", ".join(map(describe, found)) or "none"
-        raise NoReply(f"{expect} vehicles (received: {labels})", attempts=0, waited=timeout or 0.0)
+        raise NoReply(f"{expect} vehicles (heard: {labels})", attempts=0, waited=timeout or 0.0)
     return found
 
 

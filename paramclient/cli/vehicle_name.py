@@ -18,7 +18,7 @@ from paramclient.protocol.vehicle_selection import LOOK_TIME
 __all__ = ["VehicleName", "check_kind", "check_uid", "wait_for_kind"]
 
 KIND_POLL_INTERVAL: Final = 0.05
-"""Seconds between two checks whether a vehicle of a kind was received."""
+"""Seconds between two checks whether a vehicle of a kind was heard."""
 UID_TIMEOUT: Final = 5.0
 """Seconds to wait for the hardware id of a vehicle that is named by nickname or hardware id: several attempts
 of the request on a link that loses half of the packets."""
@@ -119,7 +119,7 @@ async def wait_for_kind(client: ParamClient, kind: str, timeout: float | None) -
 
 
 def check_kind(client: ParamClient, kind: str) -> Component | None:
-    """Return the only vehicle with an autopilot of this kind that is received; None if there is none.
+    """Return the only vehicle with an autopilot of this kind that is heard; None if there is none.
 
     Raises:
         AmbiguousVehicle: there are several.

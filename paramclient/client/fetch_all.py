@@ -16,9 +16,9 @@ from paramclient.client.link_component import TIMEOUT_NOTE
 from paramclient.client.local import LocalComponent
 from paramclient.errors import CacheError, ContestedAddress, NoReply
 from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.no_reply_hint import hint_of_component, hint_of_link
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_result import FetchResult, Progress
-from paramclient.protocol.silence import silence_of_component, silence_of_link
 from paramclient.protocol.station import Address, Peer, Station
 
 __all__ = ["FleetFetch", "FetchedAll"]
@@ -247,7 +247,7 @@ class FleetFetch:
                     raise failure
                 attempts = max(attempts, failure.attempts)
             whose = "any component" if self._system is None else f"any component of system {self._system}"
-            hint = silence_of_link(self._station, self._station.link)
+            hint = hint_of_link(self._station, self._station.link)
             raise NoReply(f"the parameters of {whose}", attempts=attempts, waited=waited, hint=hint)
         return FetchedAll(results, silent)
 
@@ -258,7 +258,7 @@ class FleetFetch:
             return error
         fetch = self._fetches.get(address)
         since = -math.inf if fetch is None else fetch.begun_at
-        return error.with_hint(silence_of_component(self._station, machine, since, now))
+        return error.with_hint(hint_of_component(self._station, machine, since, now))
 
     async def _end(self, wake: Callable[[], None]) -> None:
         """Release all fetches, the last ones first, so that no waiting fetch starts when another one ends."""

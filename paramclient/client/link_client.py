@@ -50,9 +50,9 @@ from paramclient.protocol.events import (
     ParamsMoved,
     TableResynced,
 )
+from paramclient.protocol.no_reply_hint import hint_of_link
 from paramclient.protocol.params.fetch_result import Policy, Progress
 from paramclient.protocol.params.sync import SyncSettings
-from paramclient.protocol.silence import silence_of_link
 from paramclient.protocol.station import Station
 from paramclient.protocol.stats.traffic import TrafficReport
 from paramclient.protocol.system_id_change import SEARCH_INTERVAL, SystemIdSearch
@@ -372,7 +372,7 @@ class LinkClient(LocalClient):
     def _not_received(self, awaited: str, began: float) -> NoReply:
         """Return the error of a component that was not received, with what was received instead."""
         refused = refused_in_words(self.signing_report())
-        hint = "" if refused else silence_of_link(self.station, self._link.name)
+        hint = "" if refused else hint_of_link(self.station, self._link.name)
         waited = anyio.current_time() - began
         return NoReply(f"{awaited}{refused}", attempts=0, waited=waited, hint=hint)
 

@@ -33,6 +33,7 @@ from paramclient.model.values import Encoding, Param, Settable, decode_value, kn
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ParamChanged, ParamsMoved
+from paramclient.protocol.no_reply_hint import hint_of_component
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.change_origin import check_author
 from paramclient.protocol.params.fetch import Fetch
@@ -43,7 +44,6 @@ from paramclient.protocol.params.sync import ComponentState, SyncState
 from paramclient.protocol.params.write_batch import SetManyResult, SetOutcome
 from paramclient.protocol.params.writes import SetResult
 from paramclient.protocol.requests.operation import Operation
-from paramclient.protocol.silence import silence_of_component
 from paramclient.protocol.station import Station
 from paramclient.protocol.vehicle.address_contest import Contest
 from paramclient.protocol.wire import (
@@ -545,7 +545,7 @@ class _Explanations:
         if id(error) not in self._done:
             component = self._component
             station, now = component.client.station, anyio.current_time()
-            hint = silence_of_component(station, component.machine, self._since, now)
+            hint = hint_of_component(station, component.machine, self._since, now)
             self._done[id(error)] = (error, error.with_hint(hint))
         return self._done[id(error)][1]
 

@@ -1,4 +1,7 @@
-"""Reconnection of a link, and of the connection to a service: delays between attempts, and the timeout."""
+"""Reconnection of a link, and of the connection to a service: delays between attempts, and the timeout.
+
+`LinkTask._reconnect` in `link_task` makes the attempts of a link, `remote.connection` those of a service.
+"""
 
 from __future__ import annotations
 

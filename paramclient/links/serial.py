@@ -1,9 +1,10 @@
 """Links over serial ports: an autopilot on USB, a telemetry radio, a UART.
 
 The library serialx, which the extra `serial` installs, opens and configures the port: 8 data bits, no parity,
-one stop bit, no flow control. On POSIX systems, bytes then go through the port's non-blocking file
-descriptor, like through the sockets of other links, on every event loop that anyio supports. Windows has no
-such descriptors: there serialx's own transport moves the bytes, which only asyncio can run.
+one stop bit, no flow control. The default and the limits of the baud rate are in `names`. On POSIX systems,
+bytes then go through the port's non-blocking file descriptor, like through the sockets of other links, on
+every event loop that anyio supports. Windows has no such descriptors: there serialx's own transport moves the
+bytes, which only asyncio can run.
 
 An open port is exclusive: two programs on one port would each receive a part of the bytes. DTR and RTS are
 raised on opening, and lowered when the last program closes the port. Linux and pyserial do the same, and with

@@ -152,7 +152,7 @@ class _Files:
             other = self.component.client.components.get((self.component.system, int(number)))
         if other is None:
             raise MetadataError(
-                f"{self.label} announces its metadata at {uri}, but component {number} has not been received",
+                f"{self.label} announces its metadata at {uri}, but component {number} has not been heard",
                 source=uri,
             )
         return Ftp(other), path

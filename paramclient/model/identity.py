@@ -43,7 +43,7 @@ class Identity:
 
     Attributes:
         system: system id, 1 to 255. Other vehicles may use the same system id.
-        link: the canonical name of the link on which the vehicle was received.
+        link: the canonical name of the link on which the vehicle was heard.
         uid: the hardware id in hexadecimal, or None while unknown.
         autopilot: MAV_AUTOPILOT of the heartbeat.
         vehicle_type: MAV_TYPE of the heartbeat.

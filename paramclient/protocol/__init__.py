@@ -7,7 +7,7 @@
 `addresses`: addresses of components and peers.
 `vehicle_selection`: the only vehicle that an incomplete address fits.
 `quick_transfer`: whether a large file may be read without a request of the user.
-`silence`: what was received instead of an awaited message, in words.
+`no_reply_hint`: the hint of a `NoReply`: what was heard on a link instead of the awaited response.
 `system_id_change`: the search for a vehicle under a new system id.
 `wire`: frames, messages, signatures.
 `params`: the parameter protocol.

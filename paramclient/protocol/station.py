@@ -75,7 +75,7 @@ REMOVAL_SEARCH_INTERVAL: Final = 0.5
 STREAM_PEERS_MAX: Final = 256
 """Stream peers with an incomplete frame."""
 SENDERS_MAX: Final = 32
-"""Senders that are remembered while no autopilot has been received, to name them to the user."""
+"""Senders that are remembered while no autopilot has been heard, to name them to the user."""
 EARLY_REQUESTS_MAX: Final = 32
 """Requests for parameter files that are kept for components that are not known yet: a log may begin with the
 read of one."""

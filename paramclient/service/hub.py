@@ -29,7 +29,7 @@ from paramclient.errors import NoReply, ParamClientError, UsageError
 from paramclient.links import Link, create_link
 from paramclient.metadata.metadata_cache import MetadataStore
 from paramclient.model.notation import time_text
-from paramclient.protocol.silence import silence_of_link
+from paramclient.protocol.no_reply_hint import hint_of_link
 from paramclient.protocol.vehicle_selection import LOOK_TIME, VehicleChoice
 from paramclient.service.description_loader import DescriptionLoader
 from paramclient.service.event_feed import EventFeed
@@ -510,7 +510,7 @@ def _is_log(link: object) -> bool:
 def _silence_of(links: Iterable[ServiceLink]) -> str:
     """Return in sentences what was received on links instead of an awaited component."""
     clients = [(each.name, local_client(each.client)) for each in links if each.client is not None]
-    return " ".join(silence_of_link(client.station, name) for name, client in clients)
+    return " ".join(hint_of_link(client.station, name) for name, client in clients)
 
 
 def _closing() -> ServiceError:

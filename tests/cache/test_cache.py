@@ -25,7 +25,7 @@ from paramclient.cache import (
     TableState,
     by_station,
     default_path,
-    table_updates,
+    history_columns,
 )
 from paramclient.cache.transaction import Transaction
 from paramclient.errors import AmbiguousVehicle, CacheError, UnknownVehicle, UsageError
@@ -295,7 +295,7 @@ def test_history_can_be_asked_for_by_component_name_and_number(path: Path) -> No
 
 
 def test_history_is_bounded_for_each_table(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(table_updates, "HISTORY_ENTRIES_MAX", 5)
+    monkeypatch.setattr(history_columns, "HISTORY_ENTRIES_MAX", 5)
     with ParamCache(path) as cache:
         cache.save(update(*(stored("A", value) for value in range(3))))
         for component in (2, 3):

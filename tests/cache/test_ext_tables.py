@@ -17,9 +17,9 @@ import pytest
 from paramclient import ParamCache, Trust
 from paramclient.cache import ExtTableUpdate, StoredExtParam
 from paramclient.cache.cells import Damaged
+from paramclient.cache.history_columns import HISTORY_ENTRIES_MAX
 from paramclient.cache.operations import SaveExt, StoreExtSnapshot
 from paramclient.cache.outbox import packed, unpacked
-from paramclient.cache.table_updates import HISTORY_ENTRIES_MAX
 from paramclient.errors import NotInCache, UnknownVehicle, UsageError
 from paramclient.model.ext_params import ExtParam, ExtParamType, ExtValue, encode_ext_value
 from paramclient.model.ext_paramset import ExtParamSet

@@ -17,7 +17,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from paramclient.cache import ParamCache, SnapshotSummary, StoredParam, TableState, snapshots, table_updates
+from paramclient.cache import ParamCache, SnapshotSummary, StoredParam, TableState, history_columns, snapshots
 from paramclient.errors import CacheError, UnknownVehicle, UsageError
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
@@ -276,7 +276,7 @@ def test_before_a_table_was_first_complete_nothing_is_claimed(path: Path) -> Non
 def test_the_error_of_state_at_says_how_far_the_history_reaches(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(table_updates, "HISTORY_ENTRIES_MAX", 3)
+    monkeypatch.setattr(history_columns, "HISTORY_ENTRIES_MAX", 3)
     with ParamCache(path) as cache:
         cache.save(update(stored("A", 0), stored("B", 0), table=DONE))
         cache.snapshot(PX4.key, 1, reason="", at=NOW + 1)
@@ -299,7 +299,7 @@ def test_added_names_and_clock_rollbacks_are_trimmed_with_the_history(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A vehicle whose parameters come and go all the time cannot fill the disk."""
-    monkeypatch.setattr(table_updates, "HISTORY_ENTRIES_MAX", 4)
+    monkeypatch.setattr(history_columns, "HISTORY_ENTRIES_MAX", 4)
     with ParamCache(path) as cache:
         cache.save(update(stored("A", 0), table=DONE))
         for after in range(0, 3000, 100):
@@ -377,7 +377,7 @@ def test_state_at_agrees_with_a_model_that_keeps_every_state(
     for left in shared.vehicles():
         shared.remove(left.key)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(table_updates, "HISTORY_ENTRIES_MAX", lines)
+        patch.setattr(history_columns, "HISTORY_ENTRIES_MAX", lines)
         for wait, params, removed, whole, state in steps:
             now += wait if backwards else abs(wait)
             items = [stored(name, bits, kind, at=now) for name, bits, kind in params]

@@ -24,8 +24,7 @@ import pytest
 
 import paramclient
 from paramclient import LinkError, ParamCache, ParamErrorCode, ParamType, Policy
-from paramclient.cli import parameters as vehicle_commands
-from paramclient.cli import run
+from paramclient.cli import read_commands, run
 from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import printable
@@ -607,7 +606,7 @@ def test_show_prints_parameters_that_differ_from_the_defaults(command: Command, 
     assert command("fetch", "sim:ardupilot", "--cache", cache).code == 0
     shown = command("show", "--changed", "--cache", cache)
     assert shown.code == 0
-    assert shown.words[0] == ["name", "value", "default", "type", "index", "heard"]
+    assert shown.words[0] == ["name", "value", "default", "type", "index", "received"]
     assert [row[:5] for row in shown.words if row[0] == "RELAY1_FUNCTION"] == [
         ["RELAY1_FUNCTION", "1", "0", "INT8", "61"]
     ]
@@ -756,7 +755,7 @@ async def test_watch_prints_events_of_the_vehicle(
 ) -> None:
     url = put(vehicle_lost_and_found())
     options = LinkOptions(json=as_json, no_cache=True, timeout=20.0)
-    assert await vehicle_commands.watch(url, options=options) == 0
+    assert await read_commands.watch(url, options=options) == 0
     printed = capsys.readouterr()
     assert printed.err == "watching 2 parameters of 1/1 px4\n"
     lines = printed.out.splitlines()
@@ -790,7 +789,7 @@ async def test_watch_prints_only_events_of_its_own_vehicle(
     other = vehicle_lost_and_found()
     other.system = 2
     url = put(Air([PX4Vehicle(table={"A": 1}), other]))
-    assert await vehicle_commands.watch(url, options=LinkOptions(no_cache=True, timeout=20.0)) == 0
+    assert await read_commands.watch(url, options=LinkOptions(no_cache=True, timeout=20.0)) == 0
     assert capsys.readouterr().out == ""
 
 
@@ -801,7 +800,7 @@ async def test_watch_can_only_listen(
     vehicle = vehicle_lost_and_found()
     url = put(vehicle)
     options = LinkOptions(cache=str(tmp_path / "cache.sqlite3"), timeout=20.0)
-    assert await vehicle_commands.watch(url, policy=Policy.CACHE_ONLY, options=options) == 0
+    assert await read_commands.watch(url, policy=Policy.CACHE_ONLY, options=options) == 0
     printed = capsys.readouterr()
     assert printed.err == "watching 0 parameters of 1/1 px4\n"
     assert len(printed.out.splitlines()) == 3, "lost, found, rebooted"
@@ -901,8 +900,8 @@ def test_a_silent_link_is_exit_code_3(live_command: Command, put: Callable[..., 
     silent = live_command("link", "udpin:127.0.0.1:0", "--seconds", 0.3, "--json")
     assert (silent.code, silent.out) == (3, "")
     assert re.fullmatch(
-        r"paramclient: no reply: anything on udpin:127\.0\.0\.1:0 in [0-9.]+ s\. Nothing was received on "
-        r"udpin:127\.0\.0\.1:0\. Is the vehicle sending to this port\?\n",
+        r"paramclient: no reply: a MAVLink frame on udpin:127\.0\.0\.1:0 in [0-9.]+ s\. Nothing was received "
+        r"on udpin:127\.0\.0\.1:0\. Is the vehicle sending to this port\?\n",
         silent.err,
     )
 
@@ -913,8 +912,8 @@ def test_a_silent_link_is_exit_code_3(live_command: Command, put: Callable[..., 
     noisy = live_command("link", put(Noise(PX4Vehicle())), "--seconds", 0.3)
     assert (noisy.code, noisy.out) == (3, "")
     assert re.search(
-        r"anything on sim:custom in [0-9.]+ s\. [1-9][0-9,]* bytes were received on sim:custom, but no valid "
-        r"MAVLink frame\.$",
+        r"a MAVLink frame on sim:custom in [0-9.]+ s\. [1-9][0-9,]* bytes were received on sim:custom, but "
+        r"no valid MAVLink frame\.$",
         noisy.err,
     )
 
@@ -1025,7 +1024,7 @@ def test_show_prints_the_cached_table(command: Command, warm: Path) -> None:
     assert component["params"] == fetched["params"]
 
     table = command("show", "--cache", warm)
-    assert table.words[0] == ["name", "value", "type", "index", "heard"]
+    assert table.words[0] == ["name", "value", "type", "index", "received"]
     assert len(table.words) == 904
     assert table.err.startswith(f"903 parameters of 1/1 px4 ({key_of(warm)}), synced 20")
 

@@ -198,7 +198,7 @@ def test_a_read_names_the_other_vehicles_on_the_link(
     read = command("fetch", url)
     assert read.code == 0
     assert re.search(
-        r"[12]/1 \w+ was used, the first vehicle received\. Also on this link: [12]/1 \w+ quadrotor.*\. "
+        r"[12]/1 \w+ was used, the first vehicle heard\. Also on this link: [12]/1 \w+ quadrotor.*\. "
         r"--system chooses one, --all reads all of them\n",
         read.err,
     )
@@ -215,7 +215,7 @@ def test_fewer_vehicles_than_expected_are_an_error(
     before = vehicles[0].requests.copy()
     done = command(name, url, *rest, "--all", "--expect", 3)
     assert (done.code, done.out) == (3, "")
-    assert "no reply: 3 vehicles (received: 1/1 px4, 2/1 ardupilot) in 10.0 s" in done.err
+    assert "no reply: 3 vehicles (heard: 1/1 px4, 2/1 ardupilot) in 10.0 s" in done.err
     assert vehicles[0].requests["PARAM_SET"] == before["PARAM_SET"]
     assert command(name, url, *rest, "--expect", 2).code == 2
 

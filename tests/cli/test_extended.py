@@ -74,6 +74,17 @@ def test_fetch_finds_them(command: Command, reach: Put) -> None:
     assert document["extended"]["CAM_NAME"]["value"] == "Front"
 
 
+def test_fetch_prints_only_the_chosen_ones(command: Command, reach: Put) -> None:
+    url = reach(small())
+    done = command("fetch", url, *CAMERA, "--only", "cam_n*")
+    assert [row[0] for row in done.words] == ["name", "CAM_NAME"]
+    assert "4 extended parameters of 1/100" in done.err
+    assert list(command("fetch", url, *CAMERA, "--only", "CAM_EV", "--json").json["extended"]) == ["CAM_EV"]
+    none = command("fetch", url, *CAMERA, "--only", "NOPE")
+    assert none.code == 2
+    assert "no extended parameter of 1/100 no autopilot is called NOPE" in none.err
+
+
 def test_a_component_with_plain_parameters_alone_is_found_too(command: Command, reach: Put) -> None:
     url = reach(GenericVehicle({"A": 1, "B": 2.5}, component=100))
     done = command("fetch", url, *CAMERA)

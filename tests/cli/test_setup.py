@@ -514,7 +514,7 @@ def test_a_failed_vehicle_does_not_stop_the_others(
     vehicles[2].reboot(down=float("inf"))
     outcome = command("verify", put(air), file(), "--all", "--expect", 3, "--timeout", 30)
     assert outcome.code == 3
-    assert "3 vehicles (received: 1/1 ardupilot, 2/1 ardupilot)" in outcome.err
+    assert "3 vehicles (heard: 1/1 ardupilot, 2/1 ardupilot)" in outcome.err
 
 
 def test_file_names_for_all_vehicles_need_a_placeholder(

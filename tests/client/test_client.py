@@ -503,9 +503,7 @@ async def test_a_component_that_is_not_there(wanted: dict[str, Any], words: str)
 @in_simulated_time
 async def test_a_component_that_is_not_there_and_what_was_received_instead() -> None:
     async with a_client(generic(autopilot=wire.MAV_AUTOPILOT_INVALID)) as client:
-        with pytest.raises(
-            NoReply, match=rf"Received on {re.escape(client.link.name)} so far: 1/1 generic\.$"
-        ):
+        with pytest.raises(NoReply, match=rf"Heard on {re.escape(client.link.name)} so far: 1/1 generic\.$"):
             await client.component(timeout=2.5)
 
 

@@ -21,7 +21,7 @@ from paramclient import (
     UsageError,
 )
 from paramclient.cache import BY_US, StoredParam, TableUpdate
-from paramclient.cache.table_updates import HISTORY_ENTRIES_MAX
+from paramclient.cache.history_columns import HISTORY_ENTRIES_MAX
 from paramclient.cli import run
 from paramclient.links import LinkKind, ReplayLink, create_link, parse_link
 from paramclient.links.replay import PAUSE_MAX

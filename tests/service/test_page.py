@@ -273,7 +273,12 @@ def test_the_details_of_a_parameter(sight: Sight) -> None:
     sight.find("MC_ROLL_P")
     sight.search.press("Enter")
     sight.grid.press("Space")
-    for text in ("Gain from the error of the roll angle", "0 to 12 1/s", "REAL32", "heard from the vehicle"):
+    for text in (
+        "Gain from the error of the roll angle",
+        "0 to 12 1/s",
+        "REAL32",
+        "received from the vehicle",
+    ):
         expect(sight.details).to_contain_text(text)
     sight.details.press("Escape")
     expect(sight.details).to_be_hidden()

@@ -127,7 +127,7 @@ async def test_find_without_a_vehicle_is_a_no_reply_problem() -> None:
         assert told["error"] == "NoReply"
         assert told["waited"] == pytest.approx(2, abs=0.01)
         assert "system id 7" in told["detail"]
-        assert told["hint"] == "Received on sim:custom so far: 1/1 generic."
+        assert told["hint"] == "Heard on sim:custom so far: 1/1 generic."
         assert told["detail"].endswith(told["hint"])
         problem(await browser.get("/api/v1/components/7/1"), 404, "unknown-component")
 

@@ -9,7 +9,7 @@ import { defaultOf, defaultSourceOf, meaningOf, moment, newsText, numberText, pa
 /** History entries shown, at most. */
 const HISTORY_ENTRIES_MAX = 20;
 const TRUST = {
-  live: "heard from the vehicle",
+  live: "received from the vehicle",
   verified: "from the cache, confirmed by the vehicle",
   cached: "from the cache, not confirmed",
 };
@@ -122,7 +122,7 @@ export class Details {
       ["Group", row.group],
       ["Category", info?.category],
       ["Value", TRUST[known.trust] ?? known.trust],
-      ["Heard", known.heard_at ? moment(known.heard_at) : null],
+      ["Received", known.heard_at ? moment(known.heard_at) : null],
       ["Restart", info?.reboot_required && "a new value counts from the next start on"],
       ["Read-only", info?.is_read_only && "the vehicle sets it by itself"],
       ["Changes", info?.is_volatile && "by itself, now and then"],

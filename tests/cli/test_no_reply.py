@@ -72,7 +72,7 @@ def test_only_another_station_is_received(command: Command, put: Put) -> None:
     done = command("get", put(Air([], others=[OtherStation(system=252)])), "A", "--timeout", 3)
     assert done.code == 3
     assert done.err == (
-        "paramclient: no reply: an autopilot in 3.0 s. Received on sim:custom so far: only 252/190 ground "
+        "paramclient: no reply: an autopilot in 3.0 s. Heard on sim:custom so far: only 252/190 ground "
         "station, and no vehicle.\n"
     )
 
@@ -110,7 +110,7 @@ def test_a_terminal_shows_what_is_awaited(
     use_terminal(monkeypatch)
     done = command("get", put(Air([], others=[OtherStation(system=252)])), "A", "--timeout", 3.2)
     texts = drawn(done.err)
-    received = "Received on sim:custom so far: only 252/190 ground station, an"
+    received = "Heard on sim:custom so far: only 252/190 ground station, an"
     assert texts[0] == "waiting for an autopilot on sim:custom (0 s). " + received[: 99 - 46]
     assert texts[-2].startswith("waiting for an autopilot on sim:custom (3 s). ")
     assert len(texts) == 7, "six times, and the erasure with the error after it"

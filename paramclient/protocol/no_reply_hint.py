@@ -1,4 +1,4 @@
-"""What was received on a link instead of an awaited message, in sentences for users."""
+"""The hint of a `NoReply`: what was heard on a link meanwhile, in sentences for users."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from paramclient.protocol.station import Station
 from paramclient.protocol.vehicle.kinds import kind_in_words
 from paramclient.protocol.wire import MAV_TYPE_GCS
 
-__all__ = ["silence_of_component", "silence_of_link"]
+__all__ = ["hint_of_component", "hint_of_link"]
 
 LISTED_MAX: Final = 5
 """Components that a message lists; it gives the number of further ones."""
@@ -26,7 +26,7 @@ _CAUSES: Final = {
 """Likely causes of a silent link, by the first part of its name."""
 
 
-def silence_of_link(station: Station, link: str) -> str:
+def hint_of_link(station: Station, link: str) -> str:
     """Return what was received on a link so far, where an awaited component was not.
 
     Args:
@@ -46,8 +46,8 @@ def silence_of_link(station: Station, link: str) -> str:
     if words:
         listed = first_of(words, LISTED_MAX)
         if station.senders <= {*known, station.own_address} and all(map(_is_ground_station, machines)):
-            return f"Received on {link} so far: only {listed}, and no vehicle.{cause}"
-        return f"Received on {link} so far: {listed}."
+            return f"Heard on {link} so far: only {listed}, and no vehicle.{cause}"
+        return f"Heard on {link} so far: {listed}."
     frames = station.framing[0]
     if frames:
         were = "was" if frames == 1 else "were"
@@ -58,7 +58,7 @@ def silence_of_link(station: Station, link: str) -> str:
     return f"Nothing was received on {link}.{cause}"
 
 
-def silence_of_component(station: Station, machine: ComponentMachine, since: float, now: float) -> str:
+def hint_of_component(station: Station, machine: ComponentMachine, since: float, now: float) -> str:
     """Return what was received while a component did not answer requests; "" for a client that sends none.
 
     Args:
@@ -84,7 +84,7 @@ def silence_of_component(station: Station, machine: ComponentMachine, since: flo
             return f"Nothing was received on {station.link} {silence}."
         words = [_in_words(each) for each in sorted(others, key=_order)]
         return (
-            f"{label} has sent nothing {silence}; received meanwhile on {station.link}: only "
+            f"{label} has sent nothing {silence}; heard meanwhile on {station.link}: only "
             f"{first_of(words, LISTED_MAX)}."
         )
     if presence.has_beaten:

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import pytest
 
 from paramclient.protocol import wire
+from paramclient.protocol.no_reply_hint import LISTED_MAX, hint_of_component, hint_of_link
 from paramclient.protocol.params.fetch_result import Policy
 from paramclient.protocol.params.sync import SyncSettings
-from paramclient.protocol.silence import LISTED_MAX, silence_of_component, silence_of_link
 from paramclient.protocol.station import SENDERS_MAX, Station
 from paramclient.protocol.wire import (
     MAV_AUTOPILOT_INVALID,
@@ -49,8 +49,8 @@ def hear(station: Station) -> Hear:
 
 
 def test_nothing_at_all(station: Station) -> None:
-    assert silence_of_link(station, LINK) == f"Nothing was received on {LINK}. {ASKS}"
-    assert silence_of_link(station, "sim:px4") == "Nothing was received on sim:px4."
+    assert hint_of_link(station, LINK) == f"Nothing was received on {LINK}. {ASKS}"
+    assert hint_of_link(station, "sim:px4") == "Nothing was received on sim:px4."
 
 
 @pytest.mark.parametrize(
@@ -59,34 +59,34 @@ def test_nothing_at_all(station: Station) -> None:
 def test_bytes_that_are_no_frames(station: Station, link: str, advice: str) -> None:
     station.receive(bytes(1500), "peer", 1.0)
     expected = f"1,500 bytes were received on {link}, but no valid MAVLink frame.{advice}"
-    assert silence_of_link(station, link) == expected
+    assert hint_of_link(station, link) == expected
 
 
 def test_only_a_ground_station(station: Station, hear: Hear) -> None:
     hear(GCS, 252, 190)
-    assert silence_of_link(station, LINK) == (
-        f"Received on {LINK} so far: only 252/190 ground station, and no vehicle. {ASKS}"
+    assert hint_of_link(station, LINK) == (
+        f"Heard on {LINK} so far: only 252/190 ground station, and no vehicle. {ASKS}"
     )
 
 
 def test_only_a_ground_station_with_the_ids_of_this_client(station: Station, hear: Hear) -> None:
     """QGroundControl has the same ids by default."""
     hear(GCS, 255, 190)
-    assert silence_of_link(station, LINK) == (
-        f"Received on {LINK} so far: only 255/190 with the ids of this client, and no vehicle. {ASKS}"
+    assert hint_of_link(station, LINK) == (
+        f"Heard on {LINK} so far: only 255/190 with the ids of this client, and no vehicle. {ASKS}"
     )
 
 
 def test_another_vehicle(station: Station, hear: Hear) -> None:
     hear(PX4, 3)
     hear(GCS, 252, 190)
-    expected = f"Received on {LINK} so far: 3/1 PX4 quadrotor, 252/190 ground station."
-    assert silence_of_link(station, LINK) == expected
+    expected = f"Heard on {LINK} so far: 3/1 PX4 quadrotor, 252/190 ground station."
+    assert hint_of_link(station, LINK) == expected
 
 
 def test_a_system_without_heartbeats(station: Station, hear: Hear) -> None:
     hear(TEXT, 7)
-    assert silence_of_link(station, LINK) == f"Received on {LINK} so far: 7/1 without heartbeat."
+    assert hint_of_link(station, LINK) == f"Heard on {LINK} so far: 7/1 without heartbeat."
 
 
 def test_frames_of_unknown_senders() -> None:
@@ -96,29 +96,29 @@ def test_frames_of_unknown_senders() -> None:
     frame = wire.encode(TEXT, system=7, component=1, sequence=0, version=2)
     listening.receive(frame, "peer", 1.0)
     expected = f"1 MAVLink frame was received on {LINK}, but no heartbeat."
-    assert silence_of_link(listening, LINK) == expected
+    assert hint_of_link(listening, LINK) == expected
 
 
 def test_many_senders_are_counted(station: Station, hear: Hear) -> None:
     for system in range(1, SENDERS_MAX + 20):
         hear(TEXT, system, 190)
-    told = silence_of_link(station, LINK)
+    told = hint_of_link(station, LINK)
     assert told.endswith(f"5/190 without heartbeat and {SENDERS_MAX - LISTED_MAX} more.")
 
 
 def test_a_link_that_is_down(station: Station, hear: Hear) -> None:
     hear(PX4, 3)
     station.pause()
-    assert silence_of_link(station, LINK) == f"{LINK} is down at present."
+    assert hint_of_link(station, LINK) == f"{LINK} is down at present."
     machine = station.components[3, 1]
-    assert silence_of_component(station, machine, 1.0, 2.0) == f"{LINK} is down at present."
+    assert hint_of_component(station, machine, 1.0, 2.0) == f"{LINK} is down at present."
 
 
 # A component that does not answer
 
 
 def answer(station: Station, since: float, now: float) -> str:
-    return silence_of_component(station, station.components[3, 1], since, now)
+    return hint_of_component(station, station.components[3, 1], since, now)
 
 
 def test_a_vehicle_that_sends_heartbeats_and_does_not_answer(station: Station, hear: Hear) -> None:
@@ -143,7 +143,7 @@ def test_a_vehicle_that_has_fallen_silent(station: Station, hear: Hear) -> None:
     assert answer(station, 2.5, 9.0) == f"Nothing was received on {LINK} for 7.0 s."
     hear(GCS, 252, 190, now=8.5)
     assert answer(station, 2.5, 9.0) == (
-        f"3/1 has sent nothing for 7.0 s; received meanwhile on {LINK}: only 252/190 ground station."
+        f"3/1 has sent nothing for 7.0 s; heard meanwhile on {LINK}: only 252/190 ground station."
     )
 
 

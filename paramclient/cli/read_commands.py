@@ -118,7 +118,7 @@ async def fetch(
         extended: Use the extended parameters (PARAM_EXT_*) of the component, such as a camera. Without this
             option, a camera, gimbal or other payload is asked whether it has extended parameters.
         plain: Use the plain parameters, even if the component has extended ones.
-        all_: Fetch from every vehicle that is received within 3 s.
+        all_: Fetch from every vehicle heard within 3 s.
         expect: With --all: wait up to 10 s for this number of vehicles, and fail with fewer.
     """
     if names:
@@ -153,7 +153,7 @@ async def fetch(
         if await is_extended_session(session, extended=extended, plain=plain or changed):
             if accept != "verified":
                 raise UsageError("--accept is for plain parameters; add --plain")
-            return await fetch_extended(session)
+            return await fetch_extended(session, only)
         with progress_bar(f"fetching {session.label}") as progress:
             fetched = await fetching.fetch(session, progress)
         fetched = await described(fetched)
@@ -211,7 +211,7 @@ async def get(
         extended: Use the extended parameters (PARAM_EXT_*) of the component, such as a camera. Without this
             option, a camera, gimbal or other payload is asked whether it has extended parameters.
         plain: Use the plain parameters, even if the component has extended ones.
-        all_: Read from every vehicle that is received within 3 s.
+        all_: Read from every vehicle heard within 3 s.
         expect: With --all: wait up to 10 s for this number of vehicles, and fail with fewer.
     """
     check_choice(extended=extended, plain=plain)
