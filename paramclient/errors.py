@@ -456,7 +456,7 @@ class ContestedAddress(VehicleError):
     def __init__(self, system: int, component: int, claimants: Sequence[str], difference: str) -> None:
         message = (
             f"{system}/{component} is contested, so nothing is read, written or cached. Several vehicles "
-            f"have the address: {'; '.join(claimants)}. What tells them apart: {difference}. Give each "
+            f"have the address: {'; '.join(claimants)}. Reason: {difference}. Give each "
             "its own system id, or switch one off."
         )
         super().__init__(message, system=system, component=component)

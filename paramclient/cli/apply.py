@@ -296,7 +296,7 @@ async def restore(
         dry_run: Print the values that would be sent, and send none of them.
         full: Also print parameters that are unchanged or left out.
         extended: Restore the extended parameters (PARAM_EXT_*) of the component, such as a camera. Without
-            this option, a camera, gimbal or other payload is asked whether it has extended parameters.
+            this option, they are used if a camera or other payload answers a request for the first one.
         plain: Restore the plain parameters, even if the component has extended ones.
         yes: Do not ask for confirmation.
     """

@@ -102,7 +102,7 @@ def may_be_extended(options: LinkOptions, *, extended: bool, plain: bool) -> boo
 async def is_extended_session(session: CommandSession, *, extended: bool, plain: bool) -> bool:
     """Return whether to use the extended parameters of the component.
 
-    Without a choice of the user, a component that usually has extended parameters is asked for its first one.
+    Without a choice of the user, the first one is requested from a component that usually has them.
     """
     if extended or plain or session.client.listens_only:
         return extended

@@ -116,7 +116,7 @@ async def fetch(
             Default: the stored metadata of the firmware; else, with --changed, that of the vehicle if it can
             be downloaded in 2 s.
         extended: Use the extended parameters (PARAM_EXT_*) of the component, such as a camera. Without this
-            option, a camera, gimbal or other payload is asked whether it has extended parameters.
+            option, they are used if a camera or other payload answers a request for the first one.
         plain: Use the plain parameters, even if the component has extended ones.
         all_: Fetch from every vehicle heard within 3 s.
         expect: With --all: wait up to 10 s for this number of vehicles, and fail with fewer.
@@ -209,7 +209,7 @@ async def get(
         names: Further parameters and patterns.
         metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
         extended: Use the extended parameters (PARAM_EXT_*) of the component, such as a camera. Without this
-            option, a camera, gimbal or other payload is asked whether it has extended parameters.
+            option, they are used if a camera or other payload answers a request for the first one.
         plain: Use the plain parameters, even if the component has extended ones.
         all_: Read from every vehicle heard within 3 s.
         expect: With --all: wait up to 10 s for this number of vehicles, and fail with fewer.
@@ -263,7 +263,7 @@ async def watch(
         policy: Requests that may be sent besides those for NAMES: all that are needed, only for the hash, or
             none.
         extended: Watch the extended parameters (PARAM_EXT_*) of the component, such as a camera. Without this
-            option, a component that usually has extended parameters is asked for its first one.
+            option, they are used if a camera or other payload answers a request for the first one.
         plain: Watch the plain parameters, even if the component has extended ones.
     """
     check_choice(extended=extended, plain=plain)

@@ -99,7 +99,7 @@ async def set_(
         durable: End only when all values and their history are on the disk and survive a power loss.
         metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
         extended: Use the extended parameters (PARAM_EXT_*) of the component, such as a camera. Without this
-            option, a camera, gimbal or other payload is asked whether it has extended parameters.
+            option, they are used if a camera or other payload answers a request for the first one.
         plain: Use the plain parameters, even if the component has extended ones.
         all_: Write to every vehicle heard within 3 s.
         expect: With --all: wait up to 10 s for this number of vehicles, and write to none if there are fewer.

@@ -289,7 +289,7 @@ class Claim:
         words = " and ".join(dict.fromkeys(kinds)) or "no heartbeat"
         ids = " and ".join(uid for uid in self.uid.all if uid)
         words += f" with the id {ids}" if ids else ""
-        words += " that tells two times since boot in turn" if self.has_two_starts else ""
+        words += " that reports two times since boot in turn" if self.has_two_starts else ""
         return f"{words} from {peer_in_words(self.peer)}"
 
 
