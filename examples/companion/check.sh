@@ -23,7 +23,7 @@ value_of() {
     sed 's/.*"value":\([^,}]*\).*/\1/'
 }
 
-# the service listens before it has received the vehicle
+# the service listens before it has heard the vehicle
 until ask "$service/api/v1/components/1/1" > /dev/null 2>&1; do
     sleep 0.2
 done
