@@ -1,4 +1,4 @@
-# Everything is installed into .venv, which the first call creates.
+# Everything is installed into .venv, which the first call creates if it does not exist.
 #
 #   make demo       the main job on a simulated vehicle
 #   make test       the tests                      make coverage   the tests with their coverage
@@ -133,10 +133,13 @@ clean:
 # The virtual environment and its dependency groups, installed again when pyproject.toml changes.
 
 $(VENV)/made:
-	@test -n "$(PYTHON)" && "$(PYTHON)" -c $(IS_NEW_ENOUGH) || { \
-		echo "paramclient needs Python 3.11 or newer; name one: make PYTHON=/path/to/python3.12"; exit 1; }
-	@echo "Making $(VENV) with $(PYTHON)"
-	@"$(PYTHON)" -m venv --clear $(VENV)
+	@if $(BIN)/python -c $(IS_NEW_ENOUGH) 2>/dev/null && $(BIN)/python -m pip --version >/dev/null 2>&1; then \
+		echo "Using the existing $(VENV)"; \
+	elif test -n "$(PYTHON)" && "$(PYTHON)" -c $(IS_NEW_ENOUGH); then \
+		echo "Making $(VENV) with $(PYTHON)" && "$(PYTHON)" -m venv --clear $(VENV); \
+	else \
+		echo "paramclient needs Python 3.11 or newer; name one: make PYTHON=/path/to/python3.12"; exit 1; \
+	fi
 	@touch $@
 
 $(VENV)/with-cli: pyproject.toml $(VENV)/made

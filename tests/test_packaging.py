@@ -175,3 +175,28 @@ def test_the_package_imports_its_modules_at_the_first_use_of_a_name() -> None:
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, encoding="utf-8", check=True, timeout=60
     )
     assert done.stdout == "['paramclient.version']\n"
+
+
+def test_make_uses_an_existing_environment_and_replaces_a_broken_one(tmp_path: Path) -> None:
+    """The README says how to make .venv, and then that `make demo` works: it keeps what was installed."""
+    environment = tmp_path / "environment"
+
+    def make() -> str:
+        (environment / "made").unlink(missing_ok=True)
+        return subprocess.run(
+            ["make", "-f", str(ROOT / "Makefile"), f"VENV={environment}", str(environment / "made")],
+            cwd=tmp_path,
+            capture_output=True,
+            encoding="utf-8",
+            check=True,
+            timeout=120,
+        ).stdout
+
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", environment], check=True, timeout=60)
+    installed = environment / "installed"
+    installed.touch()
+    assert f"Making {environment}" in make()  # without pip, it cannot be used
+    assert not installed.exists()
+    installed.touch()
+    assert f"Using the existing {environment}" in make()
+    assert installed.exists()
