@@ -37,7 +37,7 @@ PRINTED = {
     ],
     "offline": [
         r"visit: <FetchResult 1/1 903 params from stream in ",
-        r"known: .+ \(system 1, px4, components 1\)",
+        r"known: .+ \(system 1, px4, components 1, last seen \d{4}-\d\d-\d\d \d\d:\d\dZ\)",
         r"table: <CachedComponent 1/1 px4 903 params synced ",
         r"MC_ROLL_P = 4\.0 -> MC_ROLL_P = 7\.0, by us",
     ],

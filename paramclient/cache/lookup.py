@@ -3,7 +3,9 @@
 The only place that decides which vehicle a name means. In this order:
 
 1. A key, as `Identity.key` has it.
-2. One to three decimal digits: a system id, and nothing else. With `/` and a component id: an address.
+2. One to three decimal digits: a system id, and nothing else. With `/` and a component id: an address. A
+   vehicle with an autopilot has priority over a camera or another payload that has the same system id and a
+   hardware id of its own.
 3. A nickname.
 4. `px4` or `ardupilot`: the only vehicle with this autopilot.
 5. `uid:` and at least six hexadecimal digits: the beginning of a hardware id. `/` and a system id may follow
@@ -20,7 +22,7 @@ from typing import Final
 
 from paramclient.cache.records import CachedVehicle
 from paramclient.errors import AmbiguousVehicle, UnknownVehicle
-from paramclient.model.identity import autopilot_name
+from paramclient.model.identity import autopilot_name, has_autopilot
 
 __all__ = ["KINDS", "address_of", "find_vehicle", "is_vehicle_name"]
 
@@ -82,6 +84,8 @@ def find_vehicle(
         for known in named
         if system in (None, known.identity.system) and (component is None or component in known.components)
     ]
+    if len(fits) > 1 and name is not None and _SYSTEM_ID.fullmatch(name):
+        fits = [known for known in fits if has_autopilot(known.identity.autopilot)] or fits
     if len(fits) == 1:
         return fits[0]
     conditions = {"vehicle": name, "system": system, "component": component}

@@ -194,7 +194,11 @@ class CachedVehicle:
     def __str__(self) -> str:
         components = ", ".join(map(str, self.components))
         autopilot = autopilot_name(self.identity.autopilot)
-        return f"{self.key} (system {self.identity.system}, {autopilot}, components {components})"
+        seen = f"{datetime.fromtimestamp(self.last_seen, UTC):%Y-%m-%d %H:%MZ}"
+        return (
+            f"{self.key} (system {self.identity.system}, {autopilot}, components {components}, "
+            f"last seen {seen})"
+        )
 
 
 @dataclass(frozen=True, slots=True, repr=False)

@@ -10,6 +10,7 @@ __all__ = [
     "Identity",
     "autopilot_name",
     "hardware_id",
+    "has_autopilot",
     "is_sitl_uid",
     "reason_against_non_finite",
     "version_difference",
@@ -29,7 +30,9 @@ _AGAINST_NON_FINITE = {
     "and it may stop, also after each restart, until the file is deleted",
     "ardupilot": "ArduPilot ignores NaN and infinity, and does not answer",
 }
-_AUTOPILOTS = {0: "generic", 3: "ardupilot", 8: "no autopilot", 12: "px4"}
+_NO_AUTOPILOT = 8
+"""MAV_AUTOPILOT_INVALID, in the heartbeat of a camera, a gimbal or another payload."""
+_AUTOPILOTS = {0: "generic", 3: "ardupilot", _NO_AUTOPILOT: "no autopilot", 12: "px4"}
 _BRANDS = {3: "ArduPilot", 12: "PX4"}
 _FIRMWARE_TYPES = ((255, ""), (192, "-rc"), (128, "-beta"), (64, "-alpha"), (0, "-dev"))
 """The types of a firmware by the lowest byte of flight_sw_version from which on they apply
@@ -162,6 +165,11 @@ def hardware_id(uid: int, uid2: bytes) -> str | None:
         uid2: the hardware id, 18 bytes.
     """
     return uid2.hex() if any(uid2) else f"{uid:016x}" if uid else None
+
+
+def has_autopilot(autopilot: int) -> bool:
+    """Return whether a MAV_AUTOPILOT names an autopilot, and not that there is none."""
+    return autopilot != _NO_AUTOPILOT
 
 
 def autopilot_name(number: int) -> str:

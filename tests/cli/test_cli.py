@@ -1069,6 +1069,17 @@ def test_an_ambiguous_name_chooses_no_vehicle(command: Command, warm: Path) -> N
     assert len(ParamCache(warm).vehicles()) == 2
 
 
+def test_the_commands_of_a_camera_leave_the_system_id_to_the_autopilot(
+    command: Command, tmp_path: Path
+) -> None:
+    cache = tmp_path / "cache.sqlite3"
+    assert command("fetch", "sim:camera", "--component", 100, "--cache", cache).code == 0
+    assert command("fetch", "sim:px4", "--cache", cache).code == 0
+    shown = command("show", "1", "MC_ROLL_P", "--cache", cache)
+    assert (shown.code, shown.words[1][:2]) == (0, ["MC_ROLL_P", "4.0"]), shown.err
+    assert command("diff", "1", "1", "--cache", cache).code == 0
+
+
 def test_cache_list_and_path_print_the_cache(command: Command, warm: Path) -> None:
     assert command("set", "sim:px4", "MC_ROLL_P", 6.5, "MC_YAW_P", 3, "--cache", warm).code == 0
 

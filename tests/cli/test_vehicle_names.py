@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -119,6 +120,29 @@ def test_an_ambiguous_name_lists_the_matching_vehicles(name: str, fits: list[int
         + "".join(f"\n  {KEPT[each]}" for each in fits)
         + "\nChoose one by its key."
     )
+
+
+def test_a_system_id_means_the_vehicle_with_the_autopilot_and_not_its_camera() -> None:
+    camera = CachedVehicle(
+        "uid:ca3e0003", replace(known(3, "ca3e0003").identity, autopilot=8), NOW, NOW, (100,)
+    )
+    kept = [camera, *KEPT]
+    assert find_vehicle(kept, "3", place="here") is KEPT[0]
+    assert find_vehicle(kept, "3", place="here", component=100) is camera
+    assert find_vehicle(kept, "3/100", place="here") is camera
+    assert find_vehicle([camera], "3", place="here") is camera
+    with pytest.raises(AmbiguousVehicle, match="fits 2 vehicles"):
+        find_vehicle([camera, replace(camera, key="uid:ca3e0004")], "3", place="here")
+
+
+def test_the_vehicles_of_an_ambiguous_name_have_the_time_of_their_last_observation() -> None:
+    kept = [known(1, SHARED), replace(known(1, "beef000000000001"), last_seen=NOW + 86400)]
+    with pytest.raises(AmbiguousVehicle) as caught:
+        find_vehicle(kept, "1", place="here")
+    first, second = (re.search(r"last seen (\S+ \S+Z)\)", each) for each in caught.value.vehicles)
+    assert first is not None
+    assert second is not None
+    assert first[1] < second[1]
 
 
 def test_system_and_component_only_narrow_a_name() -> None:
