@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import inspect
 import logging
-from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Final
 
 import anyio
-from cyclopts import App, CycloptsError, Parameter
+from cyclopts import App, CycloptsError, MissingArgumentError, Parameter
 
 from paramclient.cli.exit_codes import ExitCode, code_of, text_of
 from paramclient.cli.output import in_local_time, printable, report, say
@@ -41,7 +41,8 @@ def run(arguments: Sequence[str]) -> int:
             # a subcommand that has asked the user something returns the function to await after that
             code = anyio.run(_until_signal, work) if callable(work) else work
         except CycloptsError as error:
-            report(str(error))
+            usage = _usage_of(error.command_chain) if isinstance(error, MissingArgumentError) else None
+            report(" ".join(filter(None, [str(error), usage])))
             return ExitCode.USAGE
         except ParamClientError as error:
             text = text_of(error)
@@ -68,6 +69,14 @@ def _shows_help(arguments: Sequence[str]) -> bool:
     """Return whether help is printed: with --help, and without a subcommand."""
     is_group = len(arguments) == 1 and arguments[0] in ("cache", "fleet", "metadata", "signing")
     return not arguments or is_group or any(word in _app.help_flags for word in arguments)
+
+
+def _usage_of(words: Iterable[str] | None) -> str | None:
+    """Return the usage line of a subcommand; None if it is made of the names of the function's arguments."""
+    app = _app
+    for word in words or ():
+        app = app[word]
+    return app.usage
 
 
 def _load(app: App) -> None:

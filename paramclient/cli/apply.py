@@ -176,9 +176,9 @@ async def apply(
         if dry_run:
             code = show.planned(*await plans(), reboot=reboot, skip_invalid=skip_invalid)
             return max(code, _armed(found, allow_armed=allow_armed))
-        found.announce_write()
         if not yes and can_confirm(options) and not await _confirm(*await plans(), reboot=reboot, full=full):
             return ExitCode.INCOMPLETE
+        found.announce_write()
         if options.no_cache and backup is None and not url.startswith("sim:"):
             say("the state before is not stored: --no-cache is given, and --backup is not")
         with show.progress_until_interrupted(f"setting {_title(found)}") as progress:
@@ -328,9 +328,9 @@ async def restore(
         if dry_run:
             code = show.planned(*await plans(), reboot=reboot, skip_invalid=True)
             return max(code, _armed(found, allow_armed=allow_armed))
-        found.announce_write()
         if not yes and can_confirm(options) and not await _confirm(*await plans(), reboot=reboot, full=full):
             return ExitCode.INCOMPLETE
+        found.announce_write()
         with show.progress_until_interrupted(f"restoring {_title(found)}") as progress:
             result = await restore_to(
                 vehicle,

@@ -30,6 +30,10 @@ __all__ = ["diff"]
 DEFAULTS: Final = "defaults"
 """The value of --base for the firmware's defaults; a file of this name is `./defaults`."""
 
+MEANING_LENGTH_MAX: Final = 40
+"""Characters of the meaning of a value in a table. A bit mask of ArduPilot may have 30 names, and one such
+row would make the table wider than every screen."""
+
 _OPTIONS: Final = LinkOptions()
 
 
@@ -105,6 +109,8 @@ async def diff(
             _print(outcome, shown, sides)
         for line in _summary(outcome):
             say(printable(line))
+        if not partial and (hint := _partial_hint(outcome, left, right)):
+            say(printable(hint))
     return ExitCode.DONE if outcome.is_same else ExitCode.DIFFERENT
 
 
@@ -169,10 +175,12 @@ def _cells(entry: Difference, sides: _Sides, *, has_base: bool) -> list[object]:
 
 
 def _shown(param: WrittenParam | None, metadata: Metadata | None) -> str | None:
-    """Return a value with its meaning, if known: `5 (Loiter)`."""
+    """Return a value with its meaning, if known: `5 (Loiter)`. `info` prints all names of a bit mask."""
     if param is None:
         return None
     meaning = meaning_of(metadata, param.name, param.settable)
+    if len(meaning) > MEANING_LENGTH_MAX:
+        meaning = f"{meaning[:MEANING_LENGTH_MAX]}..."
     return f"{value_text(param)} ({meaning})" if meaning else value_text(param)
 
 
@@ -221,6 +229,17 @@ def _summary(outcome: Comparison) -> list[str]:
         if unknown := sum(entry.moved is None for entry in outcome.entries):
             found.append(f"{unknown} not in the base")
     return [*lines, "; ".join(found)]
+
+
+def _partial_hint(outcome: Comparison, left: str, right: str) -> str | None:
+    """Return a hint at --partial if one source is a file of a few parameters, and the other one a table."""
+    for source, other, compared, standing in (
+        (left, right, outcome.left, Standing.ONLY_RIGHT),
+        (right, left, outcome.right, Standing.ONLY_LEFT),
+    ):
+        if is_file(source) and not is_file(other) and (more := outcome.counts[standing]) > len(compared):
+            return f"--partial leaves out the {more} parameters that {source} does not have"
+    return None
 
 
 _STYLES: Final = {

@@ -131,6 +131,9 @@ def _print_snapshots(kept: Sequence[SnapshotSummary], options: CacheOptions) -> 
 
         print_document(SnapshotsDoc.of(kept))
         return
+    if not kept:
+        say("no snapshots: apply and restore store one before they write")
+        return
     rows = (
         (each.id, local_time(each.at), each.component, each.size, hash_text(each.hash), _reason(each))
         for each in kept

@@ -67,18 +67,23 @@ def from_file(choice: str | None, *, offline: bool = False) -> Metadata | None:
 
 
 async def known_of_session(
-    session: CommandSession, choice: str | None, *, must: bool = False
+    session: CommandSession, choice: str | None, *, needed_for: str = ""
 ) -> Metadata | None:
     """Return the metadata of the vehicle, or None.
 
-    Downloads it from the vehicle if --metadata is `vehicle`, or with `must`, as for values that are written.
-    Otherwise uses the stored metadata of its firmware, without any request.
+    Downloads it from the vehicle if --metadata is `vehicle`, or with `needed_for`, as for values that are
+    written. Otherwise uses the stored metadata of its firmware, without any request.
+
+    Args:
+        session: the session.
+        choice: the value of --metadata.
+        needed_for: why the subcommand cannot continue without metadata, for the error; "" if it can.
 
     Raises:
         UsageError: the vehicle provides no metadata although it is required.
         VehicleError, NoReply, LinkError: as `metadata_of`.
     """
-    if choice == VEHICLE or must:
+    if choice == VEHICLE or needed_for:
         found, refusal = None, None
         try:
             found = await request_from_vehicle(session)
@@ -87,9 +92,11 @@ async def known_of_session(
         if found is None and choice != VEHICLE:
             found = await _stored(session, added_only=True)
         if found is None:
+            problem = f"{needed_for}. " if needed_for else ""
             raise refusal or UsageError(
-                f"{session.label} does not describe its parameters; --metadata takes a file that does, and "
-                f"`paramclient metadata add` remembers one.{files_of([session.component.autopilot])}"
+                f"{problem}{session.label} does not describe its parameters; --metadata takes a file that "
+                "does, and `paramclient metadata add` remembers one."
+                f"{files_of([session.component.autopilot])}"
             )
         return found
     return await _stored(session)
@@ -214,7 +221,8 @@ def parse_pairs(words: Sequence[str]) -> list[tuple[str, int | float | str]]:
     else:
         if pairs:
             return pairs
-    raise UsageError(f"set takes pairs of NAME and VALUE, or NAME=VALUE, not {len(words)} words")
+    end = f", and {words[-1]} has no value" if words else ""
+    raise UsageError(f"set takes pairs of NAME and VALUE, or NAME=VALUE{end}")
 
 
 def check_no_option(word: str) -> None:
@@ -331,6 +339,8 @@ def _fields(info: ParamInfo) -> Iterator[tuple[str, str]]:
 
 
 def _number(name: str, text: str) -> int | float:
+    if text.startswith("="):
+        raise UsageError(f"write {name}=VALUE without spaces, or {name} VALUE without an equals sign")
     number = _number_or_none(name, text)
     if number is None:
         raise UsageError(

@@ -37,7 +37,7 @@ from paramclient.cli.output import (
 from paramclient.cli.param_names import cached_names, check_given, unmatched_text
 from paramclient.cli.param_rows import show_file
 from paramclient.cli.sources import VehicleChoice, choose, chosen_vehicle, is_file, open_file, tables_in
-from paramclient.errors import NotInCache, UsageError
+from paramclient.errors import NotInCache, UnknownVehicle, UsageError
 from paramclient.metadata import Metadata, MetadataStore
 from paramclient.model.defaults import add_default, default_of
 from paramclient.model.identity import autopilot_name
@@ -116,7 +116,8 @@ def show(
     described = from_file(metadata, offline=True)
     is_log = vehicle is not None and vehicle.lower().startswith("replay:")
     with _open(options) if not is_log or vehicle is None else cache_of_log(vehicle) as cache:
-        summaries = tables_in(cache, None if is_log else vehicle, component)
+        summaries = _tables_to_show(cache, None if is_log else vehicle, component)
+        extended_sizes = cache.ext_sizes()
         nicknames = _names_by_key(cache)
         is_list = vehicle is None and len(summaries) > 1 and not options.json
         tables = [] if is_list else _load(cache, summaries)
@@ -127,12 +128,15 @@ def show(
 
         print_document(CachedTablesDoc(components=[view.document() for view in views]))
     elif is_list:
-        _print_summaries(summaries, nicknames, {})
+        _print_summaries(summaries, nicknames, extended_sizes)
         say("paramclient show VEHICLE prints the table of one vehicle, by its system id or its key")
     elif not summaries:
         say(f"the cache {printable(cache.place)} is empty")
     for view in [] if options.json else views:
         _print_table(view)
+        table = view.table
+        if not table.size and (number := extended_sizes.get((table.key, table.component))):
+            say(f"{number} extended parameters: --extended prints them")
     if changed and tables and not any(view.has_defaults for view in views):
         report_no_defaults(STORED_DEFAULTS_HINT)
         return ExitCode.INCOMPLETE
@@ -309,6 +313,24 @@ def tables_of(options: CacheOptions, vehicle: str, component: int | None) -> lis
     """
     with _open(options) as cache:
         return _load(cache, tables_in(cache, vehicle, component))
+
+
+def _tables_to_show(cache: ParamCache, vehicle: str | None, component: int | None) -> list[CachedSummary]:
+    """Return the tables that the arguments of show name, as `tables_in` does.
+
+    Raises:
+        UsageError: the name of a parameter is in the place of the vehicle.
+        UnknownVehicle, AmbiguousVehicle: as `tables_in`.
+    """
+    try:
+        return tables_in(cache, vehicle, component)
+    except UnknownVehicle:
+        if vehicle is None or vehicle.upper() not in map(str.upper, cached_names(cache)):
+            raise
+        raise UsageError(
+            f"{vehicle} is the name of a parameter: the first argument of show is the vehicle, as in "
+            f"`paramclient show 1 {vehicle}`; `paramclient info {vehicle}` prints it for every vehicle"
+        ) from None
 
 
 def _check_known(cache: ParamCache, name_patterns: Sequence[str], known: Sequence[str]) -> None:

@@ -89,6 +89,7 @@ class Coloured:
 
 def printable(text: str) -> str:
     """Return text that is safe on any terminal: characters that are not printable ASCII become `\\x1b`, …"""
+    text = text.replace("…", "...")  # of the library's messages
     if text.isascii() and text.isprintable():
         return text
     return "".join(

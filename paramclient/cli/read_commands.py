@@ -415,10 +415,12 @@ class _Fetched:
         crc = "" if result.hash is None else f"; hash {hash_text(result.hash)}"
         lost = "" if result.source == "cache" else f"{result.lost} lost, {result.repeated} repeated, "
         trip = "" if result.round_trip is None else f"round trip {milliseconds(result.round_trip)}, "
+        transferred = f"{self.bytes_received:,} bytes received, {self.bytes_sent:,} sent"
+        if len(self.session.client.components) > 1:  # the counters are those of the link
+            transferred = f"{transferred} on the whole link"
         return (
             f"{self.received}{of} parameters of {self.session.label} from {result.source} in "
-            f"{result.elapsed:.2f} s, {lost}{trip}{self.bytes_received:,} bytes received, "
-            f"{self.bytes_sent:,} sent{crc}"
+            f"{result.elapsed:.2f} s, {lost}{trip}{transferred}{crc}"
         )
 
     def document(self) -> FetchOutputDoc:

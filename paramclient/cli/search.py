@@ -19,7 +19,7 @@ from paramclient.cli.sources import tables_in
 from paramclient.errors import NotInCache, UsageError
 from paramclient.metadata import Metadata, ParamInfo
 from paramclient.model.defaults import DefaultSource, default_of
-from paramclient.model.identity import autopilot_name
+from paramclient.model.identity import autopilot_name, has_autopilot
 from paramclient.model.values import check_name, format_value, type_name
 from paramclient.model.wording import counted
 
@@ -76,7 +76,8 @@ def search(
     if not names:
         report(f"nothing found; {counted(len(found.names), 'parameter')} searched")
     if found.undescribed and not options.json:
-        say(f"only names were searched: {_how_to_describe(found.undescribed)}")
+        of_some = "of some vehicles, " if found.metadata else ""
+        say(f"{of_some}only names were searched: {_how_to_describe(found.undescribed)}")
     if not names:
         return ExitCode.INCOMPLETE
     return ExitCode.DONE
@@ -136,7 +137,7 @@ class _Known:
     metadata: Sequence[Metadata]
     names: frozenset[str]
     undescribed: Sequence[str]
-    """Autopilots of the tables without metadata."""
+    """Autopilots of the tables without metadata. A camera has none: its firmware has no such metadata."""
 
     @classmethod
     def of(cls, options: CacheOptions, vehicle: str | None, described: Metadata | None) -> _Known:
@@ -156,7 +157,7 @@ class _Known:
         without = [
             autopilot_name(table.autopilot)
             for table, each in zip(tables, found, strict=False)
-            if each is None
+            if each is None and has_autopilot(table.autopilot)
         ]
         return cls(tables, metadata, frozenset(names), sorted(set(without)))
 
@@ -169,13 +170,14 @@ class _Known:
         return [table for table in self.tables if name in table.params]
 
     def cells(self, name: str) -> tuple[object, ...]:
-        """Return the row of a found parameter. The value is that of the only vehicle that has it."""
+        """Return the row of a found parameter, with its value if that is the same on all vehicles."""
         tables = self.having(name)
         described = self.info(name)
-        param = tables[0].params[name] if len(tables) == 1 else None
+        params = [table.params[name] for table in tables]
+        values = {format_value(each.settable, each.type_number) for each in params}
         return (
             name,
-            None if param is None else format_value(param.settable, param.type_number),
+            f"{len(values)} values" if len(values) > 1 else next(iter(values), None),
             ", ".join(f"{each.system}/{each.component}" for each in tables),
             None if described is None else described.short_description,
         )

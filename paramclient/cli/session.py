@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Final
 
 import anyio
@@ -26,10 +28,12 @@ from paramclient.model.wording import first_of
 from paramclient.protocol.no_reply_hint import hint_of_link
 from paramclient.protocol.params.fetch_result import Policy
 from paramclient.protocol.vehicle.kinds import kind_in_words
+from paramclient.protocol.vehicle_selection import LOOK_TIME
 
 __all__ = [
     "Deadline",
     "CommandSession",
+    "check_link_argument",
     "connect",
     "listen",
     "received_in_words",
@@ -52,6 +56,9 @@ FIRMWARE_TIMEOUT: Final = 0.5
 """Seconds to wait for the firmware version of the vehicle, to name it to the user or to find its metadata."""
 FIRMWARE_POLL_INTERVAL: Final = 0.01
 """Seconds between two checks whether the firmware version is known."""
+
+_PARAMETER: Final = re.compile(r"[A-Z][A-Z0-9]*_[A-Z0-9_]*(=.*)?", re.IGNORECASE)
+"""A text that is probably the name of a parameter, or NAME=VALUE: it has an underscore."""
 
 
 class Deadline:
@@ -161,6 +168,28 @@ class CommandSession:
             )
 
 
+def check_link_argument(text: str) -> None:
+    """Check that the first argument of a subcommand is not the file or the parameter that follows the link.
+
+    Any other text that is not a link fails when the link is opened.
+
+    Raises:
+        UsageError: it is the name of a file or a parameter.
+    """
+    if names_service(text):
+        return
+    try:
+        parse_link(text)
+    except UsageError:
+        found = "the name of a parameter" if _PARAMETER.fullmatch(text) else ""
+        with suppress(OSError, ValueError):  # a text that is too long or has a NUL is not a file name
+            found = "a file" if Path(text).is_file() else found
+        if found:
+            raise UsageError(
+                f"{text} is {found}: the first argument is the link, such as udpin:0.0.0.0:14550 or sim:px4"
+            ) from None
+
+
 async def wait_for_firmware(vehicles: Sequence[Component], deadline: Deadline) -> None:
     """Wait until the firmware versions of vehicles are known, for at most `FIRMWARE_TIMEOUT`."""
     with anyio.move_on_after(deadline.left(FIRMWARE_TIMEOUT)):
@@ -204,6 +233,7 @@ async def connect(
         NoReply: the component was not heard.
         LinkError: the link cannot be opened, or failed.
     """
+    check_link_argument(url)
     if options.peer is not None and not options.split_peers:
         raise UsageError("--peer needs --split-peers")
     deadline = Deadline(options.timeout)
@@ -254,12 +284,13 @@ async def wait_for_vehicle(
     Raises:
         ParamClientError: as from `ParamClient.component` and `ParamClient.only_component`.
     """
-    find = client.only_component if only else client.component
     awaited = address_in_words(system, component, peer) if kind is None else f"a vehicle with {kind}"
 
     async def look(_: Callable[[], None]) -> Component:
+        if kind is None and not only:
+            return await client.component(system, component, peer=peer, timeout=timeout)
         if kind is None:
-            return await find(system, component, peer=peer, timeout=timeout)
+            return await _find_only(client, system, component, peer=peer, timeout=timeout)
         began = anyio.current_time()
         found = await wait_for_kind(client, kind, timeout)
         if found is None:
@@ -268,6 +299,24 @@ async def wait_for_vehicle(
         return found
 
     return await while_waiting(look, f"{awaited} on {client.link.name}", lambda: received_in_words(client))
+
+
+async def _find_only(
+    client: ParamClient, system: int | None, component: int | None, *, peer: str | None, timeout: float | None
+) -> Component:
+    """Wait for the only component, as `ParamClient.only_component` does; the error lists all vehicles.
+
+    That call ends with the second vehicle that is received. The user chooses one of all: the others are
+    waited for as long as an autopilot takes for a heartbeat.
+    """
+    deadline = Deadline(timeout)
+    try:
+        return await client.only_component(system, component, peer=peer, timeout=timeout)
+    except AmbiguousVehicle:
+        await anyio.sleep(deadline.left(LOOK_TIME) or 0.0)
+        with suppress(NoReply):
+            await client.only_component(system, component, peer=peer, timeout=RECHECK_TIMEOUT)
+        raise
 
 
 def listen(url: str, options: TrafficOptions, *, listen_only: bool = False) -> ParamClient:

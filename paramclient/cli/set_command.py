@@ -39,7 +39,7 @@ from paramclient.cli.metadata import (
 from paramclient.cli.options import Count, LinkOptions
 from paramclient.cli.output import print_document, print_table, printable, report, say
 from paramclient.cli.param_names import spelling
-from paramclient.cli.session import CommandSession, connect, wait_for_firmware
+from paramclient.cli.session import CommandSession, check_link_argument, connect, wait_for_firmware
 from paramclient.cli.write_outcomes import (
     OUTCOME_COLUMNS,
     counted_outcomes,
@@ -104,6 +104,7 @@ async def set_(
         all_: Write to every vehicle heard within 3 s.
         expect: With --all: wait up to 10 s for this number of vehicles, and write to none if there are fewer.
     """
+    check_link_argument(url)
     check_expected(expect, all_=all_)
     if all_:
         check_all(options, extended=extended)
@@ -168,8 +169,8 @@ async def _prepare(
     """Return names and values as the vehicle and its metadata have them."""
     wanted = [(spelling(name, session.component), value) for name, value in wanted]
     if described is None:
-        has_names = any(isinstance(value, str) for _, value in wanted)
-        described = await known_of_session(session, choice, must=has_names)
+        named = [f"{name}: {value!r} is not a number" for name, value in wanted if isinstance(value, str)]
+        described = await known_of_session(session, choice, needed_for=named[0] if named else "")
     return _Job(session, resolved(wanted, described), described)
 
 
@@ -240,7 +241,7 @@ def _print(session: CommandSession, outcomes: Sequence[SetOutcome], described: M
         return
     print_table(
         OUTCOME_COLUMNS,
-        (outcome_cells(session, outcome) for outcome in outcomes),
+        (outcome_cells(session, outcome, described) for outcome in outcomes),
         right="requested actual",
     )
 
@@ -285,7 +286,7 @@ def _show_fleet(jobs: Sequence[_Job], done: Sequence[Sequence[SetOutcome]], opti
         print_document(FleetWritesDoc(vehicles=documents))
     else:
         rows = (
-            (address_text(job.session), *outcome_cells(job.session, outcome))
+            (address_text(job.session), *outcome_cells(job.session, outcome, job.described))
             for job, outcomes in pairs
             for outcome in outcomes
         )

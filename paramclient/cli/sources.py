@@ -12,9 +12,10 @@ If both exist, `./1` is the file and `cache:1` the vehicle.
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Annotated, Final, TypeAlias
 
 import anyio
@@ -28,6 +29,7 @@ from paramclient.cli.session import CommandSession, Deadline, connect
 from paramclient.client.component import Component
 from paramclient.errors import UnknownVehicle, UsageError
 from paramclient.files import ParamFile, read_file, read_renames
+from paramclient.files.formats import ENDINGS
 from paramclient.files.param_file import AUTOPILOT
 from paramclient.links import FORMS, parse_link
 from paramclient.links.names import names_service
@@ -62,6 +64,10 @@ SOURCES: Final = f"""\
 
 VehicleChoice: TypeAlias = Annotated[str | None, Parameter(name="--vehicle")]
 """The vehicle in the cache, of a subcommand that also takes it as its first argument."""
+
+_ENDINGS: Final = frozenset({*ENDINGS, ".bin", ".ulg", ".txt", ".csv"})
+"""Extensions of files with parameters, also of formats that are not readable: a text with one of them is
+meant as a file, and no link name has one."""
 
 _CACHED: Final = "cache:"
 """The prefix of a vehicle in the cache."""
@@ -152,16 +158,32 @@ def check_link(text: str) -> None:
     """Check that an argument that is neither a file nor a cached vehicle names a link.
 
     Raises:
-        UsageError: it does not; the message lists the accepted sources.
+        UsageError: it does not; the message lists the accepted sources, unless the text is the name of a
+            file that does not exist.
     """
     try:
         if not names_service(text):
             parse_link(text)
     except UsageError as error:
+        if PurePath(text).suffix.lower() in _ENDINGS:
+            raise UsageError(f"no such file: {text}{_nearest_file(text)}") from None
         problem = str(error).splitlines()[0]
         raise UsageError(
             f"no such file, and no cached vehicle; {problem}\naccepted sources:\n{SOURCES}"
         ) from None
+
+
+def _nearest_file(text: str) -> str:
+    """Return a question about similar names in the folder, or that there is no such folder; or ""."""
+    folder = Path(text).parent
+    if not folder.is_dir():
+        return f"; there is no folder {folder} here"
+    try:
+        names = [each.name for each in folder.iterdir()]
+    except OSError:
+        return ""
+    similar = difflib.get_close_matches(Path(text).name, names, n=1)
+    return f" (did you mean {folder / similar[0]}?)" if similar else ""
 
 
 async def collect_confirmed(

@@ -10,7 +10,7 @@ from typing import Final
 import anyio
 
 from paramclient.cli.exit_codes import ExitCode, code_of
-from paramclient.cli.metadata import needs_reboot
+from paramclient.cli.metadata import meaning_of, needs_reboot
 from paramclient.cli.output import Coloured, printable, progress_bar, report, say
 from paramclient.cli.param_names import suggest
 from paramclient.cli.session import CommandSession
@@ -141,12 +141,17 @@ def _in_order(writes: Sequence[tuple[str, WireValue]], arrived: Sequence[SetOutc
     return outcomes
 
 
-def outcome_cells(session: CommandSession, outcome: SetOutcome) -> tuple[object, ...]:
-    """Return the cells of `OUTCOME_COLUMNS` for an outcome."""
+def outcome_cells(
+    session: CommandSession, outcome: SetOutcome, described: Metadata | None = None
+) -> tuple[object, ...]:
+    """Return the cells of `OUTCOME_COLUMNS` for an outcome; the reported value with its meaning, if known."""
+    actual = _text(outcome.reported, type_of(session, outcome))
+    if outcome.reported is not None and (meaning := meaning_of(described, outcome.name, outcome.reported)):
+        actual = f"{actual} ({meaning})"
     return (
         outcome.name,
         _text(outcome.requested, ParamType.REAL64),
-        _text(outcome.reported, type_of(session, outcome)),
+        actual,
         Coloured(outcome.status, _STYLES[outcome.status]),
     )
 

@@ -69,6 +69,9 @@ def test_fetch_prints_the_tables_of_every_vehicle(
     shown = command("fetch", url, "--all", "--only", "GAIN")
     assert [line[:3] for line in shown.words[1:]] == [["1/1", "GAIN", "4.0"], ["2/1", "GAIN", "4.0"]]
     assert "parameters of 2/1 ardupilot from" in shown.err
+    assert len(re.findall(r" bytes received, [0-9,]+ sent on the whole link", shown.err)) == 2
+    alone = command("fetch", put(PX4Vehicle(system=1, table=SHARED)), "--only", "GAIN")
+    assert "on the whole link" not in alone.err
 
 
 def test_one_vehicle_that_fails_stops_no_other(

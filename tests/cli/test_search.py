@@ -51,13 +51,44 @@ def test_search_limits_and_reports_nothing(command: Command) -> None:
     assert (nothing.code, nothing.out) == (1, "")
     assert nothing.err.startswith("paramclient: nothing found; ")
     assert (
-        "only names were searched: no metadata is stored for the firmware of ardupilot. `paramclient"
-        in nothing.err
+        "of some vehicles, only names were searched: no metadata is stored for the firmware of ardupilot. "
+        "`paramclient" in nothing.err
     )
     assert "https://autotest.ardupilot.org/Parameters/" in nothing.err
     of_described = command("search", "xyzzy", "--vehicle", 1)
     assert of_described.err == "paramclient: nothing found; 903 parameters searched\n"
     assert command("search", "xyzzy", "--json").json == {"results": []}
+
+
+def test_search_prints_a_value_that_all_vehicles_have_and_the_number_of_different_ones(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    leaping(monkeypatch)
+    run = in_process(capsys, "--cache", str(tmp_path / "cache.sqlite3"))
+    put = behind(monkeypatch, "sim:px4")
+    for system in (1, 2, 3):
+        table = {"GAIN_P": 4.0, "GAIN_I": system / 2, "GAIN_D": min(system, 2)}
+        assert run("fetch", put(PX4Vehicle(system=system, table=table))).code == 0
+    assert run("search", "gain").rows[1:] == [
+        ["GAIN_D", "2 values", "1/1, 2/1, 3/1"],
+        ["GAIN_I", "3 values", "1/1, 2/1, 3/1"],
+        ["GAIN_P", "4.0", "1/1, 2/1, 3/1"],
+    ]
+
+
+def test_a_camera_needs_no_metadata(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    leaping(monkeypatch)
+    run = in_process(capsys, "--cache", str(tmp_path / "cache.sqlite3"))
+    assert run("fetch", "sim:camera", "--component", 100).code == 0
+    assert run("get", "sim:px4?metadata=1", "MC_ROLL_P", "--metadata", "vehicle").code == 0
+    found = run("search", "roll")
+    assert (found.code, found.err) == (0, "")
+    assert run("fetch", "sim:ardupilot").code == 0
+    assert run("search", "roll").err.startswith(
+        "of some vehicles, only names were searched: no metadata is stored for the firmware of ardupilot. "
+    )
 
 
 def test_info_prints_description_values_and_changes(command: Command) -> None:

@@ -261,6 +261,8 @@ def test_a_user_at_a_terminal_must_confirm(
         assert "go on? [y/N]" in outcome.err
         assert ["1", "RTL_ALT", "1500", "2500", "set", "all other parameters"] in outcome.rows
         assert vehicle.requests["PARAM_SET"] == sets
+        _, _, after = outcome.err.partition("go on? [y/N]")
+        assert outcome.err.count("writing to 1/1") == after.count("writing to 1/1") == (1 if sets else 0)
         assert "go on?" not in command("apply", put(copter()), file(), "--json").err
         assert "go on?" not in command("apply", put(vehicle), file(), "--yes").err
         assert "go on?" not in command("apply", put(vehicle), file()).err, "there is nothing to ask about"

@@ -1,0 +1,154 @@
+"""Arguments that a new user mistakes: no link, a misspelled file, swapped arguments, a comma in a number."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from paramclient.sim import Air, PX4Vehicle
+from tests.commands import Command, Put, behind, in_process, leaping
+from tests.shell import Late
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Command:
+    """Run the command line in this process and in a new folder, on simulated time, with a new cache."""
+    leaping(monkeypatch)
+    monkeypatch.chdir(tmp_path)
+    return in_process(capsys, "--cache", str(tmp_path / "cache.sqlite3"))
+
+
+@pytest.fixture
+def put(monkeypatch: pytest.MonkeyPatch) -> Put:
+    return behind(monkeypatch, "udpin:0.0.0.0:14550")
+
+
+LINK_FIRST = "the first argument is the link, such as udpin:0.0.0.0:14550 or sim:px4\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["set", "MC_ROLL_P", 6.5], f"MC_ROLL_P is the name of a parameter: {LINK_FIRST}"),
+        (["set", "MC_ROLL_P=6.5"], f"MC_ROLL_P=6.5 is the name of a parameter: {LINK_FIRST}"),
+        (["get", "mc_roll_p", "MC_YAW_P"], f"mc_roll_p is the name of a parameter: {LINK_FIRST}"),
+        (["apply", "quad.parm", "sim:px4"], f"quad.parm is a file: {LINK_FIRST}"),
+        (["verify", "quad.parm", "sim:px4"], f"quad.parm is a file: {LINK_FIRST}"),
+        (["apply", "sim:px4", "qaud.parm"], "no such file: qaud.parm (did you mean quad.parm?)\n"),
+        (["apply", "sim:px4", "my/quad.parm"], "no such file: my/quad.parm; there is no folder my here\n"),
+        (["apply", "sim:px4", "fleet.yaml"], "no such file: fleet.yaml\n"),
+        (
+            ["set", "sim:px4", "MC_ROLL_P", "=", 6.5],
+            "write MC_ROLL_P=VALUE without spaces, or MC_ROLL_P VALUE without an equals sign\n",
+        ),
+        (
+            ["set", "sim:px4", "MC_ROLL_P", 6.5, "MC_YAW_P"],
+            "set takes pairs of NAME and VALUE, or NAME=VALUE, and MC_YAW_P has no value\n",
+        ),
+        (["get", "a\0b", "MC_YAW_P"], "link name 'a\\x00b'"),
+        (["get", "14550", "MC_YAW_P"], "link name '14550': the kind of link is missing"),
+    ],
+)
+def test_a_mistaken_argument_is_named(command: Command, words: list[object], text: str) -> None:
+    Path("quad.parm").write_text("MC_ROLL_P 6.8\n", encoding="utf-8")
+    outcome = command(*words)
+    assert (outcome.code, outcome.out) == (2, "")
+    assert outcome.err.startswith(f"paramclient: {text}")
+
+
+def test_a_missing_argument_is_answered_with_the_usage(command: Command) -> None:
+    outcome = command("get", "MC_ROLL_P")
+    assert (outcome.code, outcome.out) == (2, "")
+    assert outcome.err.endswith(" Usage: paramclient get [OPTIONS] URL NAME [NAME...]\n")
+    assert command("cache", "name").err.endswith(
+        " Usage: paramclient cache name [OPTIONS] VEHICLE [NICKNAME]\n"
+    )
+
+
+def test_a_text_that_is_neither_a_number_nor_a_known_name_is_quoted(command: Command) -> None:
+    outcome = command("set", "sim:px4", "MC_ROLL_P=6,5")
+    assert outcome.code == 2
+    assert "MC_ROLL_P: '6,5' is not a number. 1/1 px4 does not describe its parameters" in outcome.err
+
+
+@pytest.mark.parametrize("timeout", [[], ["--timeout", "60"]])
+def test_the_error_of_several_vehicles_lists_all_that_send_a_heartbeat(
+    command: Command, put: Put, timeout: list[str]
+) -> None:
+    vehicles = [Late(PX4Vehicle(system=number, table={"GAIN": 4.0}), number / 5) for number in (1, 2, 3, 4)]
+    outcome = command("set", put(Air(vehicles)), "GAIN", 5, *timeout)
+    assert (outcome.code, outcome.out) == (2, "")
+    assert outcome.err == (
+        "paramclient: 4 vehicles on this link: 1/1 PX4 quadrotor, 2/1 PX4 quadrotor, 3/1 PX4 quadrotor, "
+        "4/1 PX4 quadrotor. Choose one with --system.\n"
+    )
+
+
+def test_the_comparison_of_a_short_file_with_a_whole_table_mentions_partial(command: Command) -> None:
+    Path("quad.parm").write_text("MC_ROLL_P 4.0\nMC_YAW_P 2.9\n", encoding="utf-8")
+    hint = "--partial leaves out the 901 parameters that quad.parm does not have\n"
+    assert command("diff", "quad.parm", "sim:px4").err.endswith(hint)
+    assert command("diff", "sim:px4", "quad.parm").err.endswith(hint)
+    assert hint not in command("diff", "sim:px4", "quad.parm", "--partial").err
+    assert command("save", "sim:px4", "whole.parm").code == 0
+    assert "--partial" not in command("diff", "whole.parm", "quad.parm").err
+    assert "--partial" not in command("diff", "whole.parm", "sim:px4").err
+
+
+def test_an_excerpt_of_a_wrong_file_has_no_escapes(command: Command) -> None:
+    Path("readme.parm").write_text(f"{'This is a long line of text. ' * 20}\n", encoding="utf-8")
+    outcome = command("apply", "sim:px4", "readme.parm")
+    assert outcome.code == 2
+    assert "...'" in outcome.err
+    assert "\\u2026" not in outcome.err
+
+
+def test_a_bit_mask_with_many_names_does_not_widen_the_comparison(command: Command) -> None:
+    bits = ",".join(f"{bit}:Sensor number {bit}" for bit in range(20))
+    Path("apm.pdef.xml").write_text(
+        '<paramfile><vehicles><parameters name="ArduCopter"><param name="ArduCopter:MASK" '
+        f'humanName="Mask"><field name="Bitmask">{bits}</field></param></parameters></vehicles></paramfile>',
+        encoding="utf-8",
+    )
+    Path("left.parm").write_text("MASK 1048575\n", encoding="utf-8")
+    Path("right.parm").write_text("MASK 3\n", encoding="utf-8")
+    outcome = command("diff", "left.parm", "right.parm", "--metadata", "apm.pdef.xml")
+    assert outcome.rows[1][1:3] == [
+        "1048575 (Sensor number 0|Sensor number 1|Sensor n...)",
+        "3 (Sensor number 0|Sensor number 1)",
+    ]
+    assert all(len(line) < 150 for line in outcome.out.splitlines())
+
+
+def test_show_names_what_it_does_not_print(command: Command) -> None:
+    assert command("fetch", "sim:camera", "--component", 100).code == 0
+    assert command("show", "1/100").err.endswith("\n16 extended parameters: --extended prints them\n")
+    assert command("fetch", "sim:px4").code == 0
+    listed = command("show").rows
+    assert listed[0][3] == "extended"
+    assert [row[3] for row in listed[1:] if row[1] == "no autopilot"] == ["16"]
+    wrong = command("show", "mc_roll_p")
+    assert (wrong.code, wrong.out) == (2, "")
+    assert wrong.err == (
+        "paramclient: mc_roll_p is the name of a parameter: the first argument of show is the vehicle, as in "
+        "`paramclient show 1 mc_roll_p`; `paramclient info mc_roll_p` prints it for every vehicle\n"
+    )
+    assert "is not in the cache" in command("show", "NO_SUCH_PARAMETER").err
+
+
+def test_a_vehicle_without_snapshots_has_no_table_of_them(command: Command) -> None:
+    assert command("fetch", "sim:px4").code == 0
+    listed = command("history", 1, "--snapshots")
+    assert (listed.code, listed.out) == (0, "")
+    assert listed.err == "no snapshots: apply and restore store one before they write\n"
+
+
+def test_set_prints_the_name_of_the_reported_value(command: Command) -> None:
+    url = "sim:px4?metadata=1"
+    done = command("set", url, "COM_FLTMODE1=Return", "MC_ROLL_P", 6.5)
+    assert done.rows[1:] == [
+        ["COM_FLTMODE1", "5", "5 (Return)", "accepted"],
+        ["MC_ROLL_P", "6.5", "6.5", "accepted"],
+    ]
+    assert command("set", url, "COM_FLTMODE1=Return", "--json").json["results"][0]["actual"] == 5
