@@ -239,6 +239,16 @@ def test_a_program_prints_what_the_page_shows(program: str, output: str, tmp_pat
     assert DURATION.sub("0.0 s", printed) == DURATION.sub("0.0 s", output)
 
 
+def test_the_code_for_a_notebook_runs_with_await_at_the_top_level(tmp_path: Path) -> None:
+    (cell,) = blocks(DOCS / "scripts.md", "py")
+    program = (
+        "import ast, asyncio\n"
+        f"cell = compile({cell!r}, 'cell', 'exec', ast.PyCF_ALLOW_TOP_LEVEL_AWAIT)\n"
+        "asyncio.run(eval(cell))"
+    )
+    assert run("-W", "error", "-c", program, cwd=tmp_path) == "MC_ROLL_P = 4.0\n"
+
+
 RECIPE = re.compile(r"^```sh\n(.*)\n```\n(?:\n```text\n((?:(?!```).*\n)*)```\n)?", re.MULTILINE)
 
 
@@ -264,7 +274,7 @@ def test_the_commands_of_the_recipes_print_what_the_page_shows(tmp_path: Path) -
     """In one folder, in the order of the page. A command without a text below it prints nothing."""
     page = (DOCS / "recipes.md").read_text(encoding="utf-8")
     found = RECIPE.findall(page)
-    assert len(found) + len(blocks(DOCS / "recipes.md", "python")) == 23
+    assert len(found) + len(blocks(DOCS / "recipes.md", "python")) == 24
     for command, output in found:
         done = run_command(command, tmp_path)
         assert (done.returncode, done.stdout) == (0, output), command + done.stderr

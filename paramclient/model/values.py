@@ -294,7 +294,10 @@ def check_value(value: Settable) -> WireValue:
             raise UsageError(f"raw bytes for a parameter are the 4 bytes of the message, not {len(value)}")
         return value
     if isinstance(value, str):
-        raise UsageError(f"a parameter value is a number, not the text {value!r}")
+        raise UsageError(
+            f"a parameter value is a number, not the text {value!r}. The number of a value's name is "
+            "ParamInfo.parse(text), with the metadata of the parameter"
+        )
     try:
         if isinstance(value, SupportsIndex):
             return value.__index__()
