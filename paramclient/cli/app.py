@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import inspect
 import logging
+import re
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Final
 
 import anyio
-from cyclopts import App, CycloptsError, MissingArgumentError, Parameter
+from cyclopts import App, CycloptsError, MissingArgumentError, Parameter, UnknownOptionError
 
 from paramclient.cli.exit_codes import ExitCode, code_of, text_of
 from paramclient.cli.output import in_local_time, printable, report, say
@@ -41,8 +42,7 @@ def run(arguments: Sequence[str]) -> int:
             # a subcommand that has asked the user something returns the function to await after that
             code = anyio.run(_until_signal, work) if callable(work) else work
         except CycloptsError as error:
-            usage = _usage_of(error.command_chain) if isinstance(error, MissingArgumentError) else None
-            report(" ".join(filter(None, [str(error), usage])))
+            report(_usage_text(error))
             return ExitCode.USAGE
         except ParamClientError as error:
             text = text_of(error)
@@ -69,6 +69,15 @@ def _shows_help(arguments: Sequence[str]) -> bool:
     """Return whether help is printed: with --help, and without a subcommand."""
     is_group = len(arguments) == 1 and arguments[0] in ("cache", "fleet", "metadata", "signing")
     return not arguments or is_group or any(word in _app.help_flags for word in arguments)
+
+
+def _usage_text(error: CycloptsError) -> str:
+    """Return an error of the arguments as one line, with the usage if an argument is missing."""
+    if isinstance(error, MissingArgumentError) and (usage := _usage_of(error.command_chain)):
+        return f"{error} {usage}"
+    if isinstance(error, UnknownOptionError) and _ONE_HYPHEN.fullmatch(error.token.value):
+        return f"Unknown option: {error.token.value}. Did you mean -{error.token.value}?"
+    return str(error)
 
 
 def _usage_of(words: Iterable[str] | None) -> str | None:
@@ -115,6 +124,9 @@ class _LogPrinter(logging.Handler):
             name = record.name.removeprefix("paramclient.")
             say(printable(f"{record.relativeCreated / 1000:8.3f} {name}: {record.getMessage()}"))
 
+
+_ONE_HYPHEN: Final = re.compile(r"-[a-z][a-z-]+")
+"""A long option with one hyphen instead of two."""
 
 _logger: Final = logging.getLogger("paramclient")
 

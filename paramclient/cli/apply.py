@@ -370,7 +370,10 @@ async def _load_state(found: Targets, vehicle: Component, when: str | None, opti
 
 def _state_at(cache: ParamCache, key: str, component: int, moment: float | None) -> ParamSet:
     if moment is None:
-        return load_state_before_apply(cache, key, component)
+        try:
+            return load_state_before_apply(cache, key, component)
+        except NotInCache as error:
+            raise NotInCache(f"{error}, such as '2h ago', or a backup file") from None
     try:
         return cache.state_at(key, component, moment)
     except UnknownVehicle:  # the vehicle was heard on the link; the user named none of the cache

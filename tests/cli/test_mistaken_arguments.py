@@ -46,6 +46,8 @@ LINK_FIRST = "the first argument is the link, such as udpin:0.0.0.0:14550 or sim
             ["set", "sim:px4", "MC_ROLL_P", 6.5, "MC_YAW_P"],
             "set takes pairs of NAME and VALUE, or NAME=VALUE, and MC_YAW_P has no value\n",
         ),
+        (["fetch", "sim:px4", "-system", 3], "Unknown option: -system. Did you mean --system?\n"),
+        (["fetch", "sim:px4", "-q"], "Unknown option: -q."),
         (["get", "a\0b", "MC_YAW_P"], "link name 'a\\x00b'"),
         (["get", "14550", "MC_YAW_P"], "link name '14550': the kind of link is missing"),
     ],

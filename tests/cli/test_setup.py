@@ -423,6 +423,9 @@ def test_restore_needs_a_stored_state(
     outcome = command("restore", put(copter()), *when)
     assert outcome.code == 5
     assert text in outcome.err
+    assert when or outcome.err.endswith(
+        "; name the time of the state to restore, such as '2h ago', or a backup file\n"
+    )
     assert command("restore", put(copter()), *when, "--no-cache").code == 2
 
 
