@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 import sys
 from pathlib import Path
-from typing import Final
+from typing import BinaryIO, Final
 
 __all__ = [
     "GROUP_READS",
@@ -16,6 +17,7 @@ __all__ = [
     "is_own",
     "make_private",
     "mode_of",
+    "open_regular",
 ]
 
 OF_OTHERS: Final = 0o077
@@ -24,6 +26,7 @@ OTHERS_WRITE: Final = 0o022
 """Mode bits that give write access to other users than the owner."""
 GROUP_READS: Final = 0o040
 """Mode bit that gives read access to the group."""
+_NO_WAIT: Final = getattr(os, "O_NONBLOCK", 0)  # Windows has neither the flag nor such pipes
 
 
 def mode_of(status: os.stat_result) -> int:
@@ -41,6 +44,19 @@ def has_trusted_owner(status: os.stat_result) -> bool:
     return is_own(status) or status.st_uid == 0
 
 
+def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
+    """Open a regular file for reading. Never waits, unlike `open` for a named pipe without a writer.
+
+    Raises:
+        OSError: the file cannot be opened, or is not a regular file.
+    """
+    file = open(path, "rb", opener=_open_at_once)  # noqa: SIM115 - the caller closes it
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise OSError(errno.EINVAL, "Not a regular file", os.fspath(path))
+    return file
+
+
 def make_private(path: Path) -> int:
     """Restrict a file that other users can write to its owner. Return its previous mode.
 
@@ -51,3 +67,7 @@ def make_private(path: Path) -> int:
     if mode & OTHERS_WRITE:
         path.chmod(mode & ~OF_OTHERS)
     return mode
+
+
+def _open_at_once(path: str, flags: int) -> int:
+    return os.open(path, flags | _NO_WAIT)

@@ -118,8 +118,8 @@ class Database:
 
     Args:
         path: the file, absolute, with resolved symbolic links.
-        link: the symbolic link that was given as path, or None. The target of a link has to belong to the
-            user of this process.
+        link: the symbolic link that was given as path, or None. The target of a link has to exist, and to
+            belong to the user of this process.
 
     Attributes:
         path: the file.
@@ -518,17 +518,24 @@ class Database:
         )
 
     def _check_link(self) -> None:
-        """Check that the target of a symbolic link belongs to this user, or without a target, the link.
+        """Check that the target of a symbolic link exists and belongs to this user.
+
+        A missing target could be anywhere: another user may have made the link, or one that it leads to.
 
         Raises:
-            CacheError: it belongs to another user.
+            CacheError: there is no target, or it belongs to another user.
         """
         if self._link is None:
             return
-        status = _status(self.path) or self._link.lstat()
-        if not is_own(status):
+        status = _status(self.path)
+        if not is_own(status or self._link.lstat()):
             raise CacheError(
                 f"the symbolic link {self._link} leads to a file of another user, {self.path}; name that file"
+            )
+        if status is None:
+            raise CacheError(
+                f"the symbolic link {self._link} leads to a file that does not exist, {self.path};"
+                " name that file, or create it empty"
             )
 
     def _make_private(self) -> None:

@@ -9,7 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from paramclient.cache.file_ownership import GROUP_READS, OF_OTHERS, has_trusted_owner, mode_of
+from paramclient.cache.file_ownership import (
+    GROUP_READS,
+    OF_OTHERS,
+    has_trusted_owner,
+    mode_of,
+    open_regular,
+)
 from paramclient.errors import UsageError
 from paramclient.protocol.wire import SigningKey, SigningPolicy, SigningReport, timestamp_of
 
@@ -83,12 +89,12 @@ def read_private(path: str | os.PathLike[str], what: str, most: int) -> bytes:
         most: maximum number of bytes to read.
 
     Raises:
-        UsageError: the file cannot be read, its owner is neither the user of this process nor root, or it is
-            accessible to other users than its owner (on systems with file modes). A process of root also
-            rejects a file of another user, as the owner of a file can change it.
+        UsageError: the file cannot be read or is not a regular file, its owner is neither the user of this
+            process nor root, or it is accessible to other users than its owner (on systems with file modes).
+            A process of root also rejects a file of another user, as the owner of a file can change it.
     """
     try:
-        with Path(path).open("rb") as file:
+        with open_regular(path) as file:
             status = os.fstat(file.fileno())
             data = file.read(most)
     except OSError as error:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NoReturn
 
-from paramclient.cache.file_ownership import OTHERS_WRITE, has_trusted_owner, mode_of
+from paramclient.cache.file_ownership import OTHERS_WRITE, has_trusted_owner, mode_of, open_regular
 from paramclient.errors import UsageError
 
 __all__ = ["Tls", "tls_of"]
@@ -67,7 +67,7 @@ def tls_of(cert: str | os.PathLike[str] | None, key: str | os.PathLike[str] | No
 
 def _check_pem(path: Path, what: str, mark: bytes) -> None:
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             status = os.fstat(file.fileno())
             data = file.read(PEM_FILE_BYTES_MAX)
     except OSError as error:

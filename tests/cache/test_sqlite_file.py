@@ -823,6 +823,22 @@ def test_a_link_to_a_file_of_another_user_is_not_followed(
         assert len(cache.vehicles()) == 2
 
 
+def test_no_cache_is_created_through_a_link_without_a_target(tmp_path: Path) -> None:
+    """The second link could be another user's, who thus chooses where a file of this user appears."""
+    target = tmp_path / "target"
+    second, link = tmp_path / "second", tmp_path / "link"
+    second.symlink_to(target)
+    link.symlink_to(second)
+    with ParamCache(link) as cache:
+        assert cache.vehicles() == []
+        with pytest.raises(CacheError, match=r"leads to a file that does not exist, .*target; name that"):
+            cache.save(whole_table(2))
+        assert not target.exists()
+        target.touch()
+        cache.save(whole_table(2))
+        assert len(cache.vehicles()) == 1
+
+
 def test_a_newer_file_is_set_aside_for_the_program_that_wrote_it(path: Path) -> None:
     sound_but("PRAGMA user_version = 99; CREATE TABLE more (a)")(path)
     content = path.read_bytes()
