@@ -326,8 +326,11 @@ class ComponentMachine:
     def is_recipient_certain(self) -> bool:
         """Whether it is certain which vehicle receives a write."""
         home = self.peers.home
-        is_open = any(each.context.may_be_another or each.peers.is_rival(home) for each in self._autopilots())
-        return not self.context.may_be_another and not is_open
+        is_open = any(
+            each.context.may_be_another or each.peers.is_rival(home) or each.peers.is_home_unproven
+            for each in self._autopilots()
+        )
+        return not (self.context.may_be_another or self.peers.is_home_unproven or is_open)
 
     @property
     def expects_extended(self) -> bool:

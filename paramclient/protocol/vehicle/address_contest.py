@@ -147,8 +147,27 @@ class ComponentPeers:
     def is_unclear(self) -> bool:
         """Whether it is open which vehicle is active: nothing received meanwhile may be kept."""
         home_claim = self._home_claim
-        return self.contest is not None or (
-            home_claim is not None and (home_claim.is_unsettled or home_claim.is_mixed)
+        return (
+            self.contest is not None
+            or (home_claim is not None and (home_claim.is_unsettled or home_claim.is_mixed))
+            or self.is_home_unproven
+        )
+
+    @property
+    def is_home_unproven(self) -> bool:
+        """Whether the peer with the address has sent no hardware id, and a further peer may be the vehicle.
+
+        Another program may have been received first, and pretend to be the vehicle. Nothing is written to it
+        until the further peer is proven to be a path to the same vehicle, or contests the address.
+        """
+        home_claim = self._home_claim
+        return (
+            home_claim is not None
+            and not home_claim.uid.current
+            and any(
+                claim.verdict is PeerRelation.OPEN and not claim.is_by_satellite
+                for claim in self._others.values()
+            )
         )
 
     def is_rival(self, peer: Peer) -> bool:
@@ -310,6 +329,8 @@ class ComponentPeers:
             is_here = self.home is not NO_PEER
             if is_here and self._host.is_identified:  # otherwise ambiguous acknowledgements
                 self._request(home_claim, SYSTEM_TIME_ID)
+                if claim.uid.current and home_claim.uid.current is None:  # its responses may have been lost
+                    self._request(home_claim, AUTOPILOT_VERSION_ID)
         return difference if claim.verdict is PeerRelation.OTHER else ""
 
     def _is_over(self, claim: Claim, now: float) -> bool:

@@ -645,6 +645,36 @@ def test_a_peer_that_replaces_a_silent_one_without_an_id_is_another_vehicle() ->
     assert {param.value for param in net.machine.table.params.values()} <= {1.0}, "nothing of the other one"
 
 
+def test_nothing_is_written_to_a_peer_without_an_id_while_another_may_be_the_vehicle() -> None:
+    """The first one pretends to be the vehicle, and never sends its hardware id."""
+    net = Net(a=Speaker(every=0.05, uid=None, booted_at=None), b=Speaker(uid=7, start=15.0))
+    net.run(14.9)
+    hold(net, "P", "Q")
+    assert net.machine.identification.settled
+    assert net.machine.may_be_written
+    net.run(0.5)
+    write = net.machine.write("P", 5.0, net.now)
+    assert net.station.is_doubted(net.machine)
+    net.run(PEER_REQUESTS.duration + 1.0)
+    assert isinstance(write.error, ContestedAddress)
+    for peer in net.peers.values():
+        assert not any(isinstance(each, ParamSetMessage) for each in peer.heard)
+
+
+def test_a_vehicle_whose_first_path_has_lost_its_id_is_asked_again_and_written_to() -> None:
+    net = Net(a=Speaker(uid=None), b=Speaker(uid=7, start=15.0))
+    net.run(14.9)
+    hold(net, "P", "Q")
+    assert net.machine.identification.settled
+    net.peers["a"].uid = 7
+    net.run(0.2)
+    write = net.machine.write("P", 5.0, net.now)
+    net.run(3.0)
+    assert write.done
+    assert write.error is None
+    assert net.kinds() == []
+
+
 def test_a_write_does_not_go_to_the_peers_that_are_left_where_a_connection_ends() -> None:
     station = Station(link="tcpin:test", is_stream=True)
     net = Net(a=Speaker(obeys=False), station=station)
