@@ -311,7 +311,10 @@ def compare(home: Claim, other: Claim, *, is_over: bool, may_ask: bool) -> tuple
     if have_one_start is False:
         return PeerRelation.OTHER, "the time since boot"
     uid = uids[0] if uids[0] == uids[1] else None
-    if kinds[0] == kinds[1] and uid and (have_one_start or (is_over and not is_sitl_uid(uid))):
+    # an id is sent in clear: a peer that repeats it, and no clock, is not the vehicle that sends one
+    has_equal_clocks = home.tells_clock == other.tells_clock or not may_ask
+    is_enough = is_over and has_equal_clocks and uid is not None and not is_sitl_uid(uid)
+    if kinds[0] == kinds[1] and uid and (have_one_start or is_enough):
         return PeerRelation.SAME, ""
     if not is_over:
         return PeerRelation.OPEN, ""

@@ -241,6 +241,19 @@ def test_heartbeats_at_20_hz_divert_no_request() -> None:
     assert net.machine.table.params["P"].value == 1.0
 
 
+@pytest.mark.parametrize("is_first", [False, True])
+def test_a_peer_that_repeats_the_id_and_tells_no_time_is_no_path_to_the_vehicle(is_first: bool) -> None:
+    """The id is sent in clear. When the vehicle is silent for 2 s, such a path would get its writes."""
+    start = 0.0 if is_first else 1.0
+    forger, vehicle = Speaker(every=0.05, booted_at=None, start=start), Speaker(start=1.0 - start)
+    net = Net(forger=forger, vehicle=vehicle) if is_first else Net(vehicle=vehicle, forger=forger)
+    net.run(PEER_REQUESTS.duration + 2.0)
+    assert net.kinds() == ["Contested"]
+    forger.booted_at = vehicle.booted_at  # its clock was only lost
+    net.run(2 * PEER_REQUESTS.later)
+    assert net.kinds() == ["Contested", "Uncontested"]
+
+
 def test_requests_go_to_the_peer_that_gives_the_hardware_id() -> None:
     """Also where the forger was heard first."""
     vehicle = Speaker(PX4, start=0.4)
