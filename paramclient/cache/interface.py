@@ -73,8 +73,8 @@ class Store(Protocol):
         ...
 
     def limit_lock_waits(self, seconds: float) -> None:
-        """Wait for locks of other processes on files for at most these seconds from now in all. Does not
-        block."""
+        """Wait for locks of other processes on files, and for responses of a database, for at most these
+        seconds from now in all. Does not block."""
         ...
 
     def close(self) -> None:

@@ -7,6 +7,7 @@ write changes rows between its reads and its writes. A read is a consistent snap
 from __future__ import annotations
 
 import json
+import math
 import threading
 import time
 from collections import defaultdict
@@ -51,6 +52,8 @@ and wait 5 s for a lock."""
 IDLE_TRANSACTION_TIMEOUT: Final = "15s"
 """Timeout after which the database ends an idle transaction, as a PostgreSQL setting: a stopped station would
 keep its vehicles locked."""
+CLOSING_WAIT_MIN: Final = 0.25
+"""Timeout in seconds for a statement after the time of `PostgresDatabase.limit_waits`."""
 POOL_SIZE_MAX: Final = 4
 """Maximum number of connections of one cache, in addition to the one that listens."""
 
@@ -80,6 +83,7 @@ class PostgresDatabase:
 
     def __init__(self, address: DatabaseAddress) -> None:
         self.address = address
+        self._waits_end = math.inf  # by time.monotonic
         self._pool: ConnectionPool[psycopg.Connection[tuple[Any, ...]]] | None = None
         self._lock = threading.Lock()
 
@@ -92,7 +96,7 @@ class PostgresDatabase:
         """
         _, pools = _libraries()
         with self._translated():
-            kind = _connection_kind()
+            kind = _connection_kind(lambda: self._waits_end)
             listener: psycopg.Connection[tuple[Any, ...]] = kind.connect(**self._options(), autocommit=True)
             try:
                 _migrate(listener, self.address.place)
@@ -113,14 +117,26 @@ class PostgresDatabase:
                 raise
         with self._lock:
             before, self._pool = self._pool, pool
-        _end(before)
+        self._end(before)
         return listener
+
+    def limit_waits(self, seconds: float) -> None:
+        """Wait for responses of the database for at most these seconds from now in all, in statements that
+        are in progress and in later ones. A statement after that time has `CLOSING_WAIT_MIN`. Returns
+        immediately, also while another thread waits.
+        """
+        self._waits_end = time.monotonic() + seconds
+
+    @property
+    def is_given_up(self) -> bool:
+        """Whether the time of `limit_waits` has passed: the database is not worth a new connection."""
+        return time.monotonic() >= self._waits_end
 
     def close(self) -> None:
         """Close all connections except the one that listens."""
         with self._lock:
             pool, self._pool = self._pool, None
-        _end(pool)
+        self._end(pool)
 
     def read(self, work: Callable[[Transaction], T]) -> T:
         """Run a function that only reads, in one consistent snapshot, and return its result.
@@ -224,8 +240,16 @@ class PostgresDatabase:
             pool = self._pool
         if pool is None:
             raise Unavailable("the connection is closed")
-        with pool.connection() as connection, connection.transaction():
+        with pool.connection(timeout=self._left()) as connection, connection.transaction():
             yield connection
+
+    def _end(self, pool: ConnectionPool[Any] | None) -> None:
+        if pool is not None:
+            pool.close(timeout=self._left())
+
+    def _left(self) -> float:
+        """Return the seconds to wait for a connection."""
+        return max(CLOSING_WAIT_MIN, min(CONNECT_TIMEOUT, self._waits_end - time.monotonic()))
 
     @contextmanager
     def _translated(self) -> Iterator[None]:
@@ -498,12 +522,14 @@ def _libraries() -> tuple[Any, Any]:
     return psycopg, psycopg_pool
 
 
-@cache
-def _connection_kind() -> Any:
+def _connection_kind(waits_end: Callable[[], float]) -> Any:
     """Return a connection class that closes the connection when a statement exceeds `STATEMENT_TIMEOUT`.
 
     No setting of the database or of TCP detects a server that hangs: it cancels no statement, while its
     operating system continues to acknowledge received packets.
+
+    Args:
+        waits_end: returns the time, by `time.monotonic`, after which a statement has `CLOSING_WAIT_MIN`.
     """
 
     class Connection(_libraries()[0].Connection):  # type: ignore[misc]  # imported at runtime
@@ -512,20 +538,18 @@ def _connection_kind() -> Any:
 
         def _limited(self, work: Generator[Any, Any, T]) -> Generator[Any, Any, T]:
             """Run the work, which psycopg resumes when the socket is ready, and ten times a second."""
-            deadline = time.monotonic() + STATEMENT_TIMEOUT
+            begun = time.monotonic()
             try:
                 wanted = next(work)
-                while time.monotonic() < deadline:
+                while time.monotonic() < min(
+                    begun + STATEMENT_TIMEOUT, max(begun + CLOSING_WAIT_MIN, waits_end())
+                ):
                     wanted = work.send((yield wanted))
             except StopIteration as end:
                 result: T = end.value
                 return result
             self.close()
-            raise _libraries()[0].OperationalError(f"no response in {STATEMENT_TIMEOUT:g} s")
+            waited = time.monotonic() - begun
+            raise _libraries()[0].OperationalError(f"no response in {waited:.3g} s")
 
     return Connection
-
-
-def _end(pool: ConnectionPool[Any] | None) -> None:
-    if pool is not None:
-        pool.close(timeout=CONNECT_TIMEOUT)

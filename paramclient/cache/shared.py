@@ -100,8 +100,8 @@ class SharedStore:
         return self._connection.subscribe(callback)
 
     def limit_lock_waits(self, seconds: float) -> None:
-        """See `Store.limit_lock_waits`. Of the local copy."""
-        self._connection.local.database.limit_lock_waits(seconds)
+        """See `Store.limit_lock_waits`. Of the local copy and the database."""
+        self._connection.limit_waits(seconds)
 
     def close(self) -> None:
         """End the thread, and close the database connections and the file."""
@@ -192,6 +192,10 @@ class _Connection:
 
         return end
 
+    def limit_waits(self, seconds: float) -> None:
+        self.local.database.limit_lock_waits(seconds)
+        self._database.limit_waits(seconds)
+
     def close(self) -> None:
         self._is_closed = True
         self._wake_listener()
@@ -219,7 +223,8 @@ class _Connection:
         if self._is_closed:
             raise CacheError(f"the cache {self._address.place} is closed")
         is_first = self._thread is None
-        if not self._is_connected and (is_first or at_once) and self._reaching.acquire(blocking=is_first):
+        is_wanted = is_first or (at_once and not self._database.is_given_up)
+        if not self._is_connected and is_wanted and self._reaching.acquire(blocking=is_first):
             try:
                 if not self._is_connected:
                     self._reach()
@@ -392,7 +397,9 @@ class _Connection:
                     continue
                 self._wait(selector, pause)
                 pause = min(2 * pause, RETRY_INTERVAL_MAX)
-                if not self._is_closed and not self._is_connected and self._reaching.acquire(blocking=False):
+                if self._is_closed or self._is_connected or self._database.is_given_up:
+                    continue
+                if self._reaching.acquire(blocking=False):
                     try:
                         self._reach()
                     except CacheError as error:

@@ -33,7 +33,7 @@ from paramclient.cache.database_url import DatabaseAddress
 from paramclient.cache.history_columns import HistoryLine
 from paramclient.cache.operations import Save
 from paramclient.cache.outbox import LocalCopy, packed, unpacked
-from paramclient.cache.postgres import PostgresDatabase, PostgresTransaction, Unavailable
+from paramclient.cache.postgres import STATEMENT_TIMEOUT, PostgresDatabase, PostgresTransaction, Unavailable
 from paramclient.cache.shared import SharedStore, _Connection
 from paramclient.cache.transaction import Transaction
 from paramclient.cache.transfer import take_whole
@@ -600,6 +600,31 @@ def test_a_database_that_stands_still_is_given_up(
         running.go_on()
     until(lambda: a.away is None)
     assert told(b) == [(5, 1, 5), (6, 5, 6)]
+
+
+def test_a_program_that_ends_does_not_wait_for_a_database_that_stands_still(
+    fragile: tuple[Server, ParamCache, ParamCache],
+) -> None:
+    """A service manager would kill it, and what is not in the local copy yet would be lost without a word."""
+    running, a, b = fragile
+    a.save(whole_table(3))
+    b.save(a_value(5))
+    until(lambda: is_copied(a))
+    running.stand_still()
+    try:
+        with ThreadPoolExecutor(1) as pool:
+            saved = pool.submit(a.save, a_value(6))
+            began = time.monotonic()
+            with pytest.raises(TimeoutError):
+                saved.result(0.5)
+            a.limit_lock_waits(0.5)
+            saved.result(60)
+            a.close()
+            assert time.monotonic() - began < STATEMENT_TIMEOUT / 2
+    finally:
+        running.go_on()
+    with ParamCache(b.place, local=a.path) as later:
+        assert told(later) == [(5, 1, 5), (6, 5, 6)]
 
 
 def test_a_statement_that_takes_too_long_is_ended_by_the_database(
