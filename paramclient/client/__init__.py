@@ -18,6 +18,7 @@
 - `recording`: telemetry log of a link.
 - `reconnection`: delays between attempts to reopen a link, and the timeout of calls.
 - `reset`: resets of parameters to the firmware's defaults.
+- `short_traceback`: tracebacks of errors without inner frames.
 - `signing`: signing keys and options.
 - `signing_timestamps`: persistent signature timestamps.
 - `stats`: counters of a client.

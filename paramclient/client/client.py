@@ -24,9 +24,10 @@ from paramclient.client.fetch_all import FetchedAll
 from paramclient.client.files import Ftp
 from paramclient.client.link_client import ClientOptions, LinkClient
 from paramclient.client.local import LocalClient, not_given
+from paramclient.client.short_traceback import shortened
 from paramclient.client.signing import Signing
 from paramclient.client.stats import ClientStats
-from paramclient.errors import UsageError
+from paramclient.errors import ParamClientError, UsageError
 from paramclient.links import Link
 from paramclient.links.names import names_service
 from paramclient.model.values import Encoding
@@ -154,7 +155,10 @@ class ParamClient:
         return repr(self._implementation)
 
     async def __aenter__(self) -> Self:
-        await self._implementation.open()
+        try:
+            await self._implementation.open()
+        except ParamClientError as error:
+            raise shortened(error)  # noqa: B904 - the same error
         self._is_entered = True
         return self
 

@@ -9,6 +9,7 @@ from typing import Any, Final, Protocol
 
 import anyio
 
+from paramclient.client.short_traceback import shortened
 from paramclient.errors import ClientClosed, LinkError
 
 __all__ = ["ClientTask"]
@@ -131,7 +132,7 @@ class ClientTask:
     def _raise_error(self) -> None:
         error, self._error = self._error, None
         if error is not None:
-            raise error
+            raise shortened(error)
 
 
 def _spawn(function: Callable[[], Coroutine[Any, Any, None]]) -> None:

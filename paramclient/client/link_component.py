@@ -24,6 +24,7 @@ from paramclient.client.batch_wait import wait_for_batch
 from paramclient.client.component import Component
 from paramclient.client.link_extended_params import LinkExtParams
 from paramclient.client.local import LocalClient, LocalComponent
+from paramclient.client.short_traceback import shortened
 from paramclient.client.signing import timestamp_now
 from paramclient.client.subscription import Changes
 from paramclient.errors import CacheError, NoReply, NotDurable, ParamClientError, UsageError
@@ -73,10 +74,10 @@ TIMEOUT_NOTE = "The fetch ended at its timeout."
 """Note of a partial result that a timeout ended."""
 
 
-def _explains_silence(
+def _explains_errors(
     method: Callable[Concatenate[LinkComponent, Call], Awaitable[Result]],
 ) -> Callable[Concatenate[LinkComponent, Call], Coroutine[Any, Any, Result]]:
-    """Add to a NoReply of a method what was received on the link meanwhile."""
+    """Add to a NoReply of a method what was received on the link meanwhile, and shorten tracebacks."""
 
     @wraps(method)
     async def call(component: LinkComponent, /, *arguments: Call.args, **options: Call.kwargs) -> Result:
@@ -85,6 +86,8 @@ def _explains_silence(
             return await method(component, *arguments, **options)
         except NoReply as error:
             raise _Explanations(component, began).explained(error) from None
+        except ParamClientError as error:
+            raise shortened(error)  # noqa: B904 - the same error
 
     return call
 
@@ -196,7 +199,7 @@ class LinkComponent(LocalComponent):
         whose = f"{self.system}/{self.component} {self.autopilot}"
         return f"<Component {whose} {self.state} {len(self.params)}{of} params{origin}>"
 
-    @_explains_silence
+    @_explains_errors
     async def get(self, name: str | int, *, timeout: float | None = None) -> Param:
         """See `Component.get`."""
         check_requested_name(name)
@@ -212,7 +215,7 @@ class LinkComponent(LocalComponent):
             return _param_of(message, machine.table.encoding)
         return known
 
-    @_explains_silence
+    @_explains_errors
     async def set(
         self,
         name: str,
@@ -248,7 +251,7 @@ class LinkComponent(LocalComponent):
             await self.write_durably([name])
         return result
 
-    @_explains_silence
+    @_explains_errors
     async def set_many(
         self,
         values: Mapping[str, Settable] | Iterable[tuple[str, Settable]],
@@ -296,7 +299,7 @@ class LinkComponent(LocalComponent):
         what = f"PARAM_SET {names[0]}" if len(names) == 1 else f"{len(names)} PARAM_SETs"
         return f"{what} to {self.system}/{self.component}"
 
-    @_explains_silence
+    @_explains_errors
     async def fetch_all(
         self,
         *,
@@ -354,7 +357,7 @@ class LinkComponent(LocalComponent):
             self.client.wake()
             await anyio.sleep(SETUP_SIGNING_INTERVAL)
 
-    @_explains_silence
+    @_explains_errors
     async def reboot(self, *, system: int | None = None, timeout: float | None = None) -> Component:
         """See `Component.reboot`."""
         self.client.check_open()
@@ -471,7 +474,7 @@ class LinkComponent(LocalComponent):
 
     # waiting
 
-    @_explains_silence
+    @_explains_errors
     async def wait(
         self,
         operation: Operation[Result],
@@ -499,7 +502,7 @@ class LinkComponent(LocalComponent):
             raise NoReply(awaited, attempts=attempts, waited=anyio.current_time() - began)
         return _outcome(operation)
 
-    @_explains_silence
+    @_explains_errors
     async def wait_for_fetch(
         self, fetch: Fetch, deadline: float | None, progress: Callable[[Progress], None] | None
     ) -> FetchResult:

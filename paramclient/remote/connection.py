@@ -12,6 +12,7 @@ import anyio
 from paramclient.client import reconnection
 from paramclient.client.arguments import PROGRESS_CALL_INTERVAL
 from paramclient.client.reconnection import Backoff
+from paramclient.client.short_traceback import shortened
 from paramclient.errors import ClientClosed, LinkError, NoReply, ParamClientError
 from paramclient.remote.decoding import decode_errors
 from paramclient.remote.http import Requests, ServiceResponse, ServiceUnreachable, StreamPosition
@@ -149,6 +150,8 @@ class Connection:
                         if now - failing_since >= reconnection.LINK_TIMEOUT:
                             raise failure.error from failure.error.__cause__
                         await anyio.sleep(reconnection.RECONNECT_BACKOFF_MIN)
+                    except ParamClientError as error:
+                        raise shortened(error)  # noqa: B904 - the same error
             finally:
                 self._scopes.discard(scope)
         self.check_open()

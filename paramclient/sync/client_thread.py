@@ -21,7 +21,8 @@ import anyio.lowlevel
 from anyio.from_thread import BlockingPortal
 
 from paramclient.client.client import ParamClient
-from paramclient.errors import ClientClosed, UsageError
+from paramclient.client.short_traceback import shortened
+from paramclient.errors import ClientClosed, ParamClientError, UsageError
 
 __all__ = ["ClientThread", "EventLoopThread", "ReportingCall"]
 
@@ -63,7 +64,10 @@ class ClientThread:
     """
 
     def __init__(self, make: Callable[[], ParamClient]) -> None:
-        self.client = _outside_event_loops(make)
+        try:
+            self.client = _outside_event_loops(make)
+        except ParamClientError as error:
+            raise shortened(error)  # noqa: B904 - the same error
         self._link = self.client.link.name
         self._thread: EventLoopThread | None = None
         self._is_closed = False
@@ -129,9 +133,12 @@ class ClientThread:
         Raises:
             ClientClosed: the client is not open.
             UsageError: the caller is in the event loop itself, or in a forked process.
-            Exception: that of the function.
+            Exception: that of the function; see `shortened` for its traceback.
         """
-        return self._run(_Call[Result](), function)
+        try:
+            return self._run(_Call[Result](), function)
+        except ParamClientError as error:
+            raise shortened(error)  # noqa: B904 - the same error
 
     def call_reporting(
         self,
@@ -145,7 +152,10 @@ class ClientThread:
             progress: called in the thread of the caller. An exception of it cancels the function.
         """
         call = _Call[Result]()
-        return self._run(call, lambda: function(progress=call.reporter(progress)))
+        try:
+            return self._run(call, lambda: function(progress=call.reporter(progress)))
+        except ParamClientError as error:
+            raise shortened(error)  # noqa: B904 - the same error
 
     def begin_reporting(self, function: Callable[..., Awaitable[Result]]) -> ReportingCall[Any, Result]:
         """Start an asynchronous function that reports progress, without waiting for it.
@@ -542,6 +552,8 @@ class ReportingCall(Iterator[Item], Generic[Item, Result]):
             return self._call.outcome()
         except _NoEventLoop as error:
             raise ClientClosed(str(error), link=self._link) from None
+        except ParamClientError as error:
+            raise shortened(error)  # noqa: B904 - the same error
 
 
 class _NoEventLoop(Exception):

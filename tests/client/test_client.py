@@ -27,6 +27,7 @@ from paramclient import (
     LinkError,
     NoReply,
     ParamClient,
+    ParamClientError,
     ParamErrorCode,
     ParamType,
     Progress,
@@ -119,6 +120,38 @@ async def test_an_error_of_a_call_comes_out_as_it_is() -> None:
 
     with pytest.raises(UnknownParameter):
         await session()
+
+
+@in_simulated_time
+@direct_only("the wrapper of the tests around the blocking client adds frames")
+async def test_the_traceback_of_a_mistake_is_short() -> None:
+    async with a_client(generic(param_error=True)) as client:
+        component = await client.component()
+        await component.fetch_all()
+        mistakes: dict[str, Callable[[], Coroutine[Any, Any, object]]] = {
+            "get": lambda: component.get("PARAM_0"),
+            "set": lambda: component.set("PARAM_0", 1),
+            "value": lambda: component.set("PARAM_01", "high"),  # type: ignore[arg-type]  # a mistake
+            "reset": lambda: component.reset("PARAM_0"),
+            "component": lambda: client.component(system=99, timeout=1.0),
+        }
+        for name, mistake in mistakes.items():
+            with pytest.raises(ParamClientError) as caught:
+                await mistake()
+            assert len(caught.traceback) <= 4, name
+            assert caught.value.__cause__ is None
+
+
+@in_simulated_time
+async def test_the_traceback_of_an_error_in_a_callback_is_whole() -> None:
+    def give_up(progress: Progress) -> None:
+        raise UsageError("the end")
+
+    async with a_client(generic()) as client:
+        component = await client.component()
+        with pytest.raises(UsageError, match="the end") as caught:
+            await component.fetch_all(progress=give_up)
+    assert caught.traceback[-1].name == "give_up"
 
 
 @in_simulated_time

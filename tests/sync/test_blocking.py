@@ -28,6 +28,7 @@ from paramclient import (
     LinkError,
     NoReply,
     ParamCache,
+    ParamClientError,
     Progress,
     SetStatus,
     Trust,
@@ -100,6 +101,37 @@ def ctrl_c() -> Iterator[None]:
 
 
 # Calls
+
+
+def test_the_traceback_of_a_mistake_is_short() -> None:
+    """A notebook shows the call, the error and its suggestion, without the frames of the event loop."""
+    with a_client(swift_px4()) as client:
+        component = client.only_component()
+        component.fetch_all()
+        mistakes: dict[str, Callable[[], object]] = {
+            "get": lambda: component.get("PARAM_0X"),
+            "set": lambda: component.set("PARAM_0X", 1),
+            "value": lambda: component.set("PARAM_01", "high"),  # type: ignore[arg-type]  # a mistake
+            "reset": lambda: component.reset("PARAM_0X"),
+            "component": lambda: client.component(system=99, timeout=0.01),
+            "link": lambda: ParamClient("udpin:nowhere"),
+            "port": lambda: a_client("serial:/dev/not-there").open(),
+        }
+        for name, mistake in mistakes.items():
+            with pytest.raises(ParamClientError) as caught:
+                mistake()
+            assert len(caught.traceback) <= 5, name  # this function, the lambda, and at most three of ours
+            if name == "get":
+                assert "Did you mean PARAM_0" in str(caught.value)
+
+
+def test_the_traceback_of_an_error_in_a_callback_is_whole() -> None:
+    def give_up(progress: Progress) -> None:
+        raise UsageError("the end")
+
+    with a_client(swift_px4()) as client, pytest.raises(UsageError, match="the end") as caught:
+        client.only_component().fetch_all(progress=give_up)
+    assert caught.traceback[-1].name == "give_up"
 
 
 def test_the_calls_of_the_asynchronous_client_without_await() -> None:
