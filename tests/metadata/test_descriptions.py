@@ -21,6 +21,7 @@ from paramclient.metadata.info import DESCRIPTION_LENGTH_MAX
 from paramclient.model.values import ParamType
 
 DATA = Path(__file__).parents[1] / "data"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 PX4, XML, JSON = DATA / "parameters.json", DATA / "apm.pdef.xml", DATA / "apm.pdef.json"
 
 MODE = ParamInfo("MODE", values={0: "Stabilize", 5: "Loiter", 6: "RTL", 9: "Land  now", 0.5: "Half"})
@@ -241,6 +242,22 @@ def test_the_format_is_detected_from_the_content(path: Path, tmp_path: Path) -> 
         other = tmp_path / name
         other.write_bytes(content)
         assert read_metadata(other).params == plain.params
+
+
+def test_the_example_has_the_ranges_units_and_values_of_arducopter() -> None:
+    """Those of ArduCopter 4.6, as its param_parse.py writes them."""
+    metadata = read_metadata(EXAMPLES / "metadata/copter.pdef.xml")
+    modes = {*range(8), 9, 11, *range(13, 28)}
+    for number in range(1, 7):
+        assert set(metadata[f"FLTMODE{number}"].values) == modes
+    assert metadata["FLTMODE1"].parse("Follow") == 23
+    limits = {name: (info.minimum, info.maximum, info.units) for name, info in metadata.items()}
+    assert limits.pop("RTL_ALT") == (30, 300_000, "cm")
+    assert limits.pop("FENCE_RADIUS") == (30, 10_000, "m")
+    for axis in "RPY":
+        assert limits.pop(f"ATC_RATE_{axis}_MAX") == (0, 1080, "deg/s")
+        assert set(metadata[f"ATC_RATE_{axis}_MAX"].values) == {0, 60, 180, 360}
+    assert set(limits) == {f"FLTMODE{number}" for number in range(1, 7)}
 
 
 def test_parameters_with_different_descriptions_are_left_out() -> None:
