@@ -29,7 +29,7 @@ import threading
 import time
 import weakref
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from functools import cache
 from itertools import chain, count
@@ -65,6 +65,9 @@ SQLite cannot be interrupted while it waits for a lock; `Database.limit_lock_wai
 _ATTEMPTS_MAX: Final = 3
 """Maximum number of attempts of one operation: another process may rename the file, and the file may be
 damaged, once each."""
+
+_LINKS_MAX: Final = 40
+"""Maximum number of symbolic links that lead from one to the next, as in Linux (path_resolution(7))."""
 
 # Error codes if no -wal or -shm can be created: the folder is read-only, or the disk is full.
 _UNWRITABLE: Final = frozenset(
@@ -118,8 +121,8 @@ class Database:
 
     Args:
         path: the file, absolute, with resolved symbolic links.
-        link: the symbolic link that was given as path, or None. The target of a link has to exist, and to
-            belong to the user of this process.
+        link: the symbolic link that was given as path, or None. The target of a link has to belong to the
+            user of this process; while it does not exist, all links to it.
 
     Attributes:
         path: the file.
@@ -518,12 +521,12 @@ class Database:
         )
 
     def _check_link(self) -> None:
-        """Check that the target of a symbolic link exists and belongs to this user.
+        """Check that the target of a symbolic link belongs to this user; without a target, all links to it.
 
-        A missing target could be anywhere: another user may have made the link, or one that it leads to.
+        Otherwise another user could choose where a file of this user is created.
 
         Raises:
-            CacheError: there is no target, or it belongs to another user.
+            CacheError: one of them belongs to another user.
         """
         if self._link is None:
             return
@@ -532,10 +535,10 @@ class Database:
             raise CacheError(
                 f"the symbolic link {self._link} leads to a file of another user, {self.path}; name that file"
             )
-        if status is None:
+        if status is None and not all(is_own(each.lstat()) for each in _links(self._link)):
             raise CacheError(
-                f"the symbolic link {self._link} leads to a file that does not exist, {self.path};"
-                " name that file, or create it empty"
+                f"the symbolic link {self._link} leads over a link of another user to a file that does not"
+                f" exist, {self.path}; name that file"
             )
 
     def _make_private(self) -> None:
@@ -633,6 +636,15 @@ def _status(path: Path) -> os.stat_result | None:
     if not stat.S_ISREG(status.st_mode):
         raise CacheError(f"{path} cannot be a cache: it is not a regular file")
     return status
+
+
+def _links(link: Path) -> Iterator[Path]:
+    """Yield a symbolic link and the links that it leads to, one by one."""
+    for _ in range(_LINKS_MAX):
+        if not link.is_symlink():
+            return
+        yield link
+        link = link.parent / link.readlink()
 
 
 def _size(path: Path) -> int:
