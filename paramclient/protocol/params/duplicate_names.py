@@ -17,10 +17,10 @@ __all__ = ["DuplicateNameReads", "repeated_names"]
 
 DUPLICATES_LISTED_MAX: Final = 5
 """Names that a note lists one by one."""
-READ_DELAY_MIN: Final = 0.3
+FIRST_READ_DELAY_MIN: Final = 0.3
 """Seconds without a PARAM_VALUE until the names are read, at least; the timeout of a read, if longer. Late
 responses to reads by index carry the names too."""
-READ_DELAY_MAX: Final = 3.0
+FIRST_READ_DELAY_MAX: Final = 3.0
 """Seconds until the names are read, at most: another station may request one list after the other."""
 RESPONSE_PAUSE: Final = 0.15
 """Seconds from a response until the name is read again. Several late values of the name may arrive at one
@@ -121,7 +121,7 @@ class DuplicateNameReads(Operation[None]):
             self._reads.release(read)
 
     def _postpone(self, now: float) -> None:
-        at = min(now + max(self._policy.timeout, READ_DELAY_MIN), self.begun_at + READ_DELAY_MAX)
+        at = min(now + max(self._policy.timeout, FIRST_READ_DELAY_MIN), self.begun_at + FIRST_READ_DELAY_MAX)
         self._ask_at = dict.fromkeys(self._names, at)
 
     def _ask(self, name: str, now: float) -> None:
