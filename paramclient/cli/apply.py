@@ -178,7 +178,7 @@ async def apply(
             return max(code, _armed(found, allow_armed=allow_armed))
         if not yes and can_confirm(options) and not await _confirm(*await plans(), reboot=reboot, full=full):
             return ExitCode.INCOMPLETE
-        found.announce_write()
+        await found.announce_write()
         if options.no_cache and backup is None and not url.startswith("sim:"):
             say("the state before is not stored: --no-cache is given, and --backup is not")
         with show.progress_until_interrupted(f"setting {_title(found)}") as progress:
@@ -330,7 +330,7 @@ async def restore(
             return max(code, _armed(found, allow_armed=allow_armed))
         if not yes and can_confirm(options) and not await _confirm(*await plans(), reboot=reboot, full=full):
             return ExitCode.INCOMPLETE
-        found.announce_write()
+        await found.announce_write()
         with show.progress_until_interrupted(f"restoring {_title(found)}") as progress:
             result = await restore_to(
                 vehicle,

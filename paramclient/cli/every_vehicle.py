@@ -12,7 +12,7 @@ import anyio
 from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import report
-from paramclient.cli.session import CommandSession, connect
+from paramclient.cli.session import CommandSession, connect, unheard_in_words
 from paramclient.cli.targets import find_vehicles
 from paramclient.errors import ParamClientError, UsageError
 from paramclient.protocol.params.fetch_result import Policy
@@ -87,6 +87,9 @@ async def every_vehicle(
     """
     async with connect(url, options, policy=policy) as session:
         vehicles = await find_vehicles(session.client, options.component, expect, session.deadline)
+        if expect is None:
+            for sentence in await unheard_in_words(session):
+                report(f"{sentence} --expect waits longer for a number of vehicles")
         yield [replace(session, component=each) for each in vehicles]
 
 

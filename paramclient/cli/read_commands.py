@@ -157,7 +157,7 @@ async def fetch(
         with progress_bar(f"fetching {session.label}") as progress:
             fetched = await fetching.fetch(session, progress)
         fetched = await described(fetched)
-        session.report_others(has_all=True)
+        await session.report_others(has_all=True)
     has_defaults = fetched.has_defaults
     if only:
         chosen, unmatched = NameChoice(only).choose({param.name for param in fetched.params})
@@ -229,7 +229,7 @@ async def get(
         if await is_extended_session(session, extended=extended, plain=plain):
             return await get_extended(session, name_patterns)
         params, errors, described = await _read(session, name_patterns, described, metadata)
-        session.report_others(has_all=True)
+        await session.report_others(has_all=True)
     if options.json:
         from paramclient.documents.param import ReadOutputDoc  # only here: loads pydantic
 
@@ -282,7 +282,7 @@ async def watch(
         known = None if listens else set(session.component.params)
         watched = ", ".join(name_patterns) if name_patterns else f"{len(session.component.params)} parameters"
         say(printable(f"watching {watched} of {session.label}"))
-        session.report_others()
+        await session.report_others()
         failure: Exception | None = None
         async with anyio.create_task_group() as tasks:
             if name_patterns and not has_pattern and not listens:

@@ -125,6 +125,7 @@ async def reset(
         plan = _ResetPlan.of(session, params, described, read_only, lists_unknown=not changed)
         if plan.choice.without_default:
             code = ExitCode.INCOMPLETE
+        await session.report_unheard()
         if dry_run:
             plan.print_planned()
             return code

@@ -187,7 +187,7 @@ async def _from_link(
                     described = await find_defaults(one, changed.choice, changed.given, params)
                 faults += changed.add(sets, found.set, described)
         if not all_:
-            session.report_others(has_all=True)
+            await session.report_others(has_all=True)
     return sets, faults
 
 

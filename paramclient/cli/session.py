@@ -11,24 +11,27 @@ from pathlib import Path
 from typing import Final
 
 import anyio
+import anyio.to_thread
 
+from paramclient.cache import CachedSummary
 from paramclient.cli.options import LinkOptions, TrafficOptions
-from paramclient.cli.output import printable, report, say
+from paramclient.cli.output import local_time, printable, report, say
 from paramclient.cli.vehicle_name import check_kind, check_uid, wait_for_kind
 from paramclient.cli.waiting import while_waiting
 from paramclient.client.arguments import address_in_words
 from paramclient.client.client import ParamClient, implementation_of
 from paramclient.client.component import Component
 from paramclient.client.link_client import LinkClient
-from paramclient.errors import AmbiguousVehicle, NoReply, UsageError
+from paramclient.errors import AmbiguousVehicle, CacheError, NoReply, UsageError
 from paramclient.links import LinkKind, ReplayLink, parse_link
 from paramclient.links.names import names_service
 from paramclient.model.identity import version_text
-from paramclient.model.wording import first_of
+from paramclient.model.wording import counted, first_of
 from paramclient.protocol.no_reply_hint import hint_of_link
 from paramclient.protocol.params.fetch_result import Policy
 from paramclient.protocol.vehicle.kinds import kind_in_words
 from paramclient.protocol.vehicle_selection import LOOK_TIME
+from paramclient.protocol.wire import MAV_AUTOPILOT_INVALID
 
 __all__ = [
     "Deadline",
@@ -38,6 +41,7 @@ __all__ = [
     "listen",
     "received_in_words",
     "receiver_in_words",
+    "unheard_in_words",
     "vehicle_in_words",
     "wait_for_firmware",
     "wait_for_vehicle",
@@ -48,6 +52,12 @@ VEHICLE_TIMEOUT: Final = 10.0
 RECHECK_TIMEOUT: Final = 2.5
 """Seconds to check that the vehicle is still the only one: no wait is needed unless the vehicle or the link
 was lost in between."""
+
+UNHEARD_AGE_MAX: Final = 86_400.0
+"""Seconds since a vehicle in the cache was heard, up to which a command names it if it is not heard now: one
+day, because a vehicle of an earlier one is probably not here any more."""
+CACHE_LIST_TIMEOUT: Final = 0.5
+"""Seconds to wait for the list of vehicles in the cache, which takes milliseconds from a local one."""
 
 OTHERS_SHOWN_MAX: Final = 5
 """Other vehicles that a line names, so that it stays readable; it gives the number of further ones."""
@@ -106,32 +116,48 @@ class CommandSession:
         """The component with its kind and firmware, for a subcommand that writes; see `receiver_in_words`."""
         return receiver_in_words(self.component)
 
-    def report_others(self, *, has_all: bool = False) -> None:
-        """Report other vehicles that were heard, if no option chose the one that was used.
+    @property
+    def is_named(self) -> bool:
+        """Whether an option chose the vehicle, instead of the first one heard."""
+        options = self.options
+        return options.system is not None or options.vehicle is not None or options.peer is not None
+
+    async def report_others(self, *, has_all: bool = False) -> None:
+        """Report other vehicles of the link, if no option chose the one that was used.
 
         For subcommands that only read: they use the first vehicle heard, which may be another one next
-        time.
+        time. A short command may end before the heartbeat of another vehicle; the cache knows those of
+        earlier commands.
 
         Args:
             has_all: whether the subcommand has --all for every vehicle.
         """
-        options = self.options
-        if options.system is not None or options.vehicle is not None or options.peer is not None:
+        if self.is_named:
             return
         others = [each for each in self.client.autopilots if each.system != self.component.system]
+        sentences = [f"{self.label} was used, the first vehicle heard."]
         if others:
             listed = first_of([vehicle_in_words(each) for each in others], OTHERS_SHOWN_MAX)
+            sentences.append(f"Also on this link: {listed}.")
+        sentences += await unheard_in_words(self)
+        if len(sentences) > 1:
             all_of_them = ", --all reads all of them" if has_all else ""
-            report(
-                f"{self.label} was used, the first vehicle heard. Also on this link: {listed}. --system "
-                f"chooses one{all_of_them}"
-            )
+            report(f"{' '.join(sentences)} --system chooses one{all_of_them}")
 
     async def announce_write(self) -> None:
         """Print a line on stderr that says to which vehicle the subcommand writes, unless it prints JSON."""
         if not self.options.json:
             await wait_for_firmware([self.component], self.deadline)
             say(printable(f"writing to {self.receiver} on {self.client.link.name}"))
+
+    async def report_unheard(self) -> None:
+        """Report vehicles of the link that the cache knows and that were not heard, if no option chose one.
+
+        For subcommands that write, before the first write.
+        """
+        if not self.is_named:
+            for sentence in await unheard_in_words(self):
+                report(f"{sentence} --system chooses one")
 
     async def check_only(self) -> None:
         """Check that the component is still the only one that matches the options.
@@ -188,6 +214,38 @@ def check_link_argument(text: str) -> None:
             raise UsageError(
                 f"{text} is {found}: the first argument is the link, such as udpin:0.0.0.0:14550 or sim:px4"
             ) from None
+
+
+async def unheard_in_words(session: CommandSession) -> list[str]:
+    """Return a sentence about vehicles of the link in the cache that were not heard; none without any.
+
+    Vehicles that were heard last more than `UNHEARD_AGE_MAX` ago are left out, and so are those with the
+    system id of a heard one.
+    """
+    cache, now = session.client.cache, session.now
+    if cache is None:
+        return []
+    known: list[CachedSummary] = []
+    with anyio.move_on_after(CACHE_LIST_TIMEOUT), suppress(CacheError):
+        known = await anyio.to_thread.run_sync(cache.components, abandon_on_cancel=True)
+    heard = {each.system for each in session.client.components.values()}
+    link = session.client.link.name
+    unheard: dict[int, str] = {}
+    for each in known:
+        at = max(each.updated_at, each.synced_at or 0.0)
+        is_recent = now - at <= UNHEARD_AGE_MAX
+        if each.autopilot == MAV_AUTOPILOT_INVALID or each.source is not None or not is_recent:
+            continue
+        if each.identity.link != link or each.system in heard:
+            continue
+        kind = kind_in_words(each.autopilot, each.identity.vehicle_type)
+        words = f"{each.system}/{each.component} {kind}".rstrip()
+        unheard.setdefault(each.system, f"{words} (last {local_time(at)})")
+    if not unheard:
+        return []
+    listed = first_of([unheard[system] for system in sorted(unheard)], OTHERS_SHOWN_MAX)
+    was = "was" if len(unheard) == 1 else "were"
+    return [f"{counted(len(unheard), 'vehicle')} of this link in the cache {was} not heard: {listed}."]
 
 
 async def wait_for_firmware(vehicles: Sequence[Component], deadline: Deadline) -> None:

@@ -141,6 +141,7 @@ async def set_(
         await _check_values([job], force=force)
         await session.check_only()
         await session.announce_write()
+        await session.report_unheard()
         began = anyio.current_time()
         outcomes = await _write(job, settle=settle, force=force, durable=durable)
         line = summary(session, outcomes, anyio.current_time() - began)

@@ -302,7 +302,7 @@ async def _from_link(url: str, options: LinkOptions, *, is_alone: bool, only: bo
     async with connect(url, options, only=only) as session:
         found = await whole_table(session, draws=is_alone)
         if not only:
-            session.report_others()
+            await session.report_others()
         return found
 
 

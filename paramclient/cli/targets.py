@@ -78,11 +78,15 @@ class Targets:
         """The deadline of the command."""
         return self.session.deadline
 
-    def announce_write(self) -> None:
-        """Print a line on stderr for each vehicle to which the subcommand writes, unless it prints JSON."""
+    async def announce_write(self) -> None:
+        """Print a line on stderr for each vehicle to which the subcommand writes, unless it prints JSON.
+
+        Also reports vehicles of the link that were not heard; see `CommandSession.report_unheard`.
+        """
         if not self.session.options.json:
             for each in self.vehicles:
                 say(printable(f"writing to {receiver_in_words(each)} on {self.client.link.name}"))
+        await self.session.report_unheard()
 
     async def check_only(self) -> None:
         """See `CommandSession.check_only`; does nothing with --all, which names every vehicle."""

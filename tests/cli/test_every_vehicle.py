@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from paramclient import read_file
-from paramclient.cli import set_command
+from paramclient.cli import session, set_command
 from paramclient.metadata import Metadata, ParamInfo
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from tests.commands import Command, Put, behind, in_process, leaping
@@ -207,6 +207,44 @@ def test_a_read_names_the_other_vehicles_on_the_link(
     )
     for choice in (["--system", 1], ["--vehicle", "2/1"], ["--all"]):
         assert "Also on this link" not in command("fetch", url, *choice).err
+
+
+@pytest.mark.parametrize("words", [("get", "GAIN"), ("fetch",), ("set", "GAIN", 5), ("reset", "GAIN")])
+def test_vehicles_of_the_link_that_only_the_cache_knows_are_named(
+    command: Command, put: Put, vehicles: tuple[PX4Vehicle, ArduPilotVehicle], words: tuple[str, ...]
+) -> None:
+    """A quick command may end before the heartbeat of another vehicle, or that vehicle is out of range."""
+    name, *rest = words
+    alone = command(name, put(Air(vehicles[1:])), *rest)
+    assert "not heard" not in alone.err
+    url = put(Air(vehicles))
+    assert "not heard" not in command("fetch", url, "--all").err
+    put(Air(vehicles[1:]))
+    vehicles[1].set_param("GAIN", 7.0)
+    done = command(name, url, *rest)
+    assert done.code == alone.code
+    unheard = r"1 vehicle of this link in the cache was not heard: 1/1 PX4 quadrotor \(last 2\S+\)\. "
+    assert re.search(unheard + "--system chooses one", done.err)
+    if name != "reset":
+        assert re.search(unheard + "--expect waits longer", command(name, url, *rest, "--all").err)
+    for choice in (["--system", 2], ["--vehicle", "2/1"]):
+        assert "not heard" not in command(name, url, *rest, *choice).err
+
+
+def test_vehicles_of_another_day_or_link_are_not_named(
+    command: Command,
+    put: Put,
+    vehicles: tuple[PX4Vehicle, ArduPilotVehicle],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    url = put(Air(vehicles))
+    assert command("fetch", url, "--all").code == 0
+    put(Air([ArduPilotVehicle(system=number, live=(), table=SHARED) for number in (1, 2)]))
+    assert "not heard" not in command("get", url, "GAIN", "--all").err  # another vehicle with a known id
+    put(Air(vehicles[1:]))
+    assert "not heard" in command("get", url, "GAIN").err
+    monkeypatch.setattr(session, "UNHEARD_AGE_MAX", -1.0)
+    assert "not heard" not in command("get", url, "GAIN").err
 
 
 @pytest.mark.parametrize("words", [("get", "GAIN"), ("fetch",), ("set", "GAIN", 5)])
