@@ -37,6 +37,7 @@ from paramclient.cli.metadata import (
     described_cells,
     from_file,
     known_of_session,
+    loaded_of_session,
 )
 from paramclient.cli.options import Count, LinkOptions
 from paramclient.cli.output import (
@@ -157,6 +158,8 @@ async def fetch(
         with progress_bar(f"fetching {session.label}") as progress:
             fetched = await fetching.fetch(session, progress)
         fetched = await described(fetched)
+        if not changed and metadata is None:
+            await loaded_of_session(session, None)  # for info, search and show
         await session.report_others(has_all=True)
     has_defaults = fetched.has_defaults
     if only:
@@ -534,7 +537,8 @@ async def _read(
     """Read the chosen parameters of a vehicle; return them, the errors by name, and the metadata."""
     params, errors = await _get_chosen(session, name_patterns, draws=draws)
     if described is None:
-        described = await known_of_session(session, choice)
+        load = loaded_of_session if draws else known_of_session  # over one link, no two at a time
+        described = await load(session, choice)
     return params, errors, described
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final
 
@@ -11,9 +11,15 @@ from cyclopts.validators import Number
 
 from paramclient.cache import CachedComponent, HistoryEntry, ParamCache
 from paramclient.cli.exit_codes import ExitCode
-from paramclient.cli.metadata import MetadataChoice, files_of, from_file, known_of_table, print_descriptions
+from paramclient.cli.metadata import (
+    MetadataChoice,
+    from_file,
+    how_to_describe,
+    known_of_table,
+    print_descriptions,
+)
 from paramclient.cli.options import CacheOptions
-from paramclient.cli.output import local_time, print_document, print_line, print_table, report, say
+from paramclient.cli.output import local_time, print_document, print_line, print_table, printable, report, say
 from paramclient.cli.param_names import unmatched_text
 from paramclient.cli.sources import tables_in
 from paramclient.errors import NotInCache, UsageError
@@ -77,7 +83,8 @@ def search(
         report(f"nothing found; {counted(len(found.names), 'parameter')} searched")
     if found.undescribed and not options.json:
         of_some = "of some vehicles, " if found.metadata else ""
-        say(f"{of_some}only names were searched: {_how_to_describe(found.undescribed)}")
+        request = how_to_describe(found.undescribed, names[0] if names else "")
+        say(printable(f"{of_some}only names were searched: {request}"))
     if not names:
         return ExitCode.INCOMPLETE
     return ExitCode.DONE
@@ -121,7 +128,7 @@ def info(
         return ExitCode.DONE
     print_descriptions([spelled], Metadata.of([described] if described is not None else []))
     if described is None and found.undescribed:
-        say(_how_to_describe(found.undescribed))
+        say(printable(how_to_describe(found.undescribed, spelled)))
     for table in tables:
         print_line("")
         for line in _lines_of(table, spelled, described, changes[table.key, table.component]):
@@ -136,8 +143,8 @@ class _Known:
     tables: Sequence[CachedComponent]
     metadata: Sequence[Metadata]
     names: frozenset[str]
-    undescribed: Sequence[str]
-    """Autopilots of the tables without metadata. A camera has none: its firmware has no such metadata."""
+    undescribed: Sequence[CachedComponent]
+    """The tables without metadata. A camera has none: its firmware has no such metadata."""
 
     @classmethod
     def of(cls, options: CacheOptions, vehicle: str | None, described: Metadata | None) -> _Known:
@@ -155,11 +162,11 @@ class _Known:
         if not tables or described is not None:
             names.update(name for each in metadata for name in each if "{" not in name)
         without = [
-            autopilot_name(table.autopilot)
+            table
             for table, each in zip(tables, found, strict=False)
             if each is None and has_autopilot(table.autopilot)
         ]
-        return cls(tables, metadata, frozenset(names), sorted(set(without)))
+        return cls(tables, metadata, frozenset(names), without)
 
     def info(self, name: str) -> ParamInfo | None:
         """Return the description of a parameter, or None."""
@@ -181,17 +188,6 @@ class _Known:
             ", ".join(f"{each.system}/{each.component}" for each in tables),
             None if described is None else described.short_description,
         )
-
-
-def _how_to_describe(autopilots: Collection[str]) -> str:
-    """Return that no metadata is stored for autopilots, and how to store it."""
-    request = ""
-    if any(each != "ardupilot" for each in autopilots):
-        request = "`paramclient get LINK NAME --metadata vehicle` requests it from a vehicle that has it, "
-    return (
-        f"no metadata is stored for the firmware of {' and '.join(autopilots)}. {request}`paramclient "
-        f"metadata add FILE` adds a file.{files_of(autopilots)}"
-    )
 
 
 def _rank(name: str, described: ParamInfo | None, lowered_words: Iterable[str]) -> int | None:

@@ -17,7 +17,7 @@ from paramclient.metadata.formats import read_metadata
 from paramclient.metadata.info import Metadata
 from paramclient.model.identity import Identity, autopilot_name, version_text
 
-__all__ = ["AddedFiles", "AddedMetadata", "VehicleKind"]
+__all__ = ["AddedFiles", "AddedMetadata", "VehicleKind", "file_address"]
 
 VehicleKind: TypeAlias = Literal["copter", "plane", "rover", "sub", "tracker", "blimp", "px4"]
 """The firmwares whose metadata can be added: ArduPilot's, one for each vehicle type, and PX4."""
@@ -42,6 +42,15 @@ _TYPES: Final[dict[int, VehicleKind]] = {
     7: "blimp",
 }
 """Kinds of ArduPilot by MAV_TYPE."""
+_FOLDERS: Final[dict[VehicleKind, str]] = {
+    "copter": "ArduCopter",
+    "plane": "ArduPlane",
+    "rover": "Rover",
+    "sub": "ArduSub",
+    "tracker": "AntennaTracker",
+    "blimp": "Blimp",
+}
+"""Folders of ArduPilot's metadata files on the internet."""
 _AUTOPILOT_COMPONENT: Final = 1
 _version: Final = re.compile(r"[0-9]{1,3}(\.[0-9]{1,3}){0,2}").fullmatch
 _kinds: Final[dict[str, VehicleKind]] = {kind: kind for kind in get_args(VehicleKind)}
@@ -165,6 +174,13 @@ class AddedFiles:
             except MetadataError as error:
                 logger.warning("%s", error)
         return None
+
+
+def file_address(identity: Identity) -> str:
+    """Return the internet address of the metadata file of an ArduPilot, or of the folder of all files."""
+    folder = _FOLDERS.get(_TYPES.get(identity.vehicle_type, "px4"))
+    files = "https://autotest.ardupilot.org/Parameters/"
+    return files if folder is None else f"{files}{folder}/apm.pdef.xml"
 
 
 def _kind_of(identity: Identity) -> VehicleKind | None:

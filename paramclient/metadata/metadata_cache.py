@@ -7,6 +7,7 @@ import logging
 import os
 import re
 import tempfile
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -93,6 +94,25 @@ class MetadataStore:
         if path is not None:
             self._write(path, f"{crc:08x}\n".encode("ascii"))
 
+    def remember_failure(self, identity: Identity, component: int) -> None:
+        """Record that the metadata of a firmware could not be downloaded quickly on the identity's link."""
+        path = self._failure(identity, component)
+        if path is not None:
+            self._write(path, b"")
+
+    def has_failed(self, identity: Identity, component: int, *, within: float) -> bool:
+        """Return whether a quick download failed on this link, `within` seconds ago or less.
+
+        Also True for a firmware without a commit, whose failure could not be recorded.
+        """
+        path = self._failure(identity, component)
+        if path is None:
+            return True
+        try:
+            return time.time() - path.stat().st_mtime <= within
+        except OSError:
+            return False
+
     def known(self, identity: Identity, component: int) -> Metadata | None:
         """Return the metadata of a firmware, or None.
 
@@ -170,6 +190,14 @@ class MetadataStore:
         )
         return self.folder / f"{hashlib.sha256(repr(what).encode()).hexdigest()[:16]}{_NOTES}"
 
+    def _failure(self, identity: Identity, component: int) -> Path | None:
+        """Return the file that records a failed download; None for a firmware without a commit."""
+        note = self._note(identity, component)
+        if note is None:
+            return None
+        link = hashlib.sha256(identity.link.encode()).hexdigest()[:16]
+        return note.with_suffix(f".{link}{_FAILURES}")
+
     def _read(self, path: Path) -> bytes | None:
         try:
             with path.open("rb") as file:
@@ -226,4 +254,5 @@ def has_checksum(content: bytes, crc: int) -> bool:
 
 
 _NOTES: Final = ".firmware"
+_FAILURES: Final = ".failed"
 _NOTE: Final = re.compile(rb"[0-9a-f]{8}\n")

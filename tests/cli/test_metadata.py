@@ -205,14 +205,15 @@ def test_get_has_more_members_in_json_with_metadata(command: Command, put: Any) 
 def test_downloaded_metadata_is_stored(command: Command, put: Any, tmp_path: Path) -> None:
     """The stored metadata is used for its firmware without a request, also without a link."""
     cache = ("--cache", tmp_path / "cache.sqlite3")
-    plain = command("get", put(quad()), "MC_ROLL_P", *cache)
+    plain = command("get", put(quad()), "MC_ROLL_P", "--json", *cache)
     assert "units" not in plain.out
     assert "1/s" in command("get", put(quad()), "MC_ROLL_P", "--metadata", "vehicle", *cache).out
     vehicle = quad()
     assert "1/s" in command("get", put(vehicle), "MC_ROLL_P", *cache).out
     assert not vehicle.requests["FILE_TRANSFER_PROTOCOL"]
     assert "units" not in command("get", put(copter(system=2)), "TST_LOG", *cache).out
-    assert "units" not in command("get", put(quad(ftp=True)), "MC_ROLL_P", *cache).out  # newer firmware
+    newer = quad(ftp=True)
+    assert "units" not in command("get", put(newer), "MC_ROLL_P", "--json", *cache).out
     done = command("set", put(quad()), "MC_ROLL_P", 13, *cache)
     assert "above the maximum of 12" in done.err
     done = command("show", "1", "MC_ROLL_P", *cache)
