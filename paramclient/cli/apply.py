@@ -59,6 +59,7 @@ from paramclient.cli.time_arguments import parse_when
 from paramclient.client.component import Component
 from paramclient.client.local import local
 from paramclient.errors import NoReply, NotInCache, ParamClientError, UnknownVehicle, UsageError
+from paramclient.links.names import names_service
 from paramclient.metadata import Metadata
 from paramclient.model.paramset import ParamSet
 from paramclient.protocol.params.fetch_result import Progress
@@ -153,12 +154,25 @@ async def apply(
         return await apply_extended(
             url, file, options, dry_run=dry_run, yes=yes, durable=durable, backup=backup
         )
-    check_no_service(url)
     check_pattern("--overlay", over, all_vehicles=all_vehicles)
     check_pattern("--backup", backup, all_vehicles=all_vehicles)
     chosen = from_file(metadata)
     rules = read_rules(renames)
     values = Source(file, over, options, only=True)
+    if names_service(url):
+        from paramclient.cli.apply_over_service import ServiceSetUp, apply_over_service  # loads pydantic
+
+        if all_vehicles or expect is not None or backup is not None or chosen is not None:
+            raise UsageError(
+                "over a service, apply sets up one vehicle, with the metadata of the service, whose cache "
+                "has the state before: --all, --expect, --backup and --metadata FILE need the link itself"
+            )
+        choices = ServiceSetUp(
+            include, reboot, allow_armed, skip_invalid, force, durable, renames=renames, full=full
+        )
+        return await apply_over_service(
+            url, values, choices, options, metadata=metadata, dry_run=dry_run, yes=yes
+        )
     await values.open()
     async with targets(url, options, all_vehicles=all_vehicles, expect=expect, only=True) as found:
         wanted = await values.wanted(found.vehicles)

@@ -46,6 +46,7 @@ from paramclient.model.wording import counted
 
 __all__ = [
     "DESCRIBED_COLUMNS",
+    "VEHICLE",
     "MetadataChoice",
     "check_no_option",
     "described_cells",

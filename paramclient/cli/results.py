@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias
 
 from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.output import Coloured, print_table, printable, report, say
+from paramclient.errors import ParamClientError
 from paramclient.model.identity import Identity
 from paramclient.model.notation import typed
 from paramclient.model.values import WireValue, format_value
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from paramclient.documents.setup import ApplyResultDoc, InterruptedDoc, PlanDoc, VerifiedDoc
 
 __all__ = [
+    "Applied",
     "NamedVehicle",
     "applied_code",
     "applied_doc",
@@ -63,6 +65,38 @@ class NamedVehicle:
     identity: Identity
 
 
+class Applied(Protocol):
+    """The part of `ApplyResult` that is printed."""
+
+    @property
+    def system(self) -> int:
+        """As in `ApplyResult`, like all others."""
+
+    @property
+    def component(self) -> int: ...
+
+    @property
+    def rows(self) -> Mapping[str, ApplyRow]: ...
+
+    @property
+    def shown_rows(self) -> list[ApplyRow]: ...
+
+    @property
+    def counts(self) -> Mapping[ApplyStatus, int]: ...
+
+    @property
+    def complete(self) -> bool: ...
+
+    @property
+    def reboot_required(self) -> tuple[str, ...]: ...
+
+    @property
+    def error(self) -> ParamClientError | None: ...
+
+    @property
+    def elapsed(self) -> float: ...
+
+
 Cells: TypeAlias = list[object]
 """The cells of a row."""
 
@@ -70,7 +104,7 @@ Cells: TypeAlias = list[object]
 # Results
 
 
-def show_applied(results: Mapping[NamedVehicle, ApplyResult], *, full: bool) -> None:
+def show_applied(results: Mapping[NamedVehicle, Applied], *, full: bool) -> None:
     """Print one table of the outcome for each value, and a line for each vehicle on stderr."""
     _print(
         ["name", "before", "wanted", "now", "status", "reason"],
@@ -105,7 +139,7 @@ def show_interrupted(rows: Mapping[NamedVehicle, Sequence[ApplyRow]]) -> None:
     )
 
 
-def applied_code(result: ApplyResult) -> ExitCode:
+def applied_code(result: Applied) -> ExitCode:
     """Return the exit code for a result."""
     if result.complete:
         return ExitCode.DONE

@@ -95,15 +95,17 @@ class Targets:
 
 
 def check_no_service(url: str) -> None:
-    """Check that a link, and not a service, is given for a set-up of plain parameters.
+    """Check that a link, and not a service, is given for verify or restore of plain parameters.
 
     Raises:
         UsageError: the URL of a service.
     """
     if names_service(url):
         raise UsageError(
-            f"{url} is a service: apply, verify and restore of plain parameters need the link itself. The "
-            "service sets up a vehicle by POST /api/v1/components/SYSTEM/COMPONENT/apply, or with its page"
+            f"{url} is a service: verify and restore of plain parameters need the link itself. The service "
+            "does both by POST /api/v1/components/SYSTEM/COMPONENT/verify and "
+            "/api/v1/components/SYSTEM/COMPONENT/restore, or with its page; `paramclient apply` takes its "
+            "address"
         )
 
 

@@ -21,7 +21,7 @@ from paramclient.client.events import Events
 from paramclient.client.extended_params import ExtChanges, ExtParams
 from paramclient.client.link_task import LinkTask
 from paramclient.client.subscription import Changes
-from paramclient.errors import UsageError
+from paramclient.errors import ParamClientError, UsageError
 from paramclient.links import Link
 from paramclient.model.identity import Identity
 from paramclient.protocol.addresses import Address
@@ -228,6 +228,58 @@ class ServiceComponent(Component):
             NoReply: the vehicle did not respond, or the service cannot be reached.
             LinkError: the service cannot be reached.
             ParamClientError: the error that the service reports.
+        """
+
+    @abstractmethod
+    async def plan_apply(self, body: Mapping[str, Any], *, timeout: float | None = None) -> Mapping[str, Any]:
+        """Return what a set-up would write as JSON (`PlanDoc`); writes nothing.
+
+        Args:
+            body: the wanted parameters and options (`PlanRequest`).
+            timeout: seconds; None for the choice of the service.
+
+        Raises:
+            ParamClientError: as from `read_descriptions`.
+        """
+
+    @abstractmethod
+    async def begin_apply(
+        self, body: Mapping[str, Any], *, timeout: float | None = None
+    ) -> Mapping[str, Any]:
+        """Start a set-up as a job of the service, and return the job as JSON (`JobDoc`).
+
+        The job continues if this program ends. A request whose response is lost is not sent again.
+
+        Args:
+            body: the wanted parameters and options (`ApplyRequest`).
+            timeout: seconds for the job; None for no limit.
+
+        Raises:
+            ParamClientError: as from `read_descriptions`.
+        """
+
+    @abstractmethod
+    async def read_job(self, job: str) -> Mapping[str, Any]:
+        """Return a job as JSON (`JobDoc`).
+
+        Raises:
+            ParamClientError: the error with which the job failed, or as from `read_descriptions`.
+        """
+
+    @abstractmethod
+    def error_of_problem(self, problem: Mapping[str, Any]) -> ParamClientError:
+        """Return the exception of a problem document, as that of a result (`Problem`).
+
+        Raises:
+            LinkError: the document is not valid.
+        """
+
+    @abstractmethod
+    async def cancel_job(self, job: str) -> None:
+        """Cancel a job; without effect after its end.
+
+        Raises:
+            ParamClientError: as from `read_descriptions`.
         """
 
 

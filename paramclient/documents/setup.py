@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 from pydantic import Field
 
 from paramclient.documents.document import Document, Maybe, Scalar
+from paramclient.documents.problem import Problem
 from paramclient.documents.receiver import ReceiverDoc
 from paramclient.model.identity import version_text
 from paramclient.model.notation import typed, value_json
@@ -225,7 +226,8 @@ class ApplyResultDoc(Document):
     """The result of a set-up; see `ApplyResult`.
 
     `system` and `component` are the vehicle's address at the start, `now` is its address at the end. `extra`
-    is the number of the vehicle's other parameters. `vehicle` has its kind and firmware.
+    is the number of the vehicle's other parameters. `vehicle` has its kind and firmware. `problem` is the
+    error of a service's set-up that ended early.
     """
 
     system: int
@@ -240,6 +242,7 @@ class ApplyResultDoc(Document):
     reboot_required: list[str]
     error: str | None
     elapsed_s: float
+    problem: Maybe[Problem] = None
 
     @classmethod
     def of(
@@ -250,6 +253,7 @@ class ApplyResultDoc(Document):
         component: int,
         full: bool = False,
         vehicle: ReceiverDoc | None = None,
+        problem: Problem | None = None,
     ) -> ApplyResultDoc:
         """Return the document of the result for a vehicle that had this address at the start.
 
@@ -271,6 +275,7 @@ class ApplyResultDoc(Document):
             reboot_required=list(result.reboot_required),
             error=None if result.error is None else str(result.error),
             elapsed_s=round(result.elapsed, 3),
+            problem=problem,
         )
 
 

@@ -368,6 +368,61 @@ class RemoteComponent(ServiceComponent):
         document: Document = answer.document
         return document
 
+    async def plan_apply(self, body: Mapping[str, Any], *, timeout: float | None = None) -> Mapping[str, Any]:
+        """See `ServiceComponent.plan_apply`."""
+        return await self._ask("POST", f"{self._mirrored.path}/plan", body, "the plan of a set-up", timeout)
+
+    async def begin_apply(
+        self, body: Mapping[str, Any], *, timeout: float | None = None
+    ) -> Mapping[str, Any]:
+        """See `ServiceComponent.begin_apply`."""
+        return await self._ask(
+            "POST",
+            f"{self._mirrored.path}/apply",
+            {**body, "wait": False},
+            f"the set-up of {self.system}/{self.component}",
+            timeout,
+            is_write=True,
+        )
+
+    async def read_job(self, job: str) -> Mapping[str, Any]:
+        """See `ServiceComponent.read_job`."""
+        document = await self._ask("GET", f"/jobs/{job}", None, f"the state of job {job}")
+        with decode_errors(self._service.name):
+            problem = document["problem"] if document["state"] == "failed" else None
+        if problem is not None:
+            raise self.error_of_problem(problem)
+        return document
+
+    def error_of_problem(self, problem: Mapping[str, Any]) -> ParamClientError:
+        """See `ServiceComponent.error_of_problem`."""
+        with decode_errors(self._service.name):
+            return error_of(problem, status=problem["status"], link=self._service.name)
+
+    async def cancel_job(self, job: str) -> None:
+        """See `ServiceComponent.cancel_job`."""
+        await self._service.connection.ask("DELETE", f"/jobs/{job}", awaited=f"the end of job {job}")
+
+    async def _ask(
+        self,
+        method: str,
+        path: str,
+        body: Mapping[str, Any] | None,
+        awaited: str,
+        timeout: float | None = None,
+        *,
+        is_write: bool = False,
+    ) -> Mapping[str, Any]:
+        """Send a request, and return the document of the response."""
+        service, link = self._service, self._mirrored.link_name
+        answer = await service.connection.ask(
+            method, path, body, awaited=awaited, timeout=timeout, link=link, is_write=is_write
+        )
+        with decode_errors(service.name):
+            check_kind(answer.document, dict)
+        document: Document = answer.document
+        return document
+
     async def setup_signing(self, key: SigningKey | None, *, link_is_safe: bool = False) -> None:
         """Raise UsageError: SETUP_SIGNING needs the link itself, as it sends the key unencrypted."""
         raise not_given("the set-up of signing")

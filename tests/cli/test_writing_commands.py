@@ -114,7 +114,7 @@ def untouched(*vehicles: Vehicle) -> bool:
     )
 
 
-@pytest.mark.parametrize("words", [("apply",), ("apply", "--dry-run"), ("verify",), ("restore", "--plain")])
+@pytest.mark.parametrize("words", [("verify",), ("restore", "--plain")])
 def test_a_set_up_over_a_service_names_what_the_service_offers(
     command: Command, tmp_path: Path, words: tuple[str, ...]
 ) -> None:
@@ -122,8 +122,8 @@ def test_a_set_up_over_a_service_names_what_the_service_offers(
     file.write_text("A,1\n")
     done = command(words[0], "http://127.0.0.1:9", file, *words[1:])
     assert (done.code, done.out) == (2, "")
-    assert done.err.startswith("paramclient: http://127.0.0.1:9 is a service: apply, verify and restore of ")
-    assert "POST /api/v1/components/SYSTEM/COMPONENT/apply" in done.err
+    assert done.err.startswith("paramclient: http://127.0.0.1:9 is a service: verify and restore of ")
+    assert "POST /api/v1/components/SYSTEM/COMPONENT/verify and " in done.err
 
 
 @pytest.mark.parametrize("phase", [0.0, 0.35, 0.7, 0.99, 1.15])

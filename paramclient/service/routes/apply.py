@@ -36,7 +36,7 @@ from paramclient.service.param_sources import (
     read_renames,
     resolve_source,
 )
-from paramclient.service.problems import ServiceError
+from paramclient.service.problems import ServiceError, problem_of
 from paramclient.service.request_body import BodyRoute, long_request
 from paramclient.service.responses import JSON, document_response, encode_document
 from paramclient.service.route_context import (
@@ -410,7 +410,10 @@ def _begin(
             if note is not None:
                 await hub.end_setup_record(note, is_cut_off=hub.is_closing and not is_whole)
         vehicle = ReceiverDoc.at(system, component, target.component.identity)
-        return ApplyResultDoc.of(result, system=system, component=component, full=full, vehicle=vehicle)
+        problem = None if result.error is None else problem_of(result.error)
+        return ApplyResultDoc.of(
+            result, system=system, component=component, full=full, vehicle=vehicle, problem=problem
+        )
 
     return hub.jobs.start(kind, target, run, author_of(request), holder_of(request))
 

@@ -1,0 +1,350 @@
+"""The subcommand apply over a service: its set-up runs there as a job, and is shown as one on a link."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import anyio
+
+from paramclient.cli.confirmation import can_confirm, confirm
+from paramclient.cli.exit_codes import ExitCode
+from paramclient.cli.metadata import VEHICLE, request_from_vehicle
+from paramclient.cli.options import LinkOptions
+from paramclient.cli.output import print_document, printable, progress_bar, report, say
+from paramclient.cli.results import (
+    NamedVehicle,
+    applied_code,
+    planned_code,
+    show_applied,
+    show_interrupted,
+    show_planned,
+)
+from paramclient.cli.session import CommandSession, connect, receiver_in_words, wait_for_firmware
+from paramclient.cli.targets import Source, describe
+from paramclient.client.local import ServiceComponent
+from paramclient.documents.setup import (
+    AppliedRowDoc,
+    ApplyResultDoc,
+    InterruptedDoc,
+    PlanDoc,
+    PlanRowDoc,
+    StepDoc,
+)
+from paramclient.errors import LinkError, NoReply, ParamClientError, UsageError
+from paramclient.files import FileFormat, dumps
+from paramclient.model.notation import parse_value
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.values import ParamType, WireValue
+from paramclient.protocol.params.fetch_result import Progress
+from paramclient.provision import ApplyRow, ApplyStatus, Plan, PlanRow, PlanStatus
+from paramclient.provision.planning import Stage, Step
+
+__all__ = ["ServiceSetUp", "apply_over_service"]
+
+JOB_POLL_INTERVAL: Final = 0.25
+"""Seconds between two requests for the state of the job: the service updates its progress as often."""
+JOB_CANCEL_TIMEOUT: Final = 3.0
+"""Seconds in which Ctrl-C waits for the end of the job: the values in flight take one round trip."""
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceSetUp:
+    """The options of apply that a service takes, as in the subcommand."""
+
+    include: Sequence[str]
+    reboot: bool
+    allow_armed: bool
+    skip_invalid: bool
+    force: bool
+    durable: bool
+    renames: str | None
+    full: bool
+
+    def body(self, wanted: ParamSet) -> dict[str, Any]:
+        """Return the request for a plan or a set-up. Values are sent as they are in the file.
+
+        Raises:
+            FileError: the file of --renames cannot be read.
+        """
+        content = dumps(wanted, file_format=FileFormat.JSON).decode()
+        body: dict[str, Any] = {
+            "wanted": {"file": {"name": Path(wanted.source).name, "text": content, "format": "json"}},
+            "include": list(self.include),
+            "force": self.force,
+        }
+        if self.renames is not None:
+            text = Path(self.renames).read_text(encoding="utf-8")
+            body["renames"] = {"name": Path(self.renames).name, "text": text}
+        return body
+
+
+async def apply_over_service(
+    url: str,
+    source: Source,
+    choices: ServiceSetUp,
+    options: LinkOptions,
+    *,
+    metadata: str | None,
+    dry_run: bool,
+    yes: bool,
+) -> ExitCode:
+    """Set up a vehicle of a service; see the subcommand apply.
+
+    Ctrl-C cancels the job of the service. If it cannot be cancelled, its number is printed.
+
+    Args:
+        url: the service.
+        source: the wanted parameters, which are read here.
+        choices: the options for the service.
+        options: they name the vehicle.
+        metadata: None, or `vehicle` to let the service request the metadata first.
+        dry_run: print the values that would be sent.
+        yes: do not ask for confirmation.
+
+    Raises:
+        ParamClientError: as apply on a link; LinkError also if the service cannot be reached.
+    """
+    await source.open()
+    async with connect(url, options, only=True) as session:
+        component = session.component
+        assert isinstance(component, ServiceComponent)
+        wanted = (await source.wanted([component]))[component.system, component.component]
+        wanted = replace(wanted, component=component.component, system=None)
+        if metadata == VEHICLE:
+            await request_from_vehicle(session)
+        await wait_for_firmware([component], session.deadline)
+        set_up = _SetUp(session, component, choices, wanted)
+        if dry_run:
+            return await set_up.show_plan()
+        if not yes and can_confirm(options):
+            plan = await set_up.plan()
+            if plan.steps or choices.reboot:
+                show_planned({set_up.vehicle: plan}, reboot=choices.reboot, full=choices.full)
+                if not await confirm("go on?"):
+                    return ExitCode.INCOMPLETE
+        if not options.json:
+            say(printable(f"writing to {receiver_in_words(component)} on {session.client.link.name}"))
+        await session.check_only()
+        return set_up.show_result(await set_up.run())
+
+
+@dataclass(frozen=True)
+class _SetUp:
+    """One set-up of a vehicle of a service."""
+
+    session: CommandSession
+    component: ServiceComponent
+    choices: ServiceSetUp
+    wanted: ParamSet
+
+    @cached_property
+    def vehicle(self) -> NamedVehicle:
+        """The vehicle as the output names it."""
+        each = self.component
+        return NamedVehicle(
+            each.system, each.component, describe(each), receiver_in_words(each), each.identity
+        )
+
+    async def plan(self) -> Plan:
+        """Return the plan of the service, with every parameter."""
+        return _plan_of(await self._planned(full=True), self.wanted, self.vehicle)
+
+    async def show_plan(self) -> ExitCode:
+        """Print the plan; return the exit code that the set-up is expected to have."""
+        choices = self.choices
+        plan = await self.plan()
+        if self.session.options.json:
+            print_document(await self._planned(full=choices.full))
+        else:
+            show_planned({self.vehicle: plan}, reboot=choices.reboot, full=choices.full)
+        code = planned_code(plan, skip_invalid=choices.skip_invalid)
+        if self.component.is_armed and not choices.allow_armed:
+            report(f"{self.vehicle.label} is armed; nothing would be set now without --allow-armed")
+            return max(code, ExitCode.INCOMPLETE)
+        return code
+
+    async def _planned(self, *, full: bool) -> PlanDoc:
+        body = self.choices.body(self.wanted) | {"full": full}
+        timeout = self.session.deadline.left()
+        return PlanDoc.model_validate(await self.component.plan_apply(body, timeout=timeout))
+
+    async def run(self) -> ApplyResultDoc:
+        """Run the set-up as a job, and return its result; see `apply_over_service` for Ctrl-C."""
+        choices, component = self.choices, self.component
+        body = self.choices.body(self.wanted) | {
+            "full": choices.full,
+            "reboot": choices.reboot,
+            "allow_armed": choices.allow_armed,
+            "skip_invalid": choices.skip_invalid,
+            "durable": choices.durable,
+        }
+        began = anyio.current_time()
+        job = str((await component.begin_apply(body, timeout=self.session.deadline.left()))["id"])
+        try:
+            with progress_bar(f"setting {self.vehicle.label}") as draw:
+
+                def tell(progress: Mapping[str, Any]) -> None:
+                    if draw is not None:
+                        draw(_progress_of(progress, anyio.current_time() - began))
+
+                state = await self._ended(job, tell)
+        except anyio.get_cancelled_exc_class():
+            with anyio.CancelScope(shield=True):
+                await self._cancel(job)
+            raise
+        except (LinkError, NoReply):
+            report(self._continues(job))
+            raise
+        if state["state"] != "done":
+            raise UsageError(f"the set-up of {self.vehicle.label} was cancelled at the service, job {job}")
+        return ApplyResultDoc.model_validate(state["result"])
+
+    async def _ended(
+        self, job: str, tell: Callable[[Mapping[str, Any]], None] | None = None
+    ) -> Mapping[str, Any]:
+        """Wait for the end of a job, and return its last state."""
+        while True:
+            state = await self.component.read_job(job)
+            if state["state"] != "running":
+                return state
+            if tell is not None and state["progress"] is not None:
+                tell(state["progress"])
+            await anyio.sleep(JOB_POLL_INTERVAL)
+
+    async def _cancel(self, job: str) -> None:
+        """Cancel a job and print the outcomes so far; or its number, if that is not possible.
+
+        If the job has ended meanwhile, prints its result.
+        """
+        state: Mapping[str, Any] = {"state": "running"}
+        try:
+            with anyio.move_on_after(JOB_CANCEL_TIMEOUT):
+                await self.component.cancel_job(job)
+                state = await self._ended(job)
+        except ParamClientError as error:
+            report(str(error))
+        if state["state"] == "running":
+            report(self._continues(job))
+            return
+        if state["state"] == "done":
+            self.show_result(ApplyResultDoc.model_validate(state["result"]))
+            return
+        if state["result"] is None:
+            report(f"job {job} was cancelled before anything was written")
+            return
+        document = InterruptedDoc.model_validate(state["result"])
+        if self.session.options.json:
+            print_document(document)
+            return
+        rows = [_applied_row(name, row, self.wanted) for name, row in document.params.items()]
+        show_interrupted({self.vehicle: rows})
+
+    def _continues(self, job: str) -> str:
+        """Return that a job may still run, and how to look at it and cancel it."""
+        address = f"{self.session.client.link.name.partition('?')[0].rstrip('/')}/api/v1/jobs/{job}"
+        return (
+            f"the set-up of {self.vehicle.label} goes on at the service as job {job}: GET {address} shows "
+            f"it, DELETE {address} cancels it"
+        )
+
+    def show_result(self, document: ApplyResultDoc) -> ExitCode:
+        """Print the result; return the exit code."""
+        error = None
+        if document.error is not None:
+            problem = document.problem
+            error = ParamClientError(document.error)  # of an earlier version of the service
+            if problem is not None:
+                error = self.component.error_of_problem(problem.as_json())
+        result = _Applied(document, self.wanted, error)
+        if self.session.options.json:
+            print_document(document.model_copy(update={"problem": None}))
+        else:
+            show_applied({self.vehicle: result}, full=self.choices.full)
+        return applied_code(result)
+
+
+class _Applied:
+    """A result of the service, as `ApplyResult`. Its rows are only those to show."""
+
+    def __init__(self, document: ApplyResultDoc, wanted: ParamSet, error: ParamClientError | None) -> None:
+        self.system, self.component = document.now.system, document.now.component
+        self.rows = {name: _applied_row(name, row, wanted) for name, row in document.params.items()}
+        self.shown_rows = list(self.rows.values())
+        self.counts: Mapping[ApplyStatus, int] = Counter(document.counts)
+        self.complete = document.complete
+        self.reboot_required = tuple(document.reboot_required)
+        self.elapsed = document.elapsed_s
+        self.error = error
+
+
+def _plan_of(document: PlanDoc, wanted: ParamSet, vehicle: NamedVehicle) -> Plan:
+    """Return the plan of a document with every parameter."""
+    rows = {name: _plan_row(name, row, wanted) for name, row in document.params.items()}
+    by_name = {row.target.name: row for row in rows.values()}
+    stages = tuple(
+        Stage(
+            stage.purpose,
+            tuple(_step(step, by_name[step.name].wanted) for step in stage.steps),
+            reboot_first=stage.reboot_first,
+        )
+        for stage in document.stages
+    )
+    return Plan(wanted, rows, stages, identity=vehicle.identity)
+
+
+def _step(document: StepDoc, wanted: WrittenParam) -> Step:
+    kind = _type_of(document.type)
+    assert kind is not None
+    value, before = parse_value(document.value, kind), parse_value(document.before, kind)
+    return Step(document.name, value, kind, before, document.needs_reboot, wanted)
+
+
+def _plan_row(name: str, document: PlanRowDoc, wanted: ParamSet) -> PlanRow:
+    return PlanRow(status=PlanStatus(document.status), **_members(name, document, wanted))
+
+
+def _applied_row(name: str, document: AppliedRowDoc, wanted: ParamSet) -> ApplyRow:
+    actual = _value(document.actual, _type_of(document.type))
+    return ApplyRow(status=ApplyStatus(document.status), actual=actual, **_members(name, document, wanted))
+
+
+def _members(name: str, document: PlanRowDoc | AppliedRowDoc, wanted: ParamSet) -> dict[str, Any]:
+    """Return the attributes that the rows of plans and results share."""
+    kind = _type_of(document.type)
+    target = parse_value(document.wanted, ParamType.REAL64 if kind is None else kind)
+    given = wanted.get(name) or WrittenParam(name, target, kind)
+    renamed = None
+    if document.vehicle_name is not None:
+        renamed = WrittenParam(document.vehicle_name, target, kind)
+    return {
+        "wanted": given,
+        "before": _value(document.before, kind),
+        "type": kind,
+        "category": document.category,
+        "reason": document.reason,
+        "nearest": tuple(document.nearest),
+        "renamed": renamed,
+    }
+
+
+def _value(given: object, kind: ParamType | int | None) -> WireValue | None:
+    return None if given is None else parse_value(given, ParamType.REAL32 if kind is None else kind)
+
+
+def _type_of(name: str | None) -> ParamType | int | None:
+    """Return the type with this name, or with its number for a type that MAVLink does not define."""
+    if name is None:
+        return None
+    return ParamType[name] if name in ParamType.__members__ else int(json.loads(name))
+
+
+def _progress_of(document: Mapping[str, Any], seconds: float) -> Progress:
+    done, total = int(document["done"]), int(document["total"])
+    rate = done / seconds if seconds else 0.0
+    return Progress(done, total, rate, (total - done) / rate if rate else None)
