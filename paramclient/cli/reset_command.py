@@ -12,6 +12,7 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from paramclient.cli.confirmation import can_confirm, confirm
+from paramclient.cli.default_sources import say_sources
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.metadata import (
     MetadataChoice,
@@ -45,7 +46,7 @@ from paramclient.client.arguments import SETTLE_MAX
 from paramclient.client.reset import ResetChoice, read_unconfirmed
 from paramclient.errors import NoReply, ParamClientError, UsageError, VehicleError
 from paramclient.metadata import Metadata
-from paramclient.model.defaults import DefaultSource
+from paramclient.model.defaults import DefaultSource, default_of
 from paramclient.model.group_switches import is_group_switch
 from paramclient.model.notation import typed
 from paramclient.model.patterns import is_pattern
@@ -151,6 +152,7 @@ async def reset(
     plan.print_outcomes(outcomes)
     if not options.json:
         say(f"{line if outcomes else plan.nothing}; {len(plan.choice.unchanged)} had their default already")
+        plan.say_sources()
     report_outcomes(outcomes, described)
     plan.report_unwritten()
     return max(code, outcomes_code(outcomes))
@@ -304,6 +306,7 @@ class _ResetPlan:
                 f"default, {len(choice.without_default)} without a known default; nothing was sent"
             )
         )
+        self.say_sources()
 
     def print_outcomes(self, outcomes: Sequence[SetOutcome]) -> None:
         """Print the outcomes as a table or as JSON."""
@@ -319,6 +322,13 @@ class _ResetPlan:
             rows.append((name, before, None, before, _NO_DEFAULT))
         if rows:
             print_table(["name", "before", "default", "now", "status"], rows, right="before default now")
+
+    def say_sources(self) -> None:
+        """Print how many of the defaults are from the metadata, which has none of an airframe."""
+        values = self.choice.values
+        say_sources(
+            self.session.label, [default_of(self.params[name], each) for name, each in values.items()]
+        )
 
     def report_unwritten(self) -> None:
         """Print a line about the read-only parameters, and one about those without a known default."""

@@ -149,8 +149,12 @@ def test_the_metadata_of_the_vehicle_is_downloaded_where_it_gives_no_defaults(
 ) -> None:
     vehicle = PX4Vehicle(table={"MC_ROLL_P": 4.0}, metadata=True)
     vehicle.set_param("MC_ROLL_P", 6.5)
+    said = "1/1 px4: 1 of 1 default from the metadata of the firmware, which does not have the defaults of an"
+    planned = command("reset", put(vehicle), "MC_ROLL_P", "--dry-run")
+    assert said in planned.err
     done = command("reset", put(vehicle), "MC_ROLL_P")
     assert (done.code, vehicle.values["MC_ROLL_P"]) == (0, 4.0), done.err
+    assert said in done.err
 
 
 def test_dry_run_sends_no_value(command: Command, put: Put) -> None:

@@ -52,8 +52,8 @@ def test_search_limits_and_reports_nothing(command: Command) -> None:
     assert nothing.err.startswith("paramclient: nothing found; ")
     assert (
         "of some vehicles, only names were searched: no metadata is stored for the firmware of ardupilot. "
-        "For 2/1 download https://autotest.ardupilot.org/Parameters/ArduCopter/apm.pdef.xml, then run `paramclient metadata "
-        "add apm.pdef.xml`.\n" in nothing.err
+        "For 2/1 download https://autotest.ardupilot.org/Parameters/ArduCopter/apm.pdef.xml, then run "
+        "`paramclient metadata add apm.pdef.xml`.\n" in nothing.err
     )
     of_described = command("search", "xyzzy", "--vehicle", 1)
     assert of_described.err == "paramclient: nothing found; 903 parameters searched\n"
