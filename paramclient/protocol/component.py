@@ -540,6 +540,9 @@ class ComponentMachine:
                 self.fetch.announced(announced)
             if self.fetches.overheard is not None:
                 self.fetches.overheard.announced(announced, now)
+            is_count_new = count != self.table.count and count <= PARAMETERS_MAX
+            if is_count_new and self.sync.synced and self.fetch is None:
+                self._count_changed(count, name, now)
             self.reads.receive(message, now)
             return
         table = self.table

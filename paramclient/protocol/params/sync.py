@@ -16,16 +16,23 @@ from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.change_origin import is_ours
 from paramclient.protocol.params.fetch import Check, Fetch
 from paramclient.protocol.params.fetch_result import Announcement, FetchResult, Policy
+from paramclient.protocol.params.hash_check import HashCheck
 from paramclient.protocol.params.reads import Read, Reads
 from paramclient.protocol.params.sync_interval import SyncInterval
 from paramclient.protocol.params.table import NAMES_MAX, Table
-from paramclient.protocol.params.table_shift import CountChange, TableShift, reads_expected
+from paramclient.protocol.params.table_shift import (
+    SEARCH_ROUNDS,
+    CountChange,
+    TableShift,
+    reads_expected,
+    search_reads_expected,
+)
 from paramclient.protocol.params.volatile_values import VolatileReads
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.retry import FILE_IN_USE_RETRY
 from paramclient.protocol.vehicle.presence import Presence
-from paramclient.protocol.wire import HASH_CHECK, MAV_AUTOPILOT_ARDUPILOTMEGA, ParamValue
+from paramclient.protocol.wire import HASH_CHECK, ParamValue
 
 __all__ = ["ComponentState", "Sync", "SyncState", "SyncSettings"]
 
@@ -192,8 +199,9 @@ class Sync(Machine):
     to be in a low-bandwidth mode, nor, except after changes, while other requests are in flight.
 
     When parameters were added or removed, only the shifted indices are read where that is faster than a
-    download, see `TableShift`: of an ArduPilot, whose table keeps its order. The values that stay are then as
-    recent as before.
+    download, see `TableShift`: of an ArduPilot, whose table keeps its order, and of a PX4, whose table is
+    sorted. The hash of a PX4 then proves the table. The values of an ArduPilot that stay are as recent as
+    before.
 
     With each interval, the values that the hash does not cover are read again. For a component without a hash
     the file, or the list, is fetched, as often as `sync_interval` says.
@@ -247,6 +255,7 @@ class Sync(Machine):
         self._reads_volatile = False  # after a match of the requested hash
         self._resync: Fetch | None = None
         self._shift: TableShift | None = None
+        self._proof_read: Read | None = None  # of the hash that is to prove the table so shown
         self._shift_at = -math.inf  # when the next one may begin
         self._shifts = 0  # begun since the table was in sync
         self._count_changed_at = -math.inf
@@ -263,7 +272,7 @@ class Sync(Machine):
         """The state of the table of a component that is not lost."""
         if self.synced:
             return SyncState.SYNCED
-        if self._resync is not None or self._shift is not None:
+        if self._resync is not None or self._is_shifting:
             return SyncState.RESYNCING
         return SyncState.CHECKING if self._is_checking else SyncState.UNSYNCED
 
@@ -343,7 +352,8 @@ class Sync(Machine):
         if self._keeps_in_sync:
             self._has_count_changed = not self.expects_hash
             if self._is_shift_worthwhile(now):
-                earliest = self._shift_at
+                # the start of a module brings more than one parameter into use
+                earliest = max(self._shift_at, now + SETTLING_TIME) if self.expects_hash else self._shift_at
             else:
                 pause = 0.0 if self.expects_hash else self._sync_interval.shortest_pause
                 earliest = self._checked_at + pause
@@ -402,7 +412,7 @@ class Sync(Machine):
 
     def fetch_begins(self, now: float) -> None:
         """Process the beginning of a fetch, which brings what reads of shifted indices would."""
-        if self._shift is not None:
+        if self._is_shifting:
             self._cancel_shift()
             self._check_at = now  # in case that the fetch is cancelled
 
@@ -564,17 +574,17 @@ class Sync(Machine):
 
     def _check(self, now: float) -> None:
         """Check whether the table still matches the vehicle's, if the link is idle."""
-        if self.holds or self._shift is not None or self._host.is_link_busy:
+        if self.holds or self._is_shifting or self._host.is_link_busy:
             self._check_at = now + IDLE_CHECK_INTERVAL
             return
         self._plan_check(now, now)
         if self.must_not_poll:
             self._is_checking = False
+        elif self._begin_shift(now):
+            return
         elif self.expects_hash:
             self._reads_volatile = self._keeps_in_sync
             self.ask(now)
-        elif self._has_count_changed and self._begin_shift(now):
-            return
         elif self._check_at < math.inf or self._has_count_changed:
             if self._files.is_in_use(now):
                 self._check_at = min(self._check_at, now + FILE_IN_USE_RETRY)
@@ -619,12 +629,12 @@ class Sync(Machine):
             if reads_volatile and now >= self._volatile_at:
                 self._read_unhashed(announced, now, again=True)
             self._settled(now, now)
-        elif self._context.is_writing or self._context.is_fetching:
+        elif self._context.is_writing or self._context.is_fetching or self._is_shifting:
             return
         elif table.hash is None and self._changed_only_by_us and not self._keeps_in_sync:
             # cannot be recomputed here: the cause may be our writes only, or also a missed change
             self._is_checking = False
-        else:
+        elif not (self.may_resync and self._begin_shift(now)):
             self._not_confirmed()
             self._is_checking = False
             if self._keeps_in_sync and not self.must_not_poll:
@@ -637,11 +647,17 @@ class Sync(Machine):
     def _is_shift_worthwhile(self, now: float) -> bool:
         """Return whether reads of the shifted indices are expected to be clearly faster than a download."""
         changes = self._count_changes
-        if not changes or self._context.autopilot != MAV_AUTOPILOT_ARDUPILOTMEGA or self.expects_hash:
-            return False
-        if len({change.added > 0 for change in changes}) > 1:
+        if not changes or len({change.added > 0 for change in changes}) > 1:
             return False  # the order is certain for additions or removals only
-        return reads_expected(changes) <= SHIFT_TIME_SHARE * self._reads_within(self._download_time(now))
+        seconds = self._download_time(now)
+        if self.expects_hash:
+            expected = search_reads_expected(changes)
+            seconds -= SEARCH_ROUNDS * (self._context.round_trip.smoothed or 0.0)
+            is_shown = self._keeps_in_sync and self._table.volatile_known  # the hash then proves the table
+        else:
+            expected = reads_expected(changes)
+            is_shown = self._context.is_ardupilot and self._has_count_changed
+        return is_shown and expected <= SHIFT_TIME_SHARE * self._reads_within(seconds)
 
     def _download_time(self, now: float) -> float:
         """Return the expected seconds of a download of the whole table."""
@@ -651,12 +667,15 @@ class Sync(Machine):
 
     def _reads_within(self, seconds: float) -> int:
         """Return how many reads the component serves within a time."""
+        wait = 0.0 if self.expects_hash else READ_BATCH_TIME
         round_trip = self._context.round_trip.smoothed or 0.0
-        return max(0, int((seconds - round_trip - READ_BATCH_TIME) * self._reads.pace.rate))
+        return max(0, int((seconds - round_trip - wait) * self._reads.pace.rate))
 
     def _begin_shift(self, now: float) -> bool:
         """Read the shifted indices; return False if the table must be fetched."""
-        changes, order, count = self._count_changes, self._table.followed_order, self._table.count
+        table = self._table
+        changes, count = self._count_changes, table.count
+        order = table.previous_order if self.expects_hash else table.followed_order
         if not (changes and order and count and self._is_shift_worthwhile(now)):
             return False
         if len(order) + sum(change.added for change in changes) != count:
@@ -688,11 +707,41 @@ class Sync(Machine):
         table = self._table
         self._host.table_followed(table.settle(names))
         table.complete = True
-        self.synced = True
         self._has_count_changed = False
+        if self.expects_hash:
+            read = self._proof_read = self._reads.ask(HASH_CHECK, now)
+            read.on_done.append(partial(self._proof_came, read))
+            return
+        self.synced = True
         self._settled(now, self._known_at)
 
+    def _proof_came(self, read: Read) -> None:
+        """Take the table that the reads have shown if the hash proves it; otherwise check it as any other."""
+        if self._proof_read is not read:
+            return
+        self._proof_read = None
+        now, table = read.ended_at, self._table
+        announced = None if read.result is None else Announcement.answering(read)
+        is_proven = announced is not None and (
+            HashCheck(table).settle(announced, table.count or 0, needs_proof=True) is not None
+        )
+        if announced is None or not is_proven:
+            self._check_at = now
+            return
+        self.synced = self._changed_only_by_us = True
+        self._known_at = now
+        self._read_unhashed(announced.hash, now)
+        self._settled(now, now)
+
+    @property
+    def _is_shifting(self) -> bool:
+        """Whether the shifted indices are being read, or the table that they have shown is being proven."""
+        return self._shift is not None or self._proof_read is not None
+
     def _cancel_shift(self) -> None:
+        proof, self._proof_read = self._proof_read, None
+        if proof is not None:
+            self._reads.release(proof)
         shift, self._shift = self._shift, None
         if shift is not None:
             shift.cancel()

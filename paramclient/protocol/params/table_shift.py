@@ -10,7 +10,14 @@ from typing import Final, NamedTuple
 from paramclient.protocol.params.reads import Read, Reads
 from paramclient.protocol.requests.operation import Operation
 
-__all__ = ["CountChange", "ShiftedOrder", "TableShift", "reads_expected"]
+__all__ = [
+    "SEARCH_ROUNDS",
+    "CountChange",
+    "ShiftedOrder",
+    "TableShift",
+    "reads_expected",
+    "search_reads_expected",
+]
 
 CONTROL_READS: Final = 4
 """Reads spread over the table, which show a second change elsewhere. Together with the last index they are
@@ -19,6 +26,8 @@ READS_AROUND: Final = 2
 """Reads for each switch besides those of its group: the switch, and the parameter behind the group."""
 SPLITS: Final = 3
 """Reads that divide a gap in which the indices shift: 1,400 indices take 5 rounds of them."""
+SEARCH_ROUNDS: Final = 6
+"""Round trips until a group of an unknown place in such a table is found: those, and the group itself."""
 NEIGHBOURS: Final = 5
 """Reads on each side of an added parameter that was found: a group lies side by side."""
 
@@ -40,6 +49,12 @@ def reads_expected(changes: Iterable[CountChange]) -> int:
     group lies behind its switch."""
     around = sum(READS_AROUND + max(change.added, 0) for change in changes)
     return around + CONTROL_READS + 1
+
+
+def search_reads_expected(changes: Iterable[CountChange]) -> int:
+    """Return the same if nothing tells where the parameters are that stand side by side."""
+    around = sum(2 * NEIGHBOURS + max(change.added, 0) for change in changes)
+    return around + SPLITS * (SEARCH_ROUNDS - 1) + CONTROL_READS + 1
 
 
 class ShiftedOrder:

@@ -14,7 +14,7 @@ from paramclient.protocol.params.change import Added, Change, Changed, FirstValu
 from paramclient.protocol.params.sync import SyncSettings, SyncState
 from paramclient.protocol.params.sync_interval import PAUSE_MIN
 from paramclient.protocol.wire import FileTransfer, ParamRequestList, ParamRequestRead
-from paramclient.sim import Air, ArduPilotVehicle, FaultyLink
+from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle
 from tests.protocol.params.test_sync import INTERVAL, World, state
 
 GROUP = {f"GRIP_{number}": (ParamType.INT16, number) for number in range(7)}
@@ -445,3 +445,94 @@ def test_whatever_is_lost_ends_in_the_vehicles_table(seed: int) -> None:
     assert {name: param.index for name, param in table.params.items()} == {
         name: param.index for name, param in board.params.items()
     }
+
+
+# PX4: parameters that come into use
+
+
+MAG2 = "CAL_MAG2_ID"
+"""Its change brings 16 more parameters of the real quad into use."""
+
+
+def px4_in_sync(board: PX4Vehicle, faults: dict[str, Any], *, loss: float = 0.0) -> World:
+    """A session whose table was fetched and proven a while ago."""
+    links = [FaultyLink(**faults, loss=loss, seed=number) for number in (1, 2)]
+    world = World(air=Air([board], uplink=links[0], downlink=links[1]))
+    assert world.fetch().hash is not None
+    world.run(10.0)
+    assert state(world) is SyncState.SYNCED
+    world.events.clear()
+    world.sent.clear()
+    return world
+
+
+def proven(world: World, board: PX4Vehicle) -> bool:
+    """Whether the table is in sync, and is the vehicle's; its hash is."""
+    table = world.machine.table
+    listed = {name: param for name, param in table.params.items() if param.index is not None}
+    return (
+        state(world) is SyncState.SYNCED
+        and table.complete
+        and table.hash == board.announced_hash()
+        and {name: (param.index, param.value) for name, param in listed.items()}
+        == {name: (param.index, param.value) for name, param in board.params.items()}
+    )
+
+
+SERIAL: dict[str, Any] = {"burst": 3, "period": 0.075}
+"""A list of 40 values per second, as on a radio of 57600 baud."""
+
+
+@pytest.mark.parametrize(
+    ("options", "faults", "loss", "within"),
+    [
+        ({}, {"delay": 0.0005}, 0.0, 0.2),
+        ({}, {"delay": 0.05}, 0.05, 2.0),
+        (SERIAL, RADIO, 0.0, 3.0),
+        (SERIAL, RADIO, 0.05, 4.0),
+    ],
+    ids=["quick", "100 ms", "radio", "radio with loss"],
+)
+def test_parameters_that_come_into_use_are_found_by_reads_that_the_hash_proves(
+    options: dict[str, Any], faults: dict[str, Any], loss: float, within: float
+) -> None:
+    world = px4_in_sync(board := PX4Vehicle(**options), faults, loss=loss)
+    before = len(board.params)
+    world.set(MAG2, 131_341)
+    began = world.now
+    world.until(lambda: proven(world, board) and bool(changes(world, Added)))
+    assert world.now - began < within
+    assert len(changes(world, Added)) == len(board.params) - before == 16
+    assert all(change.name.startswith("CAL_MAG2_") for change in changes(world, Added))
+    assert world.sent_of(ParamRequestList) == []
+    indices = {read.param_index for read in world.sent_of(ParamRequestRead)} - {-1}
+    assert 16 <= len(indices) <= 70, "the list has more than 900"
+    world.run(2 * INTERVAL)
+    assert world.sent_of(ParamRequestList) == []
+
+
+def test_parameters_that_come_into_use_unannounced_are_found_by_reads_after_the_next_hash() -> None:
+    board = PX4Vehicle(not_in_use=("MC_ROLL_P", "MC_ROLLRATE_P", "RTL_DESCEND_ALT", "COM_RC_LOSS_T"))
+    world = px4_in_sync(board, {"delay": 0.0005})
+    board.use("MC_ROLL_P", "MC_ROLLRATE_P", "RTL_DESCEND_ALT", "COM_RC_LOSS_T")
+    world.until(lambda: proven(world, board) and bool(changes(world, Added)))
+    assert len(changes(world, Added)) == 4
+    assert world.sent_of(ParamRequestList) == []
+
+
+def test_a_table_that_the_hash_does_not_prove_is_fetched() -> None:
+    """A value has changed without a message."""
+    world = px4_in_sync(board := PX4Vehicle(), {"delay": 0.0005})
+    board.load({"MC_PITCH_P": 4.25})
+    world.set(MAG2, 131_341)
+    world.until(lambda: proven(world, board))
+    assert len(changes(world, Added)) == 16
+    assert len(world.sent_of(ParamRequestList)) == 1
+    assert "MC_PITCH_P" in {change.name for change in changes(world, Changed)}
+
+
+def test_with_a_long_round_trip_the_whole_table_is_quicker_than_the_search() -> None:
+    world = px4_in_sync(board := PX4Vehicle(), {"delay": 0.3})
+    world.set(MAG2, 131_341)
+    world.until(lambda: proven(world, board) and bool(changes(world, Added)))
+    assert len({read.param_index for read in world.sent_of(ParamRequestRead)}) > 900
