@@ -364,7 +364,7 @@ async def _find_only(
 ) -> Component:
     """Wait for the only component, as `ParamClient.only_component` does; the error lists all vehicles.
 
-    That call ends with the second vehicle that is received. The user chooses one of all: the others are
+    That call ends with the second vehicle that is heard. The user chooses one of all: the others are
     waited for as long as an autopilot takes for a heartbeat.
     """
     deadline = Deadline(timeout)
