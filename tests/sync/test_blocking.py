@@ -100,6 +100,14 @@ def ctrl_c() -> Iterator[None]:
     thread.join()
 
 
+@pytest.fixture(autouse=True)
+def raises_keyboard_interrupt() -> Iterator[None]:
+    """A job in the background of a shell ignores Ctrl-C, and so would its tests."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 # Calls
 
 
