@@ -56,6 +56,8 @@ FORWARDED_PER_TURN: Final = 16
 FORWARDED_QUEUE_MAX: Final = 1_000
 """Maximum number of queued frames of another program: a mission of 1,000 items. On a slow link further frames
 are dropped, as they would be with a link of its own."""
+SEND_BLOCK_MAX: Final = 10.0
+"""Seconds for which a slow link may block the sender; a longer time counts as a suspend of the computer."""
 
 logger = logging.getLogger(__name__)
 
@@ -262,6 +264,7 @@ class LinkTask:
             to_send = station.data_to_send()
             if to_send:
                 self._sent.set()
+            sent_from = anyio.current_time()
             turn_ends = time.perf_counter() + TURN_MAX
             for data, peer in to_send:
                 await self._transmit(data, peer)
@@ -277,7 +280,8 @@ class LinkTask:
             is_behind = self._is_behind(now)
             if is_behind:
                 due = now + TURN_MAX
-            self._suspend.expect(max(due, now))  # a deadline may have passed while the sender was blocked
+            blocked = min(now - sent_from, SEND_BLOCK_MAX)
+            self._suspend.expect(due + blocked)  # it may have passed while the link blocked the sender
             self._due = due
             wait = due - now
             with anyio.move_on_after(None if wait == math.inf else max(wait, 0.0)):
