@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import pytest
 
 from paramclient import Component, Event, Events, ParamClient
+from paramclient.cache import ParamCache
 from paramclient.client.client import implementation_of
 from paramclient.client.link_component import LinkComponent
 from paramclient.client.local import local
@@ -84,6 +85,7 @@ class ServedClient(RemoteClient):
     Args:
         link: the link.
         others: what further links of the service lead to, by their names.
+        kept: the cache of the service; None without one.
         options: of the client that the service makes for the link.
 
     Attributes:
@@ -92,10 +94,19 @@ class ServedClient(RemoteClient):
         roster: the components that it mirrors.
     """
 
-    def __init__(self, link: Any, *, others: Mapping[str, Any] | None = None, **options: Any) -> None:
+    def __init__(
+        self,
+        link: Any,
+        *,
+        others: Mapping[str, Any] | None = None,
+        kept: ParamCache | None = None,
+        **options: Any,
+    ) -> None:
         self.own: ParamClient | None = None
         self._is_served = False
         OPENED.add(self)
+        if kept is not None:
+            options["cache"] = kept
         first = ParamClient(link, **options)
         unused = [first]
 
@@ -106,7 +117,7 @@ class ServedClient(RemoteClient):
         more = [
             (name, lambda link=link: ParamClient(link, **options)) for name, link in (others or {}).items()
         ]
-        self.hub = Hub([(first.link.name, make), *more], cache=False, fetches=False)
+        self.hub = Hub([(first.link.name, make), *more], cache=kept or False, fetches=False)
         super().__init__("http://127.0.0.1:8765", transport=ASGITransport(create_app(self.hub)))
         implementation = implementation_of(self)
         assert isinstance(implementation, ServiceClient)

@@ -49,7 +49,6 @@ from paramclient.cli.targets import (
     Source,
     Targets,
     check_new,
-    check_no_service,
     check_pattern,
     describe,
     fill_pattern,
@@ -258,11 +257,20 @@ async def verify(
                 "for plain ones"
             )
         return await verify_extended(url, file, options)
-    check_no_service(url)
     check_pattern("--overlay", over, all_vehicles=all_vehicles)
     chosen = from_file(metadata)
     rules = read_rules(renames)
     values = Source(file, over, options, only=False)
+    if names_service(url):
+        from paramclient.cli.apply_over_service import ServiceSetUp, verify_over_service  # loads pydantic
+
+        if all_vehicles or expect is not None or chosen is not None:
+            raise UsageError(
+                "over a service, verify compares one vehicle, with the metadata of the service: --all, "
+                "--expect and --metadata FILE need the link itself"
+            )
+        compared_with = ServiceSetUp(include, renames=renames, full=full)
+        return await verify_over_service(url, values, compared_with, options, metadata=metadata)
     await values.open()
     async with targets(url, options, all_vehicles=all_vehicles, expect=expect, only=False) as found:
         wanted = await values.wanted(found.vehicles)
@@ -324,7 +332,17 @@ async def restore(
         if include or reboot or allow_armed or force:
             raise UsageError("--include, --reboot, --allow-armed and --force are for plain parameters")
         return await restore_extended(url, when, options, dry_run=dry_run, yes=yes, backup=backup)
-    check_no_service(url)
+    if names_service(url):
+        from paramclient.cli.apply_over_service import ServiceSetUp, restore_over_service  # loads pydantic
+
+        if backup is not None or is_plain_file:
+            raise UsageError(
+                "over a service, restore writes a state of the service's cache: a backup file and --backup "
+                "need the link itself. `paramclient apply` takes a file over a service"
+            )
+        moment = None if when is None else parse_when(when, time.time())
+        choices = ServiceSetUp(include, reboot, allow_armed, skip_invalid=True, force=force, full=full)
+        return await restore_over_service(url, moment, choices, options, dry_run=dry_run, yes=yes)
     async with targets(url, options, all_vehicles=False, expect=None, only=True) as found:
         [vehicle] = found.vehicles
         state = await _load_state(found, vehicle, when, options)

@@ -1,8 +1,10 @@
-"""The subcommand apply over a service: its set-up runs there as a job, and is shown as one on a link."""
+"""The subcommands apply, verify and restore over a service, with the output of those on a link.
+
+A set-up runs at the service as a job.
+"""
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,17 +19,20 @@ from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.metadata import VEHICLE, request_from_vehicle
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import print_document, printable, progress_bar, report, say
+from paramclient.cli.param_rows import described
 from paramclient.cli.results import (
     NamedVehicle,
     applied_code,
+    met_code,
     planned_code,
     show_applied,
     show_interrupted,
     show_planned,
+    show_verified,
 )
 from paramclient.cli.session import CommandSession, connect, receiver_in_words, wait_for_firmware
 from paramclient.cli.targets import Source, describe
-from paramclient.client.local import ServiceComponent
+from paramclient.client.local import ServiceComponent, SetUpKind
 from paramclient.documents.setup import (
     AppliedRowDoc,
     ApplyResultDoc,
@@ -35,17 +40,18 @@ from paramclient.documents.setup import (
     PlanDoc,
     PlanRowDoc,
     StepDoc,
+    VerifiedDoc,
 )
-from paramclient.errors import LinkError, NoReply, ParamClientError, UsageError
+from paramclient.errors import LinkError, NoReply, NotInCache, ParamClientError, UsageError
 from paramclient.files import FileFormat, dumps
 from paramclient.model.notation import parse_value
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType, WireValue
+from paramclient.model.values import ParamType, WireValue, type_of_name
 from paramclient.protocol.params.fetch_result import Progress
-from paramclient.provision import ApplyRow, ApplyStatus, Plan, PlanRow, PlanStatus
-from paramclient.provision.planning import Stage, Step
+from paramclient.provision import MISSING, ApplyRow, ApplyStatus, Plan, PlanRow, PlanStatus
+from paramclient.provision.planning import NOT_ON_VEHICLE, Stage, Step
 
-__all__ = ["ServiceSetUp", "apply_over_service"]
+__all__ = ["ServiceSetUp", "apply_over_service", "restore_over_service", "verify_over_service"]
 
 JOB_POLL_INTERVAL: Final = 0.25
 """Seconds between two requests for the state of the job: the service updates its progress as often."""
@@ -55,19 +61,24 @@ JOB_CANCEL_TIMEOUT: Final = 3.0
 
 @dataclass(frozen=True, slots=True)
 class ServiceSetUp:
-    """The options of apply that a service takes, as in the subcommand."""
+    """The options of a subcommand that a service takes, as in the subcommand."""
 
     include: Sequence[str]
-    reboot: bool
-    allow_armed: bool
-    skip_invalid: bool
-    force: bool
-    durable: bool
-    renames: str | None
-    full: bool
+    reboot: bool = False
+    allow_armed: bool = False
+    skip_invalid: bool = False
+    force: bool = False
+    durable: bool = False
+    renames: str | None = None
+    full: bool = False
+
+    @property
+    def of_writing(self) -> dict[str, Any]:
+        """The members of a request for any set-up, in addition to those for its plan."""
+        return {"full": self.full, "reboot": self.reboot, "allow_armed": self.allow_armed}
 
     def body(self, wanted: ParamSet) -> dict[str, Any]:
-        """Return the request for a plan or a set-up. Values are sent as they are in the file.
+        """Return the request for a comparison or a plan of apply. Values are sent as they are in the file.
 
         Raises:
             FileError: the file of --renames cannot be read.
@@ -112,36 +123,115 @@ async def apply_over_service(
     """
     await source.open()
     async with connect(url, options, only=True) as session:
-        component = session.component
-        assert isinstance(component, ServiceComponent)
-        wanted = (await source.wanted([component]))[component.system, component.component]
-        wanted = replace(wanted, component=component.component, system=None)
+        component = _of_service(session)
+        wanted = await _wanted(source, component)
         if metadata == VEHICLE:
             await request_from_vehicle(session)
         await wait_for_firmware([component], session.deadline)
-        set_up = _SetUp(session, component, choices, wanted)
-        if dry_run:
-            return await set_up.show_plan()
-        if not yes and can_confirm(options):
-            plan = await set_up.plan()
-            if plan.steps or choices.reboot:
-                show_planned({set_up.vehicle: plan}, reboot=choices.reboot, full=choices.full)
-                if not await confirm("go on?"):
-                    return ExitCode.INCOMPLETE
-        if not options.json:
-            say(printable(f"writing to {receiver_in_words(component)} on {session.client.link.name}"))
-        await session.check_only()
-        return set_up.show_result(await set_up.run())
+        body = choices.body(wanted)
+        more = choices.of_writing | {"skip_invalid": choices.skip_invalid, "durable": choices.durable}
+        set_up = _SetUp(session, component, choices, wanted, "apply", body, body | more)
+        return await set_up.ask_and_run(dry_run=dry_run, yes=yes)
+
+
+async def restore_over_service(
+    url: str,
+    when: float | None,
+    choices: ServiceSetUp,
+    options: LinkOptions,
+    *,
+    dry_run: bool,
+    yes: bool,
+) -> ExitCode:
+    """Restore an earlier state of a vehicle of a service, from its cache; see the subcommand restore.
+
+    Ctrl-C as with `apply_over_service`. The state is named by its time, so that another apply cannot change
+    what is restored.
+
+    Args:
+        url: the service.
+        when: a float is a time in unix seconds, an int the number of a snapshot, None the state before the
+            last apply.
+        choices, options, dry_run, yes: as in `apply_over_service`.
+
+    Raises:
+        ParamClientError: as restore on a link; LinkError also if the service cannot be reached.
+    """
+    async with connect(url, options, only=True) as session:
+        component = _of_service(session)
+        await wait_for_firmware([component], session.deadline)
+        try:
+            state = await component.load_state(when)
+        except NotInCache as error:
+            if when is None:
+                raise NotInCache(f"{error}, such as '2h ago'") from None
+            raise
+        say(printable(f"the state: {described(state)}"))
+        body = {"include": list(choices.include), "force": choices.force}
+        body |= {"snapshot": when} if isinstance(when, int) else {"at": state.at}
+        set_up = _SetUp(session, component, choices, state, "restore", body, body | choices.of_writing)
+        return await set_up.ask_and_run(dry_run=dry_run, yes=yes)
+
+
+async def verify_over_service(
+    url: str, source: Source, choices: ServiceSetUp, options: LinkOptions, *, metadata: str | None
+) -> ExitCode:
+    """Compare a vehicle of a service with parameters; see the subcommand verify.
+
+    Args:
+        url, source, choices, options, metadata: as in `apply_over_service`.
+
+    Raises:
+        ParamClientError: as verify on a link; LinkError also if the service cannot be reached.
+    """
+    await source.open()
+    async with connect(url, options) as session:
+        component = _of_service(session)
+        wanted = await _wanted(source, component)
+        if metadata == VEHICLE:
+            await request_from_vehicle(session)
+        body = choices.body(wanted)
+        if options.json:
+            body["full"] = choices.full
+            left = session.deadline.left()
+            document = VerifiedDoc.model_validate(await component.compare(body, timeout=left))
+            print_document(document)
+            return ExitCode.DONE if document.met else ExitCode.DIFFERENT
+        compared = _SetUp(session, component, choices, wanted, "apply", body, {})
+        plan = await compared.plan()
+        show_verified({compared.vehicle: plan}, full=choices.full)
+        return met_code(plan)
+
+
+def _of_service(session: CommandSession) -> ServiceComponent:
+    component = session.component
+    assert isinstance(component, ServiceComponent)
+    return component
+
+
+async def _wanted(source: Source, component: ServiceComponent) -> ParamSet:
+    """Return the wanted parameters, meant for this component."""
+    wanted = (await source.wanted([component]))[component.system, component.component]
+    return replace(wanted, component=component.component, system=None)
 
 
 @dataclass(frozen=True)
 class _SetUp:
-    """One set-up of a vehicle of a service."""
+    """One set-up of a vehicle of a service.
+
+    Attributes:
+        wanted: the wanted parameters, or the state to restore.
+        to_plan: the request for the plan.
+        to_run: the request for the set-up.
+    """
 
     session: CommandSession
     component: ServiceComponent
     choices: ServiceSetUp
     wanted: ParamSet
+    kind: SetUpKind
+    to_plan: Mapping[str, Any]
+    to_run: Mapping[str, Any]
 
     @cached_property
     def vehicle(self) -> NamedVehicle:
@@ -150,6 +240,22 @@ class _SetUp:
         return NamedVehicle(
             each.system, each.component, describe(each), receiver_in_words(each), each.identity
         )
+
+    async def ask_and_run(self, *, dry_run: bool, yes: bool) -> ExitCode:
+        """Print the plan, or ask for confirmation, run the set-up and print its result."""
+        session, choices = self.session, self.choices
+        if dry_run:
+            return await self.show_plan()
+        if not yes and can_confirm(session.options):
+            plan = await self.plan()
+            if plan.steps or choices.reboot:
+                show_planned({self.vehicle: plan}, reboot=choices.reboot, full=choices.full)
+                if not await confirm("go on?"):
+                    return ExitCode.INCOMPLETE
+        if not session.options.json:
+            say(printable(f"writing to {receiver_in_words(self.component)} on {session.client.link.name}"))
+        await session.check_only()
+        return self.show_result(await self.run())
 
     async def plan(self) -> Plan:
         """Return the plan of the service, with every parameter."""
@@ -170,24 +276,17 @@ class _SetUp:
         return code
 
     async def _planned(self, *, full: bool) -> PlanDoc:
-        body = self.choices.body(self.wanted) | {"full": full}
+        body = {**self.to_plan, "full": full}
         timeout = self.session.deadline.left()
-        return PlanDoc.model_validate(await self.component.plan_apply(body, timeout=timeout))
+        return PlanDoc.model_validate(await self.component.plan_set_up(self.kind, body, timeout=timeout))
 
     async def run(self) -> ApplyResultDoc:
         """Run the set-up as a job, and return its result; see `apply_over_service` for Ctrl-C."""
-        choices, component = self.choices, self.component
-        body = self.choices.body(self.wanted) | {
-            "full": choices.full,
-            "reboot": choices.reboot,
-            "allow_armed": choices.allow_armed,
-            "skip_invalid": choices.skip_invalid,
-            "durable": choices.durable,
-        }
-        began = anyio.current_time()
-        job = str((await component.begin_apply(body, timeout=self.session.deadline.left()))["id"])
+        began, timeout = anyio.current_time(), self.session.deadline.left()
+        job = str((await self.component.begin_set_up(self.kind, self.to_run, timeout=timeout))["id"])
+        title = "setting" if self.kind == "apply" else "restoring"
         try:
-            with progress_bar(f"setting {self.vehicle.label}") as draw:
+            with progress_bar(f"{title} {self.vehicle.label}") as draw:
 
                 def tell(progress: Mapping[str, Any]) -> None:
                     if draw is not None:
@@ -306,7 +405,10 @@ def _step(document: StepDoc, wanted: WrittenParam) -> Step:
 
 
 def _plan_row(name: str, document: PlanRowDoc, wanted: ParamSet) -> PlanRow:
-    return PlanRow(status=PlanStatus(document.status), **_members(name, document, wanted))
+    note = ""
+    if document.category == MISSING:
+        note = document.reason.removeprefix(NOT_ON_VEHICLE).removeprefix("; ")
+    return PlanRow(status=PlanStatus(document.status), rename_note=note, **_members(name, document, wanted))
 
 
 def _applied_row(name: str, document: AppliedRowDoc, wanted: ParamSet) -> ApplyRow:
@@ -338,10 +440,7 @@ def _value(given: object, kind: ParamType | int | None) -> WireValue | None:
 
 
 def _type_of(name: str | None) -> ParamType | int | None:
-    """Return the type with this name, or with its number for a type that MAVLink does not define."""
-    if name is None:
-        return None
-    return ParamType[name] if name in ParamType.__members__ else int(json.loads(name))
+    return None if name is None else type_of_name(name)
 
 
 def _progress_of(document: Mapping[str, Any], seconds: float) -> Progress:

@@ -25,7 +25,6 @@ from paramclient.client.client import ParamClient, implementation_of
 from paramclient.client.component import Component
 from paramclient.errors import FileError, NoReply, UsageError
 from paramclient.files import ParamFile
-from paramclient.links.names import names_service
 from paramclient.model.paramset import ParamSet
 from paramclient.provision import overlay
 from paramclient.provision.inspection import wait_for_identity
@@ -35,7 +34,6 @@ __all__ = [
     "Source",
     "Targets",
     "check_new",
-    "check_no_service",
     "check_pattern",
     "describe",
     "fill_pattern",
@@ -92,21 +90,6 @@ class Targets:
         """See `CommandSession.check_only`; does nothing with --all, which names every vehicle."""
         if not self.all_vehicles:
             await self.session.check_only()
-
-
-def check_no_service(url: str) -> None:
-    """Check that a link, and not a service, is given for verify or restore of plain parameters.
-
-    Raises:
-        UsageError: the URL of a service.
-    """
-    if names_service(url):
-        raise UsageError(
-            f"{url} is a service: verify and restore of plain parameters need the link itself. The service "
-            "does both by POST /api/v1/components/SYSTEM/COMPONENT/verify and "
-            "/api/v1/components/SYSTEM/COMPONENT/restore, or with its page; `paramclient apply` takes its "
-            "address"
-        )
 
 
 @asynccontextmanager

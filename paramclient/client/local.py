@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, Protocol, TypeVar
+from typing import Any, Final, Literal, Protocol, TypeAlias, TypeVar
 
 import anyio
 
@@ -24,6 +24,7 @@ from paramclient.client.subscription import Changes
 from paramclient.errors import ParamClientError, UsageError
 from paramclient.links import Link
 from paramclient.model.identity import Identity
+from paramclient.model.paramset import ParamSet
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.params.fetch import Fetch
@@ -36,6 +37,8 @@ __all__ = [
     "LocalComponent",
     "LocalExtParams",
     "ServiceComponent",
+    "SetUpKind",
+    "check_has_link",
     "local",
     "not_given",
     "wait_until_identified",
@@ -44,6 +47,8 @@ __all__ = [
 IDENTITY_POLL_INTERVAL: Final = 0.05
 """Seconds between two checks of the identity of a vehicle: no event reports it."""
 
+SetUpKind: TypeAlias = Literal["apply", "restore"]
+"""The set-ups that a service runs as jobs."""
 Result = TypeVar("Result")
 
 
@@ -230,9 +235,43 @@ class ServiceComponent(Component):
             ParamClientError: the error that the service reports.
         """
 
+    @property
     @abstractmethod
-    async def plan_apply(self, body: Mapping[str, Any], *, timeout: float | None = None) -> Mapping[str, Any]:
+    def service(self) -> str:
+        """The address of the service, as the name of a link."""
+
+    @abstractmethod
+    async def load_state(self, when: float | None = None) -> ParamSet:
+        """Return an earlier state of the component from the cache of the service.
+
+        Args:
+            when: a float is a time in unix seconds, an int the number of a snapshot, None the state before
+                the last apply.
+
+        Raises:
+            NotInCache: the cache has no such state.
+            ParamClientError: as from `read_descriptions`.
+        """
+
+    @abstractmethod
+    async def plan_set_up(
+        self, kind: SetUpKind, body: Mapping[str, Any], *, timeout: float | None = None
+    ) -> Mapping[str, Any]:
         """Return what a set-up would write as JSON (`PlanDoc`); writes nothing.
+
+        Args:
+            kind: the set-up.
+            body: the wanted parameters, or the state to restore, and options (`PlanRequest`,
+                `RestoreRequest`).
+            timeout: seconds; None for the choice of the service.
+
+        Raises:
+            ParamClientError: as from `read_descriptions`.
+        """
+
+    @abstractmethod
+    async def compare(self, body: Mapping[str, Any], *, timeout: float | None = None) -> Mapping[str, Any]:
+        """Return the comparison with wanted parameters as JSON (`VerifiedDoc`).
 
         Args:
             body: the wanted parameters and options (`PlanRequest`).
@@ -243,15 +282,16 @@ class ServiceComponent(Component):
         """
 
     @abstractmethod
-    async def begin_apply(
-        self, body: Mapping[str, Any], *, timeout: float | None = None
+    async def begin_set_up(
+        self, kind: SetUpKind, body: Mapping[str, Any], *, timeout: float | None = None
     ) -> Mapping[str, Any]:
         """Start a set-up as a job of the service, and return the job as JSON (`JobDoc`).
 
         The job continues if this program ends. A request whose response is lost is not sent again.
 
         Args:
-            body: the wanted parameters and options (`ApplyRequest`).
+            kind: the set-up.
+            body: as for `plan_set_up`, with the options of the set-up (`ApplyRequest`, `RestoreRequest`).
             timeout: seconds for the job; None for no limit.
 
         Raises:
@@ -292,6 +332,28 @@ def local(component: Component) -> LocalComponent:
     if not isinstance(component, LocalComponent):
         raise not_given("what this needs")
     return component
+
+
+def check_has_link(component: Component, call: str, command: str, path: str) -> None:
+    """Check that a component is on a link of this process, before a call that a service can do as well.
+
+    Args:
+        component: the component.
+        call: the name of the call.
+        command: the command that does the same over a service, with `{}` for its address.
+        path: the last part of the path at which the service does the same.
+
+    Raises:
+        UsageError: the component belongs to a client over a service; the message says how it does the same.
+    """
+    if not isinstance(component, ServiceComponent):
+        return
+    base, mark, link = component.service.partition("?")
+    address = f"{base}/api/v1/components/{component.system}/{component.component}/{path}{mark}{link}"
+    raise UsageError(
+        f"a service does not give {call}() the link itself, which it needs. The service does the same: run "
+        f"`paramclient {command.format(component.service)}`, or send POST {address}, for example with httpx"
+    )
 
 
 async def wait_until_identified(component: LocalComponent, timeout: float) -> None:

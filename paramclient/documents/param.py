@@ -18,13 +18,13 @@ from paramclient.model.notation import (
     value_written,
 )
 from paramclient.model.values import (
-    TYPES_BY_NAME,
     Param,
     ParamType,
     Trust,
     format_value,
     from_bits,
     type_name,
+    type_of_name,
 )
 
 if TYPE_CHECKING:
@@ -203,8 +203,7 @@ class ParamDoc(Document):
         Raises:
             ArithmeticError, LookupError, TypeError, ValueError: a member is not valid.
         """
-        known = TYPES_BY_NAME.get(self.type)
-        kind = int(self.type.removeprefix("TYPE_")) if known is None else known
+        kind = type_of_name(self.type)
         bits = int(self.bits, 16)
         is_raw = isinstance(self.value, str) and self.value.startswith("0x")
         default = None if self.default_source is DefaultSource.METADATA else self.default

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Final
 
+from paramclient.documents.component import IdentityDoc
 from paramclient.documents.document import Document
 from paramclient.documents.param import WrittenParamDoc
 from paramclient.files.formats import ENDINGS, WRITABLE, FileFormat
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from paramclient.model.defaults import DefaultSource
     from paramclient.model.paramset import ParamSet
 
-__all__ = ["FileDoc", "FormatDoc", "FormatsDoc", "OriginDoc", "SetDoc", "UploadedDoc"]
+__all__ = ["FileDoc", "FormatDoc", "FormatsDoc", "OriginDoc", "SetDoc", "StateDoc", "UploadedDoc"]
 
 
 class OriginDoc(Document):
@@ -62,6 +63,29 @@ class SetDoc(OriginDoc):
         origins = sources or {}
         written = {name: WrittenParamDoc.of(param, origins.get(name)) for name, param in params.items()}
         return cls(**OriginDoc.of(params).model_dump(), params=written)
+
+
+class StateDoc(Document):
+    """An earlier state of a component, with its identity at that time; `at` is in unix seconds."""
+
+    system: int | None
+    component: int | None
+    at: float | None
+    source: str
+    identity: IdentityDoc | None
+    params: dict[str, WrittenParamDoc]
+
+    @classmethod
+    def of(cls, state: ParamSet) -> StateDoc:
+        """Return the document of a `ParamSet`."""
+        return cls(
+            system=state.system,
+            component=state.component,
+            at=state.at,
+            source=state.source,
+            identity=None if state.identity is None else IdentityDoc.of(state.identity),
+            params={name: WrittenParamDoc.of(param) for name, param in state.items()},
+        )
 
 
 class FileDoc(Document):

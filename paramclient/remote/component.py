@@ -16,11 +16,12 @@ from paramclient.client.arguments import (
 )
 from paramclient.client.component import Component
 from paramclient.client.extended_params import ExtParams
-from paramclient.client.local import ServiceComponent, not_given
+from paramclient.client.local import ServiceComponent, SetUpKind, not_given
 from paramclient.client.subscription import Changes
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.model.identity import Identity
 from paramclient.model.params import ParamMap
+from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Encoding, Param, Settable, WireValue, check_value
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.params.fetch_result import FetchResult, Progress
@@ -40,6 +41,7 @@ from paramclient.remote.decoding import (
     param_of,
     set_outcome_of,
     set_result_of,
+    state_of,
     value_as_sent,
 )
 from paramclient.remote.http import ServiceResponse
@@ -368,17 +370,37 @@ class RemoteComponent(ServiceComponent):
         document: Document = answer.document
         return document
 
-    async def plan_apply(self, body: Mapping[str, Any], *, timeout: float | None = None) -> Mapping[str, Any]:
-        """See `ServiceComponent.plan_apply`."""
-        return await self._ask("POST", f"{self._mirrored.path}/plan", body, "the plan of a set-up", timeout)
+    @property
+    def service(self) -> str:
+        """See `ServiceComponent.service`."""
+        return self._service.name
 
-    async def begin_apply(
-        self, body: Mapping[str, Any], *, timeout: float | None = None
+    async def load_state(self, when: float | None = None) -> ParamSet:
+        """See `ServiceComponent.load_state`."""
+        body = {} if when is None else {"snapshot": when} if isinstance(when, int) else {"at": when}
+        document = await self._ask("POST", f"{self._mirrored.path}/state", body, "the state to restore")
+        with decode_errors(self._service.name):
+            return state_of(document)
+
+    async def plan_set_up(
+        self, kind: SetUpKind, body: Mapping[str, Any], *, timeout: float | None = None
     ) -> Mapping[str, Any]:
-        """See `ServiceComponent.begin_apply`."""
+        """See `ServiceComponent.plan_set_up`."""
+        path = "plan" if kind == "apply" else kind
+        body = body if kind == "apply" else {**body, "dry_run": True}
+        return await self._ask("POST", f"{self._mirrored.path}/{path}", body, "the plan of a set-up", timeout)
+
+    async def compare(self, body: Mapping[str, Any], *, timeout: float | None = None) -> Mapping[str, Any]:
+        """See `ServiceComponent.compare`."""
+        return await self._ask("POST", f"{self._mirrored.path}/verify", body, "a comparison", timeout)
+
+    async def begin_set_up(
+        self, kind: SetUpKind, body: Mapping[str, Any], *, timeout: float | None = None
+    ) -> Mapping[str, Any]:
+        """See `ServiceComponent.begin_set_up`."""
         return await self._ask(
             "POST",
-            f"{self._mirrored.path}/apply",
+            f"{self._mirrored.path}/{kind}",
             {**body, "wait": False},
             f"the set-up of {self.system}/{self.component}",
             timeout,

@@ -17,7 +17,9 @@ from paramclient.errors import LinkError, ParamClientError
 from paramclient.model.ext_params import ExtParam, ExtValue
 from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.identity import Identity
-from paramclient.model.values import Param, WireValue
+from paramclient.model.notation import parse_value
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.values import Param, ParamType, WireValue, type_of_name
 from paramclient.protocol.ext.fetch import ExtFetchResult
 from paramclient.protocol.ext.write_batch import ExtSetOutcome
 from paramclient.protocol.ext.writes import ExtSetResult
@@ -46,6 +48,7 @@ __all__ = [
     "progress_of",
     "set_outcome_of",
     "set_result_of",
+    "state_of",
     "stats_of",
     "decode_errors",
     "value_as_sent",
@@ -232,6 +235,28 @@ def ext_state_of(document: Document, identity: Identity) -> ExtParamSet:
         str(document["source"]),
         identity,
     )
+
+
+def state_of(document: Document) -> ParamSet:
+    """Return an earlier state of a component (`StateDoc`)."""
+    at, identity = document["at"], document["identity"]
+    for name in ("system", "component"):
+        check_kind(document[name], int, NoneType)
+    return ParamSet(
+        {name: _written_of(name, each) for name, each in document["params"].items()},
+        document["component"],
+        document["system"],
+        None if identity is None else identity_of(identity),
+        None if at is None else float(at),
+        str(document["source"]),
+    )
+
+
+def _written_of(name: str, document: Document) -> WrittenParam:
+    name_of_type = document["type"]
+    kind = None if name_of_type is None else type_of_name(name_of_type)
+    value = parse_value(document["value"], ParamType.REAL64 if kind is None else kind)
+    return WrittenParam(name, value, kind)
 
 
 def ext_value_as_sent(value: ExtValue) -> object:

@@ -353,6 +353,8 @@ def _reason(error: Exception) -> str:
             return f"its certificate is not trusted: {cause.verify_message}"
         if isinstance(cause, ssl.SSLError):  # its errno is not one of the operating system
             return f"TLS: {(cause.reason or str(cause)).replace('_', ' ').lower()}"
+        if isinstance(cause, OSError) and cause.errno == errno.ECONNREFUSED:
+            return "connection refused. Is `paramclient serve` running there?"
         if isinstance(cause, OSError) and cause.errno is not None and cause.errno in errno.errorcode:
             return os.strerror(cause.errno).lower()
         if isinstance(cause, OSError) and cause.strerror:

@@ -7,7 +7,7 @@ import binascii
 from codecs import BOM_UTF8
 from collections.abc import Callable
 from datetime import datetime
-from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Final, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from paramclient.service.hub import Hub
 
 __all__ = [
+    "EarlierState",
     "OtherComponent",
     "LimitedPatterns",
     "UploadedFile",
@@ -214,6 +215,24 @@ class CachedSource(Body):
     component: Id
     snapshot: Number | None = None
     at: Timestamp | None = None
+
+
+class EarlierState(Body):
+    """An earlier state: a snapshot, a time, or without both the state before the last apply."""
+
+    snapshot: Number | None = None
+    at: Timestamp | None = None
+
+    @model_validator(mode="after")
+    def _is_one(self) -> Self:
+        if self.snapshot is not None and self.at is not None:
+            raise ValueError("`snapshot` and `at` exclude each other")
+        return self
+
+    @property
+    def when(self) -> int | float | None:
+        """The number of the snapshot, the time, or None."""
+        return self.at if self.snapshot is None else self.snapshot
 
 
 class WantedParams(Body):

@@ -1,11 +1,12 @@
-"""apply over a service: the same result, exit codes and JSON as on a link; Ctrl-C cancels the job."""
+"""apply, verify and restore over a service: the output and exit codes of a link; Ctrl-C cancels the job."""
 
 from __future__ import annotations
 
 import asyncio
 import re
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import anyio
 import pytest
 
 from paramclient import LinkError
+from paramclient.cache import ParamCache
 from paramclient.cli import apply_over_service
 from paramclient.cli import session as cli_session
 from paramclient.links import SimLink
@@ -63,13 +65,12 @@ class ApartHub:
             await self._task
 
 
-@pytest.fixture
-def served(monkeypatch: pytest.MonkeyPatch) -> Put:
-    """Connect every URL to a service with the vehicle."""
+def serving(monkeypatch: pytest.MonkeyPatch, kept: ParamCache | None = None) -> Put:
+    """Return a function that connects every URL to a service with the vehicle."""
 
     def place(far_end: Any) -> str:
         def client(url: str, **_: Any) -> ServedClient:
-            made = ServedClient(SimLink(far_end, "sim:custom"))
+            made = ServedClient(SimLink(far_end, "sim:custom"), kept=kept)
             monkeypatch.setattr(made, "hub", ApartHub(made.hub))
             return made
 
@@ -77,6 +78,25 @@ def served(monkeypatch: pytest.MonkeyPatch) -> Put:
         return SERVICE
 
     return place
+
+
+@pytest.fixture
+def served(monkeypatch: pytest.MonkeyPatch) -> Put:
+    """Connect every URL to a service with the vehicle."""
+    return serving(monkeypatch)
+
+
+@pytest.fixture
+def kept(tmp_path: Path) -> Iterator[ParamCache]:
+    """The cache of a service."""
+    with ParamCache(tmp_path / "service.sqlite3") as cache:
+        yield cache
+
+
+@pytest.fixture
+def keeping(monkeypatch: pytest.MonkeyPatch, kept: ParamCache) -> Put:
+    """Connect every URL to a service with the vehicle and a cache."""
+    return serving(monkeypatch, kept)
 
 
 @pytest.fixture
@@ -96,8 +116,8 @@ def copter(**options: Any) -> ArduPilotVehicle:
 
 
 def comparable(text: str) -> str:
-    """The text without durations and the name of the link."""
-    return re.sub(r'in \d+\.\d s|"elapsed_s": [\d.]+|on (udpin|http)\S+', "", text)
+    """The text without durations, times and the name of the link."""
+    return re.sub(r'in \d+\.\d s|"elapsed_s": [\d.]+|on (udpin|http)\S+|\d{4}-\d\d-\d\dT\S+', "", text)
 
 
 @pytest.mark.parametrize("options", [[], ["--full"], ["--json"], ["--json", "--full"], ["--dry-run"]])
@@ -278,4 +298,158 @@ def test_options_that_need_the_link_are_refused(
     done = command("apply", served(vehicle), file, *words)
     assert done.code == 2
     assert "need the link itself" in done.err
+    assert dict(vehicle.values) == TABLE
+
+
+# verify
+
+
+@pytest.mark.parametrize("options", [[], ["--full"], ["--json"], ["--json", "--full"]])
+def test_verify_prints_what_it_prints_on_a_link(
+    command: Command, put: Put, served: Put, file: Path, options: list[str]
+) -> None:
+    on_link = command("verify", put(copter()), file, *options)
+    vehicle = copter()
+    done = command("verify", served(vehicle), file, *options)
+    assert done.code == on_link.code == 1
+    assert (done.out, comparable(done.err)) == (on_link.out, comparable(on_link.err))
+    assert "ABSENT" in done.out
+    assert dict(vehicle.values) == TABLE
+
+
+def test_verify_ends_with_0_if_the_vehicle_has_all_values(
+    command: Command, served: Put, tmp_path: Path
+) -> None:
+    file = tmp_path / "one.parm"
+    file.write_text("GAIN,4\n")
+    for options in ([], ["--json"]):
+        assert command("verify", served(copter()), file, *options).code == 0
+
+
+def test_verify_uses_renames_and_an_overlay(
+    command: Command, put: Put, served: Put, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # a service is told the name of a file, not its folder
+    over, renames = Path("over.parm"), Path("renames.yaml")
+    over.write_text("GAIN,4.0\n")
+    file.write_text("GAIN,6.5\nOLD_RATE,0.5\nGONE,1\n")
+    renames.write_text("- {old: OLD_RATE, new: RATE}\n- {old: GONE, new: GONE_TOO}\n")
+    words = (file, "--overlay", over, "--renames", renames, "--full")
+    done = command("verify", served(copter()), *words)
+    on_link = command("verify", put(copter()), *words)
+    assert (done.code, done.out) == (on_link.code, on_link.out)
+    assert "RATE on this vehicle" in done.out
+    assert "GONE_TOO" in done.out
+
+
+@pytest.mark.parametrize("option", [["--all"], ["--all", "--expect", "2"], ["--metadata", "FILE"]])
+def test_verify_refuses_options_that_need_the_link(
+    command: Command, served: Put, file: Path, option: list[str]
+) -> None:
+    described = Path(__file__).parents[2] / "examples/metadata/copter.pdef.xml"
+    done = command(
+        "verify", served(copter()), file, *[described if word == "FILE" else word for word in option]
+    )
+    assert done.code == 2
+    assert "need the link itself" in done.err
+
+
+# restore
+
+
+@pytest.mark.parametrize("options", [[], ["--full"], ["--json"], ["--json", "--full"], ["--dry-run"]])
+@pytest.mark.parametrize("kind", [copter, lambda: PX4Vehicle(table=TABLE)])
+def test_restore_prints_what_it_prints_on_a_link(
+    command: Command, put: Put, keeping: Put, file: Path, options: list[str], kind: Callable[[], Any]
+) -> None:
+    on_board = kind()
+    command("apply", put(on_board), file)
+    on_link = command("restore", put(on_board), *options)
+    vehicle = kind()
+    assert command("apply", keeping(vehicle), file).code == 1
+    assert vehicle.values["GAIN"] == 6.5
+    done = command("restore", keeping(vehicle), *options)
+    assert done.code == on_link.code == 0, done.err
+    assert comparable(done.out) == comparable(on_link.out)
+    assert comparable(done.err) == comparable(on_link.err)
+    assert "the state: 3 parameters of 1/1" in done.err
+    assert vehicle.values["GAIN"] == (6.5 if "--dry-run" in options else 4.0)
+
+
+def test_restore_takes_the_number_of_a_snapshot_and_a_time(
+    command: Command, keeping: Put, file: Path, kept: ParamCache
+) -> None:
+    vehicle = copter()
+    command("apply", keeping(vehicle), file)
+    command("restore", keeping(vehicle))
+    assert vehicle.values["GAIN"] == 4.0
+    [before_apply, before_restore] = kept.snapshots(kept.components()[0].key, 1)
+    vehicle = copter()  # a new one, as each command begins its simulated time anew
+    assert command("restore", keeping(vehicle), before_restore.id).code == 0
+    assert vehicle.values["GAIN"] == 6.5
+    done = command("restore", keeping(vehicle), before_apply.id, "--dry-run", "--json")
+    assert (done.code, done.json["params"]["GAIN"]["wanted"]) == (0, 4.0)
+    assert vehicle.values["GAIN"] == 6.5
+    assert command("restore", keeping(copter()), "2h ago").code == 5
+    vehicle = ArduPilotVehicle(live=(), table=dict(vehicle.values))
+    moment = datetime.fromtimestamp(before_apply.at, UTC).isoformat()
+    assert command("restore", keeping(vehicle), moment).code == 0
+    assert vehicle.values["GAIN"] == 4.0
+
+
+def test_restore_names_what_the_cache_of_the_service_lacks(command: Command, put: Put, keeping: Put) -> None:
+    for words in ([], ["99"]):
+        on_link = command("restore", put(copter()), *words)
+        done = command("restore", keeping(copter()), *words)
+        assert (done.code, done.out) == (on_link.code, "")
+        assert on_link.err.splitlines()[-1].startswith(done.err.splitlines()[-1].rstrip("."))
+
+
+def test_restore_is_confirmed_on_a_terminal(
+    command: Command, keeping: Put, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def decline(question: str) -> bool:
+        return False
+
+    vehicle = copter()
+    command("apply", keeping(vehicle), file)
+    monkeypatch.setattr(apply_over_service, "can_confirm", lambda options: True)
+    monkeypatch.setattr(apply_over_service, "confirm", decline)
+    done = command("restore", keeping(vehicle))
+    assert (done.code, vehicle.values["GAIN"]) == (1, 6.5)
+    assert ["1", "GAIN", "6.5", "4.0", "set", "all other parameters"] in done.rows
+    assert command("restore", keeping(vehicle), "--yes").code == 0
+    assert vehicle.values["GAIN"] == 4.0
+
+
+def test_ctrl_c_cancels_a_restore(command: Command, keeping: Put, many: Path) -> None:
+    vehicle = GenericVehicle(dict.fromkeys(NAMES, 1))
+    assert command("apply", keeping(vehicle), many).code == 0
+    interrupting = Interrupting(dict.fromkeys(NAMES, 2))
+    done = command("restore", keeping(interrupting))
+    assert done.code == 130
+    assert "interrupted: " in done.err
+    assert list(interrupting.values.values()).count(2) > 0
+
+
+def test_an_armed_vehicle_refuses_a_restore(command: Command, keeping: Put, file: Path) -> None:
+    vehicle = copter()
+    command("apply", keeping(vehicle), file)
+    armed = ArduPilotVehicle(live=(), table=dict(vehicle.values), armed=True)
+    refused = command("restore", keeping(armed))
+    assert (refused.code, armed.values["GAIN"]) == (1, 6.5)
+    assert "armed" in refused.err
+    assert command("restore", keeping(armed), "--allow-armed").code == 0
+    assert armed.values["GAIN"] == 4.0
+
+
+@pytest.mark.parametrize("words", [["--backup", "x.parm"], ["FILE"]])
+def test_restore_refuses_files(
+    command: Command, keeping: Put, file: Path, tmp_path: Path, words: list[str]
+) -> None:
+    vehicle = copter()
+    given = [{"x.parm": tmp_path / "x.parm", "FILE": file}.get(word, word) for word in words]
+    done = command("restore", keeping(vehicle), *given)
+    assert done.code == 2
+    assert "a backup file and --backup need the link itself" in done.err
     assert dict(vehicle.values) == TABLE

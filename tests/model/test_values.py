@@ -36,6 +36,7 @@ from paramclient.model.values import (
     same_bits,
     shortest_float,
     type_name,
+    type_of_name,
 )
 
 BYTEWISE, C_CAST = Encoding.BYTEWISE, Encoding.C_CAST
@@ -87,6 +88,7 @@ def test_types_have_mavlinks_numbers_and_names() -> None:
         assert getattr(dialect, f"MAV_PARAM_TYPE_{kind.name}") == kind
         assert known_type(int(kind)) is kind
         assert type_name(kind) == kind.name
+        assert type_of_name(kind.name) is kind
     assert len(KNOWN) == dialect.MAV_PARAM_TYPE_ENUM_END - 1
 
 
@@ -109,6 +111,7 @@ def test_an_unknown_type_keeps_its_number(number: int) -> None:
     assert known_type(number) == number
     assert not isinstance(known_type(number), ParamType)
     assert type_name(number) == f"TYPE_{number}"
+    assert type_of_name(f"TYPE_{number}") == number
 
 
 @pytest.mark.parametrize("number", UNDEFINED)

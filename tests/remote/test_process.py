@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import re
 import socket
 import sys
 import threading
@@ -16,7 +17,7 @@ from typing import Any
 import anyio
 import pytest
 
-from paramclient import LinkError, ParamClient, UsageError, provision
+from paramclient import LinkError, ParamClient, UsageError, provision, sync
 from paramclient.client import reconnection
 from paramclient.model.paramset import ParamSet
 from paramclient.service import Hub, Listening, serve
@@ -69,8 +70,10 @@ async def test_the_library_over_sockets_and_through_a_restart(monkeypatch: pytes
             assert (await component.set("PARAM_01", 77)).actual == 77
             assert component.params["PARAM_01"].value == 77
         await until(lambda: "away" in repr(client))
+        refused = r"connection refused\. Is `paramclient serve` running there\?"
         with pytest.raises(LinkError, match="connection refused") as caught:
             await component.get("PARAM_01")
+        assert re.fullmatch(f"{url}: {refused}", str(caught.value))
         assert caught.value.link == url
         with running(vehicle, int(url.rpartition(":")[2])):
             await until(lambda: "open" in repr(client))
@@ -105,6 +108,39 @@ def test_the_command_over_a_service(
         assert refused.code != 0
         assert "cache is only for a client with its own link" in refused.err
     assert not list(tmp_path.glob("**/*.sqlite3")), "nothing is cached here"
+
+
+def test_a_command_asks_whether_the_service_runs() -> None:
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))
+        url = f"http://127.0.0.1:{unused.getsockname()[1]}"
+        with pytest.raises(LinkError, match=r"connection refused\. Is `paramclient serve` running there\?"):
+            asyncio.run(ParamClient(url).__aenter__())
+
+
+@pytest.mark.parametrize(
+    ("call", "command", "path"),
+    [
+        ("apply", "apply {} FILE", "apply"),
+        ("restore", "restore {}", "restore"),
+        ("verify", "verify {} FILE", "verify"),
+        ("prepare", "apply --dry-run {} FILE", "plan"),
+    ],
+)
+def test_a_set_up_by_the_library_names_the_command_and_the_request_that_do_it(
+    call: str, command: str, path: str
+) -> None:
+    vehicle = small_px4()
+    wanted = ParamSet.of([vehicle.param("PARAM_01")])
+    with running(vehicle) as url, sync.ParamClient(url) as client:
+        component = client.only_component()
+        with pytest.raises(UsageError, match="a service does not give") as caught:
+            getattr(sync, call)(component, wanted)
+        told = str(caught.value)
+        assert f"does not give {call}() the link itself" in told
+        assert f"`paramclient {command.format(url)}`" in told
+        assert f"POST {url}/api/v1/components/1/1/{path}, for example with httpx" in told
+    assert vehicle.requests["PARAM_SET"] == 0
 
 
 def test_a_whole_set_up_is_refused_before_anything_is_written() -> None:

@@ -268,6 +268,10 @@ async def test_an_earlier_state_comes_back(vehicle: Callable[..., Vehicle], tmp_
     on_board = vehicle()
     async with serving(on_board, place=tmp_path) as service:
         await service.post(f"{HERE}/apply", {"wanted": {"values": {"TUNE_01": 9, "TUNE_02": 9}}})
+        state = await service.post(f"{HERE}/state", {})
+        assert (state["system"], state["identity"]["system"]) == (1, 1)
+        assert state["params"]["TUNE_01"]["value"] == pytest.approx(0.35)
+        assert state == await service.post(f"{HERE}/state", {"at": state["at"]})
         planned = await service.post(f"{HERE}/restore", {"dry_run": True})
         assert planned["params"].keys() == {"TUNE_01", "TUNE_02"}
         back = await service.post(f"{HERE}/restore", {})
@@ -280,10 +284,11 @@ async def test_an_earlier_state_comes_back(vehicle: Callable[..., Vehicle], tmp_
         again = await service.post(f"{HERE}/restore", {"snapshot": kept[1]["id"]})
         assert again["counts"]["set"] == 2
         assert on_board.values["TUNE_01"] == 9
-        unknown = await service.post(f"{HERE}/restore", {"snapshot": 999}, 404)
-        assert unknown["type"] == "urn:paramclient:unknown-state"
-        both = await service.post(f"{HERE}/restore", {"snapshot": 1, "at": 5}, 422)
-        assert "exclude each other" in both["detail"]
+        for path in ("restore", "state"):
+            unknown = await service.post(f"{HERE}/{path}", {"snapshot": 999}, 404)
+            assert unknown["type"] == "urn:paramclient:unknown-state"
+            both = await service.post(f"{HERE}/{path}", {"snapshot": 1, "at": 5}, 422)
+            assert "exclude each other" in both["detail"]
 
 
 @in_simulated_time

@@ -8,7 +8,6 @@ from typing import Final, TypeVar
 
 import anyio
 from fastapi import APIRouter, Depends, Request, Response
-from pydantic import model_validator
 
 from paramclient.documents.diff import DiffDoc
 from paramclient.documents.document import Body, Document
@@ -26,9 +25,8 @@ from paramclient.service.followed_component import FollowedComponent
 from paramclient.service.hub import Hub
 from paramclient.service.jobs import Job, Kind
 from paramclient.service.param_sources import (
-    Number,
+    EarlierState,
     Patterns,
-    Timestamp,
     UploadedRenames,
     WantedParams,
     current_set,
@@ -103,11 +101,9 @@ class ApplyRequest(PlanRequest):
     wait: bool = True
 
 
-class RestoreRequest(Body):
-    """State to restore: a snapshot, a time, or without both the state before the last apply."""
+class RestoreRequest(EarlierState):
+    """The state to restore, with options."""
 
-    snapshot: Number | None = None
-    at: Timestamp | None = None
     include: Patterns = ()
     reboot: bool = False
     allow_armed: bool = False
@@ -116,17 +112,6 @@ class RestoreRequest(Body):
     full: bool = False
     wait: bool = True
     timeout_s: Seconds = None
-
-    @model_validator(mode="after")
-    def _is_one(self) -> RestoreRequest:
-        if self.snapshot is not None and self.at is not None:
-            raise ValueError("`snapshot` and `at` exclude each other")
-        return self
-
-    @property
-    def when(self) -> int | float | None:
-        """Return the number of the snapshot, the time, or None."""
-        return self.at if self.snapshot is None else self.snapshot
 
 
 @router.post("/diff", response_model=DiffDoc)

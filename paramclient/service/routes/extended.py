@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Final, Self
+from typing import Annotated, Final
 
 import anyio
 from fastapi import APIRouter, Depends, Query, Request, Response
-from pydantic import Field, StrictInt, model_validator
+from pydantic import Field, StrictInt
 
 from paramclient.documents.document import Body, Document, InParts
 from paramclient.documents.extended_param import ExtParamDoc
@@ -42,9 +42,8 @@ from paramclient.service.followed_component import FollowedComponent
 from paramclient.service.param_sources import (
     PATTERNS_MAX,
     REQUEST_VALUES_MAX,
-    Number,
+    EarlierState,
     Pattern,
-    Timestamp,
 )
 from paramclient.service.problems import problem_of
 from paramclient.service.request_body import BodyRoute
@@ -163,24 +162,6 @@ class ExtApplyRequest(ExtPlanRequest):
     """Wanted extended parameters, with options."""
 
     durable: Durable = False
-
-
-class EarlierState(Body):
-    """An earlier state: a snapshot, a time, or without both the state before the last apply."""
-
-    snapshot: Number | None = None
-    at: Timestamp | None = None
-
-    @model_validator(mode="after")
-    def _is_one(self) -> Self:
-        if self.snapshot is not None and self.at is not None:
-            raise ValueError("`snapshot` and `at` exclude each other")
-        return self
-
-    @property
-    def when(self) -> int | float | None:
-        """The number of the snapshot, the time, or None."""
-        return self.at if self.snapshot is None else self.snapshot
 
 
 class ExtRestoreRequest(EarlierState):

@@ -18,7 +18,7 @@ from paramclient.documents.document import Body, InParts
 from paramclient.documents.extended_output import ExtHistoryDoc
 from paramclient.documents.fleet import FleetDiffDoc, NameSpreadDoc
 from paramclient.documents.history import HistoryDoc, SnapshotDoc, SnapshotsDoc, WholeSnapshotDoc
-from paramclient.documents.paramset import SetDoc
+from paramclient.documents.paramset import SetDoc, StateDoc
 from paramclient.errors import UsageError
 from paramclient.files import FileFormat
 from paramclient.files.param_file import AUTOPILOT
@@ -27,6 +27,7 @@ from paramclient.model.values import check_name
 from paramclient.service.followed_component import FollowedComponent
 from paramclient.service.hub import Hub
 from paramclient.service.param_sources import (
+    EarlierState,
     LimitedPatterns,
     Timestamp,
     UploadedFile,
@@ -188,6 +189,17 @@ async def state_at(request: Request, hub: HubArgument, target: Target, at: At) -
     async def work() -> Response:
         found = await load_state(hub, target, at)
         return await document_response(hub.run_in_thread, lambda: SetDoc.of(found))
+
+    return await run_until_disconnect(request, work)
+
+
+@router.post("/components/{system}/{component}/state", response_model=StateDoc)
+async def earlier_state(request: Request, hub: HubArgument, target: Target, body: EarlierState) -> Response:
+    """Return the state that a restore with the same members writes."""
+
+    async def work() -> Response:
+        found = await load_state(hub, target, body.when)
+        return await document_response(hub.run_in_thread, lambda: StateDoc.of(found))
 
     return await run_until_disconnect(request, work)
 
