@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import anyio
 
@@ -32,7 +32,7 @@ from paramclient.cli.results import (
 )
 from paramclient.cli.session import CommandSession, connect, receiver_in_words, wait_for_firmware
 from paramclient.cli.targets import Source, describe
-from paramclient.client.local import ServiceComponent, SetUpKind
+from paramclient.client.local import ServiceComponent
 from paramclient.documents.setup import (
     AppliedRowDoc,
     ApplyResultDoc,
@@ -229,7 +229,7 @@ class _SetUp:
     component: ServiceComponent
     choices: ServiceSetUp
     wanted: ParamSet
-    kind: SetUpKind
+    kind: Literal["apply", "restore"]
     to_plan: Mapping[str, Any]
     to_run: Mapping[str, Any]
 

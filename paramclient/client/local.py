@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, Literal, Protocol, TypeAlias, TypeVar
+from typing import Any, Final, Literal, Protocol, TypeVar
 
 import anyio
 
@@ -37,7 +37,6 @@ __all__ = [
     "LocalComponent",
     "LocalExtParams",
     "ServiceComponent",
-    "SetUpKind",
     "check_has_link",
     "local",
     "not_given",
@@ -47,8 +46,6 @@ __all__ = [
 IDENTITY_POLL_INTERVAL: Final = 0.05
 """Seconds between two checks of the identity of a vehicle: no event reports it."""
 
-SetUpKind: TypeAlias = Literal["apply", "restore"]
-"""The set-ups that a service runs as jobs."""
 Result = TypeVar("Result")
 
 
@@ -255,7 +252,7 @@ class ServiceComponent(Component):
 
     @abstractmethod
     async def plan_set_up(
-        self, kind: SetUpKind, body: Mapping[str, Any], *, timeout: float | None = None
+        self, kind: Literal["apply", "restore"], body: Mapping[str, Any], *, timeout: float | None = None
     ) -> Mapping[str, Any]:
         """Return what a set-up would write as JSON (`PlanDoc`); writes nothing.
 
@@ -283,7 +280,7 @@ class ServiceComponent(Component):
 
     @abstractmethod
     async def begin_set_up(
-        self, kind: SetUpKind, body: Mapping[str, Any], *, timeout: float | None = None
+        self, kind: Literal["apply", "restore"], body: Mapping[str, Any], *, timeout: float | None = None
     ) -> Mapping[str, Any]:
         """Start a set-up as a job of the service, and return the job as JSON (`JobDoc`).
 

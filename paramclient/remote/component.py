@@ -16,7 +16,7 @@ from paramclient.client.arguments import (
 )
 from paramclient.client.component import Component
 from paramclient.client.extended_params import ExtParams
-from paramclient.client.local import ServiceComponent, SetUpKind, not_given
+from paramclient.client.local import ServiceComponent, not_given
 from paramclient.client.subscription import Changes
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.model.identity import Identity
@@ -383,7 +383,7 @@ class RemoteComponent(ServiceComponent):
             return state_of(document)
 
     async def plan_set_up(
-        self, kind: SetUpKind, body: Mapping[str, Any], *, timeout: float | None = None
+        self, kind: Literal["apply", "restore"], body: Mapping[str, Any], *, timeout: float | None = None
     ) -> Mapping[str, Any]:
         """See `ServiceComponent.plan_set_up`."""
         path = "plan" if kind == "apply" else kind
@@ -395,7 +395,7 @@ class RemoteComponent(ServiceComponent):
         return await self._ask("POST", f"{self._mirrored.path}/verify", body, "a comparison", timeout)
 
     async def begin_set_up(
-        self, kind: SetUpKind, body: Mapping[str, Any], *, timeout: float | None = None
+        self, kind: Literal["apply", "restore"], body: Mapping[str, Any], *, timeout: float | None = None
     ) -> Mapping[str, Any]:
         """See `ServiceComponent.begin_set_up`."""
         return await self._ask(

@@ -114,18 +114,6 @@ def untouched(*vehicles: Vehicle) -> bool:
     )
 
 
-@pytest.mark.parametrize("words", [("verify",), ("restore", "--plain")])
-def test_a_set_up_over_a_service_names_what_the_service_offers(
-    command: Command, tmp_path: Path, words: tuple[str, ...]
-) -> None:
-    file = tmp_path / "one.parm"
-    file.write_text("A,1\n")
-    done = command(words[0], "http://127.0.0.1:9", file, *words[1:])
-    assert (done.code, done.out) == (2, "")
-    assert done.err.startswith("paramclient: http://127.0.0.1:9 is a service: verify and restore of ")
-    assert "POST /api/v1/components/SYSTEM/COMPONENT/verify and " in done.err
-
-
 @pytest.mark.parametrize("phase", [0.0, 0.35, 0.7, 0.99, 1.15])
 @pytest.mark.parametrize("name", [*WRITING, *SIGNING, *SHOWING])
 def test_with_two_vehicles_nothing_is_written(
