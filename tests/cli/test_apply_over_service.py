@@ -351,7 +351,7 @@ def test_verify_refuses_options_that_need_the_link(
         "verify", served(copter()), file, *[described if word == "FILE" else word for word in option]
     )
     assert done.code == 2
-    assert "need the link itself" in done.err
+    assert "--all, --expect and --metadata FILE need the link itself" in done.err
 
 
 # restore
