@@ -339,6 +339,7 @@ _add(
     "udpin:0.0.0.0:14550 --dry-run",
     "udpin:0.0.0.0:14550 '2h ago'",
     "udpin:0.0.0.0:14550 before.yaml",
+    "udpin:0.0.0.0:14550 --all --expect 5",
     arguments="URL [WHEN|FILE]",
 )
 _add(_app, "logs:import_", "flight.tlog", "logs/*.tlog --json", arguments="FILE [FILE...]")

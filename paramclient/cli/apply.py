@@ -13,7 +13,6 @@ import anyio
 import anyio.to_thread
 from cyclopts import Parameter
 
-from paramclient.cache import ParamCache
 from paramclient.cli.confirmation import can_confirm, confirm
 from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.extended import (
@@ -28,6 +27,7 @@ from paramclient.cli.metadata import MetadataChoice, from_file, known_of_session
 from paramclient.cli.options import Count, LinkOptions
 from paramclient.cli.output import print_document, printable, progress_bar, report, say
 from paramclient.cli.param_rows import described
+from paramclient.cli.restore_states import StateToRestore, check_when_for_all, load_states
 from paramclient.cli.results import (
     NamedVehicle,
     applied_code,
@@ -43,7 +43,7 @@ from paramclient.cli.results import (
     verified_doc,
 )
 from paramclient.cli.session import receiver_in_words
-from paramclient.cli.sources import is_file, open_file, read_rules
+from paramclient.cli.sources import is_file, read_rules
 from paramclient.cli.targets import (
     Address,
     Source,
@@ -56,18 +56,14 @@ from paramclient.cli.targets import (
 )
 from paramclient.cli.time_arguments import parse_when
 from paramclient.client.component import Component
-from paramclient.client.local import local
-from paramclient.errors import NoReply, NotInCache, ParamClientError, UnknownVehicle, UsageError
+from paramclient.errors import NoReply, ParamClientError, UsageError
 from paramclient.links.names import names_service
 from paramclient.metadata import Metadata
-from paramclient.model.paramset import ParamSet
 from paramclient.protocol.params.fetch_result import Progress
 from paramclient.provision import ApplyProgress, ApplyResult, ApplyRow, Plan, verify_all
 from paramclient.provision import apply_all as apply_to_all
-from paramclient.provision import restore as restore_to
-from paramclient.provision.apply_restore import restore_categories
-from paramclient.provision.inspection import wait_for_identity
-from paramclient.provision.vehicle_params import load_state_before_apply
+from paramclient.provision import restore_all as restore_to_all
+from paramclient.provision.fleet import compare_states
 
 if TYPE_CHECKING:
     from paramclient.documents.setup import SetUpDoc
@@ -291,6 +287,8 @@ async def restore(
     allow_armed: bool = False,
     force: bool = False,
     backup: str | None = None,
+    all_vehicles: AllVehicles = False,
+    expect: Count = None,
     dry_run: bool = False,
     full: bool = False,
     extended: bool = False,
@@ -309,12 +307,16 @@ async def restore(
     Args:
         url: The link.
         when: A time, such as '2h ago' or '2026-11-20 14:00'; the number of a snapshot, from `history VEHICLE
-            --snapshots`; or a backup file. Default: the state before the last apply.
+            --snapshots`; or a backup file. Default: the state before the last apply, unless a restore ran
+            since then. With --all, a time, or a backup file with {uid} or {system} in its name.
         include: Include a category that is left out by default, or a name or pattern, as with apply.
         reboot: Reboot the vehicle if values take effect only after a reboot.
         allow_armed: Continue if the vehicle is armed.
         force: Send NaN and infinity also to PX4, which cannot save them and may stop, and to ArduPilot.
-        backup: A new file for the current state of the vehicle.
+        backup: A new file for the current state of the vehicle. {uid} and {system} in the name are replaced
+            by the vehicle's ids.
+        all_vehicles: Restore all vehicles on the link, concurrently, each to its own earlier state.
+        expect: With --all, wait for this number of vehicles, and fail with fewer.
         dry_run: Print the values that would be sent, and send none of them.
         full: Also print parameters that are unchanged or left out.
         extended: Restore the extended parameters (PARAM_EXT_*) of the component, such as a camera. Without
@@ -327,10 +329,13 @@ async def restore(
     if extended or (
         not plain
         and not is_plain_file
+        and not (all_vehicles and not (when is not None and is_extended_source(when)))
         and ((when is not None and is_extended_source(when)) or await is_extended_link(url, options))
     ):
-        if include or reboot or allow_armed or force:
-            raise UsageError("--include, --reboot, --allow-armed and --force are for plain parameters")
+        if include or reboot or allow_armed or force or all_vehicles or expect is not None:
+            raise UsageError(
+                "--include, --reboot, --allow-armed, --force, --all and --expect are for plain parameters"
+            )
         return await restore_extended(url, when, options, dry_run=dry_run, yes=yes, backup=backup)
     if names_service(url):
         from paramclient.cli.apply_over_service import ServiceSetUp, restore_over_service  # loads pydantic
@@ -340,22 +345,32 @@ async def restore(
                 "over a service, restore writes a state of the service's cache: a backup file and --backup "
                 "need the link itself. `paramclient apply` takes a file over a service"
             )
+        if all_vehicles or expect is not None:
+            raise UsageError(
+                "over a service, restore is for one vehicle: --all and --expect need the link itself"
+            )
         moment = None if when is None else parse_when(when, time.time())
         choices = ServiceSetUp(include, reboot, allow_armed, skip_invalid=True, force=force, full=full)
         return await restore_over_service(url, moment, choices, options, dry_run=dry_run, yes=yes)
-    async with targets(url, options, all_vehicles=False, expect=None, only=True) as found:
-        [vehicle] = found.vehicles
-        state = await _load_state(found, vehicle, when, options)
-        say(printable(f"the state: {described(state)}"))
+    if all_vehicles:
+        check_when_for_all(when)
+        check_pattern("--backup", backup, all_vehicles=True)
+    async with targets(url, options, all_vehicles=all_vehicles, expect=expect, only=True) as found:
+        states, failed = await load_states(found, url, when, options)
+        show = _Output(found, as_json=options.json, is_fleet=all_vehicles, full=full)
+        without = show.by_vehicle(failed)
+        found = replace(
+            found, vehicles=[each for each in found.vehicles if (each.system, each.component) in states]
+        )
+        show.states(states)
+        params = {address: state.params for address, state in states.items()}
         backups = await _backups(backup, found.vehicles)
         info = await _described(found, None, None)
-        show = _Output(found, as_json=options.json, is_fleet=False, full=full)
-        address = (vehicle.system, vehicle.component)
 
         async def plans() -> tuple[dict[NamedVehicle, Plan], dict[NamedVehicle, ParamClientError]]:
-            whole = (*await restore_categories(vehicle, state), *include)
-            fleet = await _within(found, verify_all([vehicle], state, include=whole, info=info, force=force))
-            return show.by_vehicle(fleet.results), show.by_vehicle(fleet.errors)
+            compared = compare_states(found.vehicles, params, include=include, info=info, force=force)
+            fleet = await _within(found, compared)
+            return show.by_vehicle(fleet.results), without | show.by_vehicle(fleet.errors)
 
         if dry_run:
             code = show.planned(*await plans(), reboot=reboot, skip_invalid=True)
@@ -364,53 +379,26 @@ async def restore(
             return ExitCode.INCOMPLETE
         await found.announce_write()
         with show.progress_until_interrupted(f"restoring {_title(found)}") as progress:
-            result = await restore_to(
-                vehicle,
-                state,
+            fleet = await restore_to_all(
+                found.vehicles,
+                params,
                 include=include,
-                info=info(vehicle),
+                info=info,
                 reboot=reboot,
                 allow_armed=allow_armed,
                 force=force,
-                backup=backups.get(address),
+                backup=None if backup is None else lambda each: backups[each.system, each.component],
                 timeout=found.deadline.left(),
-                progress=lambda state: progress(vehicle, state),
-                before_writing=found.check_only,
+                progress=progress,
+                before_writing=lambda _: found.check_only(),
             )
-        return show.applied(show.by_vehicle({address: result}), {})
+        code = show.applied(show.by_vehicle(fleet.results), without | show.by_vehicle(fleet.errors))
+        ended = [address for address, result in fleet.results.items() if result.error is None]
+        show.restored({address: states[address] for address in ended})
+        return code
 
 
 # Preparation
-
-
-async def _load_state(found: Targets, vehicle: Component, when: str | None, options: LinkOptions) -> ParamSet:
-    """Return the state to restore."""
-    if when is not None and is_file(when):
-        return open_file(when).choose(options.component)
-    moment = None if when is None else parse_when(when, time.time())
-    cache = found.client.cache
-    if cache is None:
-        raise UsageError(
-            "earlier states are in the cache, which --no-cache excludes; leave out --no-cache, or name a "
-            "backup file"
-        )
-    await wait_for_identity(vehicle)
-    await local(vehicle).client.cache_writer.write_all()
-    key, component = vehicle.identity.key, vehicle.component
-    return await anyio.to_thread.run_sync(lambda: _state_at(cache, key, component, moment))
-
-
-def _state_at(cache: ParamCache, key: str, component: int, moment: float | None) -> ParamSet:
-    if moment is None:
-        try:
-            return load_state_before_apply(cache, key, component)
-        except NotInCache as error:
-            raise NotInCache(f"{error}, such as '2h ago', or a backup file") from None
-    try:
-        return cache.state_at(key, component, moment)
-    except UnknownVehicle:  # the vehicle was heard on the link; the user named none of the cache
-        message = f"the cache {cache.place} has no earlier state of {key}, component {component}"
-        raise NotInCache(message) from None
 
 
 async def _described(
@@ -534,6 +522,20 @@ class _Output:
         return self._print(
             plans, errors, lambda: show_verified(plans, full=self._full), verified_doc, met_code
         )
+
+    def states(self, states: Mapping[Address, StateToRestore]) -> None:
+        """Print the states to restore, and what their restore undoes, on stderr."""
+        for address, state in states.items():
+            start = f"{self._vehicles[address].label}: " if self._is_fleet else ""
+            say(printable(f"{start}the state: {described(state.params)}"))
+            if state.point:
+                say(printable(f"{start}the state is that {state.point}; {state.changes}"))
+
+    def restored(self, states: Mapping[Address, StateToRestore]) -> None:
+        """Print the restore points that were written, on stderr."""
+        for address, state in states.items():
+            if state.point:
+                say(printable(f"{self._vehicles[address].label}: restored the state {state.point}"))
 
     @contextmanager
     def progress_until_interrupted(self, title: str) -> Iterator[Callable[[Component, ApplyProgress], None]]:

@@ -30,6 +30,7 @@ from paramclient.provision import overlay
 from paramclient.provision.inspection import wait_for_identity
 
 __all__ = [
+    "PLACEHOLDERS",
     "Address",
     "Source",
     "Targets",

@@ -4,8 +4,9 @@
 - `inspection`: read what a vehicle has; `prepare` and `verify`.
 - `apply_restore`: `apply` and `restore`; `execution` runs them, `results` holds their results.
 - `extended`: the same for extended parameters.
-- `fleet`: `apply_all` and `verify_all` for several vehicles.
+- `fleet`: `apply_all`, `verify_all` and `restore_all` for several vehicles.
 - `vehicle_params`: parameters of a vehicle or of the cache as a set.
+- `restore_point`: the snapshot before the last `apply`, and what happened after it.
 - `apply_rules`, `runner`: special parameters; long computations and `before_writing`.
 """
 
@@ -21,7 +22,7 @@ from paramclient.provision.extended import (
     restore_extended,
     verify_extended,
 )
-from paramclient.provision.fleet import Wanted, apply_all, verify_all
+from paramclient.provision.fleet import Wanted, apply_all, restore_all, verify_all
 from paramclient.provision.inspection import prepare, verify
 from paramclient.provision.planning import (
     MISSING,
@@ -75,6 +76,7 @@ __all__ = [
     "plan",
     "prepare",
     "restore",
+    "restore_all",
     "restore_extended",
     "verify",
     "verify_all",

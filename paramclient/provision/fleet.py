@@ -1,4 +1,4 @@
-"""`apply_all` and `verify_all`: set up and verify several vehicles concurrently."""
+"""`apply_all`, `verify_all` and `restore_all`: set up, verify and restore several vehicles concurrently."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from paramclient.client.component import Component
 from paramclient.errors import ParamClientError, UsageError
 from paramclient.model.paramset import ParamSet
 from paramclient.model.renames import Renames
-from paramclient.provision.apply_restore import apply
+from paramclient.provision.apply_restore import apply, restore, restore_categories
 from paramclient.provision.inspection import verify
 from paramclient.provision.planning import ParamInfo, Plan
 from paramclient.provision.results import ApplyProgress, ApplyResult, FleetApplied, FleetVerified
 
-__all__ = ["apply_all", "verify_all"]
+__all__ = ["apply_all", "compare_states", "restore_all", "verify_all"]
 
 Wanted: TypeAlias = ParamSet | Mapping[tuple[int, int], ParamSet] | Callable[[Component], ParamSet]
 """The wanted parameters of several vehicles: one set for all, or a set for each by address or by a call."""
@@ -106,6 +106,78 @@ async def verify_all(
         return await verify(component, own, include=given, info=described, force=force, renames=renames)
 
     return FleetVerified(*await _run_concurrently(components, wanted, one))
+
+
+async def restore_all(
+    components: Iterable[Component],
+    states: Wanted,
+    *,
+    include: str | Iterable[str] = (),
+    info: Callable[[Component], Mapping[str, ParamInfo] | None] | None = None,
+    reboot: bool = False,
+    allow_armed: bool = False,
+    force: bool = False,
+    backup: Callable[[Component], str | os.PathLike[str]] | None = None,
+    timeout: float | None = None,
+    author: str | None = None,
+    progress: Callable[[Component, ApplyProgress], None] | None = None,
+    before_writing: Callable[[Component], object] | None = None,
+) -> FleetApplied:
+    """`restore` several vehicles concurrently. A failure of one vehicle does not stop the others.
+
+    Args:
+        components: the vehicles.
+        states: the earlier state of each vehicle, by (system, component) or by a call; or one set for all.
+        include, reboot, allow_armed, force, timeout, author: as in `restore`.
+        info, backup, progress, before_writing: as in `apply_all`.
+
+    Returns:
+        The results. The state of another vehicle is an error of the vehicle that it was given for.
+
+    Raises:
+        UsageError: `states` has no set for one of the vehicles; nothing was sent to any vehicle.
+    """
+    given = (include,) if isinstance(include, str) else tuple(include)
+
+    async def one(component: Component, own: ParamSet) -> ApplyResult:
+        return await restore(
+            component,
+            own,
+            include=given,
+            info=None if info is None else info(component),
+            reboot=reboot,
+            allow_armed=allow_armed,
+            force=force,
+            backup=None if backup is None else backup(component),
+            timeout=timeout,
+            author=author,
+            progress=None if progress is None else partial(progress, component),
+            before_writing=None if before_writing is None else partial(before_writing, component),
+        )
+
+    return FleetApplied(*await _run_concurrently(components, states, one))
+
+
+async def compare_states(
+    components: Iterable[Component],
+    states: Wanted,
+    *,
+    include: str | Iterable[str] = (),
+    info: Callable[[Component], Mapping[str, ParamInfo] | None] | None = None,
+    force: bool = False,
+) -> FleetVerified:
+    """`verify` several vehicles concurrently, with the categories that `restore_all` includes.
+
+    Arguments and errors as in `restore_all`.
+    """
+    given = (include,) if isinstance(include, str) else tuple(include)
+
+    async def one(component: Component, own: ParamSet) -> Plan:
+        whole = (*await restore_categories(component, own), *given)
+        described = None if info is None else info(component)
+        return await verify(component, own, include=whole, info=described, force=force)
+
+    return FleetVerified(*await _run_concurrently(components, states, one))
 
 
 async def _run_concurrently(

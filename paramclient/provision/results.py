@@ -173,7 +173,7 @@ class ApplyResult:
 
 @dataclass(frozen=True, slots=True)
 class FleetApplied:
-    """The results of `apply_all`.
+    """The results of `apply_all` or `restore_all`.
 
     Attributes:
         results: by (system, component) at the start, the result for each vehicle.

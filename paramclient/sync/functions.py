@@ -42,6 +42,7 @@ __all__ = [
     "metadata_of",
     "prepare",
     "restore",
+    "restore_all",
     "restore_extended",
     "verify",
     "verify_all",
@@ -130,11 +131,7 @@ def apply_all(
         timeout=timeout,
         author=author,
     )
-    callbacks: dict[str, Callable[..., object] | None] = {
-        "progress": None if progress is None else fleet.with_component(progress),
-        "before_writing": None if before_writing is None else fleet.with_component(before_writing),
-    }
-    return _run(fleet.thread, work, callbacks)
+    return _run(fleet.thread, work, fleet.callbacks(progress, before_writing))
 
 
 def verify_all(
@@ -163,6 +160,48 @@ def verify_all(
         renames=renames,
     )
     return _run(fleet.thread, work, {})
+
+
+def restore_all(
+    components: Iterable[Component],
+    states: Wanted,
+    *,
+    include: str | Iterable[str] = (),
+    info: Callable[[Component], Mapping[str, ParamInfo] | None] | None = None,
+    reboot: bool = False,
+    allow_armed: bool = False,
+    force: bool = False,
+    backup: Callable[[Component], str | os.PathLike[str]] | None = None,
+    timeout: float | None = None,
+    author: str | None = None,
+    progress: Callable[[Component, ApplyProgress], None] | None = None,
+    before_writing: Callable[[Component], object] | None = None,
+) -> FleetApplied:
+    """`restore` several vehicles concurrently. A failure of one vehicle does not stop the others.
+
+    Arguments as of `paramclient.provision.restore_all`; all functions are called in the thread of the caller.
+
+    Raises:
+        UsageError: `states` has no set for one of the vehicles, or the vehicles belong to several clients;
+            nothing was sent to any vehicle.
+    """
+    fleet = _Fleet(components)
+    if fleet.thread is None:
+        return FleetApplied({}, {})
+    work = partial(
+        provision.restore_all,
+        fleet.wrapped,
+        fleet.wanted(states),
+        include=include if isinstance(include, str) else tuple(include),
+        info=None if info is None else fleet.for_each(info),
+        reboot=reboot,
+        allow_armed=allow_armed,
+        force=force,
+        backup=None if backup is None else fleet.for_each(backup),
+        timeout=timeout,
+        author=author,
+    )
+    return _run(fleet.thread, work, fleet.callbacks(progress, before_writing))
 
 
 def check_vehicle(
@@ -213,7 +252,18 @@ class _Fleet:
         """Return the wanted parameters for the asynchronous function."""
         return wanted if isinstance(wanted, ParamSet | Mapping) else self.for_each(wanted)
 
-    def with_component(self, callback: Callable[..., object]) -> Callable[..., object]:
+    def callbacks(
+        self,
+        progress: Callable[[Component, ApplyProgress], None] | None,
+        before_writing: Callable[[Component], object] | None,
+    ) -> dict[str, Callable[..., object] | None]:
+        """Return the callbacks of a set-up by the name of their argument."""
+        return {
+            "progress": None if progress is None else self._with_component(progress),
+            "before_writing": None if before_writing is None else self._with_component(before_writing),
+        }
+
+    def _with_component(self, callback: Callable[..., object]) -> Callable[..., object]:
         """Return a callback whose first argument is the blocking component."""
         components = {_address_of(each): each for each in self._components}
         return lambda component, *values: callback(components[_address_of(component)], *values)

@@ -8,6 +8,7 @@ import pty
 import re
 import signal
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -75,6 +76,14 @@ def file(tmp_path: Path) -> Callable[..., Path]:
 
 def copter(**options: Any) -> ArduPilotVehicle:
     return ArduPilotVehicle(table=TABLE, groups={"EK2_ENABLE": GROUP}, live=(), **options)
+
+
+def restarted(vehicle: ArduPilotVehicle) -> ArduPilotVehicle:
+    """Return the vehicle with its values and a new clock: the simulated time of each command advances it."""
+    new = copter(system=vehicle.system)
+    for name, value in vehicle.values.items():
+        new.set_param(name, value)
+    return new
 
 
 # apply
@@ -363,8 +372,58 @@ def test_restore_reverts_the_last_apply(
     assert re.match(r"the state: 6 parameters of 1/1 ardupilot from snapshot 1 of uid:", back.err)
     assert vehicle.values == copter().values
     vehicle.set_param("RTL_ALT", 77)  # as after an interrupted restore
-    assert command("restore", put(vehicle)).code == 0
+    assert command("restore", put(vehicle), 1).code == 0
     assert vehicle.values == copter().values, "a restore is no apply that restore goes back behind"
+
+
+def test_restore_says_what_it_undoes(
+    command: Command, put: Put, file: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vehicle = copter()
+    command("apply", put(vehicle), file("RTL_ALT,2500\n"))
+    assert command("set", put(vehicle), "WPNAV_SPEED", 600).code == 0
+    assert command("set", put(vehicle), "WPNAV_ACCEL", 150).code == 0
+    assert command("set", put(vehicle), "WPNAV_ACCEL", 100).code == 0  # has its old value again
+    would = command("restore", put(vehicle), "--dry-run")
+    assert re.search(
+        r"^the state is that before the last apply, \d+ s ago \(snapshot 1\); "
+        r"changed since then: WPNAV_SPEED \d+ s ago, RTL_ALT \d+ s ago$",
+        would.err,
+        re.MULTILINE,
+    ), would.err
+    vehicle = restarted(vehicle)
+    later = time.time() + 9 * 60 + 5
+    monkeypatch.setattr("paramclient.cli.restore_states.time.time", lambda: later)
+    told = command("restore", put(vehicle), "--json")
+    assert told.json["complete"]
+    assert "the state is that before the last apply, 9 min ago (snapshot 1)" in told.err
+    assert told.err.endswith(
+        "1/1 ardupilot: restored the state before the last apply, 9 min ago (snapshot 1)\n"
+    )
+    assert "last apply" not in command("restore", put(vehicle), 1).err
+
+
+def test_restore_does_not_undo_an_apply_twice(command: Command, put: Put, file: Callable[..., Path]) -> None:
+    vehicle = copter()
+    command("apply", put(vehicle), file("RTL_ALT,2500\n"))
+    assert command("restore", put(vehicle)).code == 0
+    command("set", put(vehicle), "WPNAV_SPEED", 600)
+    sets = vehicle.requests["PARAM_SET"]
+    for options in ((), ("--dry-run",)):
+        again = command("restore", put(vehicle), *options)
+        assert again.code == 2
+        assert "a restore ran " in again.err
+        assert "`paramclient restore udpin:0.0.0.0:14550 1` for the state before that apply" in again.err
+        assert "`paramclient restore udpin:0.0.0.0:14550 2` for the state before that restore" in again.err
+        assert "`paramclient history 1 --snapshots` lists the snapshots" in again.err
+        assert re.search(r"or a time, as in `paramclient restore udpin:0.0.0.0:14550 '\d+s ago'`", again.err)
+    assert vehicle.requests["PARAM_SET"] == sets
+    vehicle = restarted(vehicle)
+    assert command("restore", put(vehicle), 2).code == 0
+    assert (vehicle.values["RTL_ALT"], vehicle.values["WPNAV_SPEED"]) == (2500, 500.0)
+    command("apply", put(vehicle), file("RTL_ALT,3000\n"))
+    assert command("restore", put(vehicle)).code == 0, "an apply since then has a restore point"
+    assert vehicle.values["RTL_ALT"] == 2500
 
 
 def test_restore_prints_left_out_parameters_and_succeeds(
@@ -546,6 +605,99 @@ def test_a_file_of_several_systems_has_a_set_for_each(
     text = "".join(f"{system}\t1\tRTL_ALT\t{system}000\t6\n" for system in (1, 2, 3))
     assert command("apply", put(air), file(text, "fleet.params"), "--all").code == 0
     assert [vehicle.values["RTL_ALT"] for vehicle in vehicles] == [1000, 2000, 3000]
+
+
+def test_all_vehicles_are_restored_each_to_its_own_state(
+    command: Command, put: Put, file: Callable[..., Path], tmp_path: Path
+) -> None:
+    air, vehicles = fleet()
+    for vehicle in vehicles:
+        vehicle.set_param("WPNAV_SPEED", 100.0 * vehicle.system)
+    assert command("apply", put(air), file(), "--all").code == 0
+    would = command("restore", put(air), "--all", "--expect", 3, "--dry-run")
+    assert would.code == 0
+    assert would.rows[0][0] == "vehicle"
+    assert [vehicle.values["WPNAV_SPEED"] for vehicle in vehicles] == [750.5] * 3
+    back = command("restore", put(air), "--all", "--backup", tmp_path / "{system}.yaml")
+    assert back.code == 0
+    assert back.rows[0][:2] == ["vehicle", "name"]
+    assert [row[:5] for row in back.rows if row[1] == "WPNAV_SPEED"] == [
+        [f"{system}/1", "WPNAV_SPEED", "750.5", f"{system}00.0", f"{system}00.0"] for system in (1, 2, 3)
+    ]
+    assert [vehicle.values["WPNAV_SPEED"] for vehicle in vehicles] == [100.0, 200.0, 300.0]
+    assert [vehicle.values["RTL_ALT"] for vehicle in vehicles] == [1500] * 3
+    for system in (1, 2, 3):
+        assert f"{system}/1 ardupilot: the state is that before the last apply, " in back.err
+    vehicles = [restarted(vehicle) for vehicle in vehicles]
+    air = Air(vehicles)
+    again = command("restore", put(air), "--all")
+    assert (again.code, again.err.count("a restore ran ")) == (2, 3)
+    files = command("restore", put(air), tmp_path / "{system}.yaml", "--all", "--json")
+    assert files.code == 0
+    assert [each["complete"] for each in files.json["vehicles"]] == [True] * 3
+    assert [vehicle.values["WPNAV_SPEED"] for vehicle in vehicles] == [750.5] * 3
+
+
+def test_a_vehicle_without_a_state_does_not_stop_the_restore_of_the_others(
+    command: Command, put: Put, file: Callable[..., Path]
+) -> None:
+    air, vehicles = fleet()
+    for system in (1, 3):
+        assert command("apply", put(air), file(), "--system", system).code == 0
+    back = command("restore", put(air), "--all", "--json")
+    assert back.code == 5
+    assert [each["system"] for each in back.json["vehicles"]] == [1, 3]
+    [failed] = back.json["errors"]
+    assert failed["system"] == 2
+    assert "2/1 ardupilot: the cache has no snapshot from before an apply to uid:" in back.err
+    assert "writing to 2/1" not in back.err
+    assert [vehicle.values["RTL_ALT"] for vehicle in vehicles] == [1500] * 3
+    assert not vehicles[1].requests["PARAM_SET"]
+    few = command("restore", put(air), "--all", "--expect", 4, "--timeout", 30)
+    assert (few.code, "4 vehicles (heard: 1/1" in few.err) == (3, True)
+
+
+def test_one_state_is_not_restored_to_all_vehicles(
+    command: Command, put: Put, file: Callable[..., Path]
+) -> None:
+    air, vehicles = fleet()
+    one = command("restore", put(air), file(), "--all")
+    assert (one.code, "{uid} or {system} in the file name" in one.err) == (2, True)
+    number = command("restore", put(air), 1, "--all")
+    assert (number.code, "snapshot 1 is of one vehicle" in number.err) == (2, True)
+    assert command("restore", put(air), "--all", "--backup", "same.yaml").code == 2
+    assert command("restore", put(air), "--all", "--no-cache").code == 2
+    assert command("restore", put(air), "--expect", 2).code == 2
+    assert command("restore", put(air), "--all", "--extended").code == 2
+    service = command("restore", "http://127.0.0.1:9", "--all")
+    assert (service.code, "need the link itself" in service.err) == (2, True)
+    missing = command("restore", put(air), file().parent / "none-{system}.param", "--all")
+    assert (missing.code, missing.err.count("no such file")) == (2, 3)
+    assert not any(vehicle.requests["PARAM_SET"] for vehicle in vehicles)
+
+
+@pytest.mark.parametrize(("answer", "sets"), [("y", 6), ("n", 0)])
+def test_a_restore_of_all_vehicles_must_be_confirmed(
+    command: Command,
+    put: Put,
+    file: Callable[..., Path],
+    monkeypatch: pytest.MonkeyPatch,
+    answer: str,
+    sets: int,
+) -> None:
+    air, vehicles = fleet()
+    command("apply", put(air), file(), "--all")
+    before = sum(vehicle.requests["PARAM_SET"] for vehicle in vehicles)
+    hand, terminal = pty.openpty()
+    os.write(hand, f"{answer}\n".encode())
+    with os.fdopen(hand, "wb"), os.fdopen(terminal, encoding="utf-8") as stdin:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+        done = command("restore", put(air), "--all")
+    assert done.code == (0 if sets else 1)
+    told, _, _ = done.err.partition("go on? [y/N]")
+    assert told.count("the state is that before the last apply, ") == 3
+    assert sum(vehicle.requests["PARAM_SET"] for vehicle in vehicles) - before == sets
 
 
 def test_component_chooses_another_component(

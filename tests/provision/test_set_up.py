@@ -46,6 +46,7 @@ from paramclient.provision import (
     overlay,
     prepare,
     restore,
+    restore_all,
     verify,
     verify_all,
 )
@@ -911,6 +912,34 @@ async def test_several_vehicles_are_set_up_concurrently() -> None:
         assert not verified.is_met
         assert (await verify_all(components[:1], base)).is_met
         assert (await apply_all(components[:1], base)).complete
+
+
+@in_simulated_time
+async def test_several_vehicles_are_restored_each_to_its_own_state() -> None:
+    vehicles = [ardupilot(system=system) for system in (1, 2, 3)]
+    for vehicle in vehicles:
+        vehicle.set_param("TUNE_02", 10.0 + vehicle.system)
+    async with a_client(Air(vehicles)) as client:
+        await client.fetch_all()
+        components = [client.components[vehicle.system, 1] for vehicle in vehicles]
+        applied = await apply_all(components, written({"TUNE_02": 42.0}))
+        before = {address: result.before for address, result in applied.results.items()}
+        with pytest.raises(UsageError, match="no wanted parameters are given for vehicle 3/1"):
+            await restore_all(components, {address: before[address] for address in [(1, 1), (2, 1)]})
+        assert [vehicle.param("TUNE_02").value for vehicle in vehicles] == [42.0] * 3
+        told: set[int] = set()
+        restored = await restore_all(
+            components,
+            before | {(2, 1): before[1, 1]},
+            progress=lambda component, _: told.add(component.system),
+        )
+        assert list(restored.results) == [(1, 1), (3, 1)]
+        assert str(restored.errors[2, 1]).startswith("the state is that of another vehicle")
+        assert not restored.complete
+        assert told == {1, 3}
+        assert [vehicle.param("TUNE_02").value for vehicle in vehicles] == [11.0, 42.0, 13.0]
+        assert (await restore_all(components, lambda each: before[each.system, 1])).complete
+        assert vehicles[1].param("TUNE_02").value == 12.0
 
 
 @EVERY_KIND

@@ -24,6 +24,7 @@ from paramclient.sync import (
     metadata_of,
     prepare,
     restore,
+    restore_all,
     restore_extended,
     verify,
     verify_all,
@@ -157,6 +158,29 @@ def test_several_vehicles_with_a_set_and_a_file_for_each(tmp_path: Path) -> None
         assert verify_all(both, {(1, 1): wanted(PARAM_01=71), (2, 1): wanted(PARAM_01=72)}).is_met
         with pytest.raises(UsageError, match="2/1"):
             verify_all(both, {(1, 1): wanted(PARAM_01=71)})
+
+
+def test_several_vehicles_are_restored_each_to_its_own_state(tmp_path: Path) -> None:
+    boards = [vehicle(), vehicle(system=2)]
+    before = [board.params["PARAM_01"].value for board in boards]
+    with ParamClient(Air(boards), cache=False) as client:
+        both = [client.component(system=number) for number in (1, 2)]
+        own = {(each.system, each.component): wanted(PARAM_01=70 + each.system) for each in both}
+        applied = apply_all(both, own)
+        told: set[Component] = set()
+        asked: list[Component] = []
+        fleet = restore_all(
+            both,
+            lambda each: applied.results[each.system, each.component].before,
+            backup=lambda component: tmp_path / f"{component.system}.params",
+            progress=lambda component, _: told.add(component),
+            before_writing=asked.append,
+        )
+        assert fleet.complete
+        assert told == set(asked) == set(both)
+        assert [board.params["PARAM_01"].value for board in boards] == before
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["1.params", "2.params"]
+    assert restore_all([], {}).results == {}
 
 
 def test_vehicles_of_several_clients_need_a_call_for_each() -> None:

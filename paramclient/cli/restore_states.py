@@ -1,0 +1,182 @@
+"""The states that `restore` writes, and what a restore without a time undoes."""
+
+from __future__ import annotations
+
+import shlex
+import time
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Final
+
+import anyio.to_thread
+
+from paramclient.cache import ParamCache
+from paramclient.cli.options import LinkOptions
+from paramclient.cli.sources import choose, is_file, open_file
+from paramclient.cli.targets import PLACEHOLDERS, Address, Targets, check_pattern, fill_pattern
+from paramclient.cli.time_arguments import parse_when
+from paramclient.client.component import Component
+from paramclient.client.local import local
+from paramclient.errors import FileError, NotInCache, ParamClientError, UnknownVehicle, UsageError
+from paramclient.model.paramset import ParamSet
+from paramclient.model.wording import first_of
+from paramclient.provision.inspection import wait_for_identity
+from paramclient.provision.restore_point import RestorePoint, load_restore_point
+
+__all__ = ["StateToRestore", "check_when_for_all", "load_states"]
+
+CHANGES_SHOWN_MAX: Final = 10
+"""Parameters that a line names, so that it stays short; it gives the number of further ones."""
+_AGES: Final = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"))
+"""Units of an age in seconds, longest first. An age is given in the longest unit of which it has two."""
+
+
+@dataclass(frozen=True, slots=True)
+class StateToRestore:
+    """The state to restore of one vehicle.
+
+    Attributes:
+        params: the state.
+        point: the restore point in words, such as `before the last apply, 9 min ago (snapshot 4)`; "" for a
+            state that the user chose.
+        changes: the changes since then in words; "" for a state that the user chose.
+    """
+
+    params: ParamSet
+    point: str = ""
+    changes: str = ""
+
+
+def check_when_for_all(when: str | None) -> None:
+    """Check that the state that `restore --all` names can be that of several vehicles.
+
+    Raises:
+        UsageError: the number of a snapshot, which is of one vehicle; or one file for all vehicles.
+    """
+    if when is None or _is_pattern(when):
+        return
+    if is_file(when):
+        check_pattern("the backup file", when, all_vehicles=True)
+    if isinstance(parse_when(when, time.time()), int):
+        raise UsageError(f"snapshot {when} is of one vehicle; with --all, give a time such as '2h ago'")
+
+
+async def load_states(
+    found: Targets, url: str, when: str | None, options: LinkOptions
+) -> tuple[dict[Address, StateToRestore], dict[Address, ParamClientError]]:
+    """Return the state to restore of each vehicle, and the error of each vehicle without one, by address.
+
+    Args:
+        found: the vehicles.
+        url: the link, for messages.
+        when: a time, the number of a snapshot, or a backup file; None for the state before the last `apply`.
+        options: the options of the command.
+
+    Raises:
+        UsageError: not a time; or the command has no cache.
+        ParamClientError: one vehicle was chosen, and has no such state.
+    """
+    load = _loader(found, url, when, options)
+    states: dict[Address, StateToRestore] = {}
+    errors: dict[Address, ParamClientError] = {}
+    for vehicle in found.vehicles:
+        address = (vehicle.system, vehicle.component)
+        try:
+            states[address] = await load(vehicle)
+        except ParamClientError as error:
+            if not found.all_vehicles:
+                raise
+            errors[address] = error
+    return states, errors
+
+
+def _loader(
+    found: Targets, url: str, when: str | None, options: LinkOptions
+) -> Callable[[Component], Awaitable[StateToRestore]]:
+    """Return a function that loads the state of a vehicle."""
+    if when is not None and found.all_vehicles and _is_pattern(when):
+
+        async def load(vehicle: Component) -> StateToRestore:
+            path = await fill_pattern(when, vehicle)
+            if not is_file(path):
+                raise FileError("no such file", source=path)
+            return StateToRestore(choose(open_file(path), options.component, vehicle.system))
+
+        return load
+    if when is not None and is_file(when):
+        chosen = open_file(when).choose(options.component)
+
+        async def load_file(vehicle: Component) -> StateToRestore:
+            return StateToRestore(chosen)
+
+        return load_file
+    moment = None if when is None else parse_when(when, time.time())
+    cache = found.client.cache
+    if cache is None:
+        raise UsageError(
+            "earlier states are in the cache, which --no-cache excludes; leave out --no-cache, or name a "
+            "backup file"
+        )
+
+    async def load_cached(vehicle: Component) -> StateToRestore:
+        await wait_for_identity(vehicle)
+        await local(vehicle).client.cache_writer.write_all()
+        key, component = vehicle.identity.key, vehicle.component
+        if moment is not None:
+            return await anyio.to_thread.run_sync(lambda: _state_at(cache, key, component, moment))
+        try:
+            point = await anyio.to_thread.run_sync(lambda: load_restore_point(cache, key, component))
+        except NotInCache as error:
+            raise NotInCache(f"{error}, such as '2h ago', or a backup file") from None
+        return _before_apply(point, url, vehicle.system)
+
+    return load_cached
+
+
+def _is_pattern(when: str) -> bool:
+    return any(place in when for place in PLACEHOLDERS)
+
+
+def _state_at(cache: ParamCache, key: str, component: int, moment: float) -> StateToRestore:
+    try:
+        return StateToRestore(cache.state_at(key, component, moment))
+    except UnknownVehicle:  # the vehicle was heard on the link; the user named none of the cache
+        message = f"the cache {cache.place} has no earlier state of {key}, component {component}"
+        raise NotInCache(message) from None
+
+
+def _before_apply(point: RestorePoint, url: str, system: int) -> StateToRestore:
+    """Return the state before the last `apply`, with what its restore undoes.
+
+    Raises:
+        UsageError: a restore ran since that `apply`, so that the user must choose the state.
+    """
+    now = time.time()
+    age = _age(now - point.snapshot.at)
+    if point.restored is not None:
+        restored, again = point.restored, point.snapshot.id
+        seconds = max(1, int(now - restored.at) + 1)
+        command = f"paramclient restore {shlex.quote(url)}"
+        raise UsageError(
+            f"a restore ran {_age(now - restored.at)} ago, after the last apply ({age} ago); choose the "
+            "state: "
+            f"`{command} {again}` for the state before that apply, also to continue that restore; "
+            f"`{command} {restored.id}` for the state before that restore; or a time, as in "
+            f"`{command} '{seconds}s ago'`; `paramclient history {system} --snapshots` lists the snapshots"
+        )
+    changes = [f"{each.name} {_age(now - each.at)} ago" for each in point.changes]
+    return StateToRestore(
+        point.state,
+        f"before the last apply, {age} ago (snapshot {point.snapshot.id})",
+        f"changed since then: {first_of(changes, CHANGES_SHOWN_MAX)}"
+        if changes
+        else "nothing is known to have changed since then",
+    )
+
+
+def _age(seconds: float) -> str:
+    """Return an age in words: `9 min`."""
+    for length, unit in _AGES:
+        if seconds >= 2 * length:
+            return f"{seconds // length:.0f} {unit}"
+    return f"{max(0.0, seconds):.0f} s"
