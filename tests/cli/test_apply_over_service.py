@@ -371,7 +371,11 @@ def test_restore_prints_what_it_prints_on_a_link(
     done = command("restore", keeping(vehicle), *options)
     assert done.code == on_link.code == 0, done.err
     assert comparable(done.out) == comparable(on_link.out)
-    assert comparable(done.err) == comparable(on_link.err)
+    on_link_only = ("the state is that before the last apply, ", "restored the state before the last apply, ")
+    undone = [line for line in on_link.err.splitlines() if any(text in line for text in on_link_only)]
+    assert len(undone) == (1 if "--dry-run" in options else 2), "what it undoes, which a service does not give"
+    common = "\n".join(line for line in on_link.err.splitlines() if line not in undone)
+    assert comparable(done.err).strip() == comparable(common).strip()
     assert "the state: 3 parameters of 1/1" in done.err
     assert vehicle.values["GAIN"] == (6.5 if "--dry-run" in options else 4.0)
 
