@@ -38,6 +38,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
+from paramclient.model.identity import Identity
 from paramclient.model.values import WireValue
 from paramclient.protocol import wire
 from paramclient.protocol.ftp.packets import Opcode, Packet
@@ -94,6 +95,25 @@ def read(name: str) -> tuple[Record, ...]:
         frames = framer.receive(data)
         records.append(Record((time - start) / 1e6, data, system, frames[0] if frames else None))
     return tuple(records)
+
+
+def identity_in(name: str, autopilot: int) -> Identity:
+    """Return the identity of the vehicle of a log, as the client makes it of AUTOPILOT_VERSION."""
+    version = next(message for _, message in from_vehicle(name) if isinstance(message, wire.AutopilotVersion))
+    return Identity.from_version(
+        system=1,
+        link="udpin:0.0.0.0:14550",
+        autopilot=autopilot,
+        vehicle_type=2,
+        uid=version.uid,
+        uid2=version.uid2,
+        firmware=version.flight_sw_version,
+        git_hash=version.git_hash,
+        board=version.board_version,
+        vendor_id=version.vendor_id,
+        product_id=version.product_id,
+        capabilities=version.capabilities,
+    )
 
 
 def from_ground(name: str) -> list[Record]:

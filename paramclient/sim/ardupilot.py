@@ -25,7 +25,7 @@ from paramclient.sim.param_table import (
     ek2_group,
     with_system_id,
 )
-from paramclient.sim.vehicle import Vehicle, VehicleOptions
+from paramclient.sim.vehicle import SIMULATED_COMMIT, Vehicle, VehicleOptions
 
 __all__ = ["ArduPilotVehicle"]
 
@@ -167,7 +167,7 @@ class ArduPilotVehicle(Vehicle):
             version=wire.AutopilotVersion(
                 64495 if ftp else 64495 & ~wire.CAPABILITY_FTP,
                 flight_sw_version=67502080,
-                git_hash=b"fbb78585",
+                git_hash=SIMULATED_COMMIT.encode("ascii"),
                 uid2=uid2.ljust(18, b"\0"),
             ),
             burst=burst,
@@ -473,7 +473,11 @@ _KINDS: dict[str, tuple[int, int, tuple[int, float]]] = {
 }
 """By kind: MAV_TYPE, MAV_STATE while disarmed, MAV_STATE after a reboot, and its duration in seconds."""
 _UID2 = b"3d1219c7c4c5404aa\0"
-_BANNER = ("ArduCopter V4.6.0-dev (fbb78585)", "3d1219c7c4c5404aaa1f6d2a48adfda4", "Frame: QUAD/PLUS")
+_BANNER = (
+    f"ArduCopter V4.6.0-dev ({SIMULATED_COMMIT})",
+    "3d1219c7c4c5404aaa1f6d2a48adfda4",
+    "Frame: QUAD/PLUS",
+)
 _INFO = 6
 _WARNING = 4
 _LOOP = 0.0058

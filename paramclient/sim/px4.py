@@ -23,7 +23,7 @@ from paramclient.sim.param_table import (
     px4_table,
     with_system_id,
 )
-from paramclient.sim.vehicle import VehicleOptions
+from paramclient.sim.vehicle import SIMULATED_COMMIT, VehicleOptions
 
 __all__ = ["PX4Vehicle"]
 
@@ -189,7 +189,7 @@ class PX4Vehicle(BytewiseVehicle):
             version=wire.AutopilotVersion(
                 59647,
                 flight_sw_version=_MAIN if ftp else _RELEASE,
-                git_hash=bytes.fromhex("0000009383550aa7"),
+                git_hash=bytes.fromhex(2 * SIMULATED_COMMIT)[::-1],
                 board_version=1,
                 uid=_UID + system - 1 if uid is None else uid,
             ),

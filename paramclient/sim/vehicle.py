@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from typing import Unpack
+from typing import Final, Unpack
 
 from paramclient.errors import ParamErrorCode, UsageError
 from paramclient.model.values import Encoding, Param, WireValue, bits_of
@@ -15,7 +15,13 @@ from paramclient.sim.device import Device, DeviceOptions
 from paramclient.sim.ftp import FileServer
 from paramclient.sim.param_table import Entry, SimParam
 
-__all__ = ["Vehicle", "VehicleOptions"]
+__all__ = ["SIMULATED_COMMIT", "Vehicle", "VehicleOptions"]
+
+SIMULATED_COMMIT: Final = "5eed5eed"
+"""The commit that simulated autopilots report, in hexadecimal; a simulated PX4 reports it twice, in 16
+digits. Their tables and versions are those of a real firmware, but their descriptions are not: with its
+commit, the stored descriptions of one would be used for the other. A real commit has these first 8 digits
+with a probability of 1 in 4 billion, and all 16 practically never."""
 
 
 class VehicleOptions(DeviceOptions, total=False):

@@ -402,7 +402,7 @@ async def test_a_component_is_asked_who_it_is() -> None:
         await asyncio.sleep(0.5)
         assert component.autopilot == "ardupilot"
         assert component.identity.uid is not None
-        assert component.identity.git_hash == "fbb78585"
+        assert component.identity.git_hash == "5eed5eed"
         assert component.encoding is Encoding.C_CAST
         assert "ArduPilot" in component.encoding_reason
 

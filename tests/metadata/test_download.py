@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import lzma
+import math
 import os
 import stat
 from dataclasses import replace
@@ -36,6 +37,7 @@ from paramclient.protocol.wire import (
 )
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle
 from paramclient.sim.metadata import GENERAL_FILE, METADATA_FILE
+from tests.recordings import identity_in
 from tests.shell import (
     FlakyLink,
     Tap,
@@ -160,6 +162,47 @@ async def test_metadata_of_another_firmware_is_downloaded(tmp_path: Path) -> Non
             read = await metadata_of(await client.component(), store=kept)
             assert read is not None
             assert read["PARAM_03"].units == units
+
+
+@in_simulated_time
+async def test_a_simulated_vehicle_is_never_taken_for_the_real_one(tmp_path: Path) -> None:
+    """The simulated PX4 has the version and board of the recorded one, but not its commit."""
+    real = identity_in("px4_full_download", 12)
+    store, other_store = MetadataStore(tmp_path / "first"), MetadataStore(tmp_path / "second")
+    async with a_client(PX4Vehicle(metadata=True)) as client:
+        component = await client.component()
+        assert await metadata_of(component, store=store) is not None
+        simulated = component.identity
+    for field in ("autopilot", "firmware", "board", "vendor_id", "product_id"):
+        assert getattr(simulated, field) == getattr(real, field)
+    assert store.known(simulated, 1) is not None
+    assert store.known(real, 1) is None
+    content = described("RTL_RETURN_ALT")
+    other_store.put(content, crc32_px4(content))
+    other_store.remember(real, 1, crc32_px4(content))
+    other_store.remember_failure(real, 1)
+    assert other_store.known(real, 1) is not None
+    assert other_store.known(simulated, 1) is None
+    assert not other_store.has_failed(replace(simulated, link=real.link), 1, within=math.inf)
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "recording", "autopilot", "digits"),
+    [
+        (PX4Vehicle, "px4_full_download", 12, 16),
+        (ArduPilotVehicle, "ardupilot_full_download", 3, 8),
+    ],
+)
+@in_simulated_time
+async def test_simulated_autopilots_report_a_commit_of_their_own(
+    vehicle: type[PX4Vehicle | ArduPilotVehicle], recording: str, autopilot: int, digits: int
+) -> None:
+    async with a_client(vehicle()) as client:
+        component = await client.component()
+        await anyio.sleep(0.5)
+        assert component.identity.git_hash == ("5eed5eed" * 2)[:digits]
+        assert component.identity.firmware == identity_in(recording, autopilot).firmware
+        assert component.identity.git_hash != identity_in(recording, autopilot).git_hash
 
 
 @in_simulated_time

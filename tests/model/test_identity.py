@@ -7,28 +7,7 @@ from dataclasses import replace
 import pytest
 
 from paramclient.model.identity import PX4_SITL_UID, Identity, autopilot_name, is_sitl_uid
-from paramclient.protocol.wire import AutopilotVersion
-from tests import recordings
-
-
-def identity_in(recording: str, autopilot: int) -> Identity:
-    version = next(
-        message for _, message in recordings.from_vehicle(recording) if isinstance(message, AutopilotVersion)
-    )
-    return Identity.from_version(
-        system=1,
-        link="udpin:0.0.0.0:14550",
-        autopilot=autopilot,
-        vehicle_type=2,
-        uid=version.uid,
-        uid2=version.uid2,
-        firmware=version.flight_sw_version,
-        git_hash=version.git_hash,
-        board=version.board_version,
-        vendor_id=version.vendor_id,
-        product_id=version.product_id,
-        capabilities=version.capabilities,
-    )
+from tests.recordings import identity_in
 
 
 def test_px4_git_hash_is_a_number_and_simulators_share_a_hardware_id() -> None:

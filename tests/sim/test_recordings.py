@@ -136,10 +136,18 @@ UNASKED = (
 """Values that the firmware changes and announces on its own; only those in a list are compared."""
 
 
+COMMITS = {
+    b"fbb78585": b"5eed5eed",
+    bytes.fromhex("0000009383550aa7"): bytes.fromhex("ed5eed5eed5eed5e"),
+}
+"""The commits of the recorded autopilots, and those that the simulated ones report instead."""
+
+
 def compared(messages: Messages) -> Messages:
     """Return the messages that a replay must reproduce, without unsolicited values.
 
     The first 3 s after a start PX4's heartbeat has the state 0; the simulated one has been on for longer.
+    Recorded commits are replaced with the simulated ones.
     """
     kept: Messages = []
     for time, message in messages:
@@ -147,6 +155,9 @@ def compared(messages: Messages) -> Messages:
             continue
         if isinstance(message, wire.Heartbeat) and message.system_status == 0:
             message = dataclasses.replace(message, system_status=3)
+        if isinstance(message, wire.AutopilotVersion):
+            commit = COMMITS.get(message.git_hash, message.git_hash)
+            message = dataclasses.replace(message, git_hash=commit)
         kept.append((time, message))
     return kept
 
