@@ -286,6 +286,10 @@ class Writer:
         call = Call(f"self._thread.{how}", [called, *more])
         if kind in WRAPPED:
             call = Call(f"{kind}.of", ["self._thread", call])
+        if kind == "list[Component]":
+            self.lines += call.laid_out(8, "found = ", "")
+            self.write("return [Component.of(self._thread, each) for each in found]", 2)
+            return
         assert kind in self.own or not self.own & names_in(node.returns), f"{node.name} -> {kind}"
         self.lines += call.laid_out(8, "" if kind == "None" else "return ", "")
 

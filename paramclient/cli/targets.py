@@ -23,7 +23,8 @@ from paramclient.cli.session import (
 from paramclient.cli.sources import choose, is_file, open_file, resolve
 from paramclient.client.client import ParamClient, implementation_of
 from paramclient.client.component import Component
-from paramclient.errors import FileError, NoReply, UsageError
+from paramclient.client.vehicle_search import VEHICLES_LISTENING_TIME, listen_for_vehicles
+from paramclient.errors import FileError, UsageError
 from paramclient.files import ParamFile
 from paramclient.model.paramset import ParamSet
 from paramclient.provision import overlay
@@ -45,10 +46,6 @@ __all__ = [
 Address: TypeAlias = tuple[int, int]
 """System id and component id."""
 
-FLEET_LISTENING_TIME: Final = 3.0
-"""Seconds in which every vehicle is heard, even on a link that loses two of three heartbeats."""
-POLL_INTERVAL: Final = 0.05
-"""Seconds between two checks whether all expected vehicles have been heard."""
 PLACEHOLDERS: Final = ("{uid}", "{system}")
 """Placeholders in file names, which are replaced by the ids of the vehicle."""
 
@@ -243,16 +240,13 @@ async def find_vehicles(
         NoReply: fewer than expected were received.
         LinkError: the link failed.
     """
-    timeout = deadline.left(FLEET_LISTENING_TIME if expect is None else VEHICLE_TIMEOUT)
-    with anyio.move_on_after(timeout):
-        while expect is None or len(_vehicles(client, component)) < expect:
-            implementation_of(client).check_open()
-            await anyio.sleep(POLL_INTERVAL)
-    found = _vehicles(client, component)
-    if expect is not None and len(found) < expect:
-        labels = ", ".join(map(describe, found)) or "none"
-        raise NoReply(f"{expect} vehicles (heard: {labels})", attempts=0, waited=timeout or 0.0)
-    return found
+    return await listen_for_vehicles(
+        lambda: _vehicles(client, component),
+        expect=expect,
+        timeout=deadline.left(VEHICLES_LISTENING_TIME if expect is None else VEHICLE_TIMEOUT),
+        began=anyio.current_time(),
+        check_open=implementation_of(client).check_open,
+    )
 
 
 def _vehicles(client: ParamClient, component: int | None) -> list[Component]:

@@ -23,6 +23,7 @@
 - `signing_timestamps`: persistent signature timestamps.
 - `stats`: counters of a client.
 - `subscription`: streams of items, and of parameter changes.
+- `vehicle_search`: all vehicles on a link, or an expected number of them.
 - `suspend_detection`: detection of suspend and of a stopped process.
 - `taps`: the telemetry log and the forwarder of a client.
 - `worker_thread`: a thread for blocking calls.

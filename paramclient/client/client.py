@@ -300,6 +300,30 @@ class ParamClient:
         """
         return await self._implementation.component(system, component, peer=peer, timeout=timeout)
 
+    async def find_autopilots(
+        self, *, expect: int | None = None, timeout: float | None = COMPONENT_TIMEOUT
+    ) -> list[Component]:
+        """Return the autopilot of every vehicle on the link, sorted by system id; for programs for fleets.
+
+        With `expect`, the call returns as soon as this number of autopilots has been heard, and raises
+        NoReply if fewer were heard in time. A program that sets up vehicles names the number, so that no
+        vehicle is missing. Without `expect`, the call waits for the first autopilot, then listens for
+        further ones for `VEHICLES_LISTENING_TIME` (3 s), and returns all that were heard.
+
+        The result is that of `autopilots`, and includes autopilots that were heard and are lost now.
+
+        Args:
+            expect: the number of autopilots to wait for.
+            timeout: seconds until `expect` autopilots are heard, or without `expect` the first one; None
+                waits without limit.
+
+        Raises:
+            NoReply: no autopilot was heard in time, or fewer than expected; the message names those heard.
+            UsageError: `expect` is below 1. Over a service: its links have autopilots with equal ids.
+            LinkError: the link failed, or the client was closed.
+        """
+        return await self._implementation.find_autopilots(expect=expect, timeout=timeout)
+
     async def only_component(
         self,
         system: int | None = None,

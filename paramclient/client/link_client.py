@@ -28,6 +28,7 @@ from paramclient.client.signing import Signing, refused_in_words
 from paramclient.client.signing_timestamps import TimestampKeeper
 from paramclient.client.stats import ClientStats
 from paramclient.client.taps import LinkTaps
+from paramclient.client.vehicle_search import find_autopilots
 from paramclient.errors import ClientClosed, LinkError, NoReply, UsageError
 from paramclient.links import Link, ReplayLink, SimLink, create_link
 from paramclient.model.identity import Identity
@@ -330,6 +331,15 @@ class LinkClient(LocalClient):
                 await found.wait_for_cache()
         if found is None:
             raise self._not_received(address_in_words(system, component, peer), began)
+        return found
+
+    async def find_autopilots(
+        self, *, expect: int | None = None, timeout: float | None = COMPONENT_TIMEOUT
+    ) -> list[Component]:
+        """See `ParamClient.find_autopilots`."""
+        found = await find_autopilots(self, expect=expect, timeout=timeout)
+        for each in found:
+            await local(each).wait_for_cache()
         return found
 
     async def only_component(

@@ -19,6 +19,7 @@ from paramclient.client.fetch_all import FetchedAll
 from paramclient.client.files import Ftp
 from paramclient.client.local import not_given
 from paramclient.client.stats import ClientStats
+from paramclient.client.vehicle_search import find_autopilots
 from paramclient.errors import (
     CacheError,
     ClientClosed,
@@ -228,6 +229,32 @@ class ServiceClient:
         """
         return await self._find(system, component, peer, timeout)
 
+    async def find_autopilots(
+        self, *, expect: int | None = None, timeout: float | None = COMPONENT_TIMEOUT
+    ) -> list[Component]:
+        """See `ParamClient.find_autopilots`, for the vehicles on all links or on the link in the address.
+
+        Raises:
+            UsageError: autopilots on several links have equal ids, and the address of the service names no
+                link.
+            NoReply, LinkError: as in `ParamClient.find_autopilots`.
+        """
+        found = await find_autopilots(self, expect=expect, timeout=timeout)
+        for each in found:
+            self._check_one_link(mirrored_of(each))
+        return found
+
+    def _check_one_link(self, found: MirroredComponent) -> None:
+        """Check that the ids of a component are on one link only.
+
+        Raises:
+            UsageError: they are not.
+        """
+        if len(same := self._roster.same_ids(found)) > 1:
+            links = " and ".join(each.link_name for each in same)
+            ids = f"{found.key[1]}/{found.key[2]}"
+            raise UsageError(f"{ids} is on {links} of the service; choose one with http://…?link=NAME")
+
     async def only_component(
         self,
         system: int | None = None,
@@ -264,10 +291,7 @@ class ServiceClient:
         )
         left = None if timeout is None else began + timeout - anyio.current_time()
         found = await self._roster.mirror_for(answer, left)
-        if len(same := self._roster.same_ids(found)) > 1:
-            links = " and ".join(each.link_name for each in same)
-            ids = f"{found.key[1]}/{found.key[2]}"
-            raise UsageError(f"{ids} is on {links} of the service; choose one with http://…?link=NAME")
+        self._check_one_link(found)
         return found.component
 
     async def successor(
