@@ -95,6 +95,10 @@ class ApplyRules:
         """Return whether a change of the parameter may show or hide other parameters."""
         return is_group_switch(name, self.autopilot)
 
+    def brings_any(self, name: str) -> bool:
+        """Return whether a change of the parameter may reveal parameters whose names differ from its own."""
+        return self._first("brings_any", name) is not None
+
     def is_last(self, name: str) -> bool:
         """Return whether a change of the parameter may end the connection, so that it is written last."""
         return self._first("last", name) is not None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final, Protocol
@@ -83,7 +83,8 @@ class PlanStatus(StrEnum):
     SET = "set"
     """The value differs and is to be written."""
     LATER = "later"
-    """The vehicle does not have the parameter now; a step of the plan may reveal it, and then it is set."""
+    """The vehicle does not have the parameter now; a step of the plan may reveal it, going by its name, and
+    then it is set."""
     UNCHANGED = "unchanged"
     """The vehicle has the value already."""
     SKIPPED = "skipped"
@@ -349,9 +350,9 @@ def plan(
         renames=renames or Renames(),
     )
     rows = {name: planner.row(each) for name, each in wanted.items()}
-    stages = planner.stages(rows)
     awaiting_reboot = planner.awaiting_reboot(rows)
-    rows = planner.settle_missing(rows, stages)
+    rows = planner.settle_missing(rows)
+    stages = planner.stages(rows)
     named = {row.target.name for row in rows.values()}
     extra = tuple(name for name in current if name not in named)
     return Plan(wanted, rows, stages, extra, given, identity, awaiting_reboot, force, renames)
@@ -516,12 +517,11 @@ class _Planner:
             and any(each.startswith(name.rpartition("_")[0] + "_") for each in missing)
         )
 
-    def settle_missing(self, rows: Mapping[str, PlanRow], stages: Sequence[Stage]) -> dict[str, PlanRow]:
-        """Return the rows with missing parameters as later, if a stage may reveal them, or skipped.
+    def settle_missing(self, rows: Mapping[str, PlanRow]) -> dict[str, PlanRow]:
+        """Return the rows with missing parameters as later, if a step may reveal them, or skipped.
 
         Adds the similar names that the vehicle has.
         """
-        may_appear = any(stage.reveals for stage in stages)
         names = [name for name, row in rows.items() if row.status is PlanStatus.LATER]
         if len(names) > SUGGESTIONS_MAX:
             nearest: Mapping[str, tuple[str, ...]] = {}
@@ -532,7 +532,9 @@ class _Planner:
                 name: nearest_names(name, unnamed | {spelled.get(name.upper(), name)}) for name in names
             }
         settled = dict(rows)
+        may_be_revealed = self._revealed_names(rows)
         for name in names:
+            may_appear = any(map(may_be_revealed, (name, *self._renames.other_names(name))))
             settled[name] = replace(
                 rows[name],
                 status=PlanStatus.LATER if may_appear else PlanStatus.SKIPPED,
@@ -540,6 +542,31 @@ class _Planner:
                 nearest=nearest.get(name, ()),
             )
         return settled
+
+    def _revealed_names(self, rows: Mapping[str, PlanRow]) -> Callable[[str], bool]:
+        """Return a function that tells whether a step may reveal a name that the vehicle does not have.
+
+        A switch reveals names that begin like its own: the members of its group, which may end in a digit
+        (OSD_TYPE: OSD1_ENABLE). One that is turned on may also start a driver whose names share only the part
+        up to the first underscore (CAN_P1_DRIVER: CAN_D1_UC_NODE). A new frame, and ArduPilot's scripts, may
+        bring names of every group.
+        """
+        groups: set[str] = set()
+        for row in rows.values():
+            name = row.target.name
+            if row.status is not PlanStatus.SET or self._rules.is_last(name):
+                continue
+            is_switch = self._rules.reveals(name)
+            if is_switch and row.target.settable == 0:
+                continue
+            if self._rules.brings_any(name) or (not is_switch and self._rules.chooses_frame(name)):
+                return lambda _: True
+            if is_switch:
+                groups.add(name.rpartition("_")[0])
+                if row.before == 0:
+                    groups.add(name[: name.index("_") + 1])
+        prefixes = tuple(groups)
+        return lambda name: name.startswith(prefixes)
 
     def _find_fault(
         self, name: str, value: WireValue, kind: ParamType | int | None, info: ParamInfo | None

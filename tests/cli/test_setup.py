@@ -281,7 +281,7 @@ def test_dry_run_prints_the_stages_in_order(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path], tmp_path: Path
 ) -> None:
     vehicle = copter()
-    wanted = file(FILE + "EK2_ENABLE,1\nNO_SUCH,1\n")
+    wanted = file(FILE + "EK2_ENABLE,1\nEK2_NO_SUCH,1\n")
     backup = tmp_path / "before.yaml"
     outcome = command("apply", put(vehicle), wanted, "--dry-run", "--reboot", "--backup", backup)
     assert outcome.code == 0
@@ -293,7 +293,7 @@ def test_dry_run_prints_the_stages_in_order(
         ["2", "RTL_ALT", "1500", "2500", "set"],
         ["2", "WPNAV_SPEED", "500.0", "750.5", "set"],
     ]
-    assert [row[0] for row in outcome.rows[5:]] == ["COMPASS_OFS_X", "NO_SUCH"]
+    assert [row[0] for row in outcome.rows[5:]] == ["COMPASS_OFS_X", "EK2_NO_SUCH"]
     assert outcome.err.endswith("; nothing was sent\n")
     assert vehicle.requests["PARAM_SET"] == 0
     assert vehicle.requests["COMMAND_LONG"] <= 2, "who it is may be asked, and no more"
@@ -310,6 +310,28 @@ def test_a_dry_run_with_missing_parameters_is_incomplete(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
 ) -> None:
     assert command("apply", put(copter()), file("NO_SUCH,1\n"), "--dry-run").code == 1
+
+
+def test_a_dry_run_tells_a_mistyped_name_from_one_that_a_switch_may_reveal(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+) -> None:
+    vehicle = copter()
+    wanted = file("EK2_ENABLE,1\nEK2_NEW,3\nRTL_ALTT,3\n")
+    dry = command("apply", put(vehicle), wanted, "--dry-run")
+    assert dry.code == 1
+    assert dry.rows[2:] == [
+        ["EK2_NEW", "3", "later", "not on this vehicle, unless a step reveals it"],
+        ["RTL_ALTT", "3", "skipped", "not on this vehicle (did you mean RTL_ALT?)"],
+    ]
+    assert ": 1 to set, 1 that may be revealed, 1 skipped; nothing was sent\n" in dry.err
+    assert vehicle.requests["PARAM_SET"] == 0
+    real = command("apply", put(vehicle), wanted)
+    assert real.code == 1
+    assert dry.rows[-1] in real.rows
+
+    correct = file("EK2_ENABLE,1\nEK2_GPS_TYPE,3\n")
+    codes = [command("apply", put(copter()), correct, *more).code for more in (["--dry-run"], [])]
+    assert codes == [0, 0]
 
 
 # backups

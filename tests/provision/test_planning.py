@@ -19,7 +19,7 @@ from paramclient.provision.apply_rules import OUT_OF_RANGE, READ_ONLY, ApplyRule
 from paramclient.provision.planning import SUGGESTIONS_MAX
 from paramclient.sim.param_table import SimParam, ardupilot_table, ek2_group, px4_table
 
-SECTIONS = ("left_out", "frame", "resets", "last", "system_id", "reboot")
+SECTIONS = ("left_out", "frame", "resets", "brings_any", "last", "system_id", "reboot")
 
 
 @dataclass(frozen=True)
@@ -402,6 +402,43 @@ def test_a_parameter_that_a_step_may_reveal_is_set_later() -> None:
     assert order(shown) == [["EK2_ALT_M_NSE", "WPNAV_SPEED"]]
     hidden = plan(table | held(EK2_ENABLE=1), wanted, autopilot="ardupilot")
     assert hidden.rows["EK2_ALT_M_NSE"].status is PlanStatus.SKIPPED
+
+
+@pytest.mark.parametrize(
+    ("switch", "before", "value", "later", "unknown"),
+    [
+        ("FENCE_ENABLE", 0, 1, "FENCE_ALT_MAX", "RTL_ALTT"),
+        ("FENCE_ENABLE", 1, 0, None, "FENCE_ALT_MAX"),
+        ("BATT2_MONITOR", 4, 10, "BATT2_CAPACITY", "BATT_CAPACITY"),
+        ("OSD_TYPE", 0, 1, "OSD1_ENABLE", "OD1_ENABLE"),
+        ("INS_HNTCH_ENABLE", 1, 2, "INS_HNTCH_REF", "INS_HNTC2_REF"),
+        ("CAN_P1_DRIVER", 0, 1, "CAN_D1_UC_NODE", "CAM_D1_UC_NODE"),
+        ("CAN_P1_DRIVER", 2, 1, "CAN_P1_BITRATE", "CAN_D1_UC_NODE"),
+        ("SCR_ENABLE", 0, 1, "QUIK_GAIN", None),
+        ("SCR_ENABLE", 1, 0, None, "QUIK_GAIN"),
+        ("FRAME_CLASS", 1, 7, "MOT_YAW_SV_ANGLE", None),
+        ("Q_ENABLE", 0, 1, "Q_A_RAT_RLL_P", "RTL_ALTT"),
+        ("SERIAL1_PROTOCOL", 0, 1, None, "SERIAL1_NEW"),
+        ("WPNAV_SPEED", 500, 600, None, "WPNAV_ACC"),
+    ],
+)
+def test_a_switch_reveals_only_names_that_may_be_of_its_group(
+    switch: str, before: int, value: int, later: str | None, unknown: str | None
+) -> None:
+    names = [name for name in (later, unknown) if name is not None]
+    wanted = written(**{switch: value}, **dict.fromkeys(names, 1))
+    made = plan(held(**{switch: before}), wanted, autopilot="ardupilot")
+    assert {row.name for row in made.of(PlanStatus.LATER)} == {later} - {None}
+    assert {row.name: row.reason for row in made.of(PlanStatus.SKIPPED)} == (
+        {} if unknown is None else {unknown: "not on this vehicle"}
+    )
+    assert not made.is_met
+
+
+def test_a_name_that_no_step_can_reveal_causes_no_reboot_between_two_stages() -> None:
+    table = held(EK2_ENABLE=0, WPNAV_SPEED=500.0)
+    made = plan(table, written(EK2_ENABLE=1, WPNAV_SPEED=600, RTL_ALTT=3), autopilot="ardupilot")
+    assert [stage.reboot_first for stage in made.stages] == [False, False]
 
 
 def test_px4_reboots_between_the_frame_and_the_parameters_it_resets() -> None:

@@ -138,6 +138,13 @@ def test_the_order_goes_by_the_names_of_the_vehicle() -> None:
     assert made.rows["EK1_TYPE"].status is PlanStatus.LATER
 
 
+def test_a_switch_may_reveal_a_parameter_under_its_other_name() -> None:
+    wanted = written({"EK1_ENABLE": 1, "EK1_TYPE": 3, "EK1_NEW": 1})
+    made = plan(held(**TABLE), wanted, renames=RENAMES, autopilot="ardupilot")
+    statuses = {name: str(made.rows[name].status) for name in wanted}
+    assert statuses == {"EK1_ENABLE": "set", "EK1_TYPE": "later", "EK1_NEW": "skipped"}
+
+
 # Firmware versions
 
 
