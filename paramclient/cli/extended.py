@@ -31,6 +31,7 @@ from paramclient.cli.sources import check_link, is_file, names_vehicle, tables_i
 from paramclient.cli.targets import check_new
 from paramclient.cli.time_arguments import parse_when
 from paramclient.cli.watch_lines import HEX, ext_value_text, print_changes_and_events
+from paramclient.cli.write_outcomes import status_in_words
 from paramclient.errors import CacheError, NoReply, NotInCache, UnknownParameter, UsageError
 from paramclient.files import FileFormat
 from paramclient.files.extended_document import is_extended_file, read_extended_file, write_extended_file
@@ -708,7 +709,7 @@ def _print_outcomes(session: CommandSession, outcomes: Sequence[ExtSetOutcome]) 
                 each.name,
                 ext_value_text(each.requested, ExtParamType.REAL64),
                 None if each.result is None else _text(each.result.param),
-                each.status.value,
+                status_in_words(each.status, each.error),
             )
             for each in outcomes
         )

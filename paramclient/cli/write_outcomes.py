@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
@@ -15,7 +16,7 @@ from paramclient.cli.output import Coloured, printable, progress_bar, report, sa
 from paramclient.cli.param_names import suggest
 from paramclient.cli.session import CommandSession
 from paramclient.cli.waiting import while_waiting
-from paramclient.errors import ParamClientError, UnknownParameter
+from paramclient.errors import ParamClientError, UnknownParameter, UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.values import ParamType, WireValue, format_value
 from paramclient.model.wording import counted, first_of
@@ -28,6 +29,7 @@ __all__ = [
     "outcome_cells",
     "outcomes_code",
     "report_outcomes",
+    "status_in_words",
     "summary",
     "type_of",
     "write_all",
@@ -35,6 +37,10 @@ __all__ = [
 
 OUTCOME_COLUMNS: Final = ("name", "requested", "actual", "status")
 """Columns of a table of outcomes."""
+NOT_ON_VEHICLE: Final = "not on this vehicle"
+"""The status, in a table, of a name that the vehicle does not have: it has refused nothing."""
+INVALID: Final = "invalid"
+"""The status, in a table, of a value that cannot be sent."""
 WRITE_NAMES_MAX: Final = 10
 """Parameters that a line names, so that it stays short; it gives the number of further ones."""
 
@@ -152,8 +158,17 @@ def outcome_cells(
         outcome.name,
         _text(outcome.requested, ParamType.REAL64),
         actual,
-        Coloured(outcome.status, _STYLES[outcome.status]),
+        Coloured(status_in_words(outcome.status, outcome.error), _STYLES[outcome.status]),
     )
+
+
+def status_in_words(status: SetStatus, error: Exception | None) -> str:
+    """Return a status for a table; instead of *refused* why the value was not sent, in the words of `apply`."""
+    if status is SetStatus.REFUSED and isinstance(error, UnknownParameter):
+        return NOT_ON_VEHICLE
+    if status is SetStatus.REFUSED and isinstance(error, UsageError):
+        return INVALID
+    return status
 
 
 def _text(value: WireValue | None, kind: ParamType | int) -> str | None:
@@ -214,12 +229,12 @@ def summary(session: CommandSession, outcomes: Sequence[SetOutcome], elapsed: fl
 def counted_outcomes(outcomes: Sequence[SetOutcome]) -> str:
     """Return the numbers of outcomes in words: `2 of 4 set, 1 refused, 1 not tried`."""
     done = sum(each.is_set for each in outcomes)
-    failed = {
-        status: sum(each.status is status for each in outcomes)
-        for status in SetStatus
-        if status not in (SetStatus.ACCEPTED, SetStatus.ADJUSTED)
-    }
-    others = [f"{count} {status}" for status, count in failed.items() if count]
+    failed = sorted(
+        (each for each in outcomes if each.status not in (SetStatus.ACCEPTED, SetStatus.ADJUSTED)),
+        key=lambda each: [*SetStatus].index(each.status),
+    )
+    counts = Counter(status_in_words(each.status, each.error) for each in failed)
+    others = [f"{count} {words}" for words, count in counts.items()]
     return ", ".join([f"{done} of {len(outcomes)} set", *others])
 
 

@@ -274,7 +274,7 @@ def test_an_unknown_name_does_not_stop_the_other_values(command: Command, reach:
     done = command("set", reach(camera), *CAMERA, "CAM_NAM", "x", "CAM_MODE", 5, "CAM_NAME", "Rear")
     assert done.code == 1
     assert done.rows[1:] == [
-        ["CAM_NAM", "x", "refused"],
+        ["CAM_NAM", "x", "not on this vehicle"],
         ["CAM_MODE", "5", "5", "accepted"],
         ["CAM_NAME", "Rear", "Rear", "accepted"],
     ]

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from paramclient import ParamType
 from paramclient.cli import session as cli_session
 from paramclient.links import SimLink
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
@@ -84,7 +85,7 @@ def test_every_value_has_an_outcome_of_its_own(command: Command, put: Put) -> No
     assert done.code == 1
     assert [[row[0], row[-1]] for row in done.rows[1:]] == [
         ["A", "accepted"],
-        ["NO_SUCH", "refused"],
+        ["NO_SUCH", "not on this vehicle"],
         ["COUNT", "adjusted"],
         ["FIXED", "refused"],
         ["A", "accepted"],
@@ -92,7 +93,7 @@ def test_every_value_has_an_outcome_of_its_own(command: Command, put: Put) -> No
     doubt, announced, line, *_ = done.err.splitlines()
     assert doubt == "paramclient: COUNT: 7.6 is not a whole number, and COUNT is an integer"
     assert announced == "writing to 1/1 ArduPilot quadrotor, firmware 4.6.0-dev on sim:custom"
-    assert line.startswith("3 of 5 set, 2 refused on 1/1 ArduPilot quadrotor, firmware 4.6.0-dev in ")
+    assert line.startswith("3 of 5 set, 1 not on this vehicle, 1 refused on 1/1 ArduPilot ")
     assert "NO_SUCH: " in done.err
     assert "FIXED: " in done.err
     assert vehicle.values["A"] == 6
@@ -161,3 +162,21 @@ def serve(monkeypatch: pytest.MonkeyPatch, far_end: Endpoint) -> list[ServedClie
 
     monkeypatch.setattr(cli_session, "ParamClient", client)
     return made
+
+
+def test_a_name_that_the_vehicle_lacks_and_an_invalid_value_are_not_called_refused(
+    command: Command, put: Put
+) -> None:
+    table = {"RTL_ALT": (ParamType.INT16, 1500), "RTL_TYPE": (ParamType.INT8, 0), "LOCKED": 1.0}
+    vehicle = ArduPilotVehicle(table=table, read_only=["LOCKED"], param_error=True, live=())
+    words = ["set", put(vehicle), "RTL_ALT=3000", "MISSPELT=1", "RTL_TYPE=300", "LOCKED=2"]
+    done = command(*words, "--force")
+    assert (done.code, vehicle.values["RTL_ALT"]) == (2, 3000)
+    assert done.rows[1:] == [
+        ["RTL_ALT", "3000", "3000", "accepted"],
+        ["MISSPELT", "1", "not on this vehicle"],
+        ["RTL_TYPE", "300", "invalid"],
+        ["LOCKED", "2", "refused"],
+    ]
+    assert "1 of 4 set, 1 not on this vehicle, 1 invalid, 1 refused on " in done.err
+    assert list(statuses(command(*words, "--force", "--json")).values()) == ["accepted", *["refused"] * 3]
