@@ -193,3 +193,10 @@ def test_the_parameter_files_are_what_the_check_looks_at() -> None:
     assert {path.parent.name for path in files} == {"px4", "ardupilot"}
     for path in files:
         assert not read_file(path).notes
+
+
+def test_the_demo_ends_quietly_if_its_reader_ends() -> None:
+    command = f"{sys.executable} {Path(__file__).parent.parent / 'examples' / 'demo.py'} | head -1"
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.startswith("A simulated PX4 vehicle listens on ")
+    assert done.stderr == ""

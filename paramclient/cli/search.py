@@ -82,7 +82,8 @@ def search(
     if not names:
         report(f"nothing found; {counted(len(found.names), 'parameter')} searched")
     if found.undescribed and not options.json:
-        of_some = "of some vehicles, " if found.metadata else ""
+        addresses = ", ".join(f"{each.system}/{each.component}" for each in found.undescribed)
+        of_some = f"of {addresses}, " if found.metadata else ""
         request = how_to_describe(found.undescribed, names[0] if names else "")
         say(printable(f"{of_some}only names were searched: {request}"))
     if not names:

@@ -163,7 +163,7 @@ def outcome_cells(
 
 
 def status_in_words(status: SetStatus, error: Exception | None) -> str:
-    """Return a status for a table; instead of *refused* why the value was not sent, in the words of `apply`."""
+    """Return a status for a table; a value that was not sent has the words of `apply`, not *refused*."""
     if status is SetStatus.REFUSED and isinstance(error, UnknownParameter):
         return NOT_ON_VEHICLE
     if status is SetStatus.REFUSED and isinstance(error, UsageError):

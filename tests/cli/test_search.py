@@ -51,7 +51,7 @@ def test_search_limits_and_reports_nothing(command: Command) -> None:
     assert (nothing.code, nothing.out) == (1, "")
     assert nothing.err.startswith("paramclient: nothing found; ")
     assert (
-        "of some vehicles, only names were searched: no metadata is stored for the firmware of ardupilot. "
+        "of 2/1, only names were searched: no metadata is stored for the firmware of ardupilot. "
         "For 2/1 download https://autotest.ardupilot.org/Parameters/ArduCopter/apm.pdef.xml, then run "
         "`paramclient metadata add apm.pdef.xml`.\n" in nothing.err
     )
@@ -87,7 +87,7 @@ def test_a_camera_needs_no_metadata(
     assert (found.code, found.err) == (0, "")
     assert run("fetch", "sim:ardupilot").code == 0
     assert run("search", "roll").err.startswith(
-        "of some vehicles, only names were searched: no metadata is stored for the firmware of ardupilot. "
+        "of 1/1, only names were searched: no metadata is stored for the firmware of ardupilot. "
     )
 
 
