@@ -373,7 +373,7 @@ def test_restore_prints_what_it_prints_on_a_link(
     assert comparable(done.out) == comparable(on_link.out)
     on_link_only = ("the state is that before the last apply, ", "restored the state before the last apply, ")
     undone = [line for line in on_link.err.splitlines() if any(text in line for text in on_link_only)]
-    assert len(undone) == (1 if "--dry-run" in options else 2), "what it undoes, which a service does not give"
+    assert len(undone) == (1 if "--dry-run" in options else 2), "what it undoes; not of a service"
     common = "\n".join(line for line in on_link.err.splitlines() if line not in undone)
     assert comparable(done.err).strip() == comparable(common).strip()
     assert "the state: 3 parameters of 1/1" in done.err

@@ -167,7 +167,11 @@ def serve(monkeypatch: pytest.MonkeyPatch, far_end: Endpoint) -> list[ServedClie
 def test_a_name_that_the_vehicle_lacks_and_an_invalid_value_are_not_called_refused(
     command: Command, put: Put
 ) -> None:
-    table = {"RTL_ALT": (ParamType.INT16, 1500), "RTL_TYPE": (ParamType.INT8, 0), "LOCKED": 1.0}
+    table: dict[str, float | tuple[ParamType, int]] = {
+        "RTL_ALT": (ParamType.INT16, 1500),
+        "RTL_TYPE": (ParamType.INT8, 0),
+        "LOCKED": 1.0,
+    }
     vehicle = ArduPilotVehicle(table=table, read_only=["LOCKED"], param_error=True, live=())
     words = ["set", put(vehicle), "RTL_ALT=3000", "MISSPELT=1", "RTL_TYPE=300", "LOCKED=2"]
     done = command(*words, "--force")
