@@ -351,6 +351,38 @@ def test_a_new_file_is_created_with_few_statements(path: Path, monkeypatch: pyte
     assert created - len(statements) < 15
 
 
+def test_many_changes_take_as_many_statements_as_one(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rows of `executemany` are statements too: each releases the interpreter lock."""
+    counted = 0
+
+    class Counting(sqlite3.Connection):
+        def execute(self, sql: str, *values: Any) -> sqlite3.Cursor:
+            nonlocal counted
+            counted += 1
+            return super().execute(sql, *values)
+
+        def executemany(self, sql: str, rows: Any) -> sqlite3.Cursor:
+            nonlocal counted
+            rows = list(rows)
+            counted += len(rows)
+            return super().executemany(sql, rows)
+
+    monkeypatch.setattr(sqlite3, "connect", partial(sqlite3.connect, factory=Counting))
+    needed: dict[int, int] = {}
+    with ParamCache(path) as cache:
+        cache.save(whole_table(100))
+        for size in (1, 60):
+            counted = 0
+            cache.save(
+                update(*(stored(f"PARAM_{number}", 1000 + size, index=number) for number in range(size)))
+            )
+            needed[size] = counted
+        table = cache.load(PX4.key, 1)
+        assert table is not None
+        assert len(table.history()) == 61
+    assert needed[60] <= needed[1] + 1
+
+
 def test_a_new_file_that_another_program_locks_is_an_error(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
