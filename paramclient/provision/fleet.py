@@ -61,10 +61,6 @@ async def apply_all(
     given = (include,) if isinstance(include, str) else tuple(include)
 
     async def one(component: Component, own: ParamSet) -> ApplyResult:
-        def report(state: ApplyProgress) -> None:
-            if progress is not None:
-                progress(component, state)
-
         return await apply(
             component,
             own,
@@ -79,7 +75,7 @@ async def apply_all(
             backup=None if backup is None else backup(component),
             timeout=timeout,
             author=author,
-            progress=report,
+            progress=None if progress is None else partial(progress, component),
             before_writing=None if before_writing is None else partial(before_writing, component),
         )
 
@@ -99,13 +95,7 @@ async def verify_all(
 
     Arguments and errors as in `apply_all`.
     """
-    given = (include,) if isinstance(include, str) else tuple(include)
-
-    async def one(component: Component, own: ParamSet) -> Plan:
-        described = None if info is None else info(component)
-        return await verify(component, own, include=given, info=described, force=force, renames=renames)
-
-    return FleetVerified(*await _run_concurrently(components, wanted, one))
+    return await _compare(components, wanted, include=include, info=info, force=force, renames=renames)
 
 
 async def restore_all(
@@ -170,14 +160,32 @@ async def compare_states(
 
     Arguments and errors as in `restore_all`.
     """
+    return await _compare(
+        components, states, restore_categories, include=include, info=info, force=force, renames=None
+    )
+
+
+async def _compare(
+    components: Iterable[Component],
+    wanted: Wanted,
+    categories: Callable[[Component, ParamSet], Awaitable[tuple[str, ...]]] | None = None,
+    *,
+    include: str | Iterable[str],
+    info: Callable[[Component], Mapping[str, ParamInfo] | None] | None,
+    force: bool,
+    renames: Renames | None,
+) -> FleetVerified:
+    """`verify` several vehicles concurrently; `categories` returns those to include besides `include`."""
     given = (include,) if isinstance(include, str) else tuple(include)
 
     async def one(component: Component, own: ParamSet) -> Plan:
-        whole = (*await restore_categories(component, own), *given)
+        more = () if categories is None else await categories(component, own)
         described = None if info is None else info(component)
-        return await verify(component, own, include=whole, info=described, force=force)
+        return await verify(
+            component, own, include=(*more, *given), info=described, force=force, renames=renames
+        )
 
-    return FleetVerified(*await _run_concurrently(components, states, one))
+    return FleetVerified(*await _run_concurrently(components, wanted, one))
 
 
 async def _run_concurrently(
