@@ -13,7 +13,7 @@ from paramclient.protocol.requests.pacing import LinkBandwidth
 
 __all__ = ["Scheduled", "Scheduler", "ListStatistics", "QueuedList", "ListAdmission"]
 
-TICKED_COMPONENTS_MAX: Final = 64
+TICKED_COMPONENTS_MAX: Final = 16
 """Components handled in one `tick`, which takes a few milliseconds. For more, `tick` is due again at once."""
 EXAMINED_COMPONENTS_MAX: Final = 128
 """Components whose deadlines are evaluated in one call: 3 ms. For more, `tick` is due again at once."""
