@@ -27,7 +27,7 @@ from paramclient.protocol.params.writes import Write
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.station import Station
 from paramclient.protocol.stats import traffic
-from paramclient.protocol.vehicle.metadata_location import MetadataRequest
+from paramclient.protocol.vehicle.metadata_request import MetadataRequest
 from paramclient.protocol.vehicle.reboot_command import Reboot
 from paramclient.protocol.wire import HASH_CHECK, NO_INDEX, Framer, Message
 

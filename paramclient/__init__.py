@@ -8,6 +8,8 @@
 - `model`, `errors`, `version`: plain data, exceptions, the version.
 - `service`, `documents`, `cli`: the HTTP service, JSON documents, the command line.
 - `sim`, `testing`: simulated vehicles, and fixtures for tests.
+
+To find the module of a rule, see "Find the code" in `docs/internals/design.md`.
 """
 
 from __future__ import annotations

@@ -15,7 +15,10 @@
 - `sources`, `targets`: the parameters and the vehicles that an argument names. `time_arguments`: times.
 - `session`, `options`: an open link with its vehicle; options that several subcommands share.
 - `waiting`: what a command waits for, on a terminal.
-- `output`, `param_rows`, `results`, `metadata`, `exit_codes`: tables, JSON, metadata and exit codes.
+- `output`: layout and colours of all tables, progress, JSON. `exit_codes`: exit codes.
+- `file_output`: the table of `show FILE`, and texts of parameters in files. `setup_results`: the tables of
+  apply, verify and restore.
+- `metadata`: metadata that a subcommand uses, and the columns with units and meanings.
 - `default_sources`: the metadata that gives the firmware's defaults.
 - `write_outcomes`, `confirmation`: writes with their outcomes, and the question before them.
 - `download_strip`, `link_history`, `block_characters`: drawings of a download and of a link on a terminal.

@@ -23,12 +23,13 @@ from paramclient.cli.extended import (
     restore_extended,
     verify_extended,
 )
+from paramclient.cli.file_output import described
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_session
 from paramclient.cli.options import Count, LinkOptions
 from paramclient.cli.output import print_document, printable, progress_bar, report, say
-from paramclient.cli.param_rows import described
 from paramclient.cli.restore_states import StateToRestore, check_when_for_all, load_states
-from paramclient.cli.results import (
+from paramclient.cli.session import receiver_in_words
+from paramclient.cli.setup_results import (
     NamedVehicle,
     applied_code,
     applied_doc,
@@ -42,7 +43,6 @@ from paramclient.cli.results import (
     show_verified,
     verified_doc,
 )
-from paramclient.cli.session import receiver_in_words
 from paramclient.cli.sources import is_file, read_rules
 from paramclient.cli.targets import (
     Address,

@@ -16,11 +16,12 @@ import anyio
 
 from paramclient.cli.confirmation import can_confirm, confirm
 from paramclient.cli.exit_codes import ExitCode
+from paramclient.cli.file_output import described
 from paramclient.cli.metadata import VEHICLE, request_from_vehicle
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import print_document, printable, progress_bar, report, say
-from paramclient.cli.param_rows import described
-from paramclient.cli.results import (
+from paramclient.cli.session import CommandSession, connect, receiver_in_words, wait_for_firmware
+from paramclient.cli.setup_results import (
     NamedVehicle,
     applied_code,
     met_code,
@@ -30,7 +31,6 @@ from paramclient.cli.results import (
     show_planned,
     show_verified,
 )
-from paramclient.cli.session import CommandSession, connect, receiver_in_words, wait_for_firmware
 from paramclient.cli.targets import Source, describe
 from paramclient.client.local import ServiceComponent
 from paramclient.documents.setup import (

@@ -12,10 +12,10 @@ from paramclient.cli.both_vehicles import may_have_several, resolve_both
 from paramclient.cli.default_sources import STORED_DEFAULTS_HINT, defaults_in
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.extended import are_extended, diff_extended, is_extended_source
+from paramclient.cli.file_output import described, value_text
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_sets, meaning_of, units_of
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import Coloured, print_document, print_table, printable, say
-from paramclient.cli.param_rows import described, value_text
 from paramclient.cli.sources import is_file, read_rules, resolve_all
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata

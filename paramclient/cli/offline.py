@@ -13,6 +13,7 @@ from paramclient.cache.database_url import is_address
 from paramclient.cli.default_sources import STORED_DEFAULTS_HINT, defaults_in, report_no_defaults, say_sources
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.extended import is_extended_source, show_extended
+from paramclient.cli.file_output import show_file
 from paramclient.cli.logs import cache_of_log
 from paramclient.cli.metadata import (
     DESCRIBED_COLUMNS,
@@ -35,7 +36,6 @@ from paramclient.cli.output import (
     say,
 )
 from paramclient.cli.param_names import cached_names, check_given, unmatched_text
-from paramclient.cli.param_rows import show_file
 from paramclient.cli.sources import VehicleChoice, choose, chosen_vehicle, is_file, open_file, tables_in
 from paramclient.errors import NotInCache, UnknownVehicle, UsageError
 from paramclient.metadata import Metadata, MetadataStore

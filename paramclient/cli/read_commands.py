@@ -78,7 +78,6 @@ INDICES_SHOWN_MAX: Final = 20
 """Missing indices that a message names, so that it stays readable; it gives the number of further ones."""
 
 _DEFAULTS: Final = LinkOptions()
-"""Events that watch prints."""
 
 
 async def fetch(

@@ -16,7 +16,8 @@
 - `link_task`: link reader and sender; reopens the link.
 - `local`: internal interface of a client and a component on a link of this process.
 - `recording`: telemetry log of a link.
-- `reconnection`: delays between attempts to reopen a link, and the timeout of calls.
+- `reconnect_delays`: delays between attempts to reopen a link, and the timeout of calls; `link_task` makes
+  the attempts.
 - `reset`: resets of parameters to the firmware's defaults.
 - `short_traceback`: tracebacks of errors without inner frames.
 - `signing`: signing keys and options.

@@ -18,7 +18,7 @@ from paramclient.client.loop_scheduler import (
     TURN_MAX,
     LoopScheduler,
 )
-from paramclient.client.reconnection import Backoff
+from paramclient.client.reconnect_delays import Backoff
 from paramclient.client.suspend_detection import SuspendDetector
 from paramclient.errors import LinkError
 from paramclient.links import Link, Peer

@@ -2,7 +2,8 @@
 
 - `formats`, `param_file`: the known formats, the content of a file.
 - `conversion`, `disk`: from and to bytes, reading and replacing a file.
-- `line_formats`, `script`, `param_pck`, `document_format`, `document_schema`: one module for each kind.
+- `line_formats`: QGroundControl, MAVProxy, Mission Planner. `script`, `param_pck`, `document_format`,
+  `document_schema`: PX4's scripts, packed files, JSON and YAML.
 - `extended_document`: files of extended parameters.
 - `rename_file`: files of names that firmware versions have changed.
 - `text`, `includes`, `yamltext`: lines and bad lines, `@include` lines, YAML with JSON's rules.

@@ -11,12 +11,10 @@ from paramclient.protocol.ftp import param_pck
 
 __all__ = ["is_packed", "read_packed", "write_packed"]
 
-_MAGICS = (b"\x1b\x67", b"\x1c\x67")
-
 
 def is_packed(data: bytes) -> bool:
     """Return whether these bytes begin like a packed parameter file."""
-    return data.startswith(_MAGICS)
+    return data.startswith(param_pck.MAGICS)
 
 
 def read_packed(data: bytes, source: str) -> ParamFile:

@@ -55,7 +55,7 @@ from paramclient.protocol.vehicle.boot_time_requests import BootTimeRequests
 from paramclient.protocol.vehicle.commands import Commands, MessageRequests
 from paramclient.protocol.vehicle.extended_kinds import expects_extended
 from paramclient.protocol.vehicle.identification import Identification
-from paramclient.protocol.vehicle.metadata_location import MetadataRequests
+from paramclient.protocol.vehicle.metadata_request import MetadataRequests
 from paramclient.protocol.vehicle.peer_claims import Claim, PeerRelation
 from paramclient.protocol.vehicle.presence import Presence
 from paramclient.protocol.vehicle.reboot_command import Reboot, Reboots

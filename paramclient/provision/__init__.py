@@ -7,7 +7,9 @@
 - `fleet`: `apply_all`, `verify_all` and `restore_all` for several vehicles.
 - `vehicle_params`: parameters of a vehicle or of the cache as a set.
 - `restore_point`: the snapshot before the last `apply`, and what happened after it.
-- `apply_rules`, `runner`: special parameters; long computations and `before_writing`.
+- `apply_rules`: parameters that `apply` leaves out, writes first or last, or reboots for; the list is
+  `apply_rules.toml`.
+- `runner`: long computations and `before_writing`.
 """
 
 from __future__ import annotations

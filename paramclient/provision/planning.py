@@ -1,4 +1,7 @@
-"""The plan of a set-up: the values to write, their order, and reasons for parameters that are not written."""
+"""The plan of a set-up: the values to write, their order, and reasons for parameters that are not written.
+
+The parameters that no set-up writes are in `apply_rules.toml`.
+"""
 
 from __future__ import annotations
 

@@ -9,9 +9,9 @@ from typing import Any, Final, Protocol, TypeVar
 
 import anyio
 
-from paramclient.client import reconnection
+from paramclient.client import reconnect_delays
 from paramclient.client.arguments import PROGRESS_CALL_INTERVAL
-from paramclient.client.reconnection import Backoff
+from paramclient.client.reconnect_delays import Backoff
 from paramclient.client.short_traceback import shortened
 from paramclient.errors import ClientClosed, LinkError, NoReply, ParamClientError
 from paramclient.remote.decoding import decode_errors
@@ -52,7 +52,7 @@ class Connection:
     """Follows the events of a service, and sends requests to it.
 
     A lost connection is reopened with backoff, as a link is. Calls wait for it for up to `LINK_TIMEOUT` (10
-    s, in `client.reconnection`); then they and new calls raise LinkError until the reconnection.
+    s, in `client.reconnect_delays`); then they and new calls raise LinkError until the reconnection.
 
     Args:
         requests: the HTTP requests.
@@ -144,12 +144,12 @@ class Connection:
                         if is_write and failure.may_be_done:
                             raise self._unknown(awaited, failure) from failure.error.__cause__
                         now = anyio.current_time()
-                        if now - asked_at > reconnection.LINK_TIMEOUT:  # the request had been connected
+                        if now - asked_at > reconnect_delays.LINK_TIMEOUT:  # the request had been connected
                             failing_since = now
                         failing_since = min(failing_since, now)
-                        if now - failing_since >= reconnection.LINK_TIMEOUT:
+                        if now - failing_since >= reconnect_delays.LINK_TIMEOUT:
                             raise failure.error from failure.error.__cause__
-                        await anyio.sleep(reconnection.RECONNECT_BACKOFF_MIN)
+                        await anyio.sleep(reconnect_delays.RECONNECT_BACKOFF_MIN)
                     except ParamClientError as error:
                         raise shortened(error)  # noqa: B904 - the same error
             finally:

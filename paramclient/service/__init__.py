@@ -5,7 +5,8 @@ Needs the extra `service`.
 - `app`, `server`, `routes`: the application, the server, the routes.
 - `hub`, `link`, `followed_component`, `followed_extended`: links and cache, one link, one component, its
   extended parameters.
-- `event_feed`, `jobs`: events, jobs.
+- `event_feed`, `jobs`: numbered events, jobs. The members of events are built by `followed_component`,
+  `followed_extended`, `link` and `jobs`.
 - `description_loader`: descriptions of parameters, loaded without a request.
 - `access`, `request`, `tokens`, `client_address`, `tls`: access checks of every request.
 - `acceptor`, `connection_slots`, `connections`: connections before TLS, their number, their limits.

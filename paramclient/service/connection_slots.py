@@ -124,7 +124,7 @@ class ConnectionSlots:
         return slot
 
     def remove(self, slot: ConnectionSlot) -> None:
-        """Remove a slot; see `ConnectionSlot.free`."""
+        """Remove a slot; see `ConnectionSlot.release`."""
         del self.at[slot.stage][slot]
         self._remote_count -= not slot.is_reserved
         self._counts[slot.client] -= 1

@@ -2,7 +2,8 @@
 
 A listener is only a position in the list, so that 1,000 listeners need almost no memory, and a slow listener
 delays nobody. A listener whose position was overwritten receives the number of missed events. Listeners with
-the same position and filter share one encoded batch.
+the same position and filter share one encoded batch. The members of the events are built by
+`followed_component`, `followed_extended`, `link` and `jobs`.
 """
 
 from __future__ import annotations

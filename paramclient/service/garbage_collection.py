@@ -13,8 +13,8 @@ __all__ = ["ComponentFreezer"]
 FREEZE_INTERVAL: Final = 1.0
 """Seconds between two checks of the number of followed components."""
 COLLECTED_COMPONENTS_MAX: Final = 32
-"""Number of components that full garbage collections may examine: 5 ms. Also the number of forgotten components
-that may occupy memory."""
+"""Number of components that full garbage collections may examine: 5 ms. Also the number of forgotten
+components that may occupy memory."""
 
 
 class ComponentFreezer:

@@ -22,7 +22,7 @@ from paramclient.client.events import (
     Resynced,
     Uncontested,
 )
-from paramclient.client.reconnection import Backoff
+from paramclient.client.reconnect_delays import Backoff
 from paramclient.documents.link import LinkDoc, StatsDoc
 from paramclient.errors import LinkError, ParamClientError, UsageError
 from paramclient.model.notation import hash_text, rounded

@@ -7,7 +7,7 @@ all other classes are those of `paramclient`::
         vehicle = client.component()
         print(vehicle.get("MC_ROLL_P"))
 
-- `blocking`: the classes, generated from the asynchronous ones.
+- `blocking`: the classes, generated from the asynchronous ones by `tests/sync_interface.py` (`make sync`).
 - `client_thread`: the thread in which the asynchronous client runs, and calls to it.
 - `functions`: the functions that take a client or a component, such as `apply`.
 - `fetch_iterator`: a fetch as an iterator of its progress.

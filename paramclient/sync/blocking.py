@@ -424,8 +424,8 @@ class Component(Wrapper[AsyncComponent]):
     """One component of a vehicle; see `ParamClient.component`.
 
     Ctrl-C ends a waiting call; later calls are not affected. Several threads may call at the same time. While
-    a link reconnects, calls wait for up to `LINK_TIMEOUT` (10 s, in `client.reconnection`). After that, and
-    when the client is closed, they raise LinkError. A lost component (see `Lost`) receives no requests:
+    a link reconnects, calls wait for up to `LINK_TIMEOUT` (10 s, in `client.reconnect_delays`). After that,
+    and when the client is closed, they raise LinkError. A lost component (see `Lost`) receives no requests:
     waiting calls and new ones raise NoReply immediately, except a running `fetch_all`, which continues for a
     while, as the vehicle may be rebooting. A component whose address several vehicles use (see `Contested`)
     receives no requests either: calls raise ContestedAddress. In both cases the table is kept, and its values

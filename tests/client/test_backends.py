@@ -34,7 +34,7 @@ from paramclient import (
     WrittenParam,
 )
 from paramclient.client import link_client as client_module
-from paramclient.client import reconnection
+from paramclient.client import reconnect_delays
 from paramclient.client.local import local
 from paramclient.errors import LinkError
 from paramclient.links import Link, create_link, serve_endpoint
@@ -153,7 +153,7 @@ async def test_a_second_vehicle_is_looked_for() -> None:
 
 
 async def test_a_tcp_connection_that_drops_is_opened_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reconnection, "RECONNECT_BACKOFF_MIN", 0.01)
+    monkeypatch.setattr(reconnect_delays, "RECONNECT_BACKOFF_MIN", 0.01)
     vehicle, scope = generic(stream=True, **QUICK), anyio.CancelScope()
     listening = create_link("tcpin:127.0.0.1:0")
     async with beside() as tasks:
@@ -169,7 +169,7 @@ async def test_a_tcp_connection_that_drops_is_opened_again(monkeypatch: pytest.M
 
 
 async def test_a_serial_port_that_is_unplugged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reconnection, "RECONNECT_BACKOFF_MIN", 0.01)
+    monkeypatch.setattr(reconnect_delays, "RECONNECT_BACKOFF_MIN", 0.01)
     vehicle = generic(stream=True, **QUICK)
     with Cable(tmp_path) as cable:
         async with beside() as tasks, a_client(cable.link) as client:
@@ -428,8 +428,8 @@ async def test_a_scope_around_a_client_has_the_file_closed_before_it_ends() -> N
 async def test_a_link_that_fails_reaches_everyone(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(reconnection, "LINK_TIMEOUT", 0.05)
-    monkeypatch.setattr(reconnection, "RECONNECT_BACKOFF_MIN", 0.01)
+    monkeypatch.setattr(reconnect_delays, "LINK_TIMEOUT", 0.05)
+    monkeypatch.setattr(reconnect_delays, "RECONNECT_BACKOFF_MIN", 0.01)
     link = FlakyLink(generic(**QUICK))
     async with beside(), a_client(link) as client:
         component = await client.component()

@@ -37,7 +37,7 @@ from paramclient import (
     UsageError,
     ValueNotApplied,
 )
-from paramclient.client import arguments, link_task, reconnection
+from paramclient.client import arguments, link_task, reconnect_delays
 from paramclient.client.client import local_client
 from paramclient.client.link_component import IDENTITY_TIMEOUT
 from paramclient.links import Peer, create_link, serve_endpoint
@@ -1240,7 +1240,7 @@ async def test_a_link_that_stays_away_fails_the_calls_and_not_the_client(
             error = await task
             assert type(error) is LinkError, name
             assert "refused" in str(error)
-            assert math.isclose(anyio.current_time() - went_away, reconnection.LINK_TIMEOUT, abs_tol=0.1)
+            assert math.isclose(anyio.current_time() - went_away, reconnect_delays.LINK_TIMEOUT, abs_tol=0.1)
         for call in ("get", "set", "fetch_all", "client.component", "client.fetch_all"):
             with pytest.raises(LinkError, match="refused"):
                 await CALLS[call](client, component)
@@ -1356,9 +1356,9 @@ async def test_a_tcp_connection_that_breaks_during_a_download() -> None:
 @direct_only("it is about a link of its own")
 @pytest.mark.asyncio
 async def test_a_tcp_server_that_stays_away(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reconnection, "LINK_TIMEOUT", 0.3)
-    monkeypatch.setattr(reconnection, "RECONNECT_BACKOFF_MIN", 0.05)
-    monkeypatch.setattr(reconnection, "RECONNECT_BACKOFF_MAX", 0.1)
+    monkeypatch.setattr(reconnect_delays, "LINK_TIMEOUT", 0.3)
+    monkeypatch.setattr(reconnect_delays, "RECONNECT_BACKOFF_MIN", 0.05)
+    monkeypatch.setattr(reconnect_delays, "RECONNECT_BACKOFF_MAX", 0.1)
     served = Served(generic(stream=True), "tcpin")
     async with asyncio.timeout(TIMEOUT), served, a_client(f"tcp:127.0.0.1:{served.port}") as client:
         component = await client.component()

@@ -14,7 +14,7 @@ import anyio
 import anyio.lowlevel
 import pytest
 
-from paramclient.client import reconnection
+from paramclient.client import reconnect_delays
 from paramclient.errors import LinkError
 from paramclient.links import Link, Peer, create_link, serve_endpoint, udp
 from paramclient.protocol import wire
@@ -159,7 +159,7 @@ async def test_a_socket_for_every_address_is_not_reopened(net: Net, monkeypatch:
 async def test_an_address_that_is_lost_and_restored(net: Net, monkeypatch: pytest.MonkeyPatch) -> None:
     """A complete session: `udpin` on an address that this computer loses for a while."""
     monkeypatch.setattr(udp, "UNREACHABLE_TIMEOUT", 0.0)
-    monkeypatch.setattr(reconnection, "RECONNECT_BACKOFF_MIN", 0.01)
+    monkeypatch.setattr(reconnect_delays, "RECONNECT_BACKOFF_MIN", 0.01)
     is_gone = [False]
     bind = udp.UdpIn._open
 

@@ -26,7 +26,7 @@ import pytest
 import serialx
 
 from paramclient import ParamClient
-from paramclient.client import reconnection
+from paramclient.client import reconnect_delays
 from paramclient.errors import LinkError, UsageError
 from paramclient.links import Link, Peer, create_link, refusals, serial
 from paramclient.links.transport import UNREAD_BYTES_MAX, Transport
@@ -152,9 +152,9 @@ async def test_unplugged_in_the_middle_of_a_download(
 
 @pytest.mark.asyncio
 async def test_unplugged_permanently(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reconnection, "LINK_TIMEOUT", 0.2)
-    monkeypatch.setattr(reconnection, "RECONNECT_BACKOFF_MIN", 0.05)
-    monkeypatch.setattr(reconnection, "RECONNECT_BACKOFF_MAX", 0.1)
+    monkeypatch.setattr(reconnect_delays, "LINK_TIMEOUT", 0.2)
+    monkeypatch.setattr(reconnect_delays, "RECONNECT_BACKOFF_MIN", 0.05)
+    monkeypatch.setattr(reconnect_delays, "RECONNECT_BACKOFF_MAX", 0.1)
     monkeypatch.setattr(refusals, "list_ports", list)
     vehicle = generic(stream=True)
     async with (

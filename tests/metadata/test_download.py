@@ -27,7 +27,7 @@ from paramclient.protocol.events import EventMaker
 from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.retry import VersionAttempts
 from paramclient.protocol.vehicle.commands import MessageRequests
-from paramclient.protocol.vehicle.metadata_location import MetadataRequests
+from paramclient.protocol.vehicle.metadata_request import MetadataRequests
 from paramclient.protocol.wire import (
     AUTOPILOT_VERSION_ID,
     CommandAck,

@@ -35,7 +35,7 @@ from paramclient import (
     Trust,
     UsageError,
 )
-from paramclient.client import reconnection
+from paramclient.client import reconnect_delays
 from paramclient.client.client import implementation_of
 from paramclient.metadata import metadata_of
 from paramclient.protocol import wire
@@ -529,14 +529,14 @@ async def test_a_service_that_stays_away(caplog: pytest.LogCaptureFixture) -> No
         for error in failed:
             assert type(error) is LinkError
             assert "connection refused" in str(error)
-        assert abs(anyio.current_time() - began - reconnection.LINK_TIMEOUT) < 0.5
+        assert abs(anyio.current_time() - began - reconnect_delays.LINK_TIMEOUT) < 0.5
         assert isinstance(await limited, NoReply)
         began = anyio.current_time()
         for call in calls:
             assert type(await outcome(call())) is LinkError
         assert anyio.current_time() - began < 0.01
         network.app = app
-        await asyncio.sleep(reconnection.RECONNECT_BACKOFF_MAX + 0.1)
+        await asyncio.sleep(reconnect_delays.RECONNECT_BACKOFF_MAX + 0.1)
         assert (await component.set("PARAM_01", 5)).actual == 5
     told = [each.getMessage() for each in caplog.records if each.name.startswith("paramclient.remote")]
     assert len([text for text in told if "reconnecting" in text]) == 1
@@ -597,7 +597,7 @@ async def test_the_links_of_a_service_may_be_away() -> None:
         error = await outcome(component.get("PARAM_01"))
         assert type(error) is LinkError
         assert error.link == "tcp:flaky:5760"
-        assert anyio.current_time() - began >= reconnection.LINK_TIMEOUT - 0.5
+        assert anyio.current_time() - began >= reconnect_delays.LINK_TIMEOUT - 0.5
         link.is_away = False
         resynced = await next_of(Resynced, events)
         assert resynced.component is component

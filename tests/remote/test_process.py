@@ -18,7 +18,7 @@ import anyio
 import pytest
 
 from paramclient import LinkError, ParamClient, UsageError, provision, sync
-from paramclient.client import reconnection
+from paramclient.client import reconnect_delays
 from paramclient.model.paramset import ParamSet
 from paramclient.service import Hub, Listening, serve
 from tests.commands import in_process
@@ -57,9 +57,9 @@ def running(vehicle: Any, port: int = 0, **tls: Path) -> Iterator[str]:
 
 @pytest.mark.asyncio
 async def test_the_library_over_sockets_and_through_a_restart(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reconnection, "LINK_TIMEOUT", 0.5)
-    monkeypatch.setattr(reconnection, "RECONNECT_BACKOFF_MIN", 0.05)
-    monkeypatch.setattr(reconnection, "RECONNECT_BACKOFF_MAX", 0.1)
+    monkeypatch.setattr(reconnect_delays, "LINK_TIMEOUT", 0.5)
+    monkeypatch.setattr(reconnect_delays, "RECONNECT_BACKOFF_MIN", 0.05)
+    monkeypatch.setattr(reconnect_delays, "RECONNECT_BACKOFF_MAX", 0.1)
     vehicle = small_px4()
     with anyio.fail_after(TIMEOUT):
         with running(vehicle) as url:

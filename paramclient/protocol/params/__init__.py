@@ -27,7 +27,7 @@
 `upload`: many values as one file, for ArduPilot.
 `value_check`: values that may be older than a change.
 `volatile_values`: reads of the values that a hash does not cover.
-`write_batch`: many PARAM_SETs in one call.
+`write_batch`: many PARAM_SETs in one call: which are sent next, and the outcome of each.
 `small_changes`: changes too small for PX4 to save.
-`writes`: PARAM_SET.
+`writes`: one PARAM_SET until its value is confirmed, and its repetition; how often is in `requests.retry`.
 """

@@ -1,4 +1,7 @@
-"""Many PARAM_SETs in one call: pipelining, order, and one outcome for each value."""
+"""Many PARAM_SETs in one call: pipelining, order, and one outcome for each value.
+
+`writes` repeats a PARAM_SET.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The peers of a component: several paths to one vehicle, or several vehicles that contest its address."""
+"""The peers of a component: several paths to one vehicle, or several vehicles that contest its address.
+
+The text of the warning is `errors.ContestedAddress`; `client.link_client` logs it.
+"""
 
 from __future__ import annotations
 
