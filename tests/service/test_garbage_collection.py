@@ -42,17 +42,17 @@ class Cycle:
 
 
 @pytest.fixture
-def freezer() -> Iterator[ComponentFreezer]:
+def fresh_freezer() -> Iterator[ComponentFreezer]:
     yield ComponentFreezer()
     gc.unfreeze()
 
 
-def test_memory_of_forgotten_components_is_freed(freezer: ComponentFreezer) -> None:
+def test_memory_of_forgotten_components_is_freed(fresh_freezer: ComponentFreezer) -> None:
     """A system that sends many addresses replaces them all the time, while others are frozen."""
     living: list[weakref.ref[Cycle]] = []
     for _ in range(20):
         followed = {Cycle() for _ in range(COLLECTED_COMPONENTS_MAX)}
         living += [weakref.ref(each) for each in followed]
-        freezer.check(set(followed))
+        fresh_freezer.check(set(followed))
     del followed
     assert sum(each() is not None for each in living) <= COLLECTED_COMPONENTS_MAX
