@@ -46,7 +46,7 @@ from paramclient.cache.ext_records import (
 from paramclient.cache.file_table import AddedTable
 from paramclient.cache.fleet import FleetDiff, FleetValue, FleetVehicle, Holder, NameSpread
 from paramclient.cache.history_columns import HISTORY_ENTRIES_MAX
-from paramclient.cache.interrupted_setups import CutOff, RunningSetup, SetupNotes
+from paramclient.cache.interrupted_setups import InterruptedSetup, RunningSetup, SetupNotes
 from paramclient.cache.observed_table import ObservedParams, UnixTimes
 from paramclient.cache.param_columns import BY_VEHICLE, StoredParam
 from paramclient.cache.records import (
@@ -77,7 +77,7 @@ __all__ = [
     "CachedSummary",
     "CachedVehicle",
     "CopyResult",
-    "CutOff",
+    "InterruptedSetup",
     "ExtHistoryEntry",
     "ExtSnapshot",
     "ExtTableUpdate",

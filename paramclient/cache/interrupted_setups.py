@@ -22,7 +22,7 @@ from typing import Any, Final
 from paramclient.cache.lock import try_to_lock
 from paramclient.errors import CacheError
 
-__all__ = ["CutOff", "RunningSetup", "SetupNotes"]
+__all__ = ["InterruptedSetup", "RunningSetup", "SetupNotes"]
 
 INTERRUPTED_MAX: Final = 64
 """Maximum number of interrupted set-ups that are kept, the newest."""
@@ -37,7 +37,7 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class CutOff:
+class InterruptedSetup:
     """An interrupted set-up: its process ended before the set-up did.
 
     Attributes:
@@ -146,7 +146,7 @@ class SetupNotes:
             CacheError: the note cannot be written.
         """
         now = self._clock()
-        begun = CutOff(name, kind, key, link, system, component, asked_by, now, now)
+        begun = InterruptedSetup(name, kind, key, link, system, component, asked_by, now, now)
         path = self.folder / f"{name}{_SUFFIX}"
         try:
             self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -167,7 +167,7 @@ class SetupNotes:
             ) from error
         return RunningSetup(path, descriptor, self._clock)
 
-    def cut_off(self, *, tells: bool = False) -> list[CutOff]:
+    def cut_off(self, *, tells: bool = False) -> list[InterruptedSetup]:
         """Return the interrupted set-ups, the oldest first; empty if the folder does not exist.
 
         Args:
@@ -183,7 +183,7 @@ class SetupNotes:
                 (self.folder / f"{note.id}{_SUFFIX}").unlink(missing_ok=True)
         return found[-INTERRUPTED_MAX:]
 
-    def _read(self, path: Path, *, tells: bool) -> CutOff | None:
+    def _read(self, path: Path, *, tells: bool) -> InterruptedSetup | None:
         """Return the note in a file; None if its set-up is running, or the file is not a note."""
         try:
             descriptor = os.open(path, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0))
@@ -205,14 +205,14 @@ class SetupNotes:
             os.close(descriptor)
 
 
-def _parsed(data: bytes) -> CutOff | None:
+def _parsed(data: bytes) -> InterruptedSetup | None:
     """Return the note in a file: its first line, updated by later lines; None if it is not a note."""
     entry: dict[str, Any] = {}
     kinds = {"began": float, "at": float, "system": int, "component": int, "done": int, "total": int}
     for line in data.split(b"\n")[:-1]:
         try:
             found = json.loads(line)
-            entry |= {each.name: found[each.name] for each in fields(CutOff) if each.name in found}
+            entry |= {each.name: found[each.name] for each in fields(InterruptedSetup) if each.name in found}
         except (ValueError, TypeError, RecursionError):
             break
     try:
@@ -220,7 +220,7 @@ def _parsed(data: bytes) -> CutOff | None:
         texts = [entry[name] for name in ("id", "kind", "link", "asked_by")]
         if not all(isinstance(text, str) for text in texts) or not isinstance(entry["key"], str | None):
             return None
-        return CutOff(**entry)
+        return InterruptedSetup(**entry)
     except (KeyError, TypeError, ValueError, OverflowError):
         return None
 

@@ -15,7 +15,7 @@
 - `sources`, `targets`: the parameters and the vehicles that an argument names. `time_arguments`: times.
 - `session`, `options`: an open link with its vehicle; options that several subcommands share.
 - `waiting`: what a command waits for, on a terminal.
-- `output`: layout and colours of all tables, progress, JSON. `exit_codes`: exit codes.
+- `output`: layout of all tables, progress, JSON. `exit_codes`: exit codes.
 - `file_output`: the table of `show FILE`, and texts of parameters in files. `setup_results`: the tables of
   apply, verify and restore.
 - `metadata`: metadata that a subcommand uses, and the columns with units and meanings.

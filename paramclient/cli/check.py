@@ -40,7 +40,7 @@ CHECK_TIMEOUT: Final = 60.0
 ENTRIES_SHOWN_MAX: Final = 8
 """Files and directories that a row names, so that it stays one line; it gives the number of further ones."""
 _DEFAULTS: Final = TrafficOptions()
-_COLOURS: Final = {Severity.PROBLEM: "red", Severity.SLOW: "yellow", Severity.NOTE: ""}
+_STYLES: Final = {Severity.PROBLEM: "red", Severity.SLOW: "yellow", Severity.NOTE: ""}
 """Styles of rich for each severity."""
 
 
@@ -99,7 +99,7 @@ async def check(
         if findings:
             print_table(
                 ("severity", "slow or unusual"),
-                ((Coloured(each.severity, _COLOURS[each.severity]), _sentence(each)) for each in findings),
+                ((Coloured(each.severity, _STYLES[each.severity]), _sentence(each)) for each in findings),
             )
         else:
             print_line("Nothing slow or unusual.")

@@ -9,7 +9,7 @@ from typing import Annotated, Final
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from paramclient.cache import CutOff, HistoryEntry, ParamCache, SetupNotes, SnapshotSummary
+from paramclient.cache import HistoryEntry, InterruptedSetup, ParamCache, SetupNotes, SnapshotSummary
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.extended import history_extended
 from paramclient.cli.options import CacheOptions, Id
@@ -113,7 +113,9 @@ def _entries(
     return [entry for entry in entries if entry.name in chosen and (begin is None or entry.at >= begin)]
 
 
-def _print_entries(entries: Sequence[HistoryEntry], cut_off: Sequence[CutOff], options: CacheOptions) -> None:
+def _print_entries(
+    entries: Sequence[HistoryEntry], cut_off: Sequence[InterruptedSetup], options: CacheOptions
+) -> None:
     if options.json:
         from paramclient.documents.history import HistoryDoc  # only here: loads pydantic
 
@@ -146,7 +148,7 @@ def _entry_cells(entry: HistoryEntry) -> tuple[object, ...]:
     return local_time(entry.at), entry.component, entry.name, _value(entry.old), new, entry.by
 
 
-def _cut_off_cells(note: CutOff) -> tuple[object, ...]:
+def _cut_off_cells(note: InterruptedSetup) -> tuple[object, ...]:
     progress = f"{note.done} of {note.total} values" if note.total else "nothing written"
     return local_time(note.at), note.component, f"({note.kind} cut off)", None, progress, note.asked_by
 

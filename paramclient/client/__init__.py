@@ -2,7 +2,7 @@
 
 - `arguments`: argument defaults and checks.
 - `batch_wait`: waiting for the end of a batch of writes.
-- `cache_writer`: writes parameter tables to the cache.
+- `cache_writer`: writes parameter tables to the cache, and waits for the disk if a write is durable.
 - `client`: `ParamClient`, the public class.
 - `client_task`: the task that keeps a client open from `open` to `aclose`.
 - `component`: `Component`, the public interface of one component.
@@ -14,7 +14,7 @@
 - `forwarding`: frames to and from one other program.
 - `link_client`, `link_component`, `link_extended_params`: the implementation over a link of this process.
 - `link_task`: link reader and sender; reopens the link.
-- `local`: internal interface of a client and a component on a link of this process.
+- `local`: internal interfaces: of a client and a component on a link of this process, and over a service.
 - `recording`: telemetry log of a link.
 - `reconnect_delays`: delays between attempts to reopen a link, and the timeout of calls; `link_task` makes
   the attempts.

@@ -1,4 +1,6 @@
-"""LocalClient, LocalComponent, LocalExtParams, ServiceComponent: internal interfaces of both kinds of client.
+"""LocalClient, LocalComponent, LocalExtParams, ServiceComponent: internal interfaces of both clients.
+
+Those of the client over a link of this process begin with `Local`.
 
 `local` returns it for a component, `paramclient.client.client.local_client` for a client. The service,
 provision, metadata, diagnosis, MAVFTP and the fetch of several components use only these names. They are not

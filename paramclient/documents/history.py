@@ -12,11 +12,11 @@ from paramclient.model.notation import bits_text, hash_text, time_text, value_js
 from paramclient.model.values import type_name
 
 if TYPE_CHECKING:
-    from paramclient.cache import CutOff, HistoryEntry, SnapshotSummary
+    from paramclient.cache import HistoryEntry, InterruptedSetup, SnapshotSummary
     from paramclient.model.paramset import ParamSet
 
 __all__ = [
-    "CutOffDoc",
+    "InterruptedSetupDoc",
     "ExactDoc",
     "HistoryDoc",
     "HistoryEntryDoc",
@@ -68,8 +68,8 @@ class HistoryEntryDoc(Document):
         )
 
 
-class CutOffDoc(Document):
-    """A set-up that was interrupted by the end of the service; see `CutOff`.
+class InterruptedSetupDoc(Document):
+    """A set-up that was interrupted by the end of the service; see `InterruptedSetup`.
 
     `at` (unix seconds) is the last time at which it was known to run.
     """
@@ -83,8 +83,8 @@ class CutOffDoc(Document):
     at: float
 
     @classmethod
-    def of(cls, note: CutOff) -> CutOffDoc:
-        """Return the document of a `CutOff`."""
+    def of(cls, note: InterruptedSetup) -> InterruptedSetupDoc:
+        """Return the document of a `InterruptedSetup`."""
         return cls(
             time=time_text(note.at),
             component=note.component,
@@ -104,7 +104,7 @@ class HistoryDoc(Document):
 
     history: list[HistoryEntryDoc]
     before: Maybe[float] = None
-    cut_off: Maybe[list[CutOffDoc]] = None
+    cut_off: Maybe[list[InterruptedSetupDoc]] = None
 
     @classmethod
     def of(
@@ -113,13 +113,13 @@ class HistoryDoc(Document):
         *,
         exact: bool = False,
         before: float | None = None,
-        cut_off: Iterable[CutOff] = (),
+        cut_off: Iterable[InterruptedSetup] = (),
     ) -> HistoryDoc:
         """Lines of history."""
         return cls(
             history=[HistoryEntryDoc.of(entry, exact=exact) for entry in entries],
             before=before,
-            cut_off=[CutOffDoc.of(note) for note in cut_off] or None,
+            cut_off=[InterruptedSetupDoc.of(note) for note in cut_off] or None,
         )
 
 

@@ -9,7 +9,7 @@ from paramclient.documents.document import Document
 from paramclient.documents.problem import Problem
 
 if TYPE_CHECKING:
-    from paramclient.cache import CutOff
+    from paramclient.cache import InterruptedSetup
 
 __all__ = ["JobDoc", "JobsDoc", "progress_text"]
 
@@ -35,7 +35,7 @@ class JobDoc(Document):
     problem: Problem | None
 
     @classmethod
-    def of_cut_off(cls, note: CutOff) -> JobDoc:
+    def of_cut_off(cls, note: InterruptedSetup) -> JobDoc:
         """Return the document of a set-up that was interrupted when an earlier run of the service ended."""
         detail = (
             f"The service ended while the set-up ran, {progress_text(note)}. The written values are in the "
@@ -63,6 +63,6 @@ class JobsDoc(Document):
     jobs: list[JobDoc]
 
 
-def progress_text(note: CutOff) -> str:
+def progress_text(note: InterruptedSetup) -> str:
     """Return the progress of an interrupted set-up in words."""
     return f"after {note.done} of {note.total} values" if note.total else "before anything was written"

@@ -6,7 +6,7 @@
   `document_schema`: PX4's scripts, packed files, JSON and YAML.
 - `extended_document`: files of extended parameters.
 - `rename_file`: files of names that firmware versions have changed.
-- `text`, `includes`, `yamltext`: lines and bad lines, `@include` lines, YAML with JSON's rules.
+- `text`, `includes`, `yaml_parser`: lines and bad lines, `@include` lines, YAML with JSON's rules.
 """
 
 from paramclient.files.conversion import LARGEST_FILE, dumps, loads

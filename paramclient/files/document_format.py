@@ -115,7 +115,7 @@ def parse_yaml(text: str, source: str) -> object:
     """
     if find_spec("yaml") is None:
         raise FileError("YAML is read with PyYAML: pip install 'paramclient[yaml]'", source=source)
-    from paramclient.files.yamltext import InvalidYaml, load  # imported here because it needs the extra
+    from paramclient.files.yaml_parser import InvalidYaml, load  # imported here because it needs the extra
 
     try:
         content: object = load(text)

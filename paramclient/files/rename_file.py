@@ -50,7 +50,7 @@ def loads_renames(data: bytes, *, source: str = "") -> Renames:
     """
     if find_spec("yaml") is None:
         raise FileError("YAML is read with PyYAML: pip install 'paramclient[yaml]'", source=source)
-    from paramclient.files.yamltext import InvalidYaml, load  # imported here because it needs the extra
+    from paramclient.files.yaml_parser import InvalidYaml, load  # imported here because it needs the extra
 
     if len(data) > SIZE_MAX:
         raise FileError(f"a file of renamed parameters has at most {SIZE_MAX} bytes", source=source)

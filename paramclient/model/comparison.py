@@ -190,7 +190,9 @@ def compare(
     if names is not None:
         matching = _chosen(chosen, [names] if isinstance(names, str) else names)
         chosen = matching | {name for name, param in renamed.items() if param.name in matching}
-    entries = (_hold(name, left, right, base, renamed.get(name), renames) for name in sorted(chosen - paired))
+    entries = (
+        _compared(name, left, right, base, renamed.get(name), renames) for name in sorted(chosen - paired)
+    )
     return Comparison(left, right, base, tuple(entries))
 
 
@@ -254,7 +256,7 @@ def _chosen(known: Collection[str], patterns: Iterable[str]) -> set[str]:
     return chosen
 
 
-def _hold(
+def _compared(
     name: str,
     left: ParamSet,
     right: ParamSet,

@@ -320,7 +320,7 @@ class ComponentMachine:
     @property
     def may_be_written(self) -> bool:
         """Whether it is certain which vehicle receives a write, and in which encoding."""
-        return self.identification.may_be_written and self.is_recipient_certain
+        return self.identification.is_certain and self.is_recipient_certain
 
     @property
     def is_recipient_certain(self) -> bool:

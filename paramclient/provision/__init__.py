@@ -2,11 +2,12 @@
 
 - `planning`: the values to write, their order, and the reason for each parameter that is not written.
 - `inspection`: read what a vehicle has; `prepare` and `verify`.
-- `apply_restore`: `apply` and `restore`; `execution` runs them, `results` holds their results.
+- `apply_restore`: `apply` and `restore`; `execution` runs them, and stores the
+  snapshot before the first write; `results` holds their results.
 - `extended`: the same for extended parameters.
 - `fleet`: `apply_all`, `verify_all` and `restore_all` for several vehicles.
 - `vehicle_params`: parameters of a vehicle or of the cache as a set.
-- `restore_point`: the snapshot before the last `apply`, and what happened after it.
+- `restore_point`: reads the snapshot that the last `apply` stored, and what has changed since.
 - `apply_rules`: parameters that `apply` leaves out, writes first or last, or reboots for; the list is
   `apply_rules.toml`.
 - `runner`: long computations and `before_writing`.

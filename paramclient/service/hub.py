@@ -46,7 +46,7 @@ from paramclient.service.quota import (
 )
 
 if TYPE_CHECKING:
-    from paramclient.cache import CutOff, ParamCache, RunningSetup
+    from paramclient.cache import InterruptedSetup, ParamCache, RunningSetup
     from paramclient.sim import Endpoint
 
 __all__ = ["Hub"]
@@ -220,7 +220,7 @@ class Hub:
         with anyio.CancelScope(shield=True):
             await self._worker.run(note.cut_off if is_cut_off else note.end)
 
-    async def interrupted_setups(self) -> list[CutOff]:
+    async def interrupted_setups(self) -> list[InterruptedSetup]:
         """Return the recorded set-ups that were interrupted."""
         return [] if self._setups is None else await self.run_in_thread(self._setups.cut_off)
 

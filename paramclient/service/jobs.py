@@ -18,7 +18,7 @@ from paramclient.errors import ParamClientError
 from paramclient.service.problems import ServiceError, problem_of
 
 if TYPE_CHECKING:
-    from paramclient.cache import CutOff
+    from paramclient.cache import InterruptedSetup
     from paramclient.service.event_feed import EventFeed
     from paramclient.service.followed_component import FollowedComponent
 
@@ -139,7 +139,7 @@ class Jobs:
     """
 
     def __init__(self, feed: EventFeed) -> None:
-        self.cut_off: Sequence[CutOff] = ()
+        self.cut_off: Sequence[InterruptedSetup] = ()
         self._feed = feed
         self._jobs: dict[str, Job] = {}
         self._tasks: anyio.abc.TaskGroup | None = None

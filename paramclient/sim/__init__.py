@@ -21,7 +21,7 @@ The vehicles behave as measured on real ones, with the real timing. The docstrin
 - `px4`, `ardupilot`, `generic`: the vehicles. `camera`: a camera with extended parameters.
 - `vehicle`, `device`: their base classes.
 - `param_table`, `ftp`, `metadata`: parameter tables, the MAVFTP server, metadata files.
-- `air`, `other`: the faulty link, a second ground station.
+- `air`, `other_station`: the faulty link, a second ground station.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from paramclient.sim.ardupilot import ArduPilotVehicle
 from paramclient.sim.camera import Camera, ExtEntries, camera_table
 from paramclient.sim.device import DeviceOptions
 from paramclient.sim.generic import GenericVehicle
-from paramclient.sim.other import OtherStation
+from paramclient.sim.other_station import OtherStation
 from paramclient.sim.param_table import SimParam, Table, ardupilot_table, px4_table
 from paramclient.sim.px4 import PX4Vehicle
 from paramclient.sim.vehicle import Vehicle, VehicleOptions

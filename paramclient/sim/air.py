@@ -9,7 +9,7 @@ from heapq import heappop, heappush
 from typing import Protocol, TypedDict, Unpack
 
 from paramclient.errors import UsageError
-from paramclient.sim.other import OtherStation
+from paramclient.sim.other_station import OtherStation
 
 __all__ = ["Air", "Endpoint", "FaultyLink"]
 

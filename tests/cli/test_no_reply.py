@@ -10,7 +10,7 @@ import pytest
 from paramclient.cli import session as cli_session
 from paramclient.links import SimLink
 from paramclient.sim import Air, Endpoint, GenericVehicle, PX4Vehicle
-from paramclient.sim.other import OtherStation
+from paramclient.sim.other_station import OtherStation
 from tests.client_kinds import ServedClient
 from tests.commands import Command, Put, behind, in_process, leaping
 

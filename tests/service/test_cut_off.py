@@ -13,7 +13,7 @@ from typing import Any
 import anyio
 import pytest
 
-from paramclient.cache import CutOff, SetupNotes
+from paramclient.cache import InterruptedSetup, SetupNotes
 from paramclient.cache.interrupted_setups import INTERRUPTED_MAX, NOTE_BYTES_MAX, RunningSetup
 from paramclient.errors import CacheError
 from paramclient.links import create_link, serve_endpoint
@@ -61,7 +61,7 @@ def test_one_whose_process_has_died_is_told_once(notes: SetupNotes, clock: Clock
     clock.now += 0.5
     running.note(done=4, total=20, key="uid:1")
     died(running)
-    expected = CutOff("a1", "apply", "uid:1", "sim:", 1, 1, "anna", 1_000.0, 1_005.0, 3, 20)
+    expected = InterruptedSetup("a1", "apply", "uid:1", "sim:", 1, 1, "anna", 1_000.0, 1_005.0, 3, 20)
     assert notes.cut_off() == [expected]
     assert notes.cut_off(tells=True) == [expected]
     assert [note.is_told for note in notes.cut_off(tells=True)] == [True]

@@ -84,7 +84,7 @@ seldom matches."""
 
 
 class WriteWay(StrEnum):
-    """How many values are written."""
+    """The way in which a call writes many values: PARAM_SETs, or one file."""
 
     QUICKEST = "quickest"
     """By the way that should take less time, as far as the link is measured."""

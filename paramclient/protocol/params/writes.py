@@ -146,7 +146,7 @@ class WritePermission(Protocol):
 
     @property
     def may_be_written(self) -> bool:
-        """Whether it is certain which vehicle receives a write, and in which encoding."""
+        """See `ComponentMachine.may_be_written`."""
 
 
 class Writes(Machine):

@@ -165,8 +165,11 @@ class Identification(Machine):
         return self._context.may_be_another and not self._context.is_identifying and self._may_ask
 
     @property
-    def may_be_written(self) -> bool:
-        """Whether it is certain which vehicle receives a write, and in which encoding."""
+    def is_certain(self) -> bool:
+        """Whether its encoding is known and no other vehicle may have taken its place.
+
+        Writes also need a certain recipient, see `ComponentMachine.may_be_written`.
+        """
         return self.encoding_is_certain and not self._context.may_be_another
 
     @property

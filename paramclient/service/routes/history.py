@@ -12,7 +12,7 @@ from typing import Annotated, Any, Final
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from pydantic import Field, model_validator
 
-from paramclient.cache import HISTORY_ENTRIES_MAX, CutOff, FleetDiff, HistoryEntry
+from paramclient.cache import HISTORY_ENTRIES_MAX, FleetDiff, HistoryEntry, InterruptedSetup
 from paramclient.documents.cached import CachedTableDoc, VehicleDoc, VehiclesDoc
 from paramclient.documents.document import Body, InParts
 from paramclient.documents.extended_output import ExtHistoryDoc
@@ -398,7 +398,7 @@ async def _page(
 
 async def _cut_off(
     hub: Hub, key: str, component: int, since: float | None, before: float | None
-) -> list[CutOff]:
+) -> list[InterruptedSetup]:
     """Return the interrupted set-ups of a component within a period."""
     begin, end = -math.inf if since is None else since, math.inf if before is None else before
     return [

@@ -331,15 +331,15 @@ def test_a_version_that_tells_no_encoding_waits_for_a_heartbeat() -> None:
         desk = Desk()
         desk.who.receive(10.0)
         desk.who.version(AutopilotVersion(ARDUPILOT_BITS), 10.1)
-        assert is_so(not desk.who.may_be_written)
+        assert is_so(not desk.who.is_certain)
         if heartbeat is None:  # one that never sends any keeps to the standard
             desk.tick(13.0)
-            assert is_so(not desk.who.may_be_written)
+            assert is_so(not desk.who.is_certain)
             assert desk.next_deadline() == 13.1
             desk.tick(13.1)
         else:
             desk.who.heartbeat(heartbeat)
-        assert is_so(desk.who.may_be_written)
+        assert is_so(desk.who.is_certain)
         assert desk.who.encoding is encoding
         assert desk.next_deadline() == math.inf
 
@@ -348,20 +348,20 @@ def test_a_version_that_tells_the_encoding_waits_for_no_heartbeat() -> None:
     desk = Desk()
     desk.who.receive(10.0)
     desk.who.version(AutopilotVersion(CAPABILITY_PARAM_ENCODE_BYTEWISE), 10.1)
-    assert desk.who.may_be_written
+    assert desk.who.is_certain
 
 
 def test_the_identity_is_requested_again_when_it_is_in_doubt() -> None:
     desk = settled(7)
     desk.beat(PX4, 20.0)
     assert desk.commands() == []
-    assert is_so(desk.who.may_be_written)
+    assert is_so(desk.who.is_certain)
     desk.who.doubt(30.0)
-    assert not desk.who.may_be_written
+    assert not desk.who.is_certain
     assert desk.commands() == [MAV_CMD_REQUEST_MESSAGE]
     assert desk.who.settled
     assert desk.who.version(AutopilotVersion(0, uid=7), 30.1) is False
-    assert is_so(desk.who.may_be_written)
+    assert is_so(desk.who.is_certain)
     assert desk.who.version(AutopilotVersion(0, uid=8), 30.2) is True
     assert desk.who.identity.uid == "0000000000000008"
 
@@ -397,7 +397,7 @@ def test_a_component_that_returns_is_asked_for_five_seconds_at_most_once_a_secon
     times = [30.0]
     while (deadline := desk.next_deadline()) < math.inf:
         assert is_so(desk.who.is_doubted)
-        assert not desk.who.may_be_written
+        assert not desk.who.is_certain
         times.append(deadline)
         desk.tick(deadline)
     usual = desk.retry.tries
@@ -405,6 +405,6 @@ def test_a_component_that_returns_is_asked_for_five_seconds_at_most_once_a_secon
     assert all(after - before >= DOUBT_REQUEST_INTERVAL for before, after in pairwise(times[usual - 1 : -1]))
     assert len(times) <= usual + DOUBT_TIME_MIN / DOUBT_REQUEST_INTERVAL + 2
     assert desk.who.is_unconfirmed, "it has not said that it is the same"
-    assert not desk.who.may_be_written
+    assert not desk.who.is_certain
     desk.who.version(AutopilotVersion(0, uid=7), 60.0)
     assert not is_so(desk.context.may_be_another)
