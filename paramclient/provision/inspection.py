@@ -428,7 +428,8 @@ def _in_no_hidden_group(table: Mapping[str, Param], wanted: Iterable[str]) -> fr
     """Return wanted names that an ArduPilot cannot have: neither listed nor in a hidden group.
 
     While the switch of a group, a listed INT8, is 0, the list leaves out the parameters of that group; their
-    names share a prefix (`AP_Param::next_group`). All other parameters that can be read by name are listed.
+    names begin like that of the switch (`AP_Param::next_group`), possibly without an underscore behind it
+    (OSD_TYPE: OSD1_ENABLE). All other parameters that can be read by name are listed.
 
     Args:
         table: the whole list.
@@ -437,13 +438,13 @@ def _in_no_hidden_group(table: Mapping[str, Param], wanted: Iterable[str]) -> fr
     switches = [
         name for name, param in table.items() if param.type_number is ParamType.INT8 and param.settable == 0
     ]
-    hidden = {start for name in switches for start in _starts(name)}
-    return frozenset(name for name in wanted if name not in table and hidden.isdisjoint(_starts(name)))
+    hidden = tuple({start for name in switches for start in _group_prefixes(name)})
+    return frozenset(name for name in wanted if name not in table and not name.startswith(hidden))
 
 
-def _starts(name: str) -> Iterator[str]:
-    """Return the prefixes that a name may share with its group: the part up to each underscore."""
-    return (name[: at + 1] for at, letter in enumerate(name) if letter == "_")
+def _group_prefixes(switch: str) -> Iterator[str]:
+    """Return the prefixes that the names of a switch's group may have: its name up to each underscore."""
+    return (switch[:at] for at, letter in enumerate(switch) if letter == "_" and at > 0)
 
 
 def _is_name(name: str) -> bool:

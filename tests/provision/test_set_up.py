@@ -474,6 +474,21 @@ async def test_members_of_a_group_to_reveal_are_requested_during_the_file_downlo
     assert {each.param_id for each in reads} >= hidden.keys()
 
 
+@pytest.mark.parametrize("osd_type", [0, 1])
+@in_simulated_time
+async def test_a_hidden_group_may_continue_the_name_of_its_switch_without_an_underscore(osd_type: int) -> None:
+    """ArduPilot's AP_OSD: OSD_TYPE hides OSD_CHAN and the screens OSD1_ to OSD4_."""
+    osd: dict[str, WireValue | tuple[ParamType, WireValue]] = {"OSD_CHAN": 0.0, "OSD1_ENABLE": 0.0}
+    table = SETTINGS | {"OSD_TYPE": (ParamType.INT8, 0)}
+    vehicle = ArduPilotVehicle(table=table, groups={"OSD_TYPE": osd}, ftp=True)
+    async with a_client(vehicle) as client:
+        result = await apply(
+            await client.component(), written({"OSD_TYPE": osd_type, "OSD_CHAN": 5.0, "OSD1_ENABLE": 1.0})
+        )
+    assert result.complete
+    assert (vehicle.param("OSD_CHAN").value, vehicle.param("OSD1_ENABLE").value) == (5.0, 1.0)
+
+
 @in_simulated_time
 async def test_a_group_that_cannot_be_read_by_name_is_set_once_it_is_revealed() -> None:
     vehicle = ardupilot(HidingGroup)

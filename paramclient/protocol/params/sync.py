@@ -9,7 +9,7 @@ from functools import partial
 from typing import Final, Protocol
 
 from paramclient.errors import FileTransferError, UnknownParameter, UsageError
-from paramclient.model.group_switches import is_group_switch
+from paramclient.model.group_switches import precedes_group
 from paramclient.model.values import Trust
 from paramclient.protocol.ftp import BUSY, FileTransfers
 from paramclient.protocol.params.change import Change
@@ -314,7 +314,7 @@ class Sync(Machine):
                     self._foreign_changed(now)
             self.expire_hash()
         is_followed = self.synced or self._count_changes is not None
-        if now is not None and is_followed and self._is_switch(name):
+        if now is not None and is_followed and precedes_group(name):
             self._last_switch = name
         if (self._was_marked_unsynced or self._resync is not None) and len(self._changed_names) < NAMES_MAX:
             self._changed_names[name] = None
@@ -343,7 +343,7 @@ class Sync(Machine):
             if is_late and changes and changes[-1].added == -added:
                 changes.pop()
             else:
-                changes.append(CountChange(carrier if self._is_switch(carrier) else self._last_switch, added))
+                changes.append(CountChange(carrier if precedes_group(carrier) else self._last_switch, added))
             if len(changes) > COUNT_CHANGES_FOLLOWED_MAX or self._shifts >= SHIFTS_MAX:
                 self._count_changes = None
         self._count_changed_at = now
@@ -639,10 +639,6 @@ class Sync(Machine):
             self._is_checking = False
             if self._keeps_in_sync and not self.must_not_poll:
                 self._begin_resync(now, None)
-
-    @staticmethod
-    def _is_switch(name: str) -> bool:
-        return is_group_switch(name, "ardupilot")
 
     def _is_shift_worthwhile(self, now: float) -> bool:
         """Return whether reads of the shifted indices are expected to be clearly faster than a download."""
