@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+import zlib
 from collections.abc import Iterable, Mapping
 from typing import Final, Unpack
 
@@ -146,7 +147,8 @@ class PX4Vehicle(BytewiseVehicle):
         metadata: bool = False,
         **options: Unpack[VehicleOptions],
     ) -> None:
-        rows = with_system_id(px4_table() if table is None else as_table(table), _SYSTEM_ID, system)
+        built_in = px4_table() if table is None else as_table(table)
+        rows = with_system_id(built_in, _SYSTEM_ID, system)
         if table is None and late_use is None:
             compass = _third_compass(rows)
             late_use = {"CAL_MAG2_ID": [row.name for row in compass]}
@@ -189,7 +191,7 @@ class PX4Vehicle(BytewiseVehicle):
             version=wire.AutopilotVersion(
                 59647,
                 flight_sw_version=_MAIN if ftp else _RELEASE,
-                git_hash=bytes.fromhex(2 * SIMULATED_COMMIT)[::-1],
+                git_hash=bytes.fromhex(SIMULATED_COMMIT + _commit_end(table, built_in))[::-1],
                 board_version=1,
                 uid=_UID + system - 1 if uid is None else uid,
             ),
@@ -441,6 +443,14 @@ _SAVE_INTERVAL = 2.0
 """Seconds between two saves, at least."""
 _RESET_ALL = 2.0
 """First parameter of MAV_CMD_PREFLIGHT_STORAGE that resets all parameters."""
+
+
+def _commit_end(table: Table | None, built_in: Iterable[SimParam]) -> str:
+    """Return the second half of the commit, different for each table: metadata is stored by commit."""
+    if table is None:
+        return SIMULATED_COMMIT
+    content = repr([(row.name, int(row.type), row.bits) for row in built_in])
+    return f"{zlib.crc32(content.encode()):08x}"
 
 
 def _third_compass(rows: tuple[SimParam, ...]) -> tuple[SimParam, ...]:

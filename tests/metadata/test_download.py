@@ -206,6 +206,21 @@ async def test_simulated_autopilots_report_a_commit_of_their_own(
 
 
 @in_simulated_time
+async def test_metadata_of_a_simulated_px4_is_not_used_for_one_with_another_table(tmp_path: Path) -> None:
+    cache = ParamCache(tmp_path / "cache.sqlite3")
+    identities = []
+    for vehicle in (describing(), describing(system=2), PX4Vehicle(table={"RTL_RETURN_ALT": 1.0})):
+        async with a_client(vehicle, cache=cache) as client:
+            component = await client.component()
+            await anyio.sleep(0.5)
+            identities.append(component.identity)
+            if len(identities) == 1:
+                assert await metadata_of(component) is not None
+    store = MetadataStore.beside(cache.path)
+    assert [store.known(each, 1) is not None for each in identities] == [True, True, False]
+
+
+@in_simulated_time
 async def test_without_a_cache_nothing_is_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def forbidden(*_: object) -> None:
         raise AssertionError
