@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from paramclient.errors import NotInCache, UnknownVehicle
 from paramclient.model.paramset import ParamSet
 from paramclient.provision.apply_restore import BEFORE_RESTORE
-from paramclient.provision.vehicle_params import BEFORE_APPLY, load_state_before_apply
+from paramclient.provision.vehicle_params import BEFORE_APPLY
 
 if TYPE_CHECKING:
     from paramclient.cache import HistoryEntry, ParamCache, SnapshotSummary
 
-__all__ = ["RestorePoint", "load_restore_point"]
+__all__ = ["RestorePoint", "load_restore_point", "load_state_before_apply"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class RestorePoint:
     restored: SnapshotSummary | None
 
 
-def load_restore_point(cache: ParamCache, key: str, component: int) -> RestorePoint:
+def load_state_before_apply(cache: ParamCache, key: str, component: int) -> ParamSet:
     """Return the state that the cache stored of a component before the latest `apply`.
 
     Args:
@@ -47,14 +47,22 @@ def load_restore_point(cache: ParamCache, key: str, component: int) -> RestorePo
     Raises:
         CacheError: the cache has no snapshot from before an `apply`.
     """
-    state = load_state_before_apply(cache, key, component)
+    return cache.state_at(key, component, _point_of(_snapshots(cache, key, component), key).id)
+
+
+def load_restore_point(cache: ParamCache, key: str, component: int) -> RestorePoint:
+    """Return the state before the latest `apply`, and what happened after it.
+
+    Arguments and errors as of `load_state_before_apply`.
+    """
+    snapshots = _snapshots(cache, key, component)
+    snapshot = _point_of(snapshots, key)
     try:
-        snapshots = cache.snapshots(key, component)
-        snapshot = [each for each in snapshots if each.reason == BEFORE_APPLY][-1]
+        state = cache.state_at(key, component, snapshot.id)
         table = cache.load(key, component)
         entries = cache.history(key, component)
-    except (UnknownVehicle, IndexError):  # removed from the cache since the line above
-        raise NotInCache(f"the cache has no snapshot from before an apply to {key}") from None
+    except UnknownVehicle:  # removed from the cache since the line above
+        raise _none(key) from None
     restores = [each for each in snapshots if each.reason == BEFORE_RESTORE and each.id > snapshot.id]
     now = {} if table is None else table.params
     latest = {entry.name: entry for entry in entries}  # of several entries of a name, the last one
@@ -65,3 +73,24 @@ def load_restore_point(cache: ParamCache, key: str, component: int) -> RestorePo
     ]
     changes.sort(key=lambda entry: entry.at, reverse=True)
     return RestorePoint(snapshot, state, changes, restores[-1] if restores else None)
+
+
+def _snapshots(cache: ParamCache, key: str, component: int) -> Sequence[SnapshotSummary]:
+    try:
+        return cache.snapshots(key, component)
+    except UnknownVehicle:
+        return ()
+
+
+def _point_of(snapshots: Iterable[SnapshotSummary], key: str) -> SnapshotSummary:
+    """Return the newest snapshot from before an `apply`."""
+    points = [each for each in snapshots if each.reason == BEFORE_APPLY]
+    if not points:
+        raise _none(key)
+    return points[-1]
+
+
+def _none(key: str) -> NotInCache:
+    return NotInCache(
+        f"the cache has no snapshot from before an apply to {key}; name the time of the state to restore"
+    )

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from paramclient.errors import NoReply, NotInCache, UnknownVehicle, UsageError, VehicleError
+from paramclient.errors import NoReply, NotInCache, UsageError, VehicleError
 from paramclient.model.comparison import defaults_of, non_defaults
 from paramclient.model.defaults import add_defaults
 from paramclient.model.ext_params import ExtParam
@@ -32,7 +32,6 @@ __all__ = [
     "FetchedSet",
     "set_maker",
     "extended_set",
-    "load_state_before_apply",
     "load_cached_set",
     "collect_defaults",
     "select_non_defaults",
@@ -227,28 +226,6 @@ def left_out_note(table: CachedComponent) -> str:
         f"{table.system}/{table.component} ({table.key}): skipped, because no parameter file can contain the "
         f"name: {names}; the next full fetch removes it from the cache"
     )
-
-
-def load_state_before_apply(cache: ParamCache, key: str, component: int) -> ParamSet:
-    """Return the state that the cache stored of a component before the latest `apply`.
-
-    Args:
-        cache: the cache.
-        key: `Identity.key` of the vehicle.
-        component: component id.
-
-    Raises:
-        CacheError: the cache has no snapshot from before an `apply`.
-    """
-    try:
-        snapshots = [each for each in cache.snapshots(key, component) if each.reason == BEFORE_APPLY]
-    except UnknownVehicle:
-        snapshots = []
-    if not snapshots:
-        raise NotInCache(
-            f"the cache has no snapshot from before an apply to {key}; name the time of the state to restore"
-        )
-    return cache.state_at(key, component, snapshots[-1].id)
 
 
 def select_non_defaults(whole: ParamSet, described: Mapping[str, int | float]) -> ParamSet:

@@ -22,12 +22,12 @@ from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.patterns import is_pattern
 from paramclient.model.values import Trust, check_name
 from paramclient.provision.inspection import wait_for_identity
+from paramclient.provision.restore_point import load_state_before_apply
 from paramclient.provision.runner import Runner
 from paramclient.provision.vehicle_params import (
     FetchedSet,
     fetch_set,
     load_cached_set,
-    load_state_before_apply,
     set_maker,
 )
 from paramclient.service.body_limits import PARAM_FILE_BYTES_MAX

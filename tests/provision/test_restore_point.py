@@ -1,0 +1,57 @@
+"""The state before the last `apply`: what a restore without a time writes, and when it is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from unittest import mock
+
+import pytest
+
+from paramclient import Component, NotInCache, ParamCache, ParamSet, WrittenParam
+from paramclient.provision import apply
+from paramclient.provision.restore_point import load_restore_point, load_state_before_apply
+from paramclient.sim import GenericVehicle
+from tests.shell import a_client, in_simulated_time
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "cache.sqlite3"
+
+
+def wanted(**values: float) -> ParamSet:
+    return ParamSet({name: WrittenParam(name, value) for name, value in values.items()})
+
+
+def where(component: Component) -> tuple[str, int]:
+    return component.identity.key, component.component
+
+
+@in_simulated_time
+async def test_the_point_has_the_state_before_the_apply_and_later_changes(path: Path) -> None:
+    async with a_client(GenericVehicle({"GAIN": 1, "MODE": 2, "RATE": 3}), cache=path) as client:
+        component = await client.component()
+        first = await apply(component, wanted(GAIN=5))
+        assert first.complete
+        await component.set("RATE", 7)
+    with ParamCache(path) as cache:
+        point = load_restore_point(cache, *where(component))
+        assert point.state == load_state_before_apply(cache, *where(component))
+        assert {name: each.value for name, each in point.state.items()} == {"GAIN": 1, "MODE": 2, "RATE": 3}
+        assert [each.name for each in point.changes] == ["RATE", "GAIN"]
+        with pytest.raises(NotInCache, match="no snapshot from before an apply to uid:00"):
+            load_restore_point(cache, "uid:00", 1)
+
+
+@in_simulated_time
+async def test_the_snapshots_are_read_once(path: Path) -> None:
+    async with a_client(GenericVehicle({"GAIN": 1}), cache=path) as client:
+        component = await client.component()
+        await apply(component, wanted(GAIN=5))
+    with (
+        ParamCache(path) as cache,
+        mock.patch.object(ParamCache, "snapshots", autospec=True, side_effect=ParamCache.snapshots) as read,
+    ):
+        load_restore_point(cache, *where(component))
+        load_state_before_apply(cache, *where(component))
+    assert read.call_count == 2
