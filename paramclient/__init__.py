@@ -60,6 +60,7 @@ if TYPE_CHECKING:
     from paramclient.client.stats import ClientStats
     from paramclient.client.subscription import Changes
     from paramclient.errors import (
+        AlreadyRestored,
         AmbiguousVehicle,
         AnotherVehicle,
         CacheError,
@@ -143,6 +144,7 @@ __all__ = [
     "AddedTable",
     "Added",
     "Address",
+    "AlreadyRestored",
     "AmbiguousVehicle",
     "AnotherVehicle",
     "AutopilotVersion",
@@ -332,6 +334,7 @@ _HOMES: Final = {
     "paramclient.client.stats": ("ClientStats",),
     "paramclient.client.subscription": ("Changes",),
     "paramclient.errors": (
+        "AlreadyRestored",
         "AmbiguousVehicle",
         "AnotherVehicle",
         "CacheError",

@@ -7,6 +7,7 @@ The tree shows the cause of each error::
     │   ├── FileError                 a parameter file that cannot be read or written
     │   ├── InvalidParameters         invalid values for a set-up
     │   ├── MetadataError             invalid or inaccessible parameter metadata
+    │   ├── AlreadyRestored           the state before the last apply was already restored
     │   ├── UnknownVehicle            no vehicle in the cache matches the given name
     │   └── AmbiguousVehicle          several vehicles match, on the link or in the cache
     ├── VehicleError                  the vehicle responded with an error or another value
@@ -39,6 +40,7 @@ from collections.abc import Mapping, Sequence
 from enum import IntEnum
 
 __all__ = [
+    "AlreadyRestored",
     "AmbiguousVehicle",
     "AnotherVehicle",
     "CacheError",
@@ -229,6 +231,31 @@ class MetadataError(UsageError):
     def __init__(self, message: str, *, source: str) -> None:
         super().__init__(message)
         self.source = source
+
+
+class AlreadyRestored(UsageError):
+    """A restore ran after the last `apply`, so the state before that `apply` must be named. Nothing was sent.
+
+    Restoring it again would also undo later changes.
+
+    Attributes:
+        before_apply: number of the snapshot from before the `apply`: the state that was restored. To restore
+            it again, also after an interruption, name this number.
+        before_restore: number of the snapshot from before the latest restore.
+        restored_at: time of that restore, in unix seconds.
+        summary: the text of the error without the advice.
+    """
+
+    def __init__(self, summary: str, *, before_apply: int, before_restore: int, restored_at: float) -> None:
+        super().__init__(
+            f"{summary}; name the state to restore: snapshot {before_apply} for the state before that apply, "
+            f"also to continue that restore; snapshot {before_restore} for the state before that restore; or "
+            "a time"
+        )
+        self.before_apply = before_apply
+        self.before_restore = before_restore
+        self.restored_at = restored_at
+        self.summary = summary
 
 
 class UnknownVehicle(UsageError):

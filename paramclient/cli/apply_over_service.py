@@ -20,6 +20,7 @@ from paramclient.cli.file_output import described
 from paramclient.cli.metadata import VEHICLE, request_from_vehicle
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import print_document, printable, progress_bar, report, say
+from paramclient.cli.restore_states import choices_error
 from paramclient.cli.session import CommandSession, connect, receiver_in_words, wait_for_firmware
 from paramclient.cli.setup_results import (
     NamedVehicle,
@@ -42,7 +43,7 @@ from paramclient.documents.setup import (
     StepDoc,
     VerifiedDoc,
 )
-from paramclient.errors import LinkError, NoReply, NotInCache, ParamClientError, UsageError
+from paramclient.errors import AlreadyRestored, LinkError, NoReply, NotInCache, ParamClientError, UsageError
 from paramclient.files import FileFormat, dumps
 from paramclient.model.notation import parse_value
 from paramclient.model.paramset import ParamSet, WrittenParam
@@ -166,6 +167,8 @@ async def restore_over_service(
             if when is None:
                 raise NotInCache(f"{error}, such as '2h ago'") from None
             raise
+        except AlreadyRestored as error:
+            raise choices_error(error, url, options, component) from None
         say(printable(f"the state: {described(state)}"))
         body = {"include": list(choices.include), "force": choices.force}
         body |= {"snapshot": when} if isinstance(when, int) else {"at": state.at}

@@ -26,13 +26,21 @@ from paramclient.cli.output import (
     report,
     say,
 )
+from paramclient.cli.restore_states import choices_error
 from paramclient.cli.session import CommandSession, connect
 from paramclient.cli.sources import check_link, is_file, names_vehicle, tables_in
 from paramclient.cli.targets import check_new
 from paramclient.cli.time_arguments import parse_when
 from paramclient.cli.watch_lines import HEX, ext_value_text, print_changes_and_events
 from paramclient.cli.write_outcomes import status_in_words
-from paramclient.errors import CacheError, NoReply, NotInCache, UnknownParameter, UsageError
+from paramclient.errors import (
+    AlreadyRestored,
+    CacheError,
+    NoReply,
+    NotInCache,
+    UnknownParameter,
+    UsageError,
+)
 from paramclient.files import FileFormat
 from paramclient.files.extended_document import is_extended_file, read_extended_file, write_extended_file
 from paramclient.model.ext_params import (
@@ -465,7 +473,10 @@ async def restore_extended(
             state = read_extended_file(when)
         else:
             moment = None if when is None else parse_when(when, time.time())
-            state = await load_extended_state(component, moment)
+            try:
+                state = await load_extended_state(component, moment)
+            except AlreadyRestored as error:
+                raise choices_error(error, url, options, component, extended=True) from None
         at = "" if state.at is None else f", {local_time(state.at)}"
         say(printable(f"the state: {len(state.params)} extended parameters from {state.source}{at}"))
         before = partial(_before_writing, session)

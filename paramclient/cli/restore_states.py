@@ -17,18 +17,24 @@ from paramclient.cli.targets import PLACEHOLDERS, Address, Targets, check_patter
 from paramclient.cli.time_arguments import parse_when
 from paramclient.client.component import Component
 from paramclient.client.local import local
-from paramclient.errors import FileError, NotInCache, ParamClientError, UnknownVehicle, UsageError
+from paramclient.errors import (
+    AlreadyRestored,
+    FileError,
+    NotInCache,
+    ParamClientError,
+    UnknownVehicle,
+    UsageError,
+)
+from paramclient.links.names import names_service
 from paramclient.model.paramset import ParamSet
-from paramclient.model.wording import first_of
+from paramclient.model.wording import age_in_words, first_of
 from paramclient.provision.inspection import wait_for_identity
 from paramclient.provision.restore_point import RestorePoint, load_restore_point
 
-__all__ = ["StateToRestore", "check_when_for_all", "load_states"]
+__all__ = ["StateToRestore", "check_when_for_all", "choices_error", "load_states", "restore_command"]
 
 CHANGES_SHOWN_MAX: Final = 10
 """Parameters that a line names, so that it stays short; it gives the number of further ones."""
-_AGES: Final = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"))
-"""Units of an age in seconds, longest first. An age is given in the longest unit of which it has two."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +96,61 @@ async def load_states(
     return states, errors
 
 
+def restore_command(url: str, when: object, options: LinkOptions, address: Address | None = None) -> str:
+    """Return the command that restores a state, for messages.
+
+    Args:
+        url: the link.
+        when: the state, as the command takes it.
+        options: options of a command, of which those that choose the vehicle are repeated.
+        address: the vehicle, if the options choose several.
+    """
+    chosen: dict[str, object] = {"system": options.system, "component": options.component}
+    if options.vehicle is not None:
+        chosen = {"vehicle": options.vehicle}
+    if address is not None:
+        chosen = {**chosen, "system": address[0]}
+    chosen["peer"] = options.peer
+    words = ["paramclient", "restore", url, str(when)]
+    for name, value in chosen.items():
+        words += [] if value is None else [f"--{name}", str(value)]
+    return shlex.join(words)
+
+
+def choices_error(
+    error: AlreadyRestored,
+    url: str,
+    options: LinkOptions,
+    vehicle: Component,
+    address: Address | None = None,
+    *,
+    extended: bool = False,
+) -> UsageError:
+    """Return the error with the commands that choose a state.
+
+    Args:
+        error: the error.
+        url, options, address: as in `restore_command`.
+        vehicle: the vehicle.
+        extended: whether the states are those of extended parameters.
+    """
+
+    def command(when: object) -> str:
+        return f"`{restore_command(url, when, options, address)}`"
+
+    system = vehicle.system
+    listing = f"`paramclient history {system} {'--extended ' if extended else ''}--snapshots`"
+    if names_service(url):
+        place = f"{url.partition('?')[0].rstrip('/')}/api/v1/components/{system}/{vehicle.component}"
+        listing = f"GET {place}/{'extended/' if extended else ''}snapshots"
+    seconds = max(1, int(time.time() - error.restored_at) + 1)
+    return UsageError(
+        f"{error.summary}; choose the state: {command(error.before_apply)} for the state before that apply, "
+        f"also to continue that restore; {command(error.before_restore)} for the state before that restore; "
+        f"or a time, as in {command(f'{seconds}s ago')}; {listing} lists the snapshots"
+    )
+
+
 def _loader(
     found: Targets, url: str, when: str | None, options: LinkOptions
 ) -> Callable[[Component], Awaitable[StateToRestore]]:
@@ -128,7 +189,10 @@ def _loader(
             point = await anyio.to_thread.run_sync(lambda: load_restore_point(cache, key, component))
         except NotInCache as error:
             raise NotInCache(f"{error}, such as '2h ago', or a backup file") from None
-        return _before_apply(point, url, vehicle.system)
+        except AlreadyRestored as error:
+            address = (vehicle.system, vehicle.component) if found.all_vehicles else None
+            raise choices_error(error, url, options, vehicle, address) from None
+        return _before_apply(point)
 
     return load_cached
 
@@ -145,26 +209,11 @@ def _state_at(cache: ParamCache, key: str, component: int, moment: float) -> Sta
         raise NotInCache(message) from None
 
 
-def _before_apply(point: RestorePoint, url: str, system: int) -> StateToRestore:
-    """Return the state before the last `apply`, with what its restore undoes.
-
-    Raises:
-        UsageError: a restore ran since that `apply`, so that the user must choose the state.
-    """
+def _before_apply(point: RestorePoint) -> StateToRestore:
+    """Return the state before the last `apply`, with what its restore undoes."""
     now = time.time()
-    age = _age(now - point.snapshot.at)
-    if point.restored is not None:
-        restored, again = point.restored, point.snapshot.id
-        seconds = max(1, int(now - restored.at) + 1)
-        command = f"paramclient restore {shlex.quote(url)}"
-        raise UsageError(
-            f"a restore ran {_age(now - restored.at)} ago, after the last apply ({age} ago); choose the "
-            "state: "
-            f"`{command} {again}` for the state before that apply, also to continue that restore; "
-            f"`{command} {restored.id}` for the state before that restore; or a time, as in "
-            f"`{command} '{seconds}s ago'`; `paramclient history {system} --snapshots` lists the snapshots"
-        )
-    changes = [f"{each.name} {_age(now - each.at)} ago" for each in point.changes]
+    age = age_in_words(now - point.snapshot.at)
+    changes = [f"{each.name} {age_in_words(now - each.at)} ago" for each in point.changes]
     return StateToRestore(
         point.state,
         f"before the last apply, {age} ago (snapshot {point.snapshot.id})",
@@ -172,11 +221,3 @@ def _before_apply(point: RestorePoint, url: str, system: int) -> StateToRestore:
         if changes
         else "nothing is known to have changed since then",
     )
-
-
-def _age(seconds: float) -> str:
-    """Return an age in words: `9 min`."""
-    for length, unit in _AGES:
-        if seconds >= 2 * length:
-            return f"{seconds // length:.0f} {unit}"
-    return f"{max(0.0, seconds):.0f} s"

@@ -1,10 +1,22 @@
-"""Counts and lists of names in messages."""
+"""Counts, ages and lists of names in messages."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
-__all__ = ["counted", "first_of"]
+__all__ = ["age_in_words", "counted", "first_of"]
+
+_AGES: Final = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"))
+"""Units of an age in seconds, longest first. An age is given in the longest unit of which it has two."""
+
+
+def age_in_words(seconds: float) -> str:
+    """Return an age: `9 min`."""
+    for length, unit in _AGES:
+        if seconds >= 2 * length:
+            return f"{seconds // length:.0f} {unit}"
+    return f"{max(0.0, seconds):.0f} s"
 
 
 def counted(number: int, noun: str) -> str:

@@ -13,11 +13,12 @@ import anyio
 import anyio.to_thread
 
 from paramclient.client.component import Component
-from paramclient.errors import NoReply, NotInCache, ParamClientError, UsageError
+from paramclient.errors import NoReply, ParamClientError, UsageError
 from paramclient.model.ext_params import ExtParam
 from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.protocol.ext.write_batch import ExtSetOutcome
 from paramclient.provision.apply_restore import BEFORE_RESTORE
+from paramclient.provision.restore_point import choose_restore_point
 from paramclient.provision.runner import call_and_wait
 from paramclient.provision.vehicle_params import BEFORE_APPLY, extended_set
 
@@ -227,20 +228,17 @@ async def load_extended_state(component: Component, when: float | None = None) -
     Args:
         component: the component.
         when: an int is the number of a snapshot, a float a time in unix seconds; None: the state before the
-            last `apply_extended`.
+            last `apply_extended`, unless a restore ran since then.
 
     Raises:
+        AlreadyRestored: a restore ran since that `apply_extended`, and `when` is None.
         CacheError: there is no such state, see `ParamCache.ext_state_at`; or the cache cannot be read.
         UsageError: the client has no cache.
     """
     if when is None:
-        kept = [each.id for each in await component.ext.snapshots() if each.reason == BEFORE_APPLY]
-        if not kept:
-            raise NotInCache(
-                "the cache has no snapshot from before an apply of extended parameters to "
-                f"{component.system}/{component.component}; name the time of the state to restore"
-            )
-        when = kept[-1]
+        address = f"{component.system}/{component.component}"
+        what = f"an apply of extended parameters to {address}"
+        when = choose_restore_point(await component.ext.snapshots(), what).id
     return await component.ext.load_state(when)
 
 

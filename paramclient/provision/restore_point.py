@@ -1,20 +1,22 @@
-"""The state before the last `apply` in the cache: its snapshot, changes since then, a restore since then."""
+"""The state before the last `apply` in the cache: its snapshot, and changes since then."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from paramclient.errors import NotInCache, UnknownVehicle
+from paramclient.errors import AlreadyRestored, NotInCache, UnknownVehicle
 from paramclient.model.paramset import ParamSet
+from paramclient.model.wording import age_in_words
 from paramclient.provision.apply_restore import BEFORE_RESTORE
 from paramclient.provision.vehicle_params import BEFORE_APPLY
 
 if TYPE_CHECKING:
     from paramclient.cache import HistoryEntry, ParamCache, SnapshotSummary
 
-__all__ = ["RestorePoint", "load_restore_point", "load_state_before_apply"]
+__all__ = ["RestorePoint", "choose_restore_point", "load_restore_point", "load_state_before_apply"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,13 +29,11 @@ class RestorePoint:
         changes: the latest change of each parameter that has another value in the cache than in `state`,
             newest first, as far as the history has them. They are those of the `apply` and later ones, of all
             authors.
-        restored: the newest snapshot that a `restore` has stored since then; None if there is none.
     """
 
     snapshot: SnapshotSummary
     state: ParamSet
     changes: Sequence[HistoryEntry]
-    restored: SnapshotSummary | None
 
 
 def load_state_before_apply(cache: ParamCache, key: str, component: int) -> ParamSet:
@@ -45,9 +45,10 @@ def load_state_before_apply(cache: ParamCache, key: str, component: int) -> Para
         component: component id.
 
     Raises:
+        AlreadyRestored: a restore ran since that `apply`.
         CacheError: the cache has no snapshot from before an `apply`.
     """
-    return cache.state_at(key, component, _point_of(_snapshots(cache, key, component), key).id)
+    return cache.state_at(key, component, _find_snapshot(cache, key, component).id)
 
 
 def load_restore_point(cache: ParamCache, key: str, component: int) -> RestorePoint:
@@ -55,15 +56,13 @@ def load_restore_point(cache: ParamCache, key: str, component: int) -> RestorePo
 
     Arguments and errors as of `load_state_before_apply`.
     """
-    snapshots = _snapshots(cache, key, component)
-    snapshot = _point_of(snapshots, key)
+    snapshot = _find_snapshot(cache, key, component)
     try:
         state = cache.state_at(key, component, snapshot.id)
         table = cache.load(key, component)
         entries = cache.history(key, component)
     except UnknownVehicle:  # removed from the cache since the line above
-        raise _none(key) from None
-    restores = [each for each in snapshots if each.reason == BEFORE_RESTORE and each.id > snapshot.id]
+        raise _none(_apply_to(key)) from None
     now = {} if table is None else table.params
     latest = {entry.name: entry for entry in entries}  # of several entries of a name, the last one
     changes = [
@@ -72,25 +71,50 @@ def load_restore_point(cache: ParamCache, key: str, component: int) -> RestorePo
         if name in now and name in state and now[name].settable != state[name].settable
     ]
     changes.sort(key=lambda entry: entry.at, reverse=True)
-    return RestorePoint(snapshot, state, changes, restores[-1] if restores else None)
+    return RestorePoint(snapshot, state, changes)
 
 
-def _snapshots(cache: ParamCache, key: str, component: int) -> Sequence[SnapshotSummary]:
-    try:
-        return cache.snapshots(key, component)
-    except UnknownVehicle:
-        return ()
+def choose_restore_point(snapshots: Sequence[SnapshotSummary], apply: str) -> SnapshotSummary:
+    """Return the snapshot that a restore without a time writes: the newest one from before an `apply`.
 
+    A restore stores a snapshot before its first write. If there is one after the `apply`, even of a restore
+    that did not end, the state must be named: another restore would also undo later changes.
 
-def _point_of(snapshots: Iterable[SnapshotSummary], key: str) -> SnapshotSummary:
-    """Return the newest snapshot from before an `apply`."""
+    Args:
+        snapshots: the snapshots of a component, the newest last.
+        apply: the `apply` in words, for messages.
+
+    Raises:
+        AlreadyRestored: a restore ran since that `apply`.
+        NotInCache: there is no snapshot from before an `apply`.
+    """
     points = [each for each in snapshots if each.reason == BEFORE_APPLY]
     if not points:
-        raise _none(key)
-    return points[-1]
+        raise _none(apply)
+    point, now = points[-1], time.time()
+    restores = [each for each in snapshots if each.reason == BEFORE_RESTORE and each.id > point.id]
+    if restores:
+        ago = age_in_words(now - restores[-1].at)
+        raise AlreadyRestored(
+            f"a restore ran {ago} ago, after the last apply ({age_in_words(now - point.at)} ago)",
+            before_apply=point.id,
+            before_restore=restores[-1].id,
+            restored_at=restores[-1].at,
+        )
+    return point
 
 
-def _none(key: str) -> NotInCache:
-    return NotInCache(
-        f"the cache has no snapshot from before an apply to {key}; name the time of the state to restore"
-    )
+def _find_snapshot(cache: ParamCache, key: str, component: int) -> SnapshotSummary:
+    try:
+        snapshots = cache.snapshots(key, component)
+    except UnknownVehicle:
+        snapshots = []
+    return choose_restore_point(snapshots, _apply_to(key))
+
+
+def _apply_to(key: str) -> str:
+    return f"an apply to {key}"
+
+
+def _none(apply: str) -> NotInCache:
+    return NotInCache(f"the cache has no snapshot from before {apply}; name the time of the state to restore")

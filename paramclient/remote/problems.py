@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from paramclient.errors import (
+    AlreadyRestored,
     AmbiguousVehicle,
     AnotherVehicle,
     CacheError,
@@ -120,6 +122,14 @@ def _value(given: object) -> WireValue | str:
     return str(given["text"]) if "text" in given else bytes.fromhex(given["hex"])
 
 
+def _moment(given: Any) -> float:
+    """Return a time in unix seconds."""
+    moment = float(given)
+    if not math.isfinite(moment):
+        raise ValueError("a time must be finite")
+    return moment
+
+
 def _ext_refused(kind: type[ExtSetRefused]) -> Callable[[str, Problem], ExtSetRefused]:
     return lambda detail, problem: kind(
         detail,
@@ -146,6 +156,12 @@ _MAKERS: Final[dict[str, Callable[[str, Problem], ParamClientError]]] = {
     "UsageError": lambda detail, problem: UsageError(detail),
     "FileError": lambda detail, problem: FileError(detail),
     "InvalidParameters": lambda detail, problem: InvalidParameters(dict(problem["problems"])),
+    "AlreadyRestored": lambda detail, problem: AlreadyRestored(
+        str(problem["summary"])[:DETAIL_LENGTH_MAX],
+        before_apply=int(problem["before_apply"]),
+        before_restore=int(problem["before_restore"]),
+        restored_at=_moment(problem["restored_at"]),
+    ),
     "UnknownVehicle": lambda detail, problem: UnknownVehicle(detail, vehicles=_vehicles(problem)),
     "AmbiguousVehicle": lambda detail, problem: AmbiguousVehicle(
         str(problem["summary"]), vehicles=_vehicles(problem), choose_by=str(problem["choose_by"])

@@ -218,7 +218,10 @@ class CachedSource(Body):
 
 
 class EarlierState(Body):
-    """An earlier state: a snapshot, a time, or without both the state before the last apply."""
+    """An earlier state: a snapshot, a time, or without both the state before the last apply.
+
+    Without both, a restore after that apply is an error, because another one would undo later changes.
+    """
 
     snapshot: Number | None = None
     at: Timestamp | None = None
@@ -328,6 +331,7 @@ async def load_state(hub: Hub, target: FollowedComponent, when: float | int | No
             last apply.
 
     Raises:
+        AlreadyRestored: a restore ran since the last apply, and `when` is None.
         ServiceError: the state is unknown, or there is no cache.
     """
     cache = require_cache(hub)

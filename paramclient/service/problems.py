@@ -19,6 +19,7 @@ from starlette.routing import Match
 
 from paramclient.documents.problem import Problem
 from paramclient.errors import (
+    AlreadyRestored,
     AmbiguousVehicle,
     CacheError,
     ClientClosed,
@@ -231,6 +232,7 @@ _KINDS: Final[dict[type[ParamClientError], tuple[int, str | None]]] = {
     InvalidParameters: (422, None),
     MetadataError: (422, None),
     PackError: (422, None),
+    AlreadyRestored: (409, None),
     UnknownVehicle: (404, None),
     AmbiguousVehicle: (409, None),
     UsageError: (422, "usage"),

@@ -401,6 +401,23 @@ def test_restore_takes_the_number_of_a_snapshot_and_a_time(
     assert vehicle.values["GAIN"] == 4.0
 
 
+def test_restore_does_not_undo_an_apply_twice(command: Command, keeping: Put, file: Path) -> None:
+    vehicle = copter()
+    command("apply", keeping(vehicle), file)
+    assert command("restore", keeping(vehicle)).code == 0
+    vehicle = copter()  # a new one, as each command begins its simulated time anew
+    assert command("set", keeping(vehicle), "RATE", 0.75).code == 0
+    for options in ((), ("--dry-run",)):
+        again = command("restore", keeping(vehicle), *options)
+        assert again.code == 2
+        assert re.search(r"a restore ran \d+ s ago, after the last apply", again.err)
+        assert f"`paramclient restore {SERVICE} 1` for the state before that apply" in again.err
+        assert f"`paramclient restore {SERVICE} 2` for the state before that restore" in again.err
+        assert re.search(rf"or a time, as in `paramclient restore {SERVICE} '\d+s ago'`", again.err)
+        assert f"GET {SERVICE}/api/v1/components/1/1/snapshots lists the snapshots" in again.err
+    assert vehicle.values["RATE"] == 0.75
+
+
 def test_restore_names_what_the_cache_of_the_service_lacks(command: Command, put: Put, keeping: Put) -> None:
     for words in ([], ["99"]):
         on_link = command("restore", put(copter()), *words)

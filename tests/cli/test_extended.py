@@ -253,6 +253,11 @@ def test_restore_from_the_cache(command: Command, put: Put, tmp_path: Path) -> N
     restored = command("restore", url, *CAMERA)
     assert (restored.code, camera.ext_values) == (0, before), restored.err
     assert restored.rows[1:] == [["CAM_NAME", "Front", "Front", "accepted"]]
+    again = command("restore", url, *CAMERA)
+    assert again.code == 2
+    assert "a restore ran " in again.err
+    assert f"`paramclient restore {url} 1 --component 100` for the state before that apply" in again.err
+    assert "`paramclient history 1 --extended --snapshots` lists the snapshots" in again.err
     undone = command("restore", url, 2, *CAMERA, "--extended")
     assert (undone.code, camera.ext_values["CAM_NAME"]) == (0, "Rear"), undone.err
     assert command("restore", url, 99, *CAMERA).code == 5

@@ -654,6 +654,7 @@ def test_all_vehicles_are_restored_each_to_its_own_state(
     air = Air(vehicles)
     again = command("restore", put(air), "--all")
     assert (again.code, again.err.count("a restore ran ")) == (2, 3)
+    assert all(f" --system {each}` for the state before that apply" in again.err for each in (1, 2, 3))
     files = command("restore", put(air), tmp_path / "{system}.yaml", "--all", "--json")
     assert files.code == 0
     assert [each["complete"] for each in files.json["vehicles"]] == [True] * 3

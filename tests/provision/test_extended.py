@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from paramclient import (
+    AlreadyRestored,
     CacheError,
     Component,
     ExtParam,
@@ -140,6 +141,21 @@ async def test_the_state_before_the_last_apply_is_restored(path: Path) -> None:
         assert reasons == ["before apply", "before restore"]
         undone = await restore_extended(component, await load_extended_state(component, result.snapshot))
         assert (undone.complete, camera.ext_values["NAME"]) == (True, "Top")
+
+
+@in_simulated_time
+async def test_an_apply_is_not_undone_twice(path: Path) -> None:
+    camera = small()
+    async with a_client(camera, cache=path) as client:
+        component = await the_camera(client)
+        await apply_extended(component, wanted(camera, MODE=2))
+        assert (await restore_extended(component, await load_extended_state(component))).complete
+        await component.ext.set("NAME", "Top")
+        with pytest.raises(AlreadyRestored, match=r"a restore ran \d+ s ago, after the last apply") as caught:
+            await load_extended_state(component)
+        point, later = await component.ext.snapshots()
+        assert (caught.value.before_apply, caught.value.before_restore) == (point.id, later.id)
+        assert (await load_extended_state(component, caught.value.before_apply)).params["MODE"].value == 1
 
 
 @in_simulated_time

@@ -7,8 +7,8 @@ from unittest import mock
 
 import pytest
 
-from paramclient import Component, NotInCache, ParamCache, ParamSet, WrittenParam
-from paramclient.provision import apply
+from paramclient import AlreadyRestored, Component, NotInCache, ParamCache, ParamSet, WrittenParam
+from paramclient.provision import apply, restore
 from paramclient.provision.restore_point import load_restore_point, load_state_before_apply
 from paramclient.sim import GenericVehicle
 from tests.shell import a_client, in_simulated_time
@@ -55,3 +55,27 @@ async def test_the_snapshots_are_read_once(path: Path) -> None:
         load_restore_point(cache, *where(component))
         load_state_before_apply(cache, *where(component))
     assert read.call_count == 2
+
+
+@in_simulated_time
+async def test_an_apply_is_not_undone_twice(path: Path) -> None:
+    async with a_client(GenericVehicle({"GAIN": 1, "RATE": 3}), cache=path) as client:
+        component = await client.component()
+        first = await apply(component, wanted(GAIN=5))
+        assert (await restore(component, first.before)).complete
+        await component.set("RATE", 7)
+        with ParamCache(path) as cache:
+            before_apply, before_restore = cache.snapshots(*where(component))
+            for load in (load_restore_point, load_state_before_apply):
+                with pytest.raises(
+                    AlreadyRestored,
+                    match=r"a restore ran \d+ s ago, after the last apply \(\d+ s ago\); name the state to "
+                    r"restore: snapshot \d+ for the state before that apply, also to continue that restore; "
+                    r"snapshot \d+ for the state before that restore; or a time",
+                ) as caught:
+                    load(cache, *where(component))
+                error = caught.value
+                assert (error.before_apply, error.before_restore) == (before_apply.id, before_restore.id)
+                assert error.restored_at == before_restore.at
+            assert (await apply(component, wanted(GAIN=6))).complete
+            assert load_state_before_apply(cache, *where(component))["RATE"].value == 7

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from paramclient import (
     Added,
+    AlreadyRestored,
     AnotherVehicle,
     CacheError,
     Change,
@@ -256,6 +257,7 @@ ERRORS: list[ParamClientError] = [
     LinkError("gone", link="udpin:0.0.0.0:14550"),
     CacheError("broken"),
     InvalidParameters({"A": "is too large", "B": "is no number"}),
+    AlreadyRestored("a restore ran 3 s ago", before_apply=4, before_restore=6, restored_at=1.5e9),
 ]
 
 

@@ -422,6 +422,8 @@ async def test_a_set_up_over_http(tmp_path: Path) -> None:
         assert (restored["complete"], camera.ext_values) == (True, before)
         history = (await browser.get(f"{E}/history")).json()["history"]
         assert "for" in history[-1]["by"], "the author is the one of the request"
+        for path in ("restore", "state"):
+            problem(await browser.post(f"{E}/{path}", json={}), 409, "already-restored")
         problem(await browser.post(f"{E}/restore", json={"snapshot": 99}), 404, "unknown-state")
         problem(await browser.post(f"{E}/restore", json={"snapshot": 1, "at": 5}), 422, "invalid-request")
         bad = {"wanted": {"MODE": {"type": "INT32", "value": "text"}}}

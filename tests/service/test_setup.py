@@ -284,6 +284,12 @@ async def test_an_earlier_state_comes_back(vehicle: Callable[..., Vehicle], tmp_
         again = await service.post(f"{HERE}/restore", {"snapshot": kept[1]["id"]})
         assert again["counts"]["set"] == 2
         assert on_board.values["TUNE_01"] == 9
+        for path, body in (("restore", {}), ("restore", {"dry_run": True}), ("state", {})):
+            refused = await service.post(f"{HERE}/{path}", body, 409)
+            assert refused["type"] == "urn:paramclient:already-restored"
+            assert (refused["before_apply"], refused["before_restore"]) == (kept[0]["id"], kept[1]["id"] + 1)
+            assert f"snapshot {kept[0]['id']} for the state before that apply" in refused["detail"]
+        assert on_board.values["TUNE_01"] == 9, "an apply is not undone twice"
         for path in ("restore", "state"):
             unknown = await service.post(f"{HERE}/{path}", {"snapshot": 999}, 404)
             assert unknown["type"] == "urn:paramclient:unknown-state"
