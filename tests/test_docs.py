@@ -491,6 +491,7 @@ def test_every_public_name_is_in_the_pages(module: ModuleType) -> None:
 
 MADE_BY_THE_LIBRARY = {
     *("CachedComponent.of", "ClientStats.of", "RemoteComponent.__init__"),
+    "RemoteComponent.load_restore_point",
     *("Changes.push", "Events.push", "ExtChanges.push", "SimVehicle.__init__"),
     *("ParamCache.save", "ParamCache.merge", "ParamCache.save_ext"),
 }

@@ -20,7 +20,7 @@ from paramclient.cli.file_output import described
 from paramclient.cli.metadata import VEHICLE, request_from_vehicle
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import print_document, printable, progress_bar, report, say
-from paramclient.cli.restore_states import choices_error
+from paramclient.cli.restore_states import StateToRestore, choices_error, undone_by
 from paramclient.cli.session import CommandSession, connect, receiver_in_words, wait_for_firmware
 from paramclient.cli.setup_results import (
     NamedVehicle,
@@ -162,17 +162,24 @@ async def restore_over_service(
         component = _of_service(session)
         await wait_for_firmware([component], session.deadline)
         try:
-            state = await component.load_state(when)
+            if when is None:
+                state = undone_by(await component.load_restore_point())
+            else:
+                state = StateToRestore(await component.load_state(when))
         except NotInCache as error:
             if when is None:
                 raise NotInCache(f"{error}, such as '2h ago'") from None
             raise
         except AlreadyRestored as error:
             raise choices_error(error, url, options, component) from None
-        say(printable(f"the state: {described(state)}"))
+        params = state.params
+        say(printable(f"the state: {described(params)}"))
+        if state.point:
+            say(printable(f"the state is that {state.point}; {state.changes}"))
         body = {"include": list(choices.include), "force": choices.force}
-        body |= {"snapshot": when} if isinstance(when, int) else {"at": state.at}
-        set_up = _SetUp(session, component, choices, state, "restore", body, body | choices.of_writing)
+        body |= {"snapshot": when} if isinstance(when, int) else {"at": params.at}
+        more = choices.of_writing
+        set_up = _SetUp(session, component, choices, params, "restore", body, body | more, state.point)
         return await set_up.ask_and_run(dry_run=dry_run, yes=yes)
 
 
@@ -226,6 +233,7 @@ class _SetUp:
         wanted: the wanted parameters, or the state to restore.
         to_plan: the request for the plan.
         to_run: the request for the set-up.
+        point: the restore point in words; "" for none.
     """
 
     session: CommandSession
@@ -235,6 +243,7 @@ class _SetUp:
     kind: Literal["apply", "restore"]
     to_plan: Mapping[str, Any]
     to_run: Mapping[str, Any]
+    point: str = ""
 
     @cached_property
     def vehicle(self) -> NamedVehicle:
@@ -368,6 +377,8 @@ class _SetUp:
             print_document(document.model_copy(update={"problem": None}))
         else:
             show_applied({self.vehicle: result}, full=self.choices.full)
+        if self.point and error is None:
+            say(printable(f"{self.vehicle.label}: restored the state {self.point}"))
         return applied_code(result)
 
 

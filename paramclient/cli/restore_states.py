@@ -26,12 +26,19 @@ from paramclient.errors import (
     UsageError,
 )
 from paramclient.links.names import names_service
-from paramclient.model.paramset import ParamSet
+from paramclient.model.paramset import ParamSet, RestorePoint
 from paramclient.model.wording import age_in_words, first_of
 from paramclient.provision.inspection import wait_for_identity
-from paramclient.provision.restore_point import RestorePoint, load_restore_point
+from paramclient.provision.restore_point import load_restore_point
 
-__all__ = ["StateToRestore", "check_when_for_all", "choices_error", "load_states", "restore_command"]
+__all__ = [
+    "StateToRestore",
+    "check_when_for_all",
+    "choices_error",
+    "load_states",
+    "restore_command",
+    "undone_by",
+]
 
 CHANGES_SHOWN_MAX: Final = 10
 """Parameters that a line names, so that it stays short; it gives the number of further ones."""
@@ -192,7 +199,7 @@ def _loader(
         except AlreadyRestored as error:
             address = (vehicle.system, vehicle.component) if found.all_vehicles else None
             raise choices_error(error, url, options, vehicle, address) from None
-        return _before_apply(point)
+        return undone_by(point)
 
     return load_cached
 
@@ -209,14 +216,14 @@ def _state_at(cache: ParamCache, key: str, component: int, moment: float) -> Sta
         raise NotInCache(message) from None
 
 
-def _before_apply(point: RestorePoint) -> StateToRestore:
+def undone_by(point: RestorePoint) -> StateToRestore:
     """Return the state before the last `apply`, with what its restore undoes."""
     now = time.time()
-    age = age_in_words(now - point.snapshot.at)
-    changes = [f"{each.name} {age_in_words(now - each.at)} ago" for each in point.changes]
+    age = age_in_words(now - point.at)
+    changes = [f"{name} {age_in_words(now - at)} ago" for name, at in point.changes.items()]
     return StateToRestore(
         point.state,
-        f"before the last apply, {age} ago (snapshot {point.snapshot.id})",
+        f"before the last apply, {age} ago (snapshot {point.snapshot})",
         f"changed since then: {first_of(changes, CHANGES_SHOWN_MAX)}"
         if changes
         else "nothing is known to have changed since then",

@@ -26,7 +26,7 @@ from paramclient.client.subscription import Changes
 from paramclient.errors import ParamClientError, UsageError
 from paramclient.links import Link
 from paramclient.model.identity import Identity
-from paramclient.model.paramset import ParamSet
+from paramclient.model.paramset import ParamSet, RestorePoint
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.params.fetch import Fetch
@@ -240,12 +240,21 @@ class ServiceComponent(Component):
         """The address of the service, as the name of a link."""
 
     @abstractmethod
-    async def load_state(self, when: float | None = None) -> ParamSet:
+    async def load_restore_point(self) -> RestorePoint:
+        """Return the state before the last apply from the cache of the service, and what its restore undoes.
+
+        Raises:
+            AlreadyRestored: a restore ran since that apply.
+            NotInCache: the cache has no such state.
+            ParamClientError: as from `read_descriptions`.
+        """
+
+    @abstractmethod
+    async def load_state(self, when: float) -> ParamSet:
         """Return an earlier state of the component from the cache of the service.
 
         Args:
-            when: a float is a time in unix seconds, an int the number of a snapshot, None the state before
-                the last apply.
+            when: a float is a time in unix seconds, an int the number of a snapshot.
 
         Raises:
             NotInCache: the cache has no such state.

@@ -7,7 +7,7 @@ from itertools import zip_longest
 from typing import TYPE_CHECKING, Final
 
 from paramclient.documents.component import IdentityDoc
-from paramclient.documents.document import Document
+from paramclient.documents.document import Document, Maybe
 from paramclient.documents.param import WrittenParamDoc
 from paramclient.files.formats import ENDINGS, WRITABLE, FileFormat
 from paramclient.model.identity import autopilot_name
@@ -16,9 +16,18 @@ from paramclient.model.notation import time_or_none
 if TYPE_CHECKING:
     from paramclient.files import ParamFile
     from paramclient.model.defaults import DefaultSource
-    from paramclient.model.paramset import ParamSet
+    from paramclient.model.paramset import ParamSet, RestorePoint
 
-__all__ = ["FileDoc", "FormatDoc", "FormatsDoc", "OriginDoc", "SetDoc", "StateDoc", "UploadedDoc"]
+__all__ = [
+    "FileDoc",
+    "FormatDoc",
+    "FormatsDoc",
+    "OriginDoc",
+    "RestorePointDoc",
+    "SetDoc",
+    "StateDoc",
+    "UploadedDoc",
+]
 
 
 class OriginDoc(Document):
@@ -65,8 +74,22 @@ class SetDoc(OriginDoc):
         return cls(**OriginDoc.of(params).model_dump(), params=written)
 
 
+class RestorePointDoc(Document):
+    """The snapshot before the last apply, and what a restore of it undoes; see `RestorePoint`.
+
+    `at`, and the time of the latest change of each parameter in `changes`, are in unix seconds.
+    """
+
+    snapshot: int
+    at: float
+    changes: dict[str, float]
+
+
 class StateDoc(Document):
-    """An earlier state of a component, with its identity at that time; `at` is in unix seconds."""
+    """An earlier state of a component, with its identity at that time; `at` is in unix seconds.
+
+    `restore_point` is present if the request names no state.
+    """
 
     system: int | None
     component: int | None
@@ -74,10 +97,11 @@ class StateDoc(Document):
     source: str
     identity: IdentityDoc | None
     params: dict[str, WrittenParamDoc]
+    restore_point: Maybe[RestorePointDoc] = None
 
     @classmethod
-    def of(cls, state: ParamSet) -> StateDoc:
-        """Return the document of a `ParamSet`."""
+    def of(cls, state: ParamSet, point: RestorePoint | None = None) -> StateDoc:
+        """Return the document of a `ParamSet`, and of the restore point that has it."""
         return cls(
             system=state.system,
             component=state.component,
@@ -85,6 +109,9 @@ class StateDoc(Document):
             source=state.source,
             identity=None if state.identity is None else IdentityDoc.of(state.identity),
             params={name: WrittenParamDoc.of(param) for name, param in state.items()},
+            restore_point=None
+            if point is None
+            else RestorePointDoc(snapshot=point.snapshot, at=point.at, changes=dict(point.changes)),
         )
 
 

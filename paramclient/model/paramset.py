@@ -24,7 +24,7 @@ from paramclient.model.values import (
 )
 from paramclient.model.wording import counted
 
-__all__ = ["ParamSet", "WrittenParam"]
+__all__ = ["ParamSet", "RestorePoint", "WrittenParam"]
 
 
 @dataclass(frozen=True, slots=True, init=False)
@@ -197,3 +197,22 @@ class ParamSet(Mapping[str, WrittenParam]):
     def __repr__(self) -> str:
         origin = f" from {self.source}" if self.source else ""
         return f"<ParamSet {counted(len(self.params), 'param')}{origin}>"
+
+
+@dataclass(frozen=True, slots=True)
+class RestorePoint:
+    """The state of a component before the last `apply`.
+
+    Attributes:
+        snapshot: number of the snapshot that `apply` stored.
+        at: its time in unix seconds.
+        state: its parameters.
+        changes: the time of the latest change of each parameter that has another value in the cache than in
+            `state`, newest first, as far as the history has them. They are those of the `apply` and later
+            ones, of all authors.
+    """
+
+    snapshot: int
+    at: float
+    state: ParamSet
+    changes: Mapping[str, float]

@@ -4,36 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from paramclient.errors import AlreadyRestored, NotInCache, UnknownVehicle
-from paramclient.model.paramset import ParamSet
+from paramclient.model.paramset import ParamSet, RestorePoint
 from paramclient.model.wording import age_in_words
 from paramclient.provision.apply_restore import BEFORE_RESTORE
 from paramclient.provision.vehicle_params import BEFORE_APPLY
 
 if TYPE_CHECKING:
-    from paramclient.cache import HistoryEntry, ParamCache, SnapshotSummary
+    from paramclient.cache import ParamCache, SnapshotSummary
 
-__all__ = ["RestorePoint", "choose_restore_point", "load_restore_point", "load_state_before_apply"]
-
-
-@dataclass(frozen=True, slots=True)
-class RestorePoint:
-    """The state of a component before the last `apply`.
-
-    Attributes:
-        snapshot: the snapshot that `apply` stored.
-        state: its parameters.
-        changes: the latest change of each parameter that has another value in the cache than in `state`,
-            newest first, as far as the history has them. They are those of the `apply` and later ones, of all
-            authors.
-    """
-
-    snapshot: SnapshotSummary
-    state: ParamSet
-    changes: Sequence[HistoryEntry]
+__all__ = ["choose_restore_point", "load_restore_point", "load_state_before_apply"]
 
 
 def load_state_before_apply(cache: ParamCache, key: str, component: int) -> ParamSet:
@@ -64,14 +46,13 @@ def load_restore_point(cache: ParamCache, key: str, component: int) -> RestorePo
     except UnknownVehicle:  # removed from the cache since the line above
         raise _none(_apply_to(key)) from None
     now = {} if table is None else table.params
-    latest = {entry.name: entry for entry in entries}  # of several entries of a name, the last one
-    changes = [
-        entry
-        for name, entry in reversed(latest.items())
+    latest = {entry.name: entry.at for entry in entries}  # of several entries of a name, the last one
+    changes = {
+        name: at
+        for name, at in sorted(latest.items(), key=lambda change: change[1])[::-1]
         if name in now and name in state and now[name].settable != state[name].settable
-    ]
-    changes.sort(key=lambda entry: entry.at, reverse=True)
-    return RestorePoint(snapshot, state, changes)
+    }
+    return RestorePoint(snapshot.id, snapshot.at, state, changes)
 
 
 def choose_restore_point(snapshots: Sequence[SnapshotSummary], apply: str) -> SnapshotSummary:

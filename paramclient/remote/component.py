@@ -21,7 +21,7 @@ from paramclient.client.subscription import Changes
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.model.identity import Identity
 from paramclient.model.params import ParamMap
-from paramclient.model.paramset import ParamSet
+from paramclient.model.paramset import ParamSet, RestorePoint
 from paramclient.model.values import Encoding, Param, Settable, WireValue, check_value
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.params.fetch_result import FetchResult, Progress
@@ -39,6 +39,7 @@ from paramclient.remote.decoding import (
     fetch_result_of,
     hash_of,
     param_of,
+    restore_point_of,
     set_outcome_of,
     set_result_of,
     state_of,
@@ -375,9 +376,15 @@ class RemoteComponent(ServiceComponent):
         """See `ServiceComponent.service`."""
         return self._service.name
 
-    async def load_state(self, when: float | None = None) -> ParamSet:
+    async def load_restore_point(self) -> RestorePoint:
+        """See `ServiceComponent.load_restore_point`."""
+        document = await self._ask("POST", f"{self._mirrored.path}/state", {}, "the state to restore")
+        with decode_errors(self._service.name):
+            return restore_point_of(document)
+
+    async def load_state(self, when: float) -> ParamSet:
         """See `ServiceComponent.load_state`."""
-        body = {} if when is None else {"snapshot": when} if isinstance(when, int) else {"at": when}
+        body = {"snapshot": when} if isinstance(when, int) else {"at": when}
         document = await self._ask("POST", f"{self._mirrored.path}/state", body, "the state to restore")
         with decode_errors(self._service.name):
             return state_of(document)
@@ -386,8 +393,7 @@ class RemoteComponent(ServiceComponent):
         self, kind: Literal["apply", "restore"], body: Mapping[str, Any], *, timeout: float | None = None
     ) -> Mapping[str, Any]:
         """See `ServiceComponent.plan_set_up`."""
-        path = "plan" if kind == "apply" else kind
-        body = body if kind == "apply" else {**body, "dry_run": True}
+        path = "plan" if kind == "apply" else f"{kind}/plan"
         return await self._ask("POST", f"{self._mirrored.path}/{path}", body, "the plan of a set-up", timeout)
 
     async def compare(self, body: Mapping[str, Any], *, timeout: float | None = None) -> Mapping[str, Any]:

@@ -18,7 +18,7 @@ from paramclient.model.ext_params import ExtParam, ExtValue
 from paramclient.model.ext_paramset import ExtParamSet
 from paramclient.model.identity import Identity
 from paramclient.model.notation import parse_value
-from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.paramset import ParamSet, RestorePoint, WrittenParam
 from paramclient.model.values import Param, ParamType, WireValue, type_of_name
 from paramclient.protocol.ext.fetch import ExtFetchResult
 from paramclient.protocol.ext.write_batch import ExtSetOutcome
@@ -27,7 +27,7 @@ from paramclient.protocol.params.fetch_result import FetchResult, Progress
 from paramclient.protocol.params.sampling import Sample
 from paramclient.protocol.params.write_batch import SetOutcome, SetStatus
 from paramclient.protocol.params.writes import SetResult
-from paramclient.remote.problems import error_of
+from paramclient.remote.problems import error_of, parse_unix_time
 
 __all__ = [
     "Document",
@@ -46,6 +46,7 @@ __all__ = [
     "param_of",
     "params_of",
     "progress_of",
+    "restore_point_of",
     "set_outcome_of",
     "set_result_of",
     "state_of",
@@ -250,6 +251,14 @@ def state_of(document: Document) -> ParamSet:
         None if at is None else float(at),
         str(document["source"]),
     )
+
+
+def restore_point_of(document: Document) -> RestorePoint:
+    """Return the state before the last apply (`StateDoc`)."""
+    point = document["restore_point"]
+    check_kind(point["snapshot"], int)
+    changes = {str(name): parse_unix_time(at) for name, at in point["changes"].items()}
+    return RestorePoint(point["snapshot"], parse_unix_time(point["at"]), state_of(document), changes)
 
 
 def _written_of(name: str, document: Document) -> WrittenParam:

@@ -34,7 +34,7 @@ from paramclient.errors import (
 from paramclient.model.notation import parse_number
 from paramclient.model.values import WireValue
 
-__all__ = ["NotDescribed", "NotHeard", "error_of"]
+__all__ = ["NotDescribed", "NotHeard", "error_of", "parse_unix_time"]
 
 Problem = Mapping[str, Any]
 
@@ -81,6 +81,19 @@ def error_of(problem: Problem, *, status: int, link: str) -> ParamClientError:
     return LinkError(f"{link}: {detail}", link=link)
 
 
+def parse_unix_time(given: object) -> float:
+    """Return a time in unix seconds.
+
+    Raises:
+        TypeError, ValueError: it is not a finite number.
+    """
+    if isinstance(given, bool) or not isinstance(given, int | float):
+        raise TypeError(f"a time must be a number, not {given!r}")
+    if not math.isfinite(given):
+        raise ValueError("a time must be finite")
+    return float(given)
+
+
 def _whom(problem: Problem) -> dict[str, Any]:
     index = problem.get("index")
     return {
@@ -122,14 +135,6 @@ def _value(given: object) -> WireValue | str:
     return str(given["text"]) if "text" in given else bytes.fromhex(given["hex"])
 
 
-def _moment(given: Any) -> float:
-    """Return a time in unix seconds."""
-    moment = float(given)
-    if not math.isfinite(moment):
-        raise ValueError("a time must be finite")
-    return moment
-
-
 def _ext_refused(kind: type[ExtSetRefused]) -> Callable[[str, Problem], ExtSetRefused]:
     return lambda detail, problem: kind(
         detail,
@@ -160,7 +165,7 @@ _MAKERS: Final[dict[str, Callable[[str, Problem], ParamClientError]]] = {
         str(problem["summary"])[:DETAIL_LENGTH_MAX],
         before_apply=int(problem["before_apply"]),
         before_restore=int(problem["before_restore"]),
-        restored_at=_moment(problem["restored_at"]),
+        restored_at=parse_unix_time(problem["restored_at"]),
     ),
     "UnknownVehicle": lambda detail, problem: UnknownVehicle(detail, vehicles=_vehicles(problem)),
     "AmbiguousVehicle": lambda detail, problem: AmbiguousVehicle(

@@ -18,11 +18,11 @@ from paramclient.files import FileFormat, ParamFile, loads, loads_renames
 from paramclient.files.param_file import TooManyParams
 from paramclient.files.param_pck import is_packed
 from paramclient.model.params import copy_params
-from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.paramset import ParamSet, RestorePoint, WrittenParam
 from paramclient.model.patterns import is_pattern
 from paramclient.model.values import Trust, check_name
 from paramclient.provision.inspection import wait_for_identity
-from paramclient.provision.restore_point import load_state_before_apply
+from paramclient.provision.restore_point import load_restore_point, load_state_before_apply
 from paramclient.provision.runner import Runner
 from paramclient.provision.vehicle_params import (
     FetchedSet,
@@ -65,6 +65,7 @@ __all__ = [
     "load_cached_state",
     "parse_upload",
     "resolve_source",
+    "load_last_restore_point",
     "load_state",
     "require_cache",
     "flush_cache",
@@ -339,6 +340,17 @@ async def load_state(hub: Hub, target: FollowedComponent, when: float | int | No
     if when is None:
         return await read_cache(hub, lambda: load_state_before_apply(cache, key, component))
     return await load_cached_state(hub, key, component, when)
+
+
+async def load_last_restore_point(hub: Hub, target: FollowedComponent) -> RestorePoint:
+    """Return the state before the last apply of a connected component, and what its restore undoes.
+
+    Raises:
+        AlreadyRestored, ServiceError: as from `load_state`.
+    """
+    cache = require_cache(hub)
+    key, component = await wait_for_key(hub, target), target.component.component
+    return await read_cache(hub, lambda: load_restore_point(cache, key, component))
 
 
 async def wait_for_key(hub: Hub, target: FollowedComponent) -> str:

@@ -38,7 +38,7 @@ async def test_the_point_has_the_state_before_the_apply_and_later_changes(path: 
         point = load_restore_point(cache, *where(component))
         assert point.state == load_state_before_apply(cache, *where(component))
         assert {name: each.value for name, each in point.state.items()} == {"GAIN": 1, "MODE": 2, "RATE": 3}
-        assert [each.name for each in point.changes] == ["RATE", "GAIN"]
+        assert list(point.changes) == ["RATE", "GAIN"]
         with pytest.raises(NotInCache, match="no snapshot from before an apply to uid:00"):
             load_restore_point(cache, "uid:00", 1)
 

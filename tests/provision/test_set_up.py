@@ -476,7 +476,7 @@ async def test_members_of_a_group_to_reveal_are_requested_during_the_file_downlo
 
 @pytest.mark.parametrize("osd_type", [0, 1])
 @in_simulated_time
-async def test_a_hidden_group_may_continue_the_name_of_its_switch_without_an_underscore(osd_type: int) -> None:
+async def test_a_hidden_group_may_follow_its_switch_without_an_underscore(osd_type: int) -> None:
     """ArduPilot's AP_OSD: OSD_TYPE hides OSD_CHAN and the screens OSD1_ to OSD4_."""
     osd: dict[str, WireValue | tuple[ParamType, WireValue]] = {"OSD_CHAN": 0.0, "OSD1_ENABLE": 0.0}
     table = SETTINGS | {"OSD_TYPE": (ParamType.INT8, 0)}

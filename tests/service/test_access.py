@@ -453,10 +453,16 @@ async def test_malformed_authorization_is_refused(given: str) -> None:
 READS = [
     *(("GET", READ), ("HEAD", READ), ("POST", "/api/v1/components/1/1/fetch")),
     *(("POST", "/api/v1/components/1/1/params/apply/read"), ("POST", "/api/v1/components/1/1/plan")),
+    ("POST", "/api/v1/components/1/1/restore/plan"),
     *(("POST", "/api/v1/components/1/1/diff"), ("POST", "/api/v1/files"), ("DELETE", "/api/v1/jobs/7")),
 ]
 WRITES = [
-    *(("POST", WRITE), ("POST", "/api/v1/components/1/1/reboot"), ("POST", "/api/v1/what-comes-later")),
+    *(
+        ("POST", WRITE),
+        ("POST", "/api/v1/components/1/1/reboot"),
+        ("POST", "/api/v1/components/1/1/restore"),
+        ("POST", "/api/v1/what-comes-later"),
+    ),
     *(("PUT", "/api/v1/components/1/1/params/fetch"), ("PATCH", "/api/v1/components/1/1/params")),
     *(("DELETE", "/api/v1/components"), ("POST", "/api/v1/components/1/1/fetch/"), ("LOCK", "/x/read")),
 ]

@@ -271,9 +271,15 @@ async def test_an_earlier_state_comes_back(vehicle: Callable[..., Vehicle], tmp_
         state = await service.post(f"{HERE}/state", {})
         assert (state["system"], state["identity"]["system"]) == (1, 1)
         assert state["params"]["TUNE_01"]["value"] == pytest.approx(0.35)
+        point = state.pop("restore_point")
+        assert (point["at"], point["changes"].keys()) == (state["at"], {"TUNE_01", "TUNE_02"})
         assert state == await service.post(f"{HERE}/state", {"at": state["at"]})
+        assert state == await service.post(f"{HERE}/state", {"snapshot": point["snapshot"]})
         planned = await service.post(f"{HERE}/restore", {"dry_run": True})
         assert planned["params"].keys() == {"TUNE_01", "TUNE_02"}
+        assert planned == await service.post(f"{HERE}/restore/plan", {})
+        refused = await service.post(f"{HERE}/restore/plan", {"reboot": True}, 422)
+        assert refused["type"] == "urn:paramclient:invalid-request"
         back = await service.post(f"{HERE}/restore", {})
         assert back["complete"] is True
         assert back["params"].keys() == {"TUNE_01", "TUNE_02"}
@@ -794,6 +800,21 @@ async def test_a_file_describes_parameters_too(tmp_path: Path) -> None:
         bad = await service.ask("PUT", f"{HERE}/metadata", 422, content=b"what")
         assert bad["error"] == "MetadataError"
         assert (await service.post(f"{HERE}/metadata", {}, 404))["type"] == "urn:paramclient:not-described"
+
+
+@in_simulated_time
+async def test_a_token_that_may_only_read_plans_a_restore(tmp_path: Path) -> None:
+    async with Hub([px4()], cache=tmp_path / "cache") as hub:
+        await until(lambda: hub.followed, pause=0.1)
+        tokens = Tokens.of_text("guest read guest-may-read-only-0123\nanna write anna-may-write-0123456")
+        app = create_app(hub, Settings(access=AccessSettings(tokens=tokens)))
+        async with a_browser(app) as client:
+            client.headers["authorization"] = "Bearer anna-may-write-0123456"
+            assert (await client.post(f"{HERE}/apply", json={"wanted": {"values": {"MODE": 4}}})).is_success
+            client.headers["authorization"] = "Bearer guest-may-read-only-0123"
+            planned = await client.post(f"{HERE}/restore/plan", json={})
+            assert (planned.status_code, planned.json()["params"]["MODE"]["wanted"]) == (200, 3)
+            assert (await client.post(f"{HERE}/restore", json={"dry_run": True})).status_code == 403
 
 
 @in_simulated_time

@@ -101,17 +101,22 @@ class ApplyRequest(PlanRequest):
     wait: bool = True
 
 
-class RestoreRequest(EarlierState):
-    """The state to restore, with options."""
+class RestorePlanRequest(EarlierState):
+    """The state to restore."""
 
     include: Patterns = ()
+    force: bool = False
+    full: bool = False
+    timeout_s: Seconds = None
+
+
+class RestoreRequest(RestorePlanRequest):
+    """The state to restore, with options."""
+
     reboot: bool = False
     allow_armed: bool = False
-    force: bool = False
     dry_run: bool = False
-    full: bool = False
     wait: bool = True
-    timeout_s: Seconds = None
 
 
 @router.post("/diff", response_model=DiffDoc)
@@ -182,12 +187,9 @@ async def restore_(
     request: Request, hub: HubArgument, target: Target, body: RestoreRequest
 ) -> Document | Response:
     """Restore an earlier state of a component, with its own identity and calibration."""
-    author = author_of(request)
     if body.dry_run:
-        with long_request(request):
-            found = await run_until_disconnect(request, lambda: _plan_back(hub, target, body), target)
-        system, component = target.address
-        return PlanDoc.of(found, system=system, component=component, full=body.full)
+        return await plan_restore(request, hub, target, body)
+    author = author_of(request)
 
     async def work(publish_progress: Callable[[ApplyProgress], None]) -> ApplyResult:
         return await restore(
@@ -205,6 +207,16 @@ async def restore_(
 
     job = _begin(hub, "restore", target, request, work, full=body.full)
     return await _result(request, job, waits=body.wait)
+
+
+@router.post("/restore/plan", response_model=PlanDoc)
+async def plan_restore(
+    request: Request, hub: HubArgument, target: Target, body: RestorePlanRequest
+) -> Response:
+    """Return which values a restore would write, and which it would skip. Nothing is written."""
+    return await _plan_response(
+        request, hub, target, lambda: _plan_back(hub, target, body), PlanDoc, full=body.full
+    )
 
 
 async def _diff(hub: Hub, target: FollowedComponent, body: DiffRequest) -> Response:
@@ -284,13 +296,25 @@ async def _planned(
     kind: type[PlanDoc] | type[VerifiedDoc],
 ) -> Response:
     """Return the response with the plan, as a document of this kind."""
+    return await _plan_response(request, hub, target, lambda: _plan(hub, target, body), kind, full=body.full)
+
+
+async def _plan_response(
+    request: Request,
+    hub: Hub,
+    target: FollowedComponent,
+    plan: Callable[[], Awaitable[Plan]],
+    kind: type[PlanDoc] | type[VerifiedDoc],
+    *,
+    full: bool,
+) -> Response:
     system, component = target.address
 
     async def work() -> Response:
-        found = await _plan(hub, target, body)
+        found = await plan()
         return await document_response(
             hub.run_in_file_thread,
-            lambda: kind.of(found, system=system, component=component, full=body.full),
+            lambda: kind.of(found, system=system, component=component, full=full),
         )
 
     with long_request(request):
@@ -315,7 +339,7 @@ async def _plan(hub: Hub, target: FollowedComponent, body: PlanRequest) -> Plan:
     return await _within(target, body.timeout_s, work)
 
 
-async def _plan_back(hub: Hub, target: FollowedComponent, body: RestoreRequest) -> Plan:
+async def _plan_back(hub: Hub, target: FollowedComponent, body: RestorePlanRequest) -> Plan:
     earlier = await load_state(hub, target, body.when)
 
     async def work() -> Plan:

@@ -34,6 +34,7 @@ from paramclient.service.param_sources import (
     flush_cache,
     load_cached_state,
     load_cached_table,
+    load_last_restore_point,
     load_state,
     read_cache,
     read_file,
@@ -195,11 +196,15 @@ async def state_at(request: Request, hub: HubArgument, target: Target, at: At) -
 
 @router.post("/components/{system}/{component}/state", response_model=StateDoc)
 async def earlier_state(request: Request, hub: HubArgument, target: Target, body: EarlierState) -> Response:
-    """Return the state that a restore with the same members writes."""
+    """Return the state that a restore with the same members writes.
+
+    Of the state before the last apply, also what its restore undoes.
+    """
 
     async def work() -> Response:
-        found = await load_state(hub, target, body.when)
-        return await document_response(hub.run_in_thread, lambda: StateDoc.of(found))
+        point = await load_last_restore_point(hub, target) if body.when is None else None
+        found = await load_state(hub, target, body.when) if point is None else point.state
+        return await document_response(hub.run_in_thread, lambda: StateDoc.of(found, point))
 
     return await run_until_disconnect(request, work)
 
