@@ -27,7 +27,12 @@ from paramclient.cli.file_output import described
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_session
 from paramclient.cli.options import Count, LinkOptions
 from paramclient.cli.output import print_document, printable, progress_bar, report, say
-from paramclient.cli.restore_states import StateToRestore, check_when_for_all, load_states
+from paramclient.cli.restore_states import (
+    StateToRestore,
+    check_when_for_all,
+    load_states,
+    restore_command,
+)
 from paramclient.cli.session import receiver_in_words
 from paramclient.cli.setup_results import (
     NamedVehicle,
@@ -363,6 +368,13 @@ async def restore(
             found, vehicles=[each for each in found.vehicles if (each.system, each.component) in states]
         )
         show.states(states)
+        show.continues_by(
+            {
+                address: restore_command(url, state.name, options, address if all_vehicles else None)
+                for address, state in states.items()
+                if state.name
+            }
+        )
         params = {address: state.params for address, state in states.items()}
         backups = await _backups(backup, found.vehicles)
         info = await _described(found, None, None)
@@ -485,6 +497,11 @@ class _Output:
         self._as_json = as_json
         self._is_fleet = is_fleet
         self._full = full
+        self._commands: Mapping[NamedVehicle, str] = {}
+
+    def continues_by(self, commands: Mapping[Address, str]) -> None:
+        """Set the commands that continue a set-up, for messages, where they are not the given command."""
+        self._commands = self.by_vehicle(commands)
 
     def by_vehicle(self, results: Mapping[Address, Found]) -> dict[NamedVehicle, Found]:
         """Return results by vehicle instead of by address."""
@@ -512,7 +529,11 @@ class _Output:
     ) -> ExitCode:
         """Print the results of `apply` or `restore`; return the exit code."""
         return self._print(
-            results, errors, lambda: show_applied(results, full=self._full), applied_doc, applied_code
+            results,
+            errors,
+            lambda: show_applied(results, full=self._full, commands=self._commands),
+            applied_doc,
+            applied_code,
         )
 
     def verified(
@@ -567,7 +588,7 @@ class _Output:
                     [interrupted_doc(each, outcomes.get(each, [])) for each in self._vehicles.values()]
                 )
             else:
-                show_interrupted(outcomes)
+                show_interrupted(outcomes, self._commands)
             raise
 
     def _print(

@@ -20,7 +20,7 @@ from paramclient.cli.file_output import described
 from paramclient.cli.metadata import VEHICLE, request_from_vehicle
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import print_document, printable, progress_bar, report, say
-from paramclient.cli.restore_states import StateToRestore, choices_error, undone_by
+from paramclient.cli.restore_states import choices_error, named_state, restore_command, undone_by
 from paramclient.cli.session import CommandSession, connect, receiver_in_words, wait_for_firmware
 from paramclient.cli.setup_results import (
     NamedVehicle,
@@ -165,7 +165,7 @@ async def restore_over_service(
             if when is None:
                 state = undone_by(await component.load_restore_point())
             else:
-                state = StateToRestore(await component.load_state(when))
+                state = named_state(await component.load_state(when), when)
         except NotInCache as error:
             if when is None:
                 raise NotInCache(f"{error}, such as '2h ago'") from None
@@ -179,7 +179,8 @@ async def restore_over_service(
         body = {"include": list(choices.include), "force": choices.force}
         body |= {"snapshot": when} if isinstance(when, int) else {"at": params.at}
         more = choices.of_writing
-        set_up = _SetUp(session, component, choices, params, "restore", body, body | more, state.point)
+        again = restore_command(url, state.name, options) if state.name else ""
+        set_up = _SetUp(session, component, choices, params, "restore", body, body | more, state.point, again)
         return await set_up.ask_and_run(dry_run=dry_run, yes=yes)
 
 
@@ -234,6 +235,7 @@ class _SetUp:
         to_plan: the request for the plan.
         to_run: the request for the set-up.
         point: the restore point in words; "" for none.
+        again: the command that continues after an interruption; "" for the given one.
     """
 
     session: CommandSession
@@ -244,6 +246,7 @@ class _SetUp:
     to_plan: Mapping[str, Any]
     to_run: Mapping[str, Any]
     point: str = ""
+    again: str = ""
 
     @cached_property
     def vehicle(self) -> NamedVehicle:
@@ -252,6 +255,10 @@ class _SetUp:
         return NamedVehicle(
             each.system, each.component, describe(each), receiver_in_words(each), each.identity
         )
+
+    @property
+    def _commands(self) -> Mapping[NamedVehicle, str]:
+        return {self.vehicle: self.again} if self.again else {}
 
     async def ask_and_run(self, *, dry_run: bool, yes: bool) -> ExitCode:
         """Print the plan, or ask for confirmation, run the set-up and print its result."""
@@ -354,7 +361,7 @@ class _SetUp:
             print_document(document)
             return
         rows = [_applied_row(name, row, self.wanted) for name, row in document.params.items()]
-        show_interrupted({self.vehicle: rows})
+        show_interrupted({self.vehicle: rows}, self._commands)
 
     def _continues(self, job: str) -> str:
         """Return that a job may still run, and how to look at it and cancel it."""
@@ -376,7 +383,7 @@ class _SetUp:
         if self.session.options.json:
             print_document(document.model_copy(update={"problem": None}))
         else:
-            show_applied({self.vehicle: result}, full=self.choices.full)
+            show_applied({self.vehicle: result}, full=self.choices.full, commands=self._commands)
         if self.point and error is None:
             say(printable(f"{self.vehicle.label}: restored the state {self.point}"))
         return applied_code(result)

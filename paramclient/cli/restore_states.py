@@ -12,6 +12,7 @@ import anyio.to_thread
 
 from paramclient.cache import ParamCache
 from paramclient.cli.options import LinkOptions
+from paramclient.cli.output import local_time
 from paramclient.cli.sources import choose, is_file, open_file
 from paramclient.cli.targets import PLACEHOLDERS, Address, Targets, check_pattern, fill_pattern
 from paramclient.cli.time_arguments import parse_when
@@ -36,6 +37,7 @@ __all__ = [
     "check_when_for_all",
     "choices_error",
     "load_states",
+    "named_state",
     "restore_command",
     "undone_by",
 ]
@@ -53,11 +55,14 @@ class StateToRestore:
         point: the restore point in words, such as `before the last apply, 9 min ago (snapshot 4)`; "" for a
             state that the user chose.
         changes: the changes since then in words; "" for a state that the user chose.
+        name: the state as the command takes it, to continue after an interruption; "" if that is the given
+            one. A restore without a time is refused the second time, and an age is another time later.
     """
 
     params: ParamSet
     point: str = ""
     changes: str = ""
+    name: str = ""
 
 
 def check_when_for_all(when: str | None) -> None:
@@ -210,10 +215,15 @@ def _is_pattern(when: str) -> bool:
 
 def _state_at(cache: ParamCache, key: str, component: int, moment: float) -> StateToRestore:
     try:
-        return StateToRestore(cache.state_at(key, component, moment))
+        return named_state(cache.state_at(key, component, moment), moment)
     except UnknownVehicle:  # the vehicle was heard on the link; the user named none of the cache
         message = f"the cache {cache.place} has no earlier state of {key}, component {component}"
         raise NotInCache(message) from None
+
+
+def named_state(state: ParamSet, when: float) -> StateToRestore:
+    """Return a state that was chosen by its time or by the number of a snapshot."""
+    return StateToRestore(state, name="" if isinstance(when, int) else local_time(when))
 
 
 def undone_by(point: RestorePoint) -> StateToRestore:
@@ -227,4 +237,5 @@ def undone_by(point: RestorePoint) -> StateToRestore:
         f"changed since then: {first_of(changes, CHANGES_SHOWN_MAX)}"
         if changes
         else "nothing is known to have changed since then",
+        str(point.snapshot),
     )

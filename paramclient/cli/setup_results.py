@@ -104,8 +104,13 @@ Cells: TypeAlias = list[object]
 # Results
 
 
-def show_applied(results: Mapping[NamedVehicle, Applied], *, full: bool) -> None:
-    """Print one table of the outcome for each value, and a line for each vehicle on stderr."""
+def show_applied(
+    results: Mapping[NamedVehicle, Applied], *, full: bool, commands: Mapping[NamedVehicle, str] | None = None
+) -> None:
+    """Print one table of the outcome for each value, and a line for each vehicle on stderr.
+
+    `commands` has the commands that continue after an error, if they are not the same command.
+    """
     _print(
         ["name", "before", "wanted", "now", "status", "reason"],
         {
@@ -123,20 +128,35 @@ def show_applied(results: Mapping[NamedVehicle, Applied], *, full: bool) -> None
             names = first_of(result.reboot_required, RESULT_NAMES_MAX)
             say(printable(f"{vehicle.label}: takes effect after a reboot: {names}"))
         if result.error is not None:
-            report(f"{vehicle.label}: {result.error}; run it again to continue")
+            again = _to_continue(vehicle, commands or {})
+            report(f"{vehicle.label}: {result.error}; {again}")
 
 
-def show_interrupted(rows: Mapping[NamedVehicle, Sequence[ApplyRow]]) -> None:
-    """Print the outcome for each value before Ctrl-C ended the command."""
+def show_interrupted(
+    rows: Mapping[NamedVehicle, Sequence[ApplyRow]], commands: Mapping[NamedVehicle, str] | None = None
+) -> None:
+    """Print the outcome for each value before Ctrl-C ended the command.
+
+    `commands` has the commands that continue, if they are not the same command.
+    """
     _print(
         ["name", "before", "wanted", "now", "status", "reason"],
         {vehicle: map(_applied_cells, each) for vehicle, each in rows.items()},
     )
     unproven = sum(row.status is ApplyStatus.UNPROVEN for each in rows.values() for row in each)
-    say(
-        f"interrupted: {counted(unproven, 'value')} acknowledged, not proven, and others may be in flight; "
-        "run it again to continue"
-    )
+    vehicles = list(commands or rows)
+    told = f"interrupted: {counted(unproven, 'value')} acknowledged, not proven, and others may be in flight"
+    if not commands or len(vehicles) == 1:
+        say(f"{told}; {_to_continue(vehicles[0] if vehicles else None, commands or {})}")
+        return
+    say(told)
+    for vehicle in vehicles:
+        say(f"{vehicle.label}: {_to_continue(vehicle, commands)}")
+
+
+def _to_continue(vehicle: NamedVehicle | None, commands: Mapping[NamedVehicle, str]) -> str:
+    command = None if vehicle is None else commands.get(vehicle)
+    return "run it again to continue" if command is None else printable(f"to continue: `{command}`")
 
 
 def applied_code(result: Applied) -> ExitCode:

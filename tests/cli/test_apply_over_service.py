@@ -454,7 +454,7 @@ def test_ctrl_c_cancels_a_restore(command: Command, keeping: Put, many: Path) ->
     interrupting = Interrupting(dict.fromkeys(NAMES, 2))
     done = command("restore", keeping(interrupting))
     assert done.code == 130
-    assert "interrupted: " in done.err
+    assert f"to continue: `paramclient restore {SERVICE} 1`" in done.err
     assert list(interrupting.values.values()).count(2) > 0
 
 

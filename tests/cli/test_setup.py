@@ -10,6 +10,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -784,6 +785,56 @@ def test_a_silent_vehicle_is_reported_with_the_outcomes_so_far(
     assert outcome.json["error"]
     assert outcome.json["counts"]["unproven"] + outcome.json["counts"]["failed"] > 0
     assert "run it again" in command("apply", put(Dying(dict.fromkeys(names, 1))), wanted).err
+
+
+@pytest.mark.parametrize("options", [[], ["--system", "1"]])
+def test_an_interrupted_restore_prints_the_command_that_continues(
+    command: Command, put: Put, file: Callable[..., Path], options: list[str]
+) -> None:
+    class Interrupting(GenericVehicle):
+        def _on_set(self, request: Any, sender: Any) -> None:
+            if self.requests["PARAM_SET"] == 12:
+                signal.raise_signal(signal.SIGINT)
+            else:
+                super()._on_set(request, sender)
+
+    names = [f"P{number:02}" for number in range(40)]
+    wanted = file("".join(f"{name},2\n" for name in names))
+    assert command("apply", put(GenericVehicle(dict.fromkeys(names, 1))), wanted).code == 0
+    vehicle = Interrupting(dict.fromkeys(names, 2))
+    outcome = command("restore", put(vehicle), *options)
+    assert outcome.code == 130
+    again = " ".join(["paramclient restore udpin:0.0.0.0:14550 1", *options])
+    assert re.search(rf"interrupted: .* in flight; to continue: `{again}`$", outcome.err, re.MULTILINE)
+    assert set(vehicle.values.values()) == {1, 2}
+    back = command("restore", put(vehicle), 1, *options)
+    assert (back.code, set(vehicle.values.values())) == (0, {1})
+
+
+def test_a_restore_that_fails_prints_the_command_that_continues(
+    command: Command, put: Put, file: Callable[..., Path], cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Dying(GenericVehicle):
+        def _on_set(self, request: Any, sender: Any) -> None:
+            super()._on_set(request, sender)
+            if self.requests["PARAM_SET"] == 12:
+                self._switch_on(float("inf"))
+
+    names = [f"P{number:02}" for number in range(40)]
+    wanted = file("".join(f"{name},2\n" for name in names))
+    assert command("apply", put(GenericVehicle(dict.fromkeys(names, 1))), wanted).code == 0
+    with ParamCache(cache) as kept:
+        [before] = kept.snapshots(kept.vehicles()[0].key)
+    monkeypatch.setattr("paramclient.cli.restore_states.time.time", lambda: before.at + 600)
+    told = command("restore", put(Dying(dict.fromkeys(names, 2))), "10min ago")
+    assert told.code == 3
+    found = re.search(
+        r"; to continue: `paramclient restore udpin:0.0.0.0:14550 ([^ ]*)`$", told.err, re.MULTILINE
+    )
+    assert found is not None, told.err
+    assert datetime.fromisoformat(found[1]).timestamp() == pytest.approx(before.at, abs=0.001)
+    told = command("restore", put(Dying(dict.fromkeys(names, 2))), 1)
+    assert "; run it again to continue\n" in told.err
 
 
 # Metadata
