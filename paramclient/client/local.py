@@ -39,7 +39,9 @@ __all__ = [
     "LocalComponent",
     "LocalExtParams",
     "ServiceComponent",
+    "api_address",
     "check_has_link",
+    "link_needed",
     "local",
     "not_given",
     "wait_until_identified",
@@ -354,14 +356,28 @@ def check_has_link(component: Component, call: str, command: str, path: str) -> 
     Raises:
         UsageError: the component belongs to a client over a service; the message says how it does the same.
     """
-    if not isinstance(component, ServiceComponent):
-        return
+    if isinstance(component, ServiceComponent):
+        raise link_needed(
+            call,
+            f"The service does the same: run `paramclient {command.format(component.service)}`, or send POST "
+            f"{api_address(component, path)}, for example with httpx",
+        )
+
+
+def link_needed(call: str, advice: str) -> UsageError:
+    """Return the UsageError for a call that needs the link itself.
+
+    Args:
+        call: the name of the call.
+        advice: what to do instead, in sentences.
+    """
+    return UsageError(f"a service does not give {call}() the link itself, which it needs. {advice}")
+
+
+def api_address(component: ServiceComponent, path: str) -> str:
+    """Return the address of a component in the HTTP API of its service, with `path` as its last part."""
     base, mark, link = component.service.partition("?")
-    address = f"{base}/api/v1/components/{component.system}/{component.component}/{path}{mark}{link}"
-    raise UsageError(
-        f"a service does not give {call}() the link itself, which it needs. The service does the same: run "
-        f"`paramclient {command.format(component.service)}`, or send POST {address}, for example with httpx"
-    )
+    return f"{base}/api/v1/components/{component.system}/{component.component}/{path}{mark}{link}"
 
 
 async def wait_until_identified(component: LocalComponent, timeout: float) -> None:

@@ -8,7 +8,7 @@ from typing import Final
 from paramclient.client.component import Component
 from paramclient.client.local import local
 from paramclient.errors import NoReply, UsageError, VehicleError
-from paramclient.metadata.download import metadata_of
+from paramclient.metadata.download import check_link_for_metadata, metadata_of
 from paramclient.metadata.info import Metadata
 from paramclient.metadata.metadata_cache import MetadataStore
 from paramclient.protocol.quick_transfer import obstacle_to_quick_transfer
@@ -62,6 +62,7 @@ async def load_if_quick(
         UsageError: the component belongs to a client over a service.
         LinkError: the link failed, or the client was closed.
     """
+    check_link_for_metadata(component, "load_if_quick")
     obstacle = obstacle_to_load(component)
     if obstacle is not None:
         return QuickDownload(None, obstacle)

@@ -143,6 +143,22 @@ def test_a_set_up_by_the_library_names_the_command_and_the_request_that_do_it(
     assert vehicle.requests["PARAM_SET"] == 0
 
 
+@pytest.mark.parametrize("call", ["metadata_of", "load_if_quick", "check_vehicle"])
+def test_a_call_that_needs_the_link_says_what_to_do_over_a_service(call: str) -> None:
+    with running(small_px4()) as url, sync.ParamClient(url) as client:
+        component = client.only_component()
+        arguments = (client, component) if call == "check_vehicle" else (component,)
+        with pytest.raises(UsageError) as caught:
+            getattr(sync, call)(*arguments)
+    told = str(caught.value)
+    assert told.startswith(f"a service does not give {call}() the link itself, which it needs. ")
+    if call == "check_vehicle":
+        assert "Run `paramclient check LINK`, or pass an open ParamClient(LINK, traffic=True" in told
+    else:
+        assert f"run `paramclient get {url} NAME --metadata vehicle`" in told
+        assert f"POST {url}/api/v1/components/1/1/metadata" in told
+
+
 def test_a_whole_set_up_is_refused_before_anything_is_written() -> None:
     vehicle = small_px4()
 
