@@ -56,7 +56,8 @@ def test_only_the_keeping_of_things_knows_the_time_of_day() -> None:
     library = {module for module in asking if module.split(".")[1:2] not in (["cli"], ["service"])}
     keeping = {
         *("client.cache_writer", "client.recording", "cache.store", "cache.sqlite_file"),
-        *("provision.inspection", "provision.vehicle_params", "metadata.metadata_cache"),
+        *("provision.inspection", "provision.restore_point", "provision.vehicle_params"),
+        "metadata.metadata_cache",
     }
     signing = {"client.signing"}  # whose timestamps are times of day by definition
     waiting = {"links.udp"}  # for how long a datagram has: the kernel says when it came as a time of day
