@@ -84,7 +84,7 @@ class InterruptedSetupDoc(Document):
 
     @classmethod
     def of(cls, note: InterruptedSetup) -> InterruptedSetupDoc:
-        """Return the document of a `InterruptedSetup`."""
+        """Return the document of an `InterruptedSetup`."""
         return cls(
             time=time_text(note.at),
             component=note.component,

@@ -35,4 +35,4 @@ def precedes_group(name: str) -> bool:
 
     That is the order of ArduPilot's list (`AP_Param::next_group`). PX4 sorts its list by name.
     """
-    return _CHOICES["ardupilot"].has(name)
+    return is_group_switch(name, "ardupilot")

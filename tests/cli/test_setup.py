@@ -736,17 +736,20 @@ def test_component_chooses_another_component(
 # Interruptions
 
 
+class Interrupting(GenericVehicle):
+    """A vehicle during whose twelfth PARAM_SET the user presses Ctrl-C."""
+
+    def _on_set(self, request: Any, sender: Any) -> None:
+        if self.requests["PARAM_SET"] == 12:
+            signal.raise_signal(signal.SIGINT)
+        else:
+            super()._on_set(request, sender)
+
+
 @pytest.mark.parametrize("as_json", [False, True])
 def test_ctrl_c_prints_the_outcomes_so_far(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path], as_json: bool
 ) -> None:
-    class Interrupting(GenericVehicle):
-        def _on_set(self, request: Any, sender: Any) -> None:
-            if self.requests["PARAM_SET"] == 12:
-                signal.raise_signal(signal.SIGINT)
-            else:
-                super()._on_set(request, sender)
-
     names = [f"P{number:02}" for number in range(40)]
     vehicle = Interrupting(dict.fromkeys(names, 1))
     wanted = file("".join(f"{name},2\n" for name in names))
@@ -791,13 +794,6 @@ def test_a_silent_vehicle_is_reported_with_the_outcomes_so_far(
 def test_an_interrupted_restore_prints_the_command_that_continues(
     command: Command, put: Put, file: Callable[..., Path], options: list[str]
 ) -> None:
-    class Interrupting(GenericVehicle):
-        def _on_set(self, request: Any, sender: Any) -> None:
-            if self.requests["PARAM_SET"] == 12:
-                signal.raise_signal(signal.SIGINT)
-            else:
-                super()._on_set(request, sender)
-
     names = [f"P{number:02}" for number in range(40)]
     wanted = file("".join(f"{name},2\n" for name in names))
     assert command("apply", put(GenericVehicle(dict.fromkeys(names, 1))), wanted).code == 0
