@@ -131,25 +131,29 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
     ),
 }
 """Files within the limits of size and separators, each of which takes 0.1 s or more in one call into C."""
+REFUSED_AT_ONCE = 0.02
+"""Seconds within which files are refused that are not read to the end."""
 
 
 @pytest.mark.skipif(not hasattr(time, "pthread_getcpuclockid"), reason="needs the processor time of a thread")
 @pytest.mark.parametrize("shape", HOSTILE)
 def test_other_threads_run_while_a_hostile_file_is_read(shape: str) -> None:
-    """Measures the processor time of the reading thread between two turns of another thread: other processes
-    lengthen it less than wall-clock time."""
+    """The longest processor time of the reading thread between two turns of another thread is a small part of
+    its whole time: one call into C that held the interpreter would be nearly all of it."""
     content = HOSTILE[shape]()
     before = sys.getswitchinterval()
     sys.setswitchinterval(0.001)  # as in the service, and so is the next line
     gc.freeze()
     try:
-        assert min(_longest_hold(content) for _ in range(3)) < 0.05
+        assert min(_longest_hold(content) for _ in range(3)) < 0.25
     finally:
         gc.unfreeze()
         sys.setswitchinterval(before)
 
 
 def _longest_hold(content: bytes) -> float:
+    """Return the longest part of the reading thread's time in which no other thread ran."""
+
     def read() -> None:
         is_watched.wait()
         with suppress(MetadataError):
@@ -160,11 +164,12 @@ def _longest_hold(content: bytes) -> float:
     reading.start()
     assert reading.ident is not None
     clock: Any = time.pthread_getcpuclockid(reading.ident)
-    longest, last = 0.0, time.clock_gettime(clock)
+    longest, began = 0.0, time.clock_gettime(clock)
+    last = began
     is_watched.set()
     while reading.is_alive():
         with suppress(OSError):  # it has just ended
             now = time.clock_gettime(clock)
             longest, last = max(longest, now - last), now
         time.sleep(0.001)
-    return longest
+    return longest / (last - began) if last - began > REFUSED_AT_ONCE else 0.0
