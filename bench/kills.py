@@ -245,8 +245,8 @@ class Rounds:
                 lines |= {
                     (line.name, int(line.new.value)) for line in loaded.history() if line.new is not None
                 }
-            if cache.away is not None:
-                found.lost.append(f"{kind} {number}: {cache.away}")
+            if cache.offline_reason is not None:
+                found.lost.append(f"{kind} {number}: {cache.offline_reason}")
             found.lost += [f"{kind} {number}: {note}" for note in cache.notes]
         last = {each.name: each.value for each in acknowledged}
         for each in acknowledged:

@@ -154,7 +154,7 @@ ABOUT: Final = {"run": RUN, "at": 1.0, "link": "a", "system": 1, "component": 1}
 PROGRESS: Final = {"received": 1, "total": 2, "rate": 1.0, "seconds_left": 1.0, "done": False}
 EVENTS: Final[tuple[dict[str, Any], ...]] = (
     {"run": RUN, "seq": 0, "at": 1.0, "type": "hello", "resumed": False},
-    {**ABOUT, "seq": 1, "type": "component", "why": "heard", "component_doc": COMPONENT},
+    {**ABOUT, "seq": 1, "type": "component", "why": "discovered", "component_doc": COMPONENT},
     {**ABOUT, "seq": 2, "type": "change", "name": "A", "old": PARAM, "new": PARAM, "by": "us for local"},
     {**ABOUT, "seq": 3, "type": "component", "why": "lost", "silence_s": 5.0, "component_doc": COMPONENT},
     {**ABOUT, "seq": 4, "type": "component", "why": "found", "silence_s": 5.0, "component_doc": COMPONENT},

@@ -40,7 +40,7 @@ INTERFACES: dict[type, type] = {
 
 EVENTS: dict[type, type] = {
     getattr(sync, name): getattr(paramclient, name)
-    for name in ("Heard", "Lost", "Found", "Rebooted", "Resynced", "Contested", "Uncontested")
+    for name in ("Discovered", "Lost", "Found", "Rebooted", "Resynced", "Contested", "Uncontested")
 }
 
 

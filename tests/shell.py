@@ -327,7 +327,7 @@ class FlakyLink(SimLink):
     """A link to an endpoint that can drop, and be opened again.
 
     Attributes:
-        is_away: whether it cannot be opened now.
+        is_offline: whether it cannot be opened now.
         openings: how often somebody tried.
     """
 
@@ -335,17 +335,17 @@ class FlakyLink(SimLink):
 
     def __init__(self, endpoint: Endpoint) -> None:
         super().__init__(endpoint, "tcp:flaky:5760")
-        self.is_away = False
+        self.is_offline = False
         self.openings = 0
 
     async def open(self) -> None:
         self.openings += 1
-        if self.is_away:
+        if self.is_offline:
             raise LinkError(f"{self.name}: connection refused", link=self.name)
         await super().open()
 
-    async def drop(self, *, stays_away: bool = False) -> None:
-        self.is_away = stays_away
+    async def drop(self, *, stays_offline: bool = False) -> None:
+        self.is_offline = stays_offline
         await self.close()
 
     async def receive(self) -> list[tuple[Peer, bytes]]:

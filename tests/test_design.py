@@ -240,7 +240,7 @@ SAME_NAME_CLASSES = {
     **dict.fromkeys(
         [
             *("ParamClient", "Component", "ExtParams", "Ftp", "Events", "Changes", "ExtChanges"),
-            *("Heard", "Lost", "Found", "Rebooted", "Resynced", "Contested", "Uncontested"),
+            *("Discovered", "Lost", "Found", "Rebooted", "Resynced", "Contested", "Uncontested"),
         ],
         "asynchronous, and blocking",
     ),

@@ -222,13 +222,13 @@ def _dated(
 ) -> Iterator[NameSpread]:
     """Add the times to the vehicles that differ."""
     names = list(names)
-    standing_out: defaultdict[str, list[str]] = defaultdict(list)
+    deviating: defaultdict[str, list[str]] = defaultdict(list)
     for each in names:
         for holder in (*_others(each), *each.lacking):
-            standing_out[holder.vehicle.key].append(each.name)
+            deviating[holder.vehicle.key].append(each.name)
     ids = {vehicle.key: owner for owner, vehicle in owners.items()}
-    found = _times(transaction, {ids[key]: some for key, some in standing_out.items()})
-    times = {key: found[ids[key]] for key in standing_out}
+    found = _times(transaction, {ids[key]: some for key, some in deviating.items()})
+    times = {key: found[ids[key]] for key in deviating}
 
     def dated(holders: Iterable[Holder], name: str) -> tuple[Holder, ...]:
         return tuple(Holder(each.vehicle, *times[each.vehicle.key].get(name, ())) for each in holders)

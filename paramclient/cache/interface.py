@@ -57,7 +57,7 @@ class Store(Protocol):
         ...
 
     @property
-    def away(self) -> str | None:
+    def offline_reason(self) -> str | None:
         """Why the local copy is used instead of the database. None while the database is used."""
         ...
 

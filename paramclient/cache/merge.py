@@ -59,7 +59,7 @@ class _TableMerge:
 
     def take(self, update: TableUpdate) -> None:
         """Merge one update."""
-        vehicle, found = _standing(self.transaction, update)
+        vehicle, found = _stored(self.transaction, update)
         if found is None:
             self.goes_on = True
             self._save(update, vehicle)
@@ -159,7 +159,7 @@ class _TableMerge:
         return self.transaction.values_between(self.owner, name, after, until)
 
 
-def _standing(
+def _stored(
     transaction: Transaction, update: TableUpdate
 ) -> tuple[CachedVehicle | None, tuple[int, CachedSummary] | None]:
     """Return the stored vehicle and table of an update, or None for each that does not exist."""

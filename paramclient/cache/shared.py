@@ -78,9 +78,9 @@ class SharedStore:
         return 0
 
     @property
-    def away(self) -> str | None:
+    def offline_reason(self) -> str | None:
         """Why the local copy is used at present; None while the database is used."""
-        return self._connection.away
+        return self._connection.offline_reason
 
     def read(self, work: Callable[[Transaction], T]) -> T:
         """See `Store.read`."""
@@ -112,12 +112,12 @@ class _Connection:
     """Database connection, listener thread and local copy of a store.
 
     Attributes:
-        away: why the database is not used at present, or None.
+        offline_reason: why the database is not used, or None.
         local: the local copy.
     """
 
     def __init__(self, address: DatabaseAddress, path: Path) -> None:
-        self.away: str | None = None
+        self.offline_reason: str | None = None
         self.local = LocalCopy(path)
         self._address = address
         self._database = PostgresDatabase(address)
@@ -166,7 +166,8 @@ class _Connection:
                     return self._copy_done(operation, result, before, after)
             if isinstance(operation, Remove | MergeTable):
                 raise CacheError(
-                    f"{self.away or 'the database is not connected'}; repeat the call after the reconnection"
+                    f"{self.offline_reason or 'the database is not connected'}; "
+                    "repeat the call after the reconnection"
                 )
             if isinstance(operation, StoreSnapshot | StoreExtSnapshot):
                 shown = self.local.read(operation.resolved)
@@ -237,12 +238,12 @@ class _Connection:
                 self._reaching.release()
         if not self._is_connected and not self.local.exists:
             raise CacheError(
-                f"{self.away}; there is no local copy, as it was never reached from this computer"
+                f"{self.offline_reason}; there is no local copy, as it was never reached from this computer"
             )
         return self._is_connected
 
     def _reach(self) -> None:
-        """Connect to the database and execute queued operations. On failure, `away` has the reason.
+        """Connect to the database and execute queued operations. On failure, `offline_reason` has the reason.
 
         Raises:
             CacheError: the database cannot be used.
@@ -263,13 +264,13 @@ class _Connection:
 
     def _use_connection(self, listener: psycopg.Connection[tuple[Any, ...]], revisions: Revisions) -> None:
         kept = self._kept()
-        if self.away is not None:
+        if self.offline_reason is not None:
             _log.warning("the database %s is connected again", self._address.place)
         with self._state:
             before, self._revisions = self._revisions, revisions
             old, self._listener = self._listener, listener
             self._stale_keys |= {key for key, revision in kept.items() if revisions.get(key) != revision}
-            self.away = None
+            self.offline_reason = None
             self._is_connected = True
         if old is not None:
             old.close()
@@ -313,8 +314,8 @@ class _Connection:
 
     def _lose(self, error: Unavailable) -> None:
         with self._state:
-            is_new_failure = self.away is None
-            self.away = str(error)
+            is_new_failure = self.offline_reason is None
+            self.offline_reason = str(error)
             self._is_connected = False
         if is_new_failure:
             copy = self.local
@@ -403,7 +404,7 @@ class _Connection:
                     try:
                         self._reach()
                     except CacheError as error:
-                        self.away = str(error)
+                        self.offline_reason = str(error)
                     finally:
                         self._reaching.release()
 

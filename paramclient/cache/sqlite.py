@@ -56,7 +56,7 @@ class SqliteStore:
         return self._database.replacements
 
     @property
-    def away(self) -> None:
+    def offline_reason(self) -> None:
         """Always None: a file has no local copy."""
         return
 

@@ -62,8 +62,8 @@ class ParamCache:
     is renamed with a warning in the log, and a new file is created.
 
     For a database (`postgresql://USER@HOST/NAME`), the tables that this program uses are also in a local
-    copy. While the database cannot be reached, reads and writes use the local copy, `away` has the reason,
-    and a warning is logged. After the reconnection, queued writes are executed in the database in order, each
+    copy. While the database cannot be reached, reads and writes use the local copy, `offline_reason` has the
+    reason, and a warning is logged. After the reconnection, queued writes are executed in the database in order, each
     exactly once. Several stations that receive one vehicle write to one table: the later observation of a
     value counts, and the history has both. The clocks of the stations have to agree.
 
@@ -123,9 +123,9 @@ class ParamCache:
         return self._store.place
 
     @property
-    def away(self) -> str | None:
+    def offline_reason(self) -> str | None:
         """Why the local copy is used instead of the database; None while it is used, and for a file."""
-        return self._store.away
+        return self._store.offline_reason
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -746,8 +746,8 @@ class ParamCache:
         """
         result = copy_store(self._store, target._store, progress)
         for each in (self, target):
-            if each.away is not None:
-                raise CacheError(f"{each.away}; copy again once it is back")
+            if each.offline_reason is not None:
+                raise CacheError(f"{each.offline_reason}; copy again once it is back")
         return result
 
     def remove(self, vehicle: str, component: int | None = None) -> int:

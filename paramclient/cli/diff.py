@@ -19,7 +19,7 @@ from paramclient.cli.output import Coloured, print_document, print_table, printa
 from paramclient.cli.sources import is_file, read_rules, resolve_all
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata
-from paramclient.model.comparison import Comparison, Difference, Moved, Standing, compare
+from paramclient.model.comparison import ChangedSide, Comparison, Difference, DifferenceStatus, compare
 from paramclient.model.notation import bits_written
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import type_name
@@ -147,7 +147,7 @@ def _print(outcome: Comparison, shown: list[Difference], sides: _Sides) -> None:
     has_base = outcome.base is not None
     columns = [
         *("name", "left", "right", *(["base"] if has_base else []), *(["units"] if sides.is_known else [])),
-        *("is", *(["moved"] if has_base else [])),
+        *("is", *(["changed"] if has_base else [])),
     ]
     rows = (_cells(entry, sides, has_base=has_base) for entry in shown)
     print_table(columns, rows, right="left right base")
@@ -158,19 +158,18 @@ def _cells(entry: Difference, sides: _Sides, *, has_base: bool) -> list[object]:
     left, right = _shown(entry.left, sides.left), _shown(entry.right, sides.right)
     if left == right and not entry.is_same:
         left, right = _with_bits(entry.left), _with_bits(entry.right)
-    style = "bold red" if entry.moved is Moved.CONFLICT else _STYLES[entry.standing]
-    both_sides = (Moved.BOTH, Moved.CONFLICT, None)
+    style = "bold red" if entry.changed_side is ChangedSide.CONFLICT else _STYLES[entry.status]
+    side = entry.changed_side
+    both_sides = (ChangedSide.BOTH, ChangedSide.CONFLICT, None)
     base = _shown(entry.base, sides.base)
     return [
         entry.name,
-        None if left is None else Coloured(left, style if entry.moved in (Moved.LEFT, *both_sides) else ""),
-        None
-        if right is None
-        else Coloured(right, style if entry.moved in (Moved.RIGHT, *both_sides) else ""),
+        None if left is None else Coloured(left, style if side in (ChangedSide.LEFT, *both_sides) else ""),
+        None if right is None else Coloured(right, style if side in (ChangedSide.RIGHT, *both_sides) else ""),
         *([base] if has_base else []),
         *([sides.units(entry)] if sides.is_known else []),
         Coloured(_comparison_text(entry), style),
-        *([entry.moved or "unknown"] if has_base else []),
+        *([side or "unknown"] if has_base else []),
     ]
 
 
@@ -203,7 +202,7 @@ def _comparison_text(entry: Difference) -> str:
         more.append(" and ".join(_type(each) for each in (entry.left, entry.right)))
     if entry.is_rounding:
         more.append("the same as float32")
-    return ", ".join([entry.standing, *more])
+    return ", ".join([entry.status, *more])
 
 
 def _type(param: WrittenParam | None) -> str:
@@ -216,36 +215,36 @@ def _summary(outcome: Comparison) -> list[str]:
     if outcome.base is not None:
         sides.append(("base", outcome.base))
     lines = [f"{side}: {described(params)}" for side, params in sides]
-    found = [f"{number} {standing}" for standing in Standing if (number := outcome.counts[standing])]
+    found = [f"{number} {status}" for status in DifferenceStatus if (number := outcome.counts[status])]
     if retyped := sum(entry.types_differ for entry in outcome.entries):
         found.append(f"{retyped} of another type")
     if outcome.base is not None:
-        moves = [
-            f"{number} {moved}"
-            for moved in Moved
-            if moved is not Moved.NEITHER and (number := outcome.moves[moved])
+        changed_sides = [
+            f"{number} {changed_side}"
+            for changed_side in ChangedSide
+            if changed_side is not ChangedSide.NEITHER and (number := outcome.changed_sides[changed_side])
         ]
-        found.append(f"moved from the base: {', '.join(moves) or 'none'}")
-        if unknown := sum(entry.moved is None for entry in outcome.entries):
+        found.append(f"changed from the base: {', '.join(changed_sides) or 'none'}")
+        if unknown := sum(entry.changed_side is None for entry in outcome.entries):
             found.append(f"{unknown} not in the base")
     return [*lines, "; ".join(found)]
 
 
 def _partial_hint(outcome: Comparison, left: str, right: str) -> str | None:
     """Return a hint at --partial if one source is a file of a few parameters, and the other one a table."""
-    for source, other, compared, standing in (
-        (left, right, outcome.left, Standing.ONLY_RIGHT),
-        (right, left, outcome.right, Standing.ONLY_LEFT),
+    for source, other, compared, status in (
+        (left, right, outcome.left, DifferenceStatus.ONLY_RIGHT),
+        (right, left, outcome.right, DifferenceStatus.ONLY_LEFT),
     ):
-        if is_file(source) and not is_file(other) and (more := outcome.counts[standing]) > len(compared):
+        if is_file(source) and not is_file(other) and (more := outcome.counts[status]) > len(compared):
             return f"--partial leaves out the {more} parameters that {source} does not have"
     return None
 
 
 _STYLES: Final = {
-    Standing.SAME: "",
-    Standing.DIFFERENT: "yellow",
-    Standing.ONLY_LEFT: "red",
-    Standing.ONLY_RIGHT: "green",
+    DifferenceStatus.SAME: "",
+    DifferenceStatus.DIFFERENT: "yellow",
+    DifferenceStatus.ONLY_LEFT: "red",
+    DifferenceStatus.ONLY_RIGHT: "green",
 }
 """Styles of rich for each kind of entry."""

@@ -405,7 +405,7 @@ async def diff_extended(
     if partial:
         names = list(second.params if is_file(right) and not is_file(left) else first.params)
     pairs = [(name, first.params.get(name), second.params.get(name)) for name in names]
-    entries = [(name, one, two, _standing(one, two)) for name, one, two in pairs]
+    entries = [(name, one, two, _comparison(one, two)) for name, one, two in pairs]
     different = [entry for entry in entries if entry[3] != "same"]
     shown = entries if everything else different
     if options.json:
@@ -624,7 +624,7 @@ def _by_index(params: Iterable[ExtParam]) -> list[ExtParam]:
     return sorted(params, key=lambda param: (param.index is None, param.index or 0, param.name))
 
 
-def _standing(left: ExtParam | None, right: ExtParam | None) -> str:
+def _comparison(left: ExtParam | None, right: ExtParam | None) -> str:
     if left is None or right is None:
         return "only right" if left is None else "only left"
     return "same" if left.same_value(right) else "different"

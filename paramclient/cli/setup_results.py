@@ -280,7 +280,7 @@ def show_verified(plans: Mapping[NamedVehicle, Plan], *, full: bool) -> None:
     for vehicle, plan in plans.items():
         words: dict[str, int] = {}
         for row in plan.rows.values():
-            words[row.standing] = words.get(row.standing, 0) + 1
+            words[row.comparison] = words.get(row.comparison, 0) + 1
         counted = ", ".join(f"{number} {word}" for word, number in sorted(words.items(), key=_by_word))
         say(printable(f"{vehicle.label}: {counted or 'nothing to compare'}"))
 
@@ -298,18 +298,18 @@ def verified_doc(vehicle: NamedVehicle, plan: Plan, *, full: bool) -> VerifiedDo
 
 
 def _verified_cells(row: PlanRow) -> Cells:
-    standing = row.standing
+    comparison = row.comparison
     return [
         row.name,
         _text(row.target.settable, row),
         _text(row.before, row),
-        Coloured(standing, _STANDING_STYLES[standing]),
-        f"{row.rename_note} {_like(row)}".strip() if standing == "missing" else _why(row),
+        Coloured(comparison, _COMPARISON_STYLES[comparison]),
+        f"{row.rename_note} {_like(row)}".strip() if comparison == "missing" else _why(row),
     ]
 
 
 def _by_word(counted: tuple[str, int]) -> int:
-    return list(_STANDING_STYLES).index(counted[0])
+    return list(_COMPARISON_STYLES).index(counted[0])
 
 
 # Shared by all tables
@@ -334,7 +334,7 @@ _PLAN_STYLES: Final = {
 """Styles of rich for each planned action."""
 _PLAN_WORDS: Final = {PlanStatus.SET: "to set", PlanStatus.LATER: "that may be revealed"}
 """Words for planned actions in the summary, where they differ from the status."""
-_STANDING_STYLES: Final = {"same": "", "different": "yellow", "missing": "red", "left out": "dim"}
+_COMPARISON_STYLES: Final = {"same": "", "different": "yellow", "missing": "red", "left out": "dim"}
 """Styles of rich for each comparison; the keys are in the order of the summary."""
 
 

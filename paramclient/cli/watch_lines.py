@@ -11,10 +11,10 @@ from paramclient.cli.output import local_time, print_document, print_line, print
 from paramclient.cli.session import CommandSession
 from paramclient.client.events import (
     Contested,
+    Discovered,
     Event,
     Events,
     Found,
-    Heard,
     Lost,
     Rebooted,
     Resynced,
@@ -66,7 +66,7 @@ async def print_changes_and_events(
                 if choice is not None and not choice.has(each.name):
                     continue
                 text = _change_text(each)
-            elif isinstance(each, Heard) or each.component is not session.component:
+            elif isinstance(each, Discovered) or each.component is not session.component:
                 continue
             else:
                 text = _event_text(each)

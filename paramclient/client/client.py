@@ -251,10 +251,10 @@ class ParamClient:
     def events(self) -> Events:
         """Return a stream of component events from now on: `async for event in client.events()`.
 
-        The events are Heard, Lost, Found, Rebooted, Resynced, Contested and Uncontested. The stream continues
-        across a reconnection of the link. It is released with its last reference, and ends with a replayed
-        log. It queues at most 1,000 events for a slow consumer and then drops the oldest. Cancelling the
-        iteration loses no event.
+        The events are Discovered, Lost, Found, Rebooted, Resynced, Contested and Uncontested. The stream
+        continues across a reconnection of the link. It is released with its last reference, and ends with a
+        replayed log. It queues at most 1,000 events for a slow consumer and then drops the oldest.
+        Cancelling the iteration loses no event.
 
         Raises:
             LinkError: while iterating, after the queued events: the link failed permanently, or the client

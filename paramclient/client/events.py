@@ -16,7 +16,7 @@ __all__ = [
     "Event",
     "Events",
     "Found",
-    "Heard",
+    "Discovered",
     "Lost",
     "Rebooted",
     "Resynced",
@@ -29,7 +29,7 @@ EVENTS_MAX: Final = 1_000
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class Discovered:
     """The first message of a component has arrived.
 
     Attributes:
@@ -120,14 +120,14 @@ class Uncontested:
     component: Component
 
 
-Event: TypeAlias = Heard | Lost | Found | Rebooted | Resynced | Contested | Uncontested
+Event: TypeAlias = Discovered | Lost | Found | Rebooted | Resynced | Contested | Uncontested
 
 
 def public_event(event: protocol.Event, component: Component) -> Event | None:
     """Return the public event for a protocol event; None for internal events."""
     match event:
-        case protocol.ComponentHeard():
-            return Heard(component)
+        case protocol.ComponentDiscovered():
+            return Discovered(component)
         case protocol.ComponentLost():
             return Lost(component, event.silence)
         case protocol.ComponentFound():

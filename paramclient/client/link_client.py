@@ -37,9 +37,9 @@ from paramclient.protocol.addresses import Address
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import (
     ComponentContested,
+    ComponentDiscovered,
     ComponentForgotten,
     ComponentFound,
-    ComponentHeard,
     ComponentIdentified,
     ComponentLost,
     ComponentReplaced,
@@ -48,7 +48,7 @@ from paramclient.protocol.events import (
     ExtParamChanged,
     Fetched,
     ParamChanged,
-    ParamsMoved,
+    TableChanged,
     TableResynced,
 )
 from paramclient.protocol.no_reply_hint import hint_of_link
@@ -217,7 +217,7 @@ class LinkClient(LocalClient):
         return ClientStats.of(self.station, downloads=self._downloads, cache_hits=self._cache_hits)
 
     def __repr__(self) -> str:
-        state = "away" if self.link_task.is_disconnected else "open"
+        state = "reconnecting" if self.link_task.is_disconnected else "open"
         state = "closed" if self._tasks is None or self.link_task.ended is not None else state
         return f"<ParamClient {self._link.name} {state}, {counted(len(self._components), 'component')}>"
 
@@ -451,7 +451,7 @@ class LinkClient(LocalClient):
         is_to_be_written = False
         for event in self.station.events():
             machine = event.machine
-            if isinstance(event, ParamChanged | ParamsMoved):
+            if isinstance(event, ParamChanged | TableChanged):
                 self._components[machine.address].take_change(event)
                 is_to_be_written = True
                 continue
@@ -466,7 +466,7 @@ class LinkClient(LocalClient):
             if isinstance(event, ComponentForgotten):
                 self._components.pop(machine.address).forget()
                 continue
-            if isinstance(event, ComponentHeard):
+            if isinstance(event, ComponentDiscovered):
                 self._meet(machine)
             elif isinstance(event, ComponentLost | ComponentFound) and self._splits_peers:
                 self._transfer_cache_entry(machine, is_lost=isinstance(event, ComponentLost))

@@ -33,7 +33,7 @@ from paramclient.model.params import ParamMap
 from paramclient.model.values import Encoding, Param, Settable, decode_value, known_type
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.events import ParamChanged, ParamsMoved
+from paramclient.protocol.events import ParamChanged, TableChanged
 from paramclient.protocol.no_reply_hint import hint_of_component
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.change_origin import check_author
@@ -448,7 +448,7 @@ class LinkComponent(LocalComponent):
         """Record that the cached table is in `params`, or that there is none."""
         self._cache_is_read.set()
 
-    def take_change(self, event: ParamChanged | ParamsMoved) -> None:
+    def take_change(self, event: ParamChanged | TableChanged) -> None:
         """Publish a change of a parameter, or reset the state after a change of several."""
         if isinstance(event, ParamChanged):
             self._publish(event.change)

@@ -10,7 +10,7 @@ from pydantic import Field
 from paramclient.documents.document import Document, Maybe
 from paramclient.documents.param import WrittenParamDoc, short_text
 from paramclient.documents.paramset import OriginDoc
-from paramclient.model.comparison import Moved, Standing
+from paramclient.model.comparison import ChangedSide, DifferenceStatus
 from paramclient.model.defaults import DefaultSource
 
 if TYPE_CHECKING:
@@ -28,14 +28,14 @@ class DifferenceDoc(Document):
     `renamed` has the left value as it compares with the right one.
     """
 
-    standing: Standing = Field(validation_alias="is", serialization_alias="is")
+    status: DifferenceStatus = Field(validation_alias="is", serialization_alias="is")
     types_differ: bool
     rounding: bool
     left: WrittenParamDoc | None
     right: WrittenParamDoc | None
     base: WrittenParamDoc | None
     default_source: Maybe[DefaultSource] = None
-    moved: Moved | None
+    changed_side: ChangedSide | None
     units: Maybe[str] = None
     renamed: Maybe[WrittenParamDoc] = None
     right_name: Maybe[str] = None
@@ -60,14 +60,14 @@ class DifferenceDoc(Document):
         sides = ((left, entry.name), (right, right_name))
         infos = [side.find(name) for side, name in sides if side is not None]
         return cls(
-            standing=entry.standing,
+            status=entry.status,
             types_differ=entry.types_differ,
             rounding=entry.is_rounding,
             left=None if entry.left is None else WrittenParamDoc.compared(entry.left, left),
             right=None if entry.right is None else WrittenParamDoc.compared(entry.right, right),
             base=None if entry.base is None else WrittenParamDoc.compared(entry.base, base),
             default_source=default_source,
-            moved=entry.moved,
+            changed_side=entry.changed_side,
             units=short_text(next((info.units for info in infos if info is not None and info.units), None)),
             renamed=None if entry.renamed is None else WrittenParamDoc.compared(entry.renamed, right),
             right_name=None if entry.renamed is None else right_name,
@@ -81,8 +81,8 @@ class DiffDoc(Document):
     left: OriginDoc
     right: OriginDoc
     base: OriginDoc | None
-    counts: dict[Standing, int]
-    moves: dict[Moved, int] | None
+    counts: dict[DifferenceStatus, int]
+    changed_sides: dict[ChangedSide, int] | None
     params: dict[str, DifferenceDoc]
 
     @classmethod
@@ -133,8 +133,10 @@ class DiffDoc(Document):
             left=OriginDoc.of(outcome.left),
             right=OriginDoc.of(outcome.right),
             base=None if outcome.base is None else OriginDoc.of(outcome.base),
-            counts={standing: outcome.counts[standing] for standing in Standing},
-            moves=None if outcome.base is None else {moved: outcome.moves[moved] for moved in Moved},
+            counts={status: outcome.counts[status] for status in DifferenceStatus},
+            changed_sides=None
+            if outcome.base is None
+            else {changed_side: outcome.changed_sides[changed_side] for changed_side in ChangedSide},
             params={},
         )
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Literal
 
+from pydantic import Field
+
 from paramclient.documents.document import Document, Maybe, Scalar
 from paramclient.documents.extended_param import ExtParamDoc, ext_value_json
 from paramclient.model.ext_params import ExtParam, ExtParamType
@@ -115,7 +117,7 @@ class ExtDifferenceDoc(Document):
     name: str
     left: ExtParamDoc | None
     right: ExtParamDoc | None
-    standing: str
+    comparison: str = Field(validation_alias="is", serialization_alias="is")
 
 
 class ExtDiffDoc(Document):
@@ -128,7 +130,7 @@ class ExtDiffDoc(Document):
     def of(
         cls, entries: Sequence[tuple[str, ExtParam | None, ExtParam | None, str]], *, is_same: bool
     ) -> ExtDiffDoc:
-        """Return the document of a comparison: name, left, right and standing of each entry."""
+        """Return the document of a comparison: name, left, right and comparison of each entry."""
         return cls(
             is_same=is_same,
             extended=[
@@ -136,9 +138,9 @@ class ExtDiffDoc(Document):
                     name=name,
                     left=None if left is None else ExtParamDoc.of(left),
                     right=None if right is None else ExtParamDoc.of(right),
-                    standing=standing,
+                    comparison=comparison,
                 )
-                for name, left, right, standing in entries
+                for name, left, right, comparison in entries
             ],
         )
 

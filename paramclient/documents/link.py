@@ -43,7 +43,7 @@ class StatsDoc(Document):
 
 
 class LinkDoc(Document):
-    """One link: open; away and reconnecting; failed and retried; or a log that has ended.
+    """One link: open; reconnecting; failed and retried; or a log that has ended.
 
     `name` is its name in the service, `error` the reason for the last two states, `stats` null while it is
     not open. `openings` counts how often it was opened again; each time its components and counters start

@@ -152,9 +152,9 @@ class PlanDoc(Document):
 
 
 class VerifiedRowDoc(Document):
-    """The comparison of one parameter with the wanted one; see `PlanRow.standing`."""
+    """The comparison of one parameter with the wanted one; see `PlanRow.comparison`."""
 
-    standing: RowComparison = Field(validation_alias="is", serialization_alias="is")
+    comparison: RowComparison = Field(validation_alias="is", serialization_alias="is")
     type: str | None
     before: Scalar | None
     wanted: Scalar
@@ -166,7 +166,7 @@ class VerifiedRowDoc(Document):
     @classmethod
     def of(cls, row: PlanRow) -> VerifiedRowDoc:
         """Return the document of a `PlanRow`."""
-        return cls(standing=row.standing, **_members(row))
+        return cls(comparison=row.comparison, **_members(row))
 
 
 class VerifiedDoc(Document):
@@ -190,7 +190,9 @@ class VerifiedDoc(Document):
             system=system,
             component=component,
             met=plan.is_met,
-            counts={standing: sum(row.standing is standing for row in rows) for standing in RowComparison},
+            counts={
+                comparison: sum(row.comparison is comparison for row in rows) for comparison in RowComparison
+            },
             params={row.name: VerifiedRowDoc.of(row) for row in rows if full or not row.is_met},
             firmware=FirmwareDoc.of(plan),
         )

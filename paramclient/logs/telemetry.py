@@ -20,8 +20,8 @@ from paramclient.logs.imported_table import ImportedTable
 from paramclient.model.identity import Identity
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import (
+    ComponentDiscovered,
     ComponentForgotten,
-    ComponentHeard,
     ComponentIdentified,
     ComponentReplaced,
     Fetched,
@@ -127,7 +127,7 @@ class _Import:
         while events := station.events():
             for event in events:
                 machine = event.machine
-                if isinstance(event, ComponentHeard):
+                if isinstance(event, ComponentDiscovered):
                     address = (machine.system, machine.component)
                     for introductions in (self._heartbeats, self._versions):
                         if (

@@ -19,8 +19,8 @@ from paramclient.model.values import ParamType, WireValue, bits_of, from_bits, s
 __all__ = [
     "Comparison",
     "Difference",
-    "Moved",
-    "Standing",
+    "ChangedSide",
+    "DifferenceStatus",
     "compare",
     "defaults_of",
     "non_defaults",
@@ -28,7 +28,7 @@ __all__ = [
 ]
 
 
-class Standing(StrEnum):
+class DifferenceStatus(StrEnum):
     """How the left parameter compares with the right parameter of the same name."""
 
     SAME = "same"
@@ -37,8 +37,8 @@ class Standing(StrEnum):
     ONLY_RIGHT = "only right"
 
 
-class Moved(StrEnum):
-    """Which side has another value than the base. A side without the parameter has not moved."""
+class ChangedSide(StrEnum):
+    """Which side has another value than the base. A side without the parameter counts as unchanged."""
 
     NEITHER = "neither"
     LEFT = "left"
@@ -58,8 +58,8 @@ class Difference:
         left, right: the parameter on each side, or None; at least one is not None.
         base: the parameter in the base, or None; under the name and with the value for the right side, if
             left and right have different names.
-        standing: how left and right compare, by value alone (see `types_differ`).
-        moved: which side differs from the base; None without a base, or if the base lacks the name.
+        status: how left and right compare, by value alone (see `types_differ`).
+        changed_side: which side differs from the base; None without a base, or if the base lacks the name.
         renamed: the left parameter under the name and with the value for the right side, if the right side
             has another name (see `Renames`); else None.
     """
@@ -68,18 +68,18 @@ class Difference:
     left: WrittenParam | None
     right: WrittenParam | None
     base: WrittenParam | None
-    standing: Standing
-    moved: Moved | None
+    status: DifferenceStatus
+    changed_side: ChangedSide | None
     renamed: WrittenParam | None = None
 
     @property
     def is_same(self) -> bool:
-        return self.standing is Standing.SAME
+        return self.status is DifferenceStatus.SAME
 
     @property
     def is_shown(self) -> bool:
         """Whether to report the entry: the values or types differ, or a side differs from the base."""
-        return not self.is_same or self.types_differ or self.moved not in (None, Moved.NEITHER)
+        return not self.is_same or self.types_differ or self.changed_side not in (None, ChangedSide.NEITHER)
 
     @property
     def types_differ(self) -> bool:
@@ -99,7 +99,7 @@ class Difference:
         A vehicle with the C-cast encoding reports integers beyond 24 bits rounded this way, so the values
         may be equal on board. Only a packed parameter file holds the exact value.
         """
-        if self.standing is not Standing.DIFFERENT or self._left is None or self.right is None:
+        if self.status is not DifferenceStatus.DIFFERENT or self._left is None or self.right is None:
             return False
         if self._left.is_raw or self.right.is_raw:
             return False
@@ -145,14 +145,14 @@ class Comparison:
         return tuple(entry for entry in self.entries if not entry.is_same)
 
     @property
-    def counts(self) -> Mapping[Standing, int]:
-        """The number of entries of each standing, 0 for those that do not occur."""
-        return Counter(entry.standing for entry in self.entries)
+    def counts(self) -> Mapping[DifferenceStatus, int]:
+        """The number of entries of each status, 0 for those that do not occur."""
+        return Counter(entry.status for entry in self.entries)
 
     @property
-    def moves(self) -> Mapping[Moved, int]:
-        """The number of entries of each kind of move. Names that the base lacks are not counted."""
-        return Counter(entry.moved for entry in self.entries if entry.moved is not None)
+    def changed_sides(self) -> Mapping[ChangedSide, int]:
+        """The number of entries by the side that differs from the base, without names that the base lacks."""
+        return Counter(entry.changed_side for entry in self.entries if entry.changed_side is not None)
 
     def __repr__(self) -> str:
         return f"<Comparison {len(self.differences)} of {len(self.entries)} params not the same>"
@@ -169,7 +169,7 @@ def compare(
     """Compare two sets with `same_value`.
 
     Args:
-        base: a third set, to tell which side differs from it: an earlier state, or `defaults_of` both.
+        base: a third set, to determine which side differs from it: an earlier state, or `defaults_of` both.
             Names that only the base has are ignored.
         names: names or shell patterns (`MC_*`, `SERVO?_TRIM`), case-sensitive, to compare only the names
             that match.
@@ -267,9 +267,9 @@ def _compared(
     ours = left.get(name) if renamed is None else renamed
     theirs = right.get(name if renamed is None else renamed.name)
     before = None if base is None else _in_base(name, base, renamed, renames)
-    standing = _standing(ours, theirs)
-    moved = _moved(ours, theirs, before, standing)
-    return Difference(name, left.get(name), theirs, before, standing, moved, renamed)
+    status = _status(ours, theirs)
+    changed_side = _changed_side(ours, theirs, before, status)
+    return Difference(name, left.get(name), theirs, before, status, changed_side, renamed)
 
 
 def _in_base(
@@ -284,24 +284,26 @@ def _in_base(
     return None if other is None else renames.convert(base[other], shared)
 
 
-def _standing(left: WrittenParam | None, right: WrittenParam | None) -> Standing:
+def _status(left: WrittenParam | None, right: WrittenParam | None) -> DifferenceStatus:
     if right is None:
-        return Standing.ONLY_LEFT
+        return DifferenceStatus.ONLY_LEFT
     if left is None:
-        return Standing.ONLY_RIGHT
-    return Standing.SAME if same_value(left, right) else Standing.DIFFERENT
+        return DifferenceStatus.ONLY_RIGHT
+    return DifferenceStatus.SAME if same_value(left, right) else DifferenceStatus.DIFFERENT
 
 
-def _moved(
-    left: WrittenParam | None, right: WrittenParam | None, base: WrittenParam | None, standing: Standing
-) -> Moved | None:
+def _changed_side(
+    left: WrittenParam | None, right: WrittenParam | None, base: WrittenParam | None, status: DifferenceStatus
+) -> ChangedSide | None:
     if base is None:
         return None
-    left_moved = left is not None and not same_value(left, base)
-    right_moved = right is not None and not same_value(right, base)
-    if left_moved and right_moved:
-        return Moved.BOTH if standing is Standing.SAME else Moved.CONFLICT
-    return Moved.LEFT if left_moved else Moved.RIGHT if right_moved else Moved.NEITHER
+    is_left_changed = left is not None and not same_value(left, base)
+    is_right_changed = right is not None and not same_value(right, base)
+    if is_left_changed and is_right_changed:
+        return ChangedSide.BOTH if status is DifferenceStatus.SAME else ChangedSide.CONFLICT
+    if is_left_changed:
+        return ChangedSide.LEFT
+    return ChangedSide.RIGHT if is_right_changed else ChangedSide.NEITHER
 
 
 def _common_type(left: WrittenParam, right: WrittenParam) -> ParamType | int | None:

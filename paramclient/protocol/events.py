@@ -16,7 +16,7 @@ __all__ = [
     "ComponentContested",
     "ComponentForgotten",
     "ComponentFound",
-    "ComponentHeard",
+    "ComponentDiscovered",
     "ComponentIdentified",
     "ComponentLost",
     "ComponentRebooted",
@@ -27,13 +27,13 @@ __all__ = [
     "ExtParamChanged",
     "Fetched",
     "ParamChanged",
-    "ParamsMoved",
+    "TableChanged",
     "TableResynced",
 ]
 
 
 @dataclass(frozen=True, slots=True)
-class ComponentHeard:
+class ComponentDiscovered:
     """The first message of a component was received."""
 
     machine: ComponentMachine
@@ -115,7 +115,7 @@ class ExtParamChanged:
 
 
 @dataclass(frozen=True, slots=True)
-class ParamsMoved:
+class TableChanged:
     """Parameters have changed, without an event for each."""
 
     machine: ComponentMachine
@@ -145,7 +145,7 @@ class TableResynced:
 
 
 Event: TypeAlias = (
-    ComponentHeard
+    ComponentDiscovered
     | ComponentIdentified
     | ComponentLost
     | ComponentFound
@@ -156,7 +156,7 @@ Event: TypeAlias = (
     | ComponentForgotten
     | ParamChanged
     | ExtParamChanged
-    | ParamsMoved
+    | TableChanged
     | Fetched
     | TableResynced
 )
@@ -174,7 +174,7 @@ class EventMaker:
 
     def heard(self, machine: ComponentMachine) -> None:
         """Report a new component."""
-        self._emit(ComponentHeard(machine))
+        self._emit(ComponentDiscovered(machine))
 
     def forgotten(self, machine: ComponentMachine) -> None:
         """Report that a component was removed."""
@@ -218,7 +218,7 @@ class EventMaker:
 
     def params_changed(self, machine: ComponentMachine) -> None:
         """See `ComponentObserver`."""
-        self._emit(ParamsMoved(machine))
+        self._emit(TableChanged(machine))
 
     def fetched(self, machine: ComponentMachine, result: FetchResult) -> None:
         """See `ComponentObserver`."""

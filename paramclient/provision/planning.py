@@ -159,7 +159,7 @@ class PlanRow:
         return self.before is None or not _is_same(self.target.settable, self.before, self.type)
 
     @property
-    def standing(self) -> RowComparison:
+    def comparison(self) -> RowComparison:
         """How the vehicle's parameter compares with the wanted one."""
         if self.category == MISSING:
             return RowComparison.MISSING
@@ -170,7 +170,7 @@ class PlanRow:
     @property
     def is_met(self) -> bool:
         """Whether the vehicle has the wanted value, or the parameter is left out."""
-        return self.standing in (RowComparison.SAME, RowComparison.LEFT_OUT)
+        return self.comparison in (RowComparison.SAME, RowComparison.LEFT_OUT)
 
     def __str__(self) -> str:
         kind = ParamType.REAL32 if self.type is None else self.type

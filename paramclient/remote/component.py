@@ -126,7 +126,7 @@ class RemoteComponent(ServiceComponent):
     def state(self) -> ComponentState:
         """See `Component.state`. While the service cannot be reached, the state is *cached*."""
         state = self._mirrored.state
-        if not self._service.connection.is_away or state in (ComponentState.LOST, ComponentState.NEW):
+        if not self._service.connection.is_offline or state in (ComponentState.LOST, ComponentState.NEW):
             return state
         return ComponentState.CACHED
 
@@ -135,7 +135,9 @@ class RemoteComponent(ServiceComponent):
         """See `Component.sync_state`. While the service cannot be reached, a table is *unsynced*."""
         state = SyncState.LOST if self._mirrored.is_gone else SyncState(self._mirrored.document["sync_state"])
         return (
-            SyncState.UNSYNCED if self._service.connection.is_away and state is not SyncState.LOST else state
+            SyncState.UNSYNCED
+            if self._service.connection.is_offline and state is not SyncState.LOST
+            else state
         )
 
     @property
@@ -160,7 +162,7 @@ class RemoteComponent(ServiceComponent):
     def is_armed(self) -> bool | None:
         """See `Component.is_armed`. None also while the service cannot be reached."""
         is_armed: bool | None = self._mirrored.document["is_armed"]
-        return None if self._service.connection.is_away or self._mirrored.is_gone else is_armed
+        return None if self._service.connection.is_offline or self._mirrored.is_gone else is_armed
 
     @property
     def silence(self) -> float:

@@ -59,7 +59,7 @@ class Connection:
         follower: receiver of the events.
 
     Attributes:
-        is_away: whether the service cannot be reached now.
+        is_offline: whether the service cannot be reached now.
         broken: the error that calls raise now, or None.
         ended: the error that all calls raise permanently, or None.
         failed: the error of the first connection attempt, or None.
@@ -68,7 +68,7 @@ class Connection:
     """
 
     def __init__(self, requests: Requests, follower: EventSink) -> None:
-        self.is_away = True
+        self.is_offline = True
         self.broken: LinkError | None = None
         self.ended: LinkError | None = None
         self.failed: ParamClientError | None = None
@@ -163,7 +163,7 @@ class Connection:
         Raises:
             ParamClientError: the first connection attempt has failed.
         """
-        while self.is_away:
+        while self.is_offline:
             if self.failed is not None:
                 raise self.failed
             await self.changed.wait()
@@ -221,14 +221,14 @@ class Connection:
         else:
             self._follower.begin_anew()
         self._was_there = True
-        self.is_away = False
+        self.is_offline = False
         self.broken = None
 
     async def _wait_to_try_again(self, error: ParamClientError) -> None:
         """Wait for the next attempt after the connection was lost, or an attempt has failed."""
-        if not self.is_away:
+        if not self.is_offline:
             logger.warning("%s; reconnecting", error)
-            self.is_away = True
+            self.is_offline = True
             self._backoff = Backoff()
             self._follower.leave()
             self.tell()
@@ -240,7 +240,7 @@ class Connection:
 
     async def _is_reached(self, deadline: float) -> bool:
         """Wait until the service is connected. Return False at the deadline."""
-        while self.is_away:
+        while self.is_offline:
             self.check_open()
             with anyio.move_on_after(deadline - anyio.current_time()) as waiting:
                 await self.changed.wait()

@@ -11,7 +11,7 @@ from typing import Final, TypeAlias
 import anyio
 
 from paramclient.client.component import Component
-from paramclient.client.events import Event, Found, Heard, Lost
+from paramclient.client.events import Discovered, Event, Found, Lost
 from paramclient.client.extended_params import ExtChanges
 from paramclient.client.subscription import Changes
 from paramclient.errors import NoReply, ParamClientError
@@ -171,10 +171,10 @@ class MirroredComponent:
             self.tables_were_loaded()
 
     def announce_first(self) -> None:
-        """Publish the event Heard, once."""
+        """Publish the event Discovered, once."""
         if not self._is_announced:
             self._is_announced = True
-            self.announce(Heard(self.component))
+            self.announce(Discovered(self.component))
 
     def publish(self, changes: Iterable[Change]) -> None:
         """Push changes to all streams."""

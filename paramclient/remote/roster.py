@@ -136,7 +136,7 @@ class ServiceComponents:
         if mirrored.component.state != state and mirrored.component.state in UNTRUSTED_STATES:
             self._doubt(mirrored)
         match why:
-            case "heard":
+            case "discovered":
                 mirrored.announce_first()
             case "lost":
                 self._doubt(mirrored)
@@ -300,7 +300,7 @@ class ServiceComponents:
         """Load stale lists and tables, until cancelled."""
         while True:
             changed = self.connection.changed
-            if self.connection.is_away or not (self._stale or self._is_list_stale):
+            if self.connection.is_offline or not (self._stale or self._is_list_stale):
                 await changed.wait()
                 continue
             try:

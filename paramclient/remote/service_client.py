@@ -134,8 +134,8 @@ class ServiceClient:
     def __repr__(self) -> str:
         connection = self._connection
         state = "closed" if self._tasks is None or connection.ended is not None else "open"
-        if state == "open" and connection.is_away:
-            state = "away"
+        if state == "open" and connection.is_offline:
+            state = "reconnecting"
         count = len(self._roster.components)
         return f"<RemoteClient {self._service.name} {state}, {count} component{'' if count == 1 else 's'}>"
 

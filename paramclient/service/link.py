@@ -13,10 +13,10 @@ import anyio.lowlevel
 from paramclient.client.client import ParamClient, local_client
 from paramclient.client.events import (
     Contested,
+    Discovered,
     Event,
     Events,
     Found,
-    Heard,
     Lost,
     Rebooted,
     Resynced,
@@ -55,9 +55,9 @@ class ServiceLink:
 
     Attributes:
         name: name of the link in the service.
-        state: opening; open; away (lost, the client reconnects); failed (reopened after a backoff); ended
+        state: opening; open; reconnecting (the connection was lost); failed (reopened after a backoff); ended
             (end of a log).
-        error: reason of away and failed, or None.
+        error: reason of reconnecting and failed, or None.
         openings: number of opened clients.
         client: the open client, or None.
         followed: its components, by system and component id.
@@ -138,9 +138,9 @@ class ServiceLink:
         component = event.component
         address = (component.system, component.component)
         match event:
-            case Heard():
+            case Discovered():
                 followed = self.followed[address] = FollowedComponent(component, self, self._feed)
-                followed.publish_state("heard")
+                followed.publish_state("discovered")
                 self._on_found(followed)
                 self._notify()
             case Lost(silence=silence):
@@ -184,7 +184,7 @@ class ServiceLink:
         self._forwarder = _EventForwarder(self)
         local_client(client).subscribe(self._forwarder)
         for component in client.components.values():
-            self.handle_event(Heard(component))
+            self.handle_event(Discovered(component))
         self._set_state("open")
 
     async def _check_components(self) -> None:
@@ -215,8 +215,8 @@ class ServiceLink:
         task = local_client(client).link_task
         if task.is_disconnected:
             error = self.error if task.broken is None else str(task.broken)
-            self._set_state("away", error or f"{self.name} is disconnected and reconnects")
-        elif self.state == "away":
+            self._set_state("reconnecting", error or f"{self.name} is disconnected and reconnects")
+        elif self.state == "reconnecting":
             self._set_state("open")
 
     def _set_state(self, state: str, error: str | None = None) -> None:

@@ -46,7 +46,7 @@ _COMPONENT_GAUGES: Final = {
     "round_trip_seconds": "Smoothed round-trip time in seconds.",
 }
 """Help texts of the gauges of a component."""
-_STATES: Final = ("opening", "open", "away", "failed", "ended")
+_STATES: Final = ("opening", "open", "reconnecting", "failed", "ended")
 """States of a link."""
 
 

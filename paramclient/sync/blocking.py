@@ -60,13 +60,13 @@ __all__ = [
     "Changes",
     "Component",
     "Contested",
+    "Discovered",
     "Event",
     "Events",
     "ExtChanges",
     "ExtParams",
     "Found",
     "Ftp",
-    "Heard",
     "Lost",
     "ParamClient",
     "Rebooted",
@@ -220,10 +220,10 @@ class ParamClient(BlockingClient):
     def events(self) -> Events:
         """Return a stream of component events from now on: `for event in client.events()`.
 
-        The events are Heard, Lost, Found, Rebooted, Resynced, Contested and Uncontested. The stream continues
-        across a reconnection of the link. It is released with its last reference, and ends with a replayed
-        log. It queues at most 1,000 events for a slow consumer and then drops the oldest. Ctrl-C loses no
-        event.
+        The events are Discovered, Lost, Found, Rebooted, Resynced, Contested and Uncontested. The stream
+        continues across a reconnection of the link. It is released with its last reference, and ends with a
+        replayed log. It queues at most 1,000 events for a slow consumer and then drops the oldest. Ctrl-C
+        loses no event.
 
         Raises:
             LinkError: while iterating, after the queued events: the link failed permanently, or the client
@@ -1170,7 +1170,7 @@ class Ftp(Wrapper[AsyncFtp]):
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class Discovered:
     """The first message of a component has arrived.
 
     Attributes:
@@ -1261,10 +1261,10 @@ class Uncontested:
     component: Component
 
 
-Event: TypeAlias = Heard | Lost | Found | Rebooted | Resynced | Contested | Uncontested
+Event: TypeAlias = Discovered | Lost | Found | Rebooted | Resynced | Contested | Uncontested
 
 _EVENTS: dict[type[asynchronous.Event], type[Event]] = {
-    asynchronous.Heard: Heard,
+    asynchronous.Discovered: Discovered,
     asynchronous.Lost: Lost,
     asynchronous.Found: Found,
     asynchronous.Rebooted: Rebooted,

@@ -360,7 +360,7 @@ def test_a_commit_whose_answer_was_lost_is_not_done_twice(
     a.save(whole_table(3))
     lose_an_answer(monkeypatch)
     a.save(a_value(10))
-    until(lambda: a.away is None)
+    until(lambda: a.offline_reason is None)
     a.save(a_value(11))
     assert told(b) == [(10, 1, 10), (11, 10, 11)]
 
@@ -440,19 +440,19 @@ def test_a_station_works_on_locally_and_catches_up(fragile: tuple[Server, ParamC
     until(lambda: is_copied(b))
     running.kill()
     assert values(b) == {"PARAM_0": 0, "PARAM_1": 1, "PARAM_2": 2}
-    assert b.away is not None
+    assert b.offline_reason is not None
     assert b.state_at(PX4.key, 1, made.id) == made.params
     b.save(a_value(20))
     a.save([a_value(10), a_value(5, "PARAM_2")])
     assert (values(a)["PARAM_1"], values(b)["PARAM_1"]) == (10, 20)
-    own = b.snapshot(PX4.key, 1, reason="away")
+    own = b.snapshot(PX4.key, 1, reason="offline")
     assert own.id > 1 << 50, "a number that the database will not give"
     with pytest.raises(CacheError, match="repeat the call"):
         b.remove(PX4.key)
     at_a: list[CacheChange] = []
     a.subscribe(at_a.append)
     running.start()
-    until(lambda: a.away is None and b.away is None)
+    until(lambda: a.offline_reason is None and b.offline_reason is None)
     until(lambda: at_a)
     for cache in (a, b):
         assert values(cache) == {"PARAM_0": 0, "PARAM_1": 20, "PARAM_2": 5}
@@ -464,7 +464,7 @@ def test_a_station_works_on_locally_and_catches_up(fragile: tuple[Server, ParamC
     until(lambda: is_copied(a))
     running.kill()
     assert told(a, "PARAM_1") == [(10, 1, 10), (20, 10, 20)], "the copy has what the database had"
-    assert a.away is not None
+    assert a.offline_reason is not None
     running.start()
 
 
@@ -482,7 +482,7 @@ def test_a_station_keeps_extended_parameters_and_catches_up(
     at_a: list[CacheChange] = []
     a.subscribe(at_a.append)
     running.start()
-    until(lambda: a.away is None and b.away is None)
+    until(lambda: a.offline_reason is None and b.offline_reason is None)
     until(lambda: at_a)
     for cache in (a, b):
         assert test_ext_tables.values_in(cache) == {"CAM_MODE": 7, "CAM_NAME": b"\xff"}
@@ -568,12 +568,12 @@ def test_killed_under_load_nothing_is_lost_and_nothing_doubled(
                 before = sum(written.values())
                 until(lambda before=before: sum(written.values()) > before + 20)  # type: ignore[misc]  # bound now
                 running.start()
-                until(lambda: a.away is None and b.away is None)
+                until(lambda: a.offline_reason is None and b.offline_reason is None)
         finally:
             is_over.set()
         for each in work:
             each.result()
-    until(lambda: a.away is None and b.away is None)
+    until(lambda: a.offline_reason is None and b.offline_reason is None)
     for cache in (a, b):
         for name, count in written.items():
             news = [new for _, _, new in told(cache, name)]
@@ -594,11 +594,11 @@ def test_a_database_that_stands_still_is_given_up(
             impatient.setattr("paramclient.cache.postgres.STATEMENT_TIMEOUT", 0.3)
             impatient.setattr("paramclient.cache.postgres.CONNECT_TIMEOUT", 1)
             a.save(a_value(6))
-            assert a.away is not None
+            assert a.offline_reason is not None
             assert told(a) == [(5, 1, 5), (6, 5, 6)]
     finally:
         running.go_on()
-    until(lambda: a.away is None)
+    until(lambda: a.offline_reason is None)
     assert told(b) == [(5, 1, 5), (6, 5, 6)]
 
 
@@ -703,7 +703,7 @@ def test_a_write_that_the_database_refuses_is_logged_and_delays_no_other(
 
         monkeypatch.setattr(PostgresDatabase, "write", refuse)
         own_server.start()
-        until(lambda: cache.away is None)
+        until(lambda: cache.offline_reason is None)
         assert told(cache) == [(11, 1, 11)]
         assert "refuses a write that was queued while it was not connected: not this one" in caplog.text
 
@@ -716,9 +716,9 @@ def test_a_database_that_can_only_be_read_for_a_while_costs_no_line(server_url: 
         for number in (5, 6):
             cache.save(a_value(number))
         assert values(cache)["PARAM_1"] == 6
-        until(lambda: "read-only" in str(cache.away))
+        until(lambda: "read-only" in str(cache.offline_reason))
         make_read_only(url, False)
-        until(lambda: cache.away is None)
+        until(lambda: cache.offline_reason is None)
         assert told(cache) == [(5, 1, 5), (6, 5, 6)]
 
 
@@ -744,8 +744,8 @@ def test_a_write_to_a_locked_vehicle_waits_and_is_not_refused(
         with psycopg.connect(url) as other:
             other.execute("SELECT key FROM paramclient.vehicle FOR UPDATE")
             cache.save(a_value(5))
-            assert "has locked a vehicle" in str(cache.away)
-        until(lambda: cache.away is None)
+            assert "has locked a vehicle" in str(cache.offline_reason)
+        until(lambda: cache.offline_reason is None)
         assert told(cache) == [(5, 1, 5)]
         assert "refuses" not in caplog.text
 
@@ -792,7 +792,7 @@ def test_notifications_of_other_programs_are_ignored(
     b.save(whole_table(1))
     until(lambda: at_a)
     assert at_a == [CacheChange(PX4.key, 1)]
-    assert a.away is None
+    assert a.offline_reason is None
 
 
 # Places and secrets
@@ -823,7 +823,7 @@ def test_a_password_is_told_to_nobody(tmp_path: Path, caplog: pytest.LogCaptureF
         with pytest.raises(CacheError):
             cache.save(whole_table(1))
         assert "local copy" not in caplog.text, "there is none"
-        texts = [repr(cache), cache.place, str(cache.away), str(cache.notes), caplog.text]
+        texts = [repr(cache), cache.place, str(cache.offline_reason), str(cache.notes), caplog.text]
         texts += traceback.format_exception(caught.value)[-1:]
         assert all("geheim" not in text for text in texts)
         assert cache.place == f"postgresql://me@/d?host={tmp_path}"
@@ -913,7 +913,7 @@ def test_a_copy_waits_for_a_database_that_is_away(own_server: Server, tmp_path: 
         with pytest.raises(CacheError, match=r"repeat the call|copy again"):
             old.copy_to(cache)
         own_server.start()
-        until(lambda: cache.away is None)
+        until(lambda: cache.offline_reason is None)
         assert old.copy_to(cache).tables == 3
 
 

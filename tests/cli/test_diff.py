@@ -124,7 +124,7 @@ def test_all_also_prints_equal_parameters(command: Command) -> None:
 def test_a_base_shows_the_side_that_has_changed(command: Command, cache: Path) -> None:
     keep(cache, {"B_FLOAT": (0.1, REAL32), "F_CONFLICT": (0.5, REAL32)}, THIRD)
     outcome = command("diff", 1, 2, "--base", 3)
-    assert outcome.rows[0] == ["name", "left", "right", "base", "is", "moved"]
+    assert outcome.rows[0] == ["name", "left", "right", "base", "is", "changed"]
     assert {row[0]: row[1:] for row in outcome.rows[1:]} == {
         "B_FLOAT": ["0.1", "0.2", "0.1", "different", "right"],
         "C_LEFT": ["5", "only left", "unknown"],
@@ -132,7 +132,7 @@ def test_a_base_shows_the_side_that_has_changed(command: Command, cache: Path) -
         "F_CONFLICT": ["1.5", "2.5", "0.5", "different", "conflict"],
         "G_TYPE": ["1", "1.0", "same, INT32 and REAL32", "unknown"],
     }
-    assert "; moved from the base: 1 right, 1 conflict; 5 not in the base\n" in outcome.err
+    assert "; changed from the base: 1 right, 1 conflict; 5 not in the base\n" in outcome.err
 
 
 @pytest.mark.usefixtures("two")
@@ -140,9 +140,11 @@ def test_the_defaults_are_a_base(command: Command) -> None:
     outcome = command("diff", 1, 2, "--base", "defaults", "--json")
     assert outcome.code == 1
     assert outcome.json["base"]["source"] == "the firmware's defaults"
-    assert outcome.json["moves"] == {"neither": 3, "left": 0, "right": 2, "both": 1, "conflict": 1}
-    moved = {name: (entry["is"], entry["moved"]) for name, entry in outcome.json["params"].items()}
-    assert moved == {
+    assert outcome.json["changed_sides"] == {"neither": 3, "left": 0, "right": 2, "both": 1, "conflict": 1}
+    changed_sides = {
+        name: (entry["is"], entry["changed_side"]) for name, entry in outcome.json["params"].items()
+    }
+    assert changed_sides == {
         "B_FLOAT": ("different", "right"),
         "C_LEFT": ("only left", "neither"),
         "D_RIGHT": ("only right", "right"),
@@ -183,8 +185,8 @@ def test_json_has_exact_values(command: Command, cache: Path) -> None:
     outcome = command("diff", 1, 2, "--json")
     assert outcome.err == ""
     told = outcome.json
-    assert list(told) == ["same", "left", "right", "base", "counts", "moves", "params"]
-    assert (told["same"], told["base"], told["moves"]) == (False, None, None)
+    assert list(told) == ["same", "left", "right", "base", "counts", "changed_sides", "params"]
+    assert (told["same"], told["base"], told["changed_sides"]) == (False, None, None)
     assert told["left"] == {
         "source": "cache uid:aa00000000000001",
         "system": 1,
@@ -202,7 +204,7 @@ def test_json_has_exact_values(command: Command, cache: Path) -> None:
         "left": {"value": "NaN", "type": "REAL32", "bits": "7fc00000"},
         "right": {"value": "NaN", "type": "REAL32", "bits": "7fc00001"},
         "base": None,
-        "moved": None,
+        "changed_side": None,
     }
     integers = told["params"]["B"]
     assert integers["left"] == {"value": 16777217, "type": "INT32", "bits": "01000001"}
@@ -368,7 +370,7 @@ def test_files_of_two_stations_can_be_the_same(command: Command, write: Callable
     changed = command("diff", untyped, other, "--base", typed, "--json")
     assert (changed.code, list(changed.json["params"])) == (1, ["B_FLOAT"])
     assert changed.json["params"]["B_FLOAT"]["right"] == {"value": 0.10000002, "type": None, "bits": None}
-    assert changed.json["params"]["B_FLOAT"]["moved"] == "right"
+    assert changed.json["params"]["B_FLOAT"]["changed_side"] == "right"
     assert changed.json["right"]["count"] == 3
 
 
@@ -499,7 +501,7 @@ def test_two_links_are_fetched_concurrently(command: Command, vehicles: dict[str
     assert [
         (entry["left"]["value"], entry["right"]["value"]) for entry in outcome.json["params"].values()
     ] == [(2, 3)]
-    assert outcome.json["params"]["B"]["moved"] == "right"
+    assert outcome.json["params"]["B"]["changed_side"] == "right"
     assert (outcome.json["left"]["system"], outcome.json["right"]["system"]) == (1, 7)
     assert outcome.json["right"]["source"] == "link tcp:two:1"
 

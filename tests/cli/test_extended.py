@@ -173,7 +173,7 @@ def test_files_and_comparisons(command: Command, reach: Put, tmp_path: Path) -> 
     assert other.code == 1
     assert other.rows[1:] == [["CAM_NAME", "Front", "Rear", "different"], ["CAM_EV", "0.5", "only left"]]
     document = command("diff", file, url, *CAMERA, "--json").json
-    assert [each["standing"] for each in document["extended"]] == ["different", "only left"]
+    assert [each["is"] for each in document["extended"]] == ["different", "only left"]
     refused = command("save", url, tmp_path / "camera.param", *CAMERA, "--extended")
     assert (refused.code, "cannot hold extended parameters" in refused.err) == (2, True)
     assert command("diff", file, url, *CAMERA, "--only", "CAM_*").code == 2

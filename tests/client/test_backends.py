@@ -20,8 +20,8 @@ from paramclient import (
     Change,
     ClientClosed,
     Component,
+    Discovered,
     Event,
-    Heard,
     Param,
     ParamCache,
     ParamClient,
@@ -162,7 +162,7 @@ async def test_a_tcp_connection_that_drops_is_opened_again(monkeypatch: pytest.M
         async with a_client(f"tcp:127.0.0.1:{port}") as client:
             component = await client.component()
             scope.cancel()
-            while " away, " not in repr(client):  # noqa: ASYNC110 - nobody tells
+            while " reconnecting, " not in repr(client):  # noqa: ASYNC110 - nobody tells
                 await anyio.sleep(0.001)
             await tasks.start(serve_endpoint, vehicle, create_link(f"tcpin:127.0.0.1:{port}"))
             await everything(component, vehicle)
@@ -326,7 +326,7 @@ async def test_a_vehicle_starts_again_and_listeners_are_told() -> None:
         assert await component.reboot() is component
         while Rebooted not in seen:
             seen.append(type(await anext(events)))
-    assert seen[0] is Heard
+    assert seen[0] is Discovered
 
 
 # Ends
@@ -433,10 +433,10 @@ async def test_a_link_that_fails_reaches_everyone(
     link = FlakyLink(generic(**QUICK))
     async with beside(), a_client(link) as client:
         component = await client.component()
-        await link.drop(stays_away=True)
+        await link.drop(stays_offline=True)
         with caplog.at_level(logging.ERROR), pytest.raises(LinkError, match="refused"):
             await component.get("PARAM_01")
-        link.is_away = False
+        link.is_offline = False
         while " open, " not in repr(client):  # noqa: ASYNC110 - nobody tells
             await anyio.sleep(0.001)
         assert (await component.get("PARAM_01")).value == 1

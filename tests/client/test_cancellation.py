@@ -206,13 +206,13 @@ async def test_cancelled_while_the_link_is_away(call: Call) -> None:
     link = FlakyLink(Air([small_px4(), generic(system=2)]))
     async with a_client(link) as client:
         component = await client.component()
-        await link.drop(stays_away=True)
+        await link.drop(stays_offline=True)
         task = asyncio.create_task(call(client, component))
         await asyncio.sleep(1.0)
         task.cancel()
         await asyncio.wait([task])
         assert not registered(client)
-        link.is_away = False
+        link.is_offline = False
         await asyncio.sleep(1.0)
         await check_after(call, client, component)
 

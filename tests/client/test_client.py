@@ -277,7 +277,7 @@ async def test_closing_while_the_link_is_away() -> None:
         tap.is_mute = True
         waiting = [asyncio.create_task(outcome(call(client, component))) for call in CALLS.values()]
         await settled()
-        await link.drop(stays_away=True)
+        await link.drop(stays_offline=True)
         await asyncio.sleep(1.0)
         assert not any(task.done() for task in waiting)
     assert [type(await task) for task in waiting] == [ClientClosed] * len(CALLS)
@@ -1186,12 +1186,12 @@ async def test_calls_go_on_when_the_link_is_back(way: str) -> None:
         await asyncio.sleep(1.0)
         read = asyncio.create_task(component.get("PARAM_20"))
         write = asyncio.create_task(component.set("PARAM_22", 5))
-        await link.drop(stays_away=True)
+        await link.drop(stays_offline=True)
         await asyncio.sleep(4.0)
         if way == DIRECT:
-            assert repr(client) == "<ParamClient tcp:flaky:5760 away, 1 component>"
+            assert repr(client) == "<ParamClient tcp:flaky:5760 reconnecting, 1 component>"
         assert not any(task.done() for task in (fetch, read, write))
-        link.is_away = False
+        link.is_offline = False
         assert (await read).value == 20
         assert (await write).status == "accepted"
         result = await fetch
@@ -1233,7 +1233,7 @@ async def test_a_link_that_stays_away_fails_the_calls_and_not_the_client(
         await settled()
         changes = waiting.pop("changes")
         limited = asyncio.create_task(outcome(component.get("PARAM_05", timeout=2)))
-        await link.drop(stays_away=True)
+        await link.drop(stays_offline=True)
         went_away = anyio.current_time()
         assert isinstance(await limited, NoReply)
         for name, task in waiting.items():
@@ -1250,7 +1250,7 @@ async def test_a_link_that_stays_away_fails_the_calls_and_not_the_client(
         await asyncio.sleep(30.0)
         assert 5 <= link.openings - attempts <= 7, "one every five seconds"
         tap.is_mute = False
-        link.is_away = False
+        link.is_offline = False
         await asyncio.sleep(5.1)
         assert (await component.get("PARAM_01")).value == 1
         assert (await component.fetch_all()).complete
@@ -1266,7 +1266,7 @@ async def test_the_errors_of_a_long_absence_do_not_grow() -> None:
     link = FlakyLink(generic())
     async with a_client(link) as client:
         component = await client.component()
-        await link.drop(stays_away=True)
+        await link.drop(stays_offline=True)
         await asyncio.sleep(20.0)
         lengths = set()
         for _ in range(5):

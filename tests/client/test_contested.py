@@ -15,7 +15,7 @@ from paramclient import (
     AmbiguousVehicle,
     Contested,
     ContestedAddress,
-    Heard,
+    Discovered,
     NoReply,
     ParamCache,
     ParamClient,
@@ -410,4 +410,4 @@ async def test_a_client_of_the_service_is_told_as_well() -> None:
         assert caught.value.claimants == vehicle.contest.claimants
         await until(lambda: vehicle.contest is None)
         told = [await anext(events) for _ in range(3)]
-        assert [type(each) for each in told] == [Heard, Contested, Uncontested]
+        assert [type(each) for each in told] == [Discovered, Contested, Uncontested]

@@ -325,7 +325,7 @@ async def test_a_link_that_stays_away_ends_it() -> None:
         files = await files_of(client)
         reading = asyncio.ensure_future(outcome(files.read("/APM/LOGS/1.BIN")))
         await anyio.sleep(0.3)
-        await link.drop(stays_away=True)
+        await link.drop(stays_offline=True)
         assert isinstance(await reading, LinkError)
         with pytest.raises(LinkError):
             await files.read("/APM/a.txt")

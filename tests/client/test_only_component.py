@@ -217,11 +217,11 @@ async def test_one_address_on_two_links_of_a_service_is_chosen_by_the_link() -> 
 @direct_only("it has services of its own")
 @in_simulated_time
 async def test_a_link_that_cannot_be_opened_has_no_vehicle() -> None:
-    away = FlakyLink(Air([copter()]))
-    away.is_away = True
-    async with service(px4(), away) as (_, browser):
+    offline = FlakyLink(Air([copter()]))
+    offline.is_offline = True
+    async with service(px4(), offline) as (_, browser):
         assert (await met(browser, only=True))["system"] == 1
-        away.is_away = False
-        await until(lambda: away.openings > 1, pause=0.1)
+        offline.is_offline = False
+        await until(lambda: offline.openings > 1, pause=0.1)
         await anyio.sleep(2.0)
         problem(await browser.post("/api/v1/find", json={"only": True}), 409, "ambiguous-vehicle")

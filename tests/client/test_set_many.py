@@ -223,7 +223,7 @@ async def test_a_link_that_fails_ends_the_call_and_nothing_is_lost() -> None:
 
 async def drop(link: FlakyLink) -> None:
     await asyncio.sleep(0.25)
-    await link.drop(stays_away=True)
+    await link.drop(stays_offline=True)
 
 
 @in_simulated_time

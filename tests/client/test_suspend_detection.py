@@ -216,11 +216,11 @@ async def test_a_link_that_is_away_when_the_computer_falls_asleep(sleep: Sleep) 
         component = await client.component()
         await component.fetch_all()
         events = client.events()
-        await link.drop(stays_away=True)
+        await link.drop(stays_offline=True)
         await anyio.sleep(0.1)
         vehicle.set_param("PARAM_01", 1001)
         sleep(HOURS)
-        link.is_away = False
+        link.is_offline = False
         await until(lambda: component.state == "cached")
         await anyio.sleep(5.0)
         assert drained(events) == [Resynced(component, ("PARAM_01",), vehicle.announced_hash())]

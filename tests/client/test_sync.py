@@ -19,10 +19,10 @@ from paramclient import (
     ClientClosed,
     Component,
     ComponentState,
+    Discovered,
     Event,
     Events,
     Found,
-    Heard,
     Lost,
     NoReply,
     ParamCache,
@@ -357,10 +357,10 @@ async def test_a_link_that_was_away_is_checked_like_a_loss() -> None:
         component = await client.component()
         await component.fetch_all()
         events = client.events()
-        await link.drop(stays_away=True)
+        await link.drop(stays_offline=True)
         vehicle.set_param("PARAM_01", 1001)
         await asyncio.sleep(8.0)
-        link.is_away = False
+        link.is_offline = False
         await until(lambda: component.state == "cached")
         assert state(component) is SyncState.CHECKING
         assert component.params["PARAM_05"].trust is Trust.CACHED
@@ -544,7 +544,7 @@ async def test_several_listeners_hear_the_same() -> None:
         await asyncio.sleep(3.0)
         vehicle.reboot(anyio.current_time(), down=1.5)
         await asyncio.sleep(5.0)
-        assert kinds(early) == [Heard, Rebooted, Resynced]
+        assert kinds(early) == [Discovered, Rebooted, Resynced]
         assert kinds(late) == [Rebooted, Resynced]
 
 

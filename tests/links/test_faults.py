@@ -177,7 +177,7 @@ async def test_an_address_that_is_lost_and_restored(net: Net, monkeypatch: pytes
             tasks.start_soon(serve_endpoint, vehicle, far)
             component = await client.component()
             is_gone[0], net.reason = True, errno.ENETUNREACH
-            while " away, " not in repr(client):
+            while " reconnecting, " not in repr(client):
                 with anyio.move_on_after(0.05):
                     await component.get("PARAM_01")
             await anyio.sleep(0.05)

@@ -135,7 +135,7 @@ async def test_unplugged_in_the_middle_of_a_download(
         fetch = asyncio.create_task(component.fetch_all())
         await anext(changes)
         cable.pull_out()
-        await until(lambda: " away, " in repr(client))
+        await until(lambda: " reconnecting, " in repr(client))
         assert not fetch.done()
         cable.plug_in()
         tasks.start_soon(partial(cable.carry, vehicle, rate=RATE))

@@ -10,7 +10,14 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from paramclient.errors import UsageError
-from paramclient.model.comparison import Comparison, Moved, Standing, compare, defaults_of, same_value
+from paramclient.model.comparison import (
+    ChangedSide,
+    Comparison,
+    DifferenceStatus,
+    compare,
+    defaults_of,
+    same_value,
+)
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.renames import Rename, Renames
 from paramclient.model.values import Encoding, Param, ParamType, WireValue, bits_of, decode_value, from_bits
@@ -32,8 +39,11 @@ WRITTEN = st.builds(WrittenParam, st.just("P"), VALUES, TYPES)
 SETS = st.dictionaries(
     st.sampled_from("ABCDE"), st.builds(WrittenParam, st.just("P"), VALUES, TYPES, st.none() | NUMBERS)
 ).map(lambda params: ParamSet({name: replace(param, name=name) for name, param in params.items()}))
-STANDING_MIRRORED = {Standing.ONLY_LEFT: Standing.ONLY_RIGHT, Standing.ONLY_RIGHT: Standing.ONLY_LEFT}
-MOVED_MIRRORED = {Moved.LEFT: Moved.RIGHT, Moved.RIGHT: Moved.LEFT}
+STATUS_MIRRORED = {
+    DifferenceStatus.ONLY_LEFT: DifferenceStatus.ONLY_RIGHT,
+    DifferenceStatus.ONLY_RIGHT: DifferenceStatus.ONLY_LEFT,
+}
+CHANGED_SIDE_MIRRORED = {ChangedSide.LEFT: ChangedSide.RIGHT, ChangedSide.RIGHT: ChangedSide.LEFT}
 
 
 def written(value: WireValue, number: int | None = None) -> WrittenParam:
@@ -128,10 +138,12 @@ def test_a_comparison_is_complete_and_symmetric(
     assert [entry.name for entry in there.entries] == sorted(left.keys() | right.keys())
     for ours, theirs in zip(there.entries, back.entries, strict=True):
         assert (ours.left, ours.right, ours.base) == (theirs.right, theirs.left, theirs.base)
-        assert theirs.standing == STANDING_MIRRORED.get(ours.standing, ours.standing)
-        assert theirs.moved == (ours.moved and MOVED_MIRRORED.get(ours.moved, ours.moved))
+        assert theirs.status == STATUS_MIRRORED.get(ours.status, ours.status)
+        assert theirs.changed_side == (
+            ours.changed_side and CHANGED_SIDE_MIRRORED.get(ours.changed_side, ours.changed_side)
+        )
         assert (ours.types_differ, ours.is_rounding) == (theirs.types_differ, theirs.is_rounding)
-        assert (ours.moved is None) == (base is None or ours.name not in base)
+        assert (ours.changed_side is None) == (base is None or ours.name not in base)
     assert there.is_same is back.is_same is (not there.differences)
     assert sum(there.counts.values()) == len(there.entries)
 
@@ -140,47 +152,49 @@ def test_a_comparison_is_complete_and_symmetric(
 def test_a_set_equals_itself(params: ParamSet) -> None:
     alone = compare(params, params, base=params)
     assert alone.is_same
-    assert {entry.moved for entry in alone.entries} <= {Moved.NEITHER}
+    assert {entry.changed_side for entry in alone.entries} <= {ChangedSide.NEITHER}
 
 
-def test_standing_of_each_name() -> None:
+def test_status_of_each_name() -> None:
     outcome = compare(of(B=1, A=1.5, D=4), of(C=3, A=1.25, D=4.0))
-    assert {entry.name: entry.standing for entry in outcome.entries} == {
-        "A": Standing.DIFFERENT,
-        "B": Standing.ONLY_LEFT,
-        "C": Standing.ONLY_RIGHT,
-        "D": Standing.SAME,
+    assert {entry.name: entry.status for entry in outcome.entries} == {
+        "A": DifferenceStatus.DIFFERENT,
+        "B": DifferenceStatus.ONLY_LEFT,
+        "C": DifferenceStatus.ONLY_RIGHT,
+        "D": DifferenceStatus.SAME,
     }
     assert not outcome.is_same
     assert [entry.name for entry in outcome.differences] == ["A", "B", "C"]
-    assert outcome.counts == dict.fromkeys(Standing, 1)
-    assert {entry.moved for entry in outcome.entries} == {None}
+    assert outcome.counts == dict.fromkeys(DifferenceStatus, 1)
+    assert {entry.changed_side for entry in outcome.entries} == {None}
     assert repr(outcome) == "<Comparison 3 of 4 params not the same>"
 
 
 @pytest.mark.parametrize(
-    ("left", "right", "moved"),
+    ("left", "right", "changed_side"),
     [
-        (of(A=1), of(A=1), Moved.NEITHER),
-        (of(A=2), of(A=1), Moved.LEFT),
-        (of(A=1), of(A=2), Moved.RIGHT),
-        (of(A=2), of(A=2.0), Moved.BOTH),
-        (of(A=2), of(A=3), Moved.CONFLICT),
-        (of(A=2), of(), Moved.LEFT),
-        (of(A=1), of(), Moved.NEITHER),
-        (of(), of(A=2), Moved.RIGHT),
+        (of(A=1), of(A=1), ChangedSide.NEITHER),
+        (of(A=2), of(A=1), ChangedSide.LEFT),
+        (of(A=1), of(A=2), ChangedSide.RIGHT),
+        (of(A=2), of(A=2.0), ChangedSide.BOTH),
+        (of(A=2), of(A=3), ChangedSide.CONFLICT),
+        (of(A=2), of(), ChangedSide.LEFT),
+        (of(A=1), of(), ChangedSide.NEITHER),
+        (of(), of(A=2), ChangedSide.RIGHT),
     ],
 )
-def test_moved_tells_which_side_differs_from_the_base(left: ParamSet, right: ParamSet, moved: Moved) -> None:
+def test_moved_tells_which_side_differs_from_the_base(
+    left: ParamSet, right: ParamSet, changed_side: ChangedSide
+) -> None:
     outcome = compare(left, right, base=of(A=1, B=7))
     (entry,) = outcome.entries
-    assert (entry.moved, entry.base) == (moved, WrittenParam("A", 1))
-    assert outcome.moves[moved] == 1
+    assert (entry.changed_side, entry.base) == (changed_side, WrittenParam("A", 1))
+    assert outcome.changed_sides[changed_side] == 1
 
 
 def test_names_missing_in_the_base_have_no_move() -> None:
     outcome = compare(of(A=1), of(A=2), base=of(B=1))
-    assert (outcome.entries[0].moved, sum(outcome.moves.values())) == (None, 0)
+    assert (outcome.entries[0].changed_side, sum(outcome.changed_sides.values())) == (None, 0)
 
 
 def test_a_different_type_is_not_a_different_value() -> None:
@@ -244,8 +258,8 @@ def test_defaults_of_leaves_out_unknown_and_differing_defaults() -> None:
     )
     base = defaults_of(old, new)
     assert dict(base) == {"A": WrittenParam("A", 1, INT32), "D": WrittenParam("D", 0.0, REAL32)}
-    moved = {entry.name: entry.moved for entry in compare(old, new, base=base).entries}
-    assert moved == {"A": Moved.BOTH, "B": None, "C": None, "D": Moved.RIGHT}
+    changed_side = {entry.name: entry.changed_side for entry in compare(old, new, base=base).entries}
+    assert changed_side == {"A": ChangedSide.BOTH, "B": None, "C": None, "D": ChangedSide.RIGHT}
     assert len(defaults_of(of(A=1))) == 0
 
 
@@ -263,7 +277,7 @@ def test_a_parameter_is_compared_with_that_of_its_other_name() -> None:
     assert entry.right == WrittenParam("NEW", 7.5)
     assert entry.renamed == WrittenParam("NEW", 7.5)
     back = compare(of(NEWEST=7.0), of(OLD=750), renames=CENTIMETRES)
-    assert [(each.name, each.standing) for each in back.entries] == [("NEWEST", Standing.DIFFERENT)]
+    assert [(each.name, each.status) for each in back.entries] == [("NEWEST", DifferenceStatus.DIFFERENT)]
     assert back.entries[0].renamed == WrittenParam("OLD", 700)
 
 
@@ -288,18 +302,18 @@ def test_names_choose_a_renamed_parameter_by_either_name() -> None:
 
 
 @pytest.mark.parametrize(
-    ("base", "moved"),
+    ("base", "changed_side"),
     [
-        (of(OLD=750), Moved.RIGHT),
-        (of(NEW=7.0), Moved.LEFT),
-        (of(NEWEST=8), Moved.CONFLICT),
-        (of(OLD=1, NEW=7.0), Moved.LEFT),
+        (of(OLD=750), ChangedSide.RIGHT),
+        (of(NEW=7.0), ChangedSide.LEFT),
+        (of(NEWEST=8), ChangedSide.CONFLICT),
+        (of(OLD=1, NEW=7.0), ChangedSide.LEFT),
         (of(A=1), None),
     ],
 )
-def test_a_base_is_compared_under_any_of_the_names(base: ParamSet, moved: Moved | None) -> None:
+def test_a_base_is_compared_under_any_of_the_names(base: ParamSet, changed_side: ChangedSide | None) -> None:
     (entry,) = compare(of(OLD=750), of(NEW=7.0), base=base, renames=CENTIMETRES).entries
-    assert entry.moved is moved
+    assert entry.changed_side is changed_side
 
 
 def test_a_factor_takes_the_type_of_the_old_name_and_a_new_name_alone_keeps_it() -> None:

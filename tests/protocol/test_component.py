@@ -26,7 +26,7 @@ from paramclient.protocol.events import (
     EventMaker,
     Fetched,
     ParamChanged,
-    ParamsMoved,
+    TableChanged,
 )
 from paramclient.protocol.params import table as table_room
 from paramclient.protocol.params.change import Change
@@ -171,10 +171,10 @@ def test_without_tells_changes_several_changes_make_one_event() -> None:
     desk.machine.tells_changes = False
     desk.send_list("A", "B")
     desk.cached(known("C", 1, index=2))
-    assert desk.events == [ParamsMoved(desk.machine)]
+    assert desk.events == [TableChanged(desk.machine)]
     desk.machine.has_changed = False
     desk.hear("A", 7.0)
-    assert desk.events == [ParamsMoved(desk.machine)] * 2
+    assert desk.events == [TableChanged(desk.machine)] * 2
     desk.machine.tells_changes = True
     desk.hear("A", 8.0)
     assert [change.new.value for change in desk.changes if change.new] == [8.0]

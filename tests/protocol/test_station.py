@@ -11,7 +11,7 @@ from paramclient.model.values import Encoding, ParamType, Trust
 from paramclient.protocol import station as room
 from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.events import ComponentHeard, ComponentIdentified
+from paramclient.protocol.events import ComponentDiscovered, ComponentIdentified
 from paramclient.protocol.params.fetch_result import FetchResult
 from paramclient.protocol.params.sync import SyncSettings
 from paramclient.protocol.requests.retry import HEARTBEAT_REQUESTS
@@ -118,8 +118,8 @@ def test_a_component_is_met_by_its_heartbeat_or_a_value() -> None:
     hear(station, PX4, 1, 1)
     hear(station, param_value("A"), 3, 4)
     assert list(station.components) == [(1, 1), (3, 4)]
-    events = [event for event in station.events() if isinstance(event, ComponentHeard)]
-    assert events == [ComponentHeard(machine) for machine in station.components.values()]
+    events = [event for event in station.events() if isinstance(event, ComponentDiscovered)]
+    assert events == [ComponentDiscovered(machine) for machine in station.components.values()]
     assert station.events() == []
     assert station.components[3, 4].table.params["A"].value == 0.0
 

@@ -777,14 +777,14 @@ async def test_a_failed_link_ends_the_run_with_the_rows_so_far() -> None:
 
             def cut(progress: ApplyProgress) -> None:
                 if progress.phase == "writing" and progress.done == 5:
-                    tasks.start_soon(lambda: link.drop(stays_away=True))
+                    tasks.start_soon(lambda: link.drop(stays_offline=True))
 
             result = await apply(component, written(another()), progress=cut)
         assert isinstance(result.error, LinkError)
         assert result.counts[ApplyStatus.FAILED] > 0
         with pytest.raises(LinkError):  # nothing was sent this time
             await apply(component, written(another()))
-        link.is_away = False
+        link.is_offline = False
         await anyio.sleep(10)
         assert (await apply(component, written(another()))).complete
 

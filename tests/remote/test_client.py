@@ -23,8 +23,8 @@ from paramclient import (
     AnotherVehicle,
     Change,
     Component,
+    Discovered,
     Events,
-    Heard,
     LinkError,
     NoReply,
     ParamClient,
@@ -318,7 +318,7 @@ async def test_a_program_sees_what_the_service_knows_at_once() -> None:
             assert component.hash == vehicle.announced_hash()
             assert component.identity.uid is not None
             assert repr(component).startswith("<RemoteComponent 1/1 px4 synced 903 params from stream in ")
-            assert await anext(events) == Heard(component)
+            assert await anext(events) == Discovered(component)
             assert client.autopilots == [component]
         assert vehicle.requests == requests, "and asks the vehicle for nothing"
 
@@ -431,7 +431,7 @@ async def test_a_service_that_starts_again_in_the_middle() -> None:
             network.app = None
             await station.stop()
             await settled()
-            assert "away" in repr(client)
+            assert "reconnecting" in repr(client)
             assert trusts(component) == {Trust.CACHED}
             assert component.state == "cached"
             assert component.sync_state is SyncState.UNSYNCED
@@ -454,7 +454,7 @@ async def test_a_service_that_starts_again_in_the_middle() -> None:
             told = {change.name: change async for change in _waiting(changes)}
             assert told["PARAM_01"].new is not None
             assert told["PARAM_01"].new.value == 1001
-            assert not [event for event in events._waiting if isinstance(event, Heard)]
+            assert not [event for event in events._waiting if isinstance(event, Discovered)]
 
 
 def armed(component: Component) -> bool | None:
@@ -592,13 +592,13 @@ async def test_the_links_of_a_service_may_be_away() -> None:
         component = await client.component()
         await component.fetch_all()
         events = client.events()
-        await link.drop(stays_away=True)
+        await link.drop(stays_offline=True)
         began = anyio.current_time()
         error = await outcome(component.get("PARAM_01"))
         assert type(error) is LinkError
         assert error.link == "tcp:flaky:5760"
         assert anyio.current_time() - began >= reconnect_delays.LINK_TIMEOUT - 0.5
-        link.is_away = False
+        link.is_offline = False
         resynced = await next_of(Resynced, events)
         assert resynced.component is component
         await component.refreshed()

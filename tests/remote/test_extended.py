@@ -144,13 +144,13 @@ async def test_a_connection_that_breaks_loses_nothing_and_loads_nothing_anew() -
     async with a_service(camera) as network, a_program(network) as other, a_program(network) as client:
         component = await client.component(1, 100)
         await component.ext.fetch_all()
-        away = Network(network.app)
+        offline = Network(network.app)
         changes = component.ext.changes()
         app = network.app
         network.cut(for_good=True)
         await settled()
         assert trusts(component) == {Trust.CACHED}
-        async with a_program(away) as third:
+        async with a_program(offline) as third:
             await (await third.component(1, 100)).ext.set("PARAM_01", 100)
         network.asked.clear()
         network.app = app

@@ -387,7 +387,7 @@ async def test_components_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(roster, "SERVICE_COMPONENTS_MAX", 2)
     events = [HELLO]
     for number in range(1, 6):
-        told = {"run": RUN, "seq": number, "at": 0.0, "type": "component", "why": "heard"}
+        told = {"run": RUN, "seq": number, "at": 0.0, "type": "component", "why": "discovered"}
         told |= {"link": "a", "system": number, "component": 1, "component_doc": component(system=number)}
         events.append(json.dumps(told).encode())
     async with hostile({"/events": stream(*events)}) as url:

@@ -69,7 +69,7 @@ async def test_the_library_over_sockets_and_through_a_restart(monkeypatch: pytes
             assert (await component.fetch_all()).complete
             assert (await component.set("PARAM_01", 77)).actual == 77
             assert component.params["PARAM_01"].value == 77
-        await until(lambda: "away" in repr(client))
+        await until(lambda: "reconnecting" in repr(client))
         refused = r"connection refused\. Is `paramclient serve` running there\?"
         with pytest.raises(LinkError, match="connection refused") as caught:
             await component.get("PARAM_01")
@@ -246,6 +246,6 @@ async def test_a_service_ends_in_good_order_while_somebody_listens_over_tls(
         with running(small_px4(), tls_cert=CERT, tls_key=KEY) as url:
             client = ParamClient(url)
             await client.__aenter__()
-        await until(lambda: "away" in repr(client))
+        await until(lambda: "reconnecting" in repr(client))
         await client.__aexit__(None, None, None)
     assert [record.message for record in caplog.records if record.levelname == "ERROR"] == []

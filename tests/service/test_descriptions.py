@@ -118,7 +118,7 @@ async def test_defaults_of_the_metadata_count_in_filters_files_and_comparisons()
         }
         compared = (await browser.post(f"{C}/diff", json=body)).json()
         assert compared["params"][CHANGED]["default_source"] == "metadata"
-        assert compared["params"][CHANGED]["moved"] == "right"
+        assert compared["params"][CHANGED]["changed_side"] == "right"
         assert "from the metadata" in compared["base"]["source"]
 
 
@@ -221,7 +221,7 @@ async def test_a_link_that_drops_meanwhile_does_not_prevent_it_later() -> None:
     link = FlakyLink(PX4Vehicle(metadata=True, ftp_rate=8_000.0))
     async with serving(link) as (hub, _):
         await until(lambda: hub._descriptions._loading, pause=0.05)
-        await link.drop(stays_away=False)
+        await link.drop(stays_offline=False)
         assert await described(hub, 60.0)
 
 

@@ -38,7 +38,7 @@ def events_of(text: str) -> list[tuple[str, dict[str, Any]]]:
     return found
 
 
-class Heard:
+class ReceivedEvents:
     """Server-sent events as they come, until closed.
 
     Attributes:
@@ -72,9 +72,9 @@ class Heard:
 @asynccontextmanager
 async def listening(
     browser: httpx.AsyncClient, after: str | None = None, **query: Any
-) -> AsyncIterator[Heard]:
+) -> AsyncIterator[ReceivedEvents]:
     """Listens for the time of the block."""
-    heard = Heard()
+    heard = ReceivedEvents()
     headers = {} if after is None else {"last-event-id": after}
     async with browser.stream("GET", "/api/v1/events", params=query, headers=headers) as answer:
         assert answer.status_code == 200
@@ -259,7 +259,7 @@ async def test_a_listener_hears_of_a_vehicle_its_values_and_its_fetch() -> None:
         await browser.put(f"{C}/params/PARAM_01", json={"value": 12})
         await asyncio.sleep(1)
         assert [
-            each["component_doc"]["system"] for each in heard.of("component") if each["why"] == "heard"
+            each["component_doc"]["system"] for each in heard.of("component") if each["why"] == "discovered"
         ] == [1]
         changes = heard.of("change")
         assert {each["name"] for each in changes} >= set(VALUES)

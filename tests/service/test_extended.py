@@ -15,7 +15,7 @@ from paramclient.model.ext_params import ExtParam
 from paramclient.service import AccessSettings, Hub, Settings, Tokens, create_app
 from paramclient.sim import Air, Camera, PX4Vehicle, camera_table
 from tests.asgi import a_browser
-from tests.service.test_events import Heard, listening
+from tests.service.test_events import ReceivedEvents, listening
 from tests.service_hub import met, problem, service
 from tests.shell import generic, in_simulated_time
 
@@ -374,7 +374,7 @@ async def test_a_published_table_is_not_compared_again_for_each_request() -> Non
         assert [each["count"] for each in heard.of("extended_params")][-1] == 40
 
 
-async def told(heard: Heard) -> list[dict[str, Any]]:
+async def told(heard: ReceivedEvents) -> list[dict[str, Any]]:
     """The changes of extended parameters so far."""
     await asyncio.sleep(2)
     return heard.of("extended_change")

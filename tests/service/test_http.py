@@ -60,8 +60,8 @@ async def test_a_component_behind_a_link_that_is_away_is_not_up() -> None:
         await asyncio.sleep(5)
         for is_here in (True, False, True):
             if not is_here:
-                await link.drop(stays_away=True)
-            link.is_away = not is_here
+                await link.drop(stays_offline=True)
+            link.is_offline = not is_here
             await asyncio.sleep(8)
             told = (await browser.get("/metrics")).text
             for name in ("up", "synced"):

@@ -864,7 +864,7 @@ def test_after_a_gap_everything_is_loaded_anew(sight: Sight) -> None:
             const stream = new Stream({
                 begin: () => begun.push("begin"),
                 take: (event) => begun.push(event.type),
-                standing: () => {},
+                changed: () => {},
             });
             const hello = (run, resumed) => ({ type: "hello", run, resumed });
             const change = { type: "change" };

@@ -30,7 +30,7 @@ from tests.shell import VALUES, FlakyLink, Tap, generic, in_simulated_time, sett
 @in_simulated_time
 async def test_the_service_starts_without_a_vehicle_and_without_its_link() -> None:
     link = FlakyLink(generic())
-    link.is_away = True
+    link.is_offline = True
     async with service(link, fetches=True) as (_, browser):
         await asyncio.sleep(3)
         [told] = (await browser.get("/api/v1/links")).json()["links"]
@@ -40,7 +40,7 @@ async def test_the_service_starts_without_a_vehicle_and_without_its_link() -> No
         assert (await browser.get("/api/v1/components")).json()["components"] == []
         assert 3 <= link.openings <= 6  # with back-off
 
-        link.is_away = False
+        link.is_offline = False
         found = await met(browser)
         assert (found["link"], found["system"], found["component"]) == ("tcp:flaky:5760", 1, 1)
         await asyncio.sleep(5)
@@ -69,10 +69,10 @@ async def test_a_link_that_drops_is_away_until_it_is_back() -> None:
     link = FlakyLink(generic())
     async with service(link) as (hub, browser):
         await met(browser)
-        await link.drop(stays_away=True)
+        await link.drop(stays_offline=True)
         await asyncio.sleep(1)
-        assert (await browser.get(C)).json()["link_state"] == "away"
-        link.is_away = False
+        assert (await browser.get(C)).json()["link_state"] == "reconnecting"
+        link.is_offline = False
         await asyncio.sleep(6)
         assert (await browser.get(C)).json()["link_state"] == "open"
         assert [each.state for each in hub.links.values()] == ["open"]

@@ -472,7 +472,7 @@ async def test_a_component_is_compared_with_anything(vehicle: Callable[..., Vehi
             f"{HERE}/diff",
             {"wanted": file, "partial": True, "base": {"snapshot": kept["id"]}, "only": ["TUNE_*"]},
         )
-        assert {name: row["moved"] for name, row in based["params"].items()} == {
+        assert {name: row["changed_side"] for name, row in based["params"].items()} == {
             "TUNE_01": "both",
             "TUNE_02": "left",
         }
@@ -484,7 +484,7 @@ async def test_defaults_are_a_base_where_they_are_known() -> None:
         file = {"file": {"name": "a.param", "text": "TUNE_02,8\n"}}
         body = {"wanted": file, "partial": True, "base": {"defaults": True}}
         found = await service.post(f"{HERE}/diff", body)
-        assert found["params"]["TUNE_02"]["moved"] == "left"
+        assert found["params"]["TUNE_02"]["changed_side"] == "left"
         unknown = await service.post("/api/v1/components/2/1/diff", body, 422)
         assert "defaults are not known" in unknown["detail"]
 

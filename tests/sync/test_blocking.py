@@ -37,7 +37,7 @@ from paramclient import (
 )
 from paramclient.links import Peer, SimLink
 from paramclient.sim import Air, Endpoint
-from paramclient.sync import Component, FetchIterator, Heard, Lost, ParamClient, client_thread
+from paramclient.sync import Component, Discovered, FetchIterator, Lost, ParamClient, client_thread
 from tests.cable import TIMEOUT
 from tests.shell import Late, Tap, bits, generic, small_px4
 
@@ -310,7 +310,7 @@ def test_changes_and_events_are_iterators() -> None:
             if isinstance(event, Lost):
                 assert event.silence > 5.0
                 break
-            assert isinstance(event, Heard)
+            assert isinstance(event, Discovered)
         changes = component.changes()
         with pytest.raises(NoReply):
             component.get("PARAM_01")
@@ -332,7 +332,7 @@ def test_a_stream_gives_what_it_had_queued_when_the_client_was_closed() -> None:
     assert next(changes).name == "PARAM_01"
     with pytest.raises(ClientClosed, match="was closed"):
         next(changes)
-    assert isinstance(next(events), Heard)
+    assert isinstance(next(events), Discovered)
     with pytest.raises(ClientClosed, match="was closed"):
         next(component.changes())
 
@@ -342,7 +342,7 @@ def test_streams_end_with_a_log(tmp_path: Path) -> None:
         client.component().get("PARAM_01")
     with a_client(f"replay:{tmp_path / 'log.tlog'}") as client:
         events = client.events()
-        assert {type(event) for event in events} <= {Heard}
+        assert {type(event) for event in events} <= {Discovered}
         with pytest.raises(StopIteration):
             next(events)
 
@@ -501,7 +501,7 @@ def test_in_a_notebook_cell(loop: Callable[..., Any]) -> None:
         client = a_client(generic())
         events = client.events()
         client.open()
-        assert isinstance(next(events), Heard)
+        assert isinstance(next(events), Discovered)
         client.close()
 
     loop(cell if loop is trio.run else cell())

@@ -99,14 +99,14 @@ function readable(document) {
 
 /**
  * Follows the event stream. Calls `begin()` if everything must be loaded: at the start, after a gap, and after a
- * restart of the service. Calls `take(event)` with every other event, and `standing(isOpen)` when the connection opens
+ * restart of the service. Calls `take(event)` with every other event, and `changed(isOpen)` when the connection opens
  * or closes.
  */
 export class Stream {
-  constructor({ begin, take, standing }) {
+  constructor({ begin, take, changed }) {
     this.begin = begin;
     this.take = take;
-    this.standing = standing;
+    this.changed = changed;
     this.last = null;
     this.run = null;
     this.pause = 500;
@@ -128,7 +128,7 @@ export class Stream {
     for (const kind of KINDS) source.addEventListener(kind, receive);
     source.onerror = () => {
       if (source !== this.source) return;
-      this.standing(false);
+      this.changed(false);
       if (source.readyState === EventSource.CLOSED) this.retryLater();
     };
   }
@@ -136,7 +136,7 @@ export class Stream {
   receive(event) {
     if (event.type === "hello") {
       this.pause = 500;
-      this.standing(true);
+      this.changed(true);
       const isNew = event.run !== this.run || !event.resumed;
       this.run = event.run;
       if (isNew) this.begin();
@@ -167,7 +167,7 @@ export class Stream {
       this.isNumb = false;
     } catch {
       this.isNumb = true;
-      this.standing(false);
+      this.changed(false);
     }
   }
 }

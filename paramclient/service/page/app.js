@@ -16,7 +16,7 @@ import { drawActions, drawVehicles, offerDescriptions, showError } from "./vehic
 const FILTERS = {
   all: { text: "All", has: () => true },
   changed: { text: "Changed from default", has: (row) => row.isChanged === true },
-  differs: { text: "Differs", has: (row) => ["differs", "here"].includes(store.table.standing(row)) },
+  differs: { text: "Differs", has: (row) => ["differs", "here"].includes(store.table.comparison(row)) },
   pending: { text: "Staged", has: (row) => store.table.pending.has(row.name) },
   news: { text: "Changed by others", has: (row) => row.news !== null },
 };
@@ -303,18 +303,18 @@ const stream = new Stream({
       setTimeout(() => stream.open(), 2000);
     }),
   take: (event) => store.take(event),
-  standing: (isOpen) => {
+  changed: (isOpen) => {
     if (store.isConnected === isOpen) return;
     const before = store.isConnected;
     store.isConnected = isOpen;
-    byId("away").hidden = isOpen;
+    byId("unreachable").hidden = isOpen;
     setText(
-      byId("away"),
+      byId("unreachable"),
       isOpen
         ? ""
         : "The service does not respond. Shown values may be outdated. The page reconnects automatically.",
     );
-    setText(byId("standing"), isOpen ? "" : "not connected");
+    setText(byId("connection"), isOpen ? "" : "not connected");
     if (isOpen && before === false) announce("The service responds again.");
     drawState();
   },

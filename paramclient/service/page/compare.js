@@ -152,8 +152,8 @@ export function drawBanner() {
   if (!other) return banner.replaceChildren();
   const names = [...other.values.keys()];
   const there = names.filter((name) => !table.rows.has(name)).length;
-  const differ = [...table.rows.values()].filter((row) => table.standing(row) === "differs").length;
-  const here = [...table.rows.values()].filter((row) => table.standing(row) === "here").length;
+  const differ = [...table.rows.values()].filter((row) => table.comparison(row) === "differs").length;
+  const here = [...table.rows.values()].filter((row) => table.comparison(row) === "here").length;
   const counts = [`${differ} differ`, here && `${here} only here`, there && `${there} only there`]
     .filter(Boolean)
     .join(", ");

@@ -129,7 +129,7 @@ export class Grid {
       element.setAttribute("aria-rowindex", index + 2);
     }
     const pending = table.pending.get(row.name);
-    const standing = table.standing(row);
+    const comparison = table.comparison(row);
     const other = table.other;
     setText(made.label, row.name);
     if (pending) setText(made.number, `${row.text} → ${pending.text}`);
@@ -147,8 +147,8 @@ export class Grid {
       pending && "pending",
       row.news && "news",
       row.isChanged && "changed",
-      standing === "differs" && "differs",
-      standing === "here" && "differs",
+      comparison === "differs" && "differs",
+      comparison === "here" && "differs",
       row.document.trust === "cached" && "cached",
       index === this.index && "active",
     ];

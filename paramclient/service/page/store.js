@@ -130,7 +130,7 @@ class Table {
   }
 
   /** Compares a row with the compared set: "same", "differs", "here", "there", or null. */
-  standing(row) {
+  comparison(row) {
     if (!this.other) return null;
     const other = this.other.values.get(row.name);
     if (other === undefined) return this.other.isPartial ? null : "here";

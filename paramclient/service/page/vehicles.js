@@ -42,7 +42,7 @@ const TYPES = {
   26: "gimbal",
   30: "camera",
 };
-const LINK_PROBLEMS = { away: "link away", failed: "link failed", opening: "link opening" };
+const LINK_PROBLEMS = { reconnecting: "link reconnecting", failed: "link failed", opening: "link opening" };
 
 /** Returns the state of a component in words, and the kind of its dot. */
 export function stateOf(component) {
