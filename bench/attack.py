@@ -164,13 +164,13 @@ class Service:
         """Return the milliseconds of the longest callback of the event loop since the last call, and the
         event-loop latency.
         """
-        told = self.folder / "loop"
-        told.unlink(missing_ok=True)
+        reported = self.folder / "loop"
+        reported.unlink(missing_ok=True)
         self.process.send_signal(signal.SIGUSR1)
         deadline = time.monotonic() + TIMEOUT
-        while not told.exists() and time.monotonic() < deadline:
+        while not reported.exists() and time.monotonic() < deadline:
             time.sleep(0.01)
-        longest, late = json.loads(told.read_text())
+        longest, late = json.loads(reported.read_text())
         return float(longest) * 1_000, float(late) * 1_000
 
     @contextmanager
@@ -432,7 +432,7 @@ async def large_table(rows: list[Row], quick: bool) -> None:
     """Clause 7: requests of a reader for a vehicle with as many parameters as one request may name."""
     table = {f"A{number % 97}_P{number:05}": float(number) for number in range(300 if quick else 10_000)}
     values = {"wanted": {"values": {name: value + 1 for name, value in table.items()}}, "timeout_s": 60}
-    asked: list[tuple[str, str, bytes]] = [
+    requested: list[tuple[str, str, bytes]] = [
         ("GET", f"{C}/params", b""),
         ("GET", f"{C}/params?names=A1*", b""),
         ("GET", f"{C}/file?from=known&format=parm", b""),
@@ -444,17 +444,17 @@ async def large_table(rows: list[Row], quick: bool) -> None:
     ]
     vehicle = GenericVehicle(table=table, burst=100)
     async with serving_vehicle(rows, vehicle, 1, f"{C}/fetch") as service:
-        for method, path, body in asked:
+        for method, path, body in requested:
             service.attack = f"{len(table):,} parameters: {path.removeprefix(C)}"
             with service.watched():
                 status, answer = await service.ask(method, path, body, token(READER))
                 assert status == 200, answer
         service.attack = f"{len(table):,} parameters: 6 diff at once"
         with service.watched(late=LATE):
-            asked_at_once = [
+            parallel_requests = [
                 service.ask("POST", f"{C}/diff", as_json(values, known=True), token(READER)) for _ in range(6)
             ]
-            statuses = [status for status, _ in await asyncio.gather(*asked_at_once)]
+            statuses = [status for status, _ in await asyncio.gather(*parallel_requests)]
             service.note("not answered", 0, sum(status != 200 for status in statuses), "times")
         await many_answers(service, len(table))
 
@@ -468,7 +468,7 @@ async def similar_names(rows: list[Row], quick: bool) -> None:
         for at_once, method, what in ((1, "GET", ""), (60, "POST", "/read")):
             service.attack = f"{count:,} parameters: {at_once} {method} of an unknown similar name{what}"
             with service.watched():
-                asked = [
+                requested = [
                     service.ask(
                         method,
                         f"{C}/params/MISSION_{number:04}_X{what}",
@@ -477,7 +477,7 @@ async def similar_names(rows: list[Row], quick: bool) -> None:
                     )
                     for number in range(at_once)
                 ]
-                statuses = [status for status, _ in await asyncio.gather(*asked)]
+                statuses = [status for status, _ in await asyncio.gather(*requested)]
                 service.note("not refused with 404", 0, sum(status != 404 for status in statuses), "times")
 
 
@@ -486,8 +486,8 @@ async def many_answers(service: Service, size: int) -> None:
     for count, path in ((16, f"{C}/params"), (120, f"{C}/file?from=known")):
         service.attack = f"{size:,} parameters: {count} GET {path.removeprefix(C)} at once"
         with service.watched():
-            asked = [service.ask("GET", path, b"", token(READER), source=ELSEWHERE) for _ in range(count)]
-            statuses = [status for status, _ in await asyncio.gather(*asked)]
+            requested = [service.ask("GET", path, b"", token(READER), source=ELSEWHERE) for _ in range(count)]
+            statuses = [status for status, _ in await asyncio.gather(*requested)]
             service.note("not answered", 0, sum(status != 200 for status in statuses), "times")
     run = json.loads((await service.ask("GET", "/api/v1/components", b"", token(READER)))[1])["run"]
     for count, path in ((1, "/api/v1/events"), (1, f"/api/v1/events?after={run}-0"), (128, f"{C}/params")):
@@ -496,7 +496,7 @@ async def many_answers(service: Service, size: int) -> None:
 
 async def unread(service: Service, count: int, path: str, of: str, seconds: float) -> None:
     """Request a path on many connections, and take none of the responses."""
-    service.attack = f"{of}: {count} GET {path.removeprefix(C)[-20:]}, and nobody reads"
+    service.attack = f"{of}: {count} GET {path.removeprefix(C)[-20:]}, and no client reads"
     lines = [f"GET {path} HTTP/1.1", f"Host: 127.0.0.1:{service.port}", token(READER), "", ""]
     with service.watched(), connections(service, 0, ELSEWHERE) as held:
         for _ in range(count):
@@ -514,12 +514,12 @@ async def extended_params(rows: list[Row], quick: bool) -> None:
     count, extended = 300 if quick else 10_000, "/api/v1/components/1/100/extended"
     camera = Camera({f"P{number:05}": "\U0001f6f0" * 32 for number in range(count)}, burst=50)
     patterns = urlencode([("names", f"[a-\uffff][a-\uffff]{number}") for number in range(64)])
-    asked = [
+    requested = [
         *((1, path) for path in ("params", f"params?{patterns}", "params/P0000X")),
         (16, "params"),
     ]
     async with serving_vehicle(rows, camera, 100, f"{extended}/fetch") as service:
-        for at_once, path in asked:
+        for at_once, path in requested:
             service.attack = f"{count:,} extended parameters: {at_once} GET {path[:15]}"
             with service.watched():
                 answers = [
@@ -545,7 +545,7 @@ async def descriptions(rows: list[Row], quick: bool) -> None:
     values = [{"value": number, "description": "v" * 4} for number in range(5_000)]
     group = {"name": "ABC_P{n}", "longDesc": "x" * 40_000, "units": "m" * 2_000, "values": values}
     given = {"wanted": {"values": {f"ABC_P{number:05}": 2 for number in range(count)}}, "known": True}
-    asked: list[tuple[int, str, str, bytes]] = [
+    requested: list[tuple[int, str, str, bytes]] = [
         *((at_once, "GET", path, b"") for at_once in (1, 4) for path in ("params?metadata=true", "metadata")),
         (1, "POST", "diff", as_json(given)),
     ]
@@ -554,7 +554,7 @@ async def descriptions(rows: list[Row], quick: bool) -> None:
         kind = "application/octet-stream"
         status, answer = await service.ask("PUT", f"{C}/metadata", document, token(WRITER), kind=kind)
         assert status == 200, answer
-        for at_once, method, path, body in asked:
+        for at_once, method, path, body in requested:
             service.attack = f"{count:,} long descriptions: {at_once} {method} {path}"
             with service.watched():
                 answers = [service.ask(method, f"{C}/{path}", body, token(READER)) for _ in range(at_once)]
@@ -610,11 +610,11 @@ async def many_components(rows: list[Row], quick: bool) -> None:
                 service.attack = f"{count:,} components: 5 times {at_once} POST /api/v1/fetch"
                 with service.watched():
                     for _ in range(5):
-                        asked = [
+                        requested = [
                             service.ask("POST", "/api/v1/fetch", b'{"timeout_s": 1}', token(READER))
                             for _ in range(at_once)
                         ]
-                        statuses = [status for status, _ in await asyncio.gather(*asked)]
+                        statuses = [status for status, _ in await asyncio.gather(*requested)]
                         unexpected = sum(status != 504 for status in statuses)
                         assert not unexpected, statuses
         finally:
@@ -684,7 +684,7 @@ async def beat(port: int, count: int) -> None:
 
 
 async def slices(service: Service, quick: bool) -> None:
-    """Clause 7: many small things in what one connection sends, and answers that nobody takes."""
+    """Clause 7: many small things in what one connection sends, and responses that no client reads."""
     for method, path in (("POST", "/api/v1/find"), ("POST", f"{C}/fetch"), ("GET", "/api/v1/ws")):
         await service.ask(method, path, b'{"timeout_s": 60}' if method == "POST" else b"", token(READER))
     chunked = ["Content-Type: application/json", "Transfer-Encoding: chunked"]
@@ -696,9 +696,9 @@ async def slices(service: Service, quick: bool) -> None:
         (f"{pongs} MB of pings, no pong is read", f"GET /api/v1/ws?{UPGRADE}",
          (b"\x89\xfd\0\0\0\0" + b"p" * 125) * (pongs * MEGABYTE // 131), 25),
     ]  # fmt: skip
-    for attack, asked, data, seconds in sent:
+    for attack, requested, data, seconds in sent:
         service.attack = attack
-        request, _, more = asked.partition("?")
+        request, _, more = requested.partition("?")
         lines = [f"{request} HTTP/1.1", f"Host: 127.0.0.1:{service.port}"]
         lines += [more] if more else chunked
         lines += [] if "session" in request else [token(READER)]
@@ -983,14 +983,14 @@ async def udp(rows: list[Row], quick: bool) -> None:
                 for peer in peers:
                     peer.sendto(os.urandom(200), (HERE, port))
             await asyncio.sleep(1.0 if quick else 3.0)
-        came = 0
+        received = 0
         for peer in peers:
             peer.setblocking(False)
             with contextlib.suppress(BlockingIOError, ConnectionError):
                 while peer.recv(2_000):
-                    came += 1
+                    received += 1
             peer.close()
-        service.note("datagrams back to them", 0, came, "")
+        service.note("datagrams back to them", 0, received, "")
         if quick:
             return
         service.attack = "heartbeats of 65,025 systems on UDP"
@@ -1083,13 +1083,13 @@ def main() -> int:
     parser.add_argument("--only", default="", help="only the groups whose name holds this text")
     parser.add_argument("--json", action="store_true", help="the table as JSON")
     parser.add_argument("--slack", type=float, default=1.0, help="multiply limits of time, on a busy machine")
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, min(hard, 4_096)), hard))
-    rows = asyncio.run(attack(asked.quick, asked.only))
+    rows = asyncio.run(attack(arguments.quick, arguments.only))
     for row in rows:
-        row.limit *= asked.slack if row.unit in ("s", "ms") else 1
-    if asked.json:
+        row.limit *= arguments.slack if row.unit in ("s", "ms") else 1
+    if arguments.json:
         print(json.dumps([{**dataclasses.asdict(row), "held": row.is_held} for row in rows], indent=1))
     else:
         print(table(rows))

@@ -180,13 +180,13 @@ def print_load(seconds: float, burst: int) -> bool:
     sender = spawn.Process(target=send_telemetry, args=(port, burst, stop))
     sender.start()
     try:
-        load, heard = anyio.run(listen, port, seconds)
+        load, received = anyio.run(listen, port, seconds)
     finally:
         stop.set()
         sender.join()
     is_met = load < LOAD_MAX
     how = "one by one" if burst == 1 else f"{burst} at a time"
-    print(f"hearing {heard:,.0f} other frames a second, {how}: {load:.1%} of a core", end="")
+    print(f"hearing {received:,.0f} other frames a second, {how}: {load:.1%} of a core", end="")
     print(f" (target: under {LOAD_MAX:.0%} at {TELEMETRY:,}: {verdict(is_met)})")
     return is_met
 
@@ -196,11 +196,11 @@ async def listen(port: int, seconds: float) -> tuple[float, float]:
     async with ParamClient(f"udpin:127.0.0.1:{port}", cache=False) as client:
         await client.component()
         await anyio.sleep(WARM_UP)
-        began, used, heard = time.perf_counter(), time.process_time(), client.bytes_received
+        began, used, received = time.perf_counter(), time.process_time(), client.bytes_received
         await anyio.sleep(seconds)
         wall = time.perf_counter() - began
         load = (time.process_time() - used) / wall
-        frames = (client.bytes_received - heard) / wall / MEAN_SIZE
+        frames = (client.bytes_received - received) / wall / MEAN_SIZE
     return load, frames
 
 

@@ -164,12 +164,12 @@ class Rounds:
         values = range(first, last)
         child = forked(partial(station, place, writing, values, self._durable, self._dice.random()))
         os.close(writing)
-        with os.fdopen(reading, "rb") as told:
+        with os.fdopen(reading, "rb") as reported:
             if is_early and not is_database:
                 time.sleep(life / 2)
                 said = b""
             else:
-                said = told.readline()  # waits for the first set
+                said = reported.readline()  # waits for the first set
                 time.sleep(life)
             killed_at = time.monotonic()
             if is_database:
@@ -181,7 +181,7 @@ class Rounds:
                 killed_at = float("inf")
             else:
                 os.kill(child, signal.SIGKILL)
-            said += told.read()
+            said += reported.read()
         os.waitpid(child, 0)
         lines = (line.split() for line in said.decode().splitlines(keepends=True) if line.endswith("\n"))
         return [
@@ -202,10 +202,10 @@ class Rounds:
 
         acknowledged: list[Acknowledged] = []
         before = signal.signal(signal.SIGALRM, kill)
-        with os.fdopen(reading, "rb") as told:
+        with os.fdopen(reading, "rb") as reported:
             if is_early:
                 signal.setitimer(signal.ITIMER_REAL, max(life, 0.01))
-            line = told.readline()
+            line = reported.readline()
             if line:
                 where = urlsplit(line.decode().strip())
                 connection = http.client.HTTPConnection(where.hostname or "", where.port, timeout=TIMEOUT)
@@ -221,7 +221,7 @@ class Rounds:
                         ask(connection, "PUT", f"/api/v1/components/1/1/params/{name}", body)
                         acknowledged.append(Acknowledged(name, value, durable, time.monotonic()))
                 connection.close()
-            told.read()
+            reported.read()
         signal.setitimer(signal.ITIMER_REAL, 0)
         if not killed:
             kill()
@@ -276,12 +276,12 @@ def forked(work: Callable[[], object]) -> int:
         os._exit(code)
 
 
-def station(place: str, told: int, values: Iterable[int], share: float, seed: float) -> None:
+def station(place: str, reported: int, values: Iterable[int], share: float, seed: float) -> None:
     """Set parameters, and write each acknowledged set to the pipe."""
-    anyio.run(_station, place, told, values, share, seed)
+    anyio.run(_station, place, reported, values, share, seed)
 
 
-async def _station(place: str, told: int, values: Iterable[int], share: float, seed: float) -> None:
+async def _station(place: str, reported: int, values: Iterable[int], share: float, seed: float) -> None:
     dice = random.Random(seed)
     with anyio.open_signal_receiver(signal.SIGTERM) as signals:
         async with anyio.create_task_group() as tasks:
@@ -294,7 +294,7 @@ async def _station(place: str, told: int, values: Iterable[int], share: float, s
                     for value in values:
                         name, durable = dice.choice(NAMES), dice.random() < share
                         await component.set(name, value, durable=durable)
-                        tell(told, f"{name} {value} {durable} {time.monotonic()}\n")
+                        report(reported, f"{name} {value} {durable} {time.monotonic()}\n")
                         await anyio.sleep(dice.uniform(0.0, 0.01))
                     await anyio.sleep_forever()
 
@@ -304,19 +304,19 @@ async def _station(place: str, told: int, values: Iterable[int], share: float, s
                 break
 
 
-def serve(place: str, told: int) -> None:
+def serve(place: str, reported: int) -> None:
     """Run the code of `paramclient serve`, and write its address to the pipe."""
 
     async def work() -> None:
         hub = service.Hub([PX4Vehicle(table=dict.fromkeys(NAMES, 0))], cache=place)
         listening = service.Listening(port=0)
-        await service.serve(hub, listening=listening, listens=lambda url: tell(told, f"{url}\n"))
+        await service.serve(hub, listening=listening, listens=lambda url: report(reported, f"{url}\n"))
 
     anyio.run(work)
 
 
-def tell(told: int, text: str) -> None:
-    os.write(told, text.encode())
+def report(reported: int, text: str) -> None:
+    os.write(reported, text.encode())
 
 
 def ask(connection: http.client.HTTPConnection, method: str, path: str, body: object) -> None:

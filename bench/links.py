@@ -161,13 +161,13 @@ def file_rows() -> Iterator[Row]:
     for loss, bound in ((0.0, 1.25), (0.01, 1.25), (0.05, 1.25), (0.20, 1.4), (0.40, 1.5)):
         for trip in (0.02, 0.1, 0.6, 2.5):
             # unlike the oracle, a client cannot detect a lost response within 20 ms
-            is_untold = trip == 0.02 and loss == 0.4
+            is_unstated = trip == 0.02 and loss == 0.4
             yield Row(
                 f"ArduPilot by FTP UDP {trip * 1000:g} ms {loss:.0%}",
                 ArduPilotVehicle,
                 UDP_READ_RATE / FILE_FRAME,
                 {"loss": loss, "delay": trip / 2},
-                2.5 if is_untold else bound,
+                2.5 if is_unstated else bound,
                 limits.get((trip, loss), math.inf),
                 file_rate=UDP_FILE_RATE,
             )

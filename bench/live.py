@@ -50,7 +50,7 @@ ROUND_TRIP: Final = 0.1
 """Round-trip time in seconds of the rows with packet loss."""
 FETCH_TIMEOUT: Final = 120.0
 """Timeout of one run in seconds."""
-HEARING_TIMEOUT: Final = 20.0
+DISCOVERY_TIMEOUT: Final = 20.0
 """Seconds to wait for the vehicle's heartbeat."""
 SESSION_PAUSE: Final = 3.5
 """Seconds before each run, except in the row without a pause: ArduPilot keeps a MAVFTP session that was not
@@ -212,7 +212,7 @@ async def time_fetch(vehicle: Vehicle, seed: int, *, conditions: Conditions) -> 
     """Fetch all parameters once; return the seconds of the call, after the first heartbeat."""
     vehicle.relay.change(replace(conditions, seed=seed))
     async with ParamClient(vehicle.relay.link, cache=vehicle.new_cache()) as client:
-        component = await client.component(vehicle.system, timeout=HEARING_TIMEOUT)
+        component = await client.component(vehicle.system, timeout=DISCOVERY_TIMEOUT)
         began = time.monotonic()
         result = await component.fetch_all(timeout=FETCH_TIMEOUT)
         seconds = time.monotonic() - began
@@ -225,7 +225,7 @@ async def time_gets(vehicle: Vehicle, seed: int) -> float:
     vehicle.relay.change(replace(CLEAN, seed=seed))
     names = sorted(name for name, param in vehicle.journal.before.items() if isinstance(param.value, int))
     async with ParamClient(vehicle.relay.link, cache=vehicle.new_cache()) as client:
-        component = await client.component(vehicle.system, timeout=HEARING_TIMEOUT)
+        component = await client.component(vehicle.system, timeout=DISCOVERY_TIMEOUT)
         began = time.monotonic()
         read = [await component.get(name) for name in names[:GETS]]
         seconds = time.monotonic() - began
@@ -290,7 +290,7 @@ async def time_apply(vehicle: Vehicle, seed: int) -> float:
             vehicle.wanted = await choose_values(vehicle, await client.component(vehicle.system))
         await anyio.sleep(SESSION_PAUSE)
     async with ParamClient(vehicle.relay.link, cache=vehicle.new_cache()) as client:
-        component = await client.component(vehicle.system, timeout=HEARING_TIMEOUT)
+        component = await client.component(vehicle.system, timeout=DISCOVERY_TIMEOUT)
         vehicle.journal.note(vehicle.members)
         began = time.monotonic()
         result = await apply(component, vehicle.wanted)
@@ -379,7 +379,7 @@ async def time_rows(
 ) -> tuple[str, list[Timing]]:
     """Run all rows and check that the vehicle is unchanged; return its name and the timings."""
     async with ParamClient(relay.link, cache=False) as client:
-        component = await client.only_component(options.system, timeout=HEARING_TIMEOUT)
+        component = await client.only_component(options.system, timeout=DISCOVERY_TIMEOUT)
         if component.autopilot != options.kind:
             raise UsageError(f"the vehicle is {component.autopilot}, not {options.kind}")
         result = await component.fetch_all(timeout=FETCH_TIMEOUT)
@@ -396,7 +396,7 @@ async def time_rows(
             relay.change(CLEAN)
             if journal.changed:
                 async with ParamClient(relay.link, cache=False) as client:
-                    await put_back(vehicle, await client.component(vehicle.system, timeout=HEARING_TIMEOUT))
+                    await put_back(vehicle, await client.component(vehicle.system, timeout=DISCOVERY_TIMEOUT))
 
 
 def table(timings: Sequence[Timing]) -> Iterator[str]:

@@ -508,22 +508,22 @@ def fetch_with_pymavlink(port: int, limit: float) -> tuple[float, Values]:
     is_cast = master.messages["HEARTBEAT"].autopilot == wire.MAV_AUTOPILOT_ARDUPILOTMEGA
     values: dict[str, float] = {}
     missing: set[int] | None = None
-    began = heard = time.monotonic()
+    began = received = time.monotonic()
     master.param_fetch_all()
     while missing is None or missing:
         now = time.monotonic()
         if now - began > limit:
             break
-        if now - heard >= SILENCE:
-            heard = now
+        if now - received >= SILENCE:
+            received = now
             if missing is None:
                 master.param_fetch_all()
             else:
                 for index in sorted(missing)[:MISSING_AT_ONCE]:
                     master.param_fetch_one(index)
-        message = master.recv_match(type="PARAM_VALUE", blocking=True, timeout=heard + SILENCE - now)
+        message = master.recv_match(type="PARAM_VALUE", blocking=True, timeout=received + SILENCE - now)
         if message is not None and message.param_index < message.param_count:
-            heard = time.monotonic()
+            received = time.monotonic()
             if missing is None:
                 missing = set(range(message.param_count))
             missing.discard(message.param_index)
@@ -548,7 +548,7 @@ def fetch_with_mavsdk(port: int, limit: float) -> tuple[float, Values]:
         mavsdk.add_any_connection(f"udpin://127.0.0.1:{port}")
         system = mavsdk.first_autopilot(timeout_s=START_TIMEOUT)
         if system is None:
-            raise RuntimeError("heard no autopilot")
+            raise RuntimeError("no autopilot was received")
         param = Param(system)
         began = time.monotonic()
         found = param.get_all_params()

@@ -1,6 +1,6 @@
 """Draws the downloads of the README's comparison with other clients into docs/images: `make pictures`.
 
-The figures come from the table in the README, so that picture and table cannot differ.
+The figures are those of the table in the README, so that picture and table cannot differ.
 """
 
 from __future__ import annotations
@@ -127,10 +127,10 @@ def description(downloads: list[Download]) -> str:
 def alternative_text(downloads: list[Download]) -> str:
     """Return the text for pages instead of the picture: the figures of the last condition."""
     condition, words = list(CONDITIONS.items())[-1]
-    told = "; ".join(
+    reported = "; ".join(
         f"{autopilot}: {_figures(downloads, autopilot, condition)}" for autopilot in _autopilots(downloads)
     )
-    return f"{TITLE}, as bars without packet loss and with 5% and 20%. At {_lower(words)}, {told}."
+    return f"{TITLE}, as bars without packet loss and with 5% and 20%. At {_lower(words)}, {reported}."
 
 
 def draw(downloads: list[Download], look: str) -> str:

@@ -312,7 +312,7 @@ async def fetch(sizes: Sizes, path: Path, record: Record, before: float, vehicle
                 for system in range(1, per_link + 1):
                     await client.component(system)
         await anyio.sleep(SETTLING_TIME)
-        asked = requests_of(vehicles)
+        requested = requests_of(vehicles)
         record.begin()
         cache.seconds = 0.0
         async with anyio.create_task_group() as tasks:
@@ -327,7 +327,7 @@ async def fetch(sizes: Sizes, path: Path, record: Record, before: float, vehicle
             await anyio.sleep(SETTLING_TIME)
             tasks.cancel_scope.cancel()
         grown = resident() - before
-        asked = requests_of(vehicles) - asked
+        requested = requests_of(vehicles) - requested
         later = cache.seconds - in_cache
     whole = [result for fetched in results for result in fetched.results.values()]
     return Phase(
@@ -341,7 +341,7 @@ async def fetch(sizes: Sizes, path: Path, record: Record, before: float, vehicle
         grown=grown,
         right=sum(is_right(result, sizes.parameters) for result in whole),
         source="+".join(sorted({result.source for result in whole})),
-        requests=asked,
+        requests=requested,
     )
 
 
@@ -415,12 +415,12 @@ def fly(sizes: Sizes, stop: Event, out: Connection) -> None:
                 turn.add(number)
         for number in turn:
             vehicle, sock = fleet[number]
-            with suppress(OSError):  # nobody is there, or takes it
+            with suppress(OSError):  # the peer is gone, or does not read
                 while True:
                     vehicle.receive(sock.recv(65535), now)
             vehicle.tick(now)
             for data in vehicle.data_to_send():
-                with suppress(OSError):  # nobody is there, or takes it
+                with suppress(OSError):  # the peer is gone, or does not read
                     sock.send(data)
             wake_at[number] = vehicle.next_deadline() or now
             heapq.heappush(due, (wake_at[number], number))

@@ -104,8 +104,8 @@ def main() -> int:
 
 def show(figures: Figures, listeners: list[Listener], rate: int) -> bool:
     """Print the figures; return whether every target is met."""
-    told = min((each.events for each in listeners), default=0)
-    whole = sum(each.is_whole for each in listeners)  # each has come to the last one, from where it began
+    reported = min((each.events for each in listeners), default=0)
+    whole = sum(each.is_whole for each in listeners)  # each has received all events up to the last one
     share = figures.cpu / figures.elapsed
     cuts = statistics.quantiles(figures.latencies, n=100)
     are_met = [
@@ -114,7 +114,7 @@ def show(figures: Figures, listeners: list[Listener], rate: int) -> bool:
         cuts[98] <= LATENCY_MAX,
     ]
     print(
-        f"{len(listeners)} listeners: {whole} were told of every one of {told:,} events or more, in order"
+        f"{len(listeners)} listeners: {whole} received every one of {reported:,} events or more, in order"
         f"{verdict(are_met[0])}\n"
         f"{figures.reads:,} reads at {rate} a second, beside {figures.downloads} downloads: "
         f"{1000 * cuts[49]:.1f} ms each, {1000 * cuts[98]:.1f} ms for the slowest of 100 "

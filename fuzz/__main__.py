@@ -28,14 +28,14 @@ def main() -> None:
     parser.add_argument("target", choices=TARGETS)
     parser.add_argument("--seconds", type=int, default=1800, help="duration in seconds; default 1800")
     parser.add_argument("--corpus", type=Path, help="folder for inputs; default fuzz/corpus/<target>")
-    asked, options = parser.parse_known_args()
-    corpus = asked.corpus or HERE / "corpus" / asked.target
-    findings = HERE / "findings" / asked.target
+    parsed, options = parser.parse_known_args()
+    corpus = parsed.corpus or HERE / "corpus" / parsed.target
+    findings = HERE / "findings" / parsed.target
     for folder in (corpus, findings):
         folder.mkdir(parents=True, exist_ok=True)
     with atheris.instrument_imports(include=["paramclient"]):
-        target = importlib.import_module(f"fuzz.{asked.target}")
-    arguments = [f"-max_total_time={asked.seconds}", f"-artifact_prefix={findings}/", "-print_final_stats=1"]
+        target = importlib.import_module(f"fuzz.{parsed.target}")
+    arguments = [f"-max_total_time={parsed.seconds}", f"-artifact_prefix={findings}/", "-print_final_stats=1"]
     arguments += [f"-max_len={target.INPUT_SIZE_MAX}", "-len_control=0"]
     atheris.Setup([sys.argv[0], *arguments, str(corpus), *options], target.run)
     atheris.Fuzz()

@@ -66,7 +66,7 @@ def _run_file(content: bytes) -> None:
 
 def _run_blob(changed: bytes) -> None:
     with suppress(Damaged):
-        assert unpack(changed) == unpack(_good_blob()), "the checksum tells of every change"
+        assert unpack(changed) == unpack(_good_blob()), "the checksum reports every change"
     blob = changed[:-4] + struct.pack("<I", zlib.crc32(changed[:-4]))
     rows = None
     with suppress(Damaged):
@@ -100,8 +100,8 @@ def _use(path: Path) -> None:
                 assert all(name in NAMES and param.value == 3.0 for name, param in table.params.items())
             kept.history(summary.key)
             for each in kept.snapshots(summary.key):
-                told = kept.state_at(summary.key, each.component, each.id)
-                assert all(name in NAMES and param.value == 3.0 for name, param in told.items())
+                reported = kept.state_at(summary.key, each.component, each.id)
+                assert all(name in NAMES and param.value == 3.0 for name, param in reported.items())
         kept.vehicles()
         kept.save([_update(VEHICLE, 3.0, AT + LATER), _update(OTHER, 4.0, AT + LATER)])
         held = kept.load(VEHICLE.key, 1)

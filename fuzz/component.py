@@ -270,18 +270,22 @@ class _Session:
 
     def answer_file(self, request: wire.FileTransfer, system: int, component: int) -> None:
         draw = self.draw
-        asked = request.payload
-        sequence = int.from_bytes(asked[:2], "little") + draw.one_of((1, 1, 1, 2, 3, 0, 4095, 65535))
+        requested = request.payload
+        sequence = int.from_bytes(requested[:2], "little") + draw.one_of((1, 1, 1, 2, 3, 0, 4095, 65535))
         opcode = draw.one_of((128, 128, 129))
-        offset = int.from_bytes(asked[8:12], "little")
+        offset = int.from_bytes(requested[8:12], "little")
         offset = draw.one_of((offset, offset, 0, 4, offset + 239, 0xFFFFFFFF))
         content = draw.take(draw.number() % 64)
         if opcode == 129:
             content = draw.one_of((b"\x06", b"\x0a", b"\x01", b"\x02\x02", b"\x04", b"\x05", b"\x07", b""))
         head = (sequence & 0xFFFF).to_bytes(2, "little") + bytes(
-            (draw.one_of((asked[2], asked[2], 0, 1)), opcode, draw.one_of((len(content), len(content), 255)))
+            (
+                draw.one_of((requested[2], requested[2], 0, 1)),
+                opcode,
+                draw.one_of((len(content), len(content), 255)),
+            )
         )
-        tail = bytes((draw.one_of((asked[3], asked[3], 15, 5)), draw.number() & 1, 0))
+        tail = bytes((draw.one_of((requested[3], requested[3], 15, 5)), draw.number() & 1, 0))
         payload = (head + tail + offset.to_bytes(4, "little") + content).ljust(251, b"\0")
         self.hear(
             wire.FileTransfer(0, *draw.one_of((OWN, OWN, (0, 0), (254, 190))), payload), system, component
@@ -468,7 +472,7 @@ class _Session:
         return f"{_prefix(system)}{'ABCDEFGHIJKLMNOPQR'[kind % 18]}"
 
     def entry(self, system: int, index: int, count: int) -> wire.ParamValue:
-        """Return the value of a vehicle at an index; its last byte comes from the input."""
+        """Return the value of a vehicle at an index; its last byte is from the input."""
         raw = b"\0\0" + bytes((0x80, self.draw.number() & 0x3F))
         return wire.ParamValue(f"{_prefix(system)}{'ABCDEFGHIJKLMNOPQR'[index % 18]}", raw, 9, count, index)
 

@@ -37,14 +37,14 @@ def run(data: bytes) -> None:
         again = loads(written, source=NAMES[how >> 4 & 7], file_format=form)
         assert _names(again) == _names(held), f"{form} has other parameters"
         if is_exact:
-            assert _told(again) == _told(held), f"{form} says something else"
+            assert _described(again) == _described(held), f"{form} says something else"
 
 
 def _names(file: ParamFile) -> list[str]:
     return [name for params in file.sets for name in params]
 
 
-def _told(file: ParamFile) -> list[tuple[object, ...]]:
+def _described(file: ParamFile) -> list[tuple[object, ...]]:
     """Return the values of a file, in which NaN equals itself. Comments may be written differently."""
     return [
         (params.system, params.component, each.name, each.type, repr(each.value), repr(each.default))

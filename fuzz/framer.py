@@ -88,9 +88,9 @@ def _check_codec(frame: Frame) -> None:
     options = {"system": frame.system, "component": frame.component, "sequence": frame.sequence}
     data = wire.encode(message, **options)
     (again,) = Framer(stream=False).receive(data)
-    told = wire.decode(again)
-    assert told is not None
-    assert wire.encode(told, **options) == data
+    reported = wire.decode(again)
+    assert reported is not None
+    assert wire.encode(reported, **options) == data
 
 
 def _frames_of(data: bytes) -> list[tuple[Frame, int]]:

@@ -21,10 +21,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="fuzz.keep", description="Keep the inputs that reach everything.")
     parser.add_argument("target")
     parser.add_argument("found", type=Path, nargs="?", help="a folder with further inputs")
-    asked = parser.parse_args()
-    corpus = HERE / "corpus" / asked.target
-    target = importlib.import_module(f"fuzz.{asked.target}")
-    folders = [corpus] if asked.found is None else [corpus, asked.found]
+    arguments = parser.parse_args()
+    corpus = HERE / "corpus" / arguments.target
+    target = importlib.import_module(f"fuzz.{arguments.target}")
+    folders = [corpus] if arguments.found is None else [corpus, arguments.found]
     inputs = {path.read_bytes() for folder in folders for path in folder.iterdir() if path.is_file()}
     reached: set[tuple[str, int, int]] = set()
     kept = []

@@ -51,7 +51,7 @@ def main() -> int:
         prog="fuzz.over_http", description="Send requests at random to a service."
     )
     parser.add_argument("--seconds", type=int, default=1200, help="duration in seconds; default 1200")
-    asked, options = parser.parse_known_args()
+    arguments, options = parser.parse_known_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         with (folder / "log").open("wb") as log:
@@ -66,7 +66,7 @@ def main() -> int:
             (folder / "schemathesis.toml").write_text(CONFIG)
             fuzz = [str(Path(sys.executable).with_name("schemathesis"))]
             fuzz += ["--config-file", str(folder / "schemathesis.toml"), "run", f"{url}/openapi.json"]
-            fuzz += ["--max-time", str(asked.seconds), "--checks", ",".join(CHECKS), "--mode", "all"]
+            fuzz += ["--max-time", str(arguments.seconds), "--checks", ",".join(CHECKS), "--mode", "all"]
             fuzz += [f"--exclude-path={path}" for path in LEFT_OUT]
             fuzz += [f"--workers={WORKERS}", "--request-timeout=60", "--continue-on-failure", *options]
             code = subprocess.run(fuzz, check=False, env={**os.environ, "HOME": name}).returncode

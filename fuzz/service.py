@@ -280,8 +280,11 @@ class _Hostile(httpx.AsyncBaseTransport):
         hello = b"data: " + json.dumps(EVENTS[0]).encode() + b"\n\n"
         if self._how & 1:
             return [hello, self._draw.take(64)]
-        told = [EVENTS[0], *(EVENTS[self._draw.number() % len(EVENTS)] for _ in range(self._how // 2 % 12))]
-        return [b"data: " + json.dumps(_changed(each, self._draw)).encode() + b"\n\n" for each in told]
+        reported = [
+            EVENTS[0],
+            *(EVENTS[self._draw.number() % len(EVENTS)] for _ in range(self._how // 2 % 12)),
+        ]
+        return [b"data: " + json.dumps(_changed(each, self._draw)).encode() + b"\n\n" for each in reported]
 
 
 class _Stream(httpx.AsyncByteStream):

@@ -48,7 +48,7 @@ class _Session:
         self.verifier = Verifier(self.signer, self.policy, most_streams=STREAMS_MAX)
         self.framer = Framer(stream=False)
         self.framer.guard = self.verifier.accepts
-        self.heard: list[bytes] = []
+        self.received: list[bytes] = []
         self.streams: dict[bytes, int] = {}
         self.refused: Counter[Refusal] = Counter()
         self.unproven: Counter[Refusal] = Counter()
@@ -90,9 +90,11 @@ class _Session:
         report = self.verifier.report()
         assert (report.signed, report.unsigned) == (self.signed, self.unsigned)
         assert (dict(report.refused), dict(report.unproven)) == (self.refused, self.unproven)
-        told = {bytes((each.system, each.component, each.link_id)): each.timestamp for each in report.streams}
-        assert told == self.streams
-        assert len(told) <= STREAMS_MAX
+        reported = {
+            bytes((each.system, each.component, each.link_id)): each.timestamp for each in report.streams
+        }
+        assert reported == self.streams
+        assert len(reported) <= STREAMS_MAX
 
     def _flaw(self, frame: bytes) -> Refusal | None:
         """Return why the rules refuse a frame, or None; record the timestamp of an accepted one."""
@@ -135,8 +137,8 @@ class _Session:
         """Return a frame with a valid checksum."""
         draw = self.draw
         way = draw.number() % 8
-        if way == 0 and self.heard:
-            return draw.one_of(self.heard)
+        if way == 0 and self.received:
+            return draw.one_of(self.received)
         frame = self._unsigned()
         if way == 1 or frame[0] == 0xFE:
             return frame
@@ -144,7 +146,7 @@ class _Session:
         secret = OTHER_SECRET if way == 2 else SECRET
         signer = Signer(SigningKey(secret), link_id=draw.number() % 3, timestamp=timestamp - 1)
         frame = wire.sign_frame(frame, signer)
-        self.heard.append(frame)
+        self.received.append(frame)
         if way == 3:
             return frame[: -1 - draw.number() % 13]
         if way == 4:

@@ -99,7 +99,7 @@ def _check_import(kept: ParamCache, tables: Sequence[ImportedTable], records: Se
     said = _said(records)
     times = {each.at for each in records}
     assert {(each.system, each.component) for each in tables} <= said.keys()
-    told = []
+    reported = []
     for summary in kept.components():
         table = kept.load(summary.key, summary.component)
         assert table is not None
@@ -116,8 +116,8 @@ def _check_import(kept: ParamCache, tables: Sequence[ImportedTable], records: Se
             assert (name, kind, bits_of(param.settable, kind)) in words
         assert set(table.heard_at.values()) <= times
         lines = list(kept.history(summary.key))
-        told.append(repr((summary, sorted(table.params.items()), sorted(table.heard_at.items()), lines)))
-    return sorted(told)
+        reported.append(repr((summary, sorted(table.params.items()), sorted(table.heard_at.items()), lines)))
+    return sorted(reported)
 
 
 def _said(records: Sequence[Record]) -> dict[tuple[int, int], set[tuple[str, int, bytes]]]:

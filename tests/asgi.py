@@ -1,4 +1,4 @@
-"""An ASGI application as an httpx transport: its answers come as they are sent, also those without an end."""
+"""An ASGI application as an httpx transport: responses are received as they are sent, also endless ones."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from starlette.types import ASGIApp, Message
 __all__ = ["ASGITransport", "a_browser"]
 
 HIGH_WATER: Final = 65_536
-"""Bytes that an application may have sent, and nobody has read, before `send` waits, as with uvicorn."""
+"""Bytes that an application may have sent, and no client has read, before `send` waits, as with uvicorn."""
 
 
 class ASGITransport(httpx.AsyncBaseTransport):
     """Calls an application in a task of its own for each request.
 
-    The application is told `http.disconnect` when the response is closed or the request is cancelled. What
-    it raises comes out of the request, where it has not begun to answer.
+    The application receives `http.disconnect` when the response is closed or the request is cancelled. What
+    it raises is raised by the request, if it has not begun to respond.
 
     Args:
         app: the application.

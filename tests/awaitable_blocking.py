@@ -87,7 +87,7 @@ class Caller:
             raise
 
     def count(self, change: int) -> None:
-        """Tell a `SimulatedTimeLoop` that the thread begins or ends to work."""
+        """Report to a `SimulatedTimeLoop` that the thread begins or ends to work."""
         if hasattr(self.loop, "threads"):
             self.loop.threads += change
 

@@ -71,7 +71,7 @@ class Cable:
     def recv(self, size: int) -> bytes:
         """Wait for bytes, like a socket."""
         readable, _, _ = select.select([self._file], [], [], TIMEOUT)
-        assert readable, "nothing has come"
+        assert readable, "nothing has arrived"
         return os.read(self._file, size)
 
     def drain(self) -> None:

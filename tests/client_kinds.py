@@ -182,7 +182,7 @@ def looks(component: Component) -> str:
 
 
 def served(component: Component) -> Component:
-    """The component as whoever has the link knows it."""
+    """The component as the program with the link has it."""
     if not isinstance(component, RemoteComponent):
         return component
     (client,) = (each for each in OPENED if each.roster is component._service)

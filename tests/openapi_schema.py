@@ -99,7 +99,7 @@ class Published:
             elif isinstance(more, dict):
                 fault = self._fault(more, value, f"{where}.{name}")
             else:
-                fault = None if more is True else f"{where}: nobody has said that there is {name}"
+                fault = None if more is True else f"{where}: {name} is not declared"
             if fault is not None:
                 return fault
         return None

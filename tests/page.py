@@ -88,7 +88,7 @@ class Bench:
     def set(self, name: str, value: float) -> None:
         """Another program sets a value of the PX4.
 
-        What is set on board itself is told once, and not at all where it was saved first: then it takes the
+        A value that is set on board is reported once, and not at all if it was saved first: then it takes the
         client's next look, half a minute later.
         """
         self.ask("PATCH", "/components/1/1/params?link=px4", {"values": {name: value}})
@@ -107,7 +107,8 @@ def at_work(
     port: int = 0,
     more: Mapping[str, SimVehicle[Any]] | None = None,
 ) -> Iterator[Bench]:
-    """A service over both autopilots and one with names that nobody should have, its cache in this folder."""
+    """A service over both autopilots and one with names that no vehicle should have, its cache in this
+    folder."""
     links: dict[str, SimVehicle[Any]] = {
         "px4": SimVehicle(PX4Vehicle(metadata=True, param_error=True)),
         "ardupilot": SimVehicle(Limited()),
@@ -117,7 +118,7 @@ def at_work(
     url = ""
     listens = threading.Event()
 
-    def told(where: str) -> None:
+    def reported(where: str) -> None:
         nonlocal url
         url = where
         listens.set()
@@ -129,7 +130,7 @@ def at_work(
             task_status.started(stop)
             with ParamCache(folder / "cache.sqlite3") as cache:
                 hub = Hub([(name, _maker(name, links[name], cache)) for name in links], cache=cache)
-                await serve(hub, settings, listening=Listening(port=port), stop=stop, listens=told)
+                await serve(hub, settings, listening=Listening(port=port), stop=stop, listens=reported)
 
         running, stop = portal.start_task(run)
         try:

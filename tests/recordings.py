@@ -186,7 +186,7 @@ def differences(
 
     Args:
         burst: values of a list that the vehicle sends in one burst.
-        unasked: parameters whose values outside lists are left out.
+        unrequested: parameters whose values outside lists are left out.
     """
     expected, actual = _series(name, recorded, unasked), _series(name, sent, unasked)
     if len(_passes(expected["list"])) != len(_passes(actual["list"])):
@@ -195,7 +195,7 @@ def differences(
         ]
     found = _beats(expected.pop("Heartbeat", []), actual.pop("Heartbeat", []))
     pairs = []
-    asked = _requests(name)
+    requested = _requests(name)
     for key in sorted(expected.keys() | actual.keys()):
         parts = [(expected[key], actual[key])]
         if key == "list":
@@ -208,7 +208,7 @@ def differences(
             if [message for _, message in one] != [message for _, message in other]:
                 found.append(f"{key}: other messages: {len(one)} recorded, {len(other)} sent")
                 continue
-            requests = [_request_of(one[0] if key == "list" else each, asked) for each in one]
+            requests = [_request_of(one[0] if key == "list" else each, requested) for each in one]
             for at, (time, message) in enumerate(other):
                 allowed = max(0.02, 0.2 * (one[at][0] - requests[at]))
                 first = max(at - slack, requests.index(requests[at]))
@@ -243,7 +243,7 @@ def _series(name: str, messages: Messages, unasked: Collection[str]) -> defaultd
         if isinstance(message, wire.ParamValue):
             index = message.param_index
             key = f"value {message.param_id.upper() if index == wire.NO_INDEX else index}"
-            is_first = index == 0 and passes < sum(asked <= time for asked in lists)
+            is_first = index == 0 and passes < sum(requested <= time for requested in lists)
             if is_first or (last is not None and index == last + 1):
                 key, last = "list", index
                 passes += is_first
@@ -271,9 +271,9 @@ def _requests(name: str) -> list[tuple[float, wire.Message]]:
 
 def _request_of(answer: tuple[float, wire.Message], requests: Messages) -> float:
     """Return the time of the request that a message answers; without a request, the message's own time."""
-    came, message = answer
-    times = [time for time, request in requests if time <= came and _answers(message, request)]
-    return max(times, default=came)
+    received, message = answer
+    times = [time for time, request in requests if time <= received and _answers(message, request)]
+    return max(times, default=received)
 
 
 def _answers(message: wire.Message, request: wire.Message) -> bool:
@@ -319,8 +319,6 @@ def _order(pairs: list[_Pair]) -> list[str]:
         while near and near[0][0] < pair.first - 0.05:
             ahead = max(ahead, heappop(near)[1])
         if pair.sent < ahead:
-            found.append(
-                f"recorded from {pair.first:.4f} on, sent at {pair.sent:.4f}, before what came before"
-            )
+            found.append(f"recorded from {pair.first:.4f} on, sent at {pair.sent:.4f}, before an earlier one")
         heappush(near, (pair.last, pair.sent))
     return found

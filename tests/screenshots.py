@@ -24,14 +24,14 @@ DESCRIBED = {
     "MC_ROLLRATE_P": ("Gain from the roll rate's error to torque", "", 0.15, 0.01, 0.5),
     "MC_ROLLRATE_I": ("Integral gain of the roll rate", "", 0.2, 0, 3),
     "MC_ROLLRATE_D": ("Differential gain of the roll rate", "", 0.003, 0, 0.01),
-    "MC_ROLLRATE_MAX": ("Fastest roll that is asked for", "deg/s", 220.0, 0, 1800),
+    "MC_ROLLRATE_MAX": ("Fastest roll that is requested", "deg/s", 220.0, 0, 1800),
     "MC_PITCHRATE_P": ("Gain from the pitch rate's error to torque", "", 0.15, 0.01, 0.6),
     "MC_PITCHRATE_I": ("Integral gain of the pitch rate", "", 0.2, 0, 3),
     "MC_PITCHRATE_D": ("Differential gain of the pitch rate", "", 0.003, 0, 0.01),
-    "MC_PITCHRATE_MAX": ("Fastest pitch that is asked for", "deg/s", 220.0, 0, 1800),
+    "MC_PITCHRATE_MAX": ("Fastest pitch that is requested", "deg/s", 220.0, 0, 1800),
     "MC_YAWRATE_P": ("Gain from the yaw rate's error to torque", "", 0.2, 0, 0.6),
     "MC_YAWRATE_I": ("Integral gain of the yaw rate", "", 0.1, 0, 1),
-    "MC_YAWRATE_MAX": ("Fastest turn that is asked for", "deg/s", 200.0, 0, 1800),
+    "MC_YAWRATE_MAX": ("Fastest turn that is requested", "deg/s", 200.0, 0, 1800),
     "MC_AIRMODE": ("Torque at low thrust", "", 0, None, None),
 }
 

@@ -16,7 +16,7 @@ C = "/api/v1/components/1/1"
 
 @asynccontextmanager
 async def service(*links: Any, **options: Any) -> AsyncIterator[tuple[Hub, httpx.AsyncClient]]:
-    """An open hub and a client of it; without a cache, and without fetches that nobody asked for."""
+    """An open hub and a client of it; without a cache, and without fetches that no test requested."""
     async with (
         Hub(links, **{"cache": False, "fetches": False} | options) as hub,
         a_browser(create_app(hub)) as browser,
@@ -25,7 +25,7 @@ async def service(*links: Any, **options: Any) -> AsyncIterator[tuple[Hub, httpx
 
 
 async def met(browser: httpx.AsyncClient, **sought: Any) -> dict[str, Any]:
-    """The component that is heard first."""
+    """The component that is found first."""
     answer = await browser.post("/api/v1/find", json=sought)
     assert answer.status_code == 200, answer.text
     found: dict[str, Any] = answer.json()
@@ -36,9 +36,9 @@ def problem(answer: httpx.Response, status: int, kind: str) -> dict[str, Any]:
     """What an answer says that is a problem of this kind."""
     assert answer.status_code == status, answer.text
     assert answer.headers["content-type"] == "application/problem+json"
-    told: dict[str, Any] = answer.json()
-    assert told["type"] == f"urn:paramclient:{kind}"
-    assert told["status"] == status
-    assert told["title"]
-    assert told["detail"]
-    return told
+    reported: dict[str, Any] = answer.json()
+    assert reported["type"] == f"urn:paramclient:{kind}"
+    assert reported["status"] == status
+    assert reported["title"]
+    assert reported["detail"]
+    return reported

@@ -45,7 +45,7 @@ class SimulatedTimeLoop(asyncio.SelectorEventLoop):
 
     Attributes:
         now: its clock.
-        ahead: seconds that the time of day, as the cache is told it, is ahead of that.
+        ahead: seconds that the time of day, as the cache receives it, is ahead of that.
         threads: calls in threads that are under way.
         has_run_action: whether the last `run_between_rounds` met its task still at work.
     """
@@ -80,7 +80,7 @@ class SimulatedTimeLoop(asyncio.SelectorEventLoop):
         await waiter
 
     def wake_settled(self) -> bool:
-        """Whether somebody waited for nothing to happen."""
+        """Whether a caller waited for nothing to happen."""
         waiters, self._settled_waiters = self._settled_waiters, []
         for waiter in waiters:
             if not waiter.done():
@@ -174,13 +174,13 @@ class Tap:
     """An endpoint through which another one speaks: it listens, and can hold either direction up.
 
     Attributes:
-        heard: what the station has sent: when, the frame, the message.
-        is_deaf: the endpoint hears nothing.
-        is_mute: nothing that it says comes through.
+        received: what the station has sent: time, frame, message.
+        is_deaf: the endpoint receives nothing.
+        is_mute: nothing that it sends arrives.
     """
 
     def __init__(self, endpoint: Endpoint) -> None:
-        self.heard: list[tuple[float, wire.Frame, wire.Message]] = []
+        self.received: list[tuple[float, wire.Frame, wire.Message]] = []
         self.is_deaf = False
         self.is_mute = False
         self._endpoint = endpoint
@@ -188,13 +188,13 @@ class Tap:
 
     def messages(self, kind: type[T]) -> list[T]:
         """What the station has sent, of one kind."""
-        return [message for _, _, message in self.heard if isinstance(message, kind)]
+        return [message for _, _, message in self.received if isinstance(message, kind)]
 
     def receive(self, data: bytes, now: float) -> None:
         for frame in self._framer.receive(data):
             message = wire.decode(frame)
             assert message is not None
-            self.heard.append((now, frame, message))
+            self.received.append((now, frame, message))
         if not self.is_deaf:
             self._endpoint.receive(data, now)
 
@@ -220,7 +220,7 @@ class Clock:
 
 
 class Late:
-    """A vehicle that is switched on later than the link is opened, or was heard before and falls silent.
+    """A vehicle that is switched on later than the link is opened, or was present before and falls silent.
 
     Args:
         endpoint: the vehicle.
@@ -256,7 +256,7 @@ class Late:
 
 
 class Radio(Tap):
-    """A channel that another station shares: what it sends is heard by the endpoint and by us.
+    """A channel that another station shares: the endpoint and we receive what it sends.
 
     Attributes:
         other: the other station's frames that are still to be sent.
@@ -286,25 +286,25 @@ class PeersLink:
     def __init__(self, endpoints: Mapping[Peer, Endpoint], name: str = "udpin:peers:14550") -> None:
         self.name = name
         self.endpoints = dict(endpoints)
-        self._news: anyio.Event | None = None
+        self._activity: anyio.Event | None = None
 
     async def open(self) -> None:
         await anyio.lowlevel.checkpoint()
-        self._news = anyio.Event()
+        self._activity = anyio.Event()
 
     async def receive(self) -> list[tuple[Peer, bytes]]:
-        while self._news is not None:
+        while self._activity is not None:
             now = anyio.current_time()
             for endpoint in self.endpoints.values():
                 endpoint.tick(now)
-            came = [(peer, data) for peer, each in self.endpoints.items() for data in each.data_to_send()]
-            if came:
+            received = [(peer, data) for peer, each in self.endpoints.items() for data in each.data_to_send()]
+            if received:
                 await anyio.lowlevel.checkpoint()
-                return came
+                return received
             due = [at for each in self.endpoints.values() if (at := each.next_deadline()) is not None]
-            self._news = anyio.Event()
+            self._activity = anyio.Event()
             with anyio.move_on_after(max(min(due, default=now + 1.0) - now, 0.0)):
-                await self._news.wait()
+                await self._activity.wait()
         raise LinkError(f"{self.name}: not open", link=self.name)
 
     async def send(self, data: bytes, peer: Peer | None) -> None:
@@ -316,11 +316,11 @@ class PeersLink:
 
     async def close(self) -> None:
         self._wake()
-        self._news = None
+        self._activity = None
 
     def _wake(self) -> None:
-        if self._news is not None:
-            self._news.set()
+        if self._activity is not None:
+            self._activity.set()
 
 
 class FlakyLink(SimLink):
@@ -328,7 +328,7 @@ class FlakyLink(SimLink):
 
     Attributes:
         is_offline: whether it cannot be opened now.
-        openings: how often somebody tried.
+        openings: how often a caller tried.
     """
 
     reconnects = True
@@ -393,9 +393,9 @@ def tasks_beside() -> set[str]:
 
 
 async def until(condition: Callable[[], object], pause: float = 0.001) -> None:
-    """Wait until something has come about of which nobody tells."""
+    """Wait until a condition holds that no event reports."""
     with anyio.fail_after(TIMEOUT):
-        while not condition():  # noqa: ASYNC110 - nobody tells
+        while not condition():  # noqa: ASYNC110 - no event reports it
             await asyncio.sleep(pause)
 
 

@@ -89,7 +89,7 @@ class Simulation:
     Attributes:
         now: seconds.
         sent: everything that the station has sent, with the time.
-        events: everything that it told of.
+        events: all reported events.
     """
 
     def __init__(self, *vehicles: Endpoint, air: Air | None = None, station: Station | None = None) -> None:
@@ -169,7 +169,7 @@ class Simulation:
         self.exchange()
         while not condition():
             self.now = min(self.station.next_deadline(), self._air_deadline())
-            assert self.now <= end, f"nothing came of it in {limit} s"
+            assert self.now <= end, f"no result in {limit} s"
             self.air.tick(self.now)
             self.exchange()
 

@@ -1,8 +1,8 @@
 """Thousands of the sessions of `test_machine.py`, seeded, on all cores: what `make soak` runs.
 
 Hypothesis draws the sessions of one seed, always the same ones, and the next seed draws others. A failure is
-told with its seed; `python -m tests.soak --seed N` runs just those sessions again and looks for the shortest
-one that fails.
+reported with its seed; `python -m tests.soak --seed N` runs just those sessions again and looks for the
+shortest one that fails.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def run_one(number: int, *, sessions: int = PER_SEED, shrinks: bool = False) -> 
 
     try:
         run_state_machine_as_test(Seeded, settings=chosen)
-    except Exception:  # whatever it is, it is a failure to tell of
+    except Exception:  # any exception is a failure to report
         failure = traceback.format_exc()
     return Outcome(number, Sessions.begun_sessions - before, failure)
 

@@ -50,17 +50,17 @@ class Log:
     def list(self, **values: int) -> Self:
         self.values |= values
         for index, name in enumerate(self.values):
-            self.tell(name, index)
+            self.report(name, index)
         return self
 
-    def tell(self, name: str, index: int = 65535, **values: int) -> Self:
+    def report(self, name: str, index: int = 65535, **values: int) -> Self:
         self.values |= values
         count = len(self.values)
         kind = ParamType.INT32
         return self.say(param_value(name, self.values[name], index=index, count=count, kind=kind))
 
     def change(self, name: str, value: int) -> Self:
-        return self.tell(name, **{name: value})
+        return self.report(name, **{name: value})
 
     def set(self, name: str, value: int) -> Self:
         raw = encode_value(value, ParamType.INT32, Encoding.BYTEWISE)

@@ -89,7 +89,7 @@ def test_the_oracle_by_file_waits_one_round_trip_for_what_was_lost(
 def test_service_prints_what_many_clients_at_once_cost() -> None:
     text = bench("service", "--listeners", "4", "--reads", "20", "--seconds", "1")
     assert re.search(
-        r"^4 listeners: 4 were told of every one of [\d,]+ events or more, in order: met$", text, re.MULTILINE
+        r"^4 listeners: 4 received every one of [\d,]+ events or more, in order: met$", text, re.MULTILINE
     )
     assert re.search(r"^20 reads at 20 a second, .*ms for the slowest of 100", text, re.MULTILINE), text
     assert re.search(r"^\d\.\d\d of a core in 1\.0 s", text, re.MULTILINE), text

@@ -1,4 +1,5 @@
-"""The rules that keep the rooms apart, read from the source: who may import whom, what the core may touch."""
+"""The rules that keep the rooms apart, read from the source: which room may import which, what the core may
+touch."""
 
 from __future__ import annotations
 
@@ -73,7 +74,7 @@ MAY_IMPORT = {
 public face. What is not named, command and service, may import all of these, and none of these imports it."""
 
 PURE = ("errors", "model", "protocol", "sim", "provision.planning")
-"""Rooms without input and output: time comes in as an argument, bytes as bytes."""
+"""Rooms without input and output: time and bytes are arguments."""
 
 IMPURE_MODULES = {
     *("anyio", "asyncio", "trio", "sniffio", "concurrent", "multiprocessing", "threading", "queue", "sched"),
@@ -201,7 +202,7 @@ COUNTERPARTS = {
     "extended": "extended parameters: on the wire, in the command",
     "fetch": "a fetch: of parameters, of extended ones",
     "fleet": "several vehicles: in the cache, as a command, as a document, in a set-up",
-    "formats": "the format of a file, told by its content: parameters, metadata",
+    "formats": "the format of a file, recognized by its content: parameters, metadata",
     "history": "the history: the command, its document, its route",
     "link": "a link: bytes, the command, its document, over a service, in the service",
     "metadata": "metadata: the command, the route, of simulated vehicles",
@@ -210,7 +211,7 @@ COUNTERPARTS = {
     "paramset": "a set of parameters: plain data, its document",
     "passive": "what others request: files over MAVFTP, tables",
     "ports": "serial ports: the list, the command",
-    "problems": "errors of the service: told by it, understood by its client",
+    "problems": "errors of the service: reported by it, raised by its client",
     "px4": "what is PX4's: its metadata, its simulated vehicle",
     "reads": "reads: of parameters, of extended ones",
     "results": "results: of a set-up, as documents, printed",
@@ -348,7 +349,7 @@ def test_private_names_are_found(program: str, found: list[str]) -> None:
     assert [name for name, _ in private_names_in(ast.parse(program))] == found
 
 
-def test_the_simulators_load_only_when_a_link_asks_for_them() -> None:
+def test_the_simulators_load_only_with_a_simulated_link() -> None:
     for module in MODULES:
         if not is_pure(module) and not is_command(module) and module != "paramclient.testing":
             for target, each in own_imports_of(module):
@@ -470,8 +471,8 @@ def test_every_module_says_what_it_is(module: str) -> None:
 @pytest.mark.parametrize("package", [name for name, path in MODULES.items() if path.stem == "__init__"])
 def test_every_package_names_what_is_in_it(package: str) -> None:
     inside = {name.rpartition(".")[2] for name in MODULES if name.rpartition(".")[0] == package}
-    told = ast.get_docstring(source_of(package)) or ""
-    assert {name for name in inside if not name.startswith("_")} <= set(re.findall(r"`(\w+)`", told))
+    reported = ast.get_docstring(source_of(package)) or ""
+    assert {name for name in inside if not name.startswith("_")} <= set(re.findall(r"`(\w+)`", reported))
 
 
 @EVERY_MODULE

@@ -537,10 +537,10 @@ def test_every_type_in_a_public_signature_is_public(module: ModuleType) -> None:
     hidden = set()
     for name in module.__all__:
         member = getattr(module, name)
-        told = annotations_of(member) if isinstance(member, type) else []
+        reported = annotations_of(member) if isinstance(member, type) else []
         if inspect.isfunction(member):
-            told = [("", str(text), member.__module__) for text in member.__annotations__.values()]
-        for attribute, text, place in told:
+            reported = [("", str(text), member.__module__) for text in member.__annotations__.values()]
+        for attribute, text, place in reported:
             where = f"{name}.{attribute}".rstrip(".")
             if (attribute.startswith("_") and attribute != "__init__") or where in MADE_BY_THE_LIBRARY:
                 continue

@@ -264,11 +264,11 @@ def test_values_that_a_vehicle_changes_itself_are_no_difference(tmp_path: Path) 
         "LND_FLIGHT_T_LO": param("LND_FLIGHT_T_LO", 5),
         "MAV_TYPE": param("MAV_TYPE", 1),
     }
-    wrong, moved = journal.differences(after)
+    wrong, changed = journal.differences(after)
     assert wrong == ["MAV_TYPE was 2, is 1", "SYS_HITL was 0, is absent"]
-    assert moved == ["CAL_BARO1_ID", "LND_FLIGHT_T_LO"]
+    assert changed == ["CAL_BARO1_ID", "LND_FLIGHT_T_LO"]
     journal.kind = "ardupilot"
-    assert not journal.comes_and_goes("CAL_BARO1_ID")
+    assert not journal.appears_and_disappears("CAL_BARO1_ID")
 
 
 # The relay's end towards the vehicle
@@ -293,24 +293,24 @@ def through(vehicle: RealVehicle, now: float = 1.0) -> list[bytes]:
 def test_a_stream_is_cut_into_frames() -> None:
     vehicle = RealVehicle(is_stream=True)
     data = HEARTBEAT * 3
-    vehicle.came(data[:30], "peer", 0.5)
-    vehicle.came(data[30:], "peer", 0.6)
+    vehicle.take_data(data[:30], "peer", 0.5)
+    vehicle.take_data(data[30:], "peer", 0.6)
     assert through(vehicle) == [HEARTBEAT] * 3
 
 
 def test_a_datagram_stays_one() -> None:
     vehicle = RealVehicle(is_stream=False)
-    vehicle.came(HEARTBEAT * 2, "peer", 0.5)
+    vehicle.take_data(HEARTBEAT * 2, "peer", 0.5)
     assert through(vehicle) == [HEARTBEAT * 2]
 
 
-def test_telemetry_is_left_out_where_that_is_asked_for() -> None:
+def test_telemetry_is_left_out_on_request() -> None:
     attitude = bytearray(HEARTBEAT)
     attitude[7] = ATTITUDE_ID
     vehicle = RealVehicle(is_stream=False)
     vehicle.change(Conditions(drops_telemetry=True))
-    vehicle.came(bytes(attitude), "peer", 0.5)
-    vehicle.came(HEARTBEAT, "peer", 0.5)
+    vehicle.take_data(bytes(attitude), "peer", 0.5)
+    vehicle.take_data(HEARTBEAT, "peer", 0.5)
     assert through(vehicle) == [HEARTBEAT]
 
 
@@ -346,8 +346,8 @@ def test_a_file_is_refused_in_the_place_of_the_vehicle() -> None:
 
 def test_the_first_request_is_noted() -> None:
     vehicle = RealVehicle(is_stream=False)
-    vehicle.asked(HEARTBEAT, 0.5)
+    vehicle.take_request(HEARTBEAT, 0.5)
     assert vehicle.first_request_at is None
-    vehicle.asked(LIST_REQUEST, 0.7)
-    vehicle.asked(LIST_REQUEST, 0.9)
+    vehicle.take_request(LIST_REQUEST, 0.7)
+    vehicle.take_request(LIST_REQUEST, 0.9)
     assert vehicle.first_request_at == 0.7

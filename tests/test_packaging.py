@@ -74,7 +74,7 @@ def test_the_command_is_an_entry_point(wheel: dict[str, bytes]) -> None:
 
 
 def test_pytest_finds_the_plugin(wheel: dict[str, bytes], tmp_path: Path) -> None:
-    """Installed, and not asked for: the files of the wheel, where Python looks for libraries."""
+    """Not installed by default: the files of the wheel, where Python looks for libraries."""
     for name, content in wheel.items():
         (tmp_path / "site" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "site" / name).write_bytes(content)

@@ -93,20 +93,20 @@ def test_text_is_readable_on_the_pages(pictures: ModuleType, look: str, ground: 
 
 
 def test_both_pages_show_the_pictures_with_their_figures_as_text(pictures: ModuleType) -> None:
-    told = pictures.alternative_text(pictures.downloads_in(README))
+    reported = pictures.alternative_text(pictures.downloads_in(README))
     [shown] = re.findall(r"<picture>\n(.*?)</picture>", README, re.DOTALL)
     assert re.findall(r'(?:src|srcset)="([^"]*)"', shown) == [
         *("docs/images/downloads-dark.svg", "docs/images/downloads-light.svg")
     ]
     assert 'media="(prefers-color-scheme: dark)"' in shown
-    assert re.findall(r'alt="([^"]*)"', shown) == [told], "the text of the picture is an old one"
+    assert re.findall(r'alt="([^"]*)"', shown) == [reported], "the text of the picture is an old one"
     index = (ROOT / "docs/index.md").read_text(encoding="utf-8")
     images = re.findall(
         r"^```\{image\} images/downloads-(\w+)\.svg\n:class: only-(\w+)\n.*\n:alt: (.*)\n```$",
         index,
         re.MULTILINE,
     )
-    assert images == [(look, look, told) for look in LOOKS]
+    assert images == [(look, look, reported) for look in LOOKS]
     assert index.index("{image}") < index.index("{toctree}")
 
 

@@ -135,7 +135,7 @@ def test_the_package_loads_with_the_first_test_that_uses_a_fixture(suite: Suite)
 
 
 @in_simulated_time
-async def test_a_radio_loses_what_it_is_asked_to() -> None:
+async def test_a_simulated_radio_has_the_configured_loss() -> None:
     px4 = sim_px4(table=TABLE, loss=0.3, seed=3)
     async with ParamClient(px4, cache=False) as client:
         vehicle = await client.component()

@@ -78,13 +78,13 @@ def silences() -> list[str]:
         noisy = station_on(link)
         noisy.receive(bytes(1500), "peer", 1.0)
         found.append(hint_of_link(noisy, link))
-    heard: list[list[tuple[Message, int, int]]] = [
+    received: list[list[tuple[Message, int, int]]] = [
         [(GCS, 252, 190)],
         [(GCS, 255, 190)],
         [(PX4, 3, 1), (GCS, 252, 190)],
         [(TEXT, 7, 1)],
     ]
-    for frames in heard:
+    for frames in received:
         station = station_on()
         for message, system, component in frames:
             hear(station, message, system, component)

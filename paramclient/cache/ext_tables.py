@@ -2,7 +2,7 @@
 
 The rules are those of plain tables, without a hash: the later of two observations
 of a value counts, and every change of a stored value leaves a line of history in the same transaction. An
-observation that comes later than a newer one is dropped.
+observation that arrives after a newer one is dropped.
 """
 
 from __future__ import annotations

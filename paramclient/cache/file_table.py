@@ -61,7 +61,7 @@ class AddedTable:
 
 @dataclass(frozen=True)
 class _Reference:
-    """What cached tables tell about the parameters of a firmware.
+    """What cached tables contain about the parameters of a firmware.
 
     Attributes:
         name: the table that the other attributes are of, in words; "" without one.
@@ -207,7 +207,7 @@ class FileTable:
                 f"{reference.name} lacks them" if reference.rows else "no cached table of its firmware does"
             )
             raise UsageError(
-                f"{self.params.source or 'the file'} does not tell the types of its parameters, and {where}: "
+                f"{self.params.source or 'the file'} has no types of its parameters, and {where}: "
                 f"{first_of(unknown, ADDED_NAMES_MAX)}. Fetch the vehicle, or another one with its firmware, "
                 "once; or use a file with types (.params, .pck, .json, .yaml)"
             )

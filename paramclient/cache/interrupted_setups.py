@@ -45,11 +45,11 @@ class InterruptedSetup:
         kind: "apply" or "restore".
         key: key of the vehicle in the cache, or None if it was not known yet.
         link, system, component: link and ids of the vehicle.
-        asked_by: the user who has requested it.
+        requested_by: the user who has requested it.
         began: start time, in unix seconds.
         at: last time at which it was known to run, in unix seconds.
         done, total: values written by then, and known values to write.
-        is_told: whether it was reported already.
+        is_reported: whether it was reported already.
     """
 
     id: str
@@ -58,12 +58,12 @@ class InterruptedSetup:
     link: str
     system: int
     component: int
-    asked_by: str
+    requested_by: str
     began: float
     at: float
     done: int = 0
     total: int = 0
-    is_told: bool = False
+    is_reported: bool = False
 
 
 class RunningSetup:
@@ -131,7 +131,15 @@ class SetupNotes:
         return cls(Path(cache).with_suffix(".setups"))
 
     def begin(
-        self, name: str, kind: str, *, link: str, system: int, component: int, asked_by: str, key: str | None
+        self,
+        name: str,
+        kind: str,
+        *,
+        link: str,
+        system: int,
+        component: int,
+        requested_by: str,
+        key: str | None,
     ) -> RunningSetup:
         """Write a note about a new set-up, and sync it to the disk.
 
@@ -139,14 +147,14 @@ class SetupNotes:
             name: id of the set-up.
             kind: "apply" or "restore".
             link, system, component: link and ids of the vehicle.
-            asked_by: the user who has requested it.
+            requested_by: the user who has requested it.
             key: key of the vehicle in the cache, or None.
 
         Raises:
             CacheError: the note cannot be written.
         """
         now = self._clock()
-        begun = InterruptedSetup(name, kind, key, link, system, component, asked_by, now, now)
+        begun = InterruptedSetup(name, kind, key, link, system, component, requested_by, now, now)
         path = self.folder / f"{name}{_SUFFIX}"
         try:
             self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -167,23 +175,23 @@ class SetupNotes:
             ) from error
         return RunningSetup(path, descriptor, self._clock)
 
-    def cut_off(self, *, tells: bool = False) -> list[InterruptedSetup]:
+    def cut_off(self, *, mark_reported: bool = False) -> list[InterruptedSetup]:
         """Return the interrupted set-ups, the oldest first; empty if the folder does not exist.
 
         Args:
-            tells: mark them as reported, and delete the oldest beyond `INTERRUPTED_MAX`.
+            mark_reported: mark them as reported, and delete the oldest beyond `INTERRUPTED_MAX`.
         """
         paths: list[Path] = []
         with suppress(FileNotFoundError):
             paths = [path for path in self.folder.iterdir() if path.suffix == _SUFFIX]
-        read = [self._read(path, tells=tells) for path in paths]
+        read = [self._read(path, mark_reported=mark_reported) for path in paths]
         found = sorted(filter(None, read), key=lambda note: note.at)
-        if tells:
+        if mark_reported:
             for note in found[:-INTERRUPTED_MAX]:
                 (self.folder / f"{note.id}{_SUFFIX}").unlink(missing_ok=True)
         return found[-INTERRUPTED_MAX:]
 
-    def _read(self, path: Path, *, tells: bool) -> InterruptedSetup | None:
+    def _read(self, path: Path, *, mark_reported: bool) -> InterruptedSetup | None:
         """Return the note in a file; None if its set-up is running, or the file is not a note."""
         try:
             descriptor = os.open(path, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0))
@@ -195,8 +203,8 @@ class SetupNotes:
             note = _parsed(os.read(descriptor, NOTE_BYTES_MAX))
             if note is None or note.id != path.stem:
                 return None
-            if tells and not note.is_told:
-                os.write(descriptor, _line({"is_told": True}))
+            if mark_reported and not note.is_reported:
+                os.write(descriptor, _line({"is_reported": True}))
             return note
         except OSError as error:
             logger.warning("%s cannot be read: %s", path, error.strerror)
@@ -217,7 +225,7 @@ def _parsed(data: bytes) -> InterruptedSetup | None:
             break
     try:
         entry |= {name: kind(entry[name]) for name, kind in kinds.items() if name in entry}
-        texts = [entry[name] for name in ("id", "kind", "link", "asked_by")]
+        texts = [entry[name] for name in ("id", "kind", "link", "requested_by")]
         if not all(isinstance(text, str) for text in texts) or not isinstance(entry["key"], str | None):
             return None
         return InterruptedSetup(**entry)

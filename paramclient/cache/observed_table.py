@@ -49,7 +49,7 @@ class UnixTimes:
 class ObservedParams(Sequence[StoredParam]):
     """Parameters of a live table to store. Each `StoredParam` is created on access.
 
-    A write of a whole table creates none: its columns come from the packed values of the table.
+    A write of a whole table creates none: its columns are the packed values of the table.
 
     Args:
         params: a copy of the table's parameters, with the times of the observations.

@@ -42,7 +42,7 @@ _CHARACTERS: Final = 0x110000
 _COLUMNS: Final = dict(zip(COLUMN_NAMES, COLUMNS, strict=True))
 _OPTIONAL: Final = tuple(column for column in COLUMNS if column.is_optional)
 _HAS: Final = "has "
-"""Before the name of an optional column: the bytes that tell which parameters have it."""
+"""Before the name of an optional column: the bytes that show which parameters have it."""
 
 S = TypeVar("S", bound=Sequence[float])
 

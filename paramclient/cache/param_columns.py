@@ -123,7 +123,7 @@ class StoredParam(_Fields):
         bits: the value's bits, as a signed integer.
         is_raw: 1 if the value is only known as the four bytes of the message.
         param_index: index, or None.
-        volatile: 1 if the vehicle's hash excludes the parameter; None if an observation does not tell.
+        volatile: 1 if the vehicle's hash excludes the parameter; None if an observation does not say.
         heard_at: time of the observation, in unix seconds.
         default_bits: bits of the firmware's default, or None.
         by: author of the observation; "" for a stored parameter.
@@ -187,7 +187,7 @@ class StoredParam(_Fields):
         """Return this observation as it is stored in place of the stored one.
 
         Args:
-            old: the stored parameter, or None. It provides the flag that the observation does not tell.
+            old: the stored parameter, or None. It provides the flag that the observation lacks.
             keeps_index: whether it also provides the index.
         """
         index, volatile = self[_INDEX:_HEARD_AT]

@@ -393,13 +393,13 @@ class PostgresTransaction(Transaction):
         for owner, names in named.items():
             by_names[tuple(names)].append(owner)
         for names, some in by_names.items():
-            asked = (some, list(names))
+            query_arguments = (some, list(names))
             for what, select in (
                 ("heard", "SELECT owner, name, 0, heard_at FROM param WHERE {}"),
                 ("line", _LAST.format("history", "id")),
                 ("birth", _LAST.format("birth", "line")),
             ):
-                rows = self._all(select.format("owner = ANY (?) AND name = ANY (?)"), asked)
+                rows = self._all(select.format("owner = ANY (?) AND name = ANY (?)"), query_arguments)
                 found += [(owner, name, what, line, at) for owner, name, line, at in rows]
         return found
 

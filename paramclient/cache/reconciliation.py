@@ -88,11 +88,11 @@ class TableHistory:
             if line.name == name:
                 ahead = line.new
         is_known = ahead is not None
-        has_come_back = ahead is not None and ahead[0] is None  # with this value, or an older one
+        has_returned = ahead is not None and ahead[0] is None  # with this value, or an older one
         if place is None:
             if kept is None or seen.same_value(kept):
                 return
-            if has_come_back:
+            if has_returned:
                 self._insert(HistoryLine.of(kept.heard_at, name, BY_VEHICLE, seen.value, kept.value))
                 return
             since = self._added_at(name, self.known_since)
@@ -105,7 +105,7 @@ class TableHistory:
             return
         number, line = self.lines[place]
         later, old, new = line.at, line.old, line.new
-        if seen.has_value(old) or has_come_back:  # the time at which it became `old` is not known
+        if seen.has_value(old) or has_returned:  # the time at which it became `old` is not known
             return
         added_at = self._added_at(name)
         if added_at is not None and at < added_at <= later and not is_known:  # it was `old` at `added_at`
@@ -356,5 +356,5 @@ def _respectful(update: TableUpdate, table: CachedSummary) -> TableState | None:
     state = update.table
     if state is None or state.complete or update.replace or not table.complete:
         return state
-    has_heard_less = state.count == table.count or (state.count is None and not update.params)
-    return None if has_heard_less else state
+    has_received_less = state.count == table.count or (state.count is None and not update.params)
+    return None if has_received_less else state

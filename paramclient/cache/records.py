@@ -212,7 +212,7 @@ class CachedSummary:
         autopilot: MAV_AUTOPILOT of this component's heartbeat.
         size: number of cached parameters.
         hash, count, complete, volatile_known, synced_at, file_works: as in `TableState`.
-        source: the file from which the table was added; None if it came from the vehicle, or the vehicle has
+        source: the file from which the table was added; None if the vehicle sent it, or the vehicle has
             confirmed it since.
         updated_at: time of the last write to the table.
     """

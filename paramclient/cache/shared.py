@@ -275,7 +275,7 @@ class _Connection:
         if old is not None:
             old.close()
         if before:
-            self._tell({key for key in {*before, *revisions} if before.get(key) != revisions.get(key)})
+            self._notify({key for key in {*before, *revisions} if before.get(key) != revisions.get(key)})
         self._wake_listener()
 
     def _begin_copy(self) -> None:
@@ -441,9 +441,9 @@ class _Connection:
             kept = self._kept()
             with self._state:
                 self._stale_keys |= changed & kept.keys()
-            self._tell(changed)
+            self._notify(changed)
 
-    def _tell(self, changed: set[tuple[str, int]]) -> None:
+    def _notify(self, changed: set[tuple[str, int]]) -> None:
         for key, component in sorted(changed):
             for callback in list(self._subscribers):
                 try:

@@ -103,7 +103,7 @@ class _Newer(Damaged):
     kind = "newer"
 
 
-class _Moved(Exception):
+class _FileReplaced(Exception):
     """The checked or written file is no longer the one under the path."""
 
 
@@ -202,7 +202,7 @@ class Database:
                 except _Empty:
                     self._drop()
                     return work(self._template())
-                except _Moved:
+                except _FileReplaced:
                     self.replacements += 1
                     self._drop()
                 except Damaged as damage:
@@ -240,7 +240,7 @@ class Database:
         except UnicodeDecodeError as error:
             raise Damaged(str(error)) from error
         if writing and self._which() != self._file:
-            raise _Moved
+            raise _FileReplaced
         if self._for_once:
             self._drop()
         return result
@@ -280,7 +280,7 @@ class Database:
             self._file = self._which()
             if self._is_absent():
                 if not writing:
-                    raise _Moved
+                    raise _FileReplaced
                 self._check_alone()
                 os.close(os.open(self.path, os.O_CREAT | os.O_WRONLY, 0o600))
                 self.replacements += 1

@@ -63,9 +63,9 @@ class ParamCache:
 
     For a database (`postgresql://USER@HOST/NAME`), the tables that this program uses are also in a local
     copy. While the database cannot be reached, reads and writes use the local copy, `offline_reason` has the
-    reason, and a warning is logged. After the reconnection, queued writes are executed in the database in order, each
-    exactly once. Several stations that receive one vehicle write to one table: the later observation of a
-    value counts, and the history has both. The clocks of the stations have to agree.
+    reason, and a warning is logged. After the reconnection, queued writes are executed in the database in
+    order, each exactly once. Several stations that receive one vehicle write to one table: the later
+    observation of a value counts, and the history has both. The clocks of the stations have to agree.
 
     Args:
         path: the file; None for `default_path()`; or the URL of a database.
@@ -166,7 +166,7 @@ class ParamCache:
     ) -> None:
         """Write updates of extended parameters, in one transaction.
 
-        The later of two observations of a parameter counts; an older one that comes later is dropped. A
+        The later of two observations of a parameter counts; an older one that arrives later is dropped. A
         changed or removed value leaves a line of history.
 
         Args:
@@ -386,7 +386,7 @@ class ParamCache:
             force: replace a table that was received later than `at`: the values then have the present time.
 
         Raises:
-            UsageError: the file is empty, does not tell its vehicle, lacks types that no cached table has, or
+            UsageError: the file is empty, does not name its vehicle, lacks types that no cached table has, or
                 has an invalid value; or the table was received later, and `force` is not given.
             UnknownVehicle: no vehicle in the cache has this name.
             AmbiguousVehicle: several vehicles have this name.
@@ -402,7 +402,7 @@ class ParamCache:
                 identity = self._named(transaction, identity, params.identity)
             elif identity is None:
                 what = params.source or "the file"
-                raise UsageError(f"{what} does not tell its vehicle; name one of the cache")
+                raise UsageError(f"{what} does not name its vehicle; name one of the cache")
             kept = next((each for _, each in transaction.summaries(identity.key, number)), None)
             since = moment
             if kept is not None and kept.size:

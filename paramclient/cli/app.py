@@ -39,7 +39,7 @@ def run(arguments: Sequence[str]) -> int:
                 printer.show_steps()
             call = partial(command, *bound.args, **bound.kwargs)
             work = call if inspect.iscoroutinefunction(command) else call()
-            # a subcommand that has asked the user something returns the function to await after that
+            # a subcommand that has asked the user a question returns the function to await after that
             code = anyio.run(_until_signal, work) if callable(work) else work
         except CycloptsError as error:
             report(_usage_text(error))

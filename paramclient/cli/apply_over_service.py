@@ -307,11 +307,11 @@ class _SetUp:
         try:
             with progress_bar(f"{title} {self.vehicle.label}") as draw:
 
-                def tell(progress: Mapping[str, Any]) -> None:
+                def report_progress(progress: Mapping[str, Any]) -> None:
                     if draw is not None:
                         draw(_progress_of(progress, anyio.current_time() - began))
 
-                state = await self._ended(job, tell)
+                state = await self._ended(job, report_progress)
         except anyio.get_cancelled_exc_class():
             with anyio.CancelScope(shield=True):
                 await self._cancel(job)
@@ -324,15 +324,15 @@ class _SetUp:
         return ApplyResultDoc.model_validate(state["result"])
 
     async def _ended(
-        self, job: str, tell: Callable[[Mapping[str, Any]], None] | None = None
+        self, job: str, report_progress: Callable[[Mapping[str, Any]], None] | None = None
     ) -> Mapping[str, Any]:
         """Wait for the end of a job, and return its last state."""
         while True:
             state = await self.component.read_job(job)
             if state["state"] != "running":
                 return state
-            if tell is not None and state["progress"] is not None:
-                tell(state["progress"])
+            if report_progress is not None and state["progress"] is not None:
+                report_progress(state["progress"])
             await anyio.sleep(JOB_POLL_INTERVAL)
 
     async def _cancel(self, job: str) -> None:

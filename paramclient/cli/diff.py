@@ -70,8 +70,8 @@ async def diff(
         metadata: A file that describes parameters. Default: the stored metadata of the vehicles' firmware.
         extended: Use extended parameters (PARAM_EXT_*), such as those of a camera.
     """
-    is_told = extended or is_extended_source(left) or is_extended_source(right)
-    if is_told or (base is None and not only and await are_extended((left, right), options)):
+    is_extended = extended or is_extended_source(left) or is_extended_source(right)
+    if is_extended or (base is None and not only and await are_extended((left, right), options)):
         if base is not None or only or renames is not None or metadata is not None:
             raise UsageError("--base, --only, --renames and --metadata are for plain parameters")
         return await diff_extended(left, right, options, partial=partial, everything=everything)

@@ -150,7 +150,7 @@ def _entry_cells(entry: HistoryEntry) -> tuple[object, ...]:
 
 def _cut_off_cells(note: InterruptedSetup) -> tuple[object, ...]:
     progress = f"{note.done} of {note.total} values" if note.total else "nothing written"
-    return local_time(note.at), note.component, f"({note.kind} cut off)", None, progress, note.asked_by
+    return local_time(note.at), note.component, f"({note.kind} cut off)", None, progress, note.requested_by
 
 
 def _reason(each: SnapshotSummary) -> str:

@@ -101,15 +101,15 @@ class _Samples:
     def __init__(self) -> None:
         self.losses: deque[float | None] = deque(maxlen=HISTORY_LENGTH)
         self.round_trips: deque[float | None] = deque(maxlen=HISTORY_LENGTH)
-        self._came = self._lost = self._measured = 0
+        self._frames = self._lost = self._measured = 0
         self._age = 0.0
 
     def add(
         self, traffic: ComponentTraffic, round_trip: RoundTrip | None, validity: float, elapsed: int
     ) -> None:
-        came = traffic.frames - traffic.repeated
-        arrived, lost = came - self._came, max(traffic.lost - self._lost, 0)
-        self._came, self._lost = came, traffic.lost
+        unique_frames = traffic.frames - traffic.repeated
+        arrived, lost = unique_frames - self._frames, max(traffic.lost - self._lost, 0)
+        self._frames, self._lost = unique_frames, traffic.lost
         self.losses.extend([lost / (arrived + lost) if arrived > 0 else None] * min(elapsed, HISTORY_LENGTH))
         latest = None
         if round_trip is not None and round_trip.responses:

@@ -591,11 +591,11 @@ async def _get_chosen(
         name: component.params[name] for name in chosen.names if has_pattern and name in component.params
     }
     fresh = {name: param for name, param in known.items() if param.trust is not Trust.CACHED}
-    asked = [name for name in chosen.names if name not in fresh]
+    requested = [name for name in chosen.names if name not in fresh]
     read, errors = await while_waiting(
-        lambda _: _get_all(session, asked), f"{first_of(asked, AWAITED_NAMES_MAX)} of {session.label}"
+        lambda _: _get_all(session, requested), f"{first_of(requested, AWAITED_NAMES_MAX)} of {session.label}"
     )
-    answered = [name for name in asked if name not in errors]
+    answered = [name for name in requested if name not in errors]
     found = fresh | dict(zip(answered, read, strict=True))
     return (
         [found[name] for name in chosen.names if name in found],
@@ -652,6 +652,6 @@ async def _check_watched(session: CommandSession, name_patterns: Sequence[str]) 
 
 
 async def _follow_groups(session: CommandSession) -> None:
-    """Fetch the table, so that parameters which come and go are noticed. Values were read already."""
-    with suppress(ParamClientError):  # the events and the end of the changes tell
+    """Fetch the table, so that added and removed parameters are noticed. Values were read already."""
+    with suppress(ParamClientError):  # the events and the end of the changes report it
         await session.component.fetch_all()

@@ -69,13 +69,13 @@ async def write_all(
     with _progress_until_interrupted(session, writes, show, verb if draws else None) as progress:
 
         async def write(erase: Callable[[], None]) -> SetManyResult:
-            def tell(outcome: SetOutcome) -> None:
+            def report(outcome: SetOutcome) -> None:
                 erase()
                 progress(outcome)
 
             return await session.component.set_many(
                 writes,
-                progress=tell,
+                progress=report,
                 timeout=session.deadline.left(),
                 settle=settle,
                 force=force,

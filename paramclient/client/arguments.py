@@ -16,7 +16,7 @@ __all__ = [
     "address_in_words",
     "check_accepted",
     "check_requested_name",
-    "check_asked_name",
+    "check_portable_name",
     "check_settle",
     "check_writes",
 ]
@@ -36,12 +36,12 @@ def check_requested_name(name: str | int) -> None:
         UsageError: the name is not portable, or the index is out of range.
     """
     if isinstance(name, str):
-        check_asked_name(name)
+        check_portable_name(name)
     elif not isinstance(name, int) or not 0 <= name < PARAMETERS_MAX:
         raise UsageError(f"parameter index {name}: indices are 0 to {PARAMETERS_MAX - 1}")
 
 
-def check_asked_name(name: str) -> str:
+def check_portable_name(name: str) -> str:
     """Check and return a parameter name.
 
     Raises:
@@ -67,7 +67,7 @@ def check_writes(
     pairs = values.items() if isinstance(values, Mapping) else values
     checked = []
     for name, value in pairs:
-        if check_asked_name(name) == HASH_CHECK:
+        if check_portable_name(name) == HASH_CHECK:
             raise UsageError(f"{HASH_CHECK} is read-only: it is the hash of the parameters, not a parameter")
         checked.append((name, check_value(value)))
     return checked

@@ -233,11 +233,11 @@ class FleetFetch:
                 # a traceback refers to this call, and thus to the error: a cycle
                 silent[address] = self._explained(error.with_traceback(None), address, now)
         for address, component in self._components.items():
-            is_wanted = self._system in (None, address[0])
+            is_selected = self._system in (None, address[0])
             contest = component.machine.peers.contest
-            if is_wanted and address not in self._fetches and contest is not None:
+            if is_selected and address not in self._fetches and contest is not None:
                 silent[address] = contest.error
-            elif is_wanted and address not in self._fetches and component.machine.presence.is_lost:
+            elif is_selected and address not in self._fetches and component.machine.presence.is_lost:
                 what = f"the parameters of {address[0]}/{address[1]} (lost)"
                 silent[address] = NoReply(what, attempts=0, waited=component.silence)
         if not results:
@@ -289,5 +289,5 @@ class FleetFetch:
         """Return whether a component sends messages, but no response to its fetch for this many seconds."""
         presence = self._station.components[address].presence
         since = max(fetch.begun_at + fetch.queue_wait(now), self._overdue_at.get(address, -math.inf))
-        is_heard = presence.received_at >= since or presence.is_lost or not presence.has_beaten
-        return is_heard and now - since >= timeout
+        is_present = presence.received_at >= since or presence.is_lost or not presence.has_beaten
+        return is_present and now - since >= timeout

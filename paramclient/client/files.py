@@ -61,8 +61,8 @@ class Ftp:
         what = f"the file {path}"
         files, now = self._begin(what)
         job = files.read(path, now, limit=limit)
-        tell = None if progress is None else lambda: progress(job.received, job.size)
-        return await self._wait(job, what, timeout, tell)
+        report = None if progress is None else lambda: progress(job.received, job.size)
+        return await self._wait(job, what, timeout, report)
 
     async def write(self, path: str, data: bytes, *, timeout: float | None = None) -> None:
         """Write a file, replacing an existing one.
@@ -134,13 +134,13 @@ class Ftp:
         job: FileTransferJob[Result],
         what: str,
         timeout: float | None,
-        tell: Callable[[], None] | None = None,
+        report: Callable[[], None] | None = None,
     ) -> Result:
         component = self._component
         job.is_of_caller = True
         awaited = f"{what} of {component.system}/{component.component}"
         try:
-            return await component.wait(job, timeout, lambda: (awaited, 0), tell)
+            return await component.wait(job, timeout, lambda: (awaited, 0), report)
         finally:
             component.machine.files.release(job, anyio.current_time())
             component.wake()

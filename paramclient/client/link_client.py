@@ -611,13 +611,13 @@ class LinkClient(LocalClient):
     async def _wait_until_closed(self, machine: ComponentMachine) -> None:
         carrier, files = self.link_task, machine.files
 
-        def tell(now: float) -> None:
+        def wake_waiter(now: float) -> None:
             carrier.notify()
 
         self.wake()
         while files.is_closing and not (carrier.is_disconnected or carrier.ended or machine.presence.is_lost):
-            if tell not in files.on_closed:
-                files.on_closed.append(tell)
+            if wake_waiter not in files.on_closed:
+                files.on_closed.append(wake_waiter)
             await carrier.activity.wait()
 
     @property

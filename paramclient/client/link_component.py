@@ -106,7 +106,7 @@ class LinkComponent(LocalComponent):
         self.machine = machine
         self._received_at = received_at
         self._subscriptions: weakref.WeakSet[Changes] = weakref.WeakSet()
-        machine.tells_changes = False  # until the first subscription
+        machine.reports_each_change = False  # until the first subscription
         self.system = machine.system
         self.component = machine.component
         self.params = ParamMap(machine.table.params)
@@ -273,7 +273,7 @@ class LinkComponent(LocalComponent):
         began = anyio.current_time()
         explain = _Explanations(self, began)
 
-        def tell(outcome: SetOutcome) -> None:
+        def report(outcome: SetOutcome) -> None:
             if progress is not None:
                 progress(explain.outcome(outcome))
 
@@ -282,7 +282,7 @@ class LinkComponent(LocalComponent):
         )
         try:
             self.wake()
-            outcomes = await wait_for_batch(batch, timeout, tell, self._unanswered_sets)
+            outcomes = await wait_for_batch(batch, timeout, report, self._unanswered_sets)
         finally:
             machine.write_batches.end(batch, anyio.current_time())
         failure, outcomes = explain.error(batch.failure), tuple(map(explain.outcome, outcomes))
@@ -434,7 +434,7 @@ class LinkComponent(LocalComponent):
     def listen(self, changes: Changes) -> None:
         """See `LocalComponent.listen`."""
         self._subscriptions.add(changes)
-        self.machine.tells_changes = True
+        self.machine.reports_each_change = True
         if self.client.is_over:
             changes.end(self.client.link_task.ended)
 
@@ -452,7 +452,7 @@ class LinkComponent(LocalComponent):
         """Publish a change of a parameter, or reset the state after a change of several."""
         if isinstance(event, ParamChanged):
             self._publish(event.change)
-        self.machine.tells_changes, self.machine.has_changed = len(self._subscriptions) > 0, False
+        self.machine.reports_each_change, self.machine.has_changed = len(self._subscriptions) > 0, False
 
     def _publish(self, change: Change) -> None:
         """Push a change to all streams."""

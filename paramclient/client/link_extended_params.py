@@ -13,7 +13,7 @@ from typing import Final
 import anyio
 
 from paramclient.cache import ParamCache, SnapshotSummary
-from paramclient.client.arguments import PROGRESS_CALL_INTERVAL, check_asked_name, check_requested_name
+from paramclient.client.arguments import PROGRESS_CALL_INTERVAL, check_portable_name, check_requested_name
 from paramclient.client.batch_wait import wait_for_batch
 from paramclient.client.extended_params import ExtChanges
 from paramclient.client.local import LocalComponent, LocalExtParams, wait_until_identified
@@ -109,7 +109,7 @@ class LinkExtParams(LocalExtParams):
     ) -> ExtSetResult:
         """See `ExtParams.set`."""
         machine = self._machine
-        check_asked_name(name)
+        check_portable_name(name)
         checked = check_ext_value(value)
         self._component.client.check_open()
         machine.check_uncontested()
@@ -136,7 +136,7 @@ class LinkExtParams(LocalExtParams):
     ) -> ExtSetManyResult:
         """See `ExtParams.set_many`."""
         given = values.items() if isinstance(values, Mapping) else values
-        pairs = [(check_asked_name(name), check_ext_value(value)) for name, value in given]
+        pairs = [(check_portable_name(name), check_ext_value(value)) for name, value in given]
         machine = self._machine
         self._component.client.check_open()
         machine.check_uncontested()

@@ -146,7 +146,7 @@ class LinkTask:
         self._is_processing, self._behind_since = False, math.inf
         before = drained_at = anyio.current_time()
         while True:
-            asked_at = anyio.current_time()
+            read_at = anyio.current_time()
             try:
                 chunks = await self._link.receive()
             except LinkError as error:
@@ -158,7 +158,7 @@ class LinkTask:
                 continue
             now = anyio.current_time()
             self._detect_suspend(now)
-            moments = self._moments(len(chunks), drained_at, asked_at, now)
+            moments = self._moments(len(chunks), drained_at, read_at, now)
             drained_at = now if len(chunks) < BACKLOG_DATAGRAMS_MIN else drained_at
             has_data = not chunks
             if not chunks:
@@ -184,7 +184,7 @@ class LinkTask:
                 await self._rest(min(READ_PAUSE, PAUSE_DATAGRAMS_MAX * (now - before) / max(1, len(chunks))))
             before = now
 
-    def _moments(self, count: int, drained_at: float, asked_at: float, now: float) -> Sequence[float]:
+    def _moments(self, count: int, drained_at: float, read_at: float, now: float) -> Sequence[float]:
         """Return the arrival time of each chunk of a read, by the clock of the event loop.
 
         If the link does not report arrival times and the reader was late, the time is uncertain. Each chunk
@@ -195,7 +195,7 @@ class LinkTask:
         Args:
             count: number of chunks.
             drained_at: time at which the link was last drained.
-            asked_at, now: start and end of this read.
+            read_at, now: start and end of this read.
         """
         longest = now - drained_at + self._unseen
         self._unseen = 0.0
@@ -203,7 +203,7 @@ class LinkTask:
         if len(arrived_at) == count:
             return [min(max(at, now - longest), now) for at in arrived_at]
         was_sender_late = now - self._sender_late_at < READ_GAP_MIN or now - self._due > READ_GAP_MIN
-        is_late = was_sender_late or asked_at - drained_at > READ_GAP_MIN
+        is_late = was_sender_late or read_at - drained_at > READ_GAP_MIN
         at = now - longest if is_late else now
         self._arrived_at = max(at, min(self._arrived_at + ARRIVAL_STEP, now))
         return [self._arrived_at] * count

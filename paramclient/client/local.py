@@ -99,7 +99,7 @@ class LocalClient(Protocol):
         """Wait at most one round trip until the file session that a component closes is closed on board."""
 
     def subscribe(self, events: Events) -> None:
-        """Push all further events to this stream while it is referenced. Ends it if none can come."""
+        """Push all further events to this stream while it is referenced. Ends it if none can follow."""
 
 
 class LocalExtParams(ExtParams):
@@ -107,7 +107,7 @@ class LocalExtParams(ExtParams):
 
     @abstractmethod
     def listen(self, changes: ExtChanges) -> None:
-        """Push all further changes to this stream while it is referenced. Ends it if none can come."""
+        """Push all further changes to this stream while it is referenced. Ends it if none can follow."""
 
     @abstractmethod
     def ignore(self, changes: ExtChanges) -> None:
@@ -210,7 +210,7 @@ class LocalComponent(Component):
 
     @abstractmethod
     def listen(self, changes: Changes) -> None:
-        """Push all further changes to this stream while it is referenced. Ends it if none can come."""
+        """Push all further changes to this stream while it is referenced. Ends it if none can follow."""
 
     @abstractmethod
     def ignore(self, changes: Changes) -> None:

@@ -73,7 +73,7 @@ class Worker:
             return
         self._end()
         with anyio.move_on_after(within, shield=True):
-            while thread.is_alive():  # noqa: ASYNC110 - a thread tells nobody
+            while thread.is_alive():  # noqa: ASYNC110 - a thread sets no event
                 await anyio.sleep(THREAD_END_INTERVAL)
         for call in list(self._waiting):
             call.give_up(error())
@@ -123,15 +123,15 @@ class _Call(Generic[Result]):
         except BaseException as error:
             done.set_exception(error)
         with suppress(anyio.RunFinishedError):
-            anyio.from_thread.run_sync(self._tell, done, token=self._token)
+            anyio.from_thread.run_sync(self._finish, done, token=self._token)
 
     def give_up(self, error: Exception) -> None:
         """Stop waiting for the call."""
         done: Future[Result] = Future()
         done.set_exception(error)
-        self._tell(done)
+        self._finish(done)
 
-    def _tell(self, done: Future[Result]) -> None:
+    def _finish(self, done: Future[Result]) -> None:
         if not self.ended.is_set():
             self.future = done
             del self._waiting[self]

@@ -275,14 +275,14 @@ class _Diagnosis:
             elapsed = anyio.current_time() - began
             return ListService(None, 0, elapsed, None, None, 0.0, 0, 0, False, str(error))
         now = anyio.current_time()
-        has_come = fetch.first_value_at <= now
+        has_arrived = fetch.first_value_at <= now
         return ListService(
             count=result.count,
             received=result.received,
             elapsed=now - began,
-            first=fetch.first_value_at - began if has_come else None,
+            first=fetch.first_value_at - began if has_arrived else None,
             rate=_steady_rate(fetch.first_value_at, [*arrivals, (now, result.received)], result.received),
-            longest_pause=_longest_pause(fetch.first_value_at, arrivals) if has_come else 0.0,
+            longest_pause=_longest_pause(fetch.first_value_at, arrivals) if has_arrived else 0.0,
             lost=result.lost,
             missing=len(result.missing),
             is_cut_short=not fetch.done,

@@ -89,7 +89,7 @@ class InterruptedSetupDoc(Document):
             time=time_text(note.at),
             component=note.component,
             kind=note.kind,
-            by=note.asked_by,
+            by=note.requested_by,
             done=note.done,
             total=note.total,
             at=round(note.at, 3),

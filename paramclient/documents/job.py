@@ -27,7 +27,7 @@ class JobDoc(Document):
     system: int
     component: int
     state: Literal["running", "done", "failed", "cancelled", "cut-off"]
-    asked_by: str
+    requested_by: str
     began: float
     ended: float | None
     progress: ProgressDoc | dict[str, Any] | None
@@ -48,7 +48,7 @@ class JobDoc(Document):
             system=note.system,
             component=note.component,
             state="cut-off",
-            asked_by=note.asked_by,
+            requested_by=note.requested_by,
             began=round(note.began, 3),
             ended=round(note.at, 3),
             progress={"phase": "cut-off", "done": note.done, "total": note.total},

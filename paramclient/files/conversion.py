@@ -179,7 +179,8 @@ def _header_lines(params: ParamSet) -> Iterator[str]:
 
 
 def _check(sets: list[ParamSet]) -> None:
-    """Raise UsageError for invalid names or ids, or two sets of one component, which cannot be told apart."""
+    """Raise UsageError for invalid names or ids, or two sets of one component: nothing
+    distinguishes them."""
     seen = set()
     for each in sets:
         for number in (each.system, each.component):

@@ -205,8 +205,8 @@ def ext_param_of_fields(name: str, fields: object) -> ExtParam:
         raise ValueError(f"{name}: {error}") from None
 
 
-def _number_of(name: str, told: object) -> int:
+def _number_of(name: str, type_entry: object) -> int:
     try:
-        return ext_type_number(told if isinstance(told, str) else repr(told))
+        return ext_type_number(type_entry if isinstance(type_entry, str) else repr(type_entry))
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None

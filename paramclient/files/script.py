@@ -1,7 +1,7 @@
 """Reading the parameters that a PX4 start script sets.
 
 A script is a program (PX4 guide, "System Startup"; the command `param`): the parameters that it sets may
-depend on the vehicle. The file alone tells only which ones it sets in every case, so a `param set` inside an
+depend on the vehicle. The file alone shows only which ones it sets in every case, so a `param set` inside an
 `if` or a loop, after an `exit`, or with a variable is an error. Parameters that called scripts set are not
 included.
 """

@@ -25,7 +25,7 @@ async def run_in_own_thread(
 
     Args:
         work: the function.
-        undo: called with the result after a cancellation, even if the result comes later.
+        undo: called with the result after a cancellation, even if the result arrives later.
         grace: seconds for which a cancellation waits for the end of the function.
 
     Raises:
@@ -34,7 +34,7 @@ async def run_in_own_thread(
     ended = anyio.Event()
     token = anyio.lowlevel.current_token()
     lock = threading.Lock()
-    is_wanted = True
+    is_awaited = True
     results: list[T] = []
     failures: list[BaseException] = []
 
@@ -43,7 +43,7 @@ async def run_in_own_thread(
             result = work()
             with lock:
                 results.append(result)
-                if is_wanted:
+                if is_awaited:
                     return
             if undo is not None:
                 undo(result)
@@ -59,7 +59,7 @@ async def run_in_own_thread(
         await ended.wait()
     except BaseException:
         with lock:
-            is_wanted = False
+            is_awaited = False
             finished_before_cancel = bool(results)
         with anyio.move_on_after(grace, shield=True):
             await ended.wait()

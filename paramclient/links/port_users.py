@@ -1,4 +1,5 @@
-"""The programs that use a network port or a device, as far as the operating system tells: /proc on Linux."""
+"""The programs that use a network port or a device, as far as the operating system reports them: /proc on
+Linux."""
 
 from __future__ import annotations
 
@@ -32,7 +33,7 @@ def user_of_port(port: int, *, is_tcp: bool, proc: Path = PROC) -> str | None:
         proc: the process file system.
 
     Returns:
-        None if the operating system does not tell.
+        None if the operating system does not report it.
     """
     users: dict[str, int] = {}
     for name in ("tcp", "tcp6") if is_tcp else ("udp", "udp6"):
@@ -46,7 +47,8 @@ def user_of_port(port: int, *, is_tcp: bool, proc: Path = PROC) -> str | None:
 
 
 def user_of_device(path: str, *, proc: Path = PROC) -> str | None:
-    """Return the program that has opened a device, in words; None if the operating system does not tell."""
+    """Return the program that has opened a device, in words; None if the operating system does not report
+    it."""
     return _process_with([os.path.realpath(path)], proc)
 
 

@@ -56,7 +56,7 @@ OTHER_DEVICES: Final = {(0x26AC, 0x0015)}
 
 @dataclass(frozen=True, slots=True)
 class SerialPort:
-    """A serial port of this computer. Unknown attributes are None; texts come from the device.
+    """A serial port of this computer. Unknown attributes are None; texts are those of the device.
 
     Attributes:
         device: the path or name, such as `/dev/ttyACM0` or `COM5`.

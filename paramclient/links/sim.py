@@ -134,8 +134,10 @@ def simulated(spec: LinkSpec) -> SimLink:
     faults: dict[str, Any] = dict(spec.options)
     kinds = {"px4": PX4Vehicle, "ardupilot": ArduPilotVehicle, "camera": Camera}
     make: Callable[..., Vehicle] = kinds[spec.host]
-    told: dict[str, Any] = {"metadata": True} if faults.pop("metadata", 0) else {}
-    vehicle = make(system=faults.pop("system", 1), param_error=bool(faults.pop("param_error", 0)), **told)
+    metadata_option: dict[str, Any] = {"metadata": True} if faults.pop("metadata", 0) else {}
+    vehicle = make(
+        system=faults.pop("system", 1), param_error=bool(faults.pop("param_error", 0)), **metadata_option
+    )
     return SimLink(Air.symmetric([vehicle], **faults) if faults else vehicle, spec.name)
 
 

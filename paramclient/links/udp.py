@@ -15,7 +15,7 @@ small buffer, thread with recvmmsg  1,891–2,000   512
 ==================================  ============  =============
 
 A thread waits for the interpreter's lock after each call, so it does not replace a large buffer. The link
-therefore requests the buffer, beyond the limit if the program is privileged, and `receive_buffer` tells its
+therefore requests the buffer, beyond the limit if the program is privileged, and `receive_buffer` is its
 actual size. If that is too small, `sysctl -w net.core.rmem_max=4194304` helps.
 
 Linux records the arrival time of each datagram, and reports that of the datagram read last (SIOCGSTAMP,
@@ -120,7 +120,7 @@ class UdpLink(SocketLink):
         self.receive_buffer = 0
         self.lost_sends = 0
         self.arrived_at: list[float] = []
-        self._tells_arrivals = False
+        self._has_arrival_times = False
         self._local_port = 0  # of the previous opening
         self._buffer_size = memoryview(bytearray(_LARGEST_DATAGRAM))
         self._no_route_since: float | None = None
@@ -139,7 +139,7 @@ class UdpLink(SocketLink):
         arrivals: list[float] = []
         while not batch:
             await self._readable(sock)
-            asks = self._tells_arrivals
+            needs_time = self._has_arrival_times
             for _ in range(DATAGRAMS_PER_READ):
                 try:
                     size, address = into(buffer_size)
@@ -151,9 +151,9 @@ class UdpLink(SocketLink):
                     continue  # an ICMP error for an earlier datagram
                 if size:
                     batch.append((address, bytes(buffer_size[:size])))
-                    if asks:
+                    if needs_time:
                         arrivals.append(_arrived_at(sock))
-                        asks = time.time() - arrivals[-1] > READ_DELAY_MAX
+                        needs_time = time.time() - arrivals[-1] > READ_DELAY_MAX
         if arrivals:
             ahead = seconds_ahead(time.time, anyio.current_time)
             arrivals = [at - ahead for at in arrivals]
@@ -257,7 +257,7 @@ class UdpLink(SocketLink):
             with suppress(OSError):  # beyond the limit, or not privileged
                 sock.setsockopt(socket.SOL_SOCKET, option, RECEIVE_BUFFER)
         self.receive_buffer = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
-        self._tells_arrivals = _note_arrivals(sock)
+        self._has_arrival_times = _note_arrivals(sock)
         self._peers, self._strangers = {}, {}
         self._no_route_since = None
         return sock
@@ -293,7 +293,7 @@ else:
 
 
 class UdpIn(UdpLink):
-    """`udpin`: bound to a port; sends to all addresses from which MAVLink frames came.
+    """`udpin`: bound to a port; sends to all addresses from which MAVLink frames were received.
 
     Several vehicles may send from different addresses, or one after a restart from a new one. Broadcasts go
     to the `PEERS_MAX` latest senders of valid frames in the last `PEER_TIMEOUT` seconds; those without
@@ -374,7 +374,7 @@ class UdpOut(UdpLink):
             return
 
     async def _check_address(self) -> None:
-        """While no data comes: fail if the name's address is no longer the one in use."""
+        """While no data arrives: fail if the name's address is no longer the one in use."""
         opening = self._openings
         while True:
             with suppress(LinkError, TimeoutError), anyio.fail_after(OPEN_TIMEOUT):

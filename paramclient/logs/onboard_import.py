@@ -26,7 +26,7 @@ async def import_onboard_log(path: str | os.PathLike[str], cache: ParamCache) ->
     """Import the parameters of an on-board log into a cache, in one transaction.
 
     Each value and each change has the time of the log. Later observations in the cache stay unchanged, so
-    logs may be imported in any order and repeatedly. A log does not tell whether it has all parameters of the
+    logs may be imported in any order and repeatedly. A log does not say whether it has all parameters of the
     vehicle: the table is complete only after a fetch. A dataflash log has no types: they are those of the
     vehicle's cached table, else those that most cached vehicles of the same autopilot have, else REAL32.
 

@@ -119,7 +119,7 @@ class _Import:
         finally:
             await writer.close()
         machines_in_order = (machines[address] for address in sorted(machines))
-        return tuple(self._imported_table(each) for each in machines_in_order if _is_told(each))
+        return tuple(self._imported_table(each) for each in machines_in_order if _has_content(each))
 
     async def _follow(self) -> None:
         """Handle the station's events, as the client does."""
@@ -172,7 +172,7 @@ class _Import:
         )
 
 
-def _is_told(machine: ComponentMachine) -> bool:
+def _has_content(machine: ComponentMachine) -> bool:
     """Return whether the log has parameters of a component, or something to say of them."""
     return bool(machine.table.params or machine.ext.table.params or machine.fetches.notes)
 
@@ -195,7 +195,7 @@ class _LogWriter(CacheWriter):
         self._updates: list[TableUpdate] = []
         self._ext_updates: list[ExtTableUpdate] = []
         self._based_on: dict[tuple[str, int], float] = {}
-        self._has_asked: set[tuple[str, int]] = set()
+        self._loaded: set[tuple[str, int]] = set()
         self._has_values: set[tuple[str, int]] = set()
 
     async def merge(self) -> None:
@@ -212,9 +212,9 @@ class _LogWriter(CacheWriter):
         Extended parameters need no cached table: they are compared with it when they are written.
         """
         key = (identity.key, machine.component)
-        if key in self._has_asked:
+        if key in self._loaded:
             return None, None
-        self._has_asked.add(key)
+        self._loaded.add(key)
         cached = await self._worker.run(partial(self._kept_tables.load, *key))
         if cached is None or cached.updated_at >= self._clock():
             return None, None

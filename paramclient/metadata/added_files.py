@@ -78,7 +78,7 @@ class AddedMetadata:
 
 
 class AddedFiles:
-    """The added files: copies in a folder, of which the name tells vehicle type and firmware version.
+    """The added files: copies in a folder, named after vehicle type and firmware version.
 
     Every call blocks for a few milliseconds, and for about half a second if it reads a file of ArduPilot.
 
@@ -191,7 +191,8 @@ def _kind_of(identity: Identity) -> VehicleKind | None:
 
 
 def _kind_of_file(metadata: Metadata) -> VehicleKind | None:
-    """Return the only vehicle type that a file names; PX4's files are told by the types of parameters."""
+    """Return the only vehicle type that a file names; PX4's files are recognized by the types of
+    parameters."""
     kinds = {_KINDS[info.group] for info in metadata.values() if info.group in _KINDS}
     if not kinds and all(info.type is not None for info in metadata.values()):
         return "px4"

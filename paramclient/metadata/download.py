@@ -188,14 +188,14 @@ async def announced_metadata(component: Component, timeout: float | None) -> Com
         NoReply: no response in time.
         LinkError: the link failed, or the client was closed.
     """
-    asked = local(component)
-    asked.client.check_open()
+    link_component = local(component)
+    link_component.client.check_open()
     what = f"COMPONENT_METADATA of {component.system}/{component.component}"
-    machine, now = asked.machine, anyio.current_time()
+    machine, now = link_component.machine, anyio.current_time()
     machine.check_present(what, now)
     ask = machine.metadata_requests.ask(now)
     try:
-        return await asked.wait(ask, timeout, lambda: (what, ask.attempts))
+        return await link_component.wait(ask, timeout, lambda: (what, ask.attempts))
     finally:
         machine.metadata_requests.release(ask)
 

@@ -17,7 +17,7 @@ __all__ = ["QUICK_TIMEOUT", "QuickDownload", "load_if_quick", "obstacle_to_load"
 
 QUICK_TIMEOUT: Final = 2.0
 """Seconds after which the download is given up: 0.1 MB over UDP and USB take less than 1 s, and a user who
-has not asked for the download is delayed by no more."""
+has not requested the download is delayed by no more."""
 
 
 @dataclass(frozen=True, slots=True)

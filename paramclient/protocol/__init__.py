@@ -1,4 +1,4 @@
-"""The sans-I/O core: no socket, no clock, no disk; bytes and the time come in as arguments.
+"""The sans-I/O core: no socket, no clock, no disk; bytes and the time are arguments.
 
 `station`: one link: components, our heartbeat, routing of messages.
 `component`: one component: its state and its machines.

@@ -1,4 +1,4 @@
-"""Addresses: system and component, and the peer where components are told apart by peer."""
+"""Addresses: system and component, and the peer where components are distinguished by peer."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["Address", "Peer", "PeerAddress", "peer_in_words"]
 Address: TypeAlias = tuple[int, int]
 """System and component."""
 Peer: TypeAlias = Hashable
-"""The sender of received bytes, as the link tells senders apart."""
+"""The sender of received bytes, as the link distinguishes senders."""
 
 
 class PeerAddress(tuple[int, int]):

@@ -114,13 +114,13 @@ class ComponentObserver(Protocol):
         """Only one vehicle uses the address again, or the peers are proven to be one vehicle."""
 
     def changed(self, machine: ComponentMachine, change: Change) -> None:
-        """A parameter appeared, changed or was removed; called for each change with `tells_changes`."""
+        """A parameter appeared, changed or was removed; called for each change with `reports_each_change`."""
 
     def ext_changed(self, machine: ComponentMachine, change: ExtChange) -> None:
         """An extended parameter appeared, changed or was removed."""
 
     def params_changed(self, machine: ComponentMachine) -> None:
-        """Parameters have changed; called once for several changes without `tells_changes`."""
+        """Parameters have changed; called once for several changes without `reports_each_change`."""
 
     def fetched(self, machine: ComponentMachine, result: FetchResult) -> None:
         """A fetch has ended with a result."""
@@ -144,7 +144,7 @@ class ComponentMachine:
         companions: the components of its vehicle, to which it adds itself; None for a vehicle with one.
         read_clock: enables `boot_clock` calls with clocks from its telemetry for a while; see
             `BootTimeSampling`.
-        peer: its peer, where components are told apart by peer; otherwise None.
+        peer: its peer, where components are distinguished by peer; otherwise None.
         scheduler: the scheduler of the link; None for a link with one component.
         name_quota: the name count shared by the tables of the link; None likewise.
         trace: receives each step.
@@ -175,7 +175,7 @@ class ComponentMachine:
         reboots: its reboot on command.
         rereads: the values to be read again.
         fetches: the fetches of its table.
-        tells_changes: whether the observer is called for each change. An event for each value of a long list
+        reports_each_change: whether the observer is called for each change. An event for each value of a list
             takes a tenth of the time of the value itself, and the garbage collector visits all waiting
             events.
         has_changed: whether an unhandled event reports changes; the consumer of events resets it.
@@ -266,8 +266,8 @@ class ComponentMachine:
         self.fetches = Fetches(fetch_context, self.sync, sync_settings, sync_interval, ended=self._fetched)
         self.name_searches = NameSearches(context, self.reads, self.table, self.foreign_list)
         # without requests there are no reads: the lists of other stations take their place
-        overheard = self.fetches.overheard
-        self._receive_read = self.reads.receive if overheard is None else overheard.receive
+        passive_table = self.fetches.passive_table
+        self._receive_read = self.reads.receive if passive_table is None else passive_table.receive
         self._own_address = own_address
         self._observer = observer
         self._transmit = send
@@ -278,7 +278,7 @@ class ComponentMachine:
         self._companions: list[ComponentMachine] = [] if companions is None else companions
         self._companions.append(self)
         self._known_as: str | None = None  # the key of the reported identity
-        self.tells_changes = True
+        self.reports_each_change = True
         self.has_changed = False
         self.rereads = Rereads(context, self.reads, self.table, self.sync, sync_settings.policy)
         self.ext = ExtendedParams(
@@ -419,11 +419,11 @@ class ComponentMachine:
     def is_busy(self) -> bool:
         """Whether anything is in progress except reads of volatile values after a hash match."""
         in_background = 0 if self.refresh is None else self.refresh.in_flight
-        is_asked = len(self.reads) > in_background or len(self.writes) > 0 or not self.files.is_idle
-        is_asked = is_asked or len(self.commands) > 0 or self.reboots.current is not None
-        is_asked = is_asked or self.metadata_requests.is_asking or len(self.name_searches) > 0
-        is_asked = is_asked or self.ext.is_busy
-        return is_asked or self.fetch is not None or self.identification.is_asking
+        is_busy = len(self.reads) > in_background or len(self.writes) > 0 or not self.files.is_idle
+        is_busy = is_busy or len(self.commands) > 0 or self.reboots.current is not None
+        is_busy = is_busy or self.metadata_requests.is_asking or len(self.name_searches) > 0
+        is_busy = is_busy or self.ext.is_busy
+        return is_busy or self.fetch is not None or self.identification.is_asking
 
     @property
     def is_settling(self) -> bool:
@@ -449,19 +449,19 @@ class ComponentMachine:
             self.receive_value(message, now, version, moment)
             return
         silent_since = self.presence.received_at
-        self._heard(now, version)
+        self._receive_any(now, version)
         if sequence is not None and self.presence.numbering_begins(sequence):
             self._numbering_began(silent_since, now)
         if isinstance(message, Heartbeat):
-            self._kind_told(message, now)
+            self._receive_kind(message, now)
             state = self.presence.state
             if self.presence.heartbeat(message, now):
                 self._rebooted(now)
             elif state not in (None, message.system_status):
                 self.boot_time_requests.want(now)
             self.rereads.forget_old(now)
-            if self.fetches.overheard is not None:
-                self.fetches.overheard.file.tick(now)  # in a log the time advances with messages only
+            if self.fetches.passive_table is not None:
+                self.fetches.passive_table.file.tick(now)  # in a log the time advances with messages only
         elif isinstance(message, AutopilotVersion):
             before = self.identification.firmware
             if self.identification.version(message, now):
@@ -488,20 +488,20 @@ class ComponentMachine:
             if denied:
                 self.writes.denied(denied.group(1), now)
         elif isinstance(message, SystemTime):
-            self._clock_told(self.presence.system_time(message, now), now)
+            self._receive_clock(self.presence.system_time(message, now), now)
         elif isinstance(message, FileTransfer):
             self.files.receive(message, now)
-            if self.fetches.overheard is not None:
-                self.fetches.overheard.file.reply_heard(message, now)
+            if self.fetches.passive_table is not None:
+                self.fetches.passive_table.file.receive_reply(message, now)
         elif isinstance(message, ComponentMetadata):
             self.metadata_requests.receive(message, now)
         elif isinstance(message, HighLatency2):
-            self._kind_told(message, now)
+            self._receive_kind(message, now)
             self.presence.high_latency()
         self.identification.receive(now)
         self._follow_identity(now)
 
-    def _kind_told(self, message: Heartbeat | HighLatency2, now: float) -> None:
+    def _receive_kind(self, message: Heartbeat | HighLatency2, now: float) -> None:
         """Process a changed autopilot or vehicle type: another vehicle, or the same one with other
         firmware."""
         if self.identification.heartbeat(message) and self.identification.settled:
@@ -511,7 +511,7 @@ class ComponentMachine:
 
     def receive_contested(self, message: Message, now: float, *, version: int = 2) -> None:
         """Process a message while several vehicles use the address: it only shows that one is there."""
-        self._heard(now, version)
+        self._receive_any(now, version)
         if isinstance(message, Heartbeat):
             self.presence.heartbeat(message, now)
 
@@ -524,9 +524,9 @@ class ComponentMachine:
             message: the message.
             now: the time.
             version: the MAVLink version of the frame.
-            moment: when it came from the link, if earlier; None for `now`.
+            moment: when it arrived from the link, if earlier; None for `now`.
         """
-        self._heard(now, version)
+        self._receive_any(now, version)
         identification = self.identification
         identification.receive(now)
         name, _, number, count, index = message
@@ -535,11 +535,11 @@ class ComponentMachine:
                 self.table.leave_out(name)
             return
         if name == HASH_CHECK:
-            announced = self.sync.hash_heard(message, now)
+            announced = self.sync.receive_hash(message, now)
             if self.fetch is not None:
                 self.fetch.announced(announced)
-            if self.fetches.overheard is not None:
-                self.fetches.overheard.announced(announced, now)
+            if self.fetches.passive_table is not None:
+                self.fetches.passive_table.announced(announced, now)
             is_count_new = count != self.table.count and count <= PARAMETERS_MAX
             if is_count_new and self.sync.synced and self.fetch is None:
                 self._count_changed(count, name, now)
@@ -560,21 +560,21 @@ class ComponentMachine:
         is_ours = by is not None
         if by is None:
             by = authors.of(name, now) if authors.foreign_sets else "vehicle"
-        is_wanted = is_ours and writes.wants(message)
-        if is_ours and not is_wanted and authors.foreign_sets:
+        is_requested_value = is_ours and writes.wants(message)
+        if is_ours and not is_requested_value and authors.foreign_sets:
             by = authors.setter_of(name, message.raw, now) or by
         if self._checks:
-            until = self._checks.ambiguous_until(message, now, is_wanted=is_wanted)
+            until = self._checks.ambiguous_until(message, now, is_requested=is_requested_value)
             if until > now:
                 self._receive_ambiguous(message, until, now)
                 return
-        came_at = now if moment is None else moment
-        change = table.store_value(message, by, came_at, is_exact=is_wanted)
+        arrived_at = now if moment is None else moment
+        change = table.store_value(message, by, arrived_at, is_exact=is_requested_value)
         if change is not None:
             authors.changed(name, now, is_ours)
             self._note_replaced(change, message, now)
             self.sync.changed(name, by, now)
-            self._tell(change)
+            self._report_change(change)
         elif name not in table.params:
             return  # more names than the table may hold
         fetch = self.fetches.current
@@ -591,14 +591,14 @@ class ComponentMachine:
     def boot_clock(self, message_id: int, boot_ms: int, now: float) -> None:
         """Process `time_boot_ms` of a telemetry message."""
         self.reschedule()
-        self._clock_told(self.presence.boot_clock(message_id, boot_ms, now), now)
+        self._receive_clock(self.presence.boot_clock(message_id, boot_ms, now), now)
 
-    def _clock_told(self, has_restarted: bool, now: float) -> None:
+    def _receive_clock(self, has_restarted: bool, now: float) -> None:
         if has_restarted:
             self._rebooted(now, by_clock=True)
         started_at = self.presence.started_at
         if started_at is not None and self.presence.clock_at == now:
-            self.boot_values.clock_told(now - started_at, now)
+            self.boot_values.receive_clock(now - started_at, now)
 
     def _numbering_began(self, silent_since: float, now: float) -> None:
         """Process a possible new frame numbering, as after a reboot: the clock decides whether it is one.
@@ -631,8 +631,8 @@ class ComponentMachine:
         elif not self.reads.awaits(message):
             self.foreign_list.receive(message, now)
         self.writes.defer(message, until)
-        if self.fetches.overheard is not None:
-            self.fetches.overheard.receive(message, now)
+        if self.fetches.passive_table is not None:
+            self.fetches.passive_table.receive(message, now)
         self.reads.defer(message, until, now)
 
     def foreign_set(self, name: str, raw: bytes, station: str, now: float) -> None:
@@ -652,8 +652,8 @@ class ComponentMachine:
         """Process another station's request for a file of this component."""
         self.reschedule()
         self.files.foreign_at = now
-        if self.fetches.overheard is not None:
-            self.fetches.overheard.file.request_heard(message, station, now)
+        if self.fetches.passive_table is not None:
+            self.fetches.passive_table.file.receive_request(message, station, now)
 
     def use_cached(
         self,
@@ -877,7 +877,7 @@ class ComponentMachine:
 
         Args:
             now: the time.
-            returns: whether it comes back under its address, see `Reboot`.
+            returns: whether it returns under its address, see `Reboot`.
 
         Raises:
             NoReply: the component is lost. Nothing was sent.
@@ -1057,7 +1057,7 @@ class ComponentMachine:
         self.reschedule()
         self.round_trip.received_at = now
         if not self.presence.is_lost:
-            if self.presence.was_away(silence := self.presence.receive(now)):
+            if self.presence.was_silent(silence := self.presence.receive(now)):
                 self._doubt()
                 self.sync.check(now)
             elif self.identity.uid is not None:
@@ -1100,7 +1100,7 @@ class ComponentMachine:
         )
         return f"<ComponentMachine {self.system}/{self.component} {kind} {self.state}>"
 
-    def _heard(self, now: float, version: int) -> None:
+    def _receive_any(self, now: float, version: int) -> None:
         """Process the arrival of any message."""
         self.reschedule()
         presence = self.presence
@@ -1124,8 +1124,8 @@ class ComponentMachine:
         self.sync.doubt()
         if self.fetch is not None:
             self.fetch.doubt()
-        if self.fetches.overheard is not None:
-            self.fetches.overheard.forget()
+        if self.fetches.passive_table is not None:
+            self.fetches.passive_table.forget()
 
     def _lose(self, now: float) -> None:
         """Mark the component as lost. A fetch goes on for a while: the component may only be rebooting."""
@@ -1147,7 +1147,7 @@ class ComponentMachine:
             self._observer.found(self, silence)
             self.sync.check(now)
             self.identification.doubt(now)
-        elif presence.was_away(silence) and silence < math.inf:
+        elif presence.was_silent(silence) and silence < math.inf:
             self.identification.doubt(now)
         self.reboots.silence_ended(silence, now)
         if presence.has_beaten:  # without heartbeats, no message is ever overdue
@@ -1208,7 +1208,7 @@ class ComponentMachine:
             return
         for each in (self, *self._autopilots()):
             if each.identification.is_unconfirmed:
-                what = f"{each.system}/{each.component} has not said since it was away which vehicle it is"
+                what = f"{each.system}/{each.component} has not identified itself since it was silent"
                 waited = now - each.identification.doubted_at
                 self._fail_writes(NoReply(what, attempts=each.identification.attempts, waited=waited), now)
 
@@ -1251,10 +1251,10 @@ class ComponentMachine:
 
     def _report(self, changes: list[Change]) -> None:
         for change in changes:
-            self._tell(change)
+            self._report_change(change)
 
-    def _tell(self, change: Change) -> None:
-        if self.tells_changes:
+    def _report_change(self, change: Change) -> None:
+        if self.reports_each_change:
             self._observer.changed(self, change)
         elif not self.has_changed:
             self.has_changed = True

@@ -49,7 +49,7 @@ def obstacle_to_quick_transfer(station: Station, machine: ComponentMachine) -> s
     if traffic is not None and traffic.has_radio:
         return "a telemetry radio is on the link"
     if machine.reads.pace.gap > QUICK_GAP_MAX:
-        return f"the link is slow: its list came at less than {1.0 / QUICK_GAP_MAX:.0f} values/s"
+        return f"the link is slow: its list arrived at less than {1.0 / QUICK_GAP_MAX:.0f} values/s"
     if round_trip.samples and round_trip.shortest > QUICK_ROUND_TRIP_MAX:
         return f"the link is slow: a round trip takes more than {QUICK_ROUND_TRIP_MAX:g} s"
     return None

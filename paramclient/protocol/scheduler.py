@@ -113,7 +113,7 @@ class ListAdmission:
 
     def __init__(self) -> None:
         self.bandwidth = LinkBandwidth()
-        self._are_bursty = False  # whether the lists judged last come in bursts: on a fast link
+        self._are_bursty = False  # whether the lists judged last arrive in bursts: on a fast link
         self._now = -math.inf
         self._limit = 1
         self._shown = 0  # the number of parallel lists that had enough bandwidth

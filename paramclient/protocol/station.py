@@ -205,7 +205,7 @@ class Station:
         Args:
             data, peer: the bytes, and their sender.
             now: the time.
-            moment: when they came from the link, if earlier; None for `now`.
+            moment: when they arrived from the link, if earlier; None for `now`.
         """
         self.bytes_received += len(data)
         if self._needs_raw_data:
@@ -468,8 +468,8 @@ class Station:
 
     def _tick_log(self, now: float) -> None:
         for machine in self.components.values():
-            if machine.fetches.overheard is not None:
-                machine.fetches.overheard.file.tick(now)
+            if machine.fetches.passive_table is not None:
+                machine.fetches.passive_table.file.tick(now)
 
     def _before_decoding(self, data: bytes, peer: Peer, now: float) -> None:
         """Pass received bytes to traffic counts and the search for heartbeats, before they are decoded."""
@@ -526,7 +526,7 @@ class Station:
         self._damaged += framer.damaged
 
     def _is_made_up(self, machine: ComponentMachine | None) -> bool:
-        """Return whether a PARAM_VALUE of component 190 comes from no component that has parameters.
+        """Return whether a PARAM_VALUE of component 190 is from no component that has parameters.
 
         After MAVProxy has read a parameter file, it writes a PARAM_VALUE of each parameter into its log, with
         the vehicle's system id, component 190 and the type REAL32 (measured with 1.8.75). Nothing sends
@@ -560,7 +560,7 @@ class Station:
             if machine.peers.contest is not None and peer == machine.peers.home:
                 machine.receive_contested(message, now, version=frame.version)
                 if isinstance(message, Heartbeat):
-                    self._clock_sampling.open(address, now)  # clocks may tell the peers apart
+                    self._clock_sampling.open(address, now)  # clocks may distinguish the peers
             return
         machine.receive(message, now, version=frame.version, moment=moment, sequence=frame.sequence)
         if isinstance(message, Heartbeat):
@@ -692,7 +692,7 @@ class Station:
         return any(_is_for(request, sender) for request, _ in self._early_requests)
 
     def _accepts(self, machine: ComponentMachine, peer: Peer, now: float) -> bool:
-        """Return whether to accept a message that cannot tell vehicles apart."""
+        """Return whether to accept a message that cannot distinguish vehicles."""
         if not machine.identification.has_parameters:
             machine.peers.follow(peer)
             return True

@@ -16,7 +16,7 @@ SEARCH_INTERVAL: Final = 0.5
 """Seconds until the next look when no message was received."""
 OLD_ID_SILENCE_MIN: Final = 3.0
 """Seconds by which a vehicle without a hardware id of its own must have been silent under the old system id,
-while it is heard under the new one: two heartbeats did not come."""
+while it is heard under the new one: two heartbeats were not received."""
 
 
 class SystemIdSearch:

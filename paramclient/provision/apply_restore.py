@@ -78,7 +78,7 @@ async def apply(
             that fails, `error` of the result is a CacheError.
         backup: a file for the state before the first write; its name determines the file format, see
             `paramclient.files`.
-        timeout: seconds, after which the result reports how far the run came.
+        timeout: seconds, after which the result reports the progress of the run.
         author: the author of the changes, as in `Component.set`.
         progress: called after each value and at the start of a phase; it must not raise.
         before_writing: called once after the vehicle was read, before its state is stored and the first value

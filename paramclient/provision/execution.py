@@ -68,7 +68,7 @@ VERIFY_DELAY: Final = 1.2
 """Seconds between the last write and the read that verifies it: modules of PX4 clamp the value, or set other
 parameters, up to 1.1 s after the acknowledgement (measured)."""
 ARMED_STATE_TIMEOUT: Final = 3.0
-"""Seconds to wait for a heartbeat with the armed flag: heartbeats come once a second, and some are lost."""
+"""Seconds to wait for a heartbeat with the armed flag: heartbeats arrive once a second, and some are lost."""
 SYSTEM_CHANGE_TIMEOUT: Final = 10.0
 """Seconds to wait for the vehicle under its new system id; ArduPilot sends its next heartbeat under it."""
 SYSTEM_CHANGE_DELAY: Final = 2.5

@@ -547,7 +547,7 @@ class _Planner:
         return settled
 
     def _revealed_names(self, rows: Mapping[str, PlanRow]) -> Callable[[str], bool]:
-        """Return a function that tells whether a step may reveal a name that the vehicle does not have.
+        """Return a function that decides whether a step may reveal a name that the vehicle does not have.
 
         A switch reveals names that begin like its own: the members of its group, which may end in a digit
         (OSD_TYPE: OSD1_ENABLE). One that is turned on may also start a driver whose names share only the part

@@ -175,7 +175,7 @@ def incomplete_error(component: Component, missing: Sequence[str]) -> VehicleErr
     vehicle = f"{component.system}/{component.component} {component.autopilot}"
     names = first_of(missing, NAMES_SHOWN_MAX)
     return VehicleError(
-        f"{vehicle} on {component.identity.link} is incomplete: {names} did not come",
+        f"{vehicle} on {component.identity.link} is incomplete: {names} were not received",
         system=component.system,
         component=component.component,
     )

@@ -9,7 +9,7 @@ import anyio
 
 from paramclient.client.arguments import (
     check_accepted,
-    check_asked_name,
+    check_portable_name,
     check_requested_name,
     check_settle,
     check_writes,
@@ -217,7 +217,7 @@ class RemoteComponent(ServiceComponent):
         lost, the write is not sent again: LinkError reports that it is unknown whether the write was done.
         """
         requested = check_value(value)
-        body: dict[str, Any] = {"values": {check_asked_name(name): value_as_sent(requested)}}
+        body: dict[str, Any] = {"values": {check_portable_name(name): value_as_sent(requested)}}
         if check_settle(settle):
             body["settle_s"] = settle
         if force:
@@ -335,7 +335,7 @@ class RemoteComponent(ServiceComponent):
         if seed is not None:
             body["seed"] = seed
 
-        def tell() -> None:
+        def report() -> None:
             assert progress is not None
             progress(download.since(before))
 
@@ -346,7 +346,7 @@ class RemoteComponent(ServiceComponent):
                 download.end(answer.document["received"], answer.document["count"])
             return answer
 
-        answer = await run_with_progress(fetch, None if progress is None else tell)
+        answer = await run_with_progress(fetch, None if progress is None else report)
         with decode_errors(self._service.name):
             return fetch_result_of(answer.document, self.params, anyio.current_time() - began)
 

@@ -90,7 +90,7 @@ class Connection:
                 error = refusal
             if not self._was_there:
                 self.failed = error
-                self.tell()
+                self.notify()
                 return
             await self._wait_to_try_again(error)
 
@@ -137,14 +137,14 @@ class Connection:
                     elif waits_for_ever:
                         left["timeout_s"] = None
                     sent = body if body is None and not left else {**(body or {}), **left}
-                    asked_at = anyio.current_time()
+                    requested_at = anyio.current_time()
                     try:
                         return await self._requests.ask(method, path, sent, link=link)
                     except ServiceUnreachable as failure:
                         if is_write and failure.may_be_done:
                             raise self._unknown(awaited, failure) from failure.error.__cause__
                         now = anyio.current_time()
-                        if now - asked_at > reconnect_delays.LINK_TIMEOUT:  # the request had been connected
+                        if now - requested_at > reconnect_delays.LINK_TIMEOUT:  # the request had been connected
                             failing_since = now
                         failing_since = min(failing_since, now)
                         if now - failing_since >= reconnect_delays.LINK_TIMEOUT:
@@ -185,7 +185,7 @@ class Connection:
         self.ended = error
         self._fail_calls()
 
-    def tell(self) -> None:
+    def notify(self) -> None:
         """Wake the tasks that wait for `changed`."""
         changed, self.changed = self.changed, anyio.Event()
         changed.set()
@@ -201,7 +201,7 @@ class Connection:
                 for event in events:
                     self._take(event)
                 if events:
-                    self.tell()
+                    self.notify()
 
     def _take(self, event: Mapping[str, Any]) -> None:
         with decode_errors(self._requests.name):
@@ -231,7 +231,7 @@ class Connection:
             self.is_offline = True
             self._backoff = Backoff()
             self._follower.leave()
-            self.tell()
+            self.notify()
         elif self._backoff.is_timed_out:
             name = self._requests.name
             self.broken = error if isinstance(error, LinkError) else LinkError(str(error), link=name)
@@ -255,12 +255,12 @@ class Connection:
     def _fail_calls(self) -> None:
         for scope in self._scopes:
             scope.cancel()
-        self.tell()
+        self.notify()
 
 
-async def run_with_progress(work: Callable[[], Awaitable[T]], tell: Callable[[], None] | None) -> T:
-    """Run `work`, and call `tell` from this task about ten times a second, and once at the end."""
-    if tell is None:
+async def run_with_progress(work: Callable[[], Awaitable[T]], notify: Callable[[], None] | None) -> T:
+    """Run `work`, and call `notify` from this task about ten times a second, and once at the end."""
+    if notify is None:
         return await work()
     done = anyio.Event()
     results: list[T] = []
@@ -280,7 +280,7 @@ async def run_with_progress(work: Callable[[], Awaitable[T]], tell: Callable[[],
                 with anyio.move_on_after(PROGRESS_CALL_INTERVAL):
                     await done.wait()
                 if not failures:
-                    tell()
+                    notify()
         except Exception as error:
             failures.append(error)
             tasks.cancel_scope.cancel()

@@ -35,7 +35,7 @@ class TableMirror(ABC, Generic[TableParam, TableChange]):
     def __init__(self) -> None:
         self.params: dict[str, TableParam] = {}
         self.is_loaded = False
-        self._told: dict[str, TableParam] = {}  # the parameters with the trust that the service reports
+        self._reported: dict[str, TableParam] = {}  # the parameters with the trust that the service reports
         self._is_first = True
         self._seq = -1
         self._is_reachable = True
@@ -63,11 +63,11 @@ class TableMirror(ABC, Generic[TableParam, TableChange]):
             return None
         if len(params) > NAMES_MAX:
             raise ValueError(f"a table of more than {NAMES_MAX} names")
-        before, self._told = self._told, dict(params)
+        before, self._reported = self._reported, dict(params)
         self.is_loaded, self._seq = True, seq
         self.params.clear()
-        self.params.update(self._shown(self._told))
-        changes = [] if self._is_first else self._differences(before, self._told)
+        self.params.update(self._shown(self._reported))
+        changes = [] if self._is_first else self._differences(before, self._reported)
         self._is_first = False
         for at, change in waiting:
             changes += [] if (made := self.take(at, change)) is None else [made]
@@ -92,24 +92,24 @@ class TableMirror(ABC, Generic[TableParam, TableChange]):
         if seq <= self._seq:
             return None
         name, new, by, is_added = self._parts(change)
-        old = self._told.get(name)
-        if old is None and new is not None and len(self._told) >= NAMES_MAX:
+        old = self._reported.get(name)
+        if old is None and new is not None and len(self._reported) >= NAMES_MAX:
             raise ValueError(f"a table of more than {NAMES_MAX} names")
         self._seq = seq
         if new is None:
-            self._told.pop(name, None)
+            self._reported.pop(name, None)
             self.params.pop(name, None)
             return None if old is None else self._change(name, old, None, by)
-        self._told[name] = self.params[name] = new
+        self._reported[name] = self.params[name] = new
         if old is not None and old.same_value(new):
             return None
         return self._change(name, old, new, by, is_added=is_added)
 
     def confirm(self, param: TableParam) -> None:
         """Update the trust of a parameter from a response, if the value is equal."""
-        known = self._told.get(param.name)
+        known = self._reported.get(param.name)
         if self.is_loaded and self._is_reachable and known is not None and known.same_value(param):
-            self._told[param.name] = self.params[param.name] = param
+            self._reported[param.name] = self.params[param.name] = param
 
     def doubt(self) -> None:
         """Mark the copy as stale until the next load: all values are *cached*."""
@@ -128,7 +128,7 @@ class TableMirror(ABC, Generic[TableParam, TableChange]):
         self._show()
 
     def _show(self) -> None:
-        self.params.update(self._shown(self._told))
+        self.params.update(self._shown(self._reported))
 
     def _shown(self, params: dict[str, TableParam]) -> dict[str, TableParam]:
         if self.is_loaded and self._is_reachable:
@@ -140,12 +140,12 @@ class TableMirror(ABC, Generic[TableParam, TableChange]):
     ) -> list[TableChange]:
         """Return the changes between two loads. Names that only the later one has are added to a table."""
         gone = [self._change(name, old, None) for name, old in before.items() if name not in now]
-        moved = [
+        changed = [
             self._change(name, before.get(name), new, is_added=bool(before))
             for name, new in now.items()
             if (old := before.get(name)) is None or not old.same_value(new)
         ]
-        return gone + moved
+        return gone + changed
 
     @abstractmethod
     def _change(

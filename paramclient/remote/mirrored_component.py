@@ -53,7 +53,7 @@ class MirroredComponent:
         key: name of its link on the service, system id and component id.
         component: its public component.
         document: its last received state.
-        told_at: time of the last received state, by the clock of the event loop.
+        reported_at: time of the last received state, by the clock of the event loop.
         identity: the identity in the document.
         mirror: its table.
         ext_mirror: the table of its extended parameters.
@@ -117,7 +117,7 @@ class MirroredComponent:
     @property
     def silence(self) -> float:
         """Seconds since its last message to the service, by the last report of the service."""
-        return float(self.document["silence_s"]) + anyio.current_time() - self.told_at
+        return float(self.document["silence_s"]) + anyio.current_time() - self.reported_at
 
     def listen(self, changes: Changes) -> None:
         """Push all further changes to this stream while it is referenced."""
@@ -232,7 +232,7 @@ class MirroredComponent:
         _check(document)
         self.identity = identity_of(document["identity"])
         self.document = document
-        self.told_at = anyio.current_time()
+        self.reported_at = anyio.current_time()
 
 
 def _check(document: Document) -> None:

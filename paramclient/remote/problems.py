@@ -94,7 +94,7 @@ def parse_unix_time(given: object) -> float:
     return float(given)
 
 
-def _whom(problem: Problem) -> dict[str, Any]:
+def _address_of(problem: Problem) -> dict[str, Any]:
     index = problem.get("index")
     return {
         "system": int(problem["system"]),
@@ -172,17 +172,17 @@ _MAKERS: Final[dict[str, Callable[[str, Problem], ParamClientError]]] = {
         str(problem["summary"]), vehicles=_vehicles(problem), choose_by=str(problem["choose_by"])
     ),
     "UnknownParameter": lambda detail, problem: UnknownParameter(
-        detail, **_whom(problem), nearest=tuple(map(str, problem.get("nearest", ())))
+        detail, **_address_of(problem), nearest=tuple(map(str, problem.get("nearest", ())))
     ),
-    "TypeMismatch": lambda detail, problem: TypeMismatch(detail, **_whom(problem)),
+    "TypeMismatch": lambda detail, problem: TypeMismatch(detail, **_address_of(problem)),
     "ContestedAddress": lambda detail, problem: ContestedAddress(
         int(problem["system"]),
         int(problem["component"]),
         [str(each) for each in problem["claimants"]],
         str(problem["difference"]),
     ),
-    "VehicleArmed": lambda detail, problem: VehicleArmed(detail, **_whom(problem)),
-    "Refused": lambda detail, problem: Refused(detail, code=int(problem["code"]), **_whom(problem)),
+    "VehicleArmed": lambda detail, problem: VehicleArmed(detail, **_address_of(problem)),
+    "Refused": lambda detail, problem: Refused(detail, code=int(problem["code"]), **_address_of(problem)),
     "CommandRefused": _command_refused,
     "ExtSetRefused": _ext_refused(ExtSetRefused),
     "ValueUnsupported": _ext_refused(ValueUnsupported),

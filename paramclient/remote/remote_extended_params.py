@@ -9,7 +9,7 @@ from typing import Final
 import anyio
 
 from paramclient.cache import SnapshotSummary
-from paramclient.client.arguments import check_asked_name, check_requested_name
+from paramclient.client.arguments import check_portable_name, check_requested_name
 from paramclient.client.extended_params import ExtChanges, ExtParams
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.model.ext_params import ExtParam, ExtSettable, ExtValue, check_ext_value
@@ -105,7 +105,7 @@ class RemoteExtParams(ExtParams):
         author: str | None = None,
     ) -> ExtSetResult:
         """See `ExtParams.set`. As in `Component.set`, a write whose response is lost is not sent again."""
-        pair = (check_asked_name(name), check_ext_value(value))
+        pair = (check_portable_name(name), check_ext_value(value))
         check_author(author)
         awaited = f"PARAM_EXT_SET {name} to {self._whose}"
         ((outcome,), _) = await self._write([pair], timeout, awaited, durable=durable)
@@ -130,7 +130,7 @@ class RemoteExtParams(ExtParams):
         their outcome is unknown.
         """
         given = values.items() if isinstance(values, Mapping) else values
-        pairs = [(check_asked_name(name), check_ext_value(value)) for name, value in given]
+        pairs = [(check_portable_name(name), check_ext_value(value)) for name, value in given]
         check_author(author)
         mirrored = self._mirrored
         self._service.connection.check_open()
@@ -200,7 +200,7 @@ class RemoteExtParams(ExtParams):
         download = self._mirrored.ext_progress
         before = download.count
 
-        def tell() -> None:
+        def report() -> None:
             assert progress is not None
             progress(download.since(before))
 
@@ -211,7 +211,7 @@ class RemoteExtParams(ExtParams):
                 download.end(answer.document["received"], answer.document["count"])
             return answer
 
-        answer = await run_with_progress(fetch, None if progress is None else tell)
+        answer = await run_with_progress(fetch, None if progress is None else report)
         with decode_errors(self._service.name):
             return ext_fetch_result_of(answer.document, self.params, anyio.current_time() - began)
 

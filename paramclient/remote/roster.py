@@ -181,7 +181,7 @@ class ServiceComponents:
             mirrored.mark_found(document, seq)
             self.components[key] = mirrored
             self._stale[key] = mirrored
-            self.connection.tell()
+            self.connection.notify()
         return mirrored
 
     def _doubt(self, mirrored: MirroredComponent) -> None:
@@ -223,13 +223,13 @@ class ServiceComponents:
         connection = self.connection
         with anyio.move_on_after(timeout):
             while mirrored is not None:
-                has_come = (
+                has_arrived = (
                     place is None
                     or connection.place is None
                     or connection.place.run != place.run
                     or connection.place.seq >= place.seq
                 )
-                if has_come and mirrored.is_loaded:
+                if has_arrived and mirrored.is_loaded:
                     return
                 if mirrored.key in self._stale:  # load this table next
                     self._stale = {mirrored.key: mirrored, **self._stale}
@@ -326,7 +326,7 @@ class ServiceComponents:
         except BaseException:
             self._is_list_stale = True
             raise
-        self.connection.tell()
+        self.connection.notify()
 
     def _take_list(self, documents: list[Document], seq: int) -> None:
         before, self.components = self.components, {}
@@ -363,7 +363,7 @@ class ServiceComponents:
         if mirrored.is_loaded:
             self._stale.pop(mirrored.key, None)
             mirrored.tables_were_loaded()
-            self.connection.tell()
+            self.connection.notify()
 
     async def _snapshot(self, path: str, link: str | None) -> Document:
         """Request a list or table from the run of the service whose events are followed.
@@ -371,8 +371,8 @@ class ServiceComponents:
         Raises:
             Unreached, ParamClientError: the request failed, or the service has restarted.
         """
-        asked = await self._requests.ask("GET", path, link=link, timeout=SNAPSHOT_TIMEOUT)
-        answer: Document = asked.document
+        response = await self._requests.ask("GET", path, link=link, timeout=SNAPSHOT_TIMEOUT)
+        answer: Document = response.document
         place = self.connection.place
         with decode_errors(self.name):
             is_of_run = place is not None and answer["run"] == place.run

@@ -161,7 +161,7 @@ class ServiceClient:
                 await self._learn_who_we_are()
                 await self._roster.load_list()
             tasks.start_soon(self._roster.run, name="paramclient loader")
-            tasks.start_soon(self._load_stats_when_wanted, name="paramclient statistics")
+            tasks.start_soon(self._load_stats_when_needed, name="paramclient statistics")
         except BaseException as error:
             await self._leave(tasks)
             if isinstance(error, ServiceUnreachable):
@@ -317,7 +317,7 @@ class ServiceClient:
         began = anyio.current_time()
         before = {key: each.progress.count for key, each in self._roster.components.items()}
 
-        def tell() -> None:
+        def report() -> None:
             components = self._roster.components.items()
             assert progress is not None
             progress({key[1:]: each.progress.since(before.get(key, 0)) for key, each in components})
@@ -344,7 +344,7 @@ class ServiceClient:
             await self._look_at_links()
             return answer
 
-        answer = await run_with_progress(fetch, None if progress is None else tell)
+        answer = await run_with_progress(fetch, None if progress is None else report)
         elapsed = anyio.current_time() - began
         with decode_errors(self._service.name):
             known = self._roster.components
@@ -395,7 +395,7 @@ class ServiceClient:
         with suppress(ServiceUnreachable, ParamClientError):
             await self._load_links()
 
-    async def _load_stats_when_wanted(self) -> None:
+    async def _load_stats_when_needed(self) -> None:
         while True:
             await self._roster.are_links_stale.wait()
             self._roster.are_links_stale = anyio.Event()

@@ -80,7 +80,7 @@ class DescriptionLoader:
         component = followed.component
         try:
             loaded = await load_if_quick(component, store=self._store or False)
-        except LinkError:  # the vehicle is asked again when the link is back
+        except LinkError:  # the request is repeated after the reconnection
             self._attempts.pop(_attempt(followed, identity), None)
             return
         except ParamClientError as error:

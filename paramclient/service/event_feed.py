@@ -1,8 +1,8 @@
 """The event feed: numbered events of the service, kept in one list for all listeners.
 
 A listener is only a position in the list, so that 1,000 listeners need almost no memory, and a slow listener
-delays nobody. A listener whose position was overwritten receives the number of missed events. Listeners with
-the same position and filter share one encoded batch. The members of the events are built by
+delays no other listener. A listener whose position was overwritten receives the number of missed events.
+Listeners with the same position and filter share one encoded batch. The members of the events are built by
 `followed_component`, `followed_extended`, `link` and `jobs`.
 """
 

@@ -335,7 +335,7 @@ def param_json(param: Param, received_at: float | None, described: int | float |
 
 
 def _firmware_of(identity: Identity) -> tuple[object, ...] | None:
-    """Return the members of an identity that tell the firmware; None while they are unknown."""
+    """Return the members of an identity that identify the firmware; None while they are unknown."""
     if not identity.firmware and not identity.git_hash:
         return None
     return identity.autopilot, identity.vehicle_type, identity.firmware, identity.git_hash, identity.board

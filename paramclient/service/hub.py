@@ -211,7 +211,9 @@ class Hub:
         if notes is None:
             return None
         (system, component), key = job.followed.address, job.followed.key
-        begin = partial(notes.begin, system=system, component=component, asked_by=job.asked_by, key=key)
+        begin = partial(
+            notes.begin, system=system, component=component, requested_by=job.requested_by, key=key
+        )
         return await self.run_in_thread(lambda: begin(job.id, job.kind, link=job.followed.link.name))
 
     async def end_setup_record(self, note: RunningSetup, *, is_cut_off: bool) -> None:
@@ -279,7 +281,7 @@ class Hub:
         return [(each, each.client) for each in chosen if each.client is not None]
 
     def start_fetch(
-        self, followed: FollowedComponent, asked_by: str, holder: str = "", **options: Any
+        self, followed: FollowedComponent, requested_by: str, holder: str = "", **options: Any
     ) -> Job:
         """Start a job that fetches a component's table; the options are those of `Component.fetch_all`.
 
@@ -288,10 +290,15 @@ class Hub:
         Raises:
             ServiceError: too many jobs are running, of this holder or in total.
         """
-        return self.jobs.start("fetch", followed, partial(_fetch, options), asked_by, holder)
+        return self.jobs.start("fetch", followed, partial(_fetch, options), requested_by, holder)
 
     def start_extended_fetch(
-        self, followed: FollowedComponent, asked_by: str, holder: str = "", *, timeout: float | None = None
+        self,
+        followed: FollowedComponent,
+        requested_by: str,
+        holder: str = "",
+        *,
+        timeout: float | None = None,
     ) -> Job:
         """Start a job that downloads a component's extended parameters; see `ExtParams.fetch_all`.
 
@@ -301,7 +308,7 @@ class Hub:
             ServiceError: too many jobs are running, of this holder or in total.
         """
         work = partial(_fetch_extended, timeout)
-        return self.jobs.start("extended-fetch", followed, work, asked_by, holder)
+        return self.jobs.start("extended-fetch", followed, work, requested_by, holder)
 
     async def wait_for_component(
         self, system: int | None, component: int | None, link: str | None, timeout: float | None
@@ -449,13 +456,13 @@ class Hub:
         notes = self._setups
         if notes is None:
             return
-        self.jobs.cut_off = await self._worker.run(lambda: notes.cut_off(tells=True))
+        self.jobs.cut_off = await self._worker.run(lambda: notes.cut_off(mark_reported=True))
         for each in self.jobs.cut_off:
-            if not each.is_told:
+            if not each.is_reported:
                 logger.warning(
                     "%s of %d/%d on %s, started by %s at %s, was cut off %s by the end of the service",
                     *("a restore" if each.kind == "restore" else "an apply", each.system, each.component),
-                    *(each.link, each.asked_by, time_text(each.began), progress_text(each)),
+                    *(each.link, each.requested_by, time_text(each.began), progress_text(each)),
                 )
 
     async def _load_cached(self, followed: FollowedComponent) -> None:

@@ -50,7 +50,7 @@ class Job:
         id: random id.
         kind: fetch, extended-fetch, apply or restore.
         followed: its component.
-        asked_by: author who started it.
+        requested_by: author who started it.
         holder: holder of its quota; "" for the service.
         state: running, done, failed or cancelled.
         progress: progress as a document, set by the work.
@@ -60,11 +60,11 @@ class Job:
         ended: end time in unix seconds, or None.
     """
 
-    def __init__(self, kind: Kind, followed: FollowedComponent, asked_by: str, holder: str) -> None:
+    def __init__(self, kind: Kind, followed: FollowedComponent, requested_by: str, holder: str) -> None:
         self.id = secrets.token_hex(8)
         self.kind = kind
         self.followed = followed
-        self.asked_by = asked_by
+        self.requested_by = requested_by
         self.holder = holder
         self.state: State = "running"
         self.progress: Document | None = None
@@ -86,7 +86,7 @@ class Job:
             system=system,
             component=component,
             state=self.state,
-            asked_by=self.asked_by,
+            requested_by=self.requested_by,
             began=round(self.began, 3),
             ended=None if self.ended is None else round(self.ended, 3),
             progress=None if self.progress is None else self.progress.as_json(),
@@ -172,7 +172,7 @@ class Jobs:
         return self.find(name).document_factory()
 
     def start(
-        self, kind: Kind, followed: FollowedComponent, work: Work, asked_by: str, holder: str = ""
+        self, kind: Kind, followed: FollowedComponent, work: Work, requested_by: str, holder: str = ""
     ) -> Job:
         """Start a job.
 
@@ -180,7 +180,7 @@ class Jobs:
             kind: fetch, extended-fetch, apply or restore.
             followed: its component.
             work: the work of the job.
-            asked_by: author who starts it.
+            requested_by: author who starts it.
             holder: holder of its quota; "" for the service.
 
         Raises:
@@ -205,7 +205,7 @@ class Jobs:
             )
         for name in ended[: max(0, len(ended) - ENDED_JOBS_KEPT_MAX + 1)]:
             del self._jobs[name]
-        job = Job(kind, followed, asked_by, holder)
+        job = Job(kind, followed, requested_by, holder)
         self._jobs[job.id] = job
         self.publish(job)
         self._tasks.start_soon(self._run, job, work, name=f"paramclient job {job.id}")

@@ -242,8 +242,8 @@ class Request:
     @property
     def is_preflight(self) -> bool:
         """Return whether the request is a CORS preflight request."""
-        asked = self.header(b"access-control-request-method")
-        return self.method == "OPTIONS" and self.origin is not None and asked is not None
+        requested_method = self.header(b"access-control-request-method")
+        return self.method == "OPTIONS" and self.origin is not None and requested_method is not None
 
     @property
     def is_public(self) -> bool:

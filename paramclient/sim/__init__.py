@@ -1,6 +1,6 @@
 """Simulated vehicles and a faulty link, for tests of other programs.
 
-All of it is sans-I/O: bytes and the time come in as arguments. There are no sockets, clocks or threads, and
+All of it is sans-I/O: bytes and the time are arguments. There are no sockets, clocks or threads, and
 every run has the same outcome. A complete session is a loop::
 
     vehicle = PX4Vehicle()

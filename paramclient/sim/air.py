@@ -235,7 +235,7 @@ class Air:
 
     @property
     def vehicle_count(self) -> int | None:
-        """The number of vehicles; None if an endpoint does not tell its number."""
+        """The number of vehicles; None if an endpoint does not say its number."""
         counts = [getattr(each, "vehicle_count", None) for each in self.vehicles]
         known = [count for count in counts if isinstance(count, int)]
         return sum(known) if len(known) == len(counts) else None

@@ -150,7 +150,7 @@ class Camera(BytewiseVehicle):
         return param
 
     def set_ext_param(self, name: str, value: ExtValue) -> None:
-        """Change an extended value as if on board: no message tells of it.
+        """Change an extended value as if on board: no message reports it.
 
         Raises:
             UsageError: the camera has no extended parameter with that name, or the value does not fit its

@@ -20,7 +20,7 @@ class BytewiseVehicle(Vehicle):
         self._start_list(self._now)
 
     def _on_read(self, request: wire.ParamRequestRead, sender: wire.Frame) -> None:
-        entry = self._wanted(request)
+        entry = self._requested_entry(request)
         if entry is None:
             self._refuse(ParamErrorCode.DOES_NOT_EXIST, request, sender)
         elif not self._is_dead(entry):
@@ -43,7 +43,7 @@ class BytewiseVehicle(Vehicle):
         else:
             self._send_value(entry)
 
-    def _wanted(self, request: wire.ParamRequestRead) -> Entry | None:
+    def _requested_entry(self, request: wire.ParamRequestRead) -> Entry | None:
         if request.param_index < 0:
             return self._find(request.param_id)
         return self._by_index(request.param_index)

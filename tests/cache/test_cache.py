@@ -45,7 +45,7 @@ def path(tmp_path: Path) -> Path:
 # What is kept
 
 
-def test_a_table_comes_back_as_it_was_in_the_next_session(path: Path) -> None:
+def test_a_table_is_restored_unchanged_in_the_next_session(path: Path) -> None:
     state = TableState(0xFFFFFFFF, 4, complete=True, volatile_known=True, synced_at=NOW + 1)
     with ParamCache(path) as cache:
         cache.save(
@@ -126,11 +126,11 @@ def test_two_vehicles_with_one_system_id_keep_two_tables(path: Path) -> None:
 
 
 def test_a_known_vehicle_is_known_again_under_another_system_id_and_link(path: Path) -> None:
-    moved = replace(PX4, system=7, link="serial:/dev/ttyACM0:57600", firmware=1)
+    changed = replace(PX4, system=7, link="serial:/dev/ttyACM0:57600", firmware=1)
     with ParamCache(path) as cache:
         cache.save(update(stored("A", 1)))
-        cache.save(update(identity=moved, at=NOW + 60))
-        assert cache.vehicles() == [CachedVehicle(PX4.key, moved, NOW, NOW + 60, (1,))]
+        cache.save(update(identity=changed, at=NOW + 60))
+        assert cache.vehicles() == [CachedVehicle(PX4.key, changed, NOW, NOW + 60, (1,))]
         assert values(cache) == {"A": 1}
 
 
@@ -221,7 +221,7 @@ COVERED = update(
         (update(stored("A", 1, index=0), replace=True), False),
     ],
 )
-def test_a_change_of_what_the_hash_covers_takes_the_hash_away(path: Path, change: Any, keeps: bool) -> None:
+def test_a_change_of_what_the_hash_covers_removes_the_hash(path: Path, change: Any, keeps: bool) -> None:
     with ParamCache(path) as cache:
         cache.save(COVERED)
         cache.save(change)
@@ -277,7 +277,7 @@ def test_each_change_of_a_value_leaves_a_line_and_nothing_else_does(path: Path) 
     assert table.params["F"].bits == 0x80000000
 
 
-def test_history_can_be_asked_for_by_component_name_and_number(path: Path) -> None:
+def test_history_can_be_requested_by_component_name_and_number(path: Path) -> None:
     with ParamCache(path) as cache:
         for value in range(4):
             cache.save(
@@ -432,7 +432,7 @@ def test_tables_and_vehicles_are_removed_with_their_history(three: ParamCache) -
         assert cache.history(PX4.key) == []
 
 
-def test_reprs_tell_the_state(path: Path) -> None:
+def test_reprs_show_the_state(path: Path) -> None:
     with ParamCache(path) as cache:
         cache.save(whole_table(903))
         assert repr(cache.component()) == "<CachedComponent 1/1 px4 903 params synced 2026-11-18 11:06Z>"
@@ -465,7 +465,7 @@ def test_a_table_outlives_its_link_but_a_closed_cache_answers_no_more(path: Path
             ask()
 
 
-def test_a_cache_that_is_thrown_away_closes_its_file(path: Path) -> None:
+def test_a_cache_that_is_deleted_closes_its_file(path: Path) -> None:
     ParamCache(path).save(whole_table(2))
     table = ParamCache(path).component()
     assert table.history() == []
@@ -517,7 +517,7 @@ def test_to_import_it_takes_no_other_library() -> None:
     assert not {"pydantic", "pymavlink", "anyio", "asyncio"} & set(loaded)
 
 
-# Observations that come late
+# Observations that arrive late
 
 
 def lines_of(cache: ParamCache) -> list[tuple[float, str, Any, Any]]:
@@ -537,7 +537,7 @@ def test_an_older_observation_never_replaces_a_newer_one(path: Path) -> None:
         assert values(other) == {"PARAM_0": 19, "PARAM_1": 201}
         assert lines_of(one) == [(1, "PARAM_0", 200, 17), (2, "PARAM_0", 17, 19)]
         one.save(update(stored("PARAM_0", 19, at=NOW + 2.1), at=NOW + 2.6))
-        assert len(lines_of(one)) == 2, "it was told already"
+        assert len(lines_of(one)) == 2, "it was reported already"
 
 
 def test_an_observation_older_than_a_whole_table_keeps_it_complete(path: Path) -> None:
@@ -626,8 +626,8 @@ def test_a_late_observation_of_a_name_that_was_removed_and_added_is_no_change_of
         assert lines_of(one) == [(1, "PARAM_0", 0, None), (3, "PARAM_0", 5, 7)]
         one.save(update(stored("PARAM_0", 8, index=0, at=NOW + 7), at=NOW + 7))
         other.save(update(stored("PARAM_0", 6, at=NOW + 2.5), at=NOW + 8))
-        told = [(at, new) for at, _, _, new in lines_of(one)]
-        assert {(1, None), (3, 7), (7, 8)} <= set(told), "each was so at its time"
+        reported = [(at, new) for at, _, _, new in lines_of(one)]
+        assert {(1, None), (3, 7), (7, 8)} <= set(reported), "each was so at its time"
         assert values(one) == {"PARAM_0": 8, "PARAM_1": 1}
 
 
@@ -639,7 +639,7 @@ def test_a_part_that_a_fresh_file_has_of_a_whole_table_takes_the_rest(path: Path
         assert values(cache) == {"PARAM_0": 0, "PARAM_1": 1}
 
 
-def test_a_clock_that_was_set_back_is_told_from_a_program_that_is_late(path: Path) -> None:
+def test_a_clock_that_was_set_back_is_distinguished_from_a_program_that_is_late(path: Path) -> None:
     """In a file, where one clock counts: by the present at which the late one comes to write."""
     with ParamCache(path) as cache:
         cache.save(update(stored("A", 1), at=NOW))
@@ -652,7 +652,7 @@ def test_a_clock_that_was_set_back_is_told_from_a_program_that_is_late(path: Pat
         assert values(cache) == {"A": 5}
         assert [line[2:] for line in lines_of(cache)] == [(1, 3), (3, 2), (2, 4), (4, 5)]
         cache.save(update(stored("A", 9, at=NOW + 10), at=NOW + 14), clock=lambda: NOW + 14.0)
-        assert [line[3] for line in lines_of(cache)] == [3, 2, 4, 9, 5], "also among what came since"
+        assert [line[3] for line in lines_of(cache)] == [3, 2, 4, 9, 5], "also among what arrived since"
 
 
 # The model
@@ -701,7 +701,7 @@ class Model:
         is_less = state is not None and not state.complete and self.state.complete and not whole
         counts: tuple[int | None, ...] = (self.state.count,) if params else (self.state.count, None)
         if is_less and state is not None and state.count in counts:
-            state = None  # a program that knows less of a table takes nothing away from it
+            state = None  # a program that knows less of a table removes nothing from it
         if state is not None:
             self.state = state
         elif covered != self.covered():

@@ -70,7 +70,7 @@ def values_in(cache: ParamCache, component: int = 100) -> dict[str, ExtValue]:
     return {} if found is None else {name: param.value for name, param in found.params.items()}
 
 
-def told_in(cache: ParamCache, name: str | None = None) -> list[tuple[float, str, object, object, str]]:
+def lines_in(cache: ParamCache, name: str | None = None) -> list[tuple[float, str, object, object, str]]:
     """The history: seconds after NOW, name, old value, new value, author."""
     return [
         (each.at - NOW, each.name, each.old.value, each.new and each.new.value, each.by)
@@ -78,7 +78,7 @@ def told_in(cache: ParamCache, name: str | None = None) -> list[tuple[float, str
     ]
 
 
-def test_values_of_every_type_come_back_in_the_next_session(path: Path) -> None:
+def test_values_of_every_type_are_restored_in_the_next_session(path: Path) -> None:
     params = [
         kept(name, value, index, kind) for index, (name, (kind, value)) in enumerate(EVERY_TYPE.items())
     ]
@@ -92,7 +92,7 @@ def test_values_of_every_type_come_back_in_the_next_session(path: Path) -> None:
         assert [param.value for param in found.params.values()] == [value for _, value in EVERY_TYPE.values()]
         assert set(found.heard_at.values()) == {NOW + 1}
         assert (found.key, found.component, found.count, found.complete) == (PX4.key, 100, 10, True)
-        assert told_in(cache) == []
+        assert lines_in(cache) == []
         assert cache.load_ext(PX4.key, 1) is None
         assert cache.load_ext("nothing", 100) is None
 
@@ -106,7 +106,7 @@ def test_plain_and_extended_tables_of_a_component_are_separate(path: Path) -> No
         assert values(cache, component=100) == {"A": 5, "B": 2}
         assert values_in(cache) == {"A": "other", "C": 3}
         assert [(each.name, each.new and each.new.value) for each in cache.history(PX4.key)] == [("A", 5)]
-        assert told_in(cache) == [(2.0, "A", "text", "other", "us")]
+        assert lines_in(cache) == [(2.0, "A", "text", "other", "us")]
         [summary] = cache.components()
         assert summary.size == 2
 
@@ -116,16 +116,16 @@ def test_changes_and_removals_are_in_the_history(path: Path) -> None:
         cache.save_ext([learnt(A=1, B="x", count=2, complete=True)])
         cache.save_ext([learnt(A=1, at=NOW + 1), learnt(A=2, at=NOW + 2, by="us for anna")])
         cache.save_ext([learnt(at=NOW + 3, removed={"B": NOW + 3, "NO_SUCH": NOW + 3}, count=1)])
-        assert told_in(cache) == [
+        assert lines_in(cache) == [
             (2.0, "A", 1, 2, "us for anna"),
             (3.0, "B", "x", None, "vehicle"),
         ]
-        assert told_in(cache, "B") == [(3.0, "B", "x", None, "vehicle")]
+        assert lines_in(cache, "B") == [(3.0, "B", "x", None, "vehicle")]
         assert len(cache.ext_history(PX4.key, limit=1)) == 1
         assert len(cache.ext_history(PX4.key, since=NOW + 2.5)) == 1
         found = cache.load_ext(PX4.key, 100)
         assert found is not None
-        assert (found.count, found.complete) == (1, True), "what is not told stays"
+        assert (found.count, found.complete) == (1, True), "what is not received stays"
 
 
 def test_an_older_observation_never_replaces_a_newer_one(path: Path) -> None:
@@ -133,12 +133,12 @@ def test_an_older_observation_never_replaces_a_newer_one(path: Path) -> None:
         for at in (2.0, 1.0, 3.0, 2.5):
             cache.save_ext([learnt(A=int(10 * at), at=NOW + at)], clock=lambda: NOW + 9)
         assert values_in(cache) == {"A": 30}
-        assert told_in(cache) == [(3.0, "A", 20, 30, "vehicle")]
+        assert lines_in(cache) == [(3.0, "A", 20, 30, "vehicle")]
         cache.save_ext([learnt(at=NOW + 4, removed={"A": NOW + 2.9})])
         assert values_in(cache) == {"A": 30}, "it was received after that"
 
 
-def test_an_index_stays_until_another_one_is_told(path: Path) -> None:
+def test_an_index_stays_until_another_one_is_received(path: Path) -> None:
     with ParamCache(path) as cache:
         cache.save_ext([learnt(B=1, A=2)])
         row = StoredExtParam.of(kept("A", 5), NOW + 1)
@@ -154,7 +154,7 @@ def test_the_history_is_bounded(path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     with ParamCache(path) as cache:
         for number in range(10):
             cache.save_ext([learnt(A=number, at=NOW + number)])
-        assert [line[3] for line in told_in(cache)] == [5, 6, 7, 8, 9]
+        assert [line[3] for line in lines_in(cache)] == [5, 6, 7, 8, 9]
 
 
 def test_offline_reading(path: Path) -> None:
@@ -179,7 +179,7 @@ def test_to_remove_a_table_removes_both(path: Path) -> None:
         assert cache.load_ext(PX4.key, 100) is None
         assert values(cache) == {"PARAM_0": 0, "PARAM_1": 1, "PARAM_2": 2}
         cache.save_ext([learnt(A=5, at=NOW + 2)])
-        assert told_in(cache) == []
+        assert lines_in(cache) == []
 
 
 def test_a_time_that_is_none_writes_nothing(path: Path) -> None:
@@ -192,14 +192,14 @@ def test_a_time_that_is_none_writes_nothing(path: Path) -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_in_whatever_order_they_come_the_latest_values_are_kept(path: Path, seed: int) -> None:
+def test_the_latest_values_are_kept_in_any_order_of_arrival(path: Path, seed: int) -> None:
     moments = list(range(20))
     random.Random(seed).shuffle(moments)
     with ParamCache(path) as cache:
         for moment in moments:
             cache.save_ext([learnt(A=moment, at=NOW + moment)], clock=lambda: NOW + 30)
         assert values_in(cache) == {"A": 19}
-        lines = told_in(cache)
+        lines = lines_in(cache)
         assert [line[3] for line in lines] == sorted(line[0] for line in lines)
 
 
@@ -209,12 +209,12 @@ def test_a_copy_has_extended_parameters_too(path: Path, tmp_path: Path) -> None:
         cache.save_ext([learnt(A=1, B="x", count=2, complete=True), learnt(A=2, at=NOW + 1)])
         assert (cache.copy_to(copy).tables, cache.copy_to(copy).unchanged) == (2, 2)
         assert copy.load_ext(PX4.key, 100) == cache.load_ext(PX4.key, 100)
-        assert told_in(copy) == told_in(cache)
+        assert lines_in(copy) == lines_in(cache)
         copy.save_ext([learnt(A=7, at=NOW + 5)])
         cache.save_ext([learnt(B="y", at=NOW + 4)])
         cache.copy_to(copy)
         assert values_in(copy) == {"A": 7, "B": "y"}
-        assert [line[:2] for line in told_in(copy)] == [(1.0, "A"), (4.0, "B"), (5.0, "A")]
+        assert [line[:2] for line in lines_in(copy)] == [(1.0, "A"), (4.0, "B"), (5.0, "A")]
         assert cache.copy_to(copy).unchanged == 2
 
 
@@ -311,7 +311,7 @@ def test_a_copy_has_the_snapshots_of_extended_parameters_too(path: Path, tmp_pat
         assert cache.copy_to(copy).unchanged == 1
 
 
-def test_queued_snapshots_come_back() -> None:
+def test_queued_snapshots_are_restored() -> None:
     params = {name: kept(name, value, 3, kind) for name, (kind, value) in EVERY_TYPE.items()}
     for operation in (
         StoreExtSnapshot(PX4, 100, ExtParamSet(params), NOW, "before apply", False, 7),
@@ -331,7 +331,7 @@ def test_a_damaged_snapshot_of_extended_parameters_is_an_error(path: Path) -> No
         cache.ext_state_at(PX4.key, 100, made.id)
 
 
-def test_queued_writes_come_back() -> None:
+def test_queued_writes_are_restored() -> None:
     operation = SaveExt([learnt(A=1, B=b"\xff\0", at=NOW, removed={"C": NOW}, count=2, complete=False)])
     again = unpacked(packed(operation))
     assert isinstance(again, SaveExt)

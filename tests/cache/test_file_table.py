@@ -83,7 +83,7 @@ def test_a_table_that_was_received_later_is_replaced_only_with_force(cache: Para
     assert cache.component().source == "second.params"
 
 
-def test_types_and_volatile_names_come_from_the_previous_table(cache: ParamCache) -> None:
+def test_types_and_volatile_names_are_from_the_previous_table(cache: ParamCache) -> None:
     whole = [
         stored("PARAM_0", 0, index=0, volatile=False),
         stored("PARAM_1", 0, ParamType.REAL32, index=1, volatile=False),
@@ -102,13 +102,13 @@ def test_types_and_volatile_names_come_from_the_previous_table(cache: ParamCache
     assert table.volatile == {"PARAM_2"}
 
 
-def test_types_come_from_another_table_of_the_same_firmware(cache: ParamCache) -> None:
+def test_types_are_from_another_table_of_the_same_firmware(cache: ParamCache) -> None:
     cache.save(whole_table(3, OTHER))
     added = cache.add(file(typed=False, **THREE), PX4)
     assert added.complete
     assert values(cache) == THREE
     assert cache.component(PX4.key).hash == hash_params(cache.component(PX4.key).params.values())
-    with pytest.raises(UsageError, match=r"quad.params does not tell the types .* no cached table of its"):
+    with pytest.raises(UsageError, match=r"quad.params has no types .* no cached table of its"):
         cache.add(file(typed=False, **THREE), replace(PX4, uid="0002ff", firmware=1, git_hash="b0"))
 
 
@@ -121,7 +121,7 @@ def test_files_without_types_or_with_invalid_values_are_refused(cache: ParamCach
         cache.add(wrong, PX4.key)
     with pytest.raises(UsageError, match="has no parameters"):
         cache.add(file(), PX4.key)
-    with pytest.raises(UsageError, match="does not tell its vehicle"):
+    with pytest.raises(UsageError, match="does not name its vehicle"):
         cache.add(file(**THREE))
     with pytest.raises(UnknownVehicle):
         cache.add(file(**THREE), "77")

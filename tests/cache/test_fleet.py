@@ -37,7 +37,7 @@ def wanted(**values: Any) -> ParamSet:
     return ParamSet({name: WrittenParam(name, value) for name, value in values.items()})
 
 
-def told(spread: NameSpread) -> list[tuple[Any, list[int], bool]]:
+def reported(spread: NameSpread) -> list[tuple[Any, list[int], bool]]:
     """Values, the systems that have them, and whether they agree."""
     return [
         (each.param.value, sorted(holder.vehicle.system for holder in each.holders), each.agrees)
@@ -72,7 +72,7 @@ def test_vehicles_are_compared_with_each_other_by_what_most_of_them_have(cache: 
     assert found.differs
     assert [vehicle.system for vehicle in found.vehicles] == [1, 2, 3, 4, 5]
     assert [each.differs for each in found.names] == [True, False]
-    assert [told(each) for each in found.names] == [
+    assert [reported(each) for each in found.names] == [
         [(0, [1, 2, 4, 5], True), (1, [3], False)],
         [(7, [1, 2, 3, 4, 5], True)],
     ]
@@ -98,10 +98,10 @@ def test_two_equally_common_values_are_both_listed_as_differing(cache: ParamCach
     for number, identity in enumerate(VEHICLES[:4]):
         cache.save(update(stored("A", number % 2), identity=identity, table=DONE))
     [each] = cache.fleet_diff(["A"]).names
-    assert told(each) == [(0, [1, 3], False), (1, [2, 4], False)]
+    assert reported(each) == [(0, [1, 3], False), (1, [2, 4], False)]
 
 
-def test_vehicles_are_compared_with_what_is_wanted_in_the_type_that_each_has(cache: ParamCache) -> None:
+def test_vehicles_are_compared_with_wanted_values_in_the_type_that_each_has(cache: ParamCache) -> None:
     tenth = bits_of(0.1, REAL32)
     cache.save(update(stored("F", tenth, REAL32), stored("N", 3), identity=VEHICLES[0], table=DONE))
     cache.save(
@@ -111,10 +111,10 @@ def test_vehicles_are_compared_with_what_is_wanted_in_the_type_that_each_has(cac
     found = cache.fleet_diff(wanted(F=0.1, N=3))
     assert names_of(found) == ["F", "N"]
     assert [each.wanted and each.wanted.value for each in found.names] == [0.1, 3]
-    assert {tuple(owners): agrees for _, owners, agrees in told(found.names[0])} == {
+    assert {tuple(owners): agrees for _, owners, agrees in reported(found.names[0])} == {
         (1,): True, (2,): False, (3,): False,
     }  # fmt: skip
-    assert {tuple(owners): agrees for _, owners, agrees in told(found.names[1])} == {
+    assert {tuple(owners): agrees for _, owners, agrees in reported(found.names[1])} == {
         (1,): True, (2,): False, (3,): False,
     }  # fmt: skip
 
@@ -125,8 +125,8 @@ def test_a_zero_has_no_sign_here_and_a_nan_is_itself(cache: ParamCache) -> None:
     ):
         cache.save(update(stored("Z", zero, REAL32), stored("N", nan, REAL32), identity=identity, table=DONE))
     zeros, nans = cache.fleet_diff(["Z", "N"]).names
-    assert told(zeros) == [(0.0, [1, 2, 3], True)]
-    assert [(owners, agrees) for _, owners, agrees in told(nans)] == [([1, 2], True), ([3], False)]
+    assert reported(zeros) == [(0.0, [1, 2, 3], True)]
+    assert [(owners, agrees) for _, owners, agrees in reported(nans)] == [([1, 2], True), ([3], False)]
     assert not cache.fleet_diff(wanted(Z=-0.0)).differs
 
 
@@ -137,19 +137,19 @@ def test_a_vehicle_without_the_parameter_is_lacking_and_one_with_an_incomplete_t
     cache.save(update(stored("B", 1), identity=VEHICLES[1], table=DONE))
     cache.save(update(stored("B", 1), identity=VEHICLES[2]))
     [each] = cache.fleet_diff(["A"]).names
-    assert (told(each), systems(each.lacking), systems(each.unknown)) == ([(1, [1], True)], [2], [3])
+    assert (reported(each), systems(each.lacking), systems(each.unknown)) == ([(1, [1], True)], [2], [3])
     assert each.differs
     cache.remove(VEHICLES[1].key)
     [each] = cache.fleet_diff(["A"]).names
     assert (systems(each.lacking), systems(each.unknown), each.differs) == ([], [3], True)
-    [nobody] = cache.fleet_diff(wanted(NONE=1)).names
-    assert (nobody.values, systems(nobody.lacking), systems(nobody.unknown)) == ((), [1], [3])
+    [unheld] = cache.fleet_diff(wanted(NONE=1)).names
+    assert (unheld.values, systems(unheld.lacking), systems(unheld.unknown)) == ((), [1], [3])
 
 
 def test_only_the_component_that_is_meant_is_looked_at(cache: ParamCache) -> None:
     cache.save([update(stored("A", 1)), update(stored("A", 2), component=154)])
-    assert told(cache.fleet_diff(["A"]).names[0]) == [(1, [1], True)]
-    assert told(cache.fleet_diff(["A"], component=154).names[0]) == [(2, [1], True)]
+    assert reported(cache.fleet_diff(["A"]).names[0]) == [(1, [1], True)]
+    assert reported(cache.fleet_diff(["A"], component=154).names[0]) == [(2, [1], True)]
     assert cache.fleet_diff(replace(wanted(A=2), component=154)).component == 154
     assert not cache.fleet_diff(replace(wanted(A=2), component=154)).differs
     assert cache.fleet_diff(replace(wanted(A=2), component=154), component=1).differs
@@ -187,7 +187,7 @@ def test_more_names_than_a_statement_takes_are_no_matter(
     assert [each.differs for each in cache.fleet_diff(want).names] == [False, *[True] * 9]
 
 
-def test_damage_that_is_met_is_told_as_everywhere(tmp_path: Path) -> None:
+def test_damage_during_a_comparison_is_reported_as_elsewhere(tmp_path: Path) -> None:
     path = tmp_path / "cache"
     with ParamCache(path) as cache:
         cache.save(update(stored("A", 1), table=DONE))
@@ -203,7 +203,7 @@ def test_damage_that_is_met_is_told_as_everywhere(tmp_path: Path) -> None:
 # Since when
 
 
-def test_those_that_stand_out_are_told_since_when(cache: ParamCache) -> None:
+def test_vehicles_that_differ_have_the_time_of_the_change(cache: ParamCache) -> None:
     for identity in VEHICLES:
         cache.save(update(stored("A", 1), stored("B", 1), identity=identity, table=DONE))
     changed, reborn, gone, new = VEHICLES[1:]
@@ -227,7 +227,7 @@ def test_those_that_stand_out_are_told_since_when(cache: ParamCache) -> None:
     assert all(holder.since is None for each in a.values if each.agrees for holder in each.holders)
 
 
-def test_a_change_after_a_name_came_back_is_the_latest(cache: ParamCache) -> None:
+def test_a_change_after_the_return_of_a_name_is_the_latest(cache: ParamCache) -> None:
     cache.save(update(stored("A", 1), table=DONE))
     for after, item in ((10, None), (20, 2), (30, 3)):
         params = [] if item is None else [stored("A", item, at=NOW + after)]
@@ -235,13 +235,13 @@ def test_a_change_after_a_name_came_back_is_the_latest(cache: ParamCache) -> Non
     assert since(cache.fleet_diff(wanted(A=9)).names[0]) == {1: (30, True)}
 
 
-def test_of_a_table_that_was_never_complete_it_is_known_when_it_was_heard_last(cache: ParamCache) -> None:
+def test_a_table_that_was_never_complete_has_the_time_of_its_last_value(cache: ParamCache) -> None:
     cache.save(update(stored("A", 1)))
     cache.save(update(stored("A", 1, at=NOW + 5), at=NOW + 5))
     assert since(cache.fleet_diff(wanted(A=9)).names[0]) == {1: (5, False)}
 
 
-def test_a_value_that_was_heard_before_the_table_was_complete_was_so_then(cache: ParamCache) -> None:
+def test_a_value_that_was_received_before_the_table_was_complete_was_so_then(cache: ParamCache) -> None:
     cache.save(update(stored("A", 1)))
     cache.save(update(stored("B", 1, at=NOW + 5), at=NOW + 5, table=DONE))
     cache.save(update(stored("B", 1, at=NOW + 9), at=NOW + 9))

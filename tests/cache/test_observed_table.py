@@ -45,8 +45,8 @@ def tables(draw: st.DrawFn) -> Params:
 def test_a_table_gives_the_same_rows_in_every_way(
     params: Params, volatile: frozenset[str] | None, by: dict[str, str]
 ) -> None:
-    heard = ObservedParams(params, TIMES, volatile=volatile, by=by)
-    stored = list(heard)
+    received = ObservedParams(params, TIMES, volatile=volatile, by=by)
+    stored = list(received)
     times = {name: AT - 100.0 + params.moments.get(name, 100.0) for name in params}
     assert stored == [
         StoredParam(
@@ -54,10 +54,12 @@ def test_a_table_gives_the_same_rows_in_every_way(
         )
         for name, param in params.items()
     ]
-    assert dict(heard.heard_at()) == times
-    assert [type(cell) for item in heard for cell in item] == [type(cell) for item in stored for cell in item]
+    assert dict(received.heard_at()) == times
+    assert [type(cell) for item in received for cell in item] == [
+        type(cell) for item in stored for cell in item
+    ]
     expected = {item.name: item.stored_over(None, keeps_index=True) for item in stored}
-    first = heard.first_table()
+    first = received.first_table()
     if not params:
         assert first is None
         return
@@ -78,16 +80,16 @@ def test_a_table_gives_the_same_rows_in_every_way(
     ]
 
 
-def test_overwritten_values_come_before_the_present_ones() -> None:
+def test_overwritten_values_precede_the_present_ones() -> None:
     params = Params()
     params["A"] = Param("A", 2, ParamType.INT32, 0, 2)
     before = StoredParam(Param("A", 1, ParamType.INT32, 0, 1), AT, None, "us")
-    heard = ObservedParams(params, TIMES, volatile=None, by={}, overwritten=[before])
-    assert (len(heard), heard[0], [each.param.value for each in heard[-1:]]) == (2, before, [2])
-    assert list(heard.heard_at()) == [("A", AT), ("A", AT)]
-    rows = [(item.name, item.bits, item.by) for item in heard]
+    received = ObservedParams(params, TIMES, volatile=None, by={}, overwritten=[before])
+    assert (len(received), received[0], [each.param.value for each in received[-1:]]) == (2, before, [2])
+    assert list(received.heard_at()) == [("A", AT), ("A", AT)]
+    rows = [(item.name, item.bits, item.by) for item in received]
     assert rows == [("A", 1, "us"), ("A", 2, "vehicle")]
-    assert heard.first_table() is None, "a name is in it twice"
+    assert received.first_table() is None, "a name is in it twice"
 
 
 @pytest.mark.parametrize(

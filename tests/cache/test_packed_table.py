@@ -1,4 +1,4 @@
-"""A table's parameters as bytes: every cell comes back, and of other bytes nothing is believed."""
+"""A table's parameters as bytes: every cell is restored, and damaged bytes are refused."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ BEFORE = pack(EVERY)
 
 
 def sealed(whole: bytes) -> bytes:
-    """With a checksum that is right: made by somebody, not by chance."""
+    """With a checksum that is right: made on purpose, not by chance."""
     return whole + struct.pack("<I", zlib.crc32(whole))
 
 
@@ -62,7 +62,7 @@ def order(item: tuple[str, StoredParam]) -> tuple[bool, int, str]:
 
 
 @given(TABLES)
-def test_every_cell_comes_back_in_the_order_of_a_table(rows: dict[str, StoredParam]) -> None:
+def test_every_cell_is_restored_in_the_order_of_a_table(rows: dict[str, StoredParam]) -> None:
     found = unpack(pack(rows))
     assert list(found.items()) == sorted(rows.items(), key=order)
     assert all(type(row) is StoredParam for row in found.values())
@@ -70,9 +70,7 @@ def test_every_cell_comes_back_in_the_order_of_a_table(rows: dict[str, StoredPar
 
 
 @given(TABLES, st.randoms())
-def test_the_bytes_do_not_depend_on_the_order_in_which_rows_came(
-    rows: dict[str, StoredParam], chance: Any
-) -> None:
+def test_the_bytes_do_not_depend_on_the_order_of_the_rows(rows: dict[str, StoredParam], chance: Any) -> None:
     items = list(rows.items())
     chance.shuffle(items)
     assert pack(dict(items)) == pack(rows)
@@ -105,7 +103,7 @@ def test_only_some_columns_are_the_same_as_in_all_of_it(rows: dict[str, StoredPa
     assert values_of == [(name, *rows[name].value) for name in some]
 
 
-def test_tables_of_the_same_names_are_told_by_their_bytes() -> None:
+def test_tables_of_the_same_names_are_distinguished_by_their_bytes() -> None:
     other = {name: row._replace(bits=5, heard_at=NOW) for name, row in TABLE.items()}
     assert Packed(pack(other)).named == Packed(pack(TABLE)).named
     assert (
@@ -118,7 +116,7 @@ def test_tables_of_the_same_names_are_told_by_their_bytes() -> None:
 
 
 def believed(blob: bytes) -> dict[str, StoredParam] | None:
-    """The table in some bytes, or None where it is told that they are damaged."""
+    """The table in some bytes, or None if they are reported as damaged."""
     try:
         rows = unpack(blob)
     except Damaged:
@@ -343,7 +341,7 @@ def test_a_table_of_which_nothing_has_changed_is_not_written(
         cache.save(update(identity=replace(PX4, firmware=1), at=NOW + 2))
         assert len(written) == 1
         cache.save(update(stored("PARAM_1", 1, at=NOW + 1)))
-        assert len(written) == 2, "it was heard again"
+        assert len(written) == 2, "it was received again"
 
 
 def test_a_table_can_become_empty_and_have_parameters_again(path: Path) -> None:

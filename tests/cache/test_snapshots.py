@@ -1,4 +1,5 @@
-"""Earlier states of a table: snapshots, and what history tells of any other moment, beside a model."""
+"""Earlier states of a table: snapshots, and the state by history at any other moment, compared with a
+model."""
 
 from __future__ import annotations
 
@@ -41,7 +42,7 @@ def numbers(state: ParamSet) -> dict[str, Any]:
 # Snapshots
 
 
-def test_a_snapshot_is_the_table_as_it_stood_whatever_becomes_of_it(path: Path) -> None:
+def test_a_snapshot_keeps_the_table_of_its_time(path: Path) -> None:
     kept = [
         Param("INT", -5, ParamType.INT16, 1, 0xFFFB, default=-1),
         Param("FLOAT", struct.unpack("<f", b"\xcd\xcc\xcc=")[0], REAL32, 0, 0x3DCCCCCD, default=-0.25),
@@ -132,7 +133,7 @@ WRITTEN = st.builds(
 
 @given(st.lists(WRITTEN, max_size=5))
 @settings(max_examples=200, deadline=None)
-def test_every_value_comes_back_to_the_last_bit(params: list[WrittenParam]) -> None:
+def test_every_value_is_restored_to_the_last_bit(params: list[WrittenParam]) -> None:
     identity, found = snapshots._unpacked(snapshots._packed(PX4, {each.name: each for each in params}))
     assert identity == PX4
     assert list(found) == list({each.name: each for each in params})
@@ -298,7 +299,7 @@ def test_the_error_of_state_at_says_how_far_the_history_reaches(
 def test_added_names_and_clock_rollbacks_are_trimmed_with_the_history(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A vehicle whose parameters come and go all the time cannot fill the disk."""
+    """A vehicle whose parameters appear and disappear all the time cannot fill the disk."""
     monkeypatch.setattr(history_columns, "HISTORY_ENTRIES_MAX", 4)
     with ParamCache(path) as cache:
         cache.save(update(stored("A", 0), table=DONE))

@@ -268,8 +268,8 @@ def test_several_programs_write_at_once(path: Path, begin: bytes | None) -> None
     with ParamCache(path) as cache:
         for component in range(1, 5):
             assert values(cache, Identity(1, "x"), component) == {"P": 40}
-            news = [entry.new and entry.new.value for entry in cache.history("system:1@x", component)]
-            assert news == list(range(2, 41))
+            new_values = [entry.new and entry.new.value for entry in cache.history("system:1@x", component)]
+            assert new_values == list(range(2, 41))
         shared = [
             (entry.old.value, entry.new and entry.new.value) for entry in cache.history("system:1@x", 200)
         ]
@@ -432,7 +432,7 @@ def test_a_folder_that_another_program_holds_is_waited_for_but_not_for_ever(
         os.close(folder)
 
 
-# The file goes away
+# The file is removed
 
 
 def move(path: Path, to: str) -> None:
@@ -810,9 +810,9 @@ def test_a_file_that_others_can_write_is_made_its_owners_alone(
         assert len(cache.vehicles()) == 2
         assert path.stat().st_mode & 0o777 == 0o600
         works(cache)
-    [told] = caplog.messages
-    assert told.startswith(f"other users than its owner could write to the cache {path} (mode {mode:o})")
-    assert told.endswith("its mode is now 600")
+    [reported] = caplog.messages
+    assert reported.startswith(f"other users than its owner could write to the cache {path} (mode {mode:o})")
+    assert reported.endswith("its mode is now 600")
 
 
 @pytest.mark.parametrize("may_write", [True, False])
@@ -924,7 +924,7 @@ def test_a_file_from_before_there_were_defaults_keeps_its_tables(path: Path) -> 
 
 
 def test_a_file_from_before_there_were_snapshots_has_a_past_from_its_last_write_on(path: Path) -> None:
-    """What names came when is not known of before."""
+    """The time at which names appeared is unknown for earlier rows."""
     with ParamCache(path) as cache:
         cache.save(whole_table(300))
         cache.save(update(stored("PARAM_1", 5, at=NOW + 50), at=NOW + 50))
@@ -978,7 +978,7 @@ def test_a_file_from_before_tables_were_packed_keeps_every_cell(path: Path, vers
         assert not connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'param'").fetchall()
 
 
-def test_a_file_from_before_tables_could_come_from_files_keeps_them(path: Path) -> None:
+def test_a_cache_file_of_an_older_version_keeps_its_tables(path: Path) -> None:
     path.write_bytes(sound_file())
     make_older(path, 4)
     with ParamCache(path) as cache:
@@ -1070,7 +1070,7 @@ def test_flipped_bits_never_stop_the_cache_nor_cost_the_file(flips: list[tuple[i
             assert not again.notes
 
 
-def test_damage_that_comes_to_light_later_is_dealt_with_in_the_same_way(path: Path) -> None:
+def test_damage_that_is_found_later_is_handled_in_the_same_way(path: Path) -> None:
     path.write_bytes(sound_file())
     with connect(path) as connection:
         pages = connection.execute(
@@ -1209,7 +1209,7 @@ def test_a_disk_that_is_full_from_the_beginning_holds_nothing_up(path: Path) -> 
 
 @pytest.mark.parametrize("size", [PAGE, 2 * PAGE, 8 * PAGE])
 def test_a_file_that_a_full_disk_left_without_tables_is_an_empty_cache(path: Path, size: int) -> None:
-    """Not one of an older version, as which it was told."""
+    """Not a file of an older version, as it was reported."""
     with full_disk(at=size):
         with ParamCache(path) as cache, pytest.raises(CacheError):
             cache.save(whole_table(100))

@@ -1,5 +1,5 @@
 """Every store keeps a cache in the same way: what `test_cache`, `test_fleet` and `test_snapshots` ask of a
-file is asked of PostgreSQL here, by the same tests. Then what only stations that share one can do."""
+file is tested with PostgreSQL here, by the same tests. Then what only stations that share one can do."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from tests.caches import NOW, PX4, stored, update, values, whole_table
 from tests.client.test_observation_times import interleaved
 from tests.commands import in_process
 from tests.postgres import GIVEN, PROGRAMS, WHY_NONE, Server, database_on, server
-from tests.service.test_cut_off import told_after_a_kill
+from tests.service.test_cut_off import reported_after_a_kill
 from tests.service.test_process import served
 from tests.shell import Tap, in_simulated_time, small_px4
 
@@ -52,14 +52,14 @@ TIMEOUT = 60.0
 
 OF_A_FILE = {
     # what is said of a file, of its folder, or with SQLite's own words
-    "test_a_cache_that_is_thrown_away_closes_its_file",
+    "test_a_cache_that_is_deleted_closes_its_file",
     "test_folder_and_file_are_for_the_user_alone",
     "test_the_default_path_is_in_the_users_cache_folder",
     "test_to_import_it_takes_no_other_library",
     "test_to_save_nothing_creates_nothing",
     "test_without_a_file_there_is_nothing_and_to_look_creates_nothing",
     "test_snapshots_of_an_unknown_vehicle_are_an_error_that_creates_nothing",
-    "test_damage_that_is_met_is_told_as_everywhere",
+    "test_damage_during_a_comparison_is_reported_as_elsewhere",
     "test_a_snapshot_that_is_damaged_is_an_error_and_costs_nothing_else",
     "test_added_names_and_clock_rollbacks_are_trimmed_with_the_history",
     "test_a_snapshot_that_was_made_survives_a_kill_at_any_moment",
@@ -68,20 +68,20 @@ OF_A_FILE = {
     # a time that lies before another one is another station's, not a clock that was set back
     "test_a_time_that_the_clock_went_through_twice_is_refused",
     "test_two_programs_that_write_a_moment_apart_are_no_clock_set_back",
-    "test_a_clock_that_was_set_back_is_told_from_a_program_that_is_late",
+    "test_a_clock_that_was_set_back_is_distinguished_from_a_program_that_is_late",
     # they have fixtures of their own
     "test_state_at_agrees_with_a_model_that_keeps_every_state",
-    "test_every_value_comes_back_to_the_last_bit",
+    "test_every_value_is_restored_to_the_last_bit",
     # damage of a file, and what needs no store
     "test_damage_is_noticed",
-    "test_queued_writes_come_back",
-    "test_queued_snapshots_come_back",
+    "test_queued_writes_are_restored",
+    "test_queued_snapshots_are_restored",
     "test_a_damaged_snapshot_of_extended_parameters_is_an_error",
     "test_a_queued_write_that_is_none_is_damaged",
 }
 
 
-def asked_of(module: ModuleType) -> dict[str, object]:
+def tests_of(module: ModuleType) -> dict[str, object]:
     return {
         name: each
         for name, each in vars(module).items()
@@ -90,9 +90,9 @@ def asked_of(module: ModuleType) -> dict[str, object]:
 
 
 globals().update(
-    asked_of(test_cache) | asked_of(test_file_table) | asked_of(test_fleet) | asked_of(test_snapshots)
+    tests_of(test_cache) | tests_of(test_file_table) | tests_of(test_fleet) | tests_of(test_snapshots)
 )
-globals().update(asked_of(test_ext_tables))
+globals().update(tests_of(test_ext_tables))
 three = test_cache.three
 
 
@@ -174,12 +174,12 @@ def until(condition: Callable[[], object]) -> None:
 
 
 def a_value(number: int, name: str = "PARAM_1", at: float | None = None, by: str = "vehicle") -> TableUpdate:
-    """That a value was heard; the number is also the second in which it was, unless told otherwise."""
-    heard = NOW + number if at is None else at
-    return update(stored(name, number, at=heard, by=by), at=heard)
+    """An observation of a value; the number is also its time in seconds by default."""
+    received = NOW + number if at is None else at
+    return update(stored(name, number, at=received, by=by), at=received)
 
 
-def told(cache: ParamCache, name: str | None = None) -> list[tuple[float, object, object]]:
+def reported(cache: ParamCache, name: str | None = None) -> list[tuple[float, object, object]]:
     """The history of a vehicle: seconds after NOW, old value, new value."""
     found = cache.history(PX4.key, name=name)
     return [(each.at - NOW, each.old.value, each.new and each.new.value) for each in found]
@@ -188,7 +188,7 @@ def told(cache: ParamCache, name: str | None = None) -> list[tuple[float, object
 # Stations that share a database
 
 
-def test_a_change_is_told_to_the_other_station_and_not_to_the_one_that_made_it(
+def test_a_change_is_reported_to_the_other_station_only(
     stations: tuple[ParamCache, ParamCache],
 ) -> None:
     a, b = stations
@@ -216,13 +216,13 @@ def test_the_later_observation_counts_and_both_are_in_the_history(
     b.save(a_value(20))
     a.save(a_value(10))
     assert values(a)["PARAM_1"] == values(b)["PARAM_1"] == 20
-    assert told(a) == told(b) == [(10, 1, 10), (20, 10, 20)]
+    assert reported(a) == reported(b) == [(10, 1, 10), (20, 10, 20)]
     a.save(a_value(10))
     b.save(a_value(20, at=NOW + 15))
-    assert told(a) == [(10, 1, 10), (15, 10, 20)], "it was so earlier than anybody knew"
+    assert reported(a) == [(10, 1, 10), (15, 10, 20)], "it was so earlier than anybody knew"
 
 
-def test_a_station_that_knows_less_takes_nothing_away(stations: tuple[ParamCache, ParamCache]) -> None:
+def test_a_station_that_knows_less_removes_nothing(stations: tuple[ParamCache, ParamCache]) -> None:
     a, b = stations
     a.save(whole_table(3))
     b.save(replace(a_value(10), table=TableState(None, 3)))
@@ -236,7 +236,7 @@ def test_a_station_that_knows_less_takes_nothing_away(stations: tuple[ParamCache
     assert (table.complete, table.count) == (False, 4), "the vehicle has another number of parameters now"
 
 
-def test_a_whole_table_that_comes_late_is_believed_where_nothing_else_was_heard_since(
+def test_a_late_whole_table_counts_if_nothing_else_was_received_since(
     stations: tuple[ParamCache, ParamCache],
 ) -> None:
     a, b = stations
@@ -262,26 +262,26 @@ NAMES = st.sampled_from(["PARAM_0", "PARAM_1"])
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(NAMES, st.booleans()), min_size=1, max_size=8), st.randoms(use_true_random=False))
-def test_whichever_station_comes_first_table_and_history_are_the_same(
+def test_table_and_history_do_not_depend_on_the_order_of_stations(
     observed: list[tuple[str, bool]], random: Random
 ) -> None:
-    """Each station tells what it heard in the order of its times; which of them is ahead is open."""
-    heard = [
+    """Each station writes its observations in the order of their times; either may be ahead."""
+    received = [
         (of_one, a_value(number, name, at=NOW + 10 * number))
         for number, (name, of_one) in enumerate(observed, start=10)
     ]
-    streams = [[each for of_one, each in heard if of_one is which] for which in (True, False)]
+    streams = [[each for of_one, each in received if of_one is which] for which in (True, False)]
     mixed = []
     while any(streams):
         mixed.append(random.choice([stream for stream in streams if stream]).pop(0))
-    assert kept_of(mixed) == kept_of([each for _, each in heard])
+    assert kept_of(mixed) == kept_of([each for _, each in received])
 
 
 @settings(max_examples=40, deadline=None)
 @given(
     st.lists(st.tuples(NAMES, st.integers(0, 2)), min_size=1, max_size=8), st.randoms(use_true_random=False)
 )
-def test_in_whatever_order_values_come_the_latest_are_kept_and_lines_make_a_chain(
+def test_in_any_order_of_arrival_the_latest_values_are_kept_and_lines_make_a_chain(
     observed: list[tuple[str, int]], random: Random
 ) -> None:
     updates = [a_value(value, name, at=NOW + 10 * n) for n, (name, value) in enumerate(observed, start=1)]
@@ -303,20 +303,23 @@ def test_in_whatever_order_values_come_the_latest_are_kept_and_lines_make_a_chai
 def test_of_two_that_fetch_at_different_times_the_later_writer_makes_no_false_line(
     data: st.DataObject,
 ) -> None:
-    """One writes and tells every value; the other hears of it and tells all, or the latest at each write."""
+    """One station sets and writes every value; the other writes all of them, or the latest at each write."""
     moments = [10.0, 20.0, 30.0]  # of the changes to 17, 18 and 19, in seconds behind NOW
     truth = [(0.0, 200), *zip(moments, (17, 18, 19), strict=True)]
     fetched = data.draw(st.sampled_from((0.0, 5.0, 15.0, 25.0, 35.0)), label="when the other fetches")
-    heard = [each for each in truth if each[0] >= fetched] or truth[-1:]
+    received = [each for each in truth if each[0] >= fetched] or truth[-1:]
     current = max(each for each in truth if each[0] <= fetched)
-    others = [(fetched, current[1]), *((moment + 0.5, value) for moment, value in heard if moment > fetched)]
+    others = [
+        (fetched, current[1]),
+        *((moment + 0.5, value) for moment, value in received if moment > fetched),
+    ]
     streams: list[list[TableUpdate]] = []
-    for observed, tells_all in ((truth, True), (others, data.draw(st.booleans()))):
+    for observed, has_all in ((truth, True), (others, data.draw(st.booleans()))):
         cuts = data.draw(st.sets(st.integers(1, len(observed))), label="how many each write has seen")
         stream: list[TableUpdate] = []
         begin = 0
         for end in sorted({*cuts, len(observed)}):
-            part = observed[begin:end] if tells_all else observed[end - 1 : end]
+            part = observed[begin:end] if has_all else observed[end - 1 : end]
             begin = end
             whole: dict[str, Any] = {}
             if not stream:
@@ -362,7 +365,7 @@ def test_a_commit_whose_answer_was_lost_is_not_done_twice(
     a.save(a_value(10))
     until(lambda: a.offline_reason is None)
     a.save(a_value(11))
-    assert told(b) == [(10, 1, 10), (11, 10, 11)]
+    assert reported(b) == [(10, 1, 10), (11, 10, 11)]
 
 
 def test_a_reason_with_a_zero_in_it_does_no_harm(cache: ParamCache) -> None:
@@ -387,7 +390,7 @@ def test_an_operation_whose_response_was_lost_returns_its_result(
 
 
 def lose_an_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Break the connection at the next commit: it is done, and nobody hears that it is."""
+    """Break the connection at the next commit: it is done without a confirmation."""
     write = PostgresDatabase.write
 
     def half(self: PostgresDatabase, *arguments: Any) -> Any:
@@ -456,14 +459,14 @@ def test_a_station_works_on_locally_and_catches_up(fragile: tuple[Server, ParamC
     until(lambda: at_a)
     for cache in (a, b):
         assert values(cache) == {"PARAM_0": 0, "PARAM_1": 20, "PARAM_2": 5}
-        assert told(cache, "PARAM_1") == [(10, 1, 10), (20, 10, 20)]
-        assert told(cache, "PARAM_2") == [(5, 2, 5)]
+        assert reported(cache, "PARAM_1") == [(10, 1, 10), (20, 10, 20)]
+        assert reported(cache, "PARAM_2") == [(5, 2, 5)]
         assert [each.id for each in cache.snapshots(PX4.key)] == [made.id, own.id]
         assert cache.state_at(PX4.key, 1, own.id)["PARAM_1"].value == 20
     assert a.snapshot(PX4.key, 1, reason="after").id in range(made.id + 1, 1 << 50)
     until(lambda: is_copied(a))
     running.kill()
-    assert told(a, "PARAM_1") == [(10, 1, 10), (20, 10, 20)], "the copy has what the database had"
+    assert reported(a, "PARAM_1") == [(10, 1, 10), (20, 10, 20)], "the copy has what the database had"
     assert a.offline_reason is not None
     running.start()
 
@@ -539,7 +542,7 @@ def test_writes_left_in_the_outbox_are_sent_by_the_next_program(own_server: Serv
         dead.close()
         own_server.start()
         with ParamCache(url, local=tmp_path / "a") as cache:
-            assert told(cache) == [(n, 1 if n == 10 else n - 1, n) for n in range(10, 15)]
+            assert reported(cache) == [(n, 1 if n == 10 else n - 1, n) for n in range(10, 15)]
 
 
 def test_killed_under_load_nothing_is_lost_and_nothing_doubled(
@@ -576,8 +579,8 @@ def test_killed_under_load_nothing_is_lost_and_nothing_doubled(
     until(lambda: a.offline_reason is None and b.offline_reason is None)
     for cache in (a, b):
         for name, count in written.items():
-            news = [new for _, _, new in told(cache, name)]
-            assert news == [1_000 + number for number in range(1, count + 1)]
+            new_values = [new for _, _, new in reported(cache, name)]
+            assert new_values == [1_000 + number for number in range(1, count + 1)]
 
 
 def test_a_database_that_stands_still_is_given_up(
@@ -595,11 +598,11 @@ def test_a_database_that_stands_still_is_given_up(
             impatient.setattr("paramclient.cache.postgres.CONNECT_TIMEOUT", 1)
             a.save(a_value(6))
             assert a.offline_reason is not None
-            assert told(a) == [(5, 1, 5), (6, 5, 6)]
+            assert reported(a) == [(5, 1, 5), (6, 5, 6)]
     finally:
         running.go_on()
     until(lambda: a.offline_reason is None)
-    assert told(b) == [(5, 1, 5), (6, 5, 6)]
+    assert reported(b) == [(5, 1, 5), (6, 5, 6)]
 
 
 def test_a_program_that_ends_does_not_wait_for_a_database_that_stands_still(
@@ -624,7 +627,7 @@ def test_a_program_that_ends_does_not_wait_for_a_database_that_stands_still(
     finally:
         running.go_on()
     with ParamCache(b.place, local=a.path) as later:
-        assert told(later) == [(5, 1, 5), (6, 5, 6)]
+        assert reported(later) == [(5, 1, 5), (6, 5, 6)]
 
 
 def test_a_statement_that_takes_too_long_is_ended_by_the_database(
@@ -704,7 +707,7 @@ def test_a_write_that_the_database_refuses_is_logged_and_delays_no_other(
         monkeypatch.setattr(PostgresDatabase, "write", refuse)
         own_server.start()
         until(lambda: cache.offline_reason is None)
-        assert told(cache) == [(11, 1, 11)]
+        assert reported(cache) == [(11, 1, 11)]
         assert "refuses a write that was queued while it was not connected: not this one" in caplog.text
 
 
@@ -719,7 +722,7 @@ def test_a_database_that_can_only_be_read_for_a_while_costs_no_line(server_url: 
         until(lambda: "read-only" in str(cache.offline_reason))
         make_read_only(url, False)
         until(lambda: cache.offline_reason is None)
-        assert told(cache) == [(5, 1, 5), (6, 5, 6)]
+        assert reported(cache) == [(5, 1, 5), (6, 5, 6)]
 
 
 def make_read_only(url: str, is_so: bool) -> None:
@@ -746,7 +749,7 @@ def test_a_write_to_a_locked_vehicle_waits_and_is_not_refused(
             cache.save(a_value(5))
             assert "has locked a vehicle" in str(cache.offline_reason)
         until(lambda: cache.offline_reason is None)
-        assert told(cache) == [(5, 1, 5)]
+        assert reported(cache) == [(5, 1, 5)]
         assert "refuses" not in caplog.text
 
 
@@ -766,14 +769,14 @@ def test_without_room_for_the_local_copy_the_database_is_used_all_the_same(
                 full.setattr(LocalCopy, "_write", no_room)
                 with ParamCache(url, local=tmp_path / "a") as late:
                     late.save(a_value(5))
-                    assert told(late) == [(5, 1, 5)]
+                    assert reported(late) == [(5, 1, 5)]
                 until(lambda: len(at_a) == 1)
                 b.save(a_value(6))
                 until(lambda: len(at_a) == 2)
             assert "not up to date: no room" in caplog.text
             b.save(a_value(7))
             until(lambda: len(at_a) == 3)
-            assert told(a) == [(5, 1, 5), (6, 5, 6), (7, 6, 7)]
+            assert reported(a) == [(5, 1, 5), (6, 5, 6), (7, 6, 7)]
 
 
 def no_room(*_: object) -> None:
@@ -814,7 +817,7 @@ def test_a_url_that_cannot_be_read_is_not_repeated(url: str) -> None:
     assert caught.value.__cause__ is None
 
 
-def test_a_password_is_told_to_nobody(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_password_appears_in_no_text(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("DEBUG")
     url = f"postgresql://me:geheim%21@/d?host={tmp_path}&application_name=geheim%21"
     with ParamCache(url, local=tmp_path / "a") as cache:
@@ -830,7 +833,7 @@ def test_a_password_is_told_to_nobody(tmp_path: Path, caplog: pytest.LogCaptureF
         assert not cache.path.exists()
 
 
-def test_one_database_has_one_local_copy_whoever_asks() -> None:
+def test_one_database_has_one_local_copy_for_every_spelling_of_its_address() -> None:
     def copy_of(url: str) -> Path:
         with ParamCache(url) as cache:
             return cache.path
@@ -894,14 +897,14 @@ def test_copy_to_merges_the_tables_of_one_vehicle(cache: ParamCache, tmp_path: P
         for _ in range(2):
             old.copy_to(cache)
             assert values(cache) == {"PARAM_0": 25, "PARAM_1": 20, "PARAM_2": 30}
-            assert [at for at, _, _ in told(cache)] == [10, 20, 25, 30]
+            assert [at for at, _, _ in reported(cache)] == [10, 20, 25, 30]
             assert sorted(each.reason for each in cache.snapshots(PX4.key)) == ["ours", "theirs"]
             assert cache.state_at(PX4.key, 1, mine.id) == mine.params
         with pytest.raises(CacheError, match="history begins at"):
             cache.state_at(PX4.key, 1, NOW + 15)
 
 
-def test_a_copy_waits_for_a_database_that_is_away(own_server: Server, tmp_path: Path) -> None:
+def test_a_copy_waits_for_an_unreachable_database(own_server: Server, tmp_path: Path) -> None:
     with (
         database_on(own_server.url) as url,
         ParamCache(tmp_path / "old") as old,
@@ -952,9 +955,9 @@ def test_the_command_copies_and_reads_it(
 
 @in_simulated_time
 async def test_values_of_another_station_update_cached_values(tmp_path: Path) -> None:
-    """Told by a cache that is told by a database: see above."""
+    """Reported by a cache with a database: see above."""
     vehicle = small_px4()
-    cache = Told(tmp_path / "cache")
+    cache = ReportingCache(tmp_path / "cache")
     with cache:
         async with ParamClient(vehicle, cache=cache) as client:
             await (await client.component()).fetch_all()
@@ -963,16 +966,16 @@ async def test_values_of_another_station_update_cached_values(tmp_path: Path) ->
             await anyio.sleep(2.0)
             live = await component.get("PARAM_01")
             key = component.identity.key
-            heard = [
+            received = [
                 StoredParam(replace(component.params[name], value=77, bits=77), time.time() + 60.0)
                 for name in ("PARAM_01", "PARAM_02")
             ]
             cache.save(
                 TableUpdate(
-                    identity=component.identity, component=1, autopilot=12, at=time.time(), params=heard
+                    identity=component.identity, component=1, autopilot=12, at=time.time(), params=received
                 )
             )
-            await anyio.to_thread.run_sync(cache.tell, CacheChange(key, 1))
+            await anyio.to_thread.run_sync(cache.report, CacheChange(key, 1))
             await anyio.sleep(2.0)
             assert component.params["PARAM_02"].value == 77
             assert component.params["PARAM_02"].trust is Trust.CACHED
@@ -985,9 +988,9 @@ async def test_values_of_another_station_update_cached_values(tmp_path: Path) ->
 async def test_values_of_another_station_are_announced_while_the_vehicle_is_silent_here(
     tmp_path: Path,
 ) -> None:
-    """The vehicle has flown out of reach of this station: nothing on the link brings the news to light."""
+    """The vehicle has flown out of reach of this station: nothing on the link shows the change."""
     vehicle = Tap(small_px4())
-    cache = Told(tmp_path / "cache")
+    cache = ReportingCache(tmp_path / "cache")
     with cache:
         async with ParamClient(vehicle, cache=cache) as client:
             component = await client.component()
@@ -999,9 +1002,9 @@ async def test_values_of_another_station_are_announced_while_the_vehicle_is_sile
             changes = component.changes()
             for value in range(77, 82):
                 await anyio.sleep(0.7)  # at another moment of what goes on once a second
-                heard = stored("PARAM_02", value, at=time.time() + value)
-                cache.save(update(heard, identity=component.identity, at=time.time()))
-                await anyio.to_thread.run_sync(cache.tell, CacheChange(component.identity.key, 1))
+                received = stored("PARAM_02", value, at=time.time() + value)
+                cache.save(update(received, identity=component.identity, at=time.time()))
+                await anyio.to_thread.run_sync(cache.report, CacheChange(component.identity.key, 1))
                 with anyio.fail_after(0.5):
                     change = await anext(changes)
                 assert (change.name, change.new and change.new.value) == ("PARAM_02", value)
@@ -1018,38 +1021,38 @@ async def test_a_service_shares_it_too(
                 await anyio.sleep(0.05)
 
 
-class Told(ParamCache):
-    """A cache in a file that can be told of other stations."""
+class ReportingCache(ParamCache):
+    """A cache in a file, with reports of changes by other stations."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         self.listeners: list[Callable[[CacheChange], None]] = []
 
-    def subscribe(self, told: Callable[[CacheChange], None]) -> Callable[[], None]:
-        self.listeners.append(told)
-        return lambda: self.listeners.remove(told)
+    def subscribe(self, reported: Callable[[CacheChange], None]) -> Callable[[], None]:
+        self.listeners.append(reported)
+        return lambda: self.listeners.remove(reported)
 
-    def tell(self, change: CacheChange) -> None:
+    def report(self, change: CacheChange) -> None:
         for listener in self.listeners:
             listener(change)
 
 
 @pytest.mark.asyncio
-async def test_an_apply_whose_process_is_killed_is_told_with_a_shared_database_too(
+async def test_an_apply_whose_process_is_killed_is_reported_with_a_shared_database_too(
     server_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The notes stand beside the copy on this computer: they are about what it has begun."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     with database_on(server_url) as url:
-        await told_after_a_kill(url)
+        await reported_after_a_kill(url)
     assert len([*tmp_path.rglob("*.setups")]) == 1  # noqa: ASYNC240 - nothing runs beside
 
 
 def test_a_write_that_an_earlier_version_has_queued_is_executed() -> None:
     described = [1, "udp", None, 12, 0, 0, "", 0, 0, 0, 0]
     items = [["A", 4, 65531, 0, 3, 7, NOW, True, "us"], ["B", 6, 2, 0, None, None, int(NOW), None, "vehicle"]]
-    told = ["save", [[described, 1, 12, NOW, None, items, [], False, {}, None]]]
-    operation = unpacked(zlib.compress(json.dumps(told).encode()))
+    reported = ["save", [[described, 1, 12, NOW, None, items, [], False, {}, None]]]
+    operation = unpacked(zlib.compress(json.dumps(reported).encode()))
     expected = [
         StoredParam(Param("A", -5, ParamType.INT16, 3, 0xFFFB, default=7), NOW, True, "us"),
         StoredParam(Param("B", 2, ParamType.INT32, None, 2), NOW),
@@ -1063,6 +1066,6 @@ def test_a_write_that_an_earlier_version_has_queued_is_executed() -> None:
 
 def test_a_queued_write_with_a_value_that_is_none_is_damaged() -> None:
     described = [1, "udp", None, 12, 0, 0, "", 0, 0, 0, 0]
-    told = ["save", [[described, 1, 12, NOW, None, [["A", 300, *(0,) * 7]], [], False]]]
+    reported = ["save", [[described, 1, 12, NOW, None, [["A", 300, *(0,) * 7]], [], False]]]
     with pytest.raises(Damaged):
-        unpacked(zlib.compress(json.dumps(told).encode()))
+        unpacked(zlib.compress(json.dumps(reported).encode()))

@@ -197,9 +197,9 @@ def test_the_error_that_ends_a_set_up_has_the_same_exit_code(
     done = command("apply", served(Dying(dict.fromkeys(NAMES, 1))), many)
     assert done.code == on_link.code == 3
     assert re.search(r"1/1 generic: no reply: .*; run it again to continue\n", done.err)
-    told = command("apply", served(Dying(dict.fromkeys(NAMES, 1))), many, "--json")
-    assert told.json["error"].startswith("no reply")
-    assert "problem" not in told.json
+    reported = command("apply", served(Dying(dict.fromkeys(NAMES, 1))), many, "--json")
+    assert reported.json["error"].startswith("no reply")
+    assert "problem" not in reported.json
 
 
 @pytest.mark.parametrize("as_json", [False, True])
@@ -331,7 +331,7 @@ def test_verify_ends_with_0_if_the_vehicle_has_all_values(
 def test_verify_uses_renames_and_an_overlay(
     command: Command, put: Put, served: Put, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(tmp_path)  # a service is told the name of a file, not its folder
+    monkeypatch.chdir(tmp_path)  # a service receives the name of a file, not its folder
     over, renames = Path("over.parm"), Path("renames.yaml")
     over.write_text("GAIN,4.0\n")
     file.write_text("GAIN,6.5\nOLD_RATE,0.5\nGONE,1\n")

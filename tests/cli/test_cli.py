@@ -309,16 +309,18 @@ def test_a_value_that_is_only_cached_is_missing(
 
 def test_the_system_and_the_component_can_be_chosen(command: Command) -> None:
     assert command("fetch", "sim:px4?system=7", "--system", 7, "--json", "--no-cache").json["system"] == 7
-    nobody = command("get", "sim:px4?system=7", "MC_ROLL_P", "--system", 6, "--timeout", 0.2, "--no-cache")
-    assert nobody.code == 3
-    nobody = command("get", "sim:px4", "MC_ROLL_P", "--component", 6, "--timeout", 0.2, "--no-cache")
-    assert nobody.code == 3
+    absent = command("get", "sim:px4?system=7", "MC_ROLL_P", "--system", 6, "--timeout", 0.2, "--no-cache")
+    assert absent.code == 3
+    absent = command("get", "sim:px4", "MC_ROLL_P", "--component", 6, "--timeout", 0.2, "--no-cache")
+    assert absent.code == 3
 
 
 def test_the_encoding_can_be_chosen(command: Command) -> None:
-    told = command("get", "sim:ardupilot", "RTL_ALT", "--encoding", "bytewise", "--json", "--no-cache").json
+    reported = command(
+        "get", "sim:ardupilot", "RTL_ALT", "--encoding", "bytewise", "--json", "--no-cache"
+    ).json
     cast = command("get", "sim:ardupilot", "RTL_ALT", "--json", "--no-cache").json
-    assert cast["params"]["RTL_ALT"]["value"] != told["params"]["RTL_ALT"]["value"]
+    assert cast["params"]["RTL_ALT"]["value"] != reported["params"]["RTL_ALT"]["value"]
 
 
 # get
@@ -760,10 +762,10 @@ async def test_watch_prints_events_of_the_vehicle(
     assert printed.err == "watching 2 parameters of 1/1 px4\n"
     lines = printed.out.splitlines()
     if not as_json:
-        told = [line.partition("Z  ")[2] for line in lines]
-        assert told[0] == "1/1 lost: nothing received for 5.0 s"
-        assert re.fullmatch(r"1/1 found after \d\d?\.\d s", told[1])
-        assert told[2:] == [
+        reported = [line.partition("Z  ")[2] for line in lines]
+        assert reported[0] == "1/1 lost: nothing received for 5.0 s"
+        assert re.fullmatch(r"1/1 found after \d\d?\.\d s", reported[1])
+        assert reported[2:] == [
             "1/1 rebooted",
             "B  2 -> 3  (vehicle)",
             "1/1 resynced: 1 value had changed",
@@ -841,21 +843,21 @@ HEARD_KEYS = [
 
 def test_link_prints_one_object_with_exactly_these_keys(live_command: Command) -> None:
     with simulated("px4", "--system", "7", "--delay", "0.02", "--bit-errors", "0.0001") as url:
-        heard = live_command("link", url, "--json", "--seconds", 3)
-    assert (heard.code, heard.err) == (0, "")
-    assert list(heard.json) == LINK_KEYS
-    assert heard.json["link"] == url
-    assert 2.5 <= heard.json["seconds"] < 10
-    assert 21 * 3 <= heard.json["bytes_sent"] < 1000
-    [component] = heard.json["components"]
+        received = live_command("link", url, "--json", "--seconds", 3)
+    assert (received.code, received.err) == (0, "")
+    assert list(received.json) == LINK_KEYS
+    assert received.json["link"] == url
+    assert 2.5 <= received.json["seconds"] < 10
+    assert 21 * 3 <= received.json["bytes_sent"] < 1000
+    [component] = received.json["components"]
     assert list(component) == HEARD_KEYS
     assert (component["system"], component["component"], component["mavlink"]) == (7, 1, 2)
     assert (component["autopilot"], component["type"], component["state"]) == ("px4", "quadrotor", "standby")
-    assert 0 <= component["age_s"] <= component["heartbeat_age_s"] < heard.json["seconds"]
+    assert 0 <= component["age_s"] <= component["heartbeat_age_s"] < received.json["seconds"]
     assert 0.03 < component["round_trip_s"] < 2
     beats = component["messages"]["HEARTBEAT"]
     assert beats["id"] == 0
-    assert 1 <= beats["count"] <= component["frames"] <= heard.json["frames"]
+    assert 1 <= beats["count"] <= component["frames"] <= received.json["frames"]
     assert component["radio"] is None
 
 
@@ -872,9 +874,9 @@ class Modem(PX4Vehicle):
 
 
 def test_link_prints_a_table_of_components(command: Command, put: Callable[[Endpoint], str]) -> None:
-    heard = command("link", put(Modem(telemetry=20)), "--seconds", 2)
-    assert (heard.code, heard.err) == (0, "")
-    lines = heard.out.splitlines()
+    received = command("link", put(Modem(telemetry=20)), "--seconds", 2)
+    assert (received.code, received.err) == (0, "")
+    lines = received.out.splitlines()
     assert re.split("  +", lines[0]) == [
         *("from", "what", "v", "frames/s", "bytes/s", "loss", "round trip", "heartbeat")
     ]
@@ -936,8 +938,8 @@ def test_the_round_trip_is_measured_without_identification(
 
     monkeypatch.setattr("paramclient.cli.link.MEASURE_DELAY", 0.2)
     vehicle = Shy()
-    heard = command("link", put(vehicle), "--seconds", 2, "--json")
-    [component] = heard.json["components"]
+    received = command("link", put(vehicle), "--seconds", 2, "--json")
+    [component] = received.json["components"]
     assert vehicle.requests["PARAM_REQUEST_READ"] == 1
     assert 0 <= component["round_trip_s"] < 1
 
@@ -1215,9 +1217,9 @@ def test_a_failed_cache_is_exit_code_5_and_only_a_warning_for_fetch(
         assert outcome.err.count("\n") == 1
     fetched = command("fetch", put(GenericVehicle({"A": 1})), "--json", "--cache", tmp_path)
     assert (fetched.code, fetched.json["received"]) == (0, 1)
-    warned, told = fetched.err.splitlines()
+    warned, reported = fetched.err.splitlines()
     assert warned.startswith("paramclient: warning: continuing without the cache: ")
-    assert "not written to the cache, and lost: 1 value" in told
+    assert "not written to the cache, and lost: 1 value" in reported
 
 
 def test_every_error_has_an_exit_code() -> None:
@@ -1360,16 +1362,16 @@ def test_sim_on_a_satellite_link_beside_another_station() -> None:
     misfortunes = ["--system", "7", "--high-latency", "--other-list-every", "0.2"]
     with simulated("px4", *misfortunes) as url, RemoteEnd(url) as far:
         far.ask(wire.Heartbeat(6, 8))
-        heard = set()
+        received = set()
 
         def is_both(frame: wire.Frame, message: wire.Message | None) -> bool:
             if isinstance(message, wire.ParamRequestList):
                 assert message == wire.ParamRequestList(7, 1)
-            heard.add((frame.system, type(message)))
-            return {(7, wire.HighLatency2), (254, wire.ParamRequestList)} <= heard
+            received.add((frame.system, type(message)))
+            return {(7, wire.HighLatency2), (254, wire.ParamRequestList)} <= received
 
         far.until(is_both)
-        assert {kind for system, kind in heard if system == 7} == {wire.HighLatency2}
+        assert {kind for system, kind in received if system == 7} == {wire.HighLatency2}
 
 
 def test_a_closed_pipe_ends_the_command_silently(warm: Path) -> None:

@@ -54,8 +54,8 @@ def test_subcommands_and_groups(table: completion.Table) -> None:
     assert words("fe", table) == ["fetch"]
     assert words("cache ", table) == ["list", "history", "add", "path", "name", "remove", "copy"]
     assert {"cache", "fleet", "signing", "get"} <= set(words("", table))
-    told = dict(candidates([""], table))
-    assert told["fetch"] == "Fetch all parameters"
+    reported = dict(candidates([""], table))
+    assert reported["fetch"] == "Fetch all parameters"
 
 
 def test_options_their_choices_and_their_files(table: completion.Table) -> None:
@@ -64,8 +64,8 @@ def test_options_their_choices_and_their_files(table: completion.Table) -> None:
     assert words(f"fetch {LINK} --tlog ", table) == [], "the shell completes file names"
     assert not [name for name in words("fetch --", table) if name.startswith(("--no-json", "--empty-"))]
     assert "--no-cache" in words("fetch --", table)
-    told = dict(candidates(["fetch", "--refresh"], table))
-    assert told == {"--refresh": "Download all parameters even if the cache is up to date"}
+    reported = dict(candidates(["fetch", "--refresh"], table))
+    assert reported == {"--refresh": "Download all parameters even if the cache is up to date"}
 
 
 def test_vehicles_and_names_of_the_cache(table: completion.Table, cache: Path) -> None:
@@ -114,7 +114,7 @@ def test_names_and_values_of_set_take_turns(table: completion.Table, cache: Path
         assert words(f"{begin} {before}MC_ROLL_P", table) == []
 
 
-def test_a_missing_cache_is_not_made_and_a_database_not_asked(
+def test_a_missing_cache_is_not_created_and_a_database_not_queried(
     table: completion.Table, tmp_path: Path
 ) -> None:
     for place in (tmp_path / "none.sqlite3", "postgresql://192.0.2.1/fleet"):

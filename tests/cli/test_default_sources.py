@@ -153,8 +153,8 @@ def test_a_cached_table_is_compared_with_the_remembered_metadata(command: Comman
     assert "1 of 1 default from the metadata" in shown.err
     found = command("show", "1", "--changed", "--json").json["components"][0]["params"]
     assert {name: each["default_source"] for name, each in found.items()} == {"MC_ROLL_P": "metadata"}
-    told = command("info", "MC_ROLL_P")
-    assert "default of the firmware: 4.0 (from the metadata)" in told.out
+    reported = command("info", "MC_ROLL_P")
+    assert "default of the firmware: 4.0 (from the metadata)" in reported.out
     (vehicle,) = command("info", "MC_ROLL_P", "--json").json["vehicles"]
     assert (vehicle["param"]["default_source"], vehicle["param"]["is_default"]) == ("metadata", False)
 
@@ -180,9 +180,9 @@ def test_save_writes_what_differs(command: Command, put: Put, tmp_path: Path) ->
     shown = command("show", whole, "--changed", "--metadata", given)
     assert [row[0] for row in shown.rows[1:]] == ["MC_PITCH_P"]
     assert "1 of 1 default from the metadata" in shown.err
-    [told] = command("show", whole, "--changed", "--metadata", given, "--json").json["components"]
-    assert told["params"]["MC_PITCH_P"]["default"] == 1.0
-    assert told["params"]["MC_PITCH_P"]["default_source"] == "metadata"
+    [reported] = command("show", whole, "--changed", "--metadata", given, "--json").json["components"]
+    assert reported["params"]["MC_PITCH_P"]["default"] == 1.0
+    assert reported["params"]["MC_PITCH_P"]["default_source"] == "metadata"
 
 
 def test_a_comparison_with_the_defaults_takes_those_of_the_metadata(
@@ -201,7 +201,9 @@ def test_a_comparison_with_the_defaults_takes_those_of_the_metadata(
     assert stores in command("save", "1", tmp_path / "none.parm", "--changed").err
     assert command("fetch", put(quad()), "--metadata", "vehicle").code == 0
     found = command(*words, "--json").json
-    assert {name: (each["moved"], each["default_source"]) for name, each in found["params"].items()} == {
+    assert {
+        name: (each["changed_side"], each["default_source"]) for name, each in found["params"].items()
+    } == {
         "MC_PITCH_P": ("right", "metadata"),
         "MC_ROLL_P": ("left", "metadata"),
     }

@@ -167,8 +167,8 @@ def test_equal_sets_are_exit_code_0_without_a_table(command: Command, cache: Pat
     outcome = command("diff", 1, 2)
     assert (outcome.code, outcome.out) == (0, "")
     assert outcome.err.splitlines()[-1] == "2 same"
-    told = command("diff", 1, 2, "--json")
-    assert (told.code, told.err, told.json["same"], told.json["params"]) == (0, "", True, {})
+    reported = command("diff", 1, 2, "--json")
+    assert (reported.code, reported.err, reported.json["same"], reported.json["params"]) == (0, "", True, {})
 
 
 def test_another_type_alone_is_reported_and_no_difference(command: Command, cache: Path) -> None:
@@ -184,10 +184,10 @@ def test_json_has_exact_values(command: Command, cache: Path) -> None:
     keep(cache, {"A": (from_bits(0x7FC00001, REAL32), REAL32), "B": (16777216, INT32)}, SECOND)
     outcome = command("diff", 1, 2, "--json")
     assert outcome.err == ""
-    told = outcome.json
-    assert list(told) == ["same", "left", "right", "base", "counts", "changed_sides", "params"]
-    assert (told["same"], told["base"], told["changed_sides"]) == (False, None, None)
-    assert told["left"] == {
+    reported = outcome.json
+    assert list(reported) == ["same", "left", "right", "base", "counts", "changed_sides", "params"]
+    assert (reported["same"], reported["base"], reported["changed_sides"]) == (False, None, None)
+    assert reported["left"] == {
         "source": "cache uid:aa00000000000001",
         "system": 1,
         "component": 1,
@@ -196,8 +196,8 @@ def test_json_has_exact_values(command: Command, cache: Path) -> None:
         "at": AT,
         "count": 3,
     }
-    assert told["counts"] == {"same": 0, "different": 2, "only left": 1, "only right": 0}
-    assert told["params"]["A"] == {
+    assert reported["counts"] == {"same": 0, "different": 2, "only left": 1, "only right": 0}
+    assert reported["params"]["A"] == {
         "is": "different",
         "types_differ": False,
         "rounding": False,
@@ -206,10 +206,10 @@ def test_json_has_exact_values(command: Command, cache: Path) -> None:
         "base": None,
         "changed_side": None,
     }
-    integers = told["params"]["B"]
+    integers = reported["params"]["B"]
     assert integers["left"] == {"value": 16777217, "type": "INT32", "bits": "01000001"}
     assert (integers["is"], integers["rounding"]) == ("different", True)
-    raw = told["params"]["C"]
+    raw = reported["params"]["C"]
     assert raw["left"] == {"value": "0x00000001", "type": "UINT64", "bits": "0000000000000001"}
     assert (raw["is"], raw["right"]) == ("only left", None)
     people = command("diff", 1, 2).rows
@@ -423,9 +423,9 @@ def test_show_prints_a_file(command: Command, write: Callable[..., str]) -> None
     shown = command("show", path)
     assert (shown.code, shown.rows[:2]) == (0, [["name", "value", "type"], ["A", "1", "INT32"]])
     assert shown.err == "1 parameter of 1/1 from both.params\n1 parameter of 1/100 from both.params\n"
-    told = command("show", path, "--component", 100, "--json")
-    assert (told.code, told.err) == (0, "")
-    assert told.json == {
+    reported = command("show", path, "--component", 100, "--json")
+    assert (reported.code, reported.err) == (0, "")
+    assert reported.json == {
         "file": "both.params",
         "format": "qgc",
         "components": [
@@ -510,7 +510,7 @@ def test_parameters_missing_from_a_link_are_named(command: Command, vehicles: di
     vehicles["tcp:one:1"] = Gappy({"A": 1, "B": 2})
     outcome = command("diff", "tcp:one:1", "tcp:one:1", "--timeout", 1)
     assert (outcome.code, outcome.out) == (1, "")
-    assert "1/1 generic on tcp:one:1 is incomplete: index 1 did not come" in outcome.err
+    assert "1/1 generic on tcp:one:1 is incomplete: index 1 were not received" in outcome.err
 
 
 def test_a_failed_link_ends_the_comparison(command: Command) -> None:
@@ -540,8 +540,8 @@ def test_a_link_provides_only_confirmed_values(
     vehicles["tcp:one:1"] = quad(0.75)
     outcome = command("diff", "tcp:one:1", "1", "--json")
     assert (outcome.code, outcome.err) == (1, "")
-    told = {name: (entry["is"], entry["left"]) for name, entry in outcome.json["params"].items()}
-    assert told == {
+    reported = {name: (entry["is"], entry["left"]) for name, entry in outcome.json["params"].items()}
+    assert reported == {
         "V": ("different", {"value": 0.75, "type": "REAL32", "bits": "3f400000"}),
         "Z": ("only right", None),
     }
@@ -604,5 +604,5 @@ def test_a_closed_output_ends_the_command(cache: Path) -> None:
     os.close(ours)
     with start(cache, theirs) as started:
         os.close(theirs)
-        _, told = started.communicate(timeout=TIMEOUT)
-    assert (started.returncode, "Traceback" in told) == (141, False)
+        _, reported = started.communicate(timeout=TIMEOUT)
+    assert (started.returncode, "Traceback" in reported) == (141, False)

@@ -126,7 +126,7 @@ def strips(text: str) -> list[str]:
 
 
 @pytest.mark.parametrize("vehicle", [PX4Vehicle, ArduPilotVehicle])
-def test_fetch_draws_the_indices_as_they_come(
+def test_fetch_draws_the_indices_as_they_are_received(
     command: Command, put: Put, monkeypatch: pytest.MonkeyPatch, vehicle: type[PX4Vehicle | ArduPilotVehicle]
 ) -> None:
     monkeypatch.setattr("paramclient.cli.output.marks_for", lambda output: BLOCKS)
@@ -144,7 +144,7 @@ def test_fetch_draws_the_indices_as_they_come(
     assert "requested again" in done.err
 
 
-def test_a_service_tells_no_parts_and_a_bar_is_drawn(
+def test_a_service_without_ranges_gets_a_progress_bar(
     command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     link = SimLink(Air.symmetric([PX4Vehicle()], delay=0.05), "sim:custom")

@@ -131,7 +131,7 @@ def test_own_ids(command: Command, put: Put, vehicles: tuple[PX4Vehicle, ArduPil
     tap = Tap(vehicles[0])
     url = put(tap)
     assert command("get", url, "GAIN", "--source-system", "244", "--source-component", "191").code == 0
-    assert {(frame.system, frame.component) for _, frame, _ in tap.heard} == {(244, 191)}
+    assert {(frame.system, frame.component) for _, frame, _ in tap.received} == {(244, 191)}
 
 
 def test_a_diff_with_partial_leaves_out_the_rest_of_the_vehicle_on_either_side(
@@ -223,10 +223,10 @@ def test_vehicles_of_the_link_that_only_the_cache_knows_are_named(
     vehicles[1].set_param("GAIN", 7.0)
     done = command(name, url, *rest)
     assert done.code == alone.code
-    unheard = r"1 vehicle of this link in the cache was not heard: 1/1 PX4 quadrotor \(last 2\S+\)\. "
-    assert re.search(unheard + "--system chooses one", done.err)
+    change_silently = r"1 vehicle of this link in the cache was not heard: 1/1 PX4 quadrotor \(last 2\S+\)\. "
+    assert re.search(change_silently + "--system chooses one", done.err)
     if name != "reset":
-        assert re.search(unheard + "--expect waits longer", command(name, url, *rest, "--all").err)
+        assert re.search(change_silently + "--expect waits longer", command(name, url, *rest, "--all").err)
     for choice in (["--system", 2], ["--vehicle", "2/1"]):
         assert "not heard" not in command(name, url, *rest, *choice).err
 

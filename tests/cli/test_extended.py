@@ -103,7 +103,7 @@ def test_plain_ones_of_a_component_that_has_both(command: Command, reach: Put) -
     assert (both.code, both.err) == (2, "paramclient: --extended and --plain exclude each other\n")
 
 
-def test_a_kind_that_cannot_be_told_needs_the_option(command: Command, put: Put) -> None:
+def test_a_vehicle_type_that_the_file_does_not_name_needs_the_option(command: Command, put: Put) -> None:
     camera = Camera({"A": "text"}, component=191, plain={"A": 7})
     camera._heartbeat = GenericVehicle({}, component=191)._heartbeat
     url = put(camera)
@@ -201,7 +201,7 @@ def test_apply_writes_what_differs_and_reads_it_back(command: Command, reach: Pu
     assert command("apply", url, file, *CAMERA, "--reboot").code == 2
 
 
-def test_apply_tells_what_it_cannot_do(command: Command, reach: Put, tmp_path: Path) -> None:
+def test_apply_reports_what_it_cannot_do(command: Command, reach: Put, tmp_path: Path) -> None:
     file = tmp_path / "camera.yaml"
     assert command("save", reach(small()), file, *CAMERA, "--extended").code == 0
     url = reach(Camera({"CAM_MODE": 2, "CAM_NAME": 5}, supported={"CAM_MODE": [2]}))
@@ -337,7 +337,7 @@ def test_cached_extended_parameters_are_shown_offline(command: Command, put: Put
     assert command("diff", 1, url, "--extended", *CAMERA).code == 0
 
 
-def test_a_component_without_them_is_told(command: Command, reach: Put) -> None:
+def test_a_component_without_extended_parameters_is_reported(command: Command, reach: Put) -> None:
     url = reach(PX4Vehicle(table={"A": 1}))
     done = command("fetch", url, "--extended")
     assert (done.code, "no reply: extended parameters of 1/1" in done.err) == (3, True)
@@ -373,8 +373,8 @@ def test_save_finds_plain_ones_of_such_a_component(command: Command, reach: Put,
 def test_the_history_of_extended_parameters(command: Command, put: Put) -> None:
     url = put(small())
     assert command("set", url, *CAMERA, "CAM_NAME", "Rear", "CAM_KEY", "hex:01").code == 0
-    told = command("history", 1, "--extended")
-    assert [row[1:] for row in told.rows[1:]] == [
+    reported = command("history", 1, "--extended")
+    assert [row[1:] for row in reported.rows[1:]] == [
         ["100", "CAM_NAME", "Front", "Rear", "us"],
         ["100", "CAM_KEY", "hex:ff00fe", "hex:01", "us"],
     ]
@@ -387,7 +387,8 @@ def test_the_history_of_extended_parameters(command: Command, put: Put) -> None:
 
 
 class Changing(Camera):
-    """A camera that sets one of its parameters itself after 5 s, removes another, and tells of the first."""
+    """A camera that sets one of its parameters itself after 5 s, removes another, and reports only the
+    first."""
 
     def tick(self, now: float) -> None:
         super().tick(now)

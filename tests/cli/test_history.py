@@ -264,9 +264,9 @@ def test_vehicles_are_compared_with_a_file(path: Path, tmp_path: Path, command: 
 
 def test_fleet_diff_prints_json(path: Path, tmp_path: Path, command: Command) -> None:
     three(path)
-    told = command("fleet", "diff", "A", "F", "--json")
-    assert told.code == 1
-    found = told.json
+    reported = command("fleet", "diff", "A", "F", "--json")
+    assert reported.code == 1
+    found = reported.json
     assert (found["component"], found["vehicles"], found["different"]) == (1, 3, True)
     assert [(each["name"], each["different"], each["wanted"]) for each in found["names"]] == [
         ("A", True, None),

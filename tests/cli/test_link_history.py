@@ -41,7 +41,7 @@ class Watch:
         self._sequence = 0
 
     def second(self, frames: int = 10, lost: int = 0, trip: float | None = None) -> None:
-        """Let a second pass in which some frames come, the lost ones before the last."""
+        """Let a second pass with received and lost frames, the lost ones before the last."""
         for number in range(frames):
             self._sequence += lost if number == frames - 1 else 0
             beat = encode(Heartbeat(2, 12), system=1, component=1, sequence=self._sequence % 256)

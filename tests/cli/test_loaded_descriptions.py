@@ -91,11 +91,13 @@ def test_nothing_is_loaded_for_scripts_or_while_it_would_disturb(
 
 
 @pytest.mark.parametrize("vehicle", [ArduPilotVehicle, GenericVehicle])
-def test_a_vehicle_without_metadata_is_not_asked(command: Command, put: Put, vehicle: Any) -> None:
+def test_no_metadata_is_requested_from_a_vehicle_without_it(command: Command, put: Put, vehicle: Any) -> None:
     tap = Tap(vehicle(table={"MC_ROLL_P": 4.0}))
     assert command("get", put(tap), "MC_ROLL_P").code == 0
-    asked = [each for each in tap.messages(wire.CommandLong) if each.params[0] == wire.COMPONENT_METADATA_ID]
-    assert not asked
+    requested = [
+        each for each in tap.messages(wire.CommandLong) if each.params[0] == wire.COMPONENT_METADATA_ID
+    ]
+    assert not requested
 
 
 def test_info_and_search_name_the_command_that_loads_descriptions(command: Command, put: Put) -> None:

@@ -99,7 +99,7 @@ def in_zone(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("in_zone")
-def test_times_are_local_with_their_zone_and_can_be_given_back(
+def test_times_are_local_with_their_zone_and_can_be_parsed_back(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     at = 1_795_000_000.125

@@ -211,13 +211,13 @@ def test_watch_follows_groups_that_appear(
     watched = command("watch", put(growing()), *names, "--timeout", 30)
     assert watched.code == 0, watched.err
     assert watched.err.startswith(first)
-    news = {
+    changes = {
         "GRP_ENABLE": "GRP_ENABLE  0 -> 1  (vehicle)",
         "GRP_ONE": "GRP_ONE  added: 1.0  (vehicle)",
         "GRP_TWO": "GRP_TWO  added: 2.0  (vehicle)",
     }
     found = [line for line in lines(watched.out) if not line.startswith("1/1 resynced")]
-    assert sorted(found) == [news[name] for name in printed]
+    assert sorted(found) == [changes[name] for name in printed]
 
 
 def test_watch_of_a_pattern_without_a_match_is_an_error(command: Command, put: Put) -> None:

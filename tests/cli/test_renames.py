@@ -76,8 +76,8 @@ def test_apply_writes_under_the_name_of_the_vehicle(command: Command, put: Calla
 def test_apply_prints_the_name_of_the_vehicle_as_json(
     command: Command, put: Callable[[Endpoint], str]
 ) -> None:
-    told = command("apply", put(copter()), file(), "--renames", "names.yaml", "--json").json
-    row = told["params"]["WPNAV_SPEED"]
+    reported = command("apply", put(copter()), file(), "--renames", "names.yaml", "--json").json
+    row = reported["params"]["WPNAV_SPEED"]
     assert (row["vehicle_name"], row["wanted"], row["actual"], row["status"]) == ("WP_SPD", 7.5, 7.5, "set")
 
 
@@ -86,10 +86,10 @@ def test_a_dry_run_shows_the_steps_under_both_names(command: Command, put: Calla
     outcome = command("apply", put(vehicle), file(), "--renames", "names.yaml", "--dry-run")
     reason = "WP_SPD on this vehicle; all other parameters"
     assert outcome.rows[1:] == [["1", "WPNAV_SPEED", "10.0", "7.5", "set", reason]]
-    told = command("apply", put(vehicle), file(), "--renames", "names.yaml", "--dry-run", "--json").json
-    assert [step["name"] for step in told["stages"][0]["steps"]] == ["WP_SPD"]
-    assert told["params"]["WPNAV_SPEED"]["vehicle_name"] == "WP_SPD"
-    assert "firmware" not in told
+    reported = command("apply", put(vehicle), file(), "--renames", "names.yaml", "--dry-run", "--json").json
+    assert [step["name"] for step in reported["stages"][0]["steps"]] == ["WP_SPD"]
+    assert reported["params"]["WPNAV_SPEED"]["vehicle_name"] == "WP_SPD"
+    assert "firmware" not in reported
     assert vehicle.requests["PARAM_SET"] == 0
 
 
@@ -135,8 +135,8 @@ def test_firmware_versions_that_differ_are_named_first(
     outcome = command(subcommand, put(copter()), wanted, *options)
     first = "1/1 ardupilot: the file is of ArduPilot 4.5.7, the vehicle has 4.6.0-dev\n"
     assert outcome.err.startswith(first)
-    told = command(subcommand, put(copter()), wanted, *options, "--json").json
-    assert told["firmware"] == {"file": "4.5.7", "vehicle": "4.6.0-dev"}
+    reported = command(subcommand, put(copter()), wanted, *options, "--json").json
+    assert reported["firmware"] == {"file": "4.5.7", "vehicle": "4.6.0-dev"}
     same = replace(Identity(1, "udp", autopilot=3), firmware=67502080)
     write_file("same.json", ParamSet({"OTHER": WrittenParam("OTHER", 2.0)}, identity=same))
     assert "firmware" not in command(subcommand, put(copter()), "same.json", *options, "--json").json
@@ -166,8 +166,8 @@ def test_diff_compares_parameters_under_their_other_names(command: Command) -> N
 
 def test_diff_prints_both_names_as_json(command: Command) -> None:
     old, new = file("WPNAV_SPEED,750\n", "old.param"), file("WP_SPD,7.0\n", "new.param")
-    told = command("diff", old, new, "--renames", "names.yaml", "--json").json
-    (row,) = told["params"].values()
+    reported = command("diff", old, new, "--renames", "names.yaml", "--json").json
+    (row,) = reported["params"].values()
     assert (row["is"], row["right_name"], row["renamed"]["value"]) == ("different", "WP_SPD", 7.5)
     assert (row["left"]["value"], row["right"]["value"]) == (750, 7.0)
 

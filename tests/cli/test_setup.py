@@ -120,12 +120,12 @@ def test_apply_prints_json(
 ) -> None:
     outcome = command("apply", put(copter()), file(FILE + "NO_SUCH,1\nRTL_ALTT,3\n"), "--json")
     assert outcome.code == 1
-    told = outcome.json
-    elapsed = told.pop("elapsed_s")
+    reported = outcome.json
+    elapsed = reported.pop("elapsed_s")
     assert elapsed > 0
-    params = told.pop("params")
-    assert len(told["vehicle"].pop("uid")) == 36
-    assert told == {
+    params = reported.pop("params")
+    assert len(reported["vehicle"].pop("uid")) == 36
+    assert reported == {
         "system": 1,
         "component": 1,
         "vehicle": {
@@ -297,14 +297,14 @@ def test_dry_run_prints_the_stages_in_order(
     assert [row[0] for row in outcome.rows[5:]] == ["COMPASS_OFS_X", "EK2_NO_SUCH"]
     assert outcome.err.endswith("; nothing was sent\n")
     assert vehicle.requests["PARAM_SET"] == 0
-    assert vehicle.requests["COMMAND_LONG"] <= 2, "who it is may be asked, and no more"
+    assert vehicle.requests["COMMAND_LONG"] <= 2, "its identity may be requested, and no more"
     assert not backup.exists()
 
-    told = command("apply", put(vehicle), wanted, "--dry-run", "--json").json
-    planned = [(step["name"], step["value"]) for stage in told["stages"] for step in stage["steps"]]
+    reported = command("apply", put(vehicle), wanted, "--dry-run", "--json").json
+    planned = [(step["name"], step["value"]) for stage in reported["stages"] for step in stage["steps"]]
     assert planned == [("EK2_ENABLE", 1), ("RTL_ALT", 2500), ("WPNAV_SPEED", 750.5)]
-    assert told["dry_run"] is True
-    assert told["reboot_for"] == ["EK2_ENABLE"]
+    assert reported["dry_run"] is True
+    assert reported["reboot_for"] == ["EK2_ENABLE"]
 
 
 def test_a_dry_run_with_missing_parameters_is_incomplete(
@@ -313,7 +313,7 @@ def test_a_dry_run_with_missing_parameters_is_incomplete(
     assert command("apply", put(copter()), file("NO_SUCH,1\n"), "--dry-run").code == 1
 
 
-def test_a_dry_run_tells_a_mistyped_name_from_one_that_a_switch_may_reveal(
+def test_a_dry_run_distinguishes_a_mistyped_name_from_one_that_a_switch_may_reveal(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
 ) -> None:
     vehicle = copter()
@@ -371,9 +371,9 @@ def test_a_warning_is_printed_if_the_state_before_is_not_stored(
 
 
 def test_the_help_of_restore_names_the_time_zone(command: Command) -> None:
-    told = " ".join(command("restore", "--help", "--no-cache").out.split())
-    assert "A time without a time zone is in the time zone of this computer" in told
-    assert "A time in UTC ends with Z: 2026-11-20T13:00Z" in told
+    reported = " ".join(command("restore", "--help", "--no-cache").out.split())
+    assert "A time without a time zone is in the time zone of this computer" in reported
+    assert "A time in UTC ends with Z: 2026-11-20T13:00Z" in reported
 
 
 def test_restore_reverts_the_last_apply(
@@ -417,10 +417,10 @@ def test_restore_says_what_it_undoes(
     vehicle = restarted(vehicle)
     later = time.time() + 9 * 60 + 5
     monkeypatch.setattr("paramclient.cli.restore_states.time.time", lambda: later)
-    told = command("restore", put(vehicle), "--json")
-    assert told.json["complete"]
-    assert "the state is that before the last apply, 9 min ago (snapshot 1)" in told.err
-    assert told.err.endswith(
+    reported = command("restore", put(vehicle), "--json")
+    assert reported.json["complete"]
+    assert "the state is that before the last apply, 9 min ago (snapshot 1)" in reported.err
+    assert reported.err.endswith(
         "1/1 ardupilot: restored the state before the last apply, 9 min ago (snapshot 1)\n"
     )
     assert "last apply" not in command("restore", put(vehicle), 1).err
@@ -533,10 +533,10 @@ def test_verify_compares_and_sets_nothing(
     outcome = command("verify", put(vehicle), file())
     assert (outcome.code, outcome.out) == (0, "")
     assert outcome.err == "1/1 ardupilot: 3 same, 1 left out\n"
-    told = command("verify", put(vehicle), file(), "--json", "--full").json
-    assert told["met"] is True
-    assert told["counts"] == {"same": 3, "different": 0, "missing": 0, "left out": 1}
-    assert told["params"]["RTL_ALT"]["is"] == "same"
+    reported = command("verify", put(vehicle), file(), "--json", "--full").json
+    assert reported["met"] is True
+    assert reported["counts"] == {"same": 3, "different": 0, "missing": 0, "left out": 1}
+    assert reported["params"]["RTL_ALT"]["is"] == "same"
 
 
 @pytest.mark.parametrize("kind", ["px4", "ardupilot"])
@@ -594,9 +594,9 @@ def test_a_failed_vehicle_does_not_stop_the_others(
     assert outcome.code == 1
     assert "2/1 ardupilot: " in outcome.err
     assert [vehicle.values["RTL_ALT"] for vehicle in vehicles] == [2500, 1500, 2500]
-    told = command("apply", put(air), file(), "--all", "--json").json
-    assert [each["system"] for each in told["vehicles"]] == [1, 3]
-    assert [each["system"] for each in told["errors"]] == [2]
+    reported = command("apply", put(air), file(), "--all", "--json").json
+    assert [each["system"] for each in reported["vehicles"]] == [1, 3]
+    assert [each["system"] for each in reported["errors"]] == [2]
     vehicles[1].armed = False
     vehicles[2].reboot(down=float("inf"))
     outcome = command("verify", put(air), file(), "--all", "--expect", 3, "--timeout", 30)
@@ -719,8 +719,8 @@ def test_a_restore_of_all_vehicles_must_be_confirmed(
         monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
         done = command("restore", put(air), "--all")
     assert done.code == (0 if sets else 1)
-    told, _, _ = done.err.partition("go on? [y/N]")
-    assert told.count("the state is that before the last apply, ") == 3
+    reported, _, _ = done.err.partition("go on? [y/N]")
+    assert reported.count("the state is that before the last apply, ") == 3
     assert sum(vehicle.requests["PARAM_SET"] for vehicle in vehicles) - before == sets
 
 
@@ -758,10 +758,10 @@ def test_ctrl_c_prints_the_outcomes_so_far(
     done = sum(value == 2 for value in vehicle.values.values())
     assert done < 40
     if as_json:
-        told = outcome.json
-        assert (told["complete"], told["error"]) == (False, "interrupted")
-        assert 0 < len(told["params"]) <= done
-        assert {row["status"] for row in told["params"].values()} == {"unproven"}
+        reported = outcome.json
+        assert (reported["complete"], reported["error"]) == (False, "interrupted")
+        assert 0 < len(reported["params"]) <= done
+        assert {row["status"] for row in reported["params"].values()} == {"unproven"}
     else:
         assert 0 < len(outcome.rows) - 1 <= done
         assert outcome.rows[1][4:] == ["unproven", "acknowledged, and not read back"]

@@ -126,7 +126,7 @@ def test_with_two_vehicles_nothing_is_written(
         done = command(*words(name))
         assert (done.code, done.out, done.err) == (2, "", LISTED)
         assert untouched(one, two)
-        assert {type(message) for _, _, message in air.heard} <= {*QUESTIONS}, "nothing but who they are"
+        assert {type(message) for _, _, message in air.received} <= {*QUESTIONS}, "nothing but who they are"
 
 
 @pytest.mark.parametrize("name", [*WRITING, *SIGNING])
@@ -307,7 +307,7 @@ class Watch:
 
     def __init__(self, endpoint: Endpoint) -> None:
         self.tap = Tap(endpoint)
-        self.first_heard: float | None = None
+        self.first_received: float | None = None
 
     def receive(self, data: bytes, now: float) -> None:
         self.tap.receive(data, now)
@@ -320,14 +320,14 @@ class Watch:
 
     def data_to_send(self) -> list[bytes]:
         data = self.tap.data_to_send()
-        if data and self.first_heard is None:
-            self.first_heard = anyio.current_time()
+        if data and self.first_received is None:
+            self.first_received = anyio.current_time()
         return data
 
     def written_after(self) -> float:
-        assert self.first_heard is not None
-        first = next(at for at, _, message in self.tap.heard if isinstance(message, wire.ParamSetMessage))
-        return first - self.first_heard
+        assert self.first_received is not None
+        first = next(at for at, _, message in self.tap.received if isinstance(message, wire.ParamSetMessage))
+        return first - self.first_received
 
 
 @pytest.mark.parametrize(

@@ -87,7 +87,7 @@ async def serve(
 
 
 class Woken(Tap):
-    """An endpoint that starts with the first word that it hears: nobody waits for its second heartbeat."""
+    """An endpoint that starts with the first received frame: no caller waits for its second heartbeat."""
 
     is_awake = False
 
@@ -162,7 +162,7 @@ async def test_a_tcp_connection_that_drops_is_opened_again(monkeypatch: pytest.M
         async with a_client(f"tcp:127.0.0.1:{port}") as client:
             component = await client.component()
             scope.cancel()
-            while " reconnecting, " not in repr(client):  # noqa: ASYNC110 - nobody tells
+            while " reconnecting, " not in repr(client):  # noqa: ASYNC110 - no event reports it
                 await anyio.sleep(0.001)
             await tasks.start(serve_endpoint, vehicle, create_link(f"tcpin:127.0.0.1:{port}"))
             await everything(component, vehicle)
@@ -185,7 +185,7 @@ async def test_a_serial_port_that_is_unplugged(tmp_path: Path, monkeypatch: pyte
 
 @pytest.mark.parametrize("link", ["udpin", "tcpin", "tcp"])
 async def test_a_link_that_cannot_be_opened(link: str) -> None:
-    """Not even a task remains: the error comes out as it is, in no group."""
+    """Not even a task remains: the error is raised unchanged, in no group."""
     taken = create_link("udpin:127.0.0.1:0" if link == "udpin" else "tcpin:127.0.0.1:0")
     await taken.open()
     port = port_of(taken)
@@ -200,26 +200,26 @@ async def test_a_link_that_cannot_be_opened(link: str) -> None:
 # The cache, and the three ways to a whole table
 
 
-async def test_a_table_comes_by_list_and_then_from_the_cache(tmp_path: Path) -> None:
+async def test_a_table_is_downloaded_by_list_and_then_taken_from_the_cache(tmp_path: Path) -> None:
     sources = []
-    told: list[Progress] = []
+    reported: list[Progress] = []
     with anyio.fail_after(TIMEOUT):
         for _ in range(2):
             vehicle = small_px4(**QUICK)
             async with ParamClient(vehicle, cache=tmp_path / "cache") as client:
                 component = await client.component()
-                result = await component.fetch_all(progress=told.append)
+                result = await component.fetch_all(progress=reported.append)
                 await component.refreshed()
                 sources.append(result.source)
                 assert bits(component.params) == bits(vehicle.params)
     assert sources == ["stream", "cache"]
-    assert told
+    assert reported
     assert component.params["PARAM_01"].trust is Trust.VERIFIED
     with ParamCache(tmp_path / "cache") as cache:
         assert bits(cache.component(system=1).params) == bits(vehicle.params)
 
 
-async def test_a_table_comes_as_a_file_and_files_are_read_and_written() -> None:
+async def test_a_table_is_served_as_a_file_and_files_are_read_and_written() -> None:
     vehicle = ArduPilotVehicle(live_period=0)
     async with beside(), a_client(vehicle) as client:
         component = await client.component()
@@ -288,17 +288,17 @@ async def test_a_link_whose_bytes_are_signed(tmp_path: Path) -> None:
         await everything(await client.component(), vehicle)
 
 
-# What is told
+# Reports
 
 
-async def test_changes_are_told_until_the_client_ends() -> None:
+async def test_changes_are_reported_until_the_client_ends() -> None:
     vehicle = generic(**QUICK)
-    heard: list[Change] = []
+    received: list[Change] = []
 
     async def listen(component: Component) -> None:
         try:
             async for change in component.changes():
-                heard.append(change)  # noqa: PERF401 - it never ends by itself
+                received.append(change)  # noqa: PERF401 - it never ends by itself
         except ClientClosed:
             ended.set()
 
@@ -310,15 +310,15 @@ async def test_changes_are_told_until_the_client_ends() -> None:
             tasks.start_soon(listen, component)
             await anyio.lowlevel.checkpoint()
             await component.set("PARAM_01", 78)
-            while not heard:  # noqa: ASYNC110 - nobody tells
+            while not received:  # noqa: ASYNC110 - no event reports it
                 await anyio.sleep(0.001)
         await ended.wait()
-    assert [(change.name, change.new and change.new.value, change.by) for change in heard] == [
+    assert [(change.name, change.new and change.new.value, change.by) for change in received] == [
         ("PARAM_01", 78, "us")
     ]
 
 
-async def test_a_vehicle_starts_again_and_listeners_are_told() -> None:
+async def test_a_reboot_is_reported_to_listeners() -> None:
     seen: list[type[Event]] = []
     async with beside(), a_client(generic(reboot_down=0.05, **QUICK)) as client:
         events = client.events()
@@ -374,7 +374,7 @@ async def test_calls_that_wait_end_with_the_client() -> None:
             await anyio.sleep(0.01)
         with pytest.raises(ClientClosed):
             await component.get("PARAM_01")
-        while len(endings) < 3:  # noqa: ASYNC110 - nobody tells
+        while len(endings) < 3:  # noqa: ASYNC110 - no event reports it
             await anyio.sleep(0.001)
     assert endings == ["ClientClosed"] * 3
 
@@ -437,6 +437,6 @@ async def test_a_link_that_fails_reaches_everyone(
         with caplog.at_level(logging.ERROR), pytest.raises(LinkError, match="refused"):
             await component.get("PARAM_01")
         link.is_offline = False
-        while " open, " not in repr(client):  # noqa: ASYNC110 - nobody tells
+        while " open, " not in repr(client):  # noqa: ASYNC110 - no event reports it
             await anyio.sleep(0.001)
         assert (await component.get("PARAM_01")).value == 1

@@ -60,7 +60,7 @@ from tests.shell import (
 )
 
 ODD = ("CAL_ACC0_XOFF", "PARAM_03", "PARAM_07")
-"""Volatile parameters that cannot be told from the hash alone: two are of no group that usually is."""
+"""Volatile parameters that cannot be determined from the hash alone: two are of no group that usually is."""
 
 
 @pytest.fixture
@@ -81,8 +81,8 @@ async def session(
         return result
 
 
-async def while_away(vehicle: PX4Vehicle, **values: float) -> None:
-    """Somebody changes values while nobody listens to the vehicle."""
+async def set_while_disconnected(vehicle: PX4Vehicle, **values: float) -> None:
+    """Change values on board while no client is connected."""
     for name, value in values.items():
         vehicle.set_param(name, value)
     await asyncio.sleep(5.0)
@@ -115,12 +115,12 @@ async def test_an_unchanged_vehicle_is_not_downloaded_again(
     tap = Tap(vehicle)
     async with ParamClient(Air.symmetric([tap], delay=0.1), cache=path) as client:
         component = await client.component()
-        assert bits(component.params) == bits(vehicle.params), "from the cache, before anything was asked"
+        assert bits(component.params) == bits(vehicle.params), "from the cache, before anything was requested"
         assert component.state == "cached"
         assert trusts(component, volatile) == {Trust.CACHED}
         result = await component.fetch_all()
         assert isinstance(component, LinkComponent)
-        assert anyio.current_time() - component._received_at < 0.21, "one round trip after it was heard"
+        assert anyio.current_time() - component._received_at < 0.21, "one round trip after it was received"
         assert (result.source, result.complete, result.hash) == ("cache", True, vehicle.announced_hash())
         assert bits(result.params) == bits(vehicle.params)
         assert trusts(component, component.params.keys() - volatile) == {Trust.VERIFIED}
@@ -178,7 +178,7 @@ async def test_a_fetch_waits_for_the_cached_table(path: Path) -> None:
 async def test_volatile_values_are_read_afresh_after_a_hit(path: Path) -> None:
     vehicle = small_px4()
     await session(vehicle, path)
-    await while_away(vehicle, PARAM_03=9.5)
+    await set_while_disconnected(vehicle, PARAM_03=9.5)
 
     async def check(component: Component) -> None:
         assert component.params["PARAM_03"].value == 9.5
@@ -229,7 +229,7 @@ async def test_waiting_for_volatile_values_has_an_end(path: Path) -> None:
 
 
 @in_simulated_time
-async def test_a_download_can_be_asked_for_all_the_same(path: Path) -> None:
+async def test_a_download_can_be_requested_all_the_same(path: Path) -> None:
     vehicle = small_px4()
     await session(vehicle, path)
     async with ParamClient(vehicle, cache=path) as client:
@@ -240,18 +240,18 @@ async def test_a_download_can_be_asked_for_all_the_same(path: Path) -> None:
 
 
 @in_simulated_time
-async def test_a_change_while_we_were_away_is_a_miss(path: Path) -> None:
+async def test_a_change_between_two_sessions_is_a_cache_miss(path: Path) -> None:
     vehicle = small_px4()
     await session(vehicle, path)
-    await while_away(vehicle, PARAM_01=1000, PARAM_05=5000)
+    await set_while_disconnected(vehicle, PARAM_01=1000, PARAM_05=5000)
     async with ParamClient(vehicle, cache=path) as client:
         component = await client.component()
         changes = component.changes()
         result = await component.fetch_all()
         assert result.source == "stream"
         assert result.hash == vehicle.announced_hash()
-        told = {(await anext(changes)).name for _ in range(2)}
-        assert told == {"PARAM_01", "PARAM_05"}
+        reported = {(await anext(changes)).name for _ in range(2)}
+        assert reported == {"PARAM_01", "PARAM_05"}
     assert kept(path) == bits(vehicle.params)
     with ParamCache(path) as cache:
         lines = cache.component().history()
@@ -306,7 +306,7 @@ async def test_everyone_on_the_link_starts_from_the_cache(path: Path) -> None:
 
 
 class Reticent(PX4Vehicle):
-    """It can be told not to answer messages of some kinds."""
+    """It can ignore messages of some kinds."""
 
     unanswered: tuple[type[wire.Message], ...] = ()
 
@@ -320,7 +320,9 @@ PARAMETER_REQUESTS = (wire.ParamRequestRead, wire.ParamRequestList)
 
 @pytest.mark.parametrize("unanswered", [PARAMETER_REQUESTS, (*PARAMETER_REQUESTS, wire.CommandLong)])
 @in_simulated_time
-async def test_a_silent_component_with_a_cached_table_holds_nobody_up(path: Path, unanswered: Any) -> None:
+async def test_a_silent_component_with_a_cached_table_delays_no_other_component(
+    path: Path, unanswered: Any
+) -> None:
     vehicle, silent = small_px4(), Reticent(system=2, table=VALUES)
     async with ParamClient(Air([vehicle, silent]), cache=path) as client:
         assert not (await client.fetch_all()).silent
@@ -384,7 +386,7 @@ async def test_another_vehicle_takes_the_place_within_a_session(path: Path, know
 
 
 @in_simulated_time
-async def test_the_end_of_a_table_is_no_news_of_the_vehicle_that_has_gone(path: Path) -> None:
+async def test_the_end_of_a_table_is_no_message_of_the_vehicle_that_has_gone(path: Path) -> None:
     first, second = small_px4(uid=0xA), small_px4(uid=0xB)
     first.tick(simulated_time_loop().time())
     second.reboot(simulated_time_loop().time(), down=math.inf)
@@ -462,7 +464,7 @@ async def test_a_vehicle_that_does_not_say_who_it_is(path: Path) -> None:
 
 @pytest.mark.parametrize("fetched", [True, False])
 @in_simulated_time
-async def test_an_identity_that_comes_long_after_the_values(path: Path, fetched: bool) -> None:
+async def test_an_identity_that_arrives_long_after_the_values(path: Path, fetched: bool) -> None:
     await session(PX4Vehicle(table=VALUES), path)
     changed = Reticent(table={**VALUES, "PARAM_01": 99}, not_in_use=["PARAM_02"])
     changed.unanswered = (wire.CommandLong,)
@@ -481,7 +483,7 @@ async def test_an_identity_that_comes_long_after_the_values(path: Path, fetched:
         tap.is_mute = False
         await asyncio.sleep(2.0)
         assert component.identity.key.startswith("uid:")
-        assert component.params["PARAM_01"].value == 1, "it may be another one that was heard before"
+        assert component.params["PARAM_01"].value == 1, "it may be another vehicle that was received before"
         if fetched:
             assert (await component.fetch_all()).source == "stream"
         else:
@@ -507,7 +509,7 @@ async def test_an_identity_that_comes_long_after_the_values(path: Path, fetched:
 async def test_after_our_own_set_the_next_session_hits_where_the_hash_is_computed(
     path: Path, volatile: Collection[str], fetched: bool
 ) -> None:
-    """Where it cannot be, it may stand for more than our set: for what was not heard as well."""
+    """Where it cannot be, it may stand for more than our set: for what was not received as well."""
     vehicle = small_px4(volatile=volatile)
     await session(vehicle, path)
     for name, value in (("PARAM_01", 100), ("PARAM_04", 400), ("PARAM_01", 101)):
@@ -524,7 +526,7 @@ async def test_after_our_own_set_the_next_session_hits_where_the_hash_is_compute
 
 
 @in_simulated_time
-async def test_a_change_of_ours_tells_who_asked_for_it(path: Path) -> None:
+async def test_a_change_of_ours_names_its_author(path: Path) -> None:
     """And counts as ours: the hash is computed, and the next session hits."""
     vehicle = small_px4()
     await session(vehicle, path)
@@ -535,13 +537,13 @@ async def test_a_change_of_ours_tells_who_asked_for_it(path: Path) -> None:
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(partial(component.set, "PARAM_01", 100, author="anna@10.0.0.2"))
             tasks.start_soon(partial(component.set, "PARAM_02", 200, author="ben@10.0.0.3 (script)"))
-        told = {}
+        reported = {}
         for _ in range(2):
             change = await anext(changes)
-            told[change.name] = change.by
-    assert told == {"PARAM_01": "us for anna@10.0.0.2", "PARAM_02": "us for ben@10.0.0.3 (script)"}
+            reported[change.name] = change.by
+    assert reported == {"PARAM_01": "us for anna@10.0.0.2", "PARAM_02": "us for ben@10.0.0.3 (script)"}
     with ParamCache(path) as cache:
-        assert {line.name: line.by for line in cache.component().history()} == told
+        assert {line.name: line.by for line in cache.component().history()} == reported
     assert (await session(vehicle, path)).source == "cache"
 
 
@@ -567,7 +569,7 @@ async def test_every_own_write_is_in_the_history_however_briefly_it_was_valid(pa
 
 
 @in_simulated_time
-async def test_a_write_is_told_of_as_ours_also_where_nobody_waits_for_it_any_more(path: Path) -> None:
+async def test_a_write_without_a_waiting_caller_is_reported_as_ours(path: Path) -> None:
     vehicle = small_px4()
     await session(vehicle, path)
     async with ParamClient(Air.symmetric([vehicle], delay=0.2), cache=path) as client:
@@ -601,8 +603,8 @@ async def test_a_write_is_in_the_history_also_where_the_cache_knew_nothing_befor
         await component.set("PARAM_02", 200)
     with ParamCache(path) as cache:
         lines = cache.component().history()
-    told = [(line.name, line.new and line.new.value, line.by) for line in lines]
-    assert told == [("PARAM_01", 100, "us for anna"), ("PARAM_02", 200, "us")]
+    reported = [(line.name, line.new and line.new.value, line.by) for line in lines]
+    assert reported == [("PARAM_01", 100, "us for anna"), ("PARAM_02", 200, "us")]
     assert lines[0].old.value == before
 
 
@@ -630,7 +632,7 @@ async def test_after_many_sets_at_once_the_next_session_hits(path: Path) -> None
 
 
 @in_simulated_time
-async def test_a_set_that_moves_the_count_leads_to_a_download_and_a_right_table(path: Path) -> None:
+async def test_a_set_that_changes_the_count_leads_to_a_download_and_a_right_table(path: Path) -> None:
     vehicle = PX4Vehicle()
     await session(vehicle, path)
     async with ParamClient(vehicle, cache=path) as client:
@@ -660,8 +662,8 @@ async def test_a_change_by_another_station_is_in_the_history_with_its_address(pa
         with ParamCache(path) as cache:
             assert cache.component().params["PARAM_04"].value == 44, "while the client is open"
     with ParamCache(path) as cache:
-        told = {line.name: line.by for line in cache.component().history()}
-        assert told == {"PARAM_01": "station 254/190", "PARAM_02": "us", "PARAM_04": "vehicle"}
+        reported = {line.name: line.by for line in cache.component().history()}
+        assert reported == {"PARAM_01": "station 254/190", "PARAM_02": "us", "PARAM_04": "vehicle"}
     assert (await session(vehicle, path)).source == "cache"
 
 
@@ -719,7 +721,7 @@ async def test_a_table_is_never_called_whole_that_is_not(path: Path) -> None:
 
 
 @in_simulated_time
-async def test_an_index_that_never_comes(path: Path) -> None:
+async def test_an_index_that_never_arrives(path: Path) -> None:
     class Holey(GenericVehicle):
         def _send_value(self, entry: Any, **how: Any) -> None:
             if entry.name != "PARAM_05":
@@ -768,9 +770,7 @@ async def test_a_cache_that_was_given_stays_open(path: Path) -> None:
 
 
 @in_simulated_time
-async def test_the_users_cache_is_used_unless_told_otherwise(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_the_users_cache_is_used_by_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     async with ParamClient(small_px4(), cache=False) as client:
         assert client.cache is None
@@ -788,7 +788,7 @@ async def test_the_users_cache_is_used_unless_told_otherwise(
 
 
 async def goes_on_without(path: Path | ParamCache, caplog: pytest.LogCaptureFixture) -> None:
-    """A session works, one warning tells why nothing is kept, and one at its end how much is lost."""
+    """A session works, one warning says why nothing is kept, and one at its end how much is lost."""
     vehicle = small_px4()
     with caplog.at_level(logging.WARNING):
         async with ParamClient(vehicle, cache=path) as client:
@@ -829,7 +829,7 @@ async def test_a_full_disk(path: Path, caplog: pytest.LogCaptureFixture) -> None
 
 
 @in_simulated_time
-async def test_a_cache_that_somebody_closed(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_cache_that_the_caller_closed(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     cache = ParamCache(path)
     cache.close()
     await goes_on_without(cache, caplog)
@@ -877,8 +877,8 @@ async def test_values_that_could_not_be_written_are_written_later(
             await component.set("PARAM_01", 5)
             await asyncio.sleep(1.0)
             cache.is_broken = False
-        told = [record.getMessage() for record in caplog.records]
-        assert told == ["continuing without the cache: no room"] * 2, "once for each time that it began"
+        reported = [record.getMessage() for record in caplog.records]
+        assert reported == ["continuing without the cache: no room"] * 2, "once for each time that it began"
     assert kept(path) == bits(vehicle.params)
     assert (await session(vehicle, path)).source == "cache"
 
@@ -965,20 +965,20 @@ async def test_a_vehicle_without_the_parameter_file_is_remembered_for_its_firmwa
         server.params = lambda: None
     else:
         vehicle._ftp = None
-    asked = Tap(vehicle)
-    first = await session(asked, path)
+    requested = Tap(vehicle)
+    first = await session(requested, path)
     assert (first.source, first.complete) == ("stream", True)
     assert "as a list instead of a file" in first.notes[0]
     assert said(path)[1] is False
-    assert asked.messages(wire.FileTransfer)
-    asked.heard.clear()
-    second = await session(asked, path)
+    assert requested.messages(wire.FileTransfer)
+    requested.received.clear()
+    second = await session(requested, path)
     assert (second.source, second.notes) == ("stream", ())
-    assert not asked.messages(wire.FileTransfer)
+    assert not requested.messages(wire.FileTransfer)
     vehicle._ftp, server.params = server, rows
-    assert (await session(asked, path)).source == "stream", "nobody has asked"
+    assert (await session(requested, path)).source == "stream", "nothing was requested"
     vehicle._version = replace(vehicle._version, flight_sw_version=67502081)
-    assert (await session(asked, path)).source == "ftp"
+    assert (await session(requested, path)).source == "ftp"
     assert said(path)[1] is True
 
 

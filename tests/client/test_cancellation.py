@@ -1,8 +1,8 @@
 """Every public call, cancelled at every point: nothing of it is left, and the next call works.
 
 Two ways lead to every point. One cancels a call at each of its own suspensions, before or after what it
-waits for has come. The other lets it wait and cancels it after each round of the event loop, which meets the
-protocol below in each of its states.
+waits for has arrived. The other lets it wait and cancels it after each round of the event loop, which meets
+the protocol below in each of its states.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ FEW_VALUES = {name: VALUES[name] for name in list(VALUES)[:8]}
 fresh = count(1000)
 
 POINTS_MAX = 1000
-"""None of these calls has as many: whoever gets here cancels nothing."""
+"""None of these calls has as many rounds: a test that gets here cancels nothing."""
 
 
 async def first_change(client: ParamClient, component: Component) -> object:
@@ -85,7 +85,7 @@ class Struck(Coroutine[Any, Any, Any]):
     Args:
         inner: the coroutine.
         number: which suspension.
-        late: strike only when what it waits for has come, and it would go on.
+        late: strike only when what it waits for has arrived, and it would go on.
 
     Attributes:
         is_struck: whether it had so many.
@@ -124,7 +124,7 @@ class Struck(Coroutine[Any, Any, Any]):
 
 @asynccontextmanager
 async def a_session() -> AsyncIterator[tuple[ParamClient, Component]]:
-    """A client that has just heard a vehicle with a camera, while another one comes a little later."""
+    """A client that has just found a vehicle with a camera; another one is found a little later."""
     late = generic(system=2, table=FEW_VALUES)
     late.reboot(simulated_time_loop().time(), down=0.03)
     camera = generic(component=100, table=FEW_VALUES, autopilot=wire.MAV_AUTOPILOT_INVALID)
@@ -135,7 +135,7 @@ async def a_session() -> AsyncIterator[tuple[ParamClient, Component]]:
 
 
 def registered(client: ParamClient) -> list[object]:
-    """What is registered in any component, but for the reads of the hash that nobody waits for."""
+    """What is registered in any component, except reads of the hash without a waiting caller."""
     found: list[object] = []
     for component in client.components.values():
         hashes = ["1 reads"] if wire.HASH_CHECK in local(component).machine.reads else []
@@ -202,7 +202,7 @@ async def test_cancelled_after_each_round(call: Call, by: str) -> None:
 
 @EVERY_CALL
 @in_simulated_time
-async def test_cancelled_while_the_link_is_away(call: Call) -> None:
+async def test_cancelled_while_the_link_is_disconnected(call: Call) -> None:
     link = FlakyLink(Air([small_px4(), generic(system=2)]))
     async with a_client(link) as client:
         component = await client.component()

@@ -113,7 +113,7 @@ async def test_an_exception_of_the_body_is_raised_unchanged() -> None:
 
 
 @in_simulated_time
-async def test_an_error_of_a_call_comes_out_as_it_is() -> None:
+async def test_an_error_of_a_call_is_raised_unchanged() -> None:
     async def session() -> None:
         async with a_client(generic(param_error=True)) as client:
             await (await client.component()).get("NOT_THERE")
@@ -269,7 +269,7 @@ async def test_closing_ends_everyone_who_waits() -> None:
 
 
 @in_simulated_time
-async def test_closing_while_the_link_is_away() -> None:
+async def test_closing_while_the_link_is_disconnected() -> None:
     tap = Tap(generic())
     link = FlakyLink(tap)
     async with a_client(link) as client:
@@ -374,7 +374,7 @@ async def test_the_heartbeat_of_a_ground_station_goes_out_every_second() -> None
     async with a_client(tap, system=200, component=25):
         await asyncio.sleep(5.5)
     beats = [
-        (when, frame, message) for when, frame, message in tap.heard if isinstance(message, wire.Heartbeat)
+        (when, frame, message) for when, frame, message in tap.received if isinstance(message, wire.Heartbeat)
     ]
     assert [round(when - beats[0][0], 3) for when, _, _ in beats] == [0, 1, 2, 3, 4, 5]
     for _, frame, message in beats:
@@ -383,11 +383,11 @@ async def test_the_heartbeat_of_a_ground_station_goes_out_every_second() -> None
 
 
 @in_simulated_time
-async def test_our_ids_are_those_of_a_ground_station_unless_told() -> None:
+async def test_our_ids_are_those_of_a_ground_station_by_default() -> None:
     tap = Tap(generic())
     async with a_client(tap) as client:
         await client.component()
-    assert {(frame.system, frame.component) for _, frame, _ in tap.heard} == {(255, 190)}
+    assert {(frame.system, frame.component) for _, frame, _ in tap.received} == {(255, 190)}
     for bad in (0, 256, -1):
         with pytest.raises(UsageError, match="1 to 255"):
             a_client(tap, system=bad)
@@ -396,7 +396,7 @@ async def test_our_ids_are_those_of_a_ground_station_unless_told() -> None:
 
 
 @in_simulated_time
-async def test_a_component_is_asked_who_it_is() -> None:
+async def test_a_component_is_requested_to_identify_itself() -> None:
     async with a_client(ArduPilotVehicle()) as client:
         component = await client.component()
         await asyncio.sleep(0.5)
@@ -423,7 +423,7 @@ async def test_bytes_are_counted_both_ways() -> None:
     async with a_client(tap) as client:
         assert client.bytes_received == 0
         await (await client.component()).get("PARAM_01")
-        assert client.bytes_sent == sum(12 + len(frame.payload) for _, frame, _ in tap.heard)
+        assert client.bytes_sent == sum(12 + len(frame.payload) for _, frame, _ in tap.received)
         assert client.bytes_received > 2 * 21
 
 
@@ -674,7 +674,7 @@ async def test_a_write_that_is_refused_says_why() -> None:
 
 
 @in_simulated_time
-async def test_an_unknown_name_is_told_from_silence() -> None:
+async def test_an_unknown_name_is_distinguished_from_silence() -> None:
     async with a_client(small_px4()) as client:
         component = await client.component()
         with pytest.raises(UnknownParameter, match="NOT_THERE"):
@@ -726,7 +726,7 @@ async def test_invalid_values_and_names_are_not_sent() -> None:
         component = await client.component()
         await component.fetch_all()
         await settled()
-        tap.heard.clear()
+        tap.received.clear()
         for name, value in [
             ("SMALL", 300),
             ("SMALL", -1),
@@ -749,7 +749,7 @@ async def test_invalid_values_and_names_are_not_sent() -> None:
             with pytest.raises(UsageError):
                 await component.get(bad_index)
         await settled()
-        assert not tap.heard
+        assert not tap.received
         assert not residue(component)
 
 
@@ -807,7 +807,7 @@ async def test_calls_without_a_time_limit_end_by_themselves() -> None:
 
 
 @in_simulated_time
-async def test_a_fetch_whose_time_is_over_gives_what_came() -> None:
+async def test_a_fetch_that_times_out_returns_the_received_values() -> None:
     slow = generic(burst=1, period=0.1)
     async with a_client(slow) as client:
         component = await client.component()
@@ -895,7 +895,7 @@ async def test_fetches_at_the_same_time_are_one() -> None:
 
 
 @in_simulated_time
-async def test_progress_is_told() -> None:
+async def test_the_progress_of_a_fetch_is_reported() -> None:
     async with a_client(generic(burst=1, period=0.05)) as client:
         component = await client.component()
         seen: list[Progress] = []
@@ -980,7 +980,7 @@ class Silent(GenericVehicle):
 
 @in_simulated_time
 @pytest.mark.parametrize("autopilot", [wire.MAV_AUTOPILOT_GENERIC, wire.MAV_AUTOPILOT_INVALID])
-async def test_a_silent_component_holds_nobody_up(autopilot: int) -> None:
+async def test_a_silent_component_delays_no_other_component(autopilot: int) -> None:
     silent = Silent(VALUES, component=100, autopilot=autopilot), Silent(VALUES, system=2, autopilot=autopilot)
     async with a_client(Air([*silent, generic()])) as client:
         component = await client.component(system=1, component=1)
@@ -1018,7 +1018,7 @@ async def test_a_link_without_an_autopilot_can_be_fetched() -> None:
 
 
 @in_simulated_time
-async def test_a_ground_station_is_not_asked_for_parameters() -> None:
+async def test_no_parameters_are_requested_from_a_ground_station() -> None:
     class Station(Silent):
         def __init__(self) -> None:
             super().__init__(VALUES, system=254, component=190)
@@ -1048,7 +1048,7 @@ async def test_a_lossy_link_to_one_vehicle_is_not_given_up_early() -> None:
 
 
 @in_simulated_time
-async def test_changes_tell_what_was_and_what_is() -> None:
+async def test_changes_have_the_old_and_the_new_value() -> None:
     vehicle = small_px4()
     async with a_client(vehicle) as client:
         component = await client.component()
@@ -1059,7 +1059,7 @@ async def test_changes_tell_what_was_and_what_is() -> None:
         change = await anext(first)
         assert (change.name, change.old) == ("PARAM_01", None)
         assert change.new is not None
-        assert change.new.value == 40, "two changes that nobody fetched have become one"
+        assert change.new.value == 40, "two unread changes have become one"
         await component.set("PARAM_01", 41)
         change = await anext(first)
         assert change.old is not None
@@ -1130,7 +1130,7 @@ async def test_changes_begin_when_they_are_requested() -> None:
 
 
 @in_simulated_time
-async def test_changes_end_with_the_client_and_what_waits_comes_first() -> None:
+async def test_changes_end_with_the_client_after_the_queued_ones() -> None:
     async with a_client(small_px4()) as client:
         component = await client.component()
         changes = component.changes()
@@ -1156,7 +1156,7 @@ async def test_a_dropped_changes_object_is_no_listener_any_more() -> None:
 
 
 @in_simulated_time
-async def test_changes_by_other_stations_are_told_from_the_vehicles_own() -> None:
+async def test_changes_by_other_stations_are_distinguished_from_the_vehicles_own() -> None:
     vehicle = small_px4()
     radio = Radio(vehicle)
     async with a_client(radio) as client:
@@ -1212,14 +1212,14 @@ async def test_waiting_reads_are_sent_at_once_when_the_link_is_back() -> None:
         await settled()
         read = asyncio.create_task(component.get("PARAM_01"))
         await until(lambda: link.openings == 2)
-        came_back = anyio.current_time()
+        reconnected_at = anyio.current_time()
         await read
-        assert anyio.current_time() - came_back < 1.1, "one round trip, and no time-out before it"
+        assert anyio.current_time() - reconnected_at < 1.1, "one round trip, and no time-out before it"
 
 
 @direct_only("a service waits for its links, so client.component() goes on")
 @in_simulated_time
-async def test_a_link_that_stays_away_fails_the_calls_and_not_the_client(
+async def test_a_link_that_stays_disconnected_fails_the_calls_and_not_the_client(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     tap = Tap(generic())
@@ -1234,13 +1234,15 @@ async def test_a_link_that_stays_away_fails_the_calls_and_not_the_client(
         changes = waiting.pop("changes")
         limited = asyncio.create_task(outcome(component.get("PARAM_05", timeout=2)))
         await link.drop(stays_offline=True)
-        went_away = anyio.current_time()
+        disconnected_at = anyio.current_time()
         assert isinstance(await limited, NoReply)
         for name, task in waiting.items():
             error = await task
             assert type(error) is LinkError, name
             assert "refused" in str(error)
-            assert math.isclose(anyio.current_time() - went_away, reconnect_delays.LINK_TIMEOUT, abs_tol=0.1)
+            assert math.isclose(
+                anyio.current_time() - disconnected_at, reconnect_delays.LINK_TIMEOUT, abs_tol=0.1
+            )
         for call in ("get", "set", "fetch_all", "client.component", "client.fetch_all"):
             with pytest.raises(LinkError, match="refused"):
                 await CALLS[call](client, component)
@@ -1255,9 +1257,9 @@ async def test_a_link_that_stays_away_fails_the_calls_and_not_the_client(
         assert (await component.get("PARAM_01")).value == 1
         assert (await component.fetch_all()).complete
         assert isinstance(await changes, list), "a subscription waits on"
-    told = [record for record in caplog.records if record.levelno >= logging.WARNING]
-    assert len(told) == 1
-    assert "reconnecting" in told[0].getMessage()
+    reported = [record for record in caplog.records if record.levelno >= logging.WARNING]
+    assert len(reported) == 1
+    assert "reconnecting" in reported[0].getMessage()
 
 
 @direct_only("the errors are made anew from what the service says")
@@ -1278,7 +1280,7 @@ async def test_the_errors_of_a_long_absence_do_not_grow() -> None:
 
 @direct_only("a service opens it again")
 @in_simulated_time
-async def test_a_link_that_cannot_come_back_ends_every_call() -> None:
+async def test_a_link_that_cannot_reconnect_ends_every_call() -> None:
     tap = Tap(generic())
     link = FlakyLink(tap)
     link.reconnects = False
@@ -1355,7 +1357,7 @@ async def test_a_tcp_connection_that_breaks_during_a_download() -> None:
 
 @direct_only("it is about a link of its own")
 @pytest.mark.asyncio
-async def test_a_tcp_server_that_stays_away(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_tcp_server_that_stays_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reconnect_delays, "LINK_TIMEOUT", 0.3)
     monkeypatch.setattr(reconnect_delays, "RECONNECT_BACKOFF_MIN", 0.05)
     monkeypatch.setattr(reconnect_delays, "RECONNECT_BACKOFF_MAX", 0.1)
@@ -1375,7 +1377,7 @@ async def test_a_tcp_server_that_stays_away(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 class Chatter(Tap):
-    """An endpoint beside which telemetry comes at an even pace.
+    """An endpoint with telemetry at an even rate.
 
     Attributes:
         portions: what was handed over, as it was taken together.
@@ -1517,7 +1519,7 @@ async def test_a_call_ends_a_rest_at_once(call: str, monkeypatch: pytest.MonkeyP
         vehicle = Chatter(small_px4(), 0.005)
         async with a_client(vehicle) as client:
             component = await known_component(client)
-            vehicle.heard.clear()
+            vehicle.received.clear()
             await until(lambda: vehicle.messages(wire.Heartbeat))
             await asyncio.sleep(0.05)
             began = anyio.current_time()
@@ -1547,7 +1549,7 @@ async def test_closing_does_not_wait_for_the_end_of_a_rest(monkeypatch: pytest.M
 
 @direct_only("the words name the link")
 @in_simulated_time
-async def test_their_looks_tell_how_they_stand() -> None:
+async def test_their_style_shows_the_comparison() -> None:
     client = a_client(Air([small_px4(burst=1, period=0.05), generic(system=2)]))
     assert repr(client) == "<ParamClient sim:custom closed, 0 components>"
     async with client:
@@ -1567,7 +1569,7 @@ async def test_their_looks_tell_how_they_stand() -> None:
 
 
 @in_simulated_time
-async def test_a_program_that_is_held_up_takes_what_has_come_before_it_counts_as_lost() -> None:
+async def test_a_blocked_program_processes_received_data_before_timeouts_count() -> None:
     """As by a call that blocks the event loop for half a second, in the middle of a list."""
     loop = simulated_time_loop()
     px4 = PX4Vehicle()
@@ -1585,7 +1587,7 @@ async def test_the_autopilots_are_the_vehicles_without_what_they_carry(way: str)
     camera = generic(system=1, component=100)
     vehicles = [generic(system=3), small_px4(), camera, generic(system=2, component=7)]
     async with a_client(Air(vehicles)) as client:
-        assert client.autopilots == [] or way != DIRECT, "a service may have heard them before"
+        assert client.autopilots == [] or way != DIRECT, "a service may have found them before"
         await client.fetch_all()
         addresses = [(each.system, each.component) for each in client.autopilots]
         assert addresses == [(1, 1), (2, 7), (3, 1)]

@@ -87,9 +87,9 @@ async def test_no_mixed_table_and_no_false_line_reaches_the_cache(
                 await call()
             assert (caught.value.system, caught.value.component) == (1, 1)
             assert len(caught.value.claimants) == 2
-        told = [await anext(events) for _ in range(2)]
-        assert isinstance(told[1], Contested)
-        assert told[1].contest == vehicle.contest
+        reported = [await anext(events) for _ in range(2)]
+        assert isinstance(reported[1], Contested)
+        assert reported[1].contest == vehicle.contest
     whole = [set(TABLE), set(OTHER)]
     for table in cached(path).values():
         assert set(table) in whole, "no table of both"
@@ -103,7 +103,7 @@ async def test_no_mixed_table_and_no_false_line_reaches_the_cache(
 
 @in_simulated_time
 async def test_values_received_in_a_contest_through_one_peer_are_not_cached(tmp_path: Path) -> None:
-    """Both vehicles behind one radio, with values of both in the table before they are told apart."""
+    """Both vehicles behind one radio, with values of both in the table before they are distinguished."""
     path = tmp_path / "cache.sqlite3"
     link = PeersLink({"radio": px4(), "radio ": Late(ardupilot(), 6.0, 20.0)})
     link_receive = link.receive
@@ -143,8 +143,8 @@ async def test_when_one_is_silent_the_other_is_identified_anew_and_written_again
         began = anyio.current_time()
         await until(lambda: vehicle.contest is None)
         assert anyio.current_time() - began < 8.0 + LOST_AFTER
-        told = [await anext(events) for _ in range(3)]
-        assert [type(each) for each in told][1:] == [Contested, Uncontested]
+        reported = [await anext(events) for _ in range(3)]
+        assert [type(each) for each in reported][1:] == [Contested, Uncontested]
         assert (await vehicle.set("SHARED_A", 9)).actual == 9
         await anyio.sleep(2 * cache_writer.CACHE_FLUSH_INTERVAL)
     [table] = cached(path).values()
@@ -162,7 +162,7 @@ async def test_closing_in_a_contest_writes_nothing(tmp_path: Path) -> None:
 
 
 @in_simulated_time
-async def test_the_service_tells_it_and_answers_409() -> None:
+async def test_the_service_reports_the_contest_and_answers_409() -> None:
     async with service(two()) as (_, browser):
         await met(browser)
         await anyio.sleep(3.0)
@@ -171,8 +171,8 @@ async def test_the_service_tells_it_and_answers_409() -> None:
         assert len(document["contest"]["claimants"]) == 2
         assert "autopilot" in document["contest"]["difference"]
         answer = await browser.put(f"{C}/params/SHARED_A", json={"value": 5})
-        told = problem(answer, 409, "contested-address")
-        assert told["claimants"] == document["contest"]["claimants"]
+        reported = problem(answer, 409, "contested-address")
+        assert reported["claimants"] == document["contest"]["claimants"]
 
 
 def test_the_command_says_so_on_stderr(
@@ -206,24 +206,24 @@ async def test_a_fetch_of_all_vehicles_goes_on_without_the_contested_one() -> No
 # One after the other
 
 
-class Telling(Late):
-    """A vehicle without a hardware id that tells the value 99 of A twice a second."""
+class Reporting(Late):
+    """A vehicle without a hardware id that sends the value 99 of A twice a second."""
 
     def __init__(self, by: float, until: float) -> None:
         super().__init__(GenericVehicle(table={"A": 99.0, "B": 2.0}, uid=0), by, until)
-        self._tell_at = 0.0
+        self._report_at = 0.0
         self._out: list[bytes] = []
 
     def tick(self, now: float) -> None:
         super().tick(now)
-        if self._on_at <= now < self._off_at and now >= self._tell_at:
-            self._tell_at = now + 0.5
+        if self._on_at <= now < self._off_at and now >= self._report_at:
+            self._report_at = now + 0.5
             value = param_value("A", 99.0, index=0, count=2)
             self._out.append(wire.encode(value, system=1, component=1, sequence=0))
 
     def next_deadline(self) -> float | None:
         deadline = super().next_deadline()
-        return None if deadline is None else min(deadline, max(self._tell_at, self._on_at))
+        return None if deadline is None else min(deadline, max(self._report_at, self._on_at))
 
     def data_to_send(self) -> list[bytes]:
         out, self._out = self._out, []
@@ -241,7 +241,7 @@ async def test_one_without_a_hardware_id_in_place_of_a_vehicle_leaves_nothing_wi
     link = PeersLink(
         {
             ("10.0.0.1", 14550): Late(GenericVehicle(table=table, uid=5), 0.0, 8.0),
-            ("10.0.0.2", 14550): Telling(8.5, 8.5 + stays),
+            ("10.0.0.2", 14550): Reporting(8.5, 8.5 + stays),
             ("10.0.0.3", 14550): Late(GenericVehicle(table=table, uid=5), 9.5 + stays),
         }
     )
@@ -396,7 +396,7 @@ def test_two_autopilots_on_one_udp_port(tmp_path: Path) -> None:
 
 
 @in_simulated_time
-async def test_a_client_of_the_service_is_told_as_well() -> None:
+async def test_a_client_of_the_service_receives_the_report_too() -> None:
     async with ServedClient(two(by=2.0, until=8.0), cache=False) as client:
         events = client.events()
         vehicle = await client.component()
@@ -409,5 +409,5 @@ async def test_a_client_of_the_service_is_told_as_well() -> None:
             await vehicle.set("SHARED_A", 5)
         assert caught.value.claimants == vehicle.contest.claimants
         await until(lambda: vehicle.contest is None)
-        told = [await anext(events) for _ in range(3)]
-        assert [type(each) for each in told] == [Discovered, Contested, Uncontested]
+        reported = [await anext(events) for _ in range(3)]
+        assert [type(each) for each in reported] == [Discovered, Contested, Uncontested]

@@ -123,8 +123,10 @@ async def test_without_a_disk_nothing_is_sent_or_it_is_said_what_the_vehicle_has
             await component.fetch_all()
             for broken in ("save", "sync"):
                 with mock.patch.object(cache, broken, side_effect=CacheError("no room")):
-                    told = f"1/1 has accepted {NAME}, but it is not on the disk: it could not be written: no"
-                    with pytest.raises(NotDurable, match=told):
+                    reported = (
+                        f"1/1 has accepted {NAME}, but it is not on the disk: it could not be written: no"
+                    )
+                    with pytest.raises(NotDurable, match=reported):
                         await component.set(NAME, 6.0 + len(broken), durable=True)
                     assert vehicle.values[NAME] == component.params[NAME].value == 10.0
             await component.set(NAME, 11.0, durable=True)
@@ -163,9 +165,9 @@ async def test_the_service_answers_when_it_is_on_the_disk(tmp_path: Path) -> Non
                 assert (await browser.put(f"{C}/params/{NAME}", json=body)).status_code == 200
                 assert sync.call_count == 1
             with mock.patch.object(cache, "sync", side_effect=CacheError("no room")):
-                told = problem(await browser.put(f"{C}/params/{NAME}", json=body), 503, "not-durable")
-                assert "has accepted PARAM_01, but it is not on the disk" in told["detail"]
-                assert told["error"] == "NotDurable"
+                reported = problem(await browser.put(f"{C}/params/{NAME}", json=body), 503, "not-durable")
+                assert "has accepted PARAM_01, but it is not on the disk" in reported["detail"]
+                assert reported["error"] == "NotDurable"
 
 
 def test_the_command_says_what_is_not_on_the_disk(

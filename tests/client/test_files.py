@@ -62,16 +62,16 @@ async def test_files_are_read_written_listed_and_checked(make: Any) -> None:
 
 
 @in_simulated_time
-async def test_the_progress_of_a_read_is_told() -> None:
-    told: list[tuple[int, int | None]] = []
+async def test_the_progress_of_a_read_is_reported() -> None:
+    reported: list[tuple[int, int | None]] = []
     async with a_client(with_files()) as client:
         files = await files_of(client)
-        await files.read("/APM/LOGS/1.BIN", progress=lambda *state: told.append(state))
-    received = [state[0] for state in told]
+        await files.read("/APM/LOGS/1.BIN", progress=lambda *state: reported.append(state))
+    received = [state[0] for state in reported]
     assert received == sorted(received)
     assert received[-1] == len(LOG)
-    assert len(told) > 5
-    assert {state[1] for state in told} <= {None, len(LOG)}
+    assert len(reported) > 5
+    assert {state[1] for state in reported} <= {None, len(LOG)}
 
 
 @in_simulated_time
@@ -87,7 +87,7 @@ async def test_a_file_that_is_too_long_is_not_taken() -> None:
 
 
 @in_simulated_time
-async def test_a_refusal_comes_in_words() -> None:
+async def test_a_refusal_is_a_sentence() -> None:
     async with a_client(with_files()) as client:
         files = await files_of(client)
         for call in (files.read("/none"), files.list("/none"), files.checksum("/none")):
@@ -278,7 +278,7 @@ async def test_reads_are_done_in_order() -> None:
 
 
 @in_simulated_time
-async def test_nothing_is_asked_of_a_component_that_is_lost() -> None:
+async def test_nothing_is_requested_from_a_lost_component() -> None:
     tap = Tap(with_files())
     async with a_client(tap) as client:
         component = await client.component()
@@ -319,7 +319,7 @@ async def test_a_read_goes_on_when_the_link_is_back() -> None:
 
 
 @in_simulated_time
-async def test_a_link_that_stays_away_ends_it() -> None:
+async def test_a_link_that_stays_disconnected_ends_it() -> None:
     link = FlakyLink(with_files())
     async with a_client(link) as client:
         files = await files_of(client)

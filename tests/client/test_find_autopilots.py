@@ -14,7 +14,7 @@ __all__ = ["pytest_generate_tests", "way"]
 
 
 def fleet() -> Air:
-    """Four vehicles, heard one after the other, and a camera of the first."""
+    """Four vehicles, found one after the other, and a camera of the first."""
     vehicles = [Late(small_px4(system=number), 0.7 * number) for number in (1, 2, 3, 4)]
     return Air([*vehicles, generic(system=1, component=100)])
 
@@ -34,8 +34,8 @@ async def test_fewer_vehicles_than_expected_are_an_error_that_names_them(way: st
     async with a_client(fleet()) as client:
         with pytest.raises(NoReply) as caught:
             await client.find_autopilots(expect=5, timeout=6.0)
-        heard = "1/1 px4, 2/1 px4, 3/1 px4, 4/1 px4"
-        assert str(caught.value) == f"no reply: 5 vehicles (heard: {heard}) in 6.0 s"
+        received = "1/1 px4, 2/1 px4, 3/1 px4, 4/1 px4"
+        assert str(caught.value) == f"no reply: 5 vehicles (heard: {received}) in 6.0 s"
         assert caught.value.waited == pytest.approx(6.0, abs=0.2)
 
 

@@ -28,8 +28,8 @@ class Program:
     """A link to another program.
 
     Attributes:
-        heard: what it has been given, one frame each.
-        is_stuck: it takes nothing, and whoever sends to it waits.
+        received: the frames that it was given.
+        is_stuck: it takes nothing, and a sender waits.
     """
 
     name = "program"
@@ -37,10 +37,10 @@ class Program:
     reconnects = False
 
     def __init__(self) -> None:
-        self.heard: list[bytes] = []
+        self.received: list[bytes] = []
         self.is_stuck = False
         self._said: deque[bytes] = deque()
-        self._news = anyio.Event()
+        self._activity = anyio.Event()
         self._is_open = False
 
     def say(self, *messages: wire.Message, system: int = 255) -> None:
@@ -49,11 +49,11 @@ class Program:
 
     def say_bytes(self, data: bytes) -> None:
         self._said.append(data)
-        self._news.set()
+        self._activity.set()
 
     def messages(self) -> list[wire.Message]:
         framer = wire.Framer(wire.DECODED_IDS, stream=False)
-        found = [wire.decode(each) for data in self.heard for each in framer.receive(data)]
+        found = [wire.decode(each) for data in self.received for each in framer.receive(data)]
         return [message for message in found if message is not None]
 
     async def open(self) -> None:
@@ -61,8 +61,8 @@ class Program:
 
     async def receive(self) -> list[tuple[Peer, bytes]]:
         while self._is_open and not self._said:
-            self._news = anyio.Event()
-            await self._news.wait()
+            self._activity = anyio.Event()
+            await self._activity.wait()
         if not self._is_open:
             raise LinkError("program: closed", link="program")
         said = [("program", data) for data in self._said]
@@ -71,13 +71,13 @@ class Program:
 
     async def send(self, data: bytes, peer: Peer | None) -> None:
         assert peer is None
-        while self.is_stuck:  # noqa: ASYNC110 - nobody tells
+        while self.is_stuck:  # noqa: ASYNC110 - no event reports it
             await anyio.sleep(1.0)
-        self.heard.append(data)
+        self.received.append(data)
 
     async def close(self) -> None:
         self._is_open = False
-        self._news.set()
+        self._activity.set()
 
 
 class Recorded(Tap):
@@ -106,7 +106,7 @@ async def test_every_frame_of_the_vehicle_is_passed_on_and_none_of_ours() -> Non
         result = await (await client.component()).fetch_all()
         assert result.complete
         await anyio.sleep(1.5)
-        assert program.heard == vehicle.said
+        assert program.received == vehicle.said
     assert not any(isinstance(each, wire.ParamRequestList) for each in program.messages())
 
 
@@ -116,18 +116,18 @@ async def test_requests_of_the_program_reach_the_vehicle_and_responses_the_progr
     async with a_client(vehicle, forward=program) as client:
         component = await client.component()
         await anyio.sleep(10.0)
-        program.heard.clear()
+        program.received.clear()
         program.say(wire.ParamRequestRead(1, 1, "PARAM_04", -1), system=200)
         await anyio.sleep(0.5)
         [answer] = [each for each in program.messages() if isinstance(each, wire.ParamValue)]
         assert answer.param_id == "PARAM_04"
         assert component.params["PARAM_04"].value == 4
-        assert [frame.system for _, frame, _ in vehicle.heard if frame.message_id == 20] == [200]
+        assert [frame.system for _, frame, _ in vehicle.received if frame.message_id == 20] == [200]
         # also messages that mean nothing here
         program.say_bytes(data := wire.build_frame(4, bytes(range(14)), system=9, component=9, sequence=7))
         await anyio.sleep(0.5)
         assert client.bytes_sent > 0
-        assert data not in program.heard
+        assert data not in program.received
 
 
 @in_simulated_time
@@ -140,7 +140,7 @@ async def test_a_key_is_never_passed_on() -> None:
         program.say(key, system=200)
         program.say(wire.ParamRequestRead(1, 1, "PARAM_04", -1), system=200)
         await anyio.sleep(0.5)
-        ids = [seen.message_id for _, seen, _ in vehicle.heard if seen.system == 200]
+        ids = [seen.message_id for _, seen, _ in vehicle.received if seen.system == 200]
     assert ids == [20]
 
 
@@ -183,7 +183,7 @@ async def test_a_program_that_reads_nothing_holds_nothing_up(monkeypatch: pytest
         await anyio.sleep(3.0)
         assert not forwarder._waiting
         assert forwarder.lost < lost + 20
-    assert len(program.heard) >= 11
+    assert len(program.received) >= 11
 
 
 @in_simulated_time
@@ -193,14 +193,14 @@ async def test_a_program_that_floods_takes_turns_with_us(monkeypatch: pytest.Mon
     async with a_client(vehicle, forward=program) as client:
         component = await client.component()
         await anyio.sleep(5.0)
-        vehicle.heard.clear()
+        vehicle.received.clear()
         for _ in range(300):
             program.say(wire.StatusText(6, "noise"), system=200)
         await anyio.lowlevel.checkpoint()
         param = await component.get("PARAM_07")
         assert param.value == 7
         await anyio.sleep(1.0)
-        kinds = [frame.system for _, frame, _ in vehicle.heard]
+        kinds = [frame.system for _, frame, _ in vehicle.received]
         assert kinds.count(200) == 100
         assert kinds.index(255) < 60
 
@@ -212,8 +212,8 @@ async def test_frames_of_the_program_are_not_sent_with_listen_only() -> None:
         await client.component()
         program.say(a_set("PARAM_01", 33))
         await anyio.sleep(5.0)
-    assert vehicle.heard == []
-    assert program.heard
+    assert vehicle.received == []
+    assert program.received
 
 
 class Stream(FlakyLink):
@@ -238,7 +238,7 @@ async def test_frames_of_a_stream_are_passed_on_whole_also_after_it_dropped() ->
         await anyio.sleep(2.0)
         assert (await component.get("PARAM_01")).value == 1
         await anyio.sleep(0.1)
-        assert program.heard == vehicle.said
+        assert program.received == vehicle.said
         program.say(a_set("PARAM_01", 3))
         await anyio.sleep(1.0)
         assert component.params["PARAM_01"].value == 3

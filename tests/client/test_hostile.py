@@ -78,7 +78,7 @@ def beat(session: Simulation, *, system: int = 1, component: int = 1, autopilot:
 
 
 @pytest.mark.parametrize("count", [PARAMETERS_MAX + 1, NO_INDEX - 1, NO_INDEX])
-def test_a_count_above_what_can_be_asked_for_is_none(count: int) -> None:
+def test_a_count_above_the_highest_index_is_none(count: int) -> None:
     """PARAM_REQUEST_READ has a signed index: one above 32767 cannot even be written down."""
     session = Simulation()
     beat(session)
@@ -105,7 +105,7 @@ def test_the_largest_count_is_one() -> None:
     assert PARAMETERS_MAX - 1 in [request.param_index for request in session.sent_of(ParamRequestRead)]
 
 
-def test_a_cached_count_above_what_can_be_asked_for_is_none() -> None:
+def test_a_cached_count_above_the_highest_index_is_none() -> None:
     session = Simulation()
     beat(session)
     session.machine.use_cached(
@@ -171,7 +171,7 @@ def test_a_link_has_so_many_components_and_no_more(monkeypatch: pytest.MonkeyPat
     say(session, param_value("A", 1.0), system=2)
     session.events.clear()
     assert [*session.station.components] == [(1, 1), (2, 1), (3, 1)]
-    for _ in range(20):  # the first is heard, the others are lost, and the second has told of a parameter
+    for _ in range(20):  # the first is received, the others are lost, and the second has sent a parameter
         session.run(1)
         beat(session, system=1)
     beat(session, system=4)
@@ -209,7 +209,7 @@ def test_a_flood_of_random_systems_from_random_peers_stays_within_the_page_of_th
     assert held < station_room.COMPONENTS_MAX * 28_000, "as docs/internals/bounds.md says"
 
 
-def test_changes_that_nobody_takes_are_so_many_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_unread_changes_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(subscription_room, "QUEUED_CHANGES_MAX", 3)
     changes = Changes()
     for name in "ABCDE":
@@ -229,7 +229,7 @@ def test_remembered_changes_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None
     assert len(authors._doubts) <= 3
 
 
-def test_names_that_go_are_told_to_the_cache_up_to_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_removed_names_are_reported_to_the_cache_up_to_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(table_room, "REMOVED_NAMES_MAX", 4)
     table = Table()
     for name in "ABCDE":
@@ -237,11 +237,11 @@ def test_names_that_go_are_told_to_the_cache_up_to_a_bound(monkeypatch: pytest.M
     assert len(table.take_dirty()) == 5
     table.forget()
     assert [*table.dirty] == [*"ABCD"]
-    receive(table, "F")  # what is there is always told
+    receive(table, "F")  # what is there is always returned
     assert "F" in table.dirty
 
 
-def test_a_value_that_flips_is_asked_for_only_so_often(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_value_that_flips_is_read_a_bounded_number_of_times(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(value_check, "REREADS_MAX", 2)
     session = Simulation()
     beat(session)
@@ -253,7 +253,7 @@ def test_a_value_that_flips_is_asked_for_only_so_often(monkeypatch: pytest.Monke
 
 
 def test_remembered_texts_are_bounded() -> None:
-    """Those that come again and again are one object each."""
+    """Repeated values are one object each."""
     known_well = text_of(b"MC_ROLL_P")
     for number in range(2 * TEXTS_MAX):
         text_of(b"NAME%d" % number)
@@ -275,7 +275,7 @@ def test_a_file_has_so_many_gaps_and_no_more(monkeypatch: pytest.MonkeyPatch) ->
     assert blocks.content == b"cdabcdabcdcdcdcd"
 
 
-def test_a_file_comes_in_so_many_pieces_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_pieces_of_a_file_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reading_room, "SPARE_PIECES", 10)
     session = Simulation(HostileVehicle("crumbs", system=1))
     job = session.meet().files.read("/crumbs", session.now, limit=10 * DATA_SIZE_MAX)
@@ -305,7 +305,7 @@ def test_remembered_reads_of_a_file_are_bounded() -> None:
     assert len(job._bursts) == reading_room.BURSTS_MAX
 
 
-def test_a_resync_tells_of_so_many_names_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_resync_reports_a_bounded_number_of_names(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sync_room, "NAMES_MAX", 3)
     session = Simulation(listing_ardupilot())
     session.fetch()

@@ -80,11 +80,11 @@ async def test_not_a_byte_is_sent() -> None:
         assert not local_client(client).station.is_waiting
         assert residue(component) == []
         assert client.bytes_sent == 0
-    assert channel.heard == []
+    assert channel.received == []
 
 
 @in_simulated_time
-async def test_the_list_that_another_station_asks_for_fills_the_table() -> None:
+async def test_the_list_that_another_station_requests_fills_the_table() -> None:
     vehicle = small_px4()
     channel = Channel(vehicle)
     async with listener(channel) as client:
@@ -103,7 +103,7 @@ async def test_the_list_that_another_station_asks_for_fills_the_table() -> None:
         assert again.hash == vehicle.announced_hash()
         everyone = await client.fetch_all()
         assert everyone.results[1, 1].hash == vehicle.announced_hash()
-    assert channel.heard == []
+    assert channel.received == []
 
 
 @in_simulated_time
@@ -143,7 +143,7 @@ async def test_calls_that_send_are_refused_at_once() -> None:
         assert anyio.current_time() - began < 0.01
         assert residue(component) == []
         await component.refreshed()
-    assert channel.heard == []
+    assert channel.received == []
 
 
 def test_policy_and_watch_interval_are_refused_with_listen_only() -> None:
@@ -177,11 +177,11 @@ async def test_a_list_with_gaps_ends_when_it_pauses_and_goes_on_with_what_others
         component = await client.component()
         channel.ask(LIST)
         began = anyio.current_time()
-        told: list[Progress] = []
-        result = await component.fetch_all(progress=told.append)
+        reported: list[Progress] = []
+        result = await component.fetch_all(progress=reported.append)
         assert result.missing == (3, 9)
-        assert told[-1].ranges is not None
-        parts = told[-1].ranges.split(5)
+        assert reported[-1].ranges is not None
+        parts = reported[-1].ranges.split(5)
         assert [(part.received, part.requested_again, part.missing) for part in parts] == [
             *((4, 0, 1), (4, 0, 1), (5, 0, 0), (5, 0, 0), (5, 0, 0))
         ]
@@ -196,7 +196,7 @@ async def test_a_list_with_gaps_ends_when_it_pauses_and_goes_on_with_what_others
 
 
 @in_simulated_time
-async def test_time_that_is_over_gives_what_has_come() -> None:
+async def test_a_timeout_returns_what_was_received() -> None:
     channel = Channel(small_px4())
     channel.loses = lambda each: isinstance(each, wire.ParamValue) and each.param_index == 24
     async with listener(channel) as client:
@@ -230,8 +230,8 @@ async def test_a_cached_table_is_confirmed_by_a_hash_that_others_ask_for(tmp_pat
         assert (result.source, result.hash) == ("cache", vehicle.announced_hash())
         trusts = {param.name: param.trust for param in component.params.values()}
         assert trusts["PARAM_01"] is Trust.VERIFIED
-        assert trusts["PARAM_03"] is Trust.CACHED  # which no hash covers, and nobody may ask for
-        # it changes unheard, and the next hash shows it
+        assert trusts["PARAM_03"] is Trust.CACHED  # which no hash covers, and must not be requested
+        # it changes without a message, and the next hash shows it
         channel.is_mute = True
         channel._endpoint.set_param("PARAM_01", 77)  # type: ignore[attr-defined]  # of a simulated vehicle
         await anyio.sleep(2.0)
@@ -244,7 +244,7 @@ async def test_a_cached_table_is_confirmed_by_a_hash_that_others_ask_for(tmp_pat
         result = await component.fetch_all()
         assert (result.source, result.hash) == ("stream", vehicle.announced_hash())
         assert component.params["PARAM_01"].value == 77
-    assert channel.heard == []
+    assert channel.received == []
 
 
 def test_the_command_listens_too(capsys: pytest.CaptureFixture[str]) -> None:
@@ -274,17 +274,17 @@ def say(station: Station, message: wire.Message, now: float) -> None:
     station.receive(wire.encode(message, system=1, component=1, sequence=0), "peer", now)
 
 
-def tell(station: Station, count: int, *indices: int, now: float = 1.0, prefix: str = "P") -> None:
+def report(station: Station, count: int, *indices: int, now: float = 1.0, prefix: str = "P") -> None:
     for index in indices:
         say(station, param_value(f"{prefix}{index}", 1.0, index=index, count=count), now)
 
 
-def test_a_table_is_whole_when_every_index_has_come_in_whatever_order() -> None:
+def test_a_table_is_complete_when_every_index_was_received_in_any_order() -> None:
     station = station_that_listens()
     machine = station.components[1, 1]
-    tell(station, 4, 3, 1, 0, 1, 65535)
+    report(station, 4, 3, 1, 0, 1, 65535)
     assert is_so(not machine.table.complete)
-    tell(station, 4, 2)
+    report(station, 4, 2)
     assert is_so(machine.table.complete)
     assert is_so(machine.sync.synced)
 
@@ -292,17 +292,17 @@ def test_a_table_is_whole_when_every_index_has_come_in_whatever_order() -> None:
 def test_another_count_or_name_discards_the_received_values() -> None:
     station = station_that_listens()
     machine = station.components[1, 1]
-    tell(station, 4, 0, 1, 2)
-    tell(station, 3, 0, 1)
+    report(station, 4, 0, 1, 2)
+    report(station, 3, 0, 1)
     assert is_so(not machine.table.complete)
-    tell(station, 3, 2)
+    report(station, 3, 2)
     assert is_so(machine.table.complete)
     assert sorted(machine.table.params) == ["P0", "P1", "P2"]
-    tell(station, 4, 0, 1, 2)
-    tell(station, 4, 2, prefix="Q")
-    tell(station, 4, 3)
+    report(station, 4, 0, 1, 2)
+    report(station, 4, 2, prefix="Q")
+    report(station, 4, 3)
     assert is_so(not machine.table.complete)
-    tell(station, 4, 0, 1)
+    report(station, 4, 0, 1)
     assert is_so(machine.table.complete)
     assert sorted(machine.table.params) == ["P0", "P1", "P3", "Q2"]
 
@@ -310,18 +310,18 @@ def test_another_count_or_name_discards_the_received_values() -> None:
 def test_values_from_before_a_reboot_do_not_complete_the_table() -> None:
     station = station_that_listens()
     machine = station.components[1, 1]
-    tell(station, 3, 0, 1)
+    report(station, 3, 0, 1)
     say(station, wire.Heartbeat(2, wire.MAV_AUTOPILOT_GENERIC, system_status=wire.MAV_STATE_BOOT), 1.0)
-    tell(station, 3, 2)
+    report(station, 3, 2)
     assert is_so(not machine.sync.synced)
-    tell(station, 3, 0, 1)
+    report(station, 3, 0, 1)
     assert is_so(machine.sync.synced)
 
 
 def test_silence_costs_nothing_and_nothing_is_due() -> None:
     station = station_that_listens()
     machine = station.components[1, 1]
-    tell(station, 3, 0, 1)
+    report(station, 3, 0, 1)
     for now in range(1, 100):
         station.tick(float(now))
     assert station.data_to_send() == []

@@ -1,4 +1,4 @@
-"""What a client tells of its steps, and counts."""
+"""The steps that a client logs and counts."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from tests.shell import FlakyLink, Tap, a_client, generic, in_simulated_time, sm
 WATCHED = "paramclient"
 
 
-def told(caplog: pytest.LogCaptureFixture, room: str = "protocol") -> list[str]:
+def reported(caplog: pytest.LogCaptureFixture, room: str = "protocol") -> list[str]:
     return [each.getMessage() for each in caplog.records if each.name == f"{WATCHED}.{room}"]
 
 
 @in_simulated_time
-async def test_each_step_is_told_in_one_line(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
+async def test_each_step_is_reported_in_one_line(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
     vehicle, path = small_px4(), tmp_path / "cache"
     with caplog.at_level(logging.DEBUG, WATCHED):
         async with a_client(vehicle, cache=path) as client:
@@ -36,7 +36,7 @@ async def test_each_step_is_told_in_one_line(caplog: pytest.LogCaptureFixture, t
             await component.fetch_all()
             await component.get("PARAM_01")
             await component.set("PARAM_01", 9)
-    steps = told(caplog)
+    steps = reported(caplog)
     for step in (
         r"to system 1: COMMAND_LONG 512 \(148\)",
         r"1/1: the list is wanted, 0 there",
@@ -48,17 +48,19 @@ async def test_each_step_is_told_in_one_line(caplog: pytest.LogCaptureFixture, t
         r"1/1 PARAM_01: accepted after try 1",
     ):
         assert sum(bool(re.fullmatch(step, each)) for each in steps) == 1, step
-    assert len(steps) < 15, "values of a list are not told one by one"
-    assert told(caplog, "client.link_client")[0] == "sim:custom: open"
-    assert told(caplog, "client.link_client")[-1] == "sim:custom: closing"
-    assert any("nothing" in each for each in told(caplog, "client.cache_writer"))
+    assert len(steps) < 15, "values of a list are not reported one by one"
+    assert reported(caplog, "client.link_client")[0] == "sim:custom: open"
+    assert reported(caplog, "client.link_client")[-1] == "sim:custom: closing"
+    assert any("nothing" in each for each in reported(caplog, "client.cache_writer"))
     caplog.clear()
     with caplog.at_level(logging.DEBUG, WATCHED):
         async with a_client(vehicle, cache=path) as client:
             await (await client.component()).fetch_all()
     crc = f"{vehicle.announced_hash():08x}"
-    assert f"1/1: hash {crc} announced, {crc} here" in told(caplog)
-    assert any("<CachedComponent 1/1 px4 25 params" in each for each in told(caplog, "client.cache_writer"))
+    assert f"1/1: hash {crc} announced, {crc} here" in reported(caplog)
+    assert any(
+        "<CachedComponent 1/1 px4 25 params" in each for each in reported(caplog, "client.cache_writer")
+    )
 
 
 @in_simulated_time
@@ -71,14 +73,14 @@ async def test_unanswered_requests_are_logged(caplog: pytest.LogCaptureFixture) 
                 await component.get("NO_SUCH")
             await anyio.sleep(1.0)
             stats = client.stats
-    steps = told(caplog)
+    steps = reported(caplog)
     assert any(re.fullmatch(r"1/1 NO_SUCH: no answer to try 1 in [0-9.]+ s", each) for each in steps)
     assert any(re.fullmatch(r"1/1 NO_SUCH: given up after try [0-9]+", each) for each in steps)
     assert stats.retries > 0
 
 
 @in_simulated_time
-async def test_a_link_that_drops_and_returns_is_told(caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_link_that_drops_and_returns_is_reported(caplog: pytest.LogCaptureFixture) -> None:
     link = FlakyLink(generic())
     with caplog.at_level(logging.DEBUG, WATCHED):
         async with a_client(link) as client:
@@ -89,7 +91,7 @@ async def test_a_link_that_drops_and_returns_is_told(caplog: pytest.LogCaptureFi
     assert levels == {"WARNING", "INFO"}
 
 
-def test_nothing_is_printed_unless_somebody_asks() -> None:
+def test_nothing_is_printed_unless_requested() -> None:
     program = """
 import asyncio, logging, paramclient
 paramclient.ParamClient  # loads its module
@@ -106,7 +108,7 @@ asyncio.run(main())
     assert (done.stdout, done.stderr) == ("", "")
 
 
-def test_words_are_made_up_only_when_they_are_wanted() -> None:
+def test_trace_lines_are_formatted_only_when_tracing_is_on() -> None:
     lines: list[tuple[object, ...]] = []
     station = Station(link="test", is_stream=False, trace=lambda *line: lines.append(line))
     beat = wire.Heartbeat(2, wire.MAV_AUTOPILOT_PX4, system_status=4)
@@ -128,14 +130,14 @@ def test_messages_in_words(message: wire.Message, words: str) -> None:
     assert str(LazyMessageText(message)) == words
 
 
-def test_the_command_tells_its_steps(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_logs_its_steps(capsys: pytest.CaptureFixture[str]) -> None:
     level = logging.getLogger(WATCHED).level
     for option in ("-v", "--verbose"):
         assert run(["get", "sim:px4", "MC_ROLL_P", "--no-cache", option]) == 0
-        told = capsys.readouterr()
-        assert "protocol: to system 1: PARAM_REQUEST_READ MC_ROLL_P\n" in told.err
-        assert "MC_ROLL_P" in told.out
-        assert "protocol" not in told.out
+        reported = capsys.readouterr()
+        assert "protocol: to system 1: PARAM_REQUEST_READ MC_ROLL_P\n" in reported.err
+        assert "MC_ROLL_P" in reported.out
+        assert "protocol" not in reported.out
     assert run(["link", "sim:px4", "--seconds", "0.1", "-v"]) == 0
     assert "client: sim:px4: open\n" in capsys.readouterr().err
     assert run(["get", "sim:px4", "MC_ROLL_P", "--no-cache"]) == 0
@@ -152,7 +154,7 @@ def test_control_characters_are_not_printed(capsys: pytest.CaptureFixture[str]) 
 
 
 @in_simulated_time
-async def test_numbers_tell_what_was_done(tmp_path: Path) -> None:
+async def test_metrics_count_what_was_done(tmp_path: Path) -> None:
     vehicle, path = small_px4(), tmp_path / "cache"
     async with a_client(vehicle, cache=path) as client:
         before = client.stats
@@ -179,7 +181,7 @@ async def test_numbers_tell_what_was_done(tmp_path: Path) -> None:
 
 
 @in_simulated_time
-async def test_losses_are_counted_where_that_was_asked_for() -> None:
+async def test_losses_are_counted_on_request() -> None:
     air = Air.symmetric([generic()], seed=1, loss=0.2)
     async with a_client(air, traffic=True) as client:
         await client.component()

@@ -61,7 +61,7 @@ VALUES = some_values()
 
 @pytest.fixture(scope="module", autouse=True)
 def _quiet() -> Iterator[None]:
-    """MAVSDK tells what it does on the standard output, unless somebody else takes it."""
+    """MAVSDK prints its log on standard output, unless a caller takes it."""
     log_subscribe(lambda *_: True)
     yield
     log_unsubscribe()

@@ -1,4 +1,5 @@
-"""When a value came from the link: it is kept from the socket to the cache, and decides what counts there."""
+"""When a value arrived from the link: it is kept from the socket to the cache, and decides what counts
+there."""
 
 from __future__ import annotations
 
@@ -41,7 +42,7 @@ def receive(table: Table, value: int, by: str, moment: float) -> None:
     table.store_value(param_value("A", value, index=0, kind=ParamType.INT32), by, moment)
 
 
-def test_a_value_that_is_heard_again_has_the_later_moment() -> None:
+def test_a_value_that_is_received_again_has_the_later_moment() -> None:
     table = Table()
     receive(table, 1, "vehicle", 1.0)
     receive(table, 1, "vehicle", 2.0)
@@ -83,8 +84,8 @@ def test_restored_unwritten_values_keep_their_observation_times() -> None:
     receive(table, 2, "vehicle", 2.0)
     for again in (2.5, 3.0, 3.5):
         changed, params = table.changed, table.params.copy()
-        news = (table.take_dirty(), table.take_overwritten(), table.take_removed_at(), changed, params)
-        table.restore_unwritten(*news)
+        unwritten = (table.take_dirty(), table.take_overwritten(), table.take_removed_at(), changed, params)
+        table.restore_unwritten(*unwritten)
         assert table.dirty == {"A": "vehicle"}
         receive(table, 2, "vehicle", again)
     assert [(each.param.value, each.moment) for each in table.take_overwritten()] == [(2, 2.0)]
@@ -97,9 +98,9 @@ def test_a_value_replaced_during_a_failed_write_is_kept(by: str) -> None:
     table.take_dirty()
     receive(table, 2, "vehicle", 2.0)
     changed, params = table.changed, table.params.copy()
-    news = (table.take_dirty(), table.take_overwritten(), table.take_removed_at(), changed, params)
+    unwritten = (table.take_dirty(), table.take_overwritten(), table.take_removed_at(), changed, params)
     receive(table, 3, by, 3.0)
-    table.restore_unwritten(*news)
+    table.restore_unwritten(*unwritten)
     assert [(each.param.value, each.moment) for each in table.take_overwritten()] == [(2, 2.0)]
     assert table.take_dirty() == {"A": by}
 
@@ -113,13 +114,13 @@ def test_a_removed_name_has_the_time_of_the_last_value_of_the_download() -> None
     assert table.params.moments == {"B": 2.0}
 
 
-def test_a_file_counts_from_when_it_was_asked_for() -> None:
+def test_a_file_counts_from_when_it_was_requested() -> None:
     table = Table()
     receive(table, 1, "vehicle", 1.0)
     table.store_file_entry("A", ParamType.INT32, 2, 0, None, 1.5, is_older=False)
     assert table.params.moments == {"A": 1.5}
     receive(table, 3, "vehicle", 2.0)
-    for value in (2, 3):  # also where the file has what was heard since
+    for value in (2, 3):  # also where the file has what was received since
         table.store_file_entry("A", ParamType.INT32, value, 0, None, 1.7, is_older=True)
         assert table.params.moments == {"A": 2.0}
 
@@ -221,7 +222,7 @@ class Programs(RuleBasedStateMachine):
         self.now = 100.0
         self.sequence = 0
         self.truth: dict[str, list[tuple[float, int | None]]] = {name: [(99.0, 0)] for name in NAMES}
-        self.told: dict[str, float] = {}
+        self.reported: dict[str, float] = {}
         self.runner = asyncio.Runner()
         self.opened = self.caches()
         for left in self.opened[0].vehicles():
@@ -252,7 +253,7 @@ class Programs(RuleBasedStateMachine):
 
     @rule(name=st.sampled_from(NAMES), value=st.integers(0, 2), at=st.integers(1, 3))
     def changes(self, name: str, value: int, at: int) -> None:
-        """The vehicle changes a value; it is heard by one program, or by both."""
+        """The vehicle changes a value; it is received by one program, or by both."""
         self.become(name, value)
         self.announce(self.value_of(name), at)
 
@@ -265,7 +266,7 @@ class Programs(RuleBasedStateMachine):
 
     @rule(name=st.sampled_from(NAMES))
     def goes(self, name: str) -> None:
-        """The vehicle has a parameter no more, and tells nobody."""
+        """The vehicle no longer has a parameter, and no message reports it."""
         self.become(name, None)
 
     @rule(number=SIDES, count=st.integers(1, 4))
@@ -320,7 +321,7 @@ class Programs(RuleBasedStateMachine):
         for index, name in enumerate(present):
             self.announce(self.value_of(name, index), 3)
         self.read_all(side)
-        if present:  # else not even a count was heard
+        if present:  # else not even a count was received
             side.machine.table.settle(dict(enumerate(present)))
             side.machine.table.complete = True
             side.writer.synced(side.machine, is_whole=True)
@@ -333,7 +334,7 @@ class Programs(RuleBasedStateMachine):
         table = side.machine.table
         for name in table.dirty:
             if name in table.params:
-                self.told[name] = max(self.told.get(name, 0.0), table.params.moments[name])
+                self.reported[name] = max(self.reported.get(name, 0.0), table.params.moments[name])
         assert self.runner.run(side.writer.flush())
         self.now += 0.001
         self.check()
@@ -347,7 +348,7 @@ class Programs(RuleBasedStateMachine):
         for name, param in cached.params.items():
             at = cached.heard_at[name]
             assert self.so_at(name, at) == param.value, f"{name} was not {param.value!r} at {at - NOW}"
-            assert at >= NOW + self.told.get(name, 0.0) - 1e-6, "the latest observation counts"
+            assert at >= NOW + self.reported.get(name, 0.0) - 1e-6, "the latest observation counts"
         for name in NAMES:
             self.check_lines(name, cached.history(name))
 
@@ -401,19 +402,19 @@ def test_a_file_that_two_programs_write_to_agrees_with_a_model(tmp_path: Path) -
 
 
 @pytest.mark.asyncio
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux is asked when a datagram arrived")
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux reports when a datagram arrived")
 async def test_datagrams_read_late_have_their_arrival_times() -> None:
     link = create_link("udpin:127.0.0.1:0")
     await link.open()
     with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as sender:
         sender.connect(link.address)  # type: ignore[attr-defined]  # of a link over sockets
-        is_told = False
+        has_times = False
         with anyio.fail_after(TIMEOUT):
-            while not is_told:  # the kernel begins to note arrivals a moment after it was asked to
+            while not has_times:  # the kernel begins to note arrival times a moment after the request
                 sender.send(b"\xfd")
                 await anyio.sleep(0.02)
                 await link.receive()
-                is_told = link.arrived_at[0] < anyio.current_time() - 0.015  # type: ignore[attr-defined]
+                has_times = link.arrived_at[0] < anyio.current_time() - 0.015  # type: ignore[attr-defined]
         sent = [anyio.current_time()]
         for _ in range(3):
             sender.send(b"\xfd")
@@ -453,29 +454,30 @@ class Scripted:
         return self._reads.pop(0)
 
     async def send(self, data: bytes, peer: Peer | None) -> None:
-        raise AssertionError("nobody sends here")
+        raise AssertionError("nothing is sent here")
 
     async def open(self) -> None: ...
 
     async def close(self) -> None: ...
 
 
-class Telling(Scripted):
-    """One whose system tells when something arrived."""
+class Reporting(Scripted):
+    """A link with arrival times."""
 
     arrived_at: Sequence[float] = ()
 
 
 class Asking(Station):
-    """A station that has something to do every 0.1 s; it notes of each chunk when it came from the link."""
+    """A station that has something to do every 0.1 s; it records for each chunk when it arrived from the
+    link."""
 
     def __init__(self) -> None:
         super().__init__(link="scripted", is_stream=False)
-        self.came: dict[bytes, float] = {}
+        self.received: dict[bytes, float] = {}
 
     def receive(self, data: bytes, peer: Peer, now: float, moment: float | None = None) -> bool:
         assert moment is not None
-        self.came[data] = moment
+        self.received[data] = moment
         return False
 
     def tick(self, now: float) -> None: ...
@@ -486,46 +488,48 @@ class Asking(Station):
 
 @asynccontextmanager
 async def carried(link: Scripted) -> AsyncIterator[dict[bytes, float]]:
-    """What came over a link, and when, as its station was told."""
+    """The data that arrived over a link, with the times that its station received."""
     station = Asking()
     mover = LinkTask(link, station, dispatch=lambda: None, end=lambda error: None, may_rest=False)
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(mover.read)
         tasks.start_soon(mover.send)
         await anyio.sleep(1.0)
-        yield station.came
+        yield station.received
         tasks.cancel_scope.cancel()
 
 
 @in_simulated_time
 async def test_the_arrival_time_of_the_system_is_used() -> None:
-    async with carried(link := Telling()) as came:
+    async with carried(link := Reporting()) as received:
         link.arrive(b"0")
         await anyio.sleep(1.0)
         now = anyio.current_time()
         link.arrived_at = [now - 0.5, now - 0.25]
         link.arrive(b"1", b"2")
         await anyio.sleep(0.01)
-        assert [came[b"1"], came[b"2"]] == pytest.approx([now - 0.5, now - 0.25], abs=0.001)
+        assert [received[b"1"], received[b"2"]] == pytest.approx([now - 0.5, now - 0.25], abs=0.001)
         link.arrived_at = [now - 500.0]
         link.arrive(b"3")
         await anyio.sleep(0.01)
-        assert came[b"3"] == pytest.approx(now, abs=0.001), "the clock was set: it came after the last read"
+        assert received[b"3"] == pytest.approx(now, abs=0.001), (
+            "the clock was set: it arrived after the last read"
+        )
 
 
 @in_simulated_time
 async def test_bytes_read_at_once_have_the_present_time() -> None:
-    async with carried(link := Scripted()) as came:
+    async with carried(link := Scripted()) as received:
         await anyio.sleep(5.0)
         link.arrive(b"1")
         now = anyio.current_time()
         await anyio.sleep(0.01)
-        assert came[b"1"] == pytest.approx(now, abs=0.001)
+        assert received[b"1"] == pytest.approx(now, abs=0.001)
 
 
 @in_simulated_time
 async def test_bytes_read_late_have_the_time_of_the_last_read() -> None:
-    async with carried(link := Scripted()) as came:
+    async with carried(link := Scripted()) as received:
         link.arrive(b"1")
         now = anyio.current_time()
         await anyio.sleep(0.01)
@@ -533,16 +537,16 @@ async def test_bytes_read_late_have_the_time_of_the_last_read() -> None:
         simulated_time_loop().now += 0.5  # nothing is done here meanwhile
         link.arrive(b"3")
         await anyio.sleep(0.01)
-        assert [came[b"2"], came[b"3"]] == pytest.approx([now] * 2, abs=0.001), "the buffer was full"
-        assert came[b"3"] > came[b"2"] + 0.0001, "of two values the one that came later is the newer one"
+        assert [received[b"2"], received[b"3"]] == pytest.approx([now] * 2, abs=0.001), "the buffer was full"
+        assert received[b"3"] > received[b"2"] + 0.0001, "of two values the later one is the newer one"
         await anyio.sleep(0.01)
         link.arrive(b"4")
         late = anyio.current_time()
         await anyio.sleep(0.2)
         link.arrive(b"5")
         await anyio.sleep(0.01)
-        assert came[b"4"] <= late
-        assert came[b"5"] == pytest.approx(late + 0.2, abs=0.001)
+        assert received[b"4"] <= late
+        assert received[b"5"] == pytest.approx(late + 0.2, abs=0.001)
 
 
 @in_simulated_time
@@ -551,7 +555,7 @@ async def test_datagrams_from_before_a_suspend_are_as_old_as_the_suspend(
 ) -> None:
     asleep = 0.0
     monkeypatch.setattr(suspend_detection, "time_asleep", lambda: asleep)
-    async with carried(link := Telling()) as came:
+    async with carried(link := Reporting()) as received:
         link.arrive(b"0")
         await anyio.sleep(0.05)
         asleep = 3600.0
@@ -559,7 +563,7 @@ async def test_datagrams_from_before_a_suspend_are_as_old_as_the_suspend(
         link.arrived_at = [now - 3600.04]
         link.arrive(b"1")
         await anyio.sleep(0.01)
-        assert came[b"1"] == pytest.approx(now - 3600.04, abs=0.001)
+        assert received[b"1"] == pytest.approx(now - 3600.04, abs=0.001)
 
 
 @in_simulated_time
@@ -575,7 +579,7 @@ async def test_a_station_that_slept_writes_when_things_were_observed(
             component = await client.component()
             await component.fetch_all()
             await anyio.sleep(2.0)
-            vehicle.set_param("PARAM_01", 5)  # and it tells so
+            vehicle.set_param("PARAM_01", 5)  # and it sends the value
             await until(lambda: component.params["PARAM_01"].value == 5)
             observed_at = simulated_time_loop().now + simulated_time_loop().ahead
             assert not other.history(other.component(system=1).key), "it is not written yet"

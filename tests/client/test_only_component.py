@@ -76,25 +76,28 @@ async def test_several_are_refused_with_the_list_as_soon_as_they_are_heard(phase
     assert error.vehicles == ("1/1 PX4 quadrotor", "2/1 ArduPilot quadrotor")
     assert (error.choose_by, error.summary) == ("system", TEXT)
     assert isinstance(error, UsageError | ValueError)
-    assert {type(message) for _, _, message in tap.heard} <= {wire.Heartbeat, wire.CommandLong}
+    assert {type(message) for _, _, message in tap.received} <= {wire.Heartbeat, wire.CommandLong}
 
 
-class Unheard(Tap):
-    """A vehicle of which no heartbeat comes through until it was asked for one."""
+class NotReceived(Tap):
+    """A vehicle whose heartbeats are lost until one is requested."""
 
     def data_to_send(self) -> list[bytes]:
-        is_asked = any(message.params[0] == wire.HEARTBEAT_ID for message in self.messages(wire.CommandLong))
+        is_requested = any(
+            message.params[0] == wire.HEARTBEAT_ID for message in self.messages(wire.CommandLong)
+        )
         framer = wire.Framer(wire.DECODED_IDS, stream=False)
         return [
             data
             for data in super().data_to_send()
-            if is_asked or not any(frame.message_id == wire.HEARTBEAT_ID for frame in framer.receive(data))
+            if is_requested
+            or not any(frame.message_id == wire.HEARTBEAT_ID for frame in framer.receive(data))
         ]
 
 
 @in_simulated_time
 async def test_a_vehicle_that_sends_telemetry_is_found_although_its_heartbeats_are_lost() -> None:
-    other = Unheard(small_px4(system=2, telemetry=10))
+    other = NotReceived(small_px4(system=2, telemetry=10))
     async with a_client(Tap(Air([px4(), other]))) as client:
         with pytest.raises(AmbiguousVehicle, match="2 vehicles"):
             await client.only_component()
@@ -184,12 +187,12 @@ async def test_the_vehicles_on_all_links_of_a_service_count() -> None:
     async with service(px4(), other) as (hub, browser):
         found = await met(browser)
         assert found["system"] in (1, 2)
-        told = problem(await browser.post("/api/v1/find", json={"only": True}), 409, "ambiguous-vehicle")
-        assert told["vehicles"] == [
+        reported = problem(await browser.post("/api/v1/find", json={"only": True}), 409, "ambiguous-vehicle")
+        assert reported["vehicles"] == [
             "1/1 PX4 quadrotor on sim:custom",
             "2/1 ArduPilot quadrotor on tcp:flaky:5760",
         ]
-        assert told["choose_by"] == "system"
+        assert reported["choose_by"] == "system"
         assert (await met(browser, only=True, system=2))["link"] == "tcp:flaky:5760"
         answer = await browser.post("/api/v1/find?link=sim:custom", json={"only": True})
         assert (answer.json()["system"], answer.json()["component"]) == (1, 1)

@@ -269,7 +269,7 @@ async def test_an_error_in_a_task_of_the_client_reaches_its_callers(caplog: pyte
             await client.component()
         with pytest.raises(ExceptionGroup) as closing:
             await client.aclose()
-        await client.aclose()  # it was told once
+        await client.aclose()  # it was reported once
     assert closing.group_contains(ZeroDivisionError)
     assert late.value.__cause__ is waiting.value.__cause__ is closing.value
     assert [record.getMessage() for record in caplog.records] == [

@@ -139,7 +139,7 @@ async def test_frames_of_both_directions_are_written(tmp_path: Path) -> None:
         received = client.bytes_received
     written = records(path.read_bytes())
     ours = [each for each in written if each.data[5] == 255]
-    assert [each.data for each in ours] == [wire_frame(each) for each in vehicle.heard]
+    assert [each.data for each in ours] == [wire_frame(each) for each in vehicle.received]
     assert sum(len(each.data) for each in written) - sum(len(each.data) for each in ours) == received
     assert [each.at for each in written] == sorted(each.at for each in written)
     assert before - 0.001 <= written[0].at <= written[-1].at <= time.time()
@@ -149,8 +149,8 @@ async def test_frames_of_both_directions_are_written(tmp_path: Path) -> None:
     assert [each.param_id for each in said if isinstance(each, wire.ParamSetMessage)] == ["PARAM_01"]
 
 
-def wire_frame(heard: tuple[float, wire.Frame, wire.Message]) -> bytes:
-    _, each, message = heard
+def wire_frame(received: tuple[float, wire.Frame, wire.Message]) -> bytes:
+    _, each, message = received
     return wire.encode(
         message, system=each.system, component=each.component, sequence=each.sequence, version=each.version
     )
@@ -218,7 +218,7 @@ async def test_no_key_and_no_signature_is_in_the_log(tmp_path: Path) -> None:
         component = await client.component()
         await component.get("PARAM_01")
         await component.setup_signing(wire.SigningKey(bytes(range(1, 33))), link_is_safe=True)
-    assert any(isinstance(message, wire.SetupSigning) for _, _, message in vehicle.heard)
+    assert any(isinstance(message, wire.SetupSigning) for _, _, message in vehicle.received)
     written = records(path.read_bytes())
     assert {each.data[2] for each in written} == {0}, "no frame says that it is signed"
     framer = wire.Framer(stream=False)
@@ -306,7 +306,7 @@ def test_streams_are_cut_into_whole_frames() -> None:
     assert cutter.cut(first, "two") == [first]
     damaged = first[:-1] + bytes((first[-1] ^ 1,))
     assert cutter.cut(damaged + second, "one") == [second]
-    # a header that promises more than ever comes hides what stands behind it only until the end
+    # a header with a length that never arrives hides what follows it only until the end
     assert cutter.cut(b"\xfd\xff\x00\x00\x00\x01\x01\x00\x00\x00" + first, "one") == []
     assert cutter.flush() == [first]
     for number in range(UNFINISHED_PEERS_MAX + 10):
@@ -356,11 +356,11 @@ class Pieces:
 
 
 @pytest.mark.asyncio
-async def test_a_client_that_nobody_speaks_to_writes_its_own_heartbeats(tmp_path: Path) -> None:
+async def test_a_client_that_receives_nothing_records_its_own_heartbeats(tmp_path: Path) -> None:
     path = tmp_path / "flight.tlog"
     async with ParamClient("udpout:127.0.0.1:9", cache=False, tlog=path):
         with anyio.fail_after(10):
-            while not path.stat().st_size:  # noqa: ASYNC110 - nobody tells
+            while not path.stat().st_size:  # noqa: ASYNC110 - no event reports it
                 await anyio.sleep(0.01)
     [said, *_] = messages(path)
     assert said == wire.Heartbeat(wire.MAV_TYPE_GCS, wire.MAV_AUTOPILOT_INVALID, system_status=4)

@@ -77,25 +77,25 @@ def test_a_message_of_one_component_examines_no_other(looks: Counter[int]) -> No
     assert looks[7] <= 3
 
 
-def test_a_deadline_is_kept_whoever_was_looked_at_meanwhile() -> None:
-    """Those who were asked who they are and say nothing are asked again in time."""
+def test_a_deadline_is_kept_whichever_component_was_processed_meanwhile() -> None:
+    """The identity of components that do not respond is requested again in time."""
     station = Station(link="x", is_stream=False)
     for system in range(1, 11):
         hear(station, system, system / 100)
     station.tick(0.1)
     station.data_to_send()
     assert station.next_deadline() == 0.26  # the first timeout, 0.25 s
-    asked: list[tuple[float, int]] = []
+    requested: list[tuple[float, int]] = []
     now = 0.1
-    while len(set(asked)) < 10:
+    while len(set(requested)) < 10:
         now = station.next_deadline()
         station.tick(now)
         for data, _ in station.data_to_send():
             for frame in wire.Framer(wire.DECODED_IDS, stream=False).receive(data):
                 message = wire.decode(frame)
                 if isinstance(message, wire.CommandLong):
-                    asked.append((round(now, 3), message.target_system))
-    assert sorted(set(asked)) == [(round(0.25 + system / 100, 3), system) for system in range(1, 11)]
+                    requested.append((round(now, 3), message.target_system))
+    assert sorted(set(requested)) == [(round(0.25 + system / 100, 3), system) for system in range(1, 11)]
 
 
 def test_a_request_makes_its_component_due() -> None:
@@ -152,7 +152,7 @@ def test_deadlines_of_many_are_evaluated_in_parts(monkeypatch: pytest.MonkeyPatc
     assert due == station.next_deadline()
 
 
-def test_a_fetch_that_is_given_back_is_freed_without_a_garbage_collection() -> None:
+def test_a_released_fetch_is_freed_without_a_garbage_collection() -> None:
     station = Station(link="x", is_stream=False)
     hear(station, 1, 0.0)
     machine = station.components[1, 1]
@@ -190,7 +190,7 @@ def _raise(error: Exception, *_: object) -> None:
 def test_a_forgotten_component_leaves_no_deadline_to_its_successor(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """One that is lost makes room for another, and is asked for a parameter although it is gone."""
+    """A lost component makes room for another, and a parameter is requested from it although it is gone."""
     monkeypatch.setattr(station_room, "COMPONENTS_MAX", 2)
     station = Station(link="x", is_stream=False)
     hear(station, 1, 0.0)
@@ -263,12 +263,12 @@ def session(air: Air, vehicles: list[Vehicle], *, everyone: bool) -> tuple[list[
     return fetches, now
 
 
-def test_whether_anything_is_awaited_is_asked_of_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[int] = []
+def test_only_one_component_is_checked_for_awaited_responses(monkeypatch: pytest.MonkeyPatch) -> None:
+    requested: list[int] = []
     whole = inspect.getattr_static(ComponentMachine, "is_waiting")
 
     def counted(machine: ComponentMachine) -> bool:
-        asked.append(machine.system)
+        requested.append(machine.system)
         return bool(whole.fget(machine))
 
     monkeypatch.setattr(ComponentMachine, "is_waiting", property(counted))
@@ -279,9 +279,9 @@ def test_whether_anything_is_awaited_is_asked_of_one(monkeypatch: pytest.MonkeyP
         station.components[system, 1].identification.settled = True
         station.components[system, 1].identification._context.is_identifying = False
     assert station.is_waiting
-    asked.clear()
+    requested.clear()
     assert station.is_waiting
-    assert asked == [MANY]
+    assert requested == [MANY]
 
 
 class SlowCache(ParamCache):
@@ -306,7 +306,7 @@ async def test_a_cached_table_that_is_being_read_is_waited_for(
 
 
 class Flood:
-    """A link that brings so many datagrams every few milliseconds, as it is told."""
+    """A link that brings the given number of datagrams every few milliseconds."""
 
     name = "flood"
     is_stream = False
@@ -359,7 +359,7 @@ async def carry(link: Flood, station: Watched, seconds: float, dispatch: Callabl
 
 
 @in_simulated_time
-async def test_time_outs_wait_until_what_has_come_is_read() -> None:
+async def test_time_outs_wait_until_received_data_is_read() -> None:
     link, station = Flood(), Watched()
     link.size = loop_scheduler.BACKLOG_DATAGRAMS_MIN
     began = anyio.current_time()
@@ -400,7 +400,7 @@ class Starved(Watched):
 
 @in_simulated_time
 async def test_time_outs_wait_while_other_programs_have_the_processor() -> None:
-    """What has come is there, but the reader had no turn meanwhile."""
+    """What has arrived is there, but the reader had no turn meanwhile."""
     link, station = Flood(), Starved()
     link.size = loop_scheduler.BACKLOG_DATAGRAMS_MIN
     link.interval = TURN_MAX + 0.003  # the sender wakes before it
@@ -410,7 +410,7 @@ async def test_time_outs_wait_while_other_programs_have_the_processor() -> None:
 
 
 @in_simulated_time
-async def test_time_outs_wait_for_nothing_that_does_not_come() -> None:
+async def test_time_outs_do_not_wait_for_data_that_does_not_arrive() -> None:
     """The last reading brought many, and then the link falls silent."""
     link, station = Flood(), Watched()
     link.size = loop_scheduler.BACKLOG_DATAGRAMS_MIN
@@ -515,7 +515,7 @@ async def test_a_deadline_that_passed_while_the_sender_was_blocked_is_no_suspend
 
 @in_simulated_time
 async def test_many_datagrams_at_once_give_way_to_other_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each datagram takes a millisecond; so do others that are told of what has happened by then."""
+    """Each datagram takes a millisecond; so do the tasks that process them."""
 
     class Clock:
         now = 0.0
@@ -577,7 +577,7 @@ def test_a_list_that_is_only_awaited_takes_no_time_of_others() -> None:
     assert not readers.is_busy_without("b")
 
 
-def test_no_link_has_lists_beside_each_other_while_more_has_come_on_one_than_was_read() -> None:
+def test_no_link_has_parallel_lists_while_one_has_unread_data() -> None:
     readers = loop_scheduler.LoopScheduler()
     readers.record_read("b", loop_scheduler.BACKLOG_DATAGRAMS_MIN - 1)
     assert readers.most_lists("a", 0, 1.0) == math.inf
@@ -672,12 +672,12 @@ async def test_new_tables_are_written_in_portions(tmp_path: Path, monkeypatch: p
 
 
 class Busy(Tap):
-    """A vehicle that does nothing for a while when its parameters are asked for: it has others to see to.
+    """A vehicle that does nothing for a while when its parameters are requested: it has others to see to.
 
     Args:
-        vehicle: who is asked.
+        vehicle: the vehicle that receives the requests.
         seconds: for so long it does not speak, from the first time on; half a second later it hears, too.
-        beats: whether its heartbeats come all the same.
+        beats: whether its heartbeats arrive all the same.
     """
 
     def __init__(self, vehicle: Vehicle, seconds: float, *, beats: bool) -> None:

@@ -143,7 +143,7 @@ async def test_a_switch_of_a_group_is_a_barrier() -> None:
         result = await component.set_many(wanted)
         assert result.is_complete, result.outcomes
         assert values_of(vehicle.params, wanted) == wanted
-    sent = [(at, each.param_id) for at, _, each in tap.heard if isinstance(each, wire.ParamSetMessage)]
+    sent = [(at, each.param_id) for at, _, each in tap.received if isinstance(each, wire.ParamSetMessage)]
     assert [name for _, name in sent][:3] == ["PARAM_1", "PARAM_2", "GRP_ENABLE"]
     times = {name: at for at, name in sent}
     assert times["PARAM_2"] - times["PARAM_1"] < 0.01
@@ -162,7 +162,7 @@ async def test_as_many_writes_are_in_flight_as_the_vehicle_serves() -> None:
         assert result.is_complete
         assert result.elapsed < 4.5
     first: dict[str, float] = {}
-    for at, _, each in tap.heard:
+    for at, _, each in tap.received:
         if isinstance(each, wire.ParamSetMessage):
             first.setdefault(each.param_id, at)  # a few are repeated early
     times = list(first.values())
@@ -185,7 +185,7 @@ async def test_a_lost_vehicle_ends_the_call_and_nothing_is_lost() -> None:
         await component.fetch_all()
 
         async def fall_silent() -> None:
-            while len(tap.messages(wire.ParamSetMessage)) < 50:  # noqa: ASYNC110 - nobody tells
+            while len(tap.messages(wire.ParamSetMessage)) < 50:  # noqa: ASYNC110 - no event reports it
                 await asyncio.sleep(0.01)
             tap.is_deaf = tap.is_mute = True
 
@@ -346,7 +346,7 @@ async def test_values_that_are_not_on_the_disk_are_reported_as_such(tmp_path: Pa
             await (await client.component()).set_many({"PARAM_01": 2}, durable=True)
 
 
-@direct_only("the outcome of a request that the client gave up is not told")
+@direct_only("the outcome of a request that the client gave up is not reported")
 @in_simulated_time
 async def test_two_calls_at_once_both_end() -> None:
     vehicle = PX4Vehicle(table=MANY)

@@ -32,7 +32,8 @@ KINDS: dict[str, Make] = {"px4": PX4Vehicle, "ardupilot": listing_ardupilot}
 
 
 class Shared:
-    """Two stations with paramclient on one air: both hear all that comes, and neither hears the other."""
+    """Two stations with paramclient on one air: both receive all messages, and neither receives those of the
+    other."""
 
     def __init__(self, vehicle: Vehicle, **faults: float) -> None:
         self.vehicle = vehicle
@@ -81,7 +82,7 @@ class Shared:
 
 @pytest.mark.parametrize("later", [0.2, 0.5, 0.8])
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_list_that_another_station_has_asked_for_is_followed(kind: str, later: float) -> None:
+def test_a_list_that_another_station_has_requested_is_followed(kind: str, later: float) -> None:
     def seconds_of_first(with_second: bool) -> float:
         """When the first one has everything; the second one begins in the middle of its list."""
         world = Shared(KINDS[kind](), delay=0.01)

@@ -251,7 +251,7 @@ def test_the_timestamp_file_is_private_and_contains_no_key(state: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "soon", "-5", "9" * 30, "\xff"])
-def test_a_damaged_file_is_told_and_the_time_of_day_counts(
+def test_a_damaged_file_is_reported_and_the_time_of_day_counts(
     state: Path, text: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     file = TimestampFile(state, KEY.fingerprint, 0)
@@ -279,7 +279,7 @@ def in_session(use: Callable[[Any], None], *, crashes: bool = False, **options: 
 
 
 class Clock:
-    """The system's clock, which somebody sets."""
+    """The system's clock, which can be set."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = NOW
@@ -370,7 +370,7 @@ async def test_timestamps_are_written_ahead_and_seldom(
 
 
 @in_simulated_time
-async def test_a_folder_that_cannot_be_used_is_told_and_costs_no_session(
+async def test_an_unusable_folder_is_reported_and_the_session_continues(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     file = a_file(tmp_path / "file", b"")
@@ -383,7 +383,7 @@ async def test_a_folder_that_cannot_be_used_is_told_and_costs_no_session(
 
 
 @in_simulated_time
-async def test_a_disk_that_fails_later_is_told_once(
+async def test_a_disk_that_fails_later_is_reported_once(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with a_client(signed_vehicle()) as client:
@@ -450,7 +450,7 @@ async def test_no_reply_says_that_frames_were_refused() -> None:
 
 
 @in_simulated_time
-async def test_a_key_is_given_only_where_somebody_says_that_the_link_is_safe() -> None:
+async def test_a_key_is_sent_only_if_the_caller_says_that_the_link_is_safe() -> None:
     vehicle = ArduPilotVehicle(table=VALUES)
     async with a_client(vehicle, signing=None) as client:
         component = await client.component()
@@ -522,8 +522,8 @@ def test_the_key_shows_nowhere(
             try:
                 raise RuntimeError
             except RuntimeError as error:
-                told = traceback.TracebackException.from_exception(error, capture_locals=True)
-                shown.extend(told.format())
+                reported = traceback.TracebackException.from_exception(error, capture_locals=True)
+                shown.extend(reported.format())
 
     live()
     printed = capsys.readouterr()
@@ -609,7 +609,7 @@ def test_commands_sign_with_the_key_of_a_file_or_the_environment(
     assert (code, "needs a terminal" in err) == (2, True)
 
 
-def test_link_tells_of_signatures(put: Callable[[Vehicle], str], key_file: Path, command: Command) -> None:
+def test_link_reports_signatures(put: Callable[[Vehicle], str], key_file: Path, command: Command) -> None:
     url = put(signed_vehicle(signing_timestamp=signing.timestamp_now()))
     code, out, _ = command("link", url, "--seconds", 0.3, "--signing-key", key_file)
     assert code == 0
@@ -638,7 +638,7 @@ def test_setup_and_disable_with_their_proof(
     assert vehicle.signing_key is None
 
 
-def test_the_steps_are_told_without_the_key(
+def test_the_steps_are_reported_without_the_key(
     put: Callable[[Vehicle], str], key_file: Path, command: Command
 ) -> None:
     words = ("--signing-key", key_file, "--link-is-safe", "--verbose")
@@ -697,7 +697,7 @@ def test_nothing_is_sent_before_the_link_is_said_to_be_safe(
 
 
 class Terminal:
-    """The command at a terminal where somebody types."""
+    """The command at a terminal with keyboard input."""
 
     def __init__(self, *arguments: object, **environment: str) -> None:
         self.ours, theirs = pty.openpty()
@@ -709,7 +709,7 @@ class Terminal:
             start_new_session=True,
             env={**os.environ, "TERM": "dumb", **environment},
             cwd=Path(__file__).parents[2],
-            # whoever starts the tests in the background may have Ctrl-C ignored in all that they start
+            # tests started in the background may inherit an ignored SIGINT
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         )
         os.close(theirs)

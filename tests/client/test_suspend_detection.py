@@ -87,7 +87,7 @@ async def test_a_change_during_a_suspend_is_found_and_no_component_is_lost(sleep
 
 
 @in_simulated_time
-async def test_calls_that_wait_are_asked_again(sleep: Sleep) -> None:
+async def test_requests_of_waiting_calls_are_repeated(sleep: Sleep) -> None:
     tap = Tap(vehicle := small_px4())
     async with a_client(tap) as client, asyncio.TaskGroup() as tasks:
         component = await client.component()
@@ -110,7 +110,7 @@ async def test_calls_that_wait_are_asked_again(sleep: Sleep) -> None:
 @pytest.mark.parametrize("at", [0.0, 0.2, 0.5])
 @in_simulated_time
 async def test_a_fetch_that_is_under_way_goes_on(sleep: Sleep, at: float) -> None:
-    """The hash at the head of the list was announced before: it says nothing of what has moved since."""
+    """The hash at the head of the list was announced before: it says nothing of what has changed since."""
     tap = Tap(vehicle := small_px4(burst=1, period=0.04))
     async with a_client(tap) as client, asyncio.TaskGroup() as tasks:
         component = await client.component()
@@ -132,7 +132,7 @@ async def test_a_fetch_that_is_under_way_goes_on(sleep: Sleep, at: float) -> Non
 
 
 @in_simulated_time
-async def test_a_write_does_not_reach_the_one_who_has_come_in_its_place(sleep: Sleep) -> None:
+async def test_a_write_does_not_reach_another_vehicle_at_the_address(sleep: Sleep) -> None:
     berth = Berth(small_px4(uid=1))
     stranger = small_px4(uid=2)
     async with a_client(berth) as client, asyncio.TaskGroup() as tasks:
@@ -141,7 +141,7 @@ async def test_a_write_does_not_reach_the_one_who_has_come_in_its_place(sleep: S
         berth.is_deaf = True
         writing = tasks.create_task(_error_of(component, "PARAM_02", 22))
         await anyio.sleep(0.1)
-        berth.heard.clear()
+        berth.received.clear()
         berth.moor(stranger)
         berth.is_deaf = False
         sleep(HOURS)
@@ -151,7 +151,7 @@ async def test_a_write_does_not_reach_the_one_who_has_come_in_its_place(sleep: S
 
 
 @in_simulated_time
-async def test_nor_does_one_that_is_asked_for_before_anybody_has_noticed(sleep: Sleep) -> None:
+async def test_nor_does_a_list_that_is_requested_before_the_loss_is_detected(sleep: Sleep) -> None:
     berth = Berth(small_px4(uid=1))
     async with a_client(berth) as client:
         component = await client.component()
@@ -172,7 +172,7 @@ async def test_a_vehicle_gone_during_a_suspend_is_lost_soon_with_few_requests(sl
         tap.is_deaf = tap.is_mute = True
         reads = [tasks.create_task(_error_of(component, f"PARAM_{number:02}")) for number in range(20)]
         await anyio.sleep(0.1)
-        tap.heard.clear()
+        tap.received.clear()
         sleep(HOURS)
         woken = anyio.current_time()
         async for event in events:
@@ -180,17 +180,19 @@ async def test_a_vehicle_gone_during_a_suspend_is_lost_soon_with_few_requests(sl
                 break
         assert 4.5 < anyio.current_time() - woken < 6.5
         tries, others = 7, 40  # while it counts as present; heartbeats, and what identifies it
-        assert len(tap.heard) < 20 * tries + others, "twenty reads, each with its tries and none beside them"
+        assert len(tap.received) < 20 * tries + others, (
+            "twenty reads, each with its tries and none beside them"
+        )
         for read in reads:
             assert isinstance(await read, NoReply)
-        tap.heard.clear()
+        tap.received.clear()
         await anyio.sleep(60.0)
-        assert len(tap.heard) < 65, "our heartbeat, and nothing else"
+        assert len(tap.received) < 65, "our heartbeat, and nothing else"
 
 
 @in_simulated_time
 async def test_a_vehicle_that_started_again_meanwhile(sleep: Sleep) -> None:
-    """Its clock tells less than before, and more than the seconds in which ours went."""
+    """Its clock is lower than before, and higher than the elapsed time of ours."""
     berth = Berth(small_px4(uid=1))
     async with a_client(berth) as client:
         component = await client.component()
@@ -203,13 +205,13 @@ async def test_a_vehicle_that_started_again_meanwhile(sleep: Sleep) -> None:
         restarted.data_to_send()
         berth.moor(restarted)
         await anyio.sleep(4.0)
-        told = drained(events)
-        assert Rebooted(component) in told
+        reported = drained(events)
+        assert Rebooted(component) in reported
 
 
 @in_simulated_time
-async def test_a_link_that_is_away_when_the_computer_falls_asleep(sleep: Sleep) -> None:
-    """What it comes back to was away for hours, though our clock may know of a second."""
+async def test_a_link_that_is_disconnected_at_the_suspend_of_the_computer(sleep: Sleep) -> None:
+    """The vehicle was lost for hours, although our clock may show a second."""
     vehicle = small_px4()
     link = FlakyLink(Air.symmetric([vehicle], delay=0.05))
     async with a_client(link) as client:
@@ -232,11 +234,11 @@ async def test_a_short_nap_is_none(sleep: Sleep) -> None:
     async with a_client(tap) as client:
         component = await client.component()
         await component.fetch_all()
-        tap.heard.clear()
+        tap.received.clear()
         sleep(SUSPEND_MIN - 0.1)
         await anyio.sleep(3.0)
         assert trusts(component) == {Trust.LIVE}
-        assert len(tap.heard) < 6, "heartbeats alone"
+        assert len(tap.received) < 6, "heartbeats alone"
 
 
 async def _error_of(component: Component, name: str, value: float | None = None) -> Exception | None:
@@ -259,7 +261,7 @@ def test_a_long_delay_counts_as_a_suspend() -> None:
     assert clock.unseen(1000.0) is None, "that is known by now"
 
 
-def test_sleep_that_the_clock_leaves_out_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sleep_that_the_clock_leaves_out_is_reported_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(suspend_detection, "time_asleep", lambda: 50.0)
     clock = SuspendDetector()
     clock.expect(math.inf)

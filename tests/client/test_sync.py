@@ -79,8 +79,8 @@ def trusts(component: Component) -> set[Trust]:
     return {param.trust for param in component.params.values()}
 
 
-def asked(tap: Tap) -> int:
-    """Everything the vehicle was asked that has to do with parameters."""
+def requested(tap: Tap) -> int:
+    """All requests to the vehicle that concern parameters."""
     return sum(len(tap.messages(kind)) for kind in MISSES)
 
 
@@ -88,8 +88,8 @@ def hashes(tap: Tap) -> int:
     return sum(each.param_id == HASH_CHECK for each in tap.messages(ParamRequestRead))
 
 
-async def unheard(tap: Tap, vehicle: PX4Vehicle | ArduPilotVehicle, **values: float) -> None:
-    """Values change on board, and what the vehicle tells of it is lost on the air."""
+async def change_silently(tap: Tap, vehicle: PX4Vehicle | ArduPilotVehicle, **values: float) -> None:
+    """Values change on board, and the messages that report it are lost."""
     tap.is_mute = True
     for name, value in values.items():
         vehicle.set_param(name, value)
@@ -107,7 +107,7 @@ async def away(tap: Tap, seconds: float) -> None:
 
 
 @in_simulated_time
-async def test_an_update_that_was_lost_is_told_within_one_interval() -> None:
+async def test_an_update_that_was_lost_is_reported_within_one_interval() -> None:
     vehicle = small_px4()
     tap = Tap(vehicle)
     async with a_client(tap, watch_interval=10.0) as client:
@@ -115,7 +115,7 @@ async def test_an_update_that_was_lost_is_told_within_one_interval() -> None:
         await component.fetch_all()
         await asyncio.sleep(1.0)
         events, changes = client.events(), component.changes()
-        await unheard(tap, vehicle, PARAM_01=1001, PARAM_02=1002)
+        await change_silently(tap, vehicle, PARAM_01=1001, PARAM_02=1002)
         began = anyio.current_time()
         assert component.params["PARAM_01"].value == 1
         with anyio.fail_after(11.0):
@@ -140,7 +140,7 @@ async def test_by_default_a_hash_is_watched_and_a_list_is_not() -> None:
         await client.component(2)
         await client.fetch_all()
         await asyncio.sleep(1.0)
-        px4.heard.clear()
+        px4.received.clear()
         await asyncio.sleep(100.0)
         reads = [each.param_id for each in px4.messages(ParamRequestRead)]
         assert reads.count(HASH_CHECK) == 3
@@ -156,7 +156,7 @@ async def test_an_interval_that_is_given_goes_for_lists_too() -> None:
         component = await client.component()
         await component.fetch_all()
         changes, events = component.changes(), client.events()
-        await unheard(tap, vehicle, PARAM_01=1001)
+        await change_silently(tap, vehicle, PARAM_01=1001)
         with anyio.fail_after(21.0):
             assert (await anext(changes)).name == "PARAM_01"
             assert await anext(events) == Resynced(component, ("PARAM_01",), None)
@@ -179,14 +179,14 @@ async def test_parameters_that_appear_are_added_and_can_be_set(path: Path, sourc
         await component.set("GRIP_ENABLE", 1)
         assert (await component.set("GRIP_2", 20)).status == "accepted"
         with anyio.fail_after(3.0):
-            told = [await anext(changes)]
-            while len(told) < 6:
+            reported = [await anext(changes)]
+            while len(reported) < 6:
                 each = await anext(changes)
-                told += [] if each.name in {every.name for every in told} else [each]
-        assert (type(told[0]), told[0].name) == (Changed, "GRIP_ENABLE")
+                reported += [] if each.name in {every.name for every in reported} else [each]
+        assert (type(reported[0]), reported[0].name) == (Changed, "GRIP_ENABLE")
         if source != "reads":  # they begin at once
-            assert (type(told[1]), told[1].name) == (Added, "GRIP_2")
-        assert {each.name for each in told if isinstance(each, Added)} == group.keys()
+            assert (type(reported[1]), reported[1].name) == (Added, "GRIP_2")
+        assert {each.name for each in reported if isinstance(each, Added)} == group.keys()
         await until(lambda: component.sync_state is SyncState.SYNCED)
         assert bits(component.params) == bits(vehicle.params)
         await asyncio.sleep(1.0)
@@ -215,9 +215,9 @@ async def test_an_interval_of_zero_ends_the_watch() -> None:
     async with a_client(tap, watch_interval=0) as client:
         component = await client.component()
         await component.fetch_all()
-        tap.heard.clear()
+        tap.received.clear()
         await asyncio.sleep(200.0)
-        assert asked(tap) == 0
+        assert requested(tap) == 0
         assert state(component) is SyncState.SYNCED
 
 
@@ -287,14 +287,14 @@ async def test_calls_end_at_once_when_it_is_lost() -> None:
             assert 0.0 < error.waited < 3.0
         began = anyio.current_time()
         calls += [component.fetch_all, lambda: component.fetch_all(refresh=True)]
-        tap.heard.clear()
+        tap.received.clear()
         for call in calls:
             error = await outcome(call())
             assert isinstance(error, NoReply), error
             assert error.attempts == 0
         assert anyio.current_time() - began < 0.01
         await asyncio.sleep(20.0)
-        assert asked(tap) == 0
+        assert requested(tap) == 0
         assert not residue(component)
 
 
@@ -320,7 +320,7 @@ async def test_a_fetch_survives_a_vehicle_that_starts_again() -> None:
 
 
 @in_simulated_time
-async def test_a_reboot_is_told() -> None:
+async def test_a_reboot_is_reported() -> None:
     vehicle = small_px4()
     async with a_client(vehicle) as client:
         component = await client.component()
@@ -341,16 +341,16 @@ async def test_a_write_waits_until_it_is_known_who_it_is() -> None:
         await component.fetch_all()
         await away(tap, 8.0)
         await until(lambda: component.state != "lost")
-        tap.heard.clear()
+        tap.received.clear()
         assert (await component.set("PARAM_02", 22)).actual == 22
-        order = [type(message) for _, _, message in tap.heard]
+        order = [type(message) for _, _, message in tap.received]
         assert order.index(wire.CommandLong) < order.index(ParamSetMessage)
-        times = {type(message): when for when, _, message in reversed(tap.heard)}
+        times = {type(message): when for when, _, message in reversed(tap.received)}
         assert times[ParamSetMessage] - times[wire.CommandLong] > 0.5, "a round trip"
 
 
 @in_simulated_time
-async def test_a_link_that_was_away_is_checked_like_a_loss() -> None:
+async def test_a_link_that_was_disconnected_is_checked_like_a_loss() -> None:
     vehicle = small_px4()
     link = FlakyLink(Air.symmetric([vehicle], delay=0.05))
     async with a_client(link) as client:
@@ -461,8 +461,8 @@ async def test_cache_only_sends_nothing(path: Path) -> None:
         assert everything.results[1, 1].source == "cache"
         await component.refreshed()
         await asyncio.sleep(100.0)
-        assert asked(tap) == 0
-        assert (await component.get("PARAM_01")).trust is Trust.LIVE, "what is asked for by name is asked"
+        assert requested(tap) == 0
+        assert (await component.get("PARAM_01")).trust is Trust.LIVE, "a name that is requested is read"
 
 
 @in_simulated_time
@@ -474,7 +474,7 @@ async def test_cache_only_where_nothing_is_cached(path: Path) -> None:
             await component.fetch_all()
         with pytest.raises(CacheError):
             await client.fetch_all()
-        assert asked(tap) == 0
+        assert requested(tap) == 0
         assert not residue(component)
 
 
@@ -490,7 +490,7 @@ async def test_a_component_without_a_cached_table_does_not_delay_the_others(path
 
 
 @in_simulated_time
-async def test_hash_only_asks_for_the_hash_alone(path: Path) -> None:
+async def test_hash_only_requests_the_hash_alone(path: Path) -> None:
     vehicle = small_px4()
     await learn(vehicle, path)
     tap = Tap(vehicle)
@@ -503,13 +503,13 @@ async def test_hash_only_asks_for_the_hash_alone(path: Path) -> None:
         for name, param in component.params.items():
             assert param.trust is (Trust.CACHED if name in VOLATILE else Trust.VERIFIED)
         await asyncio.sleep(100.0)
-        assert asked(tap) == hashes(tap) == 1
-        await unheard(tap, vehicle, PARAM_02=1002)
+        assert requested(tap) == hashes(tap) == 1
+        await change_silently(tap, vehicle, PARAM_02=1002)
         result = await component.fetch_all()
         assert (result.hash, result.source) == (None, "cache")
         assert "hash-only" in result.notes[0]
         assert state(component) is SyncState.UNSYNCED
-        assert asked(tap) == hashes(tap) == 2
+        assert requested(tap) == hashes(tap) == 2
 
 
 @pytest.mark.parametrize("policy", [Policy.CACHE_ONLY, Policy.HASH_ONLY])
@@ -521,7 +521,7 @@ async def test_refresh_is_refused_with_a_policy_that_forbids_downloads(policy: P
         for call in (component.fetch_all(refresh=True), client.fetch_all(refresh=True)):
             with pytest.raises(UsageError, match=f"policy is {policy}"):
                 await call
-        assert asked(tap) == 0
+        assert requested(tap) == 0
 
 
 def test_a_policy_that_does_not_exist() -> None:
@@ -557,7 +557,7 @@ async def test_events_end_with_the_client() -> None:
         await settled()
         push(events, Lost(component, 5.0))
     assert isinstance(await waiting, ClientClosed)
-    assert await anext(events) == Lost(component, 5.0), "what had come is given first"
+    assert await anext(events) == Lost(component, 5.0), "earlier events precede it"
     for each in (events, client.events()):
         with pytest.raises(ClientClosed):
             await anext(each)
@@ -603,11 +603,11 @@ async def test_a_listener_may_stop_in_the_middle() -> None:
     async with a_client(vehicle) as client:
         component = await client.component()
         await component.fetch_all()
-        heard: list[Event] = []
+        received: list[Event] = []
 
         async def listen() -> None:
             async for event in client.events():
-                heard.append(event)
+                received.append(event)
                 if isinstance(event, Rebooted):
                     return
 
@@ -615,7 +615,7 @@ async def test_a_listener_may_stop_in_the_middle() -> None:
             tasks.create_task(listen())
             await asyncio.sleep(3.0)
             vehicle.reboot(anyio.current_time(), down=1.5)
-        assert heard == [Rebooted(component)]
+        assert received == [Rebooted(component)]
 
 
 def test_feeds_are_no_iterators_of_the_other_kind() -> None:

@@ -31,7 +31,7 @@ def path(tmp_path: Path) -> Path:
 
 
 class Wall:
-    """The time of day, as far as the cache is told: it goes on with the clock of the loop, and can be set."""
+    """The time of day that the cache uses: it goes on with the clock of the loop, and can be set."""
 
     @property
     def now(self) -> float:
@@ -51,7 +51,7 @@ def wall() -> Wall:
 
 
 def test_only_the_keeping_of_things_knows_the_time_of_day() -> None:
-    """Whatever concerns a vehicle goes by a clock that nobody sets."""
+    """Times of a vehicle use a monotonic clock."""
     asking = {module for module, path in MODULES.items() if CLOCKS.search(path.read_text(encoding="utf-8"))}
     library = {module for module in asking if module.split(".")[1:2] not in (["cli"], ["service"])}
     keeping = {
@@ -60,15 +60,13 @@ def test_only_the_keeping_of_things_knows_the_time_of_day() -> None:
         "metadata.metadata_cache",
     }
     signing = {"client.signing"}  # whose timestamps are times of day by definition
-    waiting = {"links.udp"}  # for how long a datagram has: the kernel says when it came as a time of day
+    waiting = {"links.udp"}  # for how long a datagram has: the kernel says its arrival as a time of day
     assert library == {f"paramclient.{module}" for module in keeping | signing | waiting}
 
 
 @pytest.mark.parametrize("step", [-HOUR, -DAY, HOUR, 400 * DAY])
 @in_simulated_time
-async def test_a_step_of_the_clock_moves_nothing_but_what_is_written_down(
-    path: Path, wall: Wall, step: float
-) -> None:
+async def test_a_step_of_the_clock_changes_only_recorded_times(path: Path, wall: Wall, step: float) -> None:
     tap = Tap(vehicle := small_px4())
     wall.now = 1_800_000_000.0
     set_at: list[float] = []
@@ -83,10 +81,10 @@ async def test_a_step_of_the_clock_moves_nothing_but_what_is_written_down(
         await anyio.sleep(2.0)
         await write(10)
         await anyio.sleep(2.0)
-        tap.heard.clear()
+        tap.received.clear()
         wall.now += step
         await anyio.sleep(5.0)
-        assert len(tap.heard) <= 6, "our heartbeats"
+        assert len(tap.received) <= 6, "our heartbeats"
         assert component.params["PARAM_02"].trust is Trust.LIVE
         await write(20)
         await anyio.sleep(2.0)
@@ -99,7 +97,7 @@ async def test_a_step_of_the_clock_moves_nothing_but_what_is_written_down(
             "in the order of what happened"
         )
         assert [line.at for line in lines] == pytest.approx(set_at, abs=0.001)
-        assert table.heard_at["PARAM_01"] == pytest.approx(set_at[-1], abs=0.05), "it is told once more"
+        assert table.heard_at["PARAM_01"] == pytest.approx(set_at[-1], abs=0.05), "it is received once more"
         assert bits(table.params) == bits(vehicle.params)
     wall.now += step
     async with ParamClient(vehicle, cache=path) as client:
@@ -160,7 +158,7 @@ def of_another_vehicle() -> TableUpdate:
 async def test_a_file_that_goes_is_followed_by_one_that_holds_everything(
     path: Path, happens: Callable[[Path], None], known: bool
 ) -> None:
-    """Not only what is heard from then on: a table that is called whole has to be."""
+    """Not only what is received from then on: a table that is called whole has to be."""
     vehicle = small_px4()
     if known:
         async with ParamClient(vehicle, cache=path) as client:
@@ -197,7 +195,7 @@ async def test_a_file_that_goes_just_before_the_end(path: Path) -> None:
 
 
 @in_simulated_time
-async def test_half_a_table_takes_nothing_away_from_a_file_that_others_made(path: Path) -> None:
+async def test_half_a_table_removes_nothing_from_a_file_that_others_made(path: Path) -> None:
     """Another program has fetched all of it into the file that it found gone; we know a part."""
     vehicle = small_px4()
     async with ParamClient(vehicle, cache=path) as client:

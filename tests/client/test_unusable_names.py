@@ -1,4 +1,4 @@
-"""Names that no parameter file can hold: dropped, counted, and in nobody's way."""
+"""Names that no parameter file can hold: dropped, counted, and without effect on other names."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def put(monkeypatch: pytest.MonkeyPatch) -> Put:
 
 
 def say(session: Simulation, message: ParamValue | ParamSetMessage | ParamError, system: int = 1) -> None:
-    """Let somebody say something under an address."""
+    """Receive a message under an address."""
     session.station.receive(encode(message, system=system, component=1, sequence=0), PEER, session.now)
 
 
@@ -125,7 +125,7 @@ def test_a_cached_list_with_such_a_name_is_downloaded_anew() -> None:
 
 
 @in_simulated_time
-async def test_no_such_name_can_be_asked_for_or_set() -> None:
+async def test_no_such_name_can_be_requested_or_set() -> None:
     async with ParamClient(GenericVehicle({"A": (ParamType.REAL32, 1.0)}), cache=False) as client:
         vehicle = await client.component()
         with pytest.raises(UsageError, match="no parameter file can hold it"):
@@ -135,7 +135,7 @@ async def test_no_such_name_can_be_asked_for_or_set() -> None:
 
 
 class _Forged(GenericVehicle):
-    """A vehicle in whose name somebody else says something too."""
+    """A vehicle under whose address another sender sends too."""
 
     def data_to_send(self) -> list[bytes]:
         sent = super().data_to_send()

@@ -61,12 +61,12 @@ def full(path: Path) -> Iterator[None]:
         yield
 
 
-def is_heard(component: Component, value: float) -> bool:
+def is_received(component: Component, value: float) -> bool:
     return component.params[NAME].value == value
 
 
 async def written(client: ParamClient, component: Component) -> None:
-    """Wait until all that was heard of a component is in the cache."""
+    """Wait until all that was received from a component is in the cache."""
     await until(lambda: local_client(client).cache_writer.obstacle(local(component).machine) is None)
     await local_client(client).cache_writer.write_all()
 
@@ -90,7 +90,7 @@ ANSWERS = (
 
 @UNWRITABLE
 @in_simulated_time
-async def test_the_service_answers_nothing_from_a_cache_that_lacks_what_was_heard(
+async def test_the_service_answers_nothing_from_a_cache_that_lacks_received_values(
     unwritable: Holding, path: Path
 ) -> None:
     vehicle = small_px4()
@@ -143,18 +143,18 @@ async def test_values_written_late_keep_their_observation_times_and_the_whole_hi
         await written(client, component)
         began_at = anyio.current_time()
         with unwritable(path):
-            heard = []
+            received = []
             for value in (5.0, 6.0, 7.0):
                 vehicle.set_param(NAME, value)
-                await until(partial(is_heard, component, value))
-                heard.append(anyio.current_time() - began_at)
+                await until(partial(is_received, component, value))
+                received.append(anyio.current_time() - began_at)
                 await anyio.sleep(10)
         await anyio.sleep(2 * RETRY_INTERVAL + CACHE_FLUSH_INTERVAL)
     with ParamCache(path) as cache:
         lines = cache.history(cache.vehicles()[0].key)
     assert [(line.old.value, line.new and line.new.value) for line in lines] == [(1, 5), (5, 6), (6, 7)]
-    ahead = lines[0].at - heard[0]
-    assert [line.at - ahead for line in lines] == pytest.approx(heard, abs=0.01)
+    ahead = lines[0].at - received[0]
+    assert [line.at - ahead for line in lines] == pytest.approx(received, abs=0.01)
     assert [record.message for record in caplog.records if record.levelno >= logging.WARNING][1:] == []
 
 
@@ -178,8 +178,10 @@ async def test_a_client_that_ends_says_what_is_lost(
         [_, lost] = [record.message for record in caplog.records if record.levelno >= logging.WARNING]
     finally:
         holding.__exit__(None, None, None)
-    told = rf"1/1 \({key}\): not written to the cache, and lost: 1 value and 1 earlier value, as the cache .*"
-    assert re.fullmatch(told, lost), lost
+    reported = (
+        rf"1/1 \({key}\): not written to the cache, and lost: 1 value and 1 earlier value, as the cache .*"
+    )
+    assert re.fullmatch(reported, lost), lost
 
 
 @in_simulated_time

@@ -17,7 +17,7 @@ def threads() -> int:
 
 
 def test_calls_made_while_the_worker_closes_are_completed() -> None:
-    """Their calls are behind the last one of the closing, and are done and told all the same."""
+    """Their calls follow the last one of the closing, and are executed and reported all the same."""
     done: list[str] = []
     may_go_on = threading.Event()
 
@@ -50,14 +50,14 @@ def test_a_call_after_the_close_is_completed() -> None:
         assert not threads()
         assert await worker.run(lambda: 2) == 2
         with anyio.fail_after(20):
-            while threads():  # noqa: ASYNC110 - nobody tells
+            while threads():  # noqa: ASYNC110 - no event reports it
                 await anyio.sleep(0.001)
 
     with_patience(main)
 
 
 def with_patience(main: object) -> None:
-    """Run it; one that hangs for good is told of, and not waited for."""
+    """Run it; one that hangs is reported, and not waited for."""
     ended = threading.Thread(target=anyio.run, args=(main,), daemon=True)
     ended.start()
     ended.join(20)
@@ -86,7 +86,7 @@ def test_abandoned_it_does_nothing_more_and_does_not_wait() -> None:
             tasks.start_soon(ask, worker, block)
             for _ in range(3):
                 tasks.start_soon(ask, worker, lambda: begun.append("more"))
-            while not blocked.is_set():  # noqa: ASYNC110 - nobody tells
+            while not blocked.is_set():  # noqa: ASYNC110 - no event reports it
                 await anyio.sleep(0.001)
             worker.drop(lambda: EOFError("over"))
             await anyio.lowlevel.checkpoint()
@@ -97,7 +97,7 @@ def test_abandoned_it_does_nothing_more_and_does_not_wait() -> None:
             tasks.start_soon(ask, worker, lambda: begun.append("late"))
         assert errors == ["over"] * 5
         may_end.set()
-        while threads():  # noqa: ASYNC110 - nobody tells
+        while threads():  # noqa: ASYNC110 - no event reports it
             await anyio.sleep(0.001)
 
     with_patience(main)

@@ -411,7 +411,7 @@ def test_a_lossy_list_may_pause() -> None:
     assert findings_of(report(list={"longest_pause": 1.2, "lost": 30})) == []
 
 
-def test_problems_come_first() -> None:
+def test_problems_are_first() -> None:
     found = findings_of(report(is_armed=True, link={"damaged": 1}, list={"rate": 8.0}))
     assert [each.severity for each in found] == [Severity.PROBLEM, Severity.SLOW, Severity.NOTE]
 

@@ -123,7 +123,7 @@ def test_a_parameter_has_its_members_in_order_and_no_empty_ones() -> None:
     assert InfoDoc.of(ParamInfo("P")).as_json() == {}
 
 
-def test_the_default_of_metadata_is_told_apart_and_is_none_of_the_vehicle() -> None:
+def test_the_default_of_metadata_is_marked_and_is_none_of_the_vehicle() -> None:
     document = ParamDoc.kept(param("P", 1.5), described=2)
     assert (document.default, document.default_source, document.is_default) == (2, "metadata", False)
     assert document.param("P").default is None
@@ -151,8 +151,8 @@ def test_metadata_goes_over_a_service_without_loss_but_for_types() -> None:
         category="c",
         group="g",
     )
-    told = InfosDoc.of(Metadata.of([info], source="the file"), ["P7"])
-    metadata = InfosDoc.model_validate_json(told.model_dump_json()).metadata()
+    reported = InfosDoc.of(Metadata.of([info], source="the file"), ["P7"])
+    metadata = InfosDoc.model_validate_json(reported.model_dump_json()).metadata()
     assert metadata.source == "the file"
     assert dict(metadata) == {"P7": info.instance("P7", "7")}
 

@@ -394,10 +394,10 @@ def test_an_impossible_include_is_reported_with_its_line(line: str, problem: str
     )
     (first.parent / "link.parm").symlink_to(tmp_path / "outside.parm")
     error = refused(lambda: read_file(first))
-    told = str(error)
-    assert problem in told
-    assert f"{first}:2: " in told
-    assert "SECRET" not in told
+    reported = str(error)
+    assert problem in reported
+    assert f"{first}:2: " in reported
+    assert "SECRET" not in reported
 
 
 def test_an_error_in_an_included_file_names_both_lines(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Files of extended parameters: what is written comes back, and what is none is told."""
+"""Files of extended parameters: what is written is read back, and invalid files are reported."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def as_number(param: ExtParam) -> float:
 
 @pytest.mark.parametrize("ending", ["json", "yaml"])
 @given(raw=st.binary(max_size=128) | st.text(max_size=30).map(str.encode))
-def test_any_custom_value_comes_back(
+def test_any_custom_value_is_restored(
     tmp_path_factory: pytest.TempPathFactory, ending: str, raw: bytes
 ) -> None:
     path = tmp_path_factory.getbasetemp() / f"any.{ending}"
@@ -92,7 +92,7 @@ def test_nothing_is_written_without_parameters(tmp_path: Path) -> None:
         write_extended_file(tmp_path / "a.json", ExtParamSet({}))
 
 
-def test_the_two_kinds_of_files_are_told_apart(tmp_path: Path) -> None:
+def test_the_two_kinds_of_files_are_distinguished(tmp_path: Path) -> None:
     plain, extended = tmp_path / "plain.yaml", tmp_path / "camera.yaml"
     plain.write_text("paramclient: 1\nsets:\n  - params:\n      A: {value: 1, type: INT32}\n")
     write_extended_file(extended, ExtParamSet(every_kind()))

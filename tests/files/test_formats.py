@@ -500,8 +500,8 @@ def test_the_last_value_of_a_repeated_name_is_used(text: str, value: float, note
     file = loads(text.encode())
     params = file.sets[0]
     assert (list(params), repr(params["A"].value)) == (["A", "B"], repr(value))
-    (told,) = file.notes
-    assert note in told
+    (reported,) = file.notes
+    assert note in reported
 
 
 def test_the_last_of_three_values_keeps_its_comment_and_line() -> None:

@@ -74,7 +74,7 @@ def listening(host: str = "127.0.0.1", port: int = 0) -> socket.socket:
 
 
 async def failure(link: Link) -> LinkError:
-    with anyio.fail_after(TIMEOUT), pytest.raises(LinkError) as caught:  # noqa: PT012 - received data comes first
+    with anyio.fail_after(TIMEOUT), pytest.raises(LinkError) as caught:  # noqa: PT012 - received data precedes it
         while True:
             await link.receive()
     return caught.value
@@ -248,10 +248,10 @@ async def test_a_temporary_resolver_failure_changes_nothing(
     names: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(udp, "RESOLVE_INTERVAL", 0.01)
-    asked = anyio.Event()
+    requested = anyio.Event()
 
     async def unknown() -> str:
-        asked.set()
+        requested.set()
         raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
 
     with listening() as far:
@@ -266,7 +266,7 @@ async def test_a_temporary_resolver_failure_changes_nothing(
                 got.extend(await link.receive())
 
             tasks.start_soon(receive)
-            await asked.wait()
+            await requested.wait()
             await anyio.sleep(0.03)
             far.sendto(HEARTBEAT, link.address)
         assert [data for _, data in got] == [HEARTBEAT]

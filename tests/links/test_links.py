@@ -184,10 +184,10 @@ async def connected(kind: str) -> AsyncIterator[tuple[Any, Any]]:
 
 def stream_of(far: Any, size: int) -> bytes:
     """Receive this many bytes, and all data of the last receive; a stream may split them anywhere."""
-    heard = b""
-    while len(heard) < size:
-        heard += far.recv(1000)
-    return heard
+    received = b""
+    while len(received) < size:
+        received += far.recv(1000)
+    return received
 
 
 KINDS = ["udpin", "udpout", "tcp", "tcpin", "serial", "sim"]
@@ -637,8 +637,8 @@ async def test_udpin_sends_to_every_known_vehicle() -> None:
             one.send(frame(1))
             two.send(frame(2))
             odd.send(b"GET / HTTP/1.1")
-            heard = dict(await collect(link, 3))
-            assert heard == {
+            received = dict(await collect(link, 3))
+            assert received == {
                 one.getsockname(): frame(1),
                 two.getsockname(): frame(2),
                 odd.getsockname(): b"GET / HTTP/1.1",
@@ -679,11 +679,11 @@ TELEMETRY = wire.build_frame(30, bytes(range(1, 29)), system=1, component=1, seq
 async def got(sock: socket.socket) -> list[bytes]:
     """Return all data that a socket has received."""
     sock.setblocking(False)
-    came = []
+    received = []
     with suppress(BlockingIOError):
         while True:
-            came.append(sock.recv(1000))
-    return came
+            received.append(sock.recv(1000))
+    return received
 
 
 @pytest.mark.asyncio

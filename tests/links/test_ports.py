@@ -49,7 +49,7 @@ def a_few() -> list[serialx.SerialPortInfo]:
     ]
 
 
-def test_autopilots_come_first_then_usb_devices(plugged: list[serialx.SerialPortInfo]) -> None:
+def test_autopilots_are_first_then_usb_devices(plugged: list[serialx.SerialPortInfo]) -> None:
     plugged += a_few()
     found = list_ports()
     assert [port.device for port in found] == ["/dev/ttyACM1", "/dev/ttyUSB9", "/dev/ttyUSB10", "/dev/ttyS0"]
@@ -80,7 +80,7 @@ def test_the_link_uses_the_stable_name(plugged: list[serialx.SerialPortInfo]) ->
         (0x27AC, 0x1154, "Laser Navigation", "VRBrain"),
         (0x1209, 0x5740, "ArduPilot", "ArduPilot"),
         (0x1209, 0x5741, "Matek", "ArduPilot"),
-        (0x1209, 0x0001, "somebody else with a code of theirs", None),
+        (0x1209, 0x0001, "Example Robotics", None),
         (0x0483, 0x5740, "ArduPilot", "ArduPilot"),
         (0x0483, 0x5740, "mRo", "mRo"),
         (0x0483, 0x5740, "STMicroelectronics", None),

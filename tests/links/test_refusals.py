@@ -111,7 +111,9 @@ def test_a_process_of_another_user(tmp_path: Path) -> None:
     assert found == "a program of the user root"
 
 
-def test_a_system_that_does_not_tell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_system_that_does_not_report_users_of_ports(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert user_of_port(14550, is_tcp=False, proc=tmp_path / "none") is None
     assert user_of_device("/dev/ttyUSB0", proc=tmp_path / "none") is None
     monkeypatch.setattr(refusals, "user_of_port", lambda port, is_tcp: None)
@@ -122,8 +124,8 @@ def test_a_system_that_does_not_tell(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 def test_modem_manager_gives_the_port_back(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(refusals, "user_of_device", lambda _: "ModemManager (process 5)")
-    told = device_refusal("/dev/ttyACM0", 57600, OSError(errno.EBUSY, "busy"))
-    assert told.endswith("Wait 30 s, or stop it: sudo systemctl stop ModemManager")
+    reported = device_refusal("/dev/ttyACM0", 57600, OSError(errno.EBUSY, "busy"))
+    assert reported.endswith("Wait 30 s, or stop it: sudo systemctl stop ModemManager")
 
 
 @pytest.mark.parametrize(
@@ -172,5 +174,5 @@ def test_a_long_list_of_serial_ports_is_cut(monkeypatch: pytest.MonkeyPatch) -> 
         raise UsageError("serialx is missing")
 
     monkeypatch.setattr(refusals, "list_ports", fail)
-    told = device_refusal("/dev/x", 57600, missing)
-    assert told == "/dev/x does not exist. 'paramclient ports' lists the serial ports"
+    reported = device_refusal("/dev/x", 57600, missing)
+    assert reported == "/dev/x does not exist. 'paramclient ports' lists the serial ports"

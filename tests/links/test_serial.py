@@ -251,7 +251,7 @@ async def test_a_slow_device_limits_the_send_rate(cable: Cable, port: str) -> No
     """More than the system's buffer holds: data waits, and arrives complete and in order."""
     frames = [bytes([number]) * 1000 for number in range(60)]
     async with opened(cable) as link:
-        heard = b""
+        read_bytes = b""
 
         async def send() -> None:
             for frame in frames:
@@ -259,10 +259,10 @@ async def test_a_slow_device_limits_the_send_rate(cable: Cable, port: str) -> No
 
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(send)
-            while len(heard) < 60_000:
+            while len(read_bytes) < 60_000:
                 await anyio.sleep(0.001)
-                heard += await anyio.to_thread.run_sync(cable.recv, 1500)
-        assert heard == b"".join(frames)
+                read_bytes += await anyio.to_thread.run_sync(cable.recv, 1500)
+        assert read_bytes == b"".join(frames)
 
 
 @pytest.mark.asyncio

@@ -139,7 +139,7 @@ class _Run:
             result = await vehicle.fetch_all(timeout=CHECK_TIMEOUT)
             if not result.complete:
                 raise UsageError(
-                    f"{len(result.missing)} parameters did not come; see what is wrong with the link"
+                    f"{len(result.missing)} parameters were not received; see what is wrong with the link"
                 )
             listed = {name: param for name, param in result.params.items() if param.index is not None}
             journal = Journal(self._folder)
@@ -193,7 +193,7 @@ class _Run:
         if not self._options.read_only:
             keep.touch()
         problems: list[str] = []
-        moved: list[str] = []
+        changed: list[str] = []
         try:
             with anyio.fail_after(PUT_BACK_TIMEOUT):
                 self._relay.change(CLEAN)
@@ -201,10 +201,12 @@ class _Run:
                     problems += await session.journal.put_back(vehicle)
                     result = await vehicle.fetch_all(refresh=True)
                     if not result.complete:
-                        problems.append(f"{len(result.missing)} parameters did not come; asked for once more")
+                        problems.append(
+                            f"{len(result.missing)} parameters were not received; requested once more"
+                        )
                         result = await vehicle.fetch_all(refresh=True)
             listed = {name: param for name, param in result.params.items() if param.index is not None}
-            wrong, moved = session.journal.differences(listed)
+            wrong, changed = session.journal.differences(listed)
             problems += wrong
         except (ParamClientError, TimeoutError) as error:
             problems.append(f"{type(error).__name__}: {error}")
@@ -214,7 +216,7 @@ class _Run:
                 _tell(f"To bring it back: paramclient restore {self._options.link} {session.journal.file}")
             return
         keep.unlink(missing_ok=True)
-        itself = f"; changed by the vehicle itself: {', '.join(moved)}" if moved else ""
+        itself = f"; changed by the vehicle itself: {', '.join(changed)}" if changed else ""
         text = f"{len(session.journal.before)} parameters as before{itself}"
         self._report.add(Row("state after", OK, text, promise))
 

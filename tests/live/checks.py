@@ -49,7 +49,7 @@ from paramclient.provision import MISSING, ApplyStatus, apply, restore, verify
 from tests.live.choice import another_value
 from tests.live.journal import check_disarmed
 from tests.live.relay import CLEAN, FILE_TRANSFER_ID, LIST_REQUEST_ID, Conditions
-from tests.live.session import HEARING_TIMEOUT, Check, CheckFailed, Measured, Session, Skip
+from tests.live.session import DISCOVERY_TIMEOUT, Check, CheckFailed, Measured, Session, Skip
 
 __all__ = ["checks"]
 
@@ -67,12 +67,12 @@ FRACTION: Final = 0.1
 SEEN_TIMEOUT: Final = 3.0
 """Seconds in which another session has to learn of a change, and this one of a group."""
 COLLECTED_AFTER: Final = 0.5
-"""Seconds without a further parameter of a group, after which all are told."""
+"""Seconds without a further parameter of a group, after which all are reported."""
 SETTLED_AFTER: Final = 1.5
 """Seconds between a fetch and a switch: the next fetch begins at least 1 s after the last one."""
 PARAMETER_FILE: Final = "@PARAM/param.pck"
 HEARTBEATS: Final = 15
-"""Datagrams beside the blocks of a file that comes once: banner, heartbeats, and answers to requests."""
+"""Datagrams beside the blocks of a file that is sent once: banner, heartbeats, and answers to requests."""
 RADIO_RATE: Final = 5760.0
 """Bytes per second at 57600 baud."""
 SLOWEST_FETCH: Final = 240.0
@@ -147,7 +147,7 @@ def checks(*, reboots: bool) -> Iterator[Check]:
     yield Check(
         "a group shown and hidden",
         show_group,
-        "its members come and go with the switch",
+        "its members appear and disappear with the switch",
         writes=True,
         kinds=("ardupilot",),
     )
@@ -215,7 +215,7 @@ def checks(*, reboots: bool) -> Iterator[Check]:
     yield Check(
         "two sessions, a change in one",
         see_change,
-        "the other is told of it",
+        "the other one receives it",
         {"ardupilot": 1.0, "px4": 1.0},
         writes=True,
     )
@@ -275,7 +275,7 @@ def lossy_checks() -> Iterator[Check]:
     yield Check(
         "read the parameter file, 57600 baud",
         partial(read_file_once, conditions=radio),
-        "it comes once, also where the round trip is known to be short",
+        "it is sent once, also where the round trip is known to be short",
         {"ardupilot": 3.7},
     )
     yield Check(
@@ -332,10 +332,10 @@ async def fetch(session: Session, vehicle: Component, *, refresh: bool = False) 
     result = await vehicle.fetch_all(refresh=refresh, timeout=SLOWEST_FETCH)
     await vehicle.refreshed(timeout=SLOWEST_FETCH)
     await session.check_fetched(vehicle, result)
-    return told(result)
+    return reported(result)
 
 
-def told(result: FetchResult) -> Measured:
+def reported(result: FetchResult) -> Measured:
     way = {"ftp": "by file", "stream": "by list", "cache": "from the cache"}[result.source]
     return Measured(f"{result.received} in {result.elapsed:.2f} s {way}", result.elapsed)
 
@@ -349,7 +349,7 @@ async def fetch_after_kill(session: Session) -> Measured:
     process = spawn.Process(target=_open_file_and_die, args=(session.relay.link, session.system))
     process.start()
     with anyio.move_on_after(KILLED_WITHIN):
-        while process.is_alive():  # noqa: ASYNC110 - a process tells nobody of its end
+        while process.is_alive():  # noqa: ASYNC110 - no event reports its end
             await anyio.sleep(0.02)
     has_opened = process.exitcode == 0
     process.kill()
@@ -372,7 +372,7 @@ async def fetch_after_cancellation(session: Session) -> Measured:
 
 
 def _open_file_and_die(link: str, system: int) -> None:
-    """Begin to read the parameter file, and end without a word while it comes. Exit code 0 when it came."""
+    """Begin to read the parameter file, and end without closing it. Exit code 0 after its first bytes."""
 
     def die(received: int, size: int | None) -> None:
         if received:
@@ -396,7 +396,7 @@ async def replay_log(session: Session) -> Measured:
     """Replay and import the log of a fetch: both hold what the client held, with types and defaults."""
     path = session.folder / "session.tlog"
     async with ParamClient(session.relay.link, cache=False, tlog=path) as client:
-        vehicle = await client.component(session.system, timeout=HEARING_TIMEOUT)
+        vehicle = await client.component(session.system, timeout=DISCOVERY_TIMEOUT)
         source = (await vehicle.fetch_all(timeout=SLOWEST_FETCH)).source
     began = time.monotonic()
     async with ParamClient(f"replay:{path}?speed=0") as log:
@@ -435,7 +435,7 @@ async def get_some(session: Session, *, by_name: bool) -> Measured:
             if held.name != param.name or not (
                 held.same_value(param) or session.journal.moves_by_itself(param.name)
             ):
-                raise CheckFailed(f"{param} came as {held}")
+                raise CheckFailed(f"{param} was received as {held}")
     middle = statistics.median(seconds)
     return Measured(f"{middle * 1000:.0f} ms, slowest of {len(seconds)} {max(seconds) * 1000:.0f} ms")
 
@@ -600,7 +600,7 @@ async def show_group(session: Session) -> Measured:
 
 
 async def follow_group(session: Session, *, conditions: Conditions = CLEAN) -> Measured:
-    """Switch a group on and off; `changes()` must tell of it without a fetch."""
+    """Switch a group on and off; `changes()` must report it without a fetch."""
     tried: list[str] = []
     async with session.under(conditions), session.client() as vehicle:
         await vehicle.fetch_all(timeout=SLOWEST_FETCH)
@@ -627,13 +627,13 @@ async def follow_group(session: Session, *, conditions: Conditions = CLEAN) -> M
             await put_back(session, vehicle)
             if held.status != "accepted":
                 raise CheckFailed(f"{name}, just shown, was set: {held}")
-            told = f"{switch}: {len(added)} added in {seconds:.2f} s, {count} parameters, and removed"
-            return Measured(told, seconds)
+            reported = f"{switch}: {len(added)} added in {seconds:.2f} s, {count} parameters, and removed"
+            return Measured(reported, seconds)
     raise Skip(f"none of these shows a group: {', '.join(tried)}" if tried else "no switch of a group is off")
 
 
 async def collect(changes: Changes, kind: type[Change]) -> dict[str, Param]:
-    """Return the parameters in changes of this kind, until none has come for a while."""
+    """Return the parameters in changes of this kind, until none has arrived for a while."""
     found: dict[str, Param] = {}
     timeout = SEEN_TIMEOUT
     while True:
@@ -746,8 +746,8 @@ async def restore_before(session: Session) -> Measured:
         await put_back(session, vehicle)
     if not done.complete or any(done.rows[name].status is not ApplyStatus.SET for name in names):
         raise CheckFailed(f"{done}: {'; '.join(map(str, done.shown_rows[:5]))}")
-    told = f", left out {', '.join(left_out)}" if left_out else ""
-    return Measured(f"{done.counts[ApplyStatus.SET]} set in {done.elapsed:.2f} s{told}", done.elapsed)
+    reported = f", left out {', '.join(left_out)}" if left_out else ""
+    return Measured(f"{done.counts[ApplyStatus.SET]} set in {done.elapsed:.2f} s{reported}", done.elapsed)
 
 
 async def put_back(session: Session, vehicle: Component) -> None:
@@ -786,10 +786,10 @@ async def read_file(session: Session) -> Measured:
                     raise
                 raise Skip(f"the vehicle serves no parameter file: {error}") from error
             seconds.append(time.monotonic() - began)
-    told = ", ".join(f"{each:.2f}" for each in seconds)
+    reported = ", ".join(f"{each:.2f}" for each in seconds)
     if max(seconds) > 2 * min(seconds) + 0.2:
-        raise CheckFailed(f"{told} s: it does not take the same time again")
-    return Measured(f"{max(sizes)} bytes in {told} s")
+        raise CheckFailed(f"{reported} s: it does not take the same time again")
+    return Measured(f"{max(sizes)} bytes in {reported} s")
 
 
 async def read_file_once(session: Session, *, conditions: Conditions) -> Measured:
@@ -807,10 +807,10 @@ async def read_file_once(session: Session, *, conditions: Conditions) -> Measure
         seconds = time.monotonic() - began
         datagrams = session.relay.counts().down - before
     blocks = math.ceil(size / DATA_SIZE_MAX)
-    told = f"{size} bytes in {seconds:.2f} s, {datagrams} datagrams for {blocks} blocks"
+    reported = f"{size} bytes in {seconds:.2f} s, {datagrams} datagrams for {blocks} blocks"
     if datagrams > 1.5 * blocks + HEARTBEATS:
-        raise CheckFailed(told)
-    return Measured(told, seconds)
+        raise CheckFailed(reported)
+    return Measured(reported, seconds)
 
 
 async def read_missing(session: Session) -> Measured:
@@ -938,7 +938,7 @@ async def reboot_by_another(session: Session) -> Measured:
 
 
 async def count_reboots(events: Events) -> int:
-    """Return how often a restart is noticed until 6 s after now: ArduPilot tells its clock late."""
+    """Return how often a restart is noticed until 6 s after now: ArduPilot sends its clock late."""
     count = 0
     with anyio.move_on_after(NOTICING_TIME):
         async for event in events:

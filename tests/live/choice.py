@@ -33,7 +33,7 @@ HARMLESS: Final[Mapping[str, Mapping[ParamType, tuple[str, ...]]]] = {
         ParamType.REAL32: ("RTL_TIME_FACTOR", "PLD_SRCH_TOUT", "FLW_TGT_DST"),
     },
 }
-"""By autopilot and type, in the order of preference. Spare radio channels come after them."""
+"""By autopilot and type, in the order of preference. Spare radio channels arrive after them."""
 
 READ_ONLY: Final = ("BARO1_DEVID", "BARO2_DEVID", "BARO1_GND_PRESS", "FORMAT_VERSION")
 """Parameters that some versions of ArduPilot refuse to change, the least harmful first."""

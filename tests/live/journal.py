@@ -29,7 +29,7 @@ PUT_BACK_ATTEMPTS: Final = 4
 async def check_disarmed(vehicle: Component) -> None:
     """Raise VehicleArmed unless the vehicle says that it is disarmed."""
     with anyio.move_on_after(HEARTBEAT_TIMEOUT):
-        while vehicle.is_armed is None:  # noqa: ASYNC110 - no event tells it
+        while vehicle.is_armed is None:  # noqa: ASYNC110 - no event shows it
             await anyio.sleep(0.05)
     if vehicle.is_armed is not False:
         says = "is armed" if vehicle.is_armed else "does not say that it is disarmed"
@@ -115,33 +115,33 @@ class Journal:
             What differs although it should not, in words, and the names that the vehicle changes by itself.
         """
         wrong: list[str] = []
-        moved: list[str] = []
+        changed: list[str] = []
         for name in sorted(self.before.keys() | params.keys()):
             old, new = self.before.get(name), params.get(name)
             if old is not None and new is not None:
                 is_same, may_differ = old.same_value(new), self.moves_by_itself(name)
             else:
-                is_same, may_differ = False, self.comes_and_goes(name)
+                is_same, may_differ = False, self.appears_and_disappears(name)
             if is_same:
                 continue
             if may_differ:
-                moved.append(name)
+                changed.append(name)
                 continue
             was = "absent" if old is None else format_value(old.value, old.type)
             now = "absent" if new is None else format_value(new.value, new.type)
             wrong.append(f"{name} was {was}, is {now}")
-        return wrong, moved
+        return wrong, changed
 
     def moves_by_itself(self, name: str) -> bool:
-        """Whether a vehicle of this kind may give the parameter another value without being asked.
+        """Whether a vehicle of this kind may give the parameter another value without requests.
 
         Counters, calibration and what is measured or written by the vehicle alone do, by the list that the
         set-up of vehicles uses.
         """
         return self._category(name) in _MOVING
 
-    def comes_and_goes(self, name: str) -> bool:
-        """Whether a vehicle of this kind may list the parameter or not, without being asked.
+    def appears_and_disappears(self, name: str) -> bool:
+        """Whether a vehicle of this kind may list the parameter or not, without requests.
 
         PX4 lists what its firmware has used since the start: the ids of sensors that are not there are listed
         after some starts, and not after others (measured).

@@ -79,7 +79,7 @@ class Conditions:
             the vehicle sends too fast waits in a queue without bound.
         seed: of the random numbers that pick what is lost.
         refuses_files: whether the relay answers each MAVFTP request in the vehicle's place, with the NAK of
-            a server that has no such file, so that the table has to come by list.
+            a server that has no such file, so that the table has to be downloaded by list.
         drops_telemetry: whether messages that have nothing to do with parameters are left out on the way
             down, as a vehicle sends less telemetry when it knows that its link is slow.
         loses_first: message ids; of each, the first message in either direction is lost.
@@ -113,7 +113,7 @@ class Counts:
     Attributes:
         up, down: given to the lossy link, from programs to the vehicle and back.
         lost: those of them that were lost, both directions together.
-        first_request_at: when a program first asked for the list or for a file, on the clock of
+        first_request_at: when a program first requested the list or a file, on the clock of
             `time.monotonic`; None when none did.
     """
 
@@ -124,7 +124,7 @@ class Counts:
 
 
 class RealVehicle:
-    """The vehicle's end of the lossy link: an `Endpoint` whose messages come from a link elsewhere.
+    """The vehicle's end of the lossy link: an `Endpoint` whose messages are received on another link.
 
     Args:
         is_stream: whether the vehicle's link delivers a byte stream, which is cut into frames here. A
@@ -132,7 +132,7 @@ class RealVehicle:
 
     Attributes:
         outgoing: datagrams to be sent over the link to the vehicle.
-        first_request_at: when a program first asked for the list or for a file, on the clock of
+        first_request_at: when a program first requested the list or a file, on the clock of
             `time.monotonic`, since the last change of the conditions; None before.
     """
 
@@ -153,12 +153,12 @@ class RealVehicle:
         self._to_lose = set(conditions.loses_first)
         self.first_request_at = None
 
-    def asked(self, data: bytes, now: float) -> None:
+    def take_request(self, data: bytes, now: float) -> None:
         """Take note of what a program sends at the time `now`, before anything is lost."""
         if self.first_request_at is None and _message_id(data) in (LIST_REQUEST_ID, FILE_TRANSFER_ID):
             self.first_request_at = now
 
-    def came(self, data: bytes, peer: Peer, now: float) -> None:
+    def take_data(self, data: bytes, peer: Peer, now: float) -> None:
         """Take what the vehicle has sent over its link at the time `now`."""
         for datagram in (data,) if self._cutter is None else self._cutter.cut(data, peer):
             number = _message_id(datagram)
@@ -306,7 +306,8 @@ class Relay:
 
 
 class _Traffic:
-    """The relay inside its process: two links, the lossy link, and the programs that were heard."""
+    """The relay inside its process: two links, the lossy link, and the programs from which data was
+    received."""
 
     def __init__(self, vehicle_link: str, listeners: Sequence[int]) -> None:
         self._far = create_link(vehicle_link)
@@ -365,12 +366,12 @@ class _Traffic:
         while True:
             try:
                 for peer, data in await self._far.receive():
-                    self._vehicle.came(data, peer, anyio.current_time())
+                    self._vehicle.take_data(data, peer, anyio.current_time())
             except LinkError:
                 if not self._far.reconnects:
                     raise
                 await anyio.sleep(REOPEN_PAUSE)
-                with suppress(LinkError):  # the vehicle is still away
+                with suppress(LinkError):  # the vehicle is still disconnected
                     await self._far.open()
             self._wake.set()
 
@@ -380,7 +381,7 @@ class _Traffic:
                 now = anyio.current_time()
                 if peer not in self._listeners:
                     self._programs[peer] = now
-                self._vehicle.asked(data, now)
+                self._vehicle.take_request(data, now)
                 self._air.receive(data, now)
             self._wake.set()
 
@@ -443,7 +444,7 @@ def _run(vehicle_link: str, listeners: Sequence[int], control: Connection) -> No
     try:
         anyio.run(_Traffic(vehicle_link, listeners).run, control)
     except* LinkError as group:
-        with suppress(OSError):  # nobody listens any more
+        with suppress(OSError):  # no program listens any more
             control.send("; ".join(str(error) for error in group.exceptions))
     finally:
         control.close()

@@ -37,16 +37,16 @@ class Report:
     """All rows so far.
 
     Args:
-        tell: prints a line as soon as a row is there.
+        report: prints a line as soon as a row is there.
     """
 
-    tell: Callable[[str], None]
+    report: Callable[[str], None]
     rows: list[Row] = field(default_factory=list)
 
     def add(self, row: Row) -> None:
         """Add a row and print its line."""
         self.rows.append(row)
-        self.tell(f"{row.result:8}{row.name}: {row.measured}")
+        self.report(f"{row.result:8}{row.name}: {row.measured}")
 
     @property
     def failures(self) -> int:

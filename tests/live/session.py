@@ -14,9 +14,9 @@ from tests.live.choice import Choice
 from tests.live.journal import Journal
 from tests.live.relay import CLEAN, Conditions, Relay
 
-__all__ = ["HEARING_TIMEOUT", "Check", "CheckFailed", "Measured", "Session", "Skip"]
+__all__ = ["DISCOVERY_TIMEOUT", "Check", "CheckFailed", "Measured", "Session", "Skip"]
 
-HEARING_TIMEOUT: Final = 15.0
+DISCOVERY_TIMEOUT: Final = 15.0
 """Seconds to wait for the vehicle's heartbeat at the beginning of a check."""
 NAMES_SHOWN: Final = 5
 """Names that a failure lists at most."""
@@ -100,7 +100,7 @@ class Session:
             link or self.relay.link, cache=False if cache is None else cache, component=component
         )
         async with opened as client:
-            yield await client.component(self.system, timeout=HEARING_TIMEOUT)
+            yield await client.component(self.system, timeout=DISCOVERY_TIMEOUT)
 
     @asynccontextmanager
     async def under(self, conditions: Conditions) -> AsyncIterator[None]:
@@ -126,8 +126,10 @@ class Session:
     async def _check_values(self, vehicle: Component, listed: Mapping[str, Param]) -> None:
         before = self.journal.before
         unknown = sorted(listed.keys() ^ before.keys())
-        if unknown := [name for name in unknown if not self.journal.comes_and_goes(name)]:
-            raise CheckFailed(f"{len(unknown)} names came or went: {', '.join(unknown[:NAMES_SHOWN])}")
+        if unknown := [name for name in unknown if not self.journal.appears_and_disappears(name)]:
+            raise CheckFailed(
+                f"{len(unknown)} names appeared or disappeared: {', '.join(unknown[:NAMES_SHOWN])}"
+            )
         wrong: list[str] = []
         for name, param in listed.items():
             if name in before and not before[name].same_value(param):

@@ -69,7 +69,7 @@ def test_later_values_in_the_cache_are_kept_and_repetition_changes_nothing(
     assert states[0] == states[1]
 
 
-def test_types_come_from_the_cached_table_then_from_other_vehicles(cache: ParamCache, tmp_path: Path) -> None:
+def test_types_are_from_the_cached_table_then_from_other_vehicles(cache: ParamCache, tmp_path: Path) -> None:
     hold(cache, Param("ARMING_CHECK", 1, ParamType.INT32, 2, 1), BOOT - 1000)
     hold(cache, Param("SYSID_THISMAV", 3, ParamType.INT16, 1, 3), BOOT - 1000, "uid:aabbccddeeff")
     path = written(tmp_path, dataflash([*COMMON, FIX]))

@@ -156,7 +156,7 @@ async def test_long_pauses_and_clocks_that_go_back(tmp_path: Path) -> None:
 
 @in_simulated_time
 async def test_missing_parameters_are_reported_at_the_end_of_the_log(tmp_path: Path) -> None:
-    log = Log().beat().tell("A", 0, A=1, B=2, C=3).tell("C", 2)
+    log = Log().beat().report("A", 0, A=1, B=2, C=3).report("C", 2)
     async with a_replay(log.write(tmp_path / "flight.tlog")) as client:
         component = await client.component()
         for _ in range(2):  # also after its end
@@ -299,7 +299,7 @@ def test_a_repeated_import_changes_nothing(tmp_path: Path) -> None:
 def test_a_repeated_import_changes_nothing_after_a_clock_jump(tmp_path: Path) -> None:
     """All later frames have the same time, until the end of the log."""
     cache = tmp_path / "cache"
-    log = Log().tell("A", A=1).wait(-60.0).change("A", 2).write(tmp_path / "flight.tlog")
+    log = Log().report("A", A=1).wait(-60.0).change("A", 2).write(tmp_path / "flight.tlog")
     [table] = imported(log, cache=cache)
 
     def kept() -> str:
@@ -406,14 +406,14 @@ def test_a_name_removed_later_is_not_restored(tmp_path: Path) -> None:
     imported(log, log, cache=cache)
     assert kept_values(cache) == {"A": 1}
     assert lines(cache) == before
-    imported(Log(NOW + 300.0).beat().identify().tell("OLD", OLD=5).write(tmp_path / "l.tlog"), cache=cache)
+    imported(Log(NOW + 300.0).beat().identify().report("OLD", OLD=5).write(tmp_path / "l.tlog"), cache=cache)
     assert kept_values(cache) == {"A": 1, "OLD": 5}
 
 
 def test_unidentified_vehicles_are_distinguished_by_the_log(tmp_path: Path) -> None:
     cache = tmp_path / "cache"
     one = Log().beat().list(A=1).write(tmp_path / "1.tlog")
-    two = Log().beat().tell("A", 0, A=2, B=3).write(tmp_path / "2.tlog")
+    two = Log().beat().report("A", 0, A=2, B=3).write(tmp_path / "2.tlog")
     tables = imported(one, two, cache=cache)
     assert [table.key for table in tables] == [f"system:1@replay:{one}", f"system:1@replay:{two}"]
     assert [table.complete for table in tables] == [True, False]
@@ -459,8 +459,8 @@ def test_the_command_line_reads_logs(tmp_path: Path, capsys: pytest.CaptureFixtu
     capsys.readouterr()
     for names in ([], ["B"]):
         assert run(["watch", f"replay:{path}?speed=100", *names]) == 0  # ends with the log
-        told = capsys.readouterr().out.splitlines()
-        assert told == ["2023-11-14T22:18:21.000Z  B  2 -> 4  (vehicle)"], "with the time of the log"
+        reported = capsys.readouterr().out.splitlines()
+        assert reported == ["2023-11-14T22:18:21.000Z  B  2 -> 4  (vehicle)"], "with the time of the log"
     assert run(["watch", f"replay:{path}?speed=100", "A"]) == 0
     assert capsys.readouterr().out == ""
     assert run(["show", f"replay:{path}.gone"]) == 4
@@ -474,11 +474,11 @@ def test_the_command_line_imports_logs(tmp_path: Path, capsys: pytest.CaptureFix
     (tmp_path / "bad.tlog").write_bytes(b"nothing")
     files = [str(tmp_path / "bad.tlog"), str(empty), str(good)]
     assert run(["import", *files, "--cache", str(cache), "--json"]) == 2
-    told = capsys.readouterr()
-    [table] = json.loads(told.out)["tables"]
+    reported = capsys.readouterr()
+    [table] = json.loads(reported.out)["tables"]
     assert (table["file"], table["key"], table["params"], table["complete"]) == (str(good), KEY, 2, True)
-    assert "bad.tlog: not imported: a text file, and no log" in told.err
-    assert "empty.tlog has no parameters" in told.err
+    assert "bad.tlog: not imported: a text file, and no log" in reported.err
+    assert "empty.tlog has no parameters" in reported.err
     assert run(["import", str(good), "--cache", str(cache)]) == 0
     assert "flight.tlog  1/1        generic         2  yes" in capsys.readouterr().out
     assert run(["show", "1", "--cache", str(cache)]) == 0
@@ -493,14 +493,14 @@ def test_earlier_states_are_unchanged_when_a_log_completes_the_history(tmp_path:
     imported(later.write(tmp_path / "later.tlog"), cache=cache)
     moments = [NOW + 1005.0, NOW + 1015.0, NOW + 1025.0, NOW + 1035.0]
 
-    def told() -> list[dict[str, object]]:
+    def reported() -> list[dict[str, object]]:
         with ParamCache(cache) as kept:
             states = [kept.state_at(KEY, 1, at) for at in moments]
         return [{name: param.value for name, param in state.items()} for state in states]
 
-    before = told()
+    before = reported()
     assert before == [{"A": 1, "B": 2}, {"A": 3, "B": 2}, {"A": 3, "B": 2, "C": 4}, {"A": 3, "B": 5, "C": 4}]
     earlier = whole(A=7, B=8).wait(9.0).change("A", 9).wait(1.0).beat()
     imported(earlier.write(tmp_path / "earlier.tlog"), cache=cache)
     assert [each[:3] for each in lines(cache)] == [("A", 7, 9), ("A", 1, 3), ("B", 2, 5)]
-    assert told() == before
+    assert reported() == before

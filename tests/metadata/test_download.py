@@ -434,9 +434,9 @@ async def test_a_link_that_drops_during_a_download() -> None:
             await anyio.sleep(0.01)
             waited.append(local(component).machine.is_waiting)
             await link.drop()
-            asked = len(tap.messages(CommandLong))
+            requested = len(tap.messages(CommandLong))
             tap.is_deaf = False
-        assert len(tap.messages(CommandLong)) > asked
+        assert len(tap.messages(CommandLong)) > requested
         assert link.openings == 2
         assert waited == [False, True]
 
@@ -485,15 +485,15 @@ class Asked:
 
 
 def test_the_request_and_its_responses() -> None:
-    asked = Asked()
-    ask = asked.machine.ask(0.0)
-    assert asked.sent == [CommandLong(1, 1, 512, (397.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))]
-    asked.machine.receive(ComponentMetadata("mftp://a", 7), 0.1)
+    requested = Asked()
+    ask = requested.machine.ask(0.0)
+    assert requested.sent == [CommandLong(1, 1, 512, (397.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))]
+    requested.machine.receive(ComponentMetadata("mftp://a", 7), 0.1)
     assert ask.result == ComponentMetadata("mftp://a", 7)
-    asked.machine.receive(ComponentMetadata("mftp://b", 8), 0.2)  # unsolicited
-    assert asked.messages.next_deadline() == float("inf")
-    ask = asked.machine.ask(1.0)
-    asked.machine.receive(ComponentMetadata("", 0), 1.1)
+    requested.machine.receive(ComponentMetadata("mftp://b", 8), 0.2)  # unsolicited
+    assert requested.messages.next_deadline() == float("inf")
+    ask = requested.machine.ask(1.0)
+    requested.machine.receive(ComponentMetadata("", 0), 1.1)
     assert ask.done
     assert ask.result is None
 
@@ -502,49 +502,49 @@ def test_the_request_and_its_responses() -> None:
     ("result", "is_answer"), [(0, False), (1, False), (2, True), (3, True), (4, True), (5, False)]
 )
 def test_refusals_end_the_request(result: int, is_answer: bool) -> None:
-    asked = Asked()
-    ask = asked.machine.ask(0.0)
-    asked.messages.acknowledged(CommandAck(512, result, 255, 190), 0.1)
+    requested = Asked()
+    ask = requested.machine.ask(0.0)
+    requested.messages.acknowledged(CommandAck(512, result, 255, 190), 0.1)
     assert ask.done is is_answer
 
 
 def test_the_refusal_of_another_request_is_ignored() -> None:
-    asked = Asked()
-    ask = asked.machine.ask(0.0)
-    asked.messages.acknowledged(CommandAck(511, 3, 255, 190), 0.1)
-    asked.messages.acknowledged(CommandAck(512, 3, 254, 190), 0.1)  # another station's
-    version = asked.messages.begin(AUTOPILOT_VERSION_ID, VersionAttempts(asked.context.retry), 0.1)
-    asked.messages.acknowledged(CommandAck(512, 3, 255, 190), 0.1)  # may belong to AUTOPILOT_VERSION
+    requested = Asked()
+    ask = requested.machine.ask(0.0)
+    requested.messages.acknowledged(CommandAck(511, 3, 255, 190), 0.1)
+    requested.messages.acknowledged(CommandAck(512, 3, 254, 190), 0.1)  # another station's
+    version = requested.messages.begin(AUTOPILOT_VERSION_ID, VersionAttempts(requested.context.retry), 0.1)
+    requested.messages.acknowledged(CommandAck(512, 3, 255, 190), 0.1)  # may belong to AUTOPILOT_VERSION
     assert not ask.done
-    asked.messages.end(version)
-    asked.messages.acknowledged(CommandAck(512, 3), 0.1)  # MAVLink 1 has no target in COMMAND_ACK
+    requested.messages.end(version)
+    requested.messages.acknowledged(CommandAck(512, 3), 0.1)  # MAVLink 1 has no target in COMMAND_ACK
     assert ask.done
 
 
 def test_the_request_is_repeated_until_it_is_given_up() -> None:
-    asked = Asked()
-    ask = asked.machine.ask(0.0)
-    late = asked.machine.ask(0.5)
+    requested = Asked()
+    ask = requested.machine.ask(0.0)
+    late = requested.machine.ask(0.5)
     now = 0.0
     while not ask.done:
-        now = asked.messages.next_deadline()
+        now = requested.messages.next_deadline()
         assert now < 100.0
-        asked.messages.tick(now)
+        requested.messages.tick(now)
     assert isinstance(ask.error, NoReply)
     assert isinstance(late.error, NoReply)
-    assert len(asked.sent) == ask.attempts >= 5
+    assert len(requested.sent) == ask.attempts >= 5
     assert "COMPONENT_METADATA of 1/1" in str(ask.error)
-    asked.messages.tick(now + 1)
-    asked.machine.release(ask)
+    requested.messages.tick(now + 1)
+    requested.machine.release(ask)
 
 
 def test_the_request_is_repeated_when_the_link_is_restored() -> None:
-    asked = Asked()
-    asked.machine.resume(0.0)
-    assert asked.sent == []
-    asked.machine.ask(0.0)
-    asked.machine.resume(0.5)
-    assert len(asked.sent) == 2
+    requested = Asked()
+    requested.machine.resume(0.0)
+    assert requested.sent == []
+    requested.machine.ask(0.0)
+    requested.machine.resume(0.5)
+    assert len(requested.sent) == 2
     sent: list[Any] = []
     machine = ComponentMachine(
         1, 1, own_address=(255, 190), link="link", send=sent.append, observer=EventMaker(lambda _: None)

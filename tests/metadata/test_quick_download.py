@@ -76,7 +76,7 @@ async def test_less_time_is_taken_where_less_is_left() -> None:
         (PX4Vehicle(metadata=True, armed=True), "the vehicle is armed"),
         (
             PX4Vehicle(metadata=True, burst=1, period=0.125),
-            "the link is slow: its list came at less than 200 values/s",
+            "the link is slow: its list arrived at less than 200 values/s",
         ),
         (ArduPilotVehicle(), "ArduPilot does not serve its metadata"),
         (GenericVehicle(table={"A": 1}), "the vehicle does not announce MAVFTP"),
@@ -100,11 +100,11 @@ async def test_a_listening_client_requests_nothing() -> None:
     async with a_client(tap, listen_only=True) as client:
         found = await load_if_quick(await client.component())
         assert (found.metadata, found.note) == (None, "the client only listens")
-    assert not tap.heard
+    assert not tap.received
 
 
 @in_simulated_time
-async def test_a_vehicle_without_metadata_is_told_apart() -> None:
+async def test_a_vehicle_without_metadata_is_reported_as_such() -> None:
     async with a_client(PX4Vehicle()) as client:
         component = await client.component()
         await component.fetch_all()

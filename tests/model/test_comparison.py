@@ -183,7 +183,7 @@ def test_status_of_each_name() -> None:
         (of(), of(A=2), ChangedSide.RIGHT),
     ],
 )
-def test_moved_tells_which_side_differs_from_the_base(
+def test_changed_side_is_the_side_that_differs_from_the_base(
     left: ParamSet, right: ParamSet, changed_side: ChangedSide
 ) -> None:
     outcome = compare(left, right, base=of(A=1, B=7))

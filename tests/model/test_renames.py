@@ -153,7 +153,7 @@ def test_the_note_about_a_missing_parameter_names_its_other_names() -> None:
     assert CHAIN.missing_note("D") == ""
 
 
-def test_the_rules_tell_their_source() -> None:
+def test_the_rules_name_their_source() -> None:
     assert repr(CHAIN) == "<Renames 2 from names.yaml>"
     assert len(CHAIN) == 2
 

@@ -61,7 +61,7 @@ SOMETHING = Heartbeat(2, 0)
 
 
 class Desk:
-    """The component 1/1 with all that it sends and tells."""
+    """The component 1/1 with all that it sends and its events."""
 
     def __init__(self, heartbeat: Heartbeat | None = PX4, *, encoding: Encoding | None = None) -> None:
         self.now = 0.0
@@ -124,7 +124,7 @@ class Desk:
                 return
             self.now = max(deadline, self.now)
             self.machine.tick(self.now)
-        raise AssertionError("it does not come to an end")
+        raise AssertionError("it does not end")
 
     def take(self) -> list[Message]:
         sent, self.sent[:] = list(self.sent), []
@@ -155,7 +155,7 @@ def fetched(desk: Desk, *, announce: bool = True) -> None:
 # values
 
 
-def test_a_value_goes_into_the_table_and_is_told() -> None:
+def test_a_value_goes_into_the_table_and_is_reported() -> None:
     desk = Desk()
     desk.hear("A", 1.5, index=2)
     assert desk.machine.table.params["A"].value == 1.5
@@ -165,17 +165,17 @@ def test_a_value_goes_into_the_table_and_is_told() -> None:
     assert len(desk.changes) == 1
 
 
-def test_without_tells_changes_several_changes_make_one_event() -> None:
+def test_without_reports_each_change_several_changes_make_one_event() -> None:
     desk = Desk()
     desk.events.clear()
-    desk.machine.tells_changes = False
+    desk.machine.reports_each_change = False
     desk.send_list("A", "B")
     desk.cached(known("C", 1, index=2))
     assert desk.events == [TableChanged(desk.machine)]
     desk.machine.has_changed = False
     desk.hear("A", 7.0)
     assert desk.events == [TableChanged(desk.machine)] * 2
-    desk.machine.tells_changes = True
+    desk.machine.reports_each_change = True
     desk.hear("A", 8.0)
     assert [change.new.value for change in desk.changes if change.new] == [8.0]
 
@@ -223,7 +223,7 @@ def test_a_chosen_encoding_overrides_the_detected_one() -> None:
     assert desk.machine.identification.encoding_reason == "chosen by the user"
 
 
-def test_ardupilot_answers_in_the_spelling_that_was_asked_for() -> None:
+def test_ardupilot_answers_in_the_requested_spelling() -> None:
     desk = Desk(ARDUPILOT)
     read = desk.machine.read("wpnav_speed", desk.now)
     assert desk.reads() == ["WPNAV_SPEED"]
@@ -298,7 +298,7 @@ def test_other_autopilots_mind_the_case() -> None:
     assert desk.reads() == ["a"]
 
 
-def test_a_count_that_moves_takes_the_table_out_of_step() -> None:
+def test_a_changed_count_marks_the_table_unsynced() -> None:
     desk = Desk()
     fetched(desk)
     assert is_so(desk.machine.sync.synced)
@@ -383,23 +383,23 @@ def test_a_change_by_another_station() -> None:
 
 
 @pytest.mark.parametrize(
-    ("heard", "by"),
+    ("received", "by"),
     [
         pytest.param(3.0, "station 254/190", id="its value"),
         pytest.param(2.0, "us", id="our value"),
         pytest.param(2.5, "us", id="an adjustment"),
     ],
 )
-def test_a_change_while_our_write_and_another_stations_are_under_way(heard: float, by: str) -> None:
+def test_a_change_while_our_write_and_another_stations_are_under_way(received: float, by: str) -> None:
     desk = Desk()
     desk.hear("A", 1.0)
     desk.machine.write("A", 2.0, desk.now)
     desk.machine.foreign_set("A", struct.pack("<f", 3.0), "station 254/190", desk.now)
-    desk.hear("A", heard)
+    desk.hear("A", received)
     assert [change.by for change in desk.changes] == ["vehicle", by]
 
 
-def test_an_old_set_of_another_station_is_not_the_author_of_what_comes_of_our_write() -> None:
+def test_an_old_set_of_another_station_is_not_the_author_of_our_write() -> None:
     desk = Desk()
     desk.hear("A", 1.0)
     desk.machine.foreign_set("A", struct.pack("<f", 3.0), "station 254/190", desk.now)
@@ -513,7 +513,7 @@ def test_an_unidentified_component_is_written_to_by_the_standard() -> None:
 # hashes
 
 
-def test_after_our_write_the_hash_is_asked_for_once_things_have_settled() -> None:
+def test_after_our_write_the_hash_is_requested_once_things_have_settled() -> None:
     desk = Desk()
     fetched(desk)
     desk.machine.write("A", 7.0, desk.now)
@@ -574,7 +574,7 @@ def test_during_further_writes_a_hash_means_nothing() -> None:
     assert desk.machine.sync.synced
 
 
-def test_a_vehicle_without_a_hash_is_not_asked_for_it() -> None:
+def test_no_hash_is_requested_from_a_vehicle_without_one() -> None:
     for heartbeat in (ARDUPILOT, SOMETHING):
         desk = Desk(heartbeat)
         desk.hear("A", 1.0)
@@ -584,7 +584,7 @@ def test_a_vehicle_without_a_hash_is_not_asked_for_it() -> None:
         assert HASH_CHECK not in desk.reads()
 
 
-def test_a_hash_that_the_vehicle_does_not_have_is_not_asked_for_again() -> None:
+def test_a_hash_that_the_vehicle_does_not_have_is_not_requested_again() -> None:
     desk = Desk()
     desk.hear("A", 1.0)
     desk.machine.sync.ask(desk.now)
@@ -602,7 +602,7 @@ def test_a_hash_that_the_vehicle_does_not_have_is_not_asked_for_again() -> None:
 
 
 @pytest.mark.parametrize("how", ["silence", "link"])
-def test_a_hash_that_was_not_heard_may_still_be_there(how: str) -> None:
+def test_a_hash_that_was_not_received_may_still_be_there(how: str) -> None:
     desk = Desk()
     desk.machine.sync.ask(desk.now)
     if how == "silence":
@@ -656,7 +656,7 @@ def test_values_received_before_the_cache_was_read_are_kept() -> None:
     assert table.hash == hash_params(listed(table)) != hash_params(params)
 
 
-def test_a_hash_that_cannot_be_computed_is_lost_when_something_has_moved() -> None:
+def test_a_hash_that_cannot_be_computed_is_dropped_after_a_change() -> None:
     desk = Desk()
     desk.hear("A", 9, ParamType.INT32, index=0, count=2)
     desk.cached(known("A", 1, index=0), known("B", 2, index=1), confirmed=77)
@@ -796,7 +796,7 @@ def test_two_vehicles_one_after_the_other() -> None:
 
 
 @pytest.mark.parametrize("make", [PX4Vehicle, GenericVehicle])
-def test_a_vehicle_that_takes_the_place_of_another_at_once_is_told_apart_by_its_table(
+def test_a_vehicle_that_takes_the_place_of_another_at_once_is_distinguished_by_its_table(
     make: Callable[..., Vehicle],
 ) -> None:
     first, second = make(uid=1, table={"A": 1, "B": 2}), make(uid=2, table={"A": 3, "C": 4})
@@ -808,7 +808,7 @@ def test_a_vehicle_that_takes_the_place_of_another_at_once_is_told_apart_by_its_
     second.reboot(world.now, down=0.0)
     result = world.fetch()
     world.until(lambda: world.machine.identity.uid == f"{2:016x}")
-    if result.params.keys() != {"A", "C"}:  # the answer came after the end
+    if result.params.keys() != {"A", "C"}:  # the answer arrived after the end
         result = world.fetch()
     assert {name: param.value for name, param in result.params.items()} == {"A": 3, "C": 4}
 
@@ -903,12 +903,12 @@ def test_hit_results_do_not_change_afterwards() -> None:
     assert replace(result, elapsed=0.0).params is result.params
 
 
-def test_upkeep_goes_on_when_a_vehicle_is_found_whose_count_had_moved() -> None:
+def test_sync_continues_when_a_vehicle_is_found_whose_count_has_changed() -> None:
     vehicle = ArduPilotVehicle(table={"A": 1, "B_ENABLE": 0}, groups={"B_ENABLE": {"B_X": 5}}, live=())
     station = Station(link="sim:test", is_stream=False, sync_settings=SyncSettings(30.0, without_hash=True))
     world = Simulation(vehicle, station=station)
     world.fetch()
-    world.run(10.0)  # so that its clock tells that it has started again
+    world.run(10.0)  # so that its clock shows that it has started again
     world.machine.table.change_count(1)
     vehicle._entry("B_ENABLE").store(1)
     vehicle.reboot(world.now, down=8.0)

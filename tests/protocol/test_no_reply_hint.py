@@ -102,8 +102,8 @@ def test_frames_of_unknown_senders() -> None:
 def test_many_senders_are_counted(station: Station, hear: Hear) -> None:
     for system in range(1, SENDERS_MAX + 20):
         hear(TEXT, system, 190)
-    told = hint_of_link(station, LINK)
-    assert told.endswith(f"5/190 without heartbeat and {SENDERS_MAX - LISTED_MAX} more.")
+    reported = hint_of_link(station, LINK)
+    assert reported.endswith(f"5/190 without heartbeat and {SENDERS_MAX - LISTED_MAX} more.")
 
 
 def test_a_link_that_is_down(station: Station, hear: Hear) -> None:

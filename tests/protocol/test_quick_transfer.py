@@ -43,7 +43,7 @@ def test_nothing_is_in_the_way_on_a_quick_link() -> None:
 
 @pytest.mark.parametrize("options", [{"burst": 1, "period": 0.125}, {"burst": 3}])
 def test_a_slow_list_is_a_slow_link(options: dict[str, Any]) -> None:
-    assert obstacle(fetched(**options)) == "the link is slow: its list came at less than 200 values/s"
+    assert obstacle(fetched(**options)) == "the link is slow: its list arrived at less than 200 values/s"
 
 
 def test_a_long_round_trip_is_a_slow_link() -> None:
@@ -60,7 +60,7 @@ def test_the_obstacle_of_an_armed_vehicle_ends_with_its_disarming() -> None:
     assert obstacle(world) is None
 
 
-def test_a_lost_vehicle_is_not_asked() -> None:
+def test_a_lost_vehicle_is_sent_no_request() -> None:
     vehicle = PX4Vehicle(table=TABLE)
     world = Simulation(vehicle)
     assert world.fetch().complete

@@ -42,7 +42,7 @@ STEP = 0.01
 
 
 class Lane:
-    """Someone who wants a turn; `run` lets the lists come that have begun."""
+    """A component that waits for a list; `run` delivers the values of the lists that have begun."""
 
     def __init__(self) -> None:
         self.began_at = math.inf
@@ -70,7 +70,7 @@ class Lane:
 
 
 class Road:
-    """Turns for so many lanes, asked for in their order."""
+    """Turns for so many lanes, requested in their order."""
 
     def __init__(self, lanes: int) -> None:
         self.now = 0.0
@@ -84,7 +84,7 @@ class Road:
         return sum(lane.is_running for lane in self.lanes)
 
     def run(self, steps: int = 1, *, room: float = math.inf, silent: int = 0) -> None:
-        """Let values come, on a link that takes so many lists; the first so many lanes keep silent."""
+        """Let values arrive, on a link that takes so many lists; the first so many lanes keep silent."""
         for _ in range(steps):
             self.now += STEP
             speaking = [lane for lane in self.lanes[silent:] if lane.is_running]
@@ -122,7 +122,7 @@ def test_with_room_twice_as_many_run_each_time() -> None:
     assert seen == [1, GROWTH, GROWTH**2, GROWTH**3, GROWTH**4, 20]
 
 
-def test_where_values_come_in_bursts_it_goes_faster() -> None:
+def test_where_values_arrive_in_bursts_lists_are_faster() -> None:
     road = Road(100)
     for lane in road.lanes:
         lane.is_bursty = True
@@ -134,7 +134,7 @@ def test_where_values_come_in_bursts_it_goes_faster() -> None:
 
 
 def bursty(lanes: int) -> Road:
-    """A link so fast that the values of a list come together."""
+    """A link so fast that the values of a list arrive together."""
     road = Road(lanes)
     for lane in road.lanes:
         lane.is_bursty = True
@@ -187,7 +187,7 @@ def test_where_all_of_many_bursts_lose_half_as_many_run() -> None:
 
 
 def test_while_all_bursts_are_awaited_nothing_is_due() -> None:
-    """Those that took the place of others are not new, so there is nothing to look at before one comes."""
+    """Those that took the place of others are not new, so there is nothing to measure before one arrives."""
     road = Road(40)
     for lane in road.lanes:
         lane.is_bursty = True
@@ -216,7 +216,7 @@ def test_a_list_in_the_place_of_another_delays_none() -> None:
     late = next(lane for lane in reversed(road.lanes) if lane.is_running)
     assert late.is_awaited
     waiting = road.lanes
-    road.lanes = [lane for lane in waiting if lane is not late]  # nothing comes of it
+    road.lanes = [lane for lane in waiting if lane is not late]  # no result
     road.until(40)
     assert road.now < late.silent_at
 
@@ -259,7 +259,7 @@ def test_no_list_begins_beside_others_while_unread_data_is_waiting() -> None:
         assert not road.turns.tick(road.now, lists_max=1)
     assert road.running == 1
     road.end(road.lanes[0])
-    assert road.turns.tick(road.now, lists_max=1), "else it would wait for nobody"
+    assert road.turns.tick(road.now, lists_max=1), "else it would wait without end"
     assert road.running == 1
     road.run()
     assert road.running == GROWTH_BURSTY
@@ -383,7 +383,7 @@ def test_a_list_that_stops_alone_changes_no_limit() -> None:
     assert road.running >= 2
 
 
-def test_a_turn_given_back_while_waiting_is_dropped() -> None:
+def test_a_turn_released_while_waiting_is_dropped() -> None:
     road = Road(3)
     road.turns.release(road.lanes[1])
     road.end(road.lanes[0])
@@ -550,7 +550,7 @@ def test_a_list_for_another_station_fills_the_table_of_a_waiting_fetch() -> None
     assert slow.result.complete
 
 
-def test_the_turns_go_on_when_the_link_was_away() -> None:
+def test_the_turns_go_on_when_the_link_was_disconnected() -> None:
     world = a_radio([MAKES["ArduPilot"](system) for system in (1, 2)])
     fetches = begin_all(world, 2)
     world.run(0.2)
@@ -580,7 +580,7 @@ def test_a_starved_vehicle_is_not_given_up_while_the_lists_of_others_fill_the_li
     world = a_radio([quick, starved])
     first, second = begin_all(world, 2)
     world.until(lambda: second.download is not None and second.download.received > 3)
-    heard = world.station.components[2, 1].round_trip
+    received = world.station.components[2, 1].round_trip
     hold = world.air.downlink.send
 
     def starve(data: bytes, now: float) -> None:
@@ -594,7 +594,7 @@ def test_a_starved_vehicle_is_not_given_up_while_the_lists_of_others_fill_the_li
     world.until(lambda: second.done)
     assert second.result is not None
     assert second.result.complete
-    assert heard.loss > 0.0
+    assert received.loss > 0.0
     assert len(world.sent_of(ParamRequestRead)) > 0
 
 
@@ -639,7 +639,7 @@ async def test_a_cancelled_fetch_makes_room_at_once() -> None:
 
 
 async def is_given_up(system: int) -> float:
-    """After how many seconds a vehicle that hears nothing is given up."""
+    """After how many seconds a vehicle that receives nothing is given up."""
     vehicle = Tap(PX4Vehicle(system=system, table=table(10)))
     vehicle.is_deaf = True
     async with ParamClient(vehicle, cache=False) as client:
@@ -668,7 +668,7 @@ def test_a_silent_list_delays_none_where_the_program_has_time_for_one() -> None:
     assert road.turns.tick(road.now, lists_max=1)
 
 
-def test_only_lists_that_come_on_other_links_are_beside_it() -> None:
+def test_only_lists_on_other_links_are_parallel() -> None:
     road = Road(1)
     [lane] = road.lanes
     road.turns.tick(road.now, lists_max=1)
@@ -728,7 +728,7 @@ def test_a_component_is_handled_at_its_deadline_and_looked_at_after_changes_only
     assert [timer.looks for timer in timers] == [2, 2, 4]
 
 
-def test_a_deadline_that_comes_back_is_handled_once() -> None:
+def test_a_deadline_that_returns_is_handled_once() -> None:
     scheduler = Scheduler()
     timer = Timer(scheduler, 1.0)
     for due in (2.0, 1.0, 2.0, 1.0):

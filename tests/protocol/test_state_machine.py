@@ -100,7 +100,7 @@ def ardupilot(size: int, **options: Unpack[Options]) -> Vehicle:
 
 
 def ardupilot_with_a_slow_list(size: int, **options: Unpack[Options]) -> Vehicle:
-    """A vehicle whose table is followed by single reads when a group comes or goes."""
+    """A vehicle whose table is followed by single reads when a group appears or disappears."""
     rows = [SimParam(f"A_{number:03}", ParamType.INT8, number % 100) for number in range(100)]
     inner = {f"ZX_{number}": float(number) for number in range(3)}
     group = {**{name: float(number) for number, name in enumerate(GROUP)}, INNER_SWITCH: 0}
@@ -212,7 +212,7 @@ class Subject:
         self.seen: FetchResult | None = None  # the last one that was looked at
         self.proved: int | None = None  # how much had been changed when the table was last seen to be right
 
-    def moved(self, now: float) -> None:
+    def changed(self, now: float) -> None:
         self.changes += 1
         self.changed_at = now
 
@@ -263,7 +263,7 @@ class Sessions(RuleBasedStateMachine):
 
     begun_sessions: ClassVar[int] = 0
     followed_tables: ClassVar[int] = 0
-    """Tables that single reads have followed after a group came or went."""
+    """Tables that single reads have followed after a group appeared or disappeared."""
 
     @initialize(**SWITCH_ON)
     def switch_on(
@@ -299,7 +299,7 @@ class Sessions(RuleBasedStateMachine):
         self.misfortunes = misfortunes
         self.sync_settings = sync_settings
         self.is_bad = self.is_never_good(link)  # whether the link can be to blame
-        self.may_overtake = link["reorder"] > 0 or link["duplicate"] > 0  # an old PARAM_SET may come late
+        self.may_overtake = link["reorder"] > 0 or link["duplicate"] > 0  # an old PARAM_SET may arrive late
         self.world = Simulation(air=air, station=self.new_station())
         self.names = [*INTEGERS[:size], *FLOATS[:size], *VOLATILE, SWITCH]
         self.switches = [SWITCH]
@@ -327,7 +327,7 @@ class Sessions(RuleBasedStateMachine):
 
     @rule(seconds=st.sampled_from([0.1, 3.0, 8.0, 30.0]))
     def the_link_is_dead_for_a_while(self, seconds: float) -> None:
-        self.nothing_is_heard(seconds)
+        self.stay_silent(seconds)
 
     @precondition(lambda self: self.is_known)
     @rule(refresh=st.booleans(), of_camera=st.sampled_from([False, False, True]))
@@ -339,7 +339,7 @@ class Sessions(RuleBasedStateMachine):
     @precondition(lambda self: self.is_known)
     @rule(refresh=st.booleans())
     def fetch_together(self, refresh: bool) -> None:
-        subjects = [subject for subject in self.subjects if self.is_heard(subject)]
+        subjects = [subject for subject in self.subjects if self.is_received(subject)]
         if any(self.machine_of(subject).presence.is_lost for subject in subjects):
             return
         machines = [self.machine_of(subject) for subject in subjects]
@@ -360,7 +360,7 @@ class Sessions(RuleBasedStateMachine):
     def set(self, data: st.DataObject, number: int) -> None:
         name = data.draw(st.sampled_from([*self.names, "NOT_THERE"]))
         subject = self.pick(data.draw(st.sampled_from([False, False, True])))
-        subject.moved(self.world.now)
+        subject.changed(self.world.now)
         subject.acts += 1
         self.begin(subject, lambda: self.machine_of(subject).write(name, number, self.world.now))
 
@@ -373,7 +373,7 @@ class Sessions(RuleBasedStateMachine):
         subject = self.pick(data.draw(st.sampled_from([False, False, True])))
         machine = self.machine_of(subject)
         is_alone = not len(machine.writes)
-        subject.moved(self.world.now)
+        subject.changed(self.world.now)
         subject.acts += 1
         acts = subject.acts if is_alone else None
         self.begin(subject, lambda: machine.write_many(pairs, self.world.now), acts=acts, pairs=pairs)
@@ -388,28 +388,28 @@ class Sessions(RuleBasedStateMachine):
     @rule(data=st.data(), number=st.integers(60, 90))
     def a_value_changes_on_board(self, data: st.DataObject, number: int) -> None:
         name = data.draw(st.sampled_from(self.names))
-        self.moved()
+        self.changed()
         self.vehicle.set_param(name, float(number) if name in FLOATS else number)
         if data.draw(st.booleans()):
-            self.nothing_is_heard(0.1)
+            self.stay_silent(0.1)
         self.world.exchange()
 
-    @rule(data=st.data(), number=st.integers(60, 90), is_heard=st.booleans())
-    def another_station_sets(self, data: st.DataObject, number: int, is_heard: bool) -> None:
+    @rule(data=st.data(), number=st.integers(60, 90), is_received=st.booleans())
+    def another_station_sets(self, data: st.DataObject, number: int, is_received: bool) -> None:
         name = data.draw(st.sampled_from(self.names))
-        self.moved()
+        self.changed()
         encoding = Encoding.C_CAST if isinstance(self.vehicle, ArduPilotVehicle) else Encoding.BYTEWISE
         kind = ParamType.REAL32 if name in FLOATS else ParamType.INT32
         raw = encode_value(float(number) if name in FLOATS else number, kind, encoding)
-        self.another_sends(wire.ParamSetMessage(1, 1, name, raw, kind), is_heard)
+        self.another_sends(wire.ParamSetMessage(1, 1, name, raw, kind), is_received)
 
-    @rule(is_heard=st.booleans(), component=st.sampled_from([0, 1]))
-    def another_station_lists(self, is_heard: bool, component: int) -> None:
-        self.another_sends(wire.ParamRequestList(1, component), is_heard)
+    @rule(is_received=st.booleans(), component=st.sampled_from([0, 1]))
+    def another_station_lists(self, is_received: bool, component: int) -> None:
+        self.another_sends(wire.ParamRequestList(1, component), is_received)
 
     @rule(data=st.data())
     def a_group_comes_or_goes(self, data: st.DataObject) -> None:
-        self.moved()
+        self.changed()
         self.toggle(data.draw(st.sampled_from(self.switches)))
         self.world.exchange()
 
@@ -427,7 +427,7 @@ class Sessions(RuleBasedStateMachine):
         count, lists = machine.table.count, len(self.world.sent_of(wire.ParamRequestList))
         self.become(link)
         for switch in switches:
-            self.moved()
+            self.changed()
             self.toggle(switch)
             self.world.run(pause)
         self.world.run(5.0)
@@ -443,7 +443,7 @@ class Sessions(RuleBasedStateMachine):
     )
     def something_happens_in_mid_stream(self, after: int, what: str, refresh: bool, then: float) -> None:
         def happen() -> None:
-            self.moved()
+            self.changed()
             if what == "group":
                 self.toggle()
             elif what == "value":
@@ -460,11 +460,11 @@ class Sessions(RuleBasedStateMachine):
     @precondition(lambda self: not self.is_dead)
     @rule(down=st.sampled_from([0.0, 0.5, 8.0, 25.0]), data=st.data())
     def reboot(self, down: float, data: st.DataObject) -> None:
-        """It may come back with other values: they were not saved, or its memory card is another one."""
+        """It may return with other values: they were not saved, or its memory card is another one."""
         for name in data.draw(st.lists(st.sampled_from(self.names), max_size=3)):
             entry = self.vehicle._entry(name)
             entry.store(entry.bits ^ 1)
-        self.moved()
+        self.changed()
         self.vehicle.reboot(self.world.now, down=down)
         self.back_at = self.world.now + down
         self.world.exchange()
@@ -488,7 +488,7 @@ class Sessions(RuleBasedStateMachine):
         for subject in self.subjects:
             subject.seen = subject.proved = None
             if subject.is_written:
-                subject.moved(self.world.now)
+                subject.changed(self.world.now)
         self.world.run(3.0)
         if self.is_known:
             self.world.machine.use_cached(now=self.world.now, **memory)
@@ -498,28 +498,28 @@ class Sessions(RuleBasedStateMachine):
     def the_vehicle_dies(self, is_over: bool) -> None:
         if not is_over:
             return
-        self.moved()
+        self.changed()
         self.vehicle.reboot(self.world.now, down=math.inf)
         self.is_dead = True
 
     @precondition(lambda self: self.is_known)
-    @rule(unheard=st.sampled_from(["", "value", "group", "reboot"]))
-    def all_is_calm_for_a_while(self, unheard: str) -> None:
+    @rule(change_silently=st.sampled_from(["", "value", "group", "reboot"]))
+    def all_is_calm_for_a_while(self, change_silently: str) -> None:
         """The link is good and nothing changes: after one interval, a table that is kept up is the vehicle's.
 
-        That goes for a change of which nothing was heard too.
+        That goes for a change of which nothing was received too.
         """
         self.become_calm()
         self.kept_up_is_true()
-        if unheard and not self.is_dead:
-            self.moved()
-            if unheard == "value":
+        if change_silently and not self.is_dead:
+            self.changed()
+            if change_silently == "value":
                 self.vehicle.set_param(INTEGERS[0], 777)
-            elif unheard == "group":
+            elif change_silently == "group":
                 self.toggle()
             else:
                 self.vehicle.reboot(self.world.now)
-            self.nothing_is_heard(0.5)
+            self.stay_silent(0.5)
             self.become_calm()
             self.kept_up_is_true()
 
@@ -545,7 +545,7 @@ class Sessions(RuleBasedStateMachine):
         That it cannot where the link loses nothing, and not for as long as nothing changes after a download.
         """
         for subject in getattr(self, "subjects", []):
-            if self.is_heard(subject):
+            if self.is_received(subject):
                 self.look(subject)
         if hasattr(self, "world"):
             self.looked_at = self.world.now
@@ -581,9 +581,9 @@ class Sessions(RuleBasedStateMachine):
         self.synced_is_true()
         self.kept_up_is_true()
         for subject in self.subjects:
-            if self.is_heard(subject):
+            if self.is_received(subject):
                 self.the_end_of(subject)
-        self.nothing_is_asked_without_end()
+        self.requests_end()
 
     def the_end_of(self, subject: Subject) -> None:
         machine = self.machine_of(subject)
@@ -600,9 +600,9 @@ class Sessions(RuleBasedStateMachine):
             assert set(result.missing) == (set() if result.source == "ftp" else silent), "a file has them all"
             self.compare(subject, result)
 
-    def nothing_is_asked_without_end(self) -> None:
+    def requests_end(self) -> None:
         world = self.world
-        # one value after the other under one name looks like a late answer, which is asked for again
+        # one value after the other under one name looks like a late answer, which is requested again
         is_flapping = len(self.vehicle.params) < len(self.vehicle.listed) and world.air.others
         if self.sync_settings.interval == math.inf and not is_flapping:
             world.run(SETTLING)
@@ -619,9 +619,9 @@ class Sessions(RuleBasedStateMachine):
 
     @property
     def is_known(self) -> bool:
-        return hasattr(self, "world") and self.is_heard(self.subject)
+        return hasattr(self, "world") and self.is_received(self.subject)
 
-    def is_heard(self, subject: Subject) -> bool:
+    def is_received(self, subject: Subject) -> bool:
         return subject.address in self.world.station.components
 
     def machine_of(self, subject: Subject) -> ComponentMachine:
@@ -629,7 +629,7 @@ class Sessions(RuleBasedStateMachine):
 
     def pick(self, of_camera: bool) -> Subject:
         last = self.subjects[-1]
-        return last if of_camera and self.is_heard(last) else self.subject
+        return last if of_camera and self.is_received(last) else self.subject
 
     def is_never_good(self, link: Link) -> bool:
         return link["loss"] > 0 or link["rate"] is not None
@@ -643,7 +643,7 @@ class Sessions(RuleBasedStateMachine):
             for what, value in link.items():
                 setattr(way, f"_{what}", value)
 
-    def nothing_is_heard(self, seconds: float) -> None:
+    def stay_silent(self, seconds: float) -> None:
         self.is_bad = True
         air = self.world.air
         before = air.uplink._loss, air.downlink._loss
@@ -652,7 +652,7 @@ class Sessions(RuleBasedStateMachine):
         air.uplink._loss, air.downlink._loss = before
 
     def fetch_all_there_is(self) -> None:
-        subjects = [subject for subject in self.subjects if self.is_heard(subject)]
+        subjects = [subject for subject in self.subjects if self.is_received(subject)]
         machines = [self.machine_of(subject) for subject in subjects]
         if any(machine.presence.is_lost for machine in machines):
             return
@@ -675,19 +675,19 @@ class Sessions(RuleBasedStateMachine):
             world.run(self.sync_settings.interval + LOOK)
             world.until(lambda: not world.station.is_waiting, LIMIT)
 
-    def another_sends(self, message: wire.Message, is_heard: bool) -> None:
+    def another_sends(self, message: wire.Message, is_received: bool) -> None:
         world = self.world
         data = wire.encode(message, system=253, component=190, sequence=0)
         world.air.receive(data, world.now)
-        if is_heard:
+        if is_received:
             world.air.downlink.send(data, world.now)
         world.exchange()
 
     def toggle(self, switch: str = SWITCH) -> None:
         self.vehicle.set_param(switch, 1 - min(int(self.vehicle.param(switch).bits), 1))
 
-    def moved(self) -> None:
-        self.subject.moved(self.world.now)
+    def changed(self) -> None:
+        self.subject.changed(self.world.now)
         self.subject.acts += 1
 
     def begin(
@@ -698,7 +698,7 @@ class Sessions(RuleBasedStateMachine):
         acts: int | None = None,
         pairs: Sequence[tuple[str, int]] = (),
     ) -> None:
-        """Begin something; of a component that is lost, nothing can be asked."""
+        """Begin something; of a component that is lost, nothing can be requested."""
         try:
             operation = call()
         except NoReply:
@@ -726,11 +726,11 @@ class Sessions(RuleBasedStateMachine):
         operation = begun.operation
         if isinstance(operation, Write):
             machine.writes.cancel(operation, self.world.now)
-            begun.subject.moved(self.world.now)
+            begun.subject.changed(self.world.now)
             begun.subject.acts += 1
         elif isinstance(operation, WriteBatch):
             machine.write_batches.end(operation, self.world.now)
-            begun.subject.moved(self.world.now)
+            begun.subject.changed(self.world.now)
             begun.subject.acts += 1
         elif isinstance(operation, Fetch):
             machine.end_fetch(operation, self.world.now)
@@ -773,7 +773,7 @@ class Sessions(RuleBasedStateMachine):
         machine = self.machine_of(subject)
         is_written = len(machine.writes) > 0
         if is_written or subject.is_written:
-            subject.moved(self.world.now)
+            subject.changed(self.world.now)
         subject.is_written = is_written
         result = machine.fetches.last
         if result is not None and result is not subject.seen:
@@ -784,19 +784,19 @@ class Sessions(RuleBasedStateMachine):
                 subject.proved = subject.changes
         if machine.sync.synced and subject.proved == subject.changes:
             self.compare_table(subject, machine.table.params)
-        # where nothing is lost, all that was pushed has come; the generic vehicle pushes nothing
-        tells = subject is not self.subject or not isinstance(subject.vehicle, GenericVehicle)
+        # where nothing is lost, all that was pushed has arrived; the generic vehicle pushes nothing
+        reports = subject is not self.subject or not isinstance(subject.vehicle, GenericVehicle)
         is_settled = self.world.now - max(subject.changed_at, self.back_at) > SETTLING
-        if machine.sync.synced and not self.is_bad and tells and is_settled:
+        if machine.sync.synced and not self.is_bad and reports and is_settled:
             self.compare_table(subject, machine.table.params)
 
     def kept_up_is_true(self) -> None:
-        """Tables that are followed without being asked are the vehicles' by now."""
+        """Tables that are followed without requests are the vehicles' by now."""
         sync_settings = self.sync_settings
         if sync_settings.interval == math.inf or sync_settings.policy is not Policy.AUTO:
             return
         for subject in self.subjects:
-            if not self.is_heard(subject) or (
+            if not self.is_received(subject) or (
                 subject is self.subject and (self.is_dead or self.is_incomplete)
             ):
                 continue
@@ -815,7 +815,7 @@ class Sessions(RuleBasedStateMachine):
         )
 
     def compare(self, subject: Subject, result: FetchResult) -> None:
-        """Nothing has moved for a while: then what was fetched is what the vehicle has."""
+        """Nothing has changed for a while: then what was fetched is what the vehicle has."""
         vehicle = subject.vehicle
         assert result.count == len(vehicle.listed)
         self.compare_table(subject, result.params, is_volatile_old=result.source == "cache")
@@ -857,7 +857,8 @@ TestSessions.settings = SETTINGS
 
 
 class GroupSessions(Sessions):
-    """Sessions with a table that is kept up, and that single reads follow when a group comes or goes."""
+    """Sessions with a table that is kept up, and that single reads follow when a group appears or
+    disappears."""
 
     @initialize(
         **{

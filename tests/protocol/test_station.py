@@ -1,4 +1,4 @@
-"""The station on one link: who is heard, who gets what, our heartbeat, and several of everything."""
+"""The station on one link: which components are found, routing, our heartbeat, and several vehicles."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def frame(message: Message, system: int = 1, component: int = 1, *, version: int
 
 
 def sent(station: Station) -> list[tuple[Message, int, object]]:
-    """What goes out: message, MAVLink version, and for whom."""
+    """The sent messages: message, MAVLink version, and addressee."""
     framer = Framer(wire.DECODED_IDS, stream=False)
     out = []
     for data, peer in station.data_to_send():
@@ -68,7 +68,7 @@ def hear(
 # our heartbeat
 
 
-def test_our_heartbeat_comes_once_a_second() -> None:
+def test_our_heartbeat_is_sent_once_a_second() -> None:
     station = a_station()
     beats = []
     now = 0.0
@@ -107,7 +107,7 @@ def test_frames_are_numbered_and_counted() -> None:
     assert station.data_to_send() == []
 
 
-# who is heard
+# Which components are found
 
 
 def test_a_component_is_met_by_its_heartbeat_or_a_value() -> None:
@@ -135,7 +135,7 @@ def telemetry(system: int = 1, component: int = 1, *, version: int = 2) -> bytes
 
 
 def heartbeat_requests(station: Station) -> list[tuple[int, int, object]]:
-    """Of whom the heartbeat was requested, and to which peer that went."""
+    """The components whose heartbeat was requested, and the peers of the requests."""
     return [
         (message.target_system, message.target_component, peer)
         for message, _, peer in sent(station)
@@ -145,7 +145,7 @@ def heartbeat_requests(station: Station) -> list[tuple[int, int, object]]:
 
 
 @pytest.mark.parametrize("is_stream", [False, True])
-def test_a_vehicle_that_sends_telemetry_is_asked_for_its_heartbeat(is_stream: bool) -> None:
+def test_the_heartbeat_of_a_vehicle_that_sends_telemetry_is_requested(is_stream: bool) -> None:
     station = a_station(is_stream=is_stream)
     assert station.receive(telemetry(4), "there", 0.0)
     assert heartbeat_requests(station) == [(4, 1, "there")]
@@ -170,7 +170,7 @@ def test_a_heartbeat_ends_that_also_of_a_component_that_is_known_by_a_value() ->
     assert heartbeat_requests(station) == []
 
 
-def test_a_vehicle_that_never_sends_a_heartbeat_is_not_asked_for_ever() -> None:
+def test_requests_to_a_vehicle_without_heartbeats_end() -> None:
     station = a_station()
     for step in range(1000):
         station.receive(telemetry(4), "there", 0.1 * step)
@@ -178,13 +178,13 @@ def test_a_vehicle_that_never_sends_a_heartbeat_is_not_asked_for_ever() -> None:
 
 
 @pytest.mark.parametrize("is_stream", [False, True])
-def test_while_others_are_looked_for_each_that_speaks_is_asked_for_its_heartbeat(is_stream: bool) -> None:
+def test_during_a_search_the_heartbeat_of_every_sender_is_requested(is_stream: bool) -> None:
     station = a_station(is_stream=is_stream)
     hear(station, PX4, 4)
     sent(station)
     with station.looking_for_others(), station.looking_for_others():
         station.receive(telemetry(4), "there", 1.0)
-        assert heartbeat_requests(station) == [], "it was heard"
+        assert heartbeat_requests(station) == [], "it was received"
         for step in range(100):
             station.receive(telemetry(5), "there", 1.0 + 0.1 * step)
             station.receive(telemetry(4), "here", 1.0 + 0.1 * step)
@@ -207,7 +207,7 @@ def test_a_ground_station_does_not_stand_in_the_way_of_that() -> None:
 
 
 @pytest.mark.parametrize(("system", "component"), [(1, 100), (0, 1), (255, 190)])
-def test_only_an_autopilot_is_asked_for_its_heartbeat(system: int, component: int) -> None:
+def test_only_the_heartbeat_of_an_autopilot_is_requested(system: int, component: int) -> None:
     station = a_station()
     assert not station.receive(telemetry(system, component), "there", 0.0)
     assert heartbeat_requests(station) == []
@@ -280,7 +280,7 @@ def test_is_waiting_while_a_response_is_expected() -> None:
     assert not station.is_waiting
 
 
-def test_a_ground_station_is_not_asked_for_anything() -> None:
+def test_nothing_is_requested_from_a_ground_station() -> None:
     station = a_station()
     hear(station, GCS, 254, 190)
     assert sent(station) == []
@@ -293,7 +293,7 @@ def test_components_have_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     for component in range(1, 50):
         hear(station, PX4, 1, component)
     assert len(station.components) == 5
-    hear(station, param_value("A"), 1, 3)  # those that are known are heard
+    hear(station, param_value("A"), 1, 3)  # known components are processed
     assert "A" in station.components[1, 3].table.params
 
 
@@ -334,7 +334,7 @@ def test_the_end_of_a_stream_forgets_its_rest_and_its_peer() -> None:
     for system in (1, 2):
         station.components[system, 1].read("A", 0.0)
     requests = [peer for message, _, peer in sent(station) if isinstance(message, ParamRequestRead)]
-    assert requests == ["b"], "no other peer is asked for what has gone"
+    assert requests == ["b"], "nothing is requested from another peer"
 
 
 def test_the_end_of_a_stream_gives_out_what_is_whole() -> None:
@@ -363,7 +363,7 @@ def test_unfinished_streams_have_a_bound(monkeypatch: pytest.MonkeyPatch) -> Non
     assert len(station._framers) == 3
 
 
-def test_requests_go_to_the_peer_that_was_heard_first_until_it_is_silent() -> None:
+def test_requests_go_to_the_first_peer_until_it_is_silent() -> None:
     station = a_station()
     station.receive(frame(PX4), "here", 0.0)
     station.receive(frame(PX4, 2, 1), "there", 0.0)
@@ -415,19 +415,19 @@ def test_a_param_set_of_another_station_is_attributed_to_its_targets() -> None:
     hear(station, PX4, 2, 1)
     for system, component in ((1, 1), (1, 0), (0, 0), (2, 2)):
         hear(station, ParamSetMessage(system, component, f"P{system}{component}", bytes(4), 9), 254, 190)
-    told = {}
+    reported = {}
     for address, machine in station.components.items():
         for name in ("P11", "P10", "P00", "P22"):
             hear(station, param_value(name), *address)
-        told[address] = [machine._authors.of(name, 0.0) for name in ("P11", "P10", "P00", "P22")]
+        reported[address] = [machine._authors.of(name, 0.0) for name in ("P11", "P10", "P00", "P22")]
     other = "station 254/190"
-    assert told[1, 1] == [other, other, other, "vehicle"]
-    assert told[1, 2] == ["vehicle", other, other, "vehicle"]
-    assert told[2, 1] == ["vehicle", "vehicle", other, "vehicle"]
+    assert reported[1, 1] == [other, other, other, "vehicle"]
+    assert reported[1, 2] == ["vehicle", other, other, "vehicle"]
+    assert reported[2, 1] == ["vehicle", "vehicle", other, "vehicle"]
     assert (254, 190) not in station.components
 
 
-def test_our_own_sets_that_come_back_are_not_another_stations() -> None:
+def test_our_own_echoed_sets_are_not_those_of_another_station() -> None:
     station = a_station()
     hear(station, PX4)
     hear(station, ParamSetMessage(1, 1, "A", bytes(4), 9), 255, 190)
@@ -437,7 +437,7 @@ def test_our_own_sets_that_come_back_are_not_another_stations() -> None:
 # pause and resume
 
 
-def test_while_the_link_is_away_time_stands_still() -> None:
+def test_timeouts_pause_while_the_link_is_disconnected() -> None:
     station = a_station(is_stream=True)
     station.receive(frame(PX4), "a", 0.0)
     station.receive(frame(PX4)[:5], "a", 0.0)
@@ -459,7 +459,7 @@ def test_while_the_link_is_away_time_stands_still() -> None:
     assert read.done
 
 
-def test_when_the_link_is_gone_everybody_is_told() -> None:
+def test_every_waiting_call_ends_with_the_link() -> None:
     station = a_station()
     for system in (1, 2):
         hear(station, PX4, system, 1)
@@ -555,7 +555,7 @@ def settle(world: Simulation, count: int) -> None:
     world.sent.clear()
 
 
-def test_all_components_of_a_system_are_asked_with_one_list() -> None:
+def test_one_list_request_reaches_all_components_of_a_system() -> None:
     vehicles = [GenericVehicle(rows("A", 30)), GenericVehicle(rows("B", 20), component=100)]
     world = Simulation(*vehicles)
     settle(world, 2)
@@ -566,14 +566,14 @@ def test_all_components_of_a_system_are_asked_with_one_list() -> None:
     assert lists(world) == [(1, 0)]
 
 
-def test_a_component_that_loses_the_common_list_is_asked_alone() -> None:
+def test_a_component_that_loses_the_common_list_gets_its_own_request() -> None:
     deaf = GenericVehicle(rows("B", 20), component=100, boot_time=0.0)
     on_list = deaf._on_list
-    heard: list[int] = []
+    received: list[int] = []
 
     def first_one_is_lost() -> None:
-        heard.append(1)
-        if len(heard) > 1:
+        received.append(1)
+        if len(received) > 1:
             on_list()
 
     deaf._on_list = first_one_is_lost  # type: ignore[method-assign]  # a loss for one of two
@@ -583,7 +583,7 @@ def test_a_component_that_loses_the_common_list_is_asked_alone() -> None:
     assert lists(world) == [(1, 0), (1, 100)]
 
 
-def test_some_of_the_components_are_asked_one_by_one() -> None:
+def test_some_of_the_components_get_a_request_each() -> None:
     vehicles = [GenericVehicle(rows("A", 5), component=component) for component in (1, 2, 3)]
     world = Simulation(*vehicles)
     settle(world, 3)
@@ -604,7 +604,7 @@ def test_a_list_under_way_is_not_started_again_for_others() -> None:
     assert lists(world) == [(1, 1), (1, 2)]
 
 
-def test_with_a_hash_to_ask_for_each_is_asked_alone() -> None:
+def test_components_with_a_hash_get_a_request_each() -> None:
     vehicles = [PX4Vehicle(table=rows("A", 5)), GenericVehicle(rows("B", 5), component=2)]
     world = Simulation(*vehicles)
     settle(world, 2)
@@ -673,7 +673,7 @@ def test_a_write_reaches_the_one_it_is_for() -> None:
     assert [vehicle.param("SAME").value for vehicle in vehicles] == [1, 7]
 
 
-def test_identities_are_told_for_each() -> None:
+def test_identities_are_reported_for_each() -> None:
     world = Simulation(PX4Vehicle(), ArduPilotVehicle(system=9))
     settle(world, 2)
     identified = [event.machine for event in world.events if isinstance(event, ComponentIdentified)]
@@ -681,7 +681,7 @@ def test_identities_are_told_for_each() -> None:
     assert all(isinstance(machine, ComponentMachine) for machine in identified)
 
 
-def test_a_cached_table_of_one_is_not_asked_of_all() -> None:
+def test_a_cached_table_of_one_component_needs_no_common_list() -> None:
     world = Simulation(PX4Vehicle(table=rows("A", 5)), GenericVehicle(rows("B", 5), component=2))
     settle(world, 2)
     machine = world.station.components[1, 1]

@@ -33,7 +33,7 @@ GCS = Heartbeat(MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID)
 
 
 class Listening:
-    """A station that hears what a test says, from 0 s on, and is asked whose component is chosen."""
+    """A station that receives the messages of a test from 0 s on, and chooses a component."""
 
     def __init__(self, link: str = "x") -> None:
         self.station = Station(link=link, is_stream=False)
@@ -106,7 +106,7 @@ def test_a_vehicle_heard_after_the_choice_is_found_by_the_next_check(listening: 
     assert "2/1 PX4 plane" in listening.refused(6.4)
 
 
-def test_the_look_begins_anew_when_the_link_was_away(listening: Listening) -> None:
+def test_the_look_begins_anew_when_the_link_was_disconnected(listening: Listening) -> None:
     listening.hear(PX4, 5.0).hear(PX4, 6.0)
     listening.station.pause()
     choice = VehicleChoice(None, None)
@@ -198,7 +198,7 @@ def test_a_system_that_is_named_means_its_component_1_at_once(listening: Listeni
     assert listening.chosen(5.0, system=2) == (2, 1)
 
 
-def test_a_system_whose_component_1_comes_late_still_means_that(listening: Listening) -> None:
+def test_a_system_whose_component_1_is_found_late_still_means_that(listening: Listening) -> None:
     listening.hear(ROVER, 5.0, 2, 2)
     assert listening.chosen(5.9, system=2) is None
     listening.hear(PLANE, 5.95, 2, 1)

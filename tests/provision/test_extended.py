@@ -82,16 +82,16 @@ async def test_what_differs_is_written_and_read_back(tmp_path: Path, path: Path)
     with ParamCache(path) as cache:
         async with a_client(camera, cache=cache) as client:
             component = await the_camera(client)
-            told: list[ExtSetOutcome] = []
+            reported: list[ExtSetOutcome] = []
             result = await apply_extended(
                 component,
                 wanted(camera, MODE=2, NAME="Rear", KEY=b"\xff\0\xfe", CLOCK=2**62 + 3),
                 backup=tmp_path / "before.yaml",
-                progress=told.append,
+                progress=reported.append,
             )
             assert result.complete
             assert [each.name for each in result.outcomes] == ["MODE", "NAME", "CLOCK"]
-            assert sorted(each.name for each in told) == ["CLOCK", "MODE", "NAME"]
+            assert sorted(each.name for each in reported) == ["CLOCK", "MODE", "NAME"]
             assert camera.ext_values["CLOCK"] == 2**62 + 3
             before = read_extended_file(tmp_path / "before.yaml")
             assert before.params["CLOCK"].value == 2**62 + 1
@@ -110,7 +110,7 @@ async def test_what_differs_is_written_and_read_back(tmp_path: Path, path: Path)
 
 
 @in_simulated_time
-async def test_what_the_component_changes_or_refuses_is_told(path: Path) -> None:
+async def test_adjusted_and_refused_values_are_reported(path: Path) -> None:
     camera = small()
     async with a_client(camera, cache=path) as client:
         component = await the_camera(client)
@@ -193,17 +193,17 @@ async def test_without_a_cache_there_are_no_earlier_states() -> None:
 @in_simulated_time
 async def test_what_is_done_before_writing_may_end_the_call(path: Path) -> None:
     camera = small()
-    asked = []
+    requested = []
 
     async def refuse() -> None:
-        asked.append(camera.ext_values["MODE"])
+        requested.append(camera.ext_values["MODE"])
         raise UsageError("not now")
 
     async with a_client(camera, cache=path) as client:
         component = await the_camera(client)
         with pytest.raises(UsageError, match="not now"):
             await apply_extended(component, wanted(camera, MODE=2), before_writing=refuse)
-        assert (asked, await component.ext.snapshots()) == ([1], [])
+        assert (requested, await component.ext.snapshots()) == ([1], [])
         assert (await apply_extended(component, wanted(camera, MODE=1), before_writing=refuse)).complete
 
 

@@ -204,7 +204,7 @@ def test_px4_calibration_options_are_settings(name: str) -> None:
     assert only_row(plan(held(**{name: 1}), written(**{name: 2}), autopilot="px4"))[0] is PlanStatus.SET
 
 
-def test_a_parameter_that_resets_all_others_comes_first_and_needs_a_reboot() -> None:
+def test_a_parameter_that_resets_all_others_is_first_and_needs_a_reboot() -> None:
     table, wanted = held(RTL_ALT=1500, FORMAT_VERSION=120), written(RTL_ALT=2000, FORMAT_VERSION=0)
     assert order(plan(table, wanted, autopilot="ardupilot")) == [["RTL_ALT"]]
     made = plan(table, wanted, autopilot="ardupilot", include="action")

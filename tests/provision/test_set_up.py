@@ -221,13 +221,13 @@ async def test_the_verification_is_requested_after_the_last_write(make: Callable
     tap = Tap(make())
     async with a_client(tap) as client:
         assert (await apply(await client.component(), written(another()))).complete
-    messages = [message for _, _, message in tap.heard]
+    messages = [message for _, _, message in tap.received]
     last = max(place for place, message in enumerate(messages) if isinstance(message, wire.ParamSetMessage))
-    asked = messages[last + 1 :]
+    requested = messages[last + 1 :]
     if make is ardupilot:
-        assert any(isinstance(message, wire.FileTransfer) for message in asked)
+        assert any(isinstance(message, wire.FileTransfer) for message in requested)
     else:
-        hashes = [message for message in asked if isinstance(message, wire.ParamRequestRead)]
+        hashes = [message for message in requested if isinstance(message, wire.ParamRequestRead)]
         assert {message.param_id for message in hashes} == {wire.HASH_CHECK}
 
 
@@ -280,11 +280,11 @@ async def test_the_verification_reads_the_values_with_every_cache_policy(
             result = await apply(await client.component(), written(another("TUNE_01", "TUNE_04")))
         assert result.complete
         (kept,) = cache.snapshots(cache.vehicles()[0].key)
-    messages = [message for _, _, message in tap.heard]
+    messages = [message for _, _, message in tap.received]
     last = max(place for place, message in enumerate(messages) if isinstance(message, wire.ParamSetMessage))
-    asked = {each.param_id for each in messages[last + 1 :] if isinstance(each, wire.ParamRequestRead)}
+    requested = {each.param_id for each in messages[last + 1 :] if isinstance(each, wire.ParamRequestRead)}
     by_hash = make is px4 and policy == "hash-only"
-    assert asked == ({wire.HASH_CHECK} if by_hash else {"TUNE_01", "TUNE_04"})
+    assert requested == ({wire.HASH_CHECK} if by_hash else {"TUNE_01", "TUNE_04"})
     assert not kept.complete  # values that were only cached are not in it
 
 
@@ -339,7 +339,7 @@ async def test_two_downloads_suffice_for_any_file(ftp: bool) -> None:
             assert vehicle.param(name).value == value
         for name in ("EK2_ENABLE", "TUNE_01"):
             vehicle.set_param(name, 0)
-        tap.heard.clear()
+        tap.received.clear()
         began = anyio.current_time()
         result = await apply(component, written(another() | hidden | unknown))
         assert {row.name for row in result.rows.values() if row.category == MISSING} == unknown.keys()
@@ -387,7 +387,7 @@ async def four_groups(
     async with a_client(Air([tap], uplink=ways[0], downlink=ways[1])) as client:
         component = await client.component()
         await anyio.sleep(delay)
-        tap.heard.clear()
+        tap.received.clear()
         yield component, tap, wanted
         assert {name: vehicle.param(name).value for name in wanted} == wanted
 
@@ -412,7 +412,7 @@ async def test_with_packet_loss_four_groups_take_two_downloads_and_six_seconds(
         began = anyio.current_time()
         result = await apply(component, written(wanted))
         elapsed = anyio.current_time() - began
-        await anyio.sleep(5.0)  # neither the count that has moved nor the boot is a reason for more
+        await anyio.sleep(5.0)  # neither the count that has changed nor the boot is a reason for more
         downloaded = whole_tables(tap)
     assert result.complete, result
     assert set(statuses(result).values()) == {"set"}
@@ -460,13 +460,13 @@ async def test_members_of_a_group_to_reveal_are_requested_during_the_file_downlo
     async with a_client(tap) as client:
         component = await client.component()
         await anyio.sleep(10.0)  # what it measures at its start has been read
-        tap.heard.clear()
+        tap.received.clear()
         result = await apply(component, written(wanted))
     assert result.complete
     assert statuses(result) == dict.fromkeys(wanted, "set")
     assert downloads(tap) == 2
     way = wire.FileTransfer if ftp else wire.ParamRequestList
-    sent = [message for _, _, message in tap.heard]
+    sent = [message for _, _, message in tap.received]
     sent = sent[: next(at for at, message in enumerate(sent) if isinstance(message, wire.ParamSetMessage))]
     reads = [each for each in sent if isinstance(each, wire.ParamRequestRead) and each.param_index < 0]
     last_of_table = max(at for at, message in enumerate(sent) if isinstance(message, way))
@@ -494,11 +494,11 @@ async def test_a_group_that_cannot_be_read_by_name_is_set_once_it_is_revealed() 
     vehicle = ardupilot(HidingGroup)
     wanted = written({"EK2_GPS_TYPE": 3, "TUNE_01": 9.0, "EK2_ENABLE": 1, "EK2_NO_SUCH": 1})
     tap = Tap(vehicle)
-    asked: list[int] = []
+    requested: list[int] = []
 
     def count(progress: ApplyProgress) -> None:
         reads = tap.messages(wire.ParamRequestRead)
-        asked.append(sum(message.param_id == "EK2_NO_SUCH" for message in reads))
+        requested.append(sum(message.param_id == "EK2_NO_SUCH" for message in reads))
 
     async with a_client(tap) as client:
         component = await client.component()
@@ -507,7 +507,7 @@ async def test_a_group_that_cannot_be_read_by_name_is_set_once_it_is_revealed() 
         result = await apply(component, wanted, progress=count)
         count(ApplyProgress("over", 0, 0))
     # missing names were requested again after others had been revealed, and the whole table was not
-    assert asked[0] < asked[1] < asked[-1]
+    assert requested[0] < requested[1] < requested[-1]
     assert downloads(tap) == 3  # one for the plan, one before the first write, one for the verification
     assert statuses(result) == {
         "EK2_GPS_TYPE": "set",
@@ -573,11 +573,11 @@ async def test_every_written_value_records_its_author(bring: Callable[..., Any])
         wanted = written({"TUNE_01": 8.0, "TUNE_02": 9.0, "MAV_SYS_ID": 7})
         result = await bring(component, wanted, include="identity", author="anna@10.0.0.2")
         assert set(statuses(result).values()) == {"set"}
-        told = {}
+        reported = {}
         with anyio.move_on_after(1.0):
             async for change in changes:
-                told[change.name] = change.by
-    assert told == dict.fromkeys(wanted, "us for anna@10.0.0.2")
+                reported[change.name] = change.by
+    assert reported == dict.fromkeys(wanted, "us for anna@10.0.0.2")
     async with a_client(Air([px4(), px4(system=2)])) as client:
         components = [await client.component(1), await client.component(2)]
         feeds = [each.changes() for each in components]
@@ -610,13 +610,13 @@ async def test_a_wrong_include_is_raised_before_the_vehicle_is_read() -> None:
     tap = Tap(ardupilot())
     async with a_client(tap) as client:
         component = await client.component()
-        asked = len(tap.messages(wire.ParamRequestRead))
+        requested = len(tap.messages(wire.ParamRequestRead))
         for call in (apply, prepare):
             with pytest.raises(UsageError, match="neither a glob"):
                 await call(component, written({"TUNE_01": 1}), include="everything")
             with pytest.raises(UsageError, match="component 100"):
                 await call(component, written({"TUNE_01": 1}, component=100))
-        assert len(tap.messages(wire.ParamRequestRead)) == asked
+        assert len(tap.messages(wire.ParamRequestRead)) == requested
 
 
 @in_simulated_time
@@ -727,15 +727,15 @@ async def test_before_writing_may_end_the_call_for_one_of_several_vehicles() -> 
 
 @in_simulated_time
 async def test_progress_is_reported() -> None:
-    told: list[ApplyProgress] = []
+    reported: list[ApplyProgress] = []
     async with a_client(ardupilot()) as client:
-        await apply(await client.component(), written(another()), progress=told.append)
-    phases = list(dict.fromkeys(each.phase for each in told))
+        await apply(await client.component(), written(another()), progress=reported.append)
+    phases = list(dict.fromkeys(each.phase for each in reported))
     assert phases == ["reading", "writing"]
-    done = [each.done for each in told if each.phase == "writing"]
+    done = [each.done for each in reported if each.phase == "writing"]
     assert done == list(range(1, len(SETTINGS) + 1))
-    assert {each.total for each in told if each.phase == "writing"} == {len(SETTINGS)}
-    assert {each.row.name for each in told if each.row is not None} == set(SETTINGS)
+    assert {each.total for each in reported if each.phase == "writing"} == {len(SETTINGS)}
+    assert {each.row.name for each in reported if each.row is not None} == set(SETTINGS)
 
 
 @in_simulated_time
@@ -849,8 +849,8 @@ async def test_restore_skips_measured_and_read_only_parameters() -> None:
         result = await restore(component, before)
         assert result.complete
         assert set(sets(tap)) == {"LOCKED", "TUNE_01"}
-        told = {row.name: (row.category, row.actual) for row in result.shown_rows}
-        assert told == {
+        reported = {row.name: (row.category, row.actual) for row in result.shown_rows}
+        assert reported == {
             "TUNE_01": ("", 0.25),
             "BARO1_GND_PRESS": ("read-only", 9.0),
             "BARO1_DEVID": ("read-only", 7),
@@ -913,14 +913,14 @@ async def test_several_vehicles_are_set_up_concurrently() -> None:
         }
         with pytest.raises(UsageError, match="no wanted parameters are given for vehicle 3/1"):
             await apply_all(components, {address: over[address] for address in [(1, 1), (2, 1)]})
-        told: list[tuple[int, str]] = []
+        reported: list[tuple[int, str]] = []
         applied = await apply_all(
-            components, over, progress=lambda component, how: told.append((component.system, how.phase))
+            components, over, progress=lambda component, how: reported.append((component.system, how.phase))
         )
         assert list(applied.results) == [(1, 1), (2, 1)]
         assert isinstance(applied.errors[3, 1], InvalidParameters)
         assert not applied.complete
-        assert {system for system, phase in told if phase == "writing"} == {1, 2}
+        assert {system for system, phase in reported if phase == "writing"} == {1, 2}
         assert vehicles[1].param("TUNE_02").value == 42.0
         verified = await verify_all(components, lambda component: over[component.system, 1])
         assert [plan.is_met for plan in verified.results.values()] == [True, True, False]
@@ -942,16 +942,16 @@ async def test_several_vehicles_are_restored_each_to_its_own_state() -> None:
         with pytest.raises(UsageError, match="no wanted parameters are given for vehicle 3/1"):
             await restore_all(components, {address: before[address] for address in [(1, 1), (2, 1)]})
         assert [vehicle.param("TUNE_02").value for vehicle in vehicles] == [42.0] * 3
-        told: set[int] = set()
+        reported: set[int] = set()
         restored = await restore_all(
             components,
             before | {(2, 1): before[1, 1]},
-            progress=lambda component, _: told.add(component.system),
+            progress=lambda component, _: reported.add(component.system),
         )
         assert list(restored.results) == [(1, 1), (3, 1)]
         assert str(restored.errors[2, 1]).startswith("the state is that of another vehicle")
         assert not restored.complete
-        assert told == {1, 3}
+        assert reported == {1, 3}
         assert [vehicle.param("TUNE_02").value for vehicle in vehicles] == [11.0, 42.0, 13.0]
         assert (await restore_all(components, lambda each: before[each.system, 1])).complete
         assert vehicles[1].param("TUNE_02").value == 12.0
@@ -1034,11 +1034,11 @@ async def test_a_reboot_follows_values_that_take_effect_after_it() -> None:
         assert awaiting_reboot.rows["EK2_ALT_M_NSE"].category == MISSING
         plan = await prepare(component, wanted)
         assert plan.awaiting_reboot == ("EK2_ENABLE",)
-        told: list[str] = []
-        result = await apply(component, wanted, reboot=True, progress=lambda how: told.append(how.phase))
+        reported: list[str] = []
+        result = await apply(component, wanted, reboot=True, progress=lambda how: reported.append(how.phase))
     assert result.complete
     assert (result.reboots, result.reboot_required) == (1, ())
-    assert list(dict.fromkeys(told)) == ["reading", "rebooting", "writing"]
+    assert list(dict.fromkeys(reported)) == ["reading", "rebooting", "writing"]
     assert vehicle.param("EK2_ALT_M_NSE").value == 1.5
 
 
@@ -1048,9 +1048,9 @@ async def test_a_change_too_small_for_px4_is_reported_with_the_value_after_the_r
     near = from_bits(bits_of(0.25, ParamType.REAL32) + 1, ParamType.REAL32)
     async with a_client(vehicle) as client:
         component = await client.component()
-        told = await apply(component, written({"TUNE_01": near}))
-        assert told.complete
-        assert told.rows["TUNE_01"].reason == (
+        reported = await apply(component, written({"TUNE_01": near}))
+        assert reported.complete
+        assert reported.rows["TUNE_01"].reason == (
             "PX4 takes a change of at most 1.19e-07 for none: its next start may bring 0.25 back"
         )
         result = await apply(component, written({"TUNE_01": near, "SYS_HITL": 1}), reboot=True)
@@ -1147,7 +1147,7 @@ async def test_a_changed_system_id_is_followed(make: Callable[..., Any]) -> None
         assert client.components[7, 1].state == "synced"
         await anyio.sleep(5.0)  # what is measured at a start is read again
         assert residue(component) == []
-        # and back to the old id, under which it was heard just before
+        # and back to the old id, under which it was present just before
         undone = await restore(client.components[7, 1], result.before, reboot=True)
     assert undone.complete
     assert (undone.system, vehicle.system) == (1, 1)
@@ -1242,8 +1242,8 @@ async def test_parameters_that_may_end_the_connection_are_written_one_by_one() -
     async with a_client(tap) as client:
         wanted = written({"SYSID_THISMAV": 7, "SYSID_ENFORCE": 1})
         assert (await apply(await client.component(), wanted, include="identity")).complete
-    heard = [(at, message) for at, _, message in tap.heard if isinstance(message, wire.ParamSetMessage)]
-    times = {message.param_id: at for at, message in reversed(heard)}
+    received = [(at, message) for at, _, message in tap.received if isinstance(message, wire.ParamSetMessage)]
+    times = {message.param_id: at for at, message in reversed(received)}
     assert times["SYSID_ENFORCE"] + 0.001 < times["SYSID_THISMAV"]
 
 
@@ -1343,7 +1343,7 @@ class EndpointWithEvent(Tap):
 
     def receive(self, data: bytes, now: float) -> None:
         super().receive(data, now)
-        if len(self.heard) >= self._frames > 0:
+        if len(self.received) >= self._frames > 0:
             self._frames = 0
             self._happen()
 
@@ -1416,7 +1416,7 @@ def test_the_next_run_completes_after_an_interruption_anywhere(
     path = tmp_path_factory.mktemp("cache") / "cache.sqlite3"
 
     @in_simulated_time
-    async def told() -> None:
+    async def reported() -> None:
         story = Scenario(kind)
         before = story.truth()
         wanted = {name: param.value for name, param in story.wanted.items()}
@@ -1444,7 +1444,7 @@ def test_the_next_run_completes_after_an_interruption_anywhere(
                 assert ends == (before[name], wanted.get(name, before[name])), steps
                 assert all(old != new for old, new in steps)
 
-    told()
+    reported()
 
 
 @EVERY_KIND
@@ -1460,7 +1460,7 @@ async def test_a_file_of_another_autopilot_is_refused_before_the_vehicle_is_read
             with pytest.raises(UsageError, match="are those of a vehicle with"):
                 await call(component, other)
     assert not {wire.ParamSetMessage, wire.ParamRequestRead, wire.ParamRequestList} & {
-        type(message) for _, _, message in tap.heard
+        type(message) for _, _, message in tap.received
     }
 
 
@@ -1513,10 +1513,10 @@ async def test_the_verification_begins_after_the_verify_delay() -> None:
     tap = Tap(px4())
     async with a_client(tap) as client:
         assert (await apply(await client.component(), written(another()))).complete
-    sets = [at for at, _, message in tap.heard if isinstance(message, wire.ParamSetMessage)]
+    sets = [at for at, _, message in tap.received if isinstance(message, wire.ParamSetMessage)]
     hashes = [
         at
-        for at, _, message in tap.heard
+        for at, _, message in tap.received
         if isinstance(message, wire.ParamRequestRead) and message.param_id == wire.HASH_CHECK
     ]
     assert hashes[-1] - sets[-1] >= VERIFY_DELAY
@@ -1574,7 +1574,7 @@ def tuned(vehicle: ArduPilotVehicle, count: int) -> ParamSet:
 
 def reads_after_the_last_set(tap: Tap) -> list[str]:
     """Return the names that were read by name after the last write."""
-    messages = [message for _, _, message in tap.heard]
+    messages = [message for _, _, message in tap.received]
     last = max(place for place, message in enumerate(messages) if isinstance(message, wire.ParamSetMessage))
     return [each.param_id for each in messages[last + 1 :] if isinstance(each, wire.ParamRequestRead)]
 

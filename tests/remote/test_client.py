@@ -68,13 +68,13 @@ class Network(httpx.AsyncBaseTransport):
 
     Attributes:
         app: the service that answers, or None while there is none.
-        asked: the requests that have gone over it: method and path.
-        is_held: nothing of an answer comes through.
+        requested: the requests over it: method and path.
+        is_held: no part of a response arrives.
     """
 
     def __init__(self, app: ASGIApp | None) -> None:
         self.app = app
-        self.asked: list[str] = []
+        self.requested: list[str] = []
         self.is_held = False
         self._cut = asyncio.Event()
         self._released = asyncio.Event()
@@ -95,7 +95,7 @@ class Network(httpx.AsyncBaseTransport):
     async def handle_async_request(self, request: httpx.Request) -> httpx.Response:
         if self.app is None:
             raise httpx.ConnectError("connection refused")
-        self.asked.append(f"{request.method} {request.url.path}")
+        self.requested.append(f"{request.method} {request.url.path}")
         transport = ASGITransport(self.app)
         cut = self._cut
         response = await self._unless(cut, transport.handle_async_request(request))
@@ -228,7 +228,7 @@ async def test_two_programs_that_fetch_at_once_cause_one_download() -> None:
 
 
 @in_simulated_time
-async def test_a_program_that_leaves_ends_the_download_of_nobody_else() -> None:
+async def test_a_program_that_leaves_ends_no_download_of_another_program() -> None:
     vehicle = generic(burst=1, period=0.1)
     async with a_service(vehicle) as network, a_program(network) as one, a_program(network) as other:
         leaving = asyncio.create_task((await one.component()).fetch_all())
@@ -265,8 +265,8 @@ async def test_two_that_set_one_name_are_put_in_order_and_each_learns_what_happe
         sent = [int.from_bytes(each.raw, "little") for each in tap.messages(wire.ParamSetMessage)]
         assert sent == [10, 11]
         assert first.params["PARAM_01"].value == second.params["PARAM_01"].value == 11
-        told = await anext(changes)
-        assert (told.name, told.new and told.new.value, told.by) == ("PARAM_01", 11, "us")
+        reported = await anext(changes)
+        assert (reported.name, reported.new and reported.new.value, reported.by) == ("PARAM_01", 11, "us")
 
 
 @in_simulated_time
@@ -379,7 +379,7 @@ async def test_calls_that_a_service_lacks_raise_usage_errors() -> None:
         for call in refused:
             with pytest.raises(UsageError, match="a service does not give"):
                 call()
-        for asked in (
+        for requested in (
             component.setup_signing(SigningKey(bytes(range(32))), link_is_safe=True),
             metadata_of(component),
             client.link.open(),
@@ -387,7 +387,7 @@ async def test_calls_that_a_service_lacks_raise_usage_errors() -> None:
             client.link.send(b"", None),
         ):
             with pytest.raises(UsageError, match="a service does not give"):
-                await asked
+                await requested
         assert not hasattr(component, "nothing_such")
         assert not hasattr(client, "nothing_such")
 
@@ -398,11 +398,11 @@ async def test_a_restart_of_a_vehicle_goes_over_the_service() -> None:
     async with a_service(vehicle) as network, a_program(network) as client:
         component = await client.component()
         await component.set("MAV_SYS_ID", 7)
-        moved = await component.reboot(system=7)
-        assert (moved.system, moved.component) == (7, 1)
-        assert moved is client.components[7, 1]
+        changed = await component.reboot(system=7)
+        assert (changed.system, changed.component) == (7, 1)
+        assert changed is client.components[7, 1]
         with pytest.raises((NoReply, AnotherVehicle)):
-            await client.successor(moved, 9, timeout=1.0)
+            await client.successor(changed, 9, timeout=1.0)
     armed = PX4Vehicle(table={"PARAM_01": 1}, armed=True)
     async with a_service(armed) as network, a_program(network) as client:
         component = await client.component()
@@ -412,7 +412,7 @@ async def test_a_restart_of_a_vehicle_goes_over_the_service() -> None:
         assert type(caught.value).__name__ == "CommandRefused"
 
 
-# Services that go and come
+# Services that restart
 
 
 @in_simulated_time
@@ -451,9 +451,9 @@ async def test_a_service_that_starts_again_in_the_middle() -> None:
             await component.fetch_all()
             assert component.params["PARAM_01"].value == 1001
             assert trusts(component) == {Trust.LIVE}
-            told = {change.name: change async for change in _waiting(changes)}
-            assert told["PARAM_01"].new is not None
-            assert told["PARAM_01"].new.value == 1001
+            reported = {change.name: change async for change in _waiting(changes)}
+            assert reported["PARAM_01"].new is not None
+            assert reported["PARAM_01"].new.value == 1001
             assert not [event for event in events._waiting if isinstance(event, Discovered)]
 
 
@@ -475,7 +475,7 @@ async def test_a_connection_that_breaks_loses_nothing_and_loads_nothing_anew() -
         await component.fetch_all()
         changes = component.changes()
         read = asyncio.create_task(component.get("PARAM_07"))
-        network.asked.clear()
+        network.requested.clear()
         app = network.app
         network.cut(for_good=True)
         for value in (100, 101):
@@ -486,12 +486,12 @@ async def test_a_connection_that_breaks_loses_nothing_and_loads_nothing_anew() -
         network.app = app
         assert (await read).value == 7
         assert trusts(component) == {Trust.LIVE}
-        told = [await anext(changes), await anext(changes)]
-        assert sorted((each.name, each.new and each.new.value) for each in told) == [
+        reported = [await anext(changes), await anext(changes)]
+        assert sorted((each.name, each.new and each.new.value) for each in reported) == [
             ("PARAM_01", 101),
             ("PARAM_02", 101),
         ]
-        assert not [asked for asked in network.asked if asked.endswith("/params")]
+        assert not [requested for requested in network.requested if requested.endswith("/params")]
 
 
 @in_simulated_time
@@ -510,7 +510,7 @@ async def test_a_network_that_falls_silent_is_noticed() -> None:
 
 
 @in_simulated_time
-async def test_a_service_that_stays_away(caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_service_that_stays_unreachable(caplog: pytest.LogCaptureFixture) -> None:
     async with a_service(small_px4()) as network, a_program(network) as client:
         component = await client.component()
         app = network.app
@@ -538,8 +538,8 @@ async def test_a_service_that_stays_away(caplog: pytest.LogCaptureFixture) -> No
         network.app = app
         await asyncio.sleep(reconnect_delays.RECONNECT_BACKOFF_MAX + 0.1)
         assert (await component.set("PARAM_01", 5)).actual == 5
-    told = [each.getMessage() for each in caplog.records if each.name.startswith("paramclient.remote")]
-    assert len([text for text in told if "reconnecting" in text]) == 1
+    reported = [each.getMessage() for each in caplog.records if each.name.startswith("paramclient.remote")]
+    assert len([text for text in reported if "reconnecting" in text]) == 1
 
 
 @in_simulated_time
@@ -557,7 +557,7 @@ async def test_a_write_whose_answer_is_lost_is_not_sent_again() -> None:
         assert "it is unknown whether PARAM_SET PARAM_01 to 1/1 was done" in str(error)
         tap.is_mute = False
         await asyncio.sleep(3.0)
-        assert network.asked.count("PATCH /api/v1/components/1/1/params") == 1
+        assert network.requested.count("PATCH /api/v1/components/1/1/params") == 1
         assert (await component.get("PARAM_01")).value == 5
 
 
@@ -578,15 +578,15 @@ async def test_a_slow_listener_that_has_missed_events_loads_anew() -> None:
                     await own.get(f"PARAM_{value % 24:02}")
             await own.fetch_all(refresh=True)
             assert values(component) != values(own)
-            network.asked.clear()
+            network.requested.clear()
             network.release()
             await asyncio.sleep(1.0)
-            assert "GET /api/v1/components/1/1/params" in network.asked
+            assert "GET /api/v1/components/1/1/params" in network.requested
             assert values(component) == values(own)
 
 
 @in_simulated_time
-async def test_the_links_of_a_service_may_be_away() -> None:
+async def test_the_links_of_a_service_may_be_disconnected() -> None:
     link = FlakyLink(small_px4())
     async with a_service(("tcp:flaky:5760", lambda: a_client(link))) as network, a_program(network) as client:
         component = await client.component()
@@ -613,7 +613,7 @@ async def next_of(kind: Any, events: Events) -> Any:
     raise AssertionError("events have no end")
 
 
-# Those that are none, or let nobody in
+# Addresses without a service, or without access
 
 
 def answering(status: int, body: bytes, kind: str = "text/html", **headers: str) -> ASGIApp:
@@ -663,7 +663,7 @@ async def test_a_service_that_does_not_respond_is_given_up() -> None:
 
 
 @in_simulated_time
-async def test_a_wrong_token_is_told_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_wrong_token_is_reported_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("PARAMCLIENT_TOKEN", raising=False)
     async with a_hub(generic()) as hub:
         network = Network(create_app(hub, Settings(access=AccessSettings(tokens=tokens()))))

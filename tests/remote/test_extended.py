@@ -1,4 +1,4 @@
-"""Extended parameters over a service: exact values, several programs, and services that go and come."""
+"""Extended parameters over a service: exact values, several programs, and services that restart."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ def trusts(component: Component) -> set[Trust]:
 @given(st.integers(1, 255), st.binary(max_size=128), st.sampled_from(Trust))
 def test_a_parameter_loses_no_bit_on_the_way(kind: int, data: bytes, trust: Trust) -> None:
     param = ExtParam.of("PARAM", own_bytes(data, kind), kind, 3, trust)
-    came = ext_param_of(json.loads(json.dumps(ExtParamDoc.kept(param).as_json(), allow_nan=False)))
-    assert came == param
-    assert (repr(came.value), came.type) == (repr(param.value), param.type)
+    received = ext_param_of(json.loads(json.dumps(ExtParamDoc.kept(param).as_json(), allow_nan=False)))
+    assert received == param
+    assert (repr(received.value), received.type) == (repr(param.value), param.type)
 
 
 @in_simulated_time
@@ -100,7 +100,7 @@ async def test_many_values_go_out_in_several_requests() -> None:
         assert result.is_complete
         assert len(result.outcomes) == 1001
         assert camera.ext_values == wanted | {"T0000": "last"}
-        assert network.asked.count("PATCH /api/v1/components/1/100/extended/params") == 3
+        assert network.requested.count("PATCH /api/v1/components/1/100/extended/params") == 3
 
 
 @in_simulated_time
@@ -152,12 +152,12 @@ async def test_a_connection_that_breaks_loses_nothing_and_loads_nothing_anew() -
         assert trusts(component) == {Trust.CACHED}
         async with a_program(offline) as third:
             await (await third.component(1, 100)).ext.set("PARAM_01", 100)
-        network.asked.clear()
+        network.requested.clear()
         network.app = app
         change = await anext(changes)
         assert (change.name, change.new and change.new.value) == ("PARAM_01", 100)
         assert trusts(component) == {Trust.LIVE}
-        assert not [asked for asked in network.asked if asked.endswith("/params")]
+        assert not [requested for requested in network.requested if requested.endswith("/params")]
         assert other.components
 
 
@@ -173,10 +173,10 @@ async def test_a_write_whose_answer_is_lost_is_not_sent_again() -> None:
             write = asyncio.create_task(outcome(call))
             await asyncio.sleep(0.05)
             network.cut()
-            told = await write
+            reported = await write
             tap.is_mute = False
             await asyncio.sleep(3.0)
-            return told
+            return reported
 
         one = await lost(ext.set("PARAM_01", 5))
         assert isinstance(one, LinkError)
@@ -185,7 +185,7 @@ async def test_a_write_whose_answer_is_lost_is_not_sent_again() -> None:
         assert isinstance(many, ExtSetManyResult)
         assert many.outcomes[0].status is SetStatus.UNKNOWN
         assert "PARAM_EXT_SET to 1/100 was done" in str(many.error)
-        assert network.asked.count("PATCH /api/v1/components/1/100/extended/params") == 2
+        assert network.requested.count("PATCH /api/v1/components/1/100/extended/params") == 2
 
 
 STEPS = ["change", "change", "set", "get", "fetch", "remove", "cut", "down", "up", "restart", "wait", "wait"]
@@ -254,7 +254,7 @@ class EarlierService:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        assert "extended" not in scope["path"], "it is not asked for them"
+        assert "extended" not in scope["path"], "no extended parameters are requested"
 
         async def send_less(message: Message) -> None:
             lines = message.get("body", b"").decode().split("\n")

@@ -56,17 +56,17 @@ def stream(*events: bytes) -> list[bytes]:
 
 
 def component(**changed: Any) -> dict[str, Any]:
-    """What a service tells of a vehicle."""
+    """The document of a vehicle that a service returns."""
     numbers = ("system", "autopilot", "vehicle_type", "firmware", "board", "vendor_id", "product_id")
     identity = dict.fromkeys(numbers, 1) | {"capabilities": 0, "link": "a", "uid": None, "git_hash": ""}
-    told = {"link": "a", "system": 1, "component": 1, "identity": identity, "autopilot": "px4"}
-    told |= {"encoding": "bytewise", "encoding_reason": "", "count": 1, "hash": None, "state": "new"}
-    told |= {"sync_state": "unsynced", "is_armed": None, "silence_s": 0.0, "round_trip_s": None}
-    return told | {"last_fetch": None} | changed
+    reported = {"link": "a", "system": 1, "component": 1, "identity": identity, "autopilot": "px4"}
+    reported |= {"encoding": "bytewise", "encoding_reason": "", "count": 1, "hash": None, "state": "new"}
+    reported |= {"sync_state": "unsynced", "is_armed": None, "silence_s": 0.0, "round_trip_s": None}
+    return reported | {"last_fetch": None} | changed
 
 
-def components(*told: object) -> list[bytes]:
-    return document({"run": RUN, "seq": 0, "components": list(told)})
+def components(*reported: object) -> list[bytes]:
+    return document({"run": RUN, "seq": 0, "components": list(reported)})
 
 
 GOOD: dict[str, Sent] = {
@@ -139,7 +139,7 @@ def answers_with(
     return sent
 
 
-AWAY = [b"HTTP/1.1 307 Away\r\nLocation: /api/v1/events\r\nContent-Length: 0\r\n\r\n"]
+REDIRECT = [b"HTTP/1.1 307 Away\r\nLocation: /api/v1/events\r\nContent-Length: 0\r\n\r\n"]
 DEEP = b"[" * 100_000
 WIDE = b"[" + b"[]," * DOCUMENT_VALUES_MAX + b"1]"
 EVENTS = head("text/event-stream")
@@ -174,7 +174,7 @@ REFUSED = {"error": "Refused", "detail": "x", "system": 1, "component": 1}
         ("/events", answers_with(EVENTS, [b":"], 0.02), "sends no more events"),
         ("/events", answers_with(b"HTTP/1.1 200 OK\r\n", [b"X: y\r\n" * 1_000]), "too long|too large|many"),
         ("/events", answers_with(b"HTTP/1.1 200 OK\r\nX: ", [b"y" * 65_536]), "too long|too large|many"),
-        ("/events", AWAY, "not as a service"),
+        ("/events", REDIRECT, "not as a service"),
         (
             "/links",
             [b"HTTP/1.1 307 Away\r\nLocation: /api/v1/links\r\nContent-Length: 0\r\n\r\n"],
@@ -240,7 +240,7 @@ async def test_opening_a_client_of_a_hostile_service_raises_link_error(
         [],
     ],
 )
-async def test_an_error_that_it_tells_of_is_one_of_ours(problem: object) -> None:
+async def test_an_error_that_the_service_reports_is_one_of_ours(problem: object) -> None:
     body = json.dumps(problem).encode()
     refuse = [b"HTTP/1.1 409 No\r\nContent-Type: application/problem+json\r\nConnection: close\r\n\r\n", body]
     with pytest.raises(ParamClientError) as caught:
@@ -250,7 +250,7 @@ async def test_an_error_that_it_tells_of_is_one_of_ours(problem: object) -> None
 
 @pytest.mark.asyncio
 async def test_invalid_responses_to_background_loads_end_no_program() -> None:
-    """Tables are loaded beside the program; whatever comes of that is told by the calls that need them."""
+    """Tables are loaded beside the program; errors are raised by the calls that need them."""
     refuse = [b"HTTP/1.1 401 No\r\nContent-Type: application/problem+json\r\nContent-Length: 2\r\n\r\n{}"]
     async with hostile({"/components/1/1/params": refuse}) as url, ParamClient(url) as client:
         await asyncio.sleep(0.2)
@@ -262,8 +262,8 @@ async def test_invalid_responses_to_background_loads_end_no_program() -> None:
 @pytest.mark.asyncio
 @pytest.mark.parametrize("changed", [{"name": {}}, {"name": None}, {"bits": []}, {"index": "x"}, {"type": 5}])
 async def test_a_parameter_that_is_none_is_an_error(changed: dict[str, object]) -> None:
-    told = {"name": "A", "value": 1, "type": "INT32", "index": 0, "bits": "1", "trust": "live"}
-    answers = {"/components/1/1/read": document(told | changed), "/find": document(component())}
+    reported = {"name": "A", "value": 1, "type": "INT32", "index": 0, "bits": "1", "trust": "live"}
+    answers = {"/components/1/1/read": document(reported | changed), "/find": document(component())}
     answers["/components/1/1/params"] = document({"run": RUN, "seq": 0, "params": {}})
 
     async def read(client: ParamClient) -> None:
@@ -288,7 +288,7 @@ async def test_a_transport_may_have_read_the_answer() -> None:
     def answer(request: httpx.Request) -> httpx.Response:
         if request.url.path.endswith("/events"):
             return httpx.Response(200, headers={"Content-Type": "text/event-stream"}, stream=Open())
-        told = {
+        reported = {
             "links": [],
             "run": RUN,
             "seq": 0,
@@ -296,7 +296,7 @@ async def test_a_transport_may_have_read_the_answer() -> None:
             "author": "local",
             "params": {},
         }
-        return httpx.Response(200, json=told)
+        return httpx.Response(200, json=reported)
 
     async with RemoteClient("http://127.0.0.1:1", transport=httpx.MockTransport(answer)) as client:
         assert list(client.components) == [(1, 1)]
@@ -336,7 +336,7 @@ def test_depth() -> None:
                 checked_document(opening * depth + b"[]" + closing * depth)
 
 
-def test_an_event_that_comes_byte_by_byte_costs_no_more_than_one_at_once() -> None:
+def test_an_event_received_byte_by_byte_costs_no_more_than_one_at_once() -> None:
     """Each piece is looked at once, however long the line is to which it belongs."""
     reader = EventReader()
     for _ in range(EVENT_BYTES_MAX // 8):
@@ -353,7 +353,7 @@ def test_an_event_of_many_lines_is_bounded() -> None:
 
 
 @pytest.mark.parametrize("encoding", ["gzip", "deflate"])
-def test_encodings_that_are_asked_for_are_decoded(encoding: str) -> None:
+def test_encodings_that_are_requested_are_decoded(encoding: str) -> None:
     data = bytes(range(256)) * 1_000
     packed = gzip.compress(data) if encoding == "gzip" else zlib.compress(data)
     decode = decoder_of(encoding)
@@ -387,9 +387,9 @@ async def test_components_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(roster, "SERVICE_COMPONENTS_MAX", 2)
     events = [HELLO]
     for number in range(1, 6):
-        told = {"run": RUN, "seq": number, "at": 0.0, "type": "component", "why": "discovered"}
-        told |= {"link": "a", "system": number, "component": 1, "component_doc": component(system=number)}
-        events.append(json.dumps(told).encode())
+        reported = {"run": RUN, "seq": number, "at": 0.0, "type": "component", "why": "discovered"}
+        reported |= {"link": "a", "system": number, "component": 1, "component_doc": component(system=number)}
+        events.append(json.dumps(reported).encode())
     async with hostile({"/events": stream(*events)}) as url:
         with contextlib.suppress(LinkError):
             async with ParamClient(url) as client:

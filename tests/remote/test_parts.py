@@ -62,7 +62,7 @@ from paramclient.remote.service_client import ServiceClient
 
 IN_INTERFACE = {"aclose", "open", "reset"}
 """Calls that the interface itself implements, by other calls."""
-WHOM: dict[str, Any] = {"system": 1, "component": 1}
+ADDRESS: dict[str, Any] = {"system": 1, "component": 1}
 
 
 # Addresses
@@ -207,20 +207,20 @@ def test_a_parameter_loses_no_bit_on_the_way(kind: ParamType, data: st.DataObjec
     bits = data.draw(st.integers(0, (1 << 8 * kind.size) - 1))
     param = a_param(kind, bits, is_raw=False)
     param = a_param(kind, bits, is_raw=False, default=param.value)
-    came = through_json(param)
-    assert came == param
-    assert repr(came.value) == repr(param.value)
-    assert repr(came.default) == repr(param.default)
-    assert came.is_changed is False
-    assert came.trust is Trust.VERIFIED
+    received = through_json(param)
+    assert received == param
+    assert repr(received.value) == repr(param.value)
+    assert repr(received.default) == repr(param.default)
+    assert received.is_changed is False
+    assert received.trust is Trust.VERIFIED
 
 
 @given(st.sampled_from([1, 6, 8, 77, 255]), st.integers(0, 2**32 - 1))
 def test_raw_bytes_stay_raw(kind: int, bits: int) -> None:
     param = a_param(kind, bits, is_raw=True)
-    came = through_json(param)
-    assert (came, came.value, came.is_raw) == (param, param.value, True)
-    assert type_name(came.type_number) == type_name(param.type_number)
+    received = through_json(param)
+    assert (received, received.value, received.is_raw) == (param, param.value, True)
+    assert type_name(received.type_number) == type_name(param.type_number)
 
 
 @pytest.mark.parametrize("value", [0, -(2**63), 2**64, 2.0, -0.0, 1e300, math.inf, -math.inf, math.nan])
@@ -237,19 +237,19 @@ def test_raw_bytes_are_written_in_the_order_of_the_message() -> None:
 
 ERRORS: list[ParamClientError] = [
     UsageError("nothing such"),
-    UnknownParameter("gone", **WHOM, name="A"),
-    UnknownParameter("gone", **WHOM, index=7),
-    Refused("no", **WHOM, code=5, name="A"),
+    UnknownParameter("gone", **ADDRESS, name="A"),
+    UnknownParameter("gone", **ADDRESS, index=7),
+    Refused("no", **ADDRESS, code=5, name="A"),
     CommandRefused(1, 1, 246, 1),
-    TypeMismatch("no", **WHOM, name="A"),
-    ValueNotApplied("no", **WHOM, name="A", requested=1.5, actual=b"\x01\x02\x03\x04"),
-    ValueNotApplied("no", **WHOM, name="A", requested=3, actual=math.inf),
-    ValueNotApplied("no", **WHOM, name="A", requested="0x01", actual=b"\x00\xff" * 9),
-    ValueNotApplied("no", **WHOM, name="A", requested="NaN", actual=2**64 - 1),
-    ExtSetRefused("no", **WHOM, name="A", code=9),
-    ValueUnsupported("no", **WHOM, name="A", code=1),
-    SetFailed("no", **WHOM, name="A", code=2),
-    VehicleArmed("no", **WHOM),
+    TypeMismatch("no", **ADDRESS, name="A"),
+    ValueNotApplied("no", **ADDRESS, name="A", requested=1.5, actual=b"\x01\x02\x03\x04"),
+    ValueNotApplied("no", **ADDRESS, name="A", requested=3, actual=math.inf),
+    ValueNotApplied("no", **ADDRESS, name="A", requested="0x01", actual=b"\x00\xff" * 9),
+    ValueNotApplied("no", **ADDRESS, name="A", requested="NaN", actual=2**64 - 1),
+    ExtSetRefused("no", **ADDRESS, name="A", code=9),
+    ValueUnsupported("no", **ADDRESS, name="A", code=1),
+    SetFailed("no", **ADDRESS, name="A", code=2),
+    VehicleArmed("no", **ADDRESS),
     AnotherVehicle(1, 1, "this", "that"),
     NoReply("A of 1/1", attempts=4, waited=2.1234),
     NoReply("an autopilot", attempts=0, waited=2.0, hint="Nothing was received on udpin:0.0.0.0:14550."),
@@ -266,24 +266,24 @@ def test_an_error_is_the_same_on_both_sides(error: ParamClientError) -> None:
     from paramclient.service.problems import problem_of
 
     problem = problem_of(error).as_json()
-    came = error_of(json.loads(json.dumps(problem)), status=problem["status"], link="http://h:1")
-    assert type(came) is type(error)
-    assert str(came) == str(error)
-    assert vars(came) == vars(error)
+    received = error_of(json.loads(json.dumps(problem)), status=problem["status"], link="http://h:1")
+    assert type(received) is type(error)
+    assert str(received) == str(error)
+    assert vars(received) == vars(error)
 
 
 def test_a_problem_that_no_exception_stands_behind() -> None:
-    def told(kind: str, status: int) -> ParamClientError:
+    def reported(kind: str, status: int) -> ParamClientError:
         problem = {"type": f"urn:paramclient:{kind}", "detail": "So it is."}
         return error_of(problem, status=status, link="http://h:1")
 
     for kind, status in (("forbidden", 403), ("invalid-request", 422), ("ambiguous", 409)):
-        error = told(kind, status)
+        error = reported(kind, status)
         assert type(error) is UsageError
         assert str(error) == "So it is."
-    assert isinstance(told("unknown-component", 404), NoReply)
+    assert isinstance(reported("unknown-component", 404), NoReply)
     for kind, status in (("internal", 500), ("too-many", 429)):
-        error = told(kind, status)
+        error = reported(kind, status)
         assert type(error) is LinkError
         assert str(error) == "http://h:1: So it is."
     assert (
@@ -345,7 +345,7 @@ def test_events_before_a_loaded_table_are_dropped_and_later_ones_applied() -> No
     assert shown(mirror) == {}
 
 
-def test_a_first_table_is_no_change_and_a_later_one_tells_what_is_different() -> None:
+def test_a_first_table_is_no_change_and_a_later_one_gives_the_differences() -> None:
     mirror = Mirror()
     assert loaded(mirror, 1, param(1), param(2, name="B"), param(3, name="C")) == []
     mirror.doubt()
@@ -368,7 +368,7 @@ def test_added_and_removed_names_are_reported_as_such() -> None:
     assert type(mirror.take(5, Change("B", param(2, name="B"), None))) is Removed
 
 
-def test_a_slow_listener_receives_the_sum_of_what_came_and_went() -> None:
+def test_a_slow_listener_receives_the_sum_of_additions_and_removals() -> None:
     changes = Changes()
     for change in (
         Added("A", None, param(1)),
@@ -381,8 +381,8 @@ def test_a_slow_listener_receives_the_sum_of_what_came_and_went() -> None:
         Change("D", param(1, name="D"), param(2, name="D")),
     ):
         changes.push(change)
-    told = [changes._take() for _ in range(4)]
-    assert [each and (type(each), each.name) for each in told] == [
+    reported = [changes._take() for _ in range(4)]
+    assert [each and (type(each), each.name) for each in reported] == [
         (Added, "A"),
         (Changed, "C"),
         (FirstValue, "D"),
@@ -398,7 +398,7 @@ def test_a_change_of_trust_alone_is_none() -> None:
     mirror.confirm(param(1, Trust.VERIFIED))
     assert shown(mirror) == {"A": (1, Trust.VERIFIED)}
     mirror.confirm(param(2))
-    assert shown(mirror) == {"A": (1, Trust.VERIFIED)}, "what happens is told by events alone"
+    assert shown(mirror) == {"A": (1, Trust.VERIFIED)}, "only events report changes"
 
 
 @pytest.mark.parametrize("how", [Mirror.doubt, Mirror.leave])
@@ -426,7 +426,7 @@ def test_a_table_that_is_doubted_while_it_is_loaded_is_loaded_again() -> None:
     mirror.begin()
     for seq in range(LOADING_CHANGES_MAX + 1):
         mirror.take(seq, Change("A", None, param(seq)))
-    assert mirror.load(5, {"A": param(5)}) is None, "more came meanwhile than is kept"
+    assert mirror.load(5, {"A": param(5)}) is None, "more changes arrived meanwhile than are kept"
 
 
 @given(st.data())

@@ -31,13 +31,13 @@ CERT, KEY = (Path(__file__).parents[1] / "data" / name for name in ("tls_station
 def running(vehicle: Any, port: int = 0, **tls: Path) -> Iterator[str]:
     """The address of a service with this vehicle."""
     started = threading.Event()
-    told: list[Any] = []
+    reported: list[Any] = []
 
     async def run() -> None:
         stop = anyio.Event()
 
         def listens(url: str) -> None:
-            told.extend([url, asyncio.get_running_loop(), stop])
+            reported.extend([url, asyncio.get_running_loop(), stop])
             started.set()
 
         hub = Hub([vehicle], cache=False)
@@ -46,7 +46,7 @@ def running(vehicle: Any, port: int = 0, **tls: Path) -> Iterator[str]:
     thread = threading.Thread(target=asyncio.run, args=(run(),))
     thread.start()
     assert started.wait(TIMEOUT)
-    url, loop, stop = told
+    url, loop, stop = reported
     try:
         yield url
     finally:
@@ -136,10 +136,10 @@ def test_a_set_up_by_the_library_names_the_command_and_the_request_that_do_it(
         component = client.only_component()
         with pytest.raises(UsageError, match="a service does not give") as caught:
             getattr(sync, call)(component, wanted)
-        told = str(caught.value)
-        assert f"does not give {call}() the link itself" in told
-        assert f"`paramclient {command.format(url)}`" in told
-        assert f"POST {url}/api/v1/components/1/1/{path}, for example with httpx" in told
+        reported = str(caught.value)
+        assert f"does not give {call}() the link itself" in reported
+        assert f"`paramclient {command.format(url)}`" in reported
+        assert f"POST {url}/api/v1/components/1/1/{path}, for example with httpx" in reported
     assert vehicle.requests["PARAM_SET"] == 0
 
 
@@ -230,15 +230,15 @@ def test_a_handshake_that_is_cancelled_leaves_no_connection_open(loop: str) -> N
             tasks.start_soon(enter)
 
     gc.collect()
-    with warnings.catch_warnings(record=True) as told, socket.create_server(("127.0.0.1", 0)) as listener:
+    with warnings.catch_warnings(record=True) as reported, socket.create_server(("127.0.0.1", 0)) as listener:
         warnings.simplefilter("always")
         anyio.run(give_up_in_the_middle, listener, backend=loop)
         gc.collect()
-    assert [str(each.message) for each in told if issubclass(each.category, ResourceWarning)] == []
+    assert [str(each.message) for each in reported if issubclass(each.category, ResourceWarning)] == []
 
 
 @pytest.mark.asyncio
-async def test_a_service_ends_in_good_order_while_somebody_listens_over_tls(
+async def test_a_service_ends_in_good_order_with_a_listener_over_tls(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv("SSL_CERT_FILE", str(CERT))

@@ -50,12 +50,12 @@ WRITE = "/api/v1/components/1/1/apply"
 
 @dataclass
 class Answer:
-    """What came back."""
+    """The responses."""
 
     status: int
     headers: dict[str, str]
     body: bytes
-    asked: list[Any]
+    requested: list[Any]
 
     @property
     def problem(self) -> str:
@@ -154,13 +154,13 @@ class Door:
         if start["type"] in ("websocket.accept", "websocket.close"):
             return Answer(101 if start["type"] == "websocket.accept" else 403, {}, b"", taken)
         names = [name for name, _ in start["headers"]]
-        assert len(names) - names.count(b"vary") == len(set(names) - {b"vary"}), "a header came twice"
+        assert len(names) - names.count(b"vary") == len(set(names) - {b"vary"}), "a header arrived twice"
         answered = {name.decode(): value.decode() for name, value in start["headers"]}
         return Answer(start["status"], answered, sent[1]["body"], taken)
 
     @property
     def state(self) -> dict[str, Any]:
-        """What the application was told of who asks."""
+        """What the application received about the client."""
         state: dict[str, Any] = self.seen[-1][0]["state"]
         return state
 
@@ -194,8 +194,8 @@ def test_a_file_that_has_no_tokens_says_where_and_never_what(text: str, words: s
     with pytest.raises(UsageError) as caught:
         Tokens.of_text(text)
     assert words in str(caught.value)
-    told = "".join(traceback.format_exception(caught.value))
-    assert ANNA[:15] not in told.replace(__file__, "")
+    reported = "".join(traceback.format_exception(caught.value))
+    assert ANNA[:15] not in reported.replace(__file__, "")
 
 
 def test_whose_a_token_is() -> None:
@@ -221,7 +221,7 @@ def test_every_token_is_compared_whichever_it_is(monkeypatch: pytest.MonkeyPatch
         assert [len(one) == len(other) == 32 for one, other in compared] == [True, True]
 
 
-def test_tokens_come_from_a_file_or_the_environment(tmp_path: Path) -> None:
+def test_tokens_are_read_from_a_file_or_the_environment(tmp_path: Path) -> None:
     path = tmp_path / "tokens"
     token = new_token()
     path.write_text(token_line("anna", "write", token))
@@ -370,7 +370,7 @@ def test_hosts_are_named_one_by_one(host: str) -> None:
 
 
 @in_simulated_time
-async def test_without_tokens_whoever_is_on_this_machine_may_write() -> None:
+async def test_without_tokens_every_client_on_this_machine_may_write() -> None:
     door = Door()
     assert (await door.request("POST", WRITE, body=b"{}")).status == 200
     local = {"author": "local", "name": "local", "role": "write", "read_only": False}
@@ -381,7 +381,7 @@ async def test_without_tokens_whoever_is_on_this_machine_may_write() -> None:
 
 
 @in_simulated_time
-async def test_with_tokens_nothing_is_done_for_nobody() -> None:
+async def test_with_tokens_a_request_without_a_token_is_refused() -> None:
     door = Door(GUARDED)
     public = ["/", "/health", "/page/app.js", "/favicon.ico"]
     for path in public:
@@ -409,7 +409,7 @@ async def test_with_tokens_nothing_is_done_for_nobody() -> None:
 
 
 @in_simulated_time
-async def test_a_token_says_who_asks_and_goes_no_further() -> None:
+async def test_a_token_identifies_the_author_and_is_not_passed_on() -> None:
     door = Door(GUARDED)
     cookie = (b"cookie", b"other=1; paramclient-8765=nonsense")
     assert (await door.request(token=ANNA, raw=[(b"x-author", b"web page"), cookie])).status == 200
@@ -516,7 +516,7 @@ async def test_a_browser_shows_its_token_once() -> None:
     assert (await door.request("POST", WRITE, raw=[cookie])).problem == "forbidden"
     door.now = SESSION_LIFETIME
     assert (await door.request(raw=[cookie])).problem == "unauthenticated"
-    assert (await door.request(path="/", raw=[cookie])).status == 200, "or nobody could show another token"
+    assert (await door.request(path="/", raw=[cookie])).status == 200, "or no client could send another token"
 
 
 @in_simulated_time
@@ -591,30 +591,30 @@ async def test_guesses_are_answered_late_and_a_right_token_is_not_refused(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     door = Door(GUARDED)
-    asked = anyio.current_time()
+    requested = anyio.current_time()
     with caplog.at_level(logging.DEBUG):
         for number in range(WRONG_TOKENS_MAX):
             assert (await door.request(token=f"wrong-{number}")).status == 401
-        assert round(anyio.current_time() - asked, 3) == 0
+        assert round(anyio.current_time() - requested, 3) == 0
         for number in range(3):
             late = await door.request(token=f"wrong-too-{number}")
             assert (late.status, late.problem) == (429, "too-many-guesses")
             assert late.headers["retry-after"] == str(int(WRONG_TOKEN_LIFETIME))
-            assert round(anyio.current_time() - asked, 3) == (number + 1) * WRONG_TOKEN_DELAY
+            assert round(anyio.current_time() - requested, 3) == (number + 1) * WRONG_TOKEN_DELAY
     assert [record.getMessage() for record in caplog.records] == ["many wrong tokens from 10.0.0.2"]
-    asked = anyio.current_time()
+    requested = anyio.current_time()
     assert (await door.request(token=ANNA)).status == 200, "others may be behind the same proxy"
     body = json.dumps({"token": ANNA}).encode()
     assert (await door.request("POST", SESSION_PATH, body=body)).status == 200
-    assert round(anyio.current_time() - asked, 3) == 2 * WRONG_TOKEN_DELAY, (
-        "else a right one is told from a wrong one at once"
+    assert round(anyio.current_time() - requested, 3) == 2 * WRONG_TOKEN_DELAY, (
+        "else the response time distinguishes a right token from a wrong one"
     )
-    asked = anyio.current_time()
+    requested = anyio.current_time()
     assert (await door.request(token=ANNA, client=("10.0.0.3", 1))).status == 200
     assert (await door.request(path="/")).status == 200
     door.now = WRONG_TOKEN_LIFETIME
     assert (await door.request(token=ANNA)).status == 200
-    assert round(anyio.current_time() - asked, 3) == 0, "nobody else waits, and nobody a minute later"
+    assert round(anyio.current_time() - requested, 3) == 0, "no other client waits, and none a minute later"
 
 
 PROXY = AccessSettings(listen="0.0.0.0", tokens=TOKENS, proxies=["10.0.0.2", "192.0.2.0/24", "2001:db8::/32"])
@@ -641,7 +641,7 @@ PROXY = AccessSettings(listen="0.0.0.0", tokens=TOKENS, proxies=["10.0.0.2", "19
     ],
 )
 @in_simulated_time
-async def test_a_proxy_that_is_trusted_says_who_asks(raw: list[tuple[str, str]], client: str) -> None:
+async def test_a_trusted_proxy_names_the_client(raw: list[tuple[str, str]], client: str) -> None:
     door = Door(PROXY)
     headers = [(name.encode(), value.encode()) for name, value in raw]
     assert (await door.request(token=ANNA, raw=headers)).status == 200
@@ -650,15 +650,15 @@ async def test_a_proxy_that_is_trusted_says_who_asks(raw: list[tuple[str, str]],
 
 @in_simulated_time
 async def test_forwarded_headers_count_only_from_trusted_proxies() -> None:
-    told = [(b"x-forwarded-for", b"198.51.100.7"), (b"forwarded", b"for=198.51.100.8")]
+    reported = [(b"x-forwarded-for", b"198.51.100.7"), (b"forwarded", b"for=198.51.100.8")]
     door = Door(PROXY)
-    assert (await door.request(token=ANNA, raw=told, client=("10.0.0.3", 1))).status == 200
+    assert (await door.request(token=ANNA, raw=reported, client=("10.0.0.3", 1))).status == 200
     assert door.state["author"] == "anna@10.0.0.3"
-    assert (await door.request(token=ANNA, raw=told)).problem == "bad-request", (
+    assert (await door.request(token=ANNA, raw=reported)).problem == "bad-request", (
         "one of the two is not the proxy's"
     )
     door = Door(GUARDED)
-    assert (await door.request(token=ANNA, raw=told)).status == 200
+    assert (await door.request(token=ANNA, raw=reported)).status == 200
     assert door.state["author"] == "anna@10.0.0.2"
 
 
@@ -667,11 +667,11 @@ async def test_guesses_slow_down_one_client_of_a_proxy_that_is_trusted() -> None
     door = Door(PROXY)
     for number in range(2 * WRONG_TOKENS_MAX):
         await door.request(token=f"wrong-{number}", raw=[(b"x-forwarded-for", b"198.51.100.7")])
-    asked = anyio.current_time()
+    requested = anyio.current_time()
     assert (await door.request(token=ANNA, raw=[(b"x-forwarded-for", b"198.51.100.8")])).status == 200
-    assert round(anyio.current_time() - asked, 3) == 0
+    assert round(anyio.current_time() - requested, 3) == 0
     assert (await door.request(token=ANNA, raw=[(b"x-forwarded-for", b"198.51.100.7")])).status == 200
-    assert round(anyio.current_time() - asked, 3) == WRONG_TOKEN_DELAY
+    assert round(anyio.current_time() - requested, 3) == WRONG_TOKEN_DELAY
 
 
 @pytest.mark.parametrize("proxy", ["proxy.example", "10.0.0.1/8", "10.0.0.0/33", ""])
@@ -686,13 +686,13 @@ def test_behind_a_proxy_it_does_not_start_without_a_token() -> None:
 
 
 @in_simulated_time
-async def test_a_program_with_an_old_token_slows_nobody_down() -> None:
+async def test_a_program_with_an_old_token_delays_no_other_client() -> None:
     door = Door(GUARDED)
-    asked = anyio.current_time()
+    requested = anyio.current_time()
     for _ in range(10 * WRONG_TOKENS_MAX):
         assert (await door.request(token="an-old-token-of-somebody")).status == 401
     assert (await door.request(token=ANNA)).status == 200
-    assert round(anyio.current_time() - asked, 3) == 0
+    assert round(anyio.current_time() - requested, 3) == 0
 
 
 def test_those_who_guess_are_remembered_in_bounds() -> None:
@@ -730,7 +730,7 @@ async def test_loopback_host_names_are_accepted(host: str) -> None:
 )
 @in_simulated_time
 async def test_a_name_that_is_not_its_own_is_refused(host: str) -> None:
-    """A page of somebody else's may have its name led here by DNS, and is of the same origin then."""
+    """DNS rebinding: the name of a foreign page may resolve to this service, with the same origin."""
     for settings in (OPEN, GUARDED):
         door = Door(settings)
         for path in (READ, "/", "/health"):
@@ -820,12 +820,14 @@ async def test_a_page_that_is_named_may_use_it_from_elsewhere() -> None:
     door = Door(settings)
     origin = (b"origin", b"https://station.example:8443")
     foreign = [origin, (b"sec-fetch-site", b"cross-site"), *BROWSER_READS]
-    asked = await door.request("OPTIONS", WRITE, raw=[*foreign, (b"access-control-request-method", b"POST")])
-    assert asked.status == 204
-    assert asked.headers["access-control-allow-origin"] == "https://station.example:8443"
-    assert "authorization" in asked.headers["access-control-allow-headers"].lower()
-    assert {"PUT", "PATCH", "DELETE"} <= set(asked.headers["access-control-allow-methods"].split(", "))
-    assert "access-control-allow-credentials" not in asked.headers
+    requested = await door.request(
+        "OPTIONS", WRITE, raw=[*foreign, (b"access-control-request-method", b"POST")]
+    )
+    assert requested.status == 204
+    assert requested.headers["access-control-allow-origin"] == "https://station.example:8443"
+    assert "authorization" in requested.headers["access-control-allow-headers"].lower()
+    assert {"PUT", "PATCH", "DELETE"} <= set(requested.headers["access-control-allow-methods"].split(", "))
+    assert "access-control-allow-credentials" not in requested.headers
     assert not door.seen
     answer = await door.request("POST", WRITE, token=ANNA, body=b"{}", raw=foreign)
     assert (answer.status, answer.headers["vary"]) == (200, "Origin")
@@ -842,7 +844,7 @@ async def test_a_page_that_is_named_may_use_it_from_elsewhere() -> None:
 
 @in_simulated_time
 async def test_without_tokens_a_page_that_is_named_may_read_only() -> None:
-    """It is in the browser of somebody on this computer, who may do everything."""
+    """A page in the browser of a local user, who may do everything."""
     door = Door(AccessSettings(origins=["https://station.example"]))
     foreign = [(b"origin", b"https://station.example"), (b"sec-fetch-site", b"cross-site"), *BROWSER_READS]
     assert (await door.request(raw=foreign)).status == 200
@@ -869,7 +871,7 @@ async def test_a_body_is_of_a_kind_that_no_form_can_send(kind: str) -> None:
     answer = await door.request("POST", WRITE, body=b"{}", kind=kind)
     assert (answer.status, answer.problem) == (415, "content-type")
     assert answer.headers["connection"] == "close"
-    assert not answer.asked
+    assert not answer.requested
     assert not door.seen
     assert (
         await door.request("POST", WRITE, body=b"{}", kind="Application/JSON; charset=utf-8")
@@ -973,7 +975,7 @@ async def test_a_slash_in_a_name_is_a_part_of_it() -> None:
     ],
 )
 @in_simulated_time
-async def test_a_header_that_counts_comes_once(raw: list[tuple[bytes, bytes]]) -> None:
+async def test_a_header_that_counts_arrives_once(raw: list[tuple[bytes, bytes]]) -> None:
     for settings in (OPEN, GUARDED):
         door = Door(settings)
         token = None if raw[0][0] == b"authorization" else ANNA
@@ -1000,7 +1002,7 @@ SMALL = AccessSettings(max_body=100)
 
 
 @in_simulated_time
-async def test_a_body_comes_in_one_piece() -> None:
+async def test_a_body_arrives_in_one_piece() -> None:
     door = Door(SMALL)
     answer = await door.request("POST", WRITE, body=[b"12", b"", b"3" * 98])
     assert answer.body == b"12" + b"3" * 98
@@ -1011,9 +1013,9 @@ async def test_a_body_comes_in_one_piece() -> None:
 async def test_a_body_that_is_too_long_is_not_waited_for() -> None:
     door = Door(SMALL)
     said = await door.request("POST", WRITE, body=b"x" * 101)
-    assert (said.status, said.problem, said.asked) == (413, "too-large", [])
+    assert (said.status, said.problem, said.requested) == (413, "too-large", [])
     endless = await door.request("POST", WRITE, body=[b"x" * 40] * 1_000)
-    assert (endless.status, endless.problem, len(endless.asked)) == (413, "too-large", 3)
+    assert (endless.status, endless.problem, len(endless.requested)) == (413, "too-large", 3)
     assert said.headers["connection"] == endless.headers["connection"] == "close"
     assert not door.seen
     assert (await door.request("POST", WRITE, body=b"x" * 100)).status == 200
@@ -1047,7 +1049,7 @@ async def test_bodies_are_not_many_at_once(monkeypatch: pytest.MonkeyPatch) -> N
 
 @dataclass
 class Pending(Door):
-    """An application that has read its body, and answers when it is told to."""
+    """An application that has read its body, and responds on demand."""
 
     go_on: anyio.Event = field(default_factory=anyio.Event)
 
@@ -1152,7 +1154,7 @@ async def test_without_tokens_the_address_is_the_holder(
 async def test_only_values_and_files_may_be_long(method: str, path: str, most: int) -> None:
     door = Door()
     long = await door.request(method, path, raw=[(b"content-length", b"%d" % (most + 1)), _JSON])
-    assert (long.status, long.problem, long.asked) == (413, "too-large", [])
+    assert (long.status, long.problem, long.requested) == (413, "too-large", [])
     assert str(most).encode() in long.body
     assert not door.seen
     assert (await door.request(method, path, body=b"x" * most)).status == 200
@@ -1164,16 +1166,16 @@ async def test_only_what_has_a_body_may_bring_one(method: str) -> None:
     for settings, token in ((OPEN, None), (GUARDED, ANNA)):
         answer = await Door(settings).request(method, path="/", body=b"{}", token=token)
         assert answer.problem == "bad-request"
-        assert not answer.asked
+        assert not answer.requested
 
 
 @in_simulated_time
 async def test_those_without_a_token_send_nothing() -> None:
     door = Door(GUARDED)
     answer = await door.request("POST", WRITE, body=[b"x"] * 10)
-    assert (answer.problem, answer.asked) == ("unauthenticated", [])
+    assert (answer.problem, answer.requested) == ("unauthenticated", [])
     answer = await door.request("DELETE", SESSION_PATH, body=[b"x"] * 10)
-    assert (answer.problem, answer.asked) == ("bad-request", [])
+    assert (answer.problem, answer.requested) == ("bad-request", [])
 
 
 # What every answer has

@@ -1,4 +1,4 @@
-"""The service as somebody meets it who means it no good: real sockets, bytes as they please."""
+"""Attacks on the service: real sockets, arbitrary bytes."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ EVIL = "<img/src/onerr>"
 """As much of a program as fits into the name of a parameter."""
 C = "/api/v1/components/1/1"
 KERNEL = 16_000_000
-"""Bytes: more than a kernel keeps of what nobody reads, on both sides together."""
+"""Bytes: more than a kernel keeps of what no client reads, on both sides together."""
 
 pytestmark = pytest.mark.asyncio
 
@@ -68,7 +68,7 @@ class Served:
         return Answer.of(await self.send(self.head(method, path, "Connection: close", *more, **options)))
 
     async def send(self, data: bytes) -> bytes:
-        """All that comes for these bytes, until the service closes."""
+        """The response to these bytes, until the service closes."""
         async with self.connection() as (reader, writer):
             writer.write(data)
             return await taken(reader)
@@ -89,7 +89,7 @@ class Served:
 
 @dataclass
 class Answer:
-    """What came back."""
+    """The responses."""
 
     status: int
     headers: dict[str, str]
@@ -130,7 +130,7 @@ async def served(*links: Any, listening: Listening | None = None, **access: Any)
 
 
 async def taken(reader: asyncio.StreamReader) -> bytes:
-    """What comes until the end, which may be a rough one."""
+    """The data up to the end, which may be a reset."""
     data = b""
     with contextlib.suppress(ConnectionError):
         while piece := await asyncio.wait_for(reader.read(65_536), 30):
@@ -147,7 +147,7 @@ def a_vehicle(**options: Any) -> GenericVehicle:
 
 
 async def met(service: Served, *more: str) -> None:
-    """See that the vehicle is heard, with all its parameters."""
+    """Check that the vehicle is present, with all its parameters."""
     body = b'{"timeout_s": 30}'
     for path in ("/api/v1/find", f"{C}/fetch"):
         head = service.head(
@@ -162,7 +162,7 @@ async def met(service: Served, *more: str) -> None:
         assert answer.status == 200, answer.body
 
 
-# Those whom nobody knows
+# Unknown clients
 
 
 async def test_an_unknown_client_learns_nothing_and_changes_nothing() -> None:
@@ -192,7 +192,7 @@ async def test_an_unknown_client_learns_nothing_and_changes_nothing() -> None:
     assert vehicle.params["A"].value == 1.0
 
 
-async def test_a_write_tells_who_asked_and_a_reader_cannot() -> None:
+async def test_a_write_names_its_author_and_a_reader_cannot_write() -> None:
     async with served(a_vehicle(), tokens=TOKENS) as service:
         await met(service, bearer(BEN))
         changes = service.hub.find_component(1, 1, None).component.changes()
@@ -243,7 +243,7 @@ def trusting() -> ssl.SSLContext:
     return ssl.create_default_context(cafile=str(DATA / "tls_station.pem"))
 
 
-# Those who come by way of a browser
+# Requests by way of a browser
 
 
 FOREIGN: list[tuple[str, tuple[str, ...], str]] = [
@@ -332,7 +332,7 @@ HEADERS: list[list[str]] = [
 
 
 async def test_headers_that_mean_two_things_mean_none() -> None:
-    """And what follows, as a request of somebody else's might, is none."""
+    """And what follows, as the request of another client might, is none."""
     smuggled = f"GET {C}/params HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
     first = ["POST /api/v1/find HTTP/1.1", "Content-Type: application/json"]
     async with served() as service:
@@ -449,7 +449,7 @@ async def test_connections_without_a_request_are_closed(monkeypatch: pytest.Monk
             await reader.readuntil(b'"note"')
 
 
-async def test_a_body_that_does_not_come_is_not_waited_for_at_the_end(
+async def test_a_missing_request_body_does_not_delay_the_end(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     async with contextlib.AsyncExitStack() as stack:
@@ -458,7 +458,7 @@ async def test_a_body_that_does_not_come_is_not_waited_for_at_the_end(
             length = "Content-Length: 100"
             head = service.head("POST", "/api/v1/find", "Content-Type: application/json", length)
             writer.write(head + b"{")
-            await service.ask()  # by then it has come
+            await service.ask()  # by then it has arrived
         assert await taken(reader) == b""
     assert [record for record in caplog.records if record.levelno >= logging.ERROR] == []
 
@@ -508,7 +508,7 @@ def a_narrow_socket(port: int) -> socket.socket:
     return narrow
 
 
-async def test_a_slow_listener_is_told_that_it_lost_events_and_goes_on() -> None:
+async def test_a_slow_listener_is_informed_of_lost_events_and_continues() -> None:
     async with served() as service:
         feed = service.hub.feed
         feed._events = deque(maxlen=64)
@@ -529,15 +529,15 @@ async def test_a_slow_listener_is_told_that_it_lost_events_and_goes_on() -> None
                     found = re.search(rb"^data: (.*)$", event, re.MULTILINE)
                     if found is None:
                         continue
-                    told = json.loads(found[1])
-                    if told["type"] == "gap":
-                        assert told["missed"] > 64
-                        assert told["seq"] == last + told["missed"]
+                    reported = json.loads(found[1])
+                    if reported["type"] == "gap":
+                        assert reported["missed"] > 64
+                        assert reported["seq"] == last + reported["missed"]
                         feed.publish("end", {})
                     elif kinds:
-                        assert told["seq"] == last + 1
-                    kinds.append(told["type"])
-                    last = told["seq"]
+                        assert reported["seq"] == last + 1
+                    kinds.append(reported["type"])
+                    last = reported["seq"]
             assert kinds.count("gap") == 1
         finally:
             writer.transport.abort()
@@ -629,8 +629,8 @@ async def test_a_websocket_message_that_is_none_closes_it_without_a_traceback(
         writer.write(service.head("GET", "/api/v1/ws", *UPGRADE))
         await reader.readuntil(b'"resumed":false}')
         writer.write(frames)
-        told = await taken(reader)
-        assert code is None or told[2:4] == struct.pack("!H", code)
+        reported = await taken(reader)
+        assert code is None or reported[2:4] == struct.pack("!H", code)
         assert (await service.ask()).status == 200
     assert [record for record in caplog.records if record.levelno >= logging.WARNING] == []
 
@@ -672,20 +672,20 @@ async def test_a_name_that_tries_to_be_html_is_a_text_everywhere() -> None:
     async with served(a_vehicle()) as service:
         await met(service)
         name = quote(EVIL, safe="")
-        told = {
+        reported = {
             path: await service.ask("GET", path) for path in (f"{C}/params", f"{C}/params/{name}", "/metrics")
         }
-        told |= {
+        reported |= {
             path: await service.ask("GET", path) for path in ("/api/v1/components", f"{C}/params/{name}x")
         }
-        told |= {
+        reported |= {
             path: await service.ask("GET", path)
             for path in (f"/{name}", f"/page/{name}", f"/api/v1/jobs/{name}")
         }
-        told["?"] = await service.ask("GET", f"{C}/params?names={name}&{name}={name}")
-        assert EVIL in json.loads(told[f"{C}/params"].body)["params"]
-        assert json.loads(told[f"{C}/params/{name}"].body)["name"] == EVIL
-        for path, answer in told.items():
+        reported["?"] = await service.ask("GET", f"{C}/params?names={name}&{name}={name}")
+        assert EVIL in json.loads(reported[f"{C}/params"].body)["params"]
+        assert json.loads(reported[f"{C}/params/{name}"].body)["name"] == EVIL
+        for path, answer in reported.items():
             kind = answer.headers["content-type"]
             assert kind.startswith(
                 ("application/json", "application/problem+json", "text/plain; version=0.0.4")
@@ -712,7 +712,7 @@ async def test_a_name_that_tries_to_be_html_is_a_text_everywhere() -> None:
 # Those who listen on the way
 
 
-async def test_over_tls_nothing_is_told_in_clear() -> None:
+async def test_over_tls_nothing_is_sent_in_clear() -> None:
     async with served(tokens=TOKENS, listening=over_tls()) as service:
         body = json.dumps({"token": ANNA}).encode()
         head = service.head(
@@ -730,7 +730,7 @@ async def test_over_tls_nothing_is_told_in_clear() -> None:
                 pass
 
 
-async def test_a_certificate_with_another_key_is_told_before_anybody_connects() -> None:
+async def test_a_certificate_with_another_key_is_reported_before_a_connection() -> None:
     listening = Listening(port=0, tls_cert=DATA / "tls_station.pem", tls_key=DATA / "tls_other.key")
     with pytest.raises(UsageError, match=r"tls_other\.key: this private key does not belong"):
         await serve(Hub((), cache=False), listening=listening)

@@ -1,4 +1,5 @@
-"""Set-ups that the service has not brought to their end: noted when they begin, and told of afterwards."""
+"""Set-ups that the service has not brought to their end: noted when they begin, and reported at the next
+start."""
 
 from __future__ import annotations
 
@@ -37,7 +38,7 @@ def notes(tmp_path: Path, clock: Clock) -> SetupNotes:
 
 
 def begun(notes: SetupNotes, name: str = "a1") -> RunningSetup:
-    return notes.begin(name, "apply", link="sim:", system=1, component=1, asked_by="anna", key=None)
+    return notes.begin(name, "apply", link="sim:", system=1, component=1, requested_by="anna", key=None)
 
 
 def died(running: RunningSetup) -> None:
@@ -48,13 +49,13 @@ def died(running: RunningSetup) -> None:
 def test_a_running_or_ended_set_up_is_not_cut_off(notes: SetupNotes) -> None:
     assert notes.cut_off() == []
     running = begun(notes)
-    assert notes.cut_off(tells=True) == []
+    assert notes.cut_off(mark_reported=True) == []
     running.end()
     assert notes.cut_off() == []
     assert list(notes.folder.iterdir()) == []
 
 
-def test_one_whose_process_has_died_is_told_once(notes: SetupNotes, clock: Clock) -> None:
+def test_one_whose_process_has_died_is_reported_once(notes: SetupNotes, clock: Clock) -> None:
     running = begun(notes)
     clock.now += 5
     running.note(done=3, total=20, key="uid:1")
@@ -63,8 +64,8 @@ def test_one_whose_process_has_died_is_told_once(notes: SetupNotes, clock: Clock
     died(running)
     expected = InterruptedSetup("a1", "apply", "uid:1", "sim:", 1, 1, "anna", 1_000.0, 1_005.0, 3, 20)
     assert notes.cut_off() == [expected]
-    assert notes.cut_off(tells=True) == [expected]
-    assert [note.is_told for note in notes.cut_off(tells=True)] == [True]
+    assert notes.cut_off(mark_reported=True) == [expected]
+    assert [note.is_reported for note in notes.cut_off(mark_reported=True)] == [True]
 
 
 def test_a_set_up_cut_off_by_the_end_of_the_service_has_its_progress(notes: SetupNotes, clock: Clock) -> None:
@@ -93,7 +94,7 @@ def test_those_cut_off_last_are_kept(notes: SetupNotes, clock: Clock) -> None:
     for number in range(INTERRUPTED_MAX + 5):
         clock.now += 1
         died(begun(notes, f"job{number}"))
-    kept = notes.cut_off(tells=True)
+    kept = notes.cut_off(mark_reported=True)
     assert [kept[0].id, kept[-1].id, len(kept)] == ["job5", f"job{INTERRUPTED_MAX + 4}", INTERRUPTED_MAX]
     assert len(list(notes.folder.iterdir())) == INTERRUPTED_MAX
 
@@ -103,15 +104,15 @@ def test_those_cut_off_last_are_kept(notes: SetupNotes, clock: Clock) -> None:
     [
         *(b"", b"{", b"[]\n", b"{}\n", b"\xff\n", b"[" * 60_000 + b"\n", b'{"id": "a1"}\n', b"null\n"),
         json.dumps({"id": "b2", "kind": "apply"}).encode() + b"\n",
-        b'{"id":"a1","kind":"apply","key":null,"link":"","system":1e999,"component":1,"asked_by":"","began":1,"at":1}\n',
+        b'{"id":"a1","kind":"apply","key":null,"link":"","system":1e999,"component":1,"requested_by":"","began":1,"at":1}\n',
     ],
 )
-def test_a_file_that_is_no_note_tells_nothing(notes: SetupNotes, content: bytes) -> None:
+def test_a_file_that_is_no_note_is_ignored(notes: SetupNotes, content: bytes) -> None:
     notes.folder.mkdir()
     (notes.folder / "a1.json").write_bytes(content)
     (notes.folder / "c3.json").symlink_to("/dev/zero")
     os.mkfifo(notes.folder / "d4.json")
-    assert notes.cut_off(tells=True) == []
+    assert notes.cut_off(mark_reported=True) == []
 
 
 def test_a_set_up_that_cannot_be_noted_does_not_begin(tmp_path: Path) -> None:
@@ -132,20 +133,22 @@ BODY = {"wanted": {"values": dict.fromkeys(TUNE, 7.5)}, "wait": False}
 
 
 @in_simulated_time
-async def test_an_apply_that_the_end_of_the_service_cuts_off_is_told_at_the_next_start(
+async def test_an_apply_that_the_end_of_the_service_cuts_off_is_reported_at_the_next_start(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
 ) -> None:
     async with serving(Quiet(px4()), place=tmp_path) as service:
         job = (await service.client.post(f"{HERE}/apply", json=BODY)).json()["id"]
-        told = await service.job(job, lambda told: told["progress"] and told["progress"]["done"] >= 5)
-        assert told["state"] == "running"
+        reported = await service.job(
+            job, lambda reported: reported["progress"] and reported["progress"]["done"] >= 5
+        )
+        assert reported["state"] == "running"
     caplog.clear()
     async with serving(px4(), place=tmp_path) as service:
         [line] = [message for message in caplog.messages if "cut off" in message]
         assert line.startswith("an apply of 1/1 on sim:0, started by local at 20")
         assert line.endswith("of 20 values by the end of the service")
         [listed] = await set_ups(service)
-        assert (listed["id"], listed["state"], listed["asked_by"]) == (job, "cut-off", "local")
+        assert (listed["id"], listed["state"], listed["requested_by"]) == (job, "cut-off", "local")
         assert listed["progress"]["done"] >= 5
         assert listed["problem"]["type"] == "urn:paramclient:cut-off"
         assert await service.get(f"/api/v1/jobs/{job}") == listed
@@ -160,7 +163,7 @@ async def test_an_apply_that_the_end_of_the_service_cuts_off_is_told_at_the_next
         assert len(await set_ups(service)) == 2
     caplog.clear()
     async with serving(px4(), place=tmp_path) as service:
-        assert not [message for message in caplog.messages if "cut off" in message], "it was told"
+        assert not [message for message in caplog.messages if "cut off" in message], "it was reported"
         [listed] = await set_ups(service)
         assert listed["id"] == job
     outcome = in_process(capsys, "--cache", str(tmp_path / "cache.sqlite3"))("history", "1")
@@ -174,9 +177,9 @@ async def test_an_apply_that_the_end_of_the_service_cuts_off_is_told_at_the_next
 async def test_a_cancelled_set_up_is_not_cut_off(tmp_path: Path) -> None:
     async with serving(Quiet(px4()), place=tmp_path) as service:
         job = (await service.client.post(f"{HERE}/apply", json=BODY)).json()["id"]
-        await service.job(job, lambda told: told["progress"] and told["progress"]["done"])
+        await service.job(job, lambda reported: reported["progress"] and reported["progress"]["done"])
         await service.client.delete(f"/api/v1/jobs/{job}")
-        await service.job(job, lambda told: told["state"] == "cancelled")
+        await service.job(job, lambda reported: reported["state"] == "cancelled")
     async with serving(px4(), place=tmp_path) as service:
         assert await set_ups(service) == []
 
@@ -190,12 +193,12 @@ class Mute(Tap):
 
 
 @pytest.mark.asyncio
-async def test_an_apply_whose_process_is_killed_is_told_at_the_next_start(tmp_path: Path) -> None:
-    await told_after_a_kill(str(tmp_path / "cache.sqlite3"))
+async def test_an_apply_whose_process_is_killed_is_reported_at_the_next_start(tmp_path: Path) -> None:
+    await reported_after_a_kill(str(tmp_path / "cache.sqlite3"))
 
 
-async def told_after_a_kill(cache: str) -> None:
-    """A service with this cache is killed while it applies values; the next one tells that."""
+async def reported_after_a_kill(cache: str) -> None:
+    """A service with this cache is killed while it applies values; the next one mark_reported that."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -207,11 +210,11 @@ async def told_after_a_kill(cache: str) -> None:
             body = {"wanted": {"values": {f"PARAM_{number:02}": 77 for number in range(20)}}, "wait": False}
             job = (await browser.post(f"{C}/apply", json=body)).json()["id"]
             with anyio.fail_after(TIMEOUT):
-                told: dict[str, Any] = {}
-                while not (told.get("progress") or {}).get("done"):
+                reported: dict[str, Any] = {}
+                while not (reported.get("progress") or {}).get("done"):
                     await asyncio.sleep(0.02)
-                    told = (await browser.get(f"/api/v1/jobs/{job}")).json()
-            assert told["state"] == "running"
+                    reported = (await browser.get(f"/api/v1/jobs/{job}")).json()
+            assert reported["state"] == "running"
             process.kill()
             await process.wait()
         tasks.cancel_scope.cancel()

@@ -89,11 +89,11 @@ async def test_descriptions_are_loaded_after_the_table_and_give_the_defaults() -
         assert await described(hub)
         infos = (await browser.get(f"{C}/metadata")).json()
         assert infos["params"][CHANGED]["units"] == "1/s"
-        told = (await browser.get(f"{C}/params")).json()["params"]
-        param = told[CHANGED]
+        reported = (await browser.get(f"{C}/params")).json()["params"]
+        param = reported[CHANGED]
         assert (param["value"], param["default"], param["default_source"]) == (6.5, 4, "metadata")
         assert param["is_default"] is False
-        assert told["MC_PITCH_P"]["is_default"] is True
+        assert reported["MC_PITCH_P"]["is_default"] is True
         assert (await browser.get(f"{C}/params/{CHANGED}")).json()["default_source"] == "metadata"
         assert "metadata_note" not in (await browser.get(C)).json()
 
@@ -208,7 +208,7 @@ async def test_a_listening_service_and_one_without_fetches_request_nothing() -> 
 
 
 @in_simulated_time
-async def test_a_vehicle_without_descriptions_is_asked_once() -> None:
+async def test_descriptions_of_a_vehicle_without_them_are_requested_once() -> None:
     tap = Tap(PX4Vehicle())
     async with serving(tap) as (hub, browser):
         assert not await described(hub, 120.0)
@@ -248,13 +248,13 @@ async def test_another_firmware_has_descriptions_of_its_own(tmp_path: Path) -> N
     tap = Tap(vehicle)
     async with serving(tap, tmp_path) as (hub, browser):
         assert await described(hub)
-        first, asked = hub.followed[0].metadata, locations_requested(tap)
+        first, requested = hub.followed[0].metadata, locations_requested(tap)
         vehicle._version = replace(vehicle._version, git_hash=bytes(range(1, 9)))
         vehicle.reboot(down=8.0)
         await anyio.sleep(60.0)
         assert hub.followed[0].component.identity.git_hash == bytes(range(1, 9))[::-1].hex()
         assert hub.followed[0].metadata is not first
-        assert locations_requested(tap) == asked + 1
+        assert locations_requested(tap) == requested + 1
         assert (await browser.get(f"{C}/params/{CHANGED}")).json()["default_source"] == "metadata"
 
 

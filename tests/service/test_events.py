@@ -1,4 +1,5 @@
-"""What the service tells as it happens: nothing is lost or doubled, and whoever is slow learns of it."""
+"""The event stream of the service: no event is lost or repeated, and a slow listener is informed of lost
+ones."""
 
 from __future__ import annotations
 
@@ -39,10 +40,10 @@ def events_of(text: str) -> list[tuple[str, dict[str, Any]]]:
 
 
 class ReceivedEvents:
-    """Server-sent events as they come, until closed.
+    """Server-sent events as they arrive, until closed.
 
     Attributes:
-        text: all that has come.
+        text: all that has arrived.
         status: of the answer.
     """
 
@@ -54,9 +55,9 @@ class ReceivedEvents:
     def all(self) -> list[dict[str, Any]]:
         """Every event so far; their ids are those of their numbers."""
         found = []
-        for name, told in events_of(self.text):
-            assert name == f"{told['run']}-{told['seq']}"
-            found.append(told)
+        for name, reported in events_of(self.text):
+            assert name == f"{reported['run']}-{reported['seq']}"
+            found.append(reported)
         return found
 
     def of(self, kind: str) -> list[dict[str, Any]]:
@@ -65,7 +66,7 @@ class ReceivedEvents:
 
     @property
     def last_id(self) -> str:
-        """What a browser would come back with."""
+        """The Last-Event-ID that a browser sends at a reconnection."""
         return [line for line in self.text.split("\n") if line.startswith("id: ")][-1][4:]
 
 
@@ -74,7 +75,7 @@ async def listening(
     browser: httpx.AsyncClient, after: str | None = None, **query: Any
 ) -> AsyncIterator[ReceivedEvents]:
     """Listens for the time of the block."""
-    heard = ReceivedEvents()
+    received = ReceivedEvents()
     headers = {} if after is None else {"last-event-id": after}
     async with browser.stream("GET", "/api/v1/events", params=query, headers=headers) as answer:
         assert answer.status_code == 200
@@ -82,13 +83,13 @@ async def listening(
 
         async def read() -> None:
             async for chunk in answer.aiter_text():
-                heard.text += chunk
-            heard.is_ended = True
+                received.text += chunk
+            received.is_ended = True
 
         reader = asyncio.create_task(read())
         await asyncio.sleep(0.01)
         try:
-            yield heard
+            yield received
         finally:
             reader.cancel()
 
@@ -103,8 +104,8 @@ def publish(feed: EventFeed, count: int, **about: Any) -> None:
 
 async def taken(listener: Listener) -> list[int]:
     """The numbers of what a listener is given at once."""
-    news = await listener.next(0.01)
-    return [] if news is None else [seq for seq, _ in news[0].texts]
+    batches = await listener.next(0.01)
+    return [] if batches is None else [seq for seq, _ in batches[0].texts]
 
 
 @asynccontextmanager
@@ -154,13 +155,13 @@ def test_a_place_is_read_as_it_is_written() -> None:
 
 
 @in_simulated_time
-async def test_a_slow_listener_learns_how_much_it_has_lost_and_goes_on() -> None:
+async def test_a_slow_listener_receives_the_number_of_lost_events_and_continues() -> None:
     async with a_feed(kept=10) as feed:
         listener = feed.listen()
         publish(feed, 25)
-        news = await listener.next(1)
-        assert news is not None
-        assert (news[0].missed, news[0].texts) == (25, ())
+        batches = await listener.next(1)
+        assert batches is not None
+        assert (batches[0].missed, batches[0].texts) == (25, ())
         assert listener.position == feed.position
         publish(feed, 2)
         assert await taken(listener) == [26, 27]
@@ -183,7 +184,8 @@ async def test_listeners_get_what_they_want_and_move_on_past_the_rest() -> None:
 
 @in_simulated_time
 async def test_many_listeners_are_woken_seldom_and_one_at_once() -> None:
-    """What many are told is gathered: else a download would be told value by value to each of them."""
+    """Events for many listeners are collected, so that a download is not sent value by value to each of
+    them."""
 
     async def count(listeners: int) -> int:
         wakings = 0
@@ -221,9 +223,9 @@ async def test_an_event_that_was_sent_releases_what_it_was_written_from() -> Non
         del members
         assert released() is not None
         for each in (listener, feed.listen(EventPosition(feed.run, 0))):  # the second one gets the same text
-            news = await each.next(1)
-            assert news is not None
-            assert json.loads(news[0].texts[0][1])["value"] == 1
+            answer = await each.next(1)
+            assert answer is not None
+            assert json.loads(answer[0].texts[0][1])["value"] == 1
         assert released() is None
 
 
@@ -248,10 +250,10 @@ async def test_an_event_is_encoded_once_for_all_listeners() -> None:
 
 
 @in_simulated_time
-async def test_a_listener_hears_of_a_vehicle_its_values_and_its_fetch() -> None:
+async def test_a_listener_receives_the_events_of_a_vehicle_its_values_and_its_fetch() -> None:
     vehicle = small_px4(burst=1, period=0.1)
-    async with service(vehicle) as (hub, browser), listening(browser) as heard:
-        hello = heard.all[0]
+    async with service(vehicle) as (hub, browser), listening(browser) as received:
+        hello = received.all[0]
         assert (hello["type"], hello["resumed"]) == ("hello", False)
         assert hello["run"] == hub.feed.run
         await met(browser)
@@ -259,22 +261,24 @@ async def test_a_listener_hears_of_a_vehicle_its_values_and_its_fetch() -> None:
         await browser.put(f"{C}/params/PARAM_01", json={"value": 12})
         await asyncio.sleep(1)
         assert [
-            each["component_doc"]["system"] for each in heard.of("component") if each["why"] == "discovered"
+            each["component_doc"]["system"]
+            for each in received.of("component")
+            if each["why"] == "discovered"
         ] == [1]
-        changes = heard.of("change")
+        changes = received.of("change")
         assert {each["name"] for each in changes} >= set(VALUES)
         assert (changes[-1]["name"], changes[-1]["new"]["value"], changes[-1]["by"]) == (
             "PARAM_01",
             12,
             "us for local",
         )
-        progress = heard.of("progress")
+        progress = received.of("progress")
         assert all(0 <= a["received"] <= b["received"] for a, b in pairwise(progress))
         assert progress[-1]["done"] is True
         assert 5 <= len(progress) <= 25  # of 2.5 seconds
-        assert [each["job"]["state"] for each in heard.of("job")] == ["running", "done"]
-        assert [each["state"] for each in heard.of("link")] == ["open"]
-        numbers = [each["seq"] for each in heard.all]
+        assert [each["job"]["state"] for each in received.of("job")] == ["running", "done"]
+        assert [each["state"] for each in received.of("link")] == ["open"]
+        numbers = [each["seq"] for each in received.all]
         assert numbers == sorted(set(numbers))
 
 
@@ -286,11 +290,11 @@ async def test_a_client_that_reconnects_misses_no_event_and_gets_none_twice() ->
         last = str(hub.feed.position)
         fetch = asyncio.create_task(browser.post(f"{C}/fetch", json={}))
         for _ in range(6):
-            async with listening(browser, after=last) as heard:
-                assert heard.all[0]["resumed"]
+            async with listening(browser, after=last) as received:
+                assert received.all[0]["resumed"]
                 await asyncio.sleep(0.31)
-                whole += [each["seq"] for each in heard.all[1:]]
-                last = heard.last_id
+                whole += [each["seq"] for each in received.all[1:]]
+                last = received.last_id
             await asyncio.sleep(0.07)
         await fetch
         first = whole[0]
@@ -302,47 +306,47 @@ async def test_a_client_that_reconnects_misses_no_event_and_gets_none_twice() ->
 async def test_after_another_run_everything_is_to_be_loaded_anew() -> None:
     async with (
         service(generic()) as (hub, browser),
-        listening(browser, after="0123456789abcdef-1") as heard,
+        listening(browser, after="0123456789abcdef-1") as received,
         listening(browser, after="nonsense") as other,
         listening(browser, after=str(hub.feed.position)) as by_query,
     ):
-        assert [each.all[0]["resumed"] for each in (heard, other, by_query)] == [False, False, True]
+        assert [each.all[0]["resumed"] for each in (received, other, by_query)] == [False, False, True]
 
 
 @in_simulated_time
-async def test_a_listener_hears_of_what_it_has_asked_for() -> None:
+async def test_a_listener_receives_the_events_that_it_has_selected() -> None:
     two = Air.symmetric([generic(system=1), generic(system=2)])
     async with (
         service(two) as (_, browser),
-        listening(browser, types="change,component", system=2) as heard,
+        listening(browser, types="change,component", system=2) as received,
     ):
         await met(browser, system=2)
         await browser.post("/api/v1/fetch", json={})
         await asyncio.sleep(1)
-        told = heard.all[1:]
-        assert {each["type"] for each in told} == {"change", "component"}
-        assert {each["system"] for each in told} == {2}
+        reported = received.all[1:]
+        assert {each["type"] for each in reported} == {"change", "component"}
+        assert {each["system"] for each in reported} == {2}
 
 
 @in_simulated_time
 async def test_a_stream_in_which_nothing_happens_says_that_it_lives() -> None:
-    async with service() as (_, browser), listening(browser) as heard:
+    async with service() as (_, browser), listening(browser) as received:
         await asyncio.sleep(10 * events.KEEPALIVE_INTERVAL)
-        assert 9 <= heard.text.count(": \n") <= 11
-        assert len(heard.all) == 1
+        assert 9 <= received.text.count(": \n") <= 11
+        assert len(received.all) == 1
 
 
 @in_simulated_time
 async def test_filtered_events_advance_the_position() -> None:
-    async with service(generic()) as (hub, browser), listening(browser, types="link") as heard:
+    async with service(generic()) as (hub, browser), listening(browser, types="link") as received:
         await met(browser)
         await browser.post(f"{C}/fetch", json={})
         await asyncio.sleep(3 * events.KEEPALIVE_INTERVAL)
-        assert heard.last_id == str(hub.feed.position)
+        assert received.last_id == str(hub.feed.position)
 
 
 @in_simulated_time
-async def test_a_listener_that_does_not_read_is_told_of_the_gap(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_listener_that_does_not_read_is_informed_of_the_gap(monkeypatch: pytest.MonkeyPatch) -> None:
     vehicle = small_px4()
     hub = Hub([vehicle], cache=False, fetches=False)
     hub.feed = EventFeed(kept=20)
@@ -366,7 +370,7 @@ async def test_a_listener_that_does_not_read_is_told_of_the_gap(monkeypatch: pyt
         may_go_on.set()
         await asyncio.sleep(1)
         listener.cancel()
-    hello, gap, *_ = [told for _, told in events_of(b"".join(got).decode())]
+    hello, gap, *_ = [reported for _, reported in events_of(b"".join(got).decode())]
     assert (hello["type"], gap["type"]) == ("hello", "gap")
     assert gap["missed"] == gap["seq"] - hello["seq"]
 
@@ -415,20 +419,20 @@ async def test_of_a_listener_that_leaves_nothing_is_left() -> None:
 
 
 @in_simulated_time
-async def test_a_vehicle_that_is_lost_and_comes_back_is_told_of() -> None:
+async def test_the_loss_and_return_of_a_vehicle_are_reported() -> None:
     vehicle = Tap(generic())
-    async with service(vehicle) as (_, browser), listening(browser) as heard:
+    async with service(vehicle) as (_, browser), listening(browser) as received:
         await met(browser)
         await browser.post(f"{C}/fetch", json={})
         vehicle.is_mute = True
         await asyncio.sleep(8)
-        [lost] = [each for each in heard.of("component") if each["why"] == "lost"]
+        [lost] = [each for each in received.of("component") if each["why"] == "lost"]
         assert lost["component_doc"]["is_lost"]
         assert lost["silence_s"] >= 5
         assert (await browser.get(f"{C}/params/PARAM_01")).json()["trust"] == "cached"
         vehicle.is_mute = False
         await asyncio.sleep(5)
-        assert [each["why"] for each in heard.of("component")].count("found") == 1
+        assert [each["why"] for each in received.of("component")].count("found") == 1
 
 
 # the same over a WebSocket
@@ -479,7 +483,7 @@ async def test_a_websocket_carries_the_same_events_and_resumes() -> None:
     async with service(generic()) as (hub, browser):
         await met(browser)
         place = hub.feed.position
-        async with listening(browser, after=str(place)) as heard:
+        async with listening(browser, after=str(place)) as received:
             inbox: asyncio.Queue[Message] = asyncio.Queue()
             query = f"after={place}&types=change,job"
             calling = call_app(hub, "/api/v1/ws", send, kind="websocket", query=query, received=inbox)
@@ -487,9 +491,9 @@ async def test_a_websocket_carries_the_same_events_and_resumes() -> None:
             await browser.post(f"{C}/fetch", json={})
             await asyncio.sleep(1)
             assert sent[0]["type"] == "websocket.accept"
-            hello, *told = [json.loads(each["text"]) for each in sent[1:]]
+            hello, *reported = [json.loads(each["text"]) for each in sent[1:]]
             assert hello["resumed"]
-            assert told == [each for each in heard.all if each["type"] in ("change", "job")]
+            assert reported == [each for each in received.all if each["type"] in ("change", "job")]
             inbox.put_nowait({"type": "websocket.disconnect", "code": 1001})
             await call
             assert hub.feed.listeners == 1

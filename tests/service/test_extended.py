@@ -1,4 +1,4 @@
-"""Extended parameters over HTTP: what the service tells of them, what it writes, how it fails."""
+"""Extended parameters over HTTP: what the service returns, what it writes, how it fails."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ async def test_the_known_table() -> None:
         assert table["run"] == hub.feed.run
         assert list(table["params"]) == list(camera_table())
         for name, param in camera.ext_params.items():
-            told = table["params"][name]
-            assert ExtParamDoc.model_validate(told).param(name) == param
-            assert (told["name"], told["trust"]) == (name, "live")
-            assert told["heard_at"] > 1_700_000_000
+            reported = table["params"][name]
+            assert ExtParamDoc.model_validate(reported).param(name) == param
+            assert (reported["name"], reported["trust"]) == (name, "live")
+            assert reported["heard_at"] > 1_700_000_000
         params = table["params"]
         assert params["CAM_CLOCK"]["value"] == 1_700_000_000_123_456_789
         assert params["CAM_NAME"]["value"] == "Front camera"
@@ -61,8 +61,8 @@ async def test_the_known_table() -> None:
         assert (state.pop("count"), state.pop("params")) == (16, 16)
         assert state == {"is_spoken": True, "is_expected": True, "is_complete": True}
         assert (await browser.get("/api/v1/components/1/100/params")).json()["params"] == {}
-        told = problem(await browser.get(f"{E}/params/CAM_NAMES"), 404, "unknown-parameter")
-        assert told["nearest"][0] == "CAM_NAME"
+        reported = problem(await browser.get(f"{E}/params/CAM_NAMES"), 404, "unknown-parameter")
+        assert reported["nearest"][0] == "CAM_NAME"
 
 
 @in_simulated_time
@@ -262,14 +262,14 @@ async def test_the_history_of_a_component(tmp_path: Path) -> None:
 
 
 @in_simulated_time
-async def test_a_listener_hears_of_values_and_of_their_fetch() -> None:
+async def test_a_listener_receives_the_events_of_values_and_of_their_fetch() -> None:
     camera = Camera(burst=1, period=0.1)
-    async with service(camera) as (hub, browser), listening(browser) as heard:
+    async with service(camera) as (hub, browser), listening(browser) as received:
         await met(browser, system=1, component=100)
         await browser.post(f"{E}/fetch", json={})
         done = await browser.put(f"{E}/params/CAM_CLOCK", json={"value": 2**62 + 1})
         await asyncio.sleep(2)
-        changes = heard.of("extended_change")
+        changes = received.of("extended_change")
         assert [each["name"] for each in changes] == [*camera_table(), "CAM_CLOCK"], "one for each value"
         assert [each["new"]["index"] for each in changes[:-1]] == list(range(16))
         assert {each["kind"] for each in changes} == {"changed"}
@@ -278,15 +278,15 @@ async def test_a_listener_hears_of_values_and_of_their_fetch() -> None:
         assert (last["by"], last["system"], last["component"]) == ("us for local", 1, 100)
         assert last["seq"] <= int(done.headers["x-seq"].partition("-")[2])
         assert ExtParamDoc.model_validate(last["new"]).param("CAM_CLOCK") == done_param(hub, "CAM_CLOCK")
-        progress = heard.of("extended_progress")
+        progress = received.of("extended_progress")
         assert [each["received"] for each in progress] == sorted(each["received"] for each in progress)
         assert (progress[-1]["done"], progress[-1]["total"]) == (True, 16)
         assert 4 <= len(progress) <= 16  # of 1.6 seconds
-        states = [each["component_doc"]["extended"] for each in heard.of("component")]
+        states = [each["component_doc"]["extended"] for each in received.of("component")]
         assert states[0]["count"] is None
         assert (states[-1]["count"], states[-1]["is_complete"], states[-1]["is_spoken"]) == (16, True, True)
-        assert heard.of("change") == []
-        assert [each["job"]["kind"] for each in heard.of("job")] == ["extended-fetch"] * 2
+        assert received.of("change") == []
+        assert [each["job"]["kind"] for each in received.of("job")] == ["extended-fetch"] * 2
 
 
 @in_simulated_time
@@ -294,7 +294,7 @@ async def test_a_listener_may_ask_for_extended_parameters_alone() -> None:
     air = Air.symmetric([Camera(), PX4Vehicle(table={"A": 1}), Camera(system=2)])
     async with (
         service(air) as (_, browser),
-        listening(browser, types="extended_change", system=1) as heard,
+        listening(browser, types="extended_change", system=1) as received,
         listening(browser, types="extended_change", component=1) as other,
     ):
         for system in (1, 2):
@@ -303,46 +303,46 @@ async def test_a_listener_may_ask_for_extended_parameters_alone() -> None:
         await met(browser, system=1, component=1)
         await browser.post("/api/v1/components/1/1/fetch", json={})
         await asyncio.sleep(1)
-        told = heard.all[1:]
-        assert {(each["type"], each["system"]) for each in told} == {("extended_change", 1)}
-        assert len(told) == 16
+        reported = received.all[1:]
+        assert {(each["type"], each["system"]) for each in reported} == {("extended_change", 1)}
+        assert len(reported) == 16
         assert other.all[1:] == []
 
 
 @in_simulated_time
-async def test_parameters_that_come_and_go() -> None:
+async def test_parameters_that_appear_and_disappear() -> None:
     camera = Camera({"A": 1, "B": 2})
-    async with service(camera) as (_, browser), listening(browser) as heard:
+    async with service(camera) as (_, browser), listening(browser) as received:
         await met(browser, system=1, component=100)
         await browser.post(f"{E}/fetch", json={})
         camera.remove_ext_param("A")
         await browser.post(f"{E}/fetch", json={})
-        (removed,) = (each for each in await told(heard) if each["kind"] == "removed")
+        (removed,) = (each for each in await reported(received) if each["kind"] == "removed")
         assert (removed["name"], removed["old"]["value"], removed["new"]) == ("A", 1, None)
         camera.add_ext_param("C", 7)
         await browser.post(f"{E}/fetch", json={})
-        (added,) = (each for each in await told(heard) if each["kind"] == "added")
+        (added,) = (each for each in await reported(received) if each["kind"] == "added")
         assert (added["name"], added["old"], added["new"]["value"]) == ("C", None, 7)
 
 
 @in_simulated_time
-async def test_the_trust_of_many_is_told_at_once_and_that_of_few_singly() -> None:
+async def test_the_trust_of_many_is_reported_at_once_and_that_of_few_singly() -> None:
     for count, singly in ((32, True), (33, False)):
         camera = Camera({f"P{number:02}": number for number in range(count)})
-        async with service(camera) as (_, browser), listening(browser) as heard:
+        async with service(camera) as (_, browser), listening(browser) as received:
             await met(browser, system=1, component=100)
             await browser.post(f"{E}/fetch", json={})
-            await told(heard)
-            before = len(heard.all)
+            await reported(received)
+            before = len(received.all)
             camera.reboot(down=8)
             await asyncio.sleep(20)
-            news = [each for each in heard.all[before:] if each["type"].startswith("extended")]
+            events = [each for each in received.all[before:] if each["type"].startswith("extended")]
             if singly:
-                assert [(each["type"], each["new"]["trust"]) for each in news] == 32 * [
+                assert [(each["type"], each["new"]["trust"]) for each in events] == 32 * [
                     ("extended_change", "cached")
                 ]
             else:
-                assert [(each["type"], each["count"]) for each in news] == [("extended_params", 33)]
+                assert [(each["type"], each["count"]) for each in events] == [("extended_params", 33)]
             table = (await browser.get(f"{E}/params")).json()["params"]
             assert {each["trust"] for each in table.values()} == {"cached"}
 
@@ -359,7 +359,7 @@ async def test_a_published_table_is_not_compared_again_for_each_request() -> Non
             return super().get(name, default)
 
     camera = Camera({f"P{number:02}": number for number in range(40)})
-    async with service(camera) as (hub, browser), listening(browser) as heard:
+    async with service(camera) as (hub, browser), listening(browser) as received:
         await met(browser, system=1, component=100)
         await browser.post(f"{E}/fetch", json={})
         extended = hub.followed[0].extended
@@ -370,14 +370,14 @@ async def test_a_published_table_is_not_compared_again_for_each_request() -> Non
         local(hub.followed[0].component).machine.ext.table.doubt()
         await asyncio.gather(*[browser.get(f"{E}/params") for _ in range(10)])
         assert counted.looks == 40
-        await told(heard)
-        assert [each["count"] for each in heard.of("extended_params")][-1] == 40
+        await reported(received)
+        assert [each["count"] for each in received.of("extended_params")][-1] == 40
 
 
-async def told(heard: ReceivedEvents) -> list[dict[str, Any]]:
+async def reported(received: ReceivedEvents) -> list[dict[str, Any]]:
     """The changes of extended parameters so far."""
     await asyncio.sleep(2)
-    return heard.of("extended_change")
+    return received.of("extended_change")
 
 
 def done_param(hub: Hub, name: str) -> ExtParam:

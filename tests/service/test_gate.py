@@ -121,7 +121,7 @@ def test_those_beyond_this_computer_end_no_connection_of_it() -> None:
     assert len(seats) == 8
 
 
-def test_a_place_is_given_back_once() -> None:
+def test_a_place_is_released_once() -> None:
     seats = ConnectionSlots(8)
     slot = take(seats, "192.0.2.1")
     slot.release()
@@ -169,7 +169,7 @@ def test_of_each_kind_there_is_one_line_in_a_minute(
     assert caplog.messages[2:] == ["refused again"]
 
 
-def test_at_the_end_it_is_told_how_many_there_were(limit: LogLimit, caplog: pytest.LogCaptureFixture) -> None:
+def test_at_the_end_the_number_is_reported(limit: LogLimit, caplog: pytest.LogCaptureFixture) -> None:
     for _ in range(3):
         limit.log(LOG, "full", "refused")
     limit.flush(ends=True)
@@ -192,7 +192,7 @@ def test_lines_of_libraries_are_held_to_the_same(limit: LogLimit, caplog: pytest
             aio.error("Task exception was never retrieved")
     limit.flush(ends=True)
     said = [message.partition("\n")[0] for message in caplog.messages]
-    assert said.count("Task exception was never retrieved") == 5, "nobody from outside causes these"
+    assert said.count("Task exception was never retrieved") == 5, "no external client causes these"
     assert said.count("Invalid HTTP request received.") == 1
     assert said.count("socket.accept() out of system resource") == 1
     assert said[-2:] == [
@@ -222,7 +222,7 @@ def silent(port: int, count: int, source: str = "127.0.0.1", data: bytes = b"") 
         yield
 
 
-async def asked_over_tls(service: Served) -> Answer:
+async def request_over_tls(service: Served) -> Answer:
     async with service.connection(ssl=trusting()) as (reader, writer):
         writer.write(service.head("GET", "/health", "Connection: close"))
         return Answer.of(await taken(reader))
@@ -243,7 +243,7 @@ async def narrow(
 @pytest.mark.asyncio
 @pytest.mark.parametrize("source", ["127.0.0.1", "127.0.0.2"])
 @pytest.mark.parametrize("data", [b"", b"\x16\x03\x01"])
-async def test_silent_connections_keep_nobody_out(
+async def test_silent_connections_block_no_other_client(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, source: str, data: bytes
 ) -> None:
     """From this computer, where there is no limit for one address, and from beyond it."""
@@ -253,15 +253,13 @@ async def test_silent_connections_keep_nobody_out(
         with silent(service.port, 200, source, data):
             for _ in range(3):
                 with anyio.fail_after(TIMEOUT):
-                    assert (await asked_over_tls(service)).status == 200
+                    assert (await request_over_tls(service)).status == 200
     assert len([record for record in caplog.records if record.name != "asyncio"]) < 10
 
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize("data", [b"", b"\x16"])
-async def test_a_handshake_that_does_not_come_is_not_waited_for(
-    monkeypatch: pytest.MonkeyPatch, data: bytes
-) -> None:
+async def test_a_missing_handshake_is_not_waited_for(monkeypatch: pytest.MonkeyPatch, data: bytes) -> None:
     monkeypatch.setattr(acceptor, "HANDSHAKE_TIMEOUT", 0.2)
     async with served(listening=over_tls()) as service, service.connection() as (reader, writer):
         writer.write(data)

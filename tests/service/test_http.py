@@ -44,16 +44,16 @@ async def test_an_address_says_all_the_methods_that_it_knows() -> None:
         ):
             refused = await browser.request("TRACE", path)
             problem(refused, 405, "method-not-allowed")
-            asked = await browser.options(path)
-            assert (asked.status_code, asked.content) == (204, b"")
-            assert refused.headers["allow"] == asked.headers["allow"] == allowed
+            requested = await browser.options(path)
+            assert (requested.status_code, requested.content) == (204, b"")
+            assert refused.headers["allow"] == requested.headers["allow"] == allowed
 
 
 # what others rely on
 
 
 @in_simulated_time
-async def test_a_component_behind_a_link_that_is_away_is_not_up() -> None:
+async def test_a_component_of_a_disconnected_link_is_not_up() -> None:
     link = FlakyLink(small_px4())
     async with service(link, fetches=True) as (_, browser):
         await met(browser)
@@ -63,10 +63,10 @@ async def test_a_component_behind_a_link_that_is_away_is_not_up() -> None:
                 await link.drop(stays_offline=True)
             link.is_offline = not is_here
             await asyncio.sleep(8)
-            told = (await browser.get("/metrics")).text
+            reported = (await browser.get("/metrics")).text
             for name in ("up", "synced"):
                 sample = f'paramclient_component_{name}{{component="1",link="{link.name}",system="1"}}'
-                assert f"{sample} {float(is_here)}\n" in told
+                assert f"{sample} {float(is_here)}\n" in reported
 
 
 @in_simulated_time
@@ -86,13 +86,13 @@ async def test_the_document_of_the_api_has_the_body_of_everything_that_takes_one
 @in_simulated_time
 async def test_a_name_that_no_vehicle_has_is_no_failure_of_the_cache(tmp_path: Path) -> None:
     async with service(small_px4(), cache=tmp_path / "cache.sqlite3", fetches=True) as (_, browser):
-        told = await browser.post("/api/v1/fleet/diff", json={"names": ["PARAM_01"]})
-        assert "holds no table" in problem(told, 404, "unknown-state")["detail"]
+        reported = await browser.post("/api/v1/fleet/diff", json={"names": ["PARAM_01"]})
+        assert "holds no table" in problem(reported, 404, "unknown-state")["detail"]
         await met(browser)
         await asyncio.sleep(5)
         assert (await browser.post("/api/v1/fleet/diff", json={"names": ["PARAM_01"]})).status_code == 200
-        told = await browser.post("/api/v1/fleet/diff", json={"names": ["NOBODY_HAS"]})
-        assert "NOBODY_HAS" in problem(told, 404, "unknown-state")["detail"]
+        reported = await browser.post("/api/v1/fleet/diff", json={"names": ["NOBODY_HAS"]})
+        assert "NOBODY_HAS" in problem(reported, 404, "unknown-state")["detail"]
 
 
 # names and numbers

@@ -110,7 +110,7 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture
 def visit(browser: Browser) -> Iterator[Callable[..., Sight]]:
-    """Opens the page; at the end nothing may have been complained of, nor asked of anybody else."""
+    """Opens the page; at the end there must be no error, and no request to another host."""
     wrong: list[str] = []
     hosts: set[str] = set()
     urls: set[str] = set()
@@ -149,7 +149,7 @@ def until(is_so: Callable[[], object], patience: float = 30.0) -> None:
     """Wait until something is so."""
     end = time.monotonic() + patience
     while not is_so():
-        assert time.monotonic() < end, "it did not come to pass"
+        assert time.monotonic() < end, "it did not happen"
         time.sleep(0.05)
 
 
@@ -177,7 +177,7 @@ def test_no_text_can_become_markup() -> None:
             assert not markup.search(text)
 
 
-def test_nothing_comes_from_elsewhere() -> None:
+def test_the_page_loads_nothing_from_other_hosts() -> None:
     for path in FILES.iterdir():
         addresses = set(
             re.findall(r"(?:https?:)?//[\w.]+\.[a-z]+[^\s\"']*", path.read_text(encoding="utf-8"))
@@ -323,7 +323,7 @@ def test_an_edit_is_staged_then_reviewed_then_sent_and_can_be_undone(sight: Sigh
     assert bench.px4.values["MC_PITCH_P"] == before
     sight.dialog.get_by_role("button", name="Done").click()
     expect(sight.value("MC_PITCH_P")).to_have_text(repr(before))
-    expect(sight.row("MC_PITCH_P")).not_to_have_class(re.compile("news"))  # it was us
+    expect(sight.row("MC_PITCH_P")).not_to_have_class(re.compile("recent"))  # it was us
 
 
 @needs_browser
@@ -443,7 +443,7 @@ def test_an_armed_vehicle_wants_a_second_word(sight: Sight, bench: Bench) -> Non
         sight.review()
         send = sight.dialog.get_by_role("button", name="Send")
         expect(send).to_be_enabled()
-        bench.do(arm, True)  # while somebody looks at what is to be sent
+        bench.do(arm, True)  # during a review
         expect(sight.dialog.get_by_role("alert")).to_contain_text("The vehicle is armed.")
         expect(sight.page.locator("#badges")).to_contain_text("ARMED")
         expect(sight.spoken).to_contain_text("PX4 1/1 is armed.")
@@ -468,7 +468,7 @@ def test_a_change_by_another_client_is_marked_and_keeps_the_focus(sight: Sight, 
     expect(field).to_be_focused()
     expect(field).to_have_value("0.3")
     field.press("Escape")
-    expect(sight.row("MC_YAWRATE_P")).to_have_class(re.compile("news"))
+    expect(sight.row("MC_YAWRATE_P")).to_have_class(re.compile("recent"))
     expect(sight.spoken).to_contain_text("MC_YAWRATE_P is 0.4 now")
     sight.find("")
     sight.page.get_by_role("button", name="Changed by others").click()
@@ -479,11 +479,13 @@ def test_a_change_by_another_client_is_marked_and_keeps_the_focus(sight: Sight, 
 
 
 @needs_browser
-def test_parameters_that_come_and_go_are_announced(visit: Callable[..., Sight], bench: Bench) -> None:
+def test_parameters_that_appear_and_disappear_are_announced(
+    visit: Callable[..., Sight], bench: Bench
+) -> None:
     sight = visit(bench.url, "ArduPilot 2/1")
     sight.find("EK2_GPS_TYPE")
     bench.ask("PATCH", "/components/2/1/params?link=ardupilot", {"values": {"EK2_ENABLE": 1}})
-    expect(sight.row("EK2_GPS_TYPE")).to_have_class(re.compile("news"))
+    expect(sight.row("EK2_GPS_TYPE")).to_have_class(re.compile("recent"))
     expect(sight.spoken).to_contain_text("52 parameters were added.")
     bench.ask("PATCH", "/components/2/1/params?link=ardupilot", {"values": {"EK2_ENABLE": 0}})
     expect(sight.row("EK2_GPS_TYPE")).to_have_count(0)
@@ -750,7 +752,7 @@ def test_on_a_phone(visit: Callable[..., Sight], bench: Bench) -> None:
 
 
 @needs_browser
-def test_a_service_that_goes_and_comes_back(visit: Callable[..., Sight], tmp_path: Path) -> None:
+def test_a_service_that_restarts(visit: Callable[..., Sight], tmp_path: Path) -> None:
     with at_work(tmp_path) as first:
         until(lambda: first.is_synced(1))
         sight = visit(first.url)
@@ -828,7 +830,7 @@ def test_a_forgotten_vehicle_stays_in_view(sight: Sight) -> None:
 
 
 @needs_browser
-def test_a_token_is_asked_for_and_who_may_only_read_sees_that(
+def test_a_token_is_requested_and_a_reader_sees_that_it_may_only_read(
     visit: Callable[..., Sight], tmp_path: Path
 ) -> None:
     reader, writer = "r" * 32, "w" * 32

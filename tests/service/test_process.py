@@ -77,7 +77,7 @@ async def test_serve_waits_for_a_vehicle_and_ends_cleanly(tmp_path: Path) -> Non
             return str((await browser.get("/health")).json()["links"][0]["state"])
 
         with anyio.fail_after(TIMEOUT):
-            while await state() != "failed":  # noqa: ASYNC110 - asked over HTTP
+            while await state() != "failed":  # noqa: ASYNC110 - requested over HTTP
                 await asyncio.sleep(0.05)
         await tasks.start(serve_endpoint, vehicle, create_link(f"tcpin:127.0.0.1:{port}"))
         await browser.post("/api/v1/find", json={})

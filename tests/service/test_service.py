@@ -1,4 +1,4 @@
-"""The service over HTTP, in this process: what it tells of vehicles, what it does, how it fails."""
+"""The service over HTTP, in this process: what it returns, what it does, how it fails."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ async def test_the_service_starts_without_a_vehicle_and_without_its_link() -> No
     link.is_offline = True
     async with service(link, fetches=True) as (_, browser):
         await asyncio.sleep(3)
-        [told] = (await browser.get("/api/v1/links")).json()["links"]
-        assert told["state"] == "failed"
-        assert "connection refused" in told["error"]
-        assert told["stats"] is None
+        [reported] = (await browser.get("/api/v1/links")).json()["links"]
+        assert reported["state"] == "failed"
+        assert "connection refused" in reported["error"]
+        assert reported["stats"] is None
         assert (await browser.get("/api/v1/components")).json()["components"] == []
         assert 3 <= link.openings <= 6  # with back-off
 
@@ -47,9 +47,9 @@ async def test_the_service_starts_without_a_vehicle_and_without_its_link() -> No
         component = ComponentDoc.model_validate((await browser.get(C)).json())
         assert component.state == "synced"
         assert component.params == component.count == len(VALUES)
-        [told] = (await browser.get("/api/v1/links")).json()["links"]
-        assert (told["state"], told["error"], told["openings"]) == ("open", None, 1)
-        assert told["stats"]["round_trips"]["1/1"] > 0
+        [reported] = (await browser.get("/api/v1/links")).json()["links"]
+        assert (reported["state"], reported["error"], reported["openings"]) == ("open", None, 1)
+        assert reported["stats"]["round_trips"]["1/1"] > 0
 
 
 @in_simulated_time
@@ -65,7 +65,7 @@ async def test_requests_to_the_cache_of_a_closing_service_get_closing(tmp_path: 
 
 
 @in_simulated_time
-async def test_a_link_that_drops_is_away_until_it_is_back() -> None:
+async def test_a_dropped_link_is_reconnecting_until_it_is_open() -> None:
     link = FlakyLink(generic())
     async with service(link) as (hub, browser):
         await met(browser)
@@ -98,9 +98,9 @@ async def test_a_log_is_followed_to_its_end_and_stays_to_be_looked_at() -> None:
     async with service(name, cache=None, fetches=True) as (hub, browser):
         found = await met(browser)
         await asyncio.sleep(20)
-        [told] = (await browser.get("/api/v1/links")).json()["links"]
-        assert (told["state"], told["error"], told["openings"]) == ("ended", None, 1)
-        assert told["listens_only"]
+        [reported] = (await browser.get("/api/v1/links")).json()["links"]
+        assert (reported["state"], reported["error"], reported["openings"]) == ("ended", None, 1)
+        assert reported["listens_only"]
         assert found["link_state"] in ("open", "ended")
         assert len((await browser.get(f"{C}/params")).json()["params"]) > 900
         assert hub.jobs.all == []
@@ -111,8 +111,8 @@ async def test_ids_that_two_links_carry_need_the_link_beside_them() -> None:
     async with service(SimLink(generic(), "sim:a"), SimLink(generic(), "sim:b")) as (_, browser):
         await met(browser)
         await asyncio.sleep(2)
-        told = problem(await browser.get(C), 409, "ambiguous")
-        assert told["links"] == ["sim:a", "sim:b"]
+        reported = problem(await browser.get(C), 409, "ambiguous")
+        assert reported["links"] == ["sim:a", "sim:b"]
         assert (await browser.get(C, params={"link": "sim:b"})).json()["link"] == "sim:b"
         problem(await browser.get(C, params={"link": "sim:c"}), 404, "unknown-component")
         problem(await browser.post("/api/v1/find", json={}, params={"link": "sim:c"}), 404, "unknown-link")
@@ -121,14 +121,14 @@ async def test_ids_that_two_links_carry_need_the_link_beside_them() -> None:
 @in_simulated_time
 async def test_find_without_a_vehicle_is_a_no_reply_problem() -> None:
     async with service(SimLink(generic())) as (_, browser):
-        told = problem(
+        reported = problem(
             await browser.post("/api/v1/find", json={"system": 7, "timeout_s": 2}), 504, "no-reply"
         )
-        assert told["error"] == "NoReply"
-        assert told["waited"] == pytest.approx(2, abs=0.01)
-        assert "system id 7" in told["detail"]
-        assert told["hint"] == "Heard on sim:custom so far: 1/1 generic."
-        assert told["detail"].endswith(told["hint"])
+        assert reported["error"] == "NoReply"
+        assert reported["waited"] == pytest.approx(2, abs=0.01)
+        assert "system id 7" in reported["detail"]
+        assert reported["hint"] == "Heard on sim:custom so far: 1/1 generic."
+        assert reported["detail"].endswith(reported["hint"])
         problem(await browser.get("/api/v1/components/7/1"), 404, "unknown-component")
 
 
@@ -171,9 +171,9 @@ async def test_the_fast_encoding_of_parameters_equals_the_documents(tmp_path: Pa
         assert everything["run"] == hub.feed.run
         assert list(everything["params"]) == list(followed.component.params)
         for name, param in followed.component.params.items():
-            told = ParamDoc.kept(param, heard_at=followed.received_at(name)).as_json()
-            assert everything["params"][name] == told
-            assert told["heard_at"] > 1_700_000_000
+            reported = ParamDoc.kept(param, heard_at=followed.received_at(name)).as_json()
+            assert everything["params"][name] == reported
+            assert reported["heard_at"] > 1_700_000_000
         one = (await browser.get(f"{C}/params/RTL_ALT")).json()
         assert one == everything["params"]["RTL_ALT"]
         assert one["trust"] == "live"
@@ -185,7 +185,7 @@ async def test_the_fast_encoding_of_parameters_equals_the_documents(tmp_path: Pa
 
 
 @in_simulated_time
-async def test_one_is_asked_for_by_name_and_by_index() -> None:
+async def test_one_is_requested_by_name_and_by_index() -> None:
     vehicle = generic()
     async with service(SimLink(vehicle)) as (_, browser):
         await met(browser)
@@ -197,8 +197,8 @@ async def test_one_is_asked_for_by_name_and_by_index() -> None:
         assert (await browser.post(f"{C}/read", json={"name": "PARAM_03"})).json()["value"] == 0.75
         assert (await browser.get(f"{C}/params/PARAM_03")).json()["value"] == 0.75
         problem(await browser.post(f"{C}/read", json={}), 422, "usage")
-        told = problem(await browser.post(f"{C}/read", json={"name": "NONE"}), 404, "unknown-parameter")
-        assert told["name"] == "NONE"
+        reported = problem(await browser.post(f"{C}/read", json={"name": "NONE"}), 404, "unknown-parameter")
+        assert reported["name"] == "NONE"
         assert vehicle.requests["PARAM_REQUEST_LIST"] == 0
 
 
@@ -242,7 +242,7 @@ async def test_values_of_every_kind_are_written() -> None:
 
 
 @in_simulated_time
-async def test_of_many_values_each_is_tried_and_told_of() -> None:
+async def test_of_many_values_each_is_tried_and_reported() -> None:
     vehicle = small_px4(param_error=True)
     async with service(SimLink(vehicle)) as (hub, browser):
         await met(browser)
@@ -286,11 +286,11 @@ async def test_events_of_a_call_precede_its_response() -> None:
         run, _, seq = done.headers["x-seq"].partition("-")
         assert run == hub.feed.run
         await asyncio.sleep(0.2)
-        news = await before.next(1)
-        assert news is not None
+        batches = await before.next(1)
+        assert batches is not None
         [number] = [
             number
-            for number, text in news[0].texts
+            for number, text in batches[0].texts
             if '"type":"change"' in text and json.loads(text)["new"]["value"] == 11
         ]
         assert number <= int(seq)
@@ -300,7 +300,7 @@ async def test_events_of_a_call_precede_its_response() -> None:
 
 @in_simulated_time
 async def test_the_component_event_of_a_call_precedes_its_response() -> None:
-    """Also where it was told a moment before, and would else wait for its turn."""
+    """Also if it was reported a moment before, and would otherwise wait."""
     async with service(SimLink(small_px4())) as (hub, browser):
         await met(browser)
         await browser.post(f"{C}/fetch", json={})
@@ -309,15 +309,15 @@ async def test_the_component_event_of_a_call_precedes_its_response() -> None:
             done = await browser.put(f"{C}/params/PARAM_01", json={"value": value})
             now = (await browser.get(C)).json()["hash"]
             await asyncio.sleep(0.01)
-            news = await listener.next(1)
-            assert news is not None
-            told = [json.loads(text) for _, text in news[0].texts]
-            last = [each for each in told if each["type"] == "component"][-1]
+            batches = await listener.next(1)
+            assert batches is not None
+            reported = [json.loads(text) for _, text in batches[0].texts]
+            last = [each for each in reported if each["type"] == "component"][-1]
             assert last["component_doc"]["hash"] == now
             assert last["seq"] <= int(done.headers["x-seq"].partition("-")[2])
 
 
-def test_a_value_that_comes_again_is_as_young_as_that(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_value_that_is_received_again_has_the_later_time(monkeypatch: pytest.MonkeyPatch) -> None:
     times = iter(range(2_000_000_000, 2_000_000_100))
 
     @in_simulated_time
@@ -343,7 +343,7 @@ def test_a_value_that_comes_again_is_as_young_as_that(monkeypatch: pytest.Monkey
 def test_values_of_before_are_cached_with_their_age_until_the_hash_confirms_them(
     most_told_singly: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """That their trust has moved is told one by one where they are few, else at once for all."""
+    """A few changes of trust are reported one by one, many by one event."""
     monkeypatch.setattr(followed_component, "SINGLE_CHANGES_MAX", most_told_singly)
     in_simulated_time(confirm)(most_told_singly, tmp_path)
 
@@ -368,16 +368,16 @@ async def confirm(most_told_singly: int, tmp_path: Path) -> None:
             await browser.post(f"{C}/fetch", json={})
             await asyncio.sleep(1)
             assert (await browser.get(f"{C}/params/PARAM_01")).json()["trust"] == "verified"
-            news = await listener.next(1)
-            assert news is not None
-            told = [json.loads(text) for _, text in news[0].texts]
+            batches = await listener.next(1)
+            assert batches is not None
+            reported = [json.loads(text) for _, text in batches[0].texts]
             if most_told_singly:
-                first, moved = [each for each in told if each.get("name") == "PARAM_01"]
+                first, changed = [each for each in reported if each.get("name") == "PARAM_01"]
                 assert (first["old"], first["new"]["trust"]) == (None, "cached")
-                assert (moved["old"]["trust"], moved["new"]["trust"]) == ("cached", "verified")
+                assert (changed["old"]["trust"], changed["new"]["trust"]) == ("cached", "verified")
             else:
-                assert {each["count"] for each in told if each["type"] == "params"} == {len(VALUES) + 1}
-                assert len([each for each in told if each.get("name") == "PARAM_01"]) == 1
+                assert {each["count"] for each in reported if each["type"] == "params"} == {len(VALUES) + 1}
+                assert len([each for each in reported if each.get("name") == "PARAM_01"]) == 1
         assert vehicle.requests["PARAM_REQUEST_LIST"] == 1
 
 
@@ -401,7 +401,7 @@ async def test_two_who_fetch_at_once_cause_one_download_and_one_may_leave() -> N
 
 
 @in_simulated_time
-async def test_a_download_that_nobody_waits_for_any_more_stops() -> None:
+async def test_a_download_without_a_waiting_caller_stops() -> None:
     vehicle = generic(burst=1, period=0.2)
     async with service(SimLink(vehicle)) as (hub, browser):
         await met(browser)
@@ -424,7 +424,7 @@ async def test_a_fetch_is_a_job_that_can_be_looked_at_and_cancelled() -> None:
         assert begun.json()["id"] in place
         await asyncio.sleep(1)
         running = JobDoc.model_validate((await browser.get(place)).json())
-        assert (running.state, running.kind, running.asked_by) == ("running", "fetch", "local")
+        assert (running.state, running.kind, running.requested_by) == ("running", "fetch", "local")
         assert running.progress is not None
         another = (await browser.post(f"{C}/fetch", json={"wait": False})).headers["location"]
         assert (await browser.delete(another)).status_code == 204
@@ -452,8 +452,8 @@ async def test_a_fetch_that_fails_says_why() -> None:
     async with service(SimLink(vehicle)) as (_, browser):
         await met(browser)
         vehicle.is_deaf = True
-        told = problem(await browser.post(f"{C}/fetch", json={}), 504, "no-reply")
-        assert told["attempts"] > 1
+        reported = problem(await browser.post(f"{C}/fetch", json={}), 504, "no-reply")
+        assert reported["attempts"] > 1
         answer = await browser.post(f"{C}/fetch", json={"sample": 0})
         problem(answer, 422, "invalid-request")
 
@@ -477,7 +477,7 @@ async def test_a_call_whose_client_leaves_is_given_up() -> None:
 
 
 @in_simulated_time
-async def test_at_the_end_whoever_waits_is_answered() -> None:
+async def test_at_the_end_every_waiting_request_gets_a_response() -> None:
     vehicle = Tap(generic())
     hub = Hub([SimLink(vehicle)], cache=False, fetches=False)
     browser = a_browser(create_app(hub))
@@ -532,8 +532,8 @@ async def test_an_internal_error_reveals_no_details(
 ) -> None:
     async with service() as (hub, browser):
         monkeypatch.setattr(type(hub), "followed", property(lambda _: dict[str, str]()["the secret"]))
-        told = problem(await browser.get("/api/v1/components"), 500, "internal")
-        assert "secret" not in json.dumps(told)
+        reported = problem(await browser.get("/api/v1/components"), 500, "internal")
+        assert "secret" not in json.dumps(reported)
         assert "the secret" in caplog.text
 
 
@@ -575,9 +575,9 @@ async def test_its_numbers_are_in_the_format_of_prometheus() -> None:
 async def test_health_says_what_may_be_known() -> None:
     async with service(SimLink(generic(), "sim:a")) as (_, browser):
         await met(browser)
-        told = (await browser.get("/health")).json()
-        assert told["status"] == "ok"
-        assert told["links"] == [{"name": "sim:a", "state": "open"}]
+        reported = (await browser.get("/health")).json()
+        assert reported["status"] == "ok"
+        assert reported["links"] == [{"name": "sim:a", "state": "open"}]
 
 
 @in_simulated_time

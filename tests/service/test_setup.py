@@ -87,9 +87,9 @@ class Checked:
 
     async def job(self, name: str, is_so: Callable[[Any], object]) -> Any:
         """A job, as soon as something is so."""
-        while not is_so(told := await self.get(f"/api/v1/jobs/{name}")):  # noqa: ASYNC110 - nobody tells
+        while not is_so(reported := await self.get(f"/api/v1/jobs/{name}")):  # noqa: ASYNC110 - no event reports it
             await anyio.sleep(0.001)
-        return told
+        return reported
 
     async def file(self, path: str, **query: Any) -> httpx.Response:
         answer = await self.client.get(path, params=query or None)
@@ -139,10 +139,10 @@ async def test_a_file_is_planned_applied_and_verified(
 
         result = await service.post(f"{HERE}/apply", wanted)
         assert result["complete"] is True
-        told = result["vehicle"]
-        assert (told["system"], told["component"]) == (1, 1)
-        assert told["kind"] in ("PX4 quadrotor", "ArduPilot quadrotor")
-        assert told["firmware"]
+        reported = result["vehicle"]
+        assert (reported["system"], reported["component"]) == (1, 1)
+        assert reported["kind"] in ("PX4 quadrotor", "ArduPilot quadrotor")
+        assert reported["firmware"]
         assert result["counts"]["set"] == 20
         assert result["params"]["TUNE_01"] == {
             "status": "set",
@@ -182,26 +182,26 @@ async def test_names_that_changed_with_the_firmware_are_compared_planned_and_app
 ) -> None:
     on_board = vehicle()
     renames = {"name": "names.yaml", "text": RULES}
-    asked = {"wanted": {"values": {"OLD_TUNE": 775, "NEW_TUNE": 3.5, "GONE": 1}}, "renames": renames}
+    requested = {"wanted": {"values": {"OLD_TUNE": 775, "NEW_TUNE": 3.5, "GONE": 1}}, "renames": renames}
     async with serving(on_board, place=tmp_path) as service:
-        differences = (await service.post(f"{HERE}/diff", {**asked, "partial": True}))["params"]
+        differences = (await service.post(f"{HERE}/diff", {**requested, "partial": True}))["params"]
         assert differences["OLD_TUNE"]["right_name"] == "TUNE_01"
         assert differences["NEW_TUNE"]["right_name"] == "TUNE_02"
         assert differences.keys() == {"OLD_TUNE", "NEW_TUNE", "GONE"}
-        plan = await service.post(f"{HERE}/plan", asked)
+        plan = await service.post(f"{HERE}/plan", requested)
         assert plan["params"]["OLD_TUNE"]["vehicle_name"] == "TUNE_01"
         assert plan["params"]["OLD_TUNE"]["wanted"] == 7.75
         assert plan["params"]["GONE"]["category"] == "missing"
-        assert (await service.post(f"{HERE}/verify", asked))["counts"]["different"] == 2
-        result = await service.post(f"{HERE}/apply", {**asked, "only": ["OLD_*", "NEW_*"]})
+        assert (await service.post(f"{HERE}/verify", requested))["counts"]["different"] == 2
+        result = await service.post(f"{HERE}/apply", {**requested, "only": ["OLD_*", "NEW_*"]})
         assert result["counts"]["set"] == 2
-        assert (await service.post(f"{HERE}/verify", asked))["counts"]["same"] == 2
+        assert (await service.post(f"{HERE}/verify", requested))["counts"]["same"] == 2
         assert on_board.values["TUNE_01"] == 7.75
         assert on_board.values["TUNE_02"] == 3.5
 
 
 @pytest.mark.parametrize(
-    ("text", "status", "told"),
+    ("text", "status", "reported"),
     [
         ("- {old: A, new: B}\n- {old: B, new: A}\n", 422, "return to"),
         ("- {old: A, new: B, factor: 0}\n", 422, "factor"),
@@ -212,12 +212,12 @@ async def test_names_that_changed_with_the_firmware_are_compared_planned_and_app
 )
 @in_simulated_time
 async def test_a_wrong_file_of_changed_names_is_rejected(
-    text: str, status: int, told: str, tmp_path: Path
+    text: str, status: int, reported: str, tmp_path: Path
 ) -> None:
-    asked = {"wanted": {"values": {"TUNE_01": 1}}, "renames": {"name": "names.yaml", "text": text}}
+    requested = {"wanted": {"values": {"TUNE_01": 1}}, "renames": {"name": "names.yaml", "text": text}}
     async with serving(px4(), place=tmp_path) as service:
         for path in ("diff", "plan", "verify", "apply"):
-            assert told in (await service.post(f"{HERE}/{path}", asked, status))["detail"]
+            assert reported in (await service.post(f"{HERE}/{path}", requested, status))["detail"]
 
 
 @BOTH
@@ -234,12 +234,12 @@ async def test_an_apply_without_waiting_is_a_job_with_progress(
         while seen[-1]["state"] == "running":
             await anyio.sleep(0.05)
             seen.append(await service.get(where))
-        told = seen[-1]
-        assert (told["kind"], told["state"], told["asked_by"]) == ("apply", "done", "local")
-        assert told["result"]["counts"]["set"] == 20
-        assert told["progress"]["phase"] == "reading"
-        assert (told["progress"]["done"], told["progress"]["total"]) == (20, 20)
-        assert told["problem"] is None
+        reported = seen[-1]
+        assert (reported["kind"], reported["state"], reported["requested_by"]) == ("apply", "done", "local")
+        assert reported["result"]["counts"]["set"] == 20
+        assert reported["progress"]["phase"] == "reading"
+        assert (reported["progress"]["done"], reported["progress"]["total"]) == (20, 20)
+        assert reported["problem"] is None
 
 
 @in_simulated_time
@@ -248,23 +248,23 @@ async def test_progress_of_a_set_up_is_among_the_events(tmp_path: Path) -> None:
         place = (await service.get("/api/v1/components"))["seq"]
         run = (await service.get("/api/v1/components"))["run"]
         await service.post(f"{HERE}/apply", {"wanted": {"values": {"MODE": 4}}})
-        told = []
+        reported = []
         async with service.client.stream(
             "GET", "/api/v1/events", params={"after": f"{run}-{place}", "types": "job"}
         ) as stream:
             async for line in stream.aiter_lines():
                 if line.startswith("data: ") and (event := json.loads(line[6:]))["type"] == "job":
-                    told.append(event["job"])
-                    if told[-1]["state"] != "running":
+                    reported.append(event["job"])
+                    if reported[-1]["state"] != "running":
                         break
-        assert [job["state"] for job in told[-1:]] == ["done"]
-        assert any(job["progress"] and job["progress"]["phase"] == "writing" for job in told)
-        assert all(job["result"] is None for job in told)
+        assert [job["state"] for job in reported[-1:]] == ["done"]
+        assert any(job["progress"] and job["progress"]["phase"] == "writing" for job in reported)
+        assert all(job["result"] is None for job in reported)
 
 
 @BOTH
 @in_simulated_time
-async def test_an_earlier_state_comes_back(vehicle: Callable[..., Vehicle], tmp_path: Path) -> None:
+async def test_an_earlier_state_is_restored(vehicle: Callable[..., Vehicle], tmp_path: Path) -> None:
     on_board = vehicle()
     async with serving(on_board, place=tmp_path) as service:
         await service.post(f"{HERE}/apply", {"wanted": {"values": {"TUNE_01": 9, "TUNE_02": 9}}})
@@ -316,8 +316,8 @@ async def test_two_set_ups_do_not_mix_and_one_can_be_ended(tmp_path: Path) -> No
         assert (busy["type"], busy["job"]) == ("urn:paramclient:busy", job)
         assert (await service.post(f"{HERE}/restore", {}, 409))["type"] == "urn:paramclient:busy"
         assert (await service.client.delete(f"/api/v1/jobs/{job}")).status_code == 204
-        told = await service.job(job, lambda told: told["state"] != "running")
-        assert (told["state"], told["problem"]["type"]) == ("cancelled", "urn:paramclient:cancelled")
+        reported = await service.job(job, lambda reported: reported["state"] != "running")
+        assert (reported["state"], reported["problem"]["type"]) == ("cancelled", "urn:paramclient:cancelled")
         tap.is_mute = False
         await service.post(f"{HERE}/apply", {**body, "wait": True})
         assert on_board.values["TUNE_00"] == 7.5
@@ -337,12 +337,12 @@ async def test_a_cancelled_apply_reports_the_values_written_so_far(tmp_path: Pat
     async with serving(Quiet(px4()), place=tmp_path) as service:
         body = {"wanted": {"values": dict.fromkeys(TUNE, 7.5)}, "wait": False}
         job = (await service.client.post(f"{HERE}/apply", json=body)).json()["id"]
-        await service.job(job, lambda told: told["progress"] and told["progress"]["done"])
+        await service.job(job, lambda reported: reported["progress"] and reported["progress"]["done"])
         assert (await service.client.delete(f"/api/v1/jobs/{job}")).status_code == 204
-        told = await service.job(job, lambda told: told["state"] != "running")
-        assert (told["state"], told["result"]["error"]) == ("cancelled", "interrupted")
-        assert told["result"]["params"]
-        assert {row["status"] for row in told["result"]["params"].values()} == {"unproven"}
+        reported = await service.job(job, lambda reported: reported["state"] != "running")
+        assert (reported["state"], reported["result"]["error"]) == ("cancelled", "interrupted")
+        assert reported["result"]["params"]
+        assert {row["status"] for row in reported["result"]["params"].values()} == {"unproven"}
 
 
 @in_simulated_time
@@ -389,7 +389,7 @@ async def test_the_vehicle_starts_again_where_values_count_only_then(tmp_path: P
 
 
 @in_simulated_time
-async def test_only_what_is_named_is_wanted_and_one_file_lies_over_another() -> None:
+async def test_only_named_parameters_are_wanted_and_one_file_overlays_another() -> None:
     on_board = px4()
     async with serving(on_board) as service:
         base = {"file": {"name": "all.param", "base64": base64.b64encode(FILE.encode()).decode()}}
@@ -400,8 +400,8 @@ async def test_only_what_is_named_is_wanted_and_one_file_lies_over_another() -> 
             "TUNE_03": 33.0,
             "TUNE_11": 3.85,
         }
-        nobody = await service.post(f"{HERE}/plan", {**body, "only": ["TUNE_99"]}, 422)
-        assert "TUNE_99" in nobody["detail"]
+        unmatched = await service.post(f"{HERE}/plan", {**body, "only": ["TUNE_99"]}, 422)
+        assert "TUNE_99" in unmatched["detail"]
         left_out = await service.post(f"{HERE}/plan", {"wanted": {"values": {"CAL_ACC0_XOFF": 1}}})
         assert left_out["params"]["CAL_ACC0_XOFF"]["category"] == "calibration"
         chosen = {"wanted": {"values": {"CAL_ACC0_XOFF": 1}}, "include": ["CAL_ACC0_XOFF"]}
@@ -494,7 +494,9 @@ async def test_defaults_are_a_base_where_they_are_known() -> None:
 
 @BOTH
 @in_simulated_time
-async def test_a_table_comes_as_a_file_of_every_form_and_goes_back(vehicle: Callable[..., Vehicle]) -> None:
+async def test_a_table_is_written_to_a_file_of_every_format_and_read_back(
+    vehicle: Callable[..., Vehicle],
+) -> None:
     on_board = vehicle()
     async with serving(on_board) as service:
         for form in WRITABLE:
@@ -514,7 +516,7 @@ async def test_a_table_comes_as_a_file_of_every_form_and_goes_back(vehicle: Call
             assert (uploaded["format"], uploaded["file"]) == (form, name)
             assert uploaded["params"]["TUNE_01"]["value"] == 0.35
             on_board.set_param("TUNE_01", 9.0)
-            await anyio.sleep(2)  # until a hash that was heard counts no more
+            await anyio.sleep(2)  # until a received hash no longer counts
             encoded = base64.b64encode(answer.content).decode()
             wanted = {"file": {"name": name, "base64": encoded}}
             result = await service.post(f"{HERE}/apply", {"wanted": wanted, "include": ["calibration"]})
@@ -523,7 +525,7 @@ async def test_a_table_comes_as_a_file_of_every_form_and_goes_back(vehicle: Call
 
 
 @in_simulated_time
-async def test_the_name_of_a_file_is_safe_whoever_the_vehicle_is() -> None:
+async def test_the_name_of_a_file_is_safe_for_any_vehicle_name() -> None:
     whose = replace(PX4, autopilot=200, system=9)
     params = ParamSet(
         {"A": WrittenParam("A", 1, ParamType.INT32)}, system=9, component=1, identity=whose, at=NOW
@@ -535,7 +537,7 @@ async def test_the_name_of_a_file_is_safe_whoever_the_vehicle_is() -> None:
 
 
 @in_simulated_time
-async def test_an_earlier_state_comes_as_a_file_too(tmp_path: Path) -> None:
+async def test_an_earlier_state_is_served_as_a_file_too(tmp_path: Path) -> None:
     async with serving(px4(), place=tmp_path) as service:
         kept = await service.ask("POST", f"{HERE}/snapshots", 201, json={"reason": "as it came"})
         await service.ask("PUT", f"{HERE}/params/TUNE_01", json={"value": 5})
@@ -557,7 +559,7 @@ async def test_an_incomplete_table_is_no_file() -> None:
     async with serving(on_board) as service:
         for source, status in (("known", 409), ("live", 409)):
             problem = await service.get(f"{HERE}/file", status, **{"from": source})
-            assert "did not come" in problem["detail"] or problem["type"] == "urn:paramclient:incomplete"
+            assert "not received" in problem["detail"] or problem["type"] == "urn:paramclient:incomplete"
 
 
 @in_simulated_time
@@ -572,7 +574,7 @@ async def test_only_what_differs_from_the_defaults_is_a_file_too() -> None:
 
 
 @in_simulated_time
-async def test_a_file_is_read_and_its_faults_are_told_by_line() -> None:
+async def test_a_file_is_read_and_its_faults_are_reported_by_line() -> None:
     async with serving(px4()) as service:
 
         async def upload(content: bytes, status: int = 200, **query: Any) -> Any:
@@ -621,7 +623,7 @@ async def test_files_are_read_one_after_the_other_and_not_without_end() -> None:
 
 
 @in_simulated_time
-async def test_forms_are_told() -> None:
+async def test_formats_are_recognized() -> None:
     async with serving(px4()) as service:
         forms = (await service.get("/api/v1/formats"))["formats"]
         assert [form["name"] for form in forms if form["writes"]] == WRITABLE
@@ -632,8 +634,8 @@ async def test_forms_are_told() -> None:
 
 
 @in_simulated_time
-async def test_history_comes_in_pages_without_a_loss(tmp_path: Path) -> None:
-    """Also where many changes were heard at one moment."""
+async def test_history_is_served_in_pages_without_a_loss(tmp_path: Path) -> None:
+    """Also if many changes were received at one moment."""
     cache = ParamCache(tmp_path / "cache.sqlite3")
     updates = [
         TableUpdate(
@@ -730,11 +732,12 @@ async def test_vehicles_are_compared_with_each_other(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "asked", [{"names": ["TUNE_0?", "MODE", "T*_02"]}, {"values": {"TUNE_03": 1, "MODE": 5, "NO_SUCH": 2}}]
+    "requested",
+    [{"names": ["TUNE_0?", "MODE", "T*_02"]}, {"values": {"TUNE_03": 1, "MODE": 5, "NO_SUCH": 2}}],
 )
 @in_simulated_time
 async def test_vehicles_are_compared_in_parts(
-    asked: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    requested: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As a whole and name by name gives the same; what is too large is not even begun."""
     parts: list[int] = []
@@ -748,23 +751,23 @@ async def test_vehicles_are_compared_in_parts(
     monkeypatch.setattr(ParamCache, "fleet_diff", noted)
     async with serving(px4(), px4(system=2), px4(system=3), place=tmp_path) as service:
         await service.ask("PUT", f"{HERE}/params/MODE", json={"value": 5})
-        whole = await service.post("/api/v1/fleet/diff", asked)
+        whole = await service.post("/api/v1/fleet/diff", requested)
         count = len(whole["names"])
         assert count >= 3
         assert parts == [count]
         with ParamCache(tmp_path / "cache.sqlite3") as cache:
-            wanted = asked.get("names") or ParamSet(
-                {name: WrittenParam(name, value) for name, value in asked["values"].items()}
+            wanted = requested.get("names") or ParamSet(
+                {name: WrittenParam(name, value) for name, value in requested["values"].items()}
             )
             assert whole == FleetDiffDoc.of(compare(cache, wanted)).as_json()
         parts.clear()
         monkeypatch.setattr(history_room, "FLEET_CELLS_OF_PART", 5)
-        assert await service.post("/api/v1/fleet/diff", asked) == whole
+        assert await service.post("/api/v1/fleet/diff", requested) == whole
         assert parts == [1] * count
         parts.clear()
         monkeypatch.setattr(history_room, "FLEET_CELLS_MAX", 3 * count - 1)
-        told = await service.post("/api/v1/fleet/diff", asked, 413)
-        assert f"At most {count - 1} names can be compared among 3 vehicles" in told["detail"]
+        reported = await service.post("/api/v1/fleet/diff", requested, 413)
+        assert f"At most {count - 1} names can be compared among 3 vehicles" in reported["detail"]
         assert not parts
 
 
@@ -772,11 +775,11 @@ async def test_vehicles_are_compared_in_parts(
 
 
 @in_simulated_time
-async def test_a_vehicle_describes_its_parameters_when_it_is_asked_to(tmp_path: Path) -> None:
+async def test_a_vehicle_describes_its_parameters_on_request(tmp_path: Path) -> None:
     async with serving(PX4Vehicle(metadata=True), place=tmp_path) as service:
         assert (await service.get(f"{HERE}/metadata", 404))["type"] == "urn:paramclient:not-described"
-        told = await service.post(f"{HERE}/metadata", {})
-        assert told["count"] > 100
+        reported = await service.post(f"{HERE}/metadata", {})
+        assert reported["count"] > 100
         infos = await service.get(f"{HERE}/metadata", names="MC_ROLL_P")
         assert infos["params"]["MC_ROLL_P"]["short_description"]
         compared = await service.post(
@@ -794,8 +797,8 @@ async def test_a_file_describes_parameters_too(tmp_path: Path) -> None:
         {"parameters": [{"name": "TUNE_00", "type": "Float", "max": 2.0, "units": "m"}], "version": 1}
     )
     async with serving(px4()) as service:
-        told = await service.ask("PUT", f"{HERE}/metadata?name=p.json", content=content.encode())
-        assert told["count"] == 1
+        reported = await service.ask("PUT", f"{HERE}/metadata?name=p.json", content=content.encode())
+        assert reported["count"] == 1
         assert (await service.get(f"{HERE}/metadata"))["params"]["TUNE_00"] == {"units": "m", "maximum": 2.0}
         bad = await service.ask("PUT", f"{HERE}/metadata", 422, content=b"what")
         assert bad["error"] == "MetadataError"

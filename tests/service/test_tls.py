@@ -1,4 +1,4 @@
-"""Certificates: whatever is wrong with them is told before anybody connects, with the name of the file."""
+"""Certificates: errors are reported before the first connection, with the name of the file."""
 
 from __future__ import annotations
 

@@ -169,20 +169,20 @@ async def test_a_request_has_few_patterns_and_many_names(monkeypatch: pytest.Mon
         await fetched(browser)
         for path, member in (("diff", "only"), ("plan", "only"), ("plan", "include"), ("verify", "include")):
             body = {"wanted": {"values": VALUES}, member: many}
-            told = problem(await browser.post(f"{C}/{path}", json=body), 422, "invalid-request")
-            assert f"at most {PATTERNS_MAX} of the names may be patterns" in told["detail"]
+            reported = problem(await browser.post(f"{C}/{path}", json=body), 422, "invalid-request")
+            assert f"at most {PATTERNS_MAX} of the names may be patterns" in reported["detail"]
             body = {"wanted": {"values": VALUES}, member: [*few, *TABLE]}
             assert (await browser.post(f"{C}/{path}", json=body)).status_code == 200
         body = {
             "wanted": {"values": VALUES},
             "only": [f"A{number}" for number in range(REQUEST_NAMES_MAX + 1)],
         }
-        told = problem(await browser.post(f"{C}/diff", json=body), 422, "invalid-request")
-        assert str(REQUEST_NAMES_MAX) in told["detail"]
-        told = problem(
+        reported = problem(await browser.post(f"{C}/diff", json=body), 422, "invalid-request")
+        assert str(REQUEST_NAMES_MAX) in reported["detail"]
+        reported = problem(
             await browser.post("/api/v1/fleet/diff", json={"names": many[:500]}), 422, "invalid-request"
         )
-        assert f"at most {PATTERNS_MAX}" in told["detail"]
+        assert f"at most {PATTERNS_MAX}" in reported["detail"]
 
         with threads_of(monkeypatch, (params_room, "NameChoice")) as seen:
             answer = await browser.get(f"{C}/params", params={"names": few})
@@ -247,18 +247,20 @@ async def test_a_request_with_more_values_than_a_vehicle_has_is_refused() -> Non
     vehicle = Tap(GenericVehicle(table=TABLE))
     async with service(vehicle) as (_, browser):
         await fetched(browser)
-        vehicle.heard.clear()
+        vehicle.received.clear()
         answer = await browser.post(f"{C}/plan", json={"wanted": {"values": unknown}})
         assert problem(answer, 413, "too-large")["most"] == SEPARATORS_MAX
         few = dict(list(unknown.items())[: REQUEST_VALUES_MAX + 1])
         answer = await browser.post(f"{C}/plan", json={"wanted": {"values": few}})
         assert str(REQUEST_VALUES_MAX) in problem(answer, 422, "invalid-request")["detail"]
         for path in ("plan", "verify", "diff"):
-            told = problem(await browser.post(f"{C}/{path}", json={"wanted": a_file(text)}), 413, "too-large")
-            assert told["most"] == REQUEST_VALUES_MAX
+            reported = problem(
+                await browser.post(f"{C}/{path}", json={"wanted": a_file(text)}), 413, "too-large"
+            )
+            assert reported["most"] == REQUEST_VALUES_MAX
         answer = await browser.post("/api/v1/files?name=a.parm", content=text.encode(), headers=A_FILE)
         assert problem(answer, 413, "too-large")["most"] == REQUEST_VALUES_MAX
-        assert not vehicle.heard, "the vehicle is asked for none of them"
+        assert not vehicle.received, "none of them is requested from the vehicle"
 
 
 @in_simulated_time
@@ -304,7 +306,7 @@ async def test_the_rows_of_a_comparison_are_written_one_by_one(monkeypatch: pyte
 
 @in_simulated_time
 async def test_the_first_requests_build_neither_handlers_nor_models(monkeypatch: pytest.MonkeyPatch) -> None:
-    """To build those of one router takes 30 ms and more, in which nobody else is served."""
+    """To build those of one router takes 30 ms and more, in which no other client is served."""
     built: list[str] = []
     analyze = dependency_utils.get_typed_signature
 
@@ -340,7 +342,7 @@ async def test_the_first_requests_build_neither_handlers_nor_models(monkeypatch:
     ],
 )
 @in_simulated_time
-async def test_of_many_faults_of_one_kind_the_first_is_told(
+async def test_of_many_faults_of_one_kind_the_first_is_reported(
     path: str, body: dict[str, Any], where: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async with service(GenericVehicle(table=TABLE)) as (_, browser):
@@ -359,9 +361,9 @@ async def test_of_many_wrong_values_a_part_is_looked_at() -> None:
         await fetched(browser)
         with peak() as used:
             answer = await browser.post(f"{C}/plan", content=body, headers=A_JSON)
-            told = problem(answer, 422, "invalid-request")
+            reported = problem(answer, 422, "invalid-request")
             assert used() < 4
-        assert told["faults"][0]["where"].startswith("body.wanted.values.A0")
+        assert reported["faults"][0]["where"].startswith("body.wanted.values.A0")
 
 
 MANY = 3_000
@@ -439,7 +441,7 @@ async def test_long_work_is_done_in_a_thread(monkeypatch: pytest.MonkeyPatch) ->
 @in_simulated_time
 async def test_a_table_is_copied_out_in_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     """A table may have thousands of names; each takes 5 µs."""
-    asked: list[tuple[str, str, dict[str, Any] | None]] = [
+    requested: list[tuple[str, str, dict[str, Any] | None]] = [
         *(("GET", f"file?from={source}&format=parm", None) for source in ("known", "live")),
         *(("POST", "diff", {"wanted": {"values": VALUES}, "known": known}) for known in (True, False)),
         ("POST", "diff", {"wanted": {"component": {"system": 1, "component": 1}}, "known": True}),
@@ -447,7 +449,7 @@ async def test_a_table_is_copied_out_in_a_thread(monkeypatch: pytest.MonkeyPatch
     ]
     async with service(GenericVehicle(table=TABLE)) as (_, browser):
         await fetched(browser)
-        for method, path, body in asked:
+        for method, path, body in requested:
             with threads_of(monkeypatch, (WrittenParam, "of")) as seen:
                 answer = await browser.request(method, f"{C}/{path}", json=body)
                 assert answer.status_code == 200, answer.text
@@ -566,14 +568,14 @@ async def test_jobs_have_a_quota_for_each_holder() -> None:
             (await browser.post(f"{C}/fetch", json=body, headers=BEN)).status_code for _ in range(256)
         ]
         assert statuses == [202] * jobs.HOLDER_JOBS_MAX + [429] * (256 - jobs.HOLDER_JOBS_MAX)
-        told = problem(await browser.post(f"{C}/fetch", json=body, headers=BEN), 429, "too-many")
-        assert told["most"] == jobs.HOLDER_JOBS_MAX
+        reported = problem(await browser.post(f"{C}/fetch", json=body, headers=BEN), 429, "too-many")
+        assert reported["most"] == jobs.HOLDER_JOBS_MAX
         others = await browser.post(f"{C}/fetch", json=body, headers=ANNA)
         assert others.status_code == 202
         hub.start_fetch(hub.find_component(1, 1), "service")
         listed = (await browser.get("/api/v1/jobs", headers=ANNA)).json()["jobs"]
         assert len(listed) == jobs.HOLDER_JOBS_MAX + 2
-        own = next(job["id"] for job in listed if job["asked_by"].startswith("ben"))
+        own = next(job["id"] for job in listed if job["requested_by"].startswith("ben"))
         await browser.delete(f"/api/v1/jobs/{own}", headers=BEN)
         await until(lambda: hub.jobs.find(own).state == "cancelled")
         assert (await browser.post(f"{C}/fetch", json=body, headers=BEN)).status_code == 202
@@ -598,8 +600,8 @@ async def test_plans_have_a_quota_for_each_holder_and_for_all(monkeypatch: pytes
             await anyio.sleep(0.5)
             assert not answers, "they wait for the vehicle"
             for path in ("plan", "diff", "verify"):
-                told = problem(await browser.post(f"{C}/{path}", json=body), 429, "too-many")
-                assert told["most"] == LONG_REQUESTS_OF_HOLDER_MAX
+                reported = problem(await browser.post(f"{C}/{path}", json=body), 429, "too-many")
+                assert reported["most"] == LONG_REQUESTS_OF_HOLDER_MAX
             problem(await browser.post("/api/v1/fetch", json={"timeout_s": 20}), 429, "too-many")
             dry = {**body, "dry_run": True}
             problem(await browser.post(f"{C}/apply", json=dry), 429, "too-many")
@@ -639,8 +641,8 @@ async def test_waiting_requests_have_a_quota_for_each_holder_and_for_all(
                 tasks.start_soon(ask)
             await anyio.sleep(0.5)
             assert not statuses, "they wait"
-            told = problem(await browser.post(path, json=body), 429, "too-many")
-            assert told["most"] == WAITING_REQUESTS_OF_HOLDER_MAX
+            reported = problem(await browser.post(path, json=body), 429, "too-many")
+            assert reported["most"] == WAITING_REQUESTS_OF_HOLDER_MAX
             assert (await browser.get(f"{C}/params")).status_code == 200
             assert (await other.post("/api/v1/find", json={})).status_code == 200
             none_left = Quota("requests", total_max=0, holder_max=1)

@@ -258,15 +258,15 @@ class TestClock:
         (time,) = station.wait(0.0).receive(wire.SystemTime)[1:]
         assert time.time_boot_ms == 5000
 
-    @pytest.mark.parametrize(("kind", "asked"), [("copter", [True]), ("plane", []), ("rover", [])])
+    @pytest.mark.parametrize(("kind", "requested"), [("copter", [True]), ("plane", []), ("rover", [])])
     def test_ardupilot_sends_system_time_when_its_main_loop_runs(
-        self, kind: Literal["copter", "plane", "rover"], asked: list[bool]
+        self, kind: Literal["copter", "plane", "rover"], requested: list[bool]
     ) -> None:
         """A Copter only on request; an earlier request is acknowledged, and SYSTEM_TIME sent then."""
         vehicle = ArduPilotVehicle(table=TEN, kind=kind)
         station = Station(vehicle).wait(5.5)
         unasked = [time.time_boot_ms for time in station.receive(wire.SystemTime)]
-        assert unasked == ([] if asked else [2000, 3000, 4000, 5000])
+        assert unasked == ([] if requested else [2000, 3000, 4000, 5000])
         vehicle.reboot(station.now, down=1.0)
         station.wait(1.2)
         station.log.clear()
@@ -459,8 +459,8 @@ class TestOtherStation:
         assert [vehicle.requests["HEARTBEAT"] for vehicle in vehicles] == [4, 4]
         assert vehicles[1].requests == {"HEARTBEAT": 4, "PARAM_REQUEST_LIST": 3, "PARAM_SET": 2}
         assert (vehicles[0].values["B_INT"], vehicles[1].values["B_INT"]) == (7, 8)
-        heard = [(time, frame, message) for time, frame, message in station.log if frame.system == 254]
-        assert [(time, type(message)) for time, _, message in heard] == [
+        received = [(time, frame, message) for time, frame, message in station.log if frame.system == 254]
+        assert [(time, type(message)) for time, _, message in received] == [
             (0.0, wire.Heartbeat),
             (0.5, wire.ParamSetMessage),
             (1.0, wire.Heartbeat),
@@ -471,9 +471,9 @@ class TestOtherStation:
             (3.0, wire.Heartbeat),
             (3.0, wire.ParamRequestList),
         ]
-        assert [frame.sequence for _, frame, _ in heard] == list(range(9))
+        assert [frame.sequence for _, frame, _ in received] == list(range(9))
         assert wire.ParamSetMessage(2, 1, "B_INT", b"\x08\0\0\0", ParamType.INT32) in [
-            each[2] for each in heard
+            each[2] for each in received
         ]
 
     def test_another_station_uses_the_vehicles_encoding(self) -> None:

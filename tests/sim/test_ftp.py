@@ -36,7 +36,7 @@ class Pilot:
     def listen(self, seconds: float) -> list[Packet]:
         """Return the responses within this time."""
         end = self.now + seconds
-        heard = []
+        received = []
         while (due := self.vehicle.next_deadline()) is not None and due <= end:
             self.now = max(due, self.now)
             self.vehicle.tick(self.now)
@@ -45,9 +45,9 @@ class Pilot:
                 message = wire.decode(frame)
                 if isinstance(message, wire.FileTransfer):
                     assert (message.target_system, message.target_component) == (255, self.component)
-                    heard.append(Packet.unpack(message.payload))
+                    received.append(Packet.unpack(message.payload))
         self.now = end
-        return heard
+        return received
 
     def ask(
         self, opcode: Opcode, data: bytes = b"", *, session: int = 3, offset: int = 0, size: int = 0
@@ -310,11 +310,11 @@ def test_a_long_directory_is_listed_in_parts() -> None:
     pilot = Pilot(ArduPilotVehicle())
     names = [f"file{number:03d}" for number in range(60)]
     pilot.vehicle.files.update(dict.fromkeys((f"d/{name}" for name in names), b""))
-    heard: list[bytes] = []
-    while (answer := pilot.ask(Opcode.LIST_DIRECTORY, b"d", offset=len(heard))).opcode == Opcode.ACK:
+    received: list[bytes] = []
+    while (answer := pilot.ask(Opcode.LIST_DIRECTORY, b"d", offset=len(received))).opcode == Opcode.ACK:
         assert len(answer.data) <= DATA_SIZE_MAX
-        heard += answer.data.split(b"\0")[:-1]
-    assert heard == [f"F{name}\t0".encode() for name in names]
+        received += answer.data.split(b"\0")[:-1]
+    assert received == [f"F{name}\t0".encode() for name in names]
 
 
 class TestSessions:
@@ -469,9 +469,9 @@ class TestPace:
         pilot.ask(Opcode.OPEN_FILE_RO, b"a")
         pilot.send(Packet(100, 3, Opcode.BURST_READ_FILE, size=size))
         frame = size + 27
-        heard = pilot.listen(9.5 * frame / 1920)
-        assert len(heard) == 10
-        assert len(heard + pilot.listen(frame / 1920)) == 11
+        received = pilot.listen(9.5 * frame / 1920)
+        assert len(received) == 10
+        assert len(received + pilot.listen(frame / 1920)) == 11
 
     def test_on_a_serial_port_the_banner_precedes_the_first_block(self) -> None:
         """On a real one at 57600 baud, 0.095 to 0.105 s after the requests for open and burst."""

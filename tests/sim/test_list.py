@@ -99,10 +99,10 @@ def test_reads_pause_the_list() -> None:
     station = listing(0.15)
     for index in range(1200, 1380, 5):
         station.send(*(read(index=each) for each in range(index, index + 5))).wait(0.1)
-    asked = range(1200, 1380)
-    runs = [(round(first, 2), round(last, 2)) for first, last in pauses(station, asked)]
+    requested = range(1200, 1380)
+    runs = [(round(first, 2), round(last, 2)) for first, last in pauses(station, requested)]
     assert runs[:4] == [(0.36, 0.5), (0.62, 0.8), (0.92, 1.1), (1.22, 1.4)]
-    answers = Counter(int(time * 10 + 0.01) for time in answered(station, asked) if time < 1.4)
+    answers = Counter(int(time * 10 + 0.01) for time in answered(station, requested) if time < 1.4)
     assert answers == {2: 5, 3: 5} | dict.fromkeys(range(4, 14), 5)
 
 

@@ -352,12 +352,12 @@ class TestDifferences:
         ends = max(time for time, each in recorded if isinstance(each, wire.FileTransfer) and time < 1.0)
 
         def with_end(later: float) -> Messages:
-            moved = [(time + later if time == ends else time, each) for time, each in recorded]
-            return sorted(moved, key=lambda item: item[0])
+            changed = [(time + later if time == ends else time, each) for time, each in recorded]
+            return sorted(changed, key=lambda item: item[0])
 
         assert differences(name, recorded, with_end(0.04), burst=10) == []
         (found,) = {each.split(",")[-1] for each in differences(name, recorded, with_end(0.1), burst=10)}
-        assert found == " before what came before"
+        assert found == " before an earlier one"
 
 
 class TestReplay:

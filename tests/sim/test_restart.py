@@ -27,7 +27,7 @@ class Desk:
     def __init__(self, vehicle: Vehicle) -> None:
         self.vehicle = vehicle
         self.now = 0.0
-        self.heard: list[tuple[float, wire.Frame, wire.Message]] = []
+        self.received: list[tuple[float, wire.Frame, wire.Message]] = []
         self._framer = wire.Framer(wire.DECODED_IDS, stream=False)
         self._sequence = 0
         vehicle.tick(0.0)
@@ -54,7 +54,7 @@ class Desk:
 
     def command(self, mode: float = 1.0) -> list[int]:
         """Send the reboot command; return the immediate responses."""
-        self.heard.clear()
+        self.received.clear()
         self.send(wire.CommandLong(self.vehicle.system, 1, REBOOT, (mode, *[0.0] * 6)))
         acks = self.messages(wire.CommandAck)
         assert acks == [wire.CommandAck(REBOOT, ack.result, 255, 190) for ack in acks]
@@ -66,17 +66,17 @@ class Desk:
         )
 
     def messages(self, kind: type[T]) -> list[T]:
-        return [message for _, _, message in self.heard if isinstance(message, kind)]
+        return [message for _, _, message in self.received if isinstance(message, kind)]
 
     def silence(self, since: float, until: float) -> bool:
-        return not any(since < when < until for when, _, _ in self.heard)
+        return not any(since < when < until for when, _, _ in self.received)
 
     def _take(self) -> None:
         for data in self.vehicle.data_to_send():
             for frame in self._framer.receive(data):
                 message = wire.decode(frame)
                 assert message is not None
-                self.heard.append((self.now, frame, message))
+                self.received.append((self.now, frame, message))
 
 
 @pytest.mark.parametrize(("make", "delay"), [(PX4Vehicle, 0.4), (ArduPilotVehicle, 0.2), (generic, 0.3)])
@@ -88,10 +88,10 @@ def test_a_vehicle_acknowledges_switches_off_and_returns(make: Any, delay: float
     desk.run(30.0)
     on_at = 10.25 + delay + 5.0
     assert desk.silence(10.25 + delay, on_at)
-    started_at = [when for when, frame, _ in desk.heard if frame.sequence == 0][-1]
+    started_at = [when for when, frame, _ in desk.received if frame.sequence == 0][-1]
     assert started_at == pytest.approx(on_at)
     assert desk.vehicle._version == version
-    assert [each for _, each, _ in desk.heard if each.sequence == 0][-1].message_id == 0
+    assert [each for _, each, _ in desk.received if each.sequence == 0][-1].message_id == 0
     assert desk.vehicle.system == 1
 
 
@@ -127,9 +127,9 @@ def test_other_reboot_commands(make: Any, answers: Mapping[int, int]) -> None:
     desk = Desk(make())
     for mode, answer in answers.items():
         assert desk.command(mode) == [answer]
-    desk.heard.clear()
+    desk.received.clear()
     desk.run(5.0)
-    beats = [when for when, _, each in desk.heard if isinstance(each, wire.Heartbeat)]
+    beats = [when for when, _, each in desk.received if isinstance(each, wire.Heartbeat)]
     assert beats == [1.0, 2.0, 3.0, 4.0, 5.0]
 
 
@@ -158,14 +158,14 @@ def test_px4s_system_id_takes_effect_after_a_reboot() -> None:
     desk = Desk(PX4Vehicle(uid=7))
     desk.set("MAV_SYS_ID", 9, ParamType.INT32, Encoding.BYTEWISE)
     desk.run(10.0)
-    assert {frame.system for _, frame, _ in desk.heard} == {1}
+    assert {frame.system for _, frame, _ in desk.received} == {1}
     desk.command()
     desk.run(20.0)
     assert desk.vehicle.system == 9
-    assert {frame.system for when, frame, _ in desk.heard if when > 10.5} == {9}
-    desk.heard.clear()
+    assert {frame.system for when, frame, _ in desk.received if when > 10.5} == {9}
+    desk.received.clear()
     desk.send(wire.ParamRequestRead(1, 1, "MAV_SYS_ID"))
-    assert not desk.heard
+    assert not desk.received
     desk.send(wire.ParamRequestRead(9, 1, "MAV_SYS_ID"))
     assert desk.messages(wire.ParamValue)
 
@@ -242,10 +242,10 @@ def test_plane_and_rover_change_their_system_id_within_a_second(by_file: bool) -
     else:
         desk.set("SYSID_THISMAV", 9, ParamType.INT16, Encoding.C_CAST)
     desk.run(10.9)
-    assert {frame.system for _, frame, _ in desk.heard} == {1}
-    desk.heard.clear()
+    assert {frame.system for _, frame, _ in desk.received} == {1}
+    desk.received.clear()
     desk.run(12.0)
-    assert {frame.system for _, frame, _ in desk.heard} == {9}
+    assert {frame.system for _, frame, _ in desk.received} == {9}
     assert desk.vehicle._version.uid2 == ArduPilotVehicle()._version.uid2
     desk.command()
     desk.run(20.0)
@@ -286,7 +286,7 @@ def test_a_late_call_does_not_change_the_end_of_a_reboot() -> None:
     vehicle.tick(9.3)
     assert vehicle._on_at == pytest.approx(2.3)
     desk.now = 9.3
-    desk.heard.clear()
+    desk.received.clear()
     desk.run(9.3)
     assert [each.time_boot_ms for each in desk.messages(wire.SystemTime)] == [7000]
 

@@ -837,10 +837,10 @@ class TestArduPilot:
         assert station.times() == pytest.approx([0.1] * 5 + [0.2] * 5 + [0.3] * 5)
         assert indices(station.values()) == list(range(15))
 
-    @pytest.mark.parametrize(("asked", "answered"), [(25, 25), (40, 25), (300, 25)])
-    def test_the_read_queue_drops_silently(self, asked: int, answered: int) -> None:
+    @pytest.mark.parametrize(("requested", "answered"), [(25, 25), (40, 25), (300, 25)])
+    def test_the_read_queue_drops_silently(self, requested: int, answered: int) -> None:
         station = Station(ArduPilotVehicle())
-        assert indices(station.ask(*(read(index=index) for index in range(asked)), seconds=5.0)) == list(
+        assert indices(station.ask(*(read(index=index) for index in range(requested)), seconds=5.0)) == list(
             range(answered)
         )
         assert len(station.ask(read(index=0))) == 1

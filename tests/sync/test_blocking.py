@@ -59,7 +59,7 @@ def threads_of_clients() -> list[threading.Thread]:
 
 
 def until(condition: Callable[[], object]) -> None:
-    """Wait until something has come about of which nobody tells."""
+    """Wait until a condition holds that no event reports."""
     deadline = time.monotonic() + TIMEOUT
     while not condition():
         assert time.monotonic() < deadline
@@ -92,9 +92,9 @@ def send(number: signal.Signals) -> None:
 
 @contextlib.contextmanager
 def ctrl_c() -> Iterator[None]:
-    """Press Ctrl-C while the body waits; the KeyboardInterrupt must come out of it."""
+    """Press Ctrl-C while the body waits; it must raise KeyboardInterrupt."""
     thread = threading.Thread(target=send, args=[signal.SIGINT])
-    with pytest.raises(KeyboardInterrupt):  # noqa: PT012 - the signal must not come before
+    with pytest.raises(KeyboardInterrupt):  # noqa: PT012 - the signal must not arrive before
         thread.start()
         yield
     thread.join()
@@ -144,11 +144,11 @@ def test_the_traceback_of_an_error_in_a_callback_is_whole() -> None:
 
 def test_the_calls_of_the_asynchronous_client_without_await() -> None:
     vehicle = swift_px4()
-    told: list[tuple[Progress, str]] = []
+    reported: list[tuple[Progress, str]] = []
     with a_client(vehicle) as client:
         component = client.only_component()
         result = component.fetch_all(
-            progress=lambda progress: told.append((progress, threading.current_thread().name))
+            progress=lambda progress: reported.append((progress, threading.current_thread().name))
         )
         assert result.complete
         assert bits(component.params) == bits(vehicle.params)
@@ -163,8 +163,8 @@ def test_the_calls_of_the_asynchronous_client_without_await() -> None:
             component.get("NO_SUCH")
         with pytest.raises(NoReply):
             client.component(system=99, timeout=0.01)
-    assert told[-1] == (Progress(25, 25, told[-1][0].rate, 0.0), threading.current_thread().name)
-    ranges = told[-1][0].ranges
+    assert reported[-1] == (Progress(25, 25, reported[-1][0].rate, 0.0), threading.current_thread().name)
+    ranges = reported[-1][0].ranges
     assert ranges is not None
     assert [part.received for part in ranges.split(5)] == [5] * 5
 
@@ -217,7 +217,7 @@ def test_a_set_is_in_the_cache_after_the_with(tmp_path: Path) -> None:
         assert cache.component(system=1).params["PARAM_01"].value == 77
 
 
-def test_values_may_come_from_an_iterator_that_calls_the_client() -> None:
+def test_values_may_be_those_of_an_iterator_that_calls_the_client() -> None:
     with a_client(generic()) as client:
         component = client.component()
         done = component.set_many(
@@ -648,7 +648,7 @@ def test_ctrl_c_loses_no_change() -> None:
 def test_ctrl_c_in_the_body_closes_the_client() -> None:
     client = a_client(generic())
     thread = threading.Thread(target=send, args=[signal.SIGINT])
-    with pytest.raises(KeyboardInterrupt), client:  # noqa: PT012 - the signal must not come before
+    with pytest.raises(KeyboardInterrupt), client:  # noqa: PT012 - the signal must not arrive before
         thread.start()
         client.component(99, timeout=None)
     assert " closed, " in repr(client)

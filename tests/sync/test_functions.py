@@ -63,15 +63,15 @@ def test_a_set_up_from_the_plan_to_the_restore(tmp_path: Path) -> None:
         assert board.params["PARAM_01"].value == before
         assert not verify(component, content).is_met
 
-        told: list[tuple[ApplyProgress, str]] = []
+        reported: list[tuple[ApplyProgress, str]] = []
         result = apply(
             component,
             plan,
             backup=tmp_path / "before.params",
-            progress=lambda state: told.append((state, threading.current_thread().name)),
+            progress=lambda state: reported.append((state, threading.current_thread().name)),
         )
         assert result.complete
-        assert {name for _, name in told} == {threading.current_thread().name}
+        assert {name for _, name in reported} == {threading.current_thread().name}
         assert verify(component, content).is_met
 
         assert restore(component, read_file(tmp_path / "before.params").choose()).complete
@@ -136,8 +136,8 @@ def test_several_vehicles_with_a_set_and_a_file_for_each(tmp_path: Path) -> None
     boards = [vehicle(), vehicle(system=2)]
     with ParamClient(Air(boards), cache=False) as client:
         both = [client.component(system=number) for number in (1, 2)]
-        told: set[Component] = set()
-        asked: list[Component] = []
+        reported: set[Component] = set()
+        requested: list[Component] = []
         main = threading.current_thread()
 
         def wanted_of(component: Component) -> ParamSet:
@@ -148,11 +148,11 @@ def test_several_vehicles_with_a_set_and_a_file_for_each(tmp_path: Path) -> None
             both,
             wanted_of,
             backup=lambda component: tmp_path / f"{component.system}.params",
-            progress=lambda component, _: told.add(component),
-            before_writing=asked.append,
+            progress=lambda component, _: reported.add(component),
+            before_writing=requested.append,
         )
         assert fleet.complete
-        assert told == set(asked) == set(both)
+        assert reported == set(requested) == set(both)
         assert [board.params["PARAM_01"].value for board in boards] == [71, 72]
         assert sorted(path.name for path in tmp_path.iterdir()) == ["1.params", "2.params"]
         assert verify_all(both, {(1, 1): wanted(PARAM_01=71), (2, 1): wanted(PARAM_01=72)}).is_met
@@ -167,17 +167,17 @@ def test_several_vehicles_are_restored_each_to_its_own_state(tmp_path: Path) -> 
         both = [client.component(system=number) for number in (1, 2)]
         own = {(each.system, each.component): wanted(PARAM_01=70 + each.system) for each in both}
         applied = apply_all(both, own)
-        told: set[Component] = set()
-        asked: list[Component] = []
+        reported: set[Component] = set()
+        requested: list[Component] = []
         fleet = restore_all(
             both,
             lambda each: applied.results[each.system, each.component].before,
             backup=lambda component: tmp_path / f"{component.system}.params",
-            progress=lambda component, _: told.add(component),
-            before_writing=asked.append,
+            progress=lambda component, _: reported.add(component),
+            before_writing=requested.append,
         )
         assert fleet.complete
-        assert told == set(asked) == set(both)
+        assert reported == set(requested) == set(both)
         assert [board.params["PARAM_01"].value for board in boards] == before
         assert sorted(path.name for path in tmp_path.iterdir()) == ["1.params", "2.params"]
     assert restore_all([], {}).results == {}

@@ -92,7 +92,7 @@ class ExtendedParams(Machine):
         Args:
             message: the message.
             now: the time.
-            moment: when it came from the link, if earlier; None for `now`.
+            moment: when it arrived from the link, if earlier; None for `now`.
         """
         name = message.param_id
         if not is_portable_name(name):
@@ -101,7 +101,7 @@ class ExtendedParams(Machine):
         message = message._replace(raw=param.raw)
         if self.table.use_count(message.param_count):
             self.fetches.count_changed(now)
-        until = self._checks.ambiguous_until(message, now, is_wanted=False)
+        until = self._checks.ambiguous_until(message, now, is_requested=False)
         if until > now:
             self._checks.ask(name, until)
             self.reads.defer(message, until, now)

@@ -91,7 +91,7 @@ class ExtFetch(Operation[ExtFetchResult]):
         self.first_at = math.inf
         self.longest: float | None = None
         self.front = -1
-        self.came = 0
+        self.downloaded = 0
         self.count_changes = 0
         self.reads: dict[int, ExtRead] = {}
         self.unread: deque[int] = deque()
@@ -174,7 +174,7 @@ class ExtFetches(Machine):
         fetch.first_at = min(fetch.first_at, now)
         fetch.value_at = fetch.quiet_since = now
         if index < message.param_count:
-            fetch.came += index not in fetch.received
+            fetch.downloaded += index not in fetch.received
             fetch.received[index] = message.param_id
             fetch.front = max(fetch.front, index)
         self._look(fetch, now)
@@ -210,7 +210,7 @@ class ExtFetches(Machine):
         """Return the progress of a fetch."""
         running = now - fetch.first_at if fetch.first_at < math.inf else 0.0
         ranges = DownloadRanges("parameters", partial(self._split, fetch)) if fetch.has_begun else None
-        return Progress.after(len(fetch.received), self._table.count, fetch.came, running, ranges)
+        return Progress.after(len(fetch.received), self._table.count, fetch.downloaded, running, ranges)
 
     def _split(self, fetch: ExtFetch, number: int) -> tuple[DownloadRange, ...]:
         requested = fetch.requested_again - fetch.dead

@@ -91,7 +91,7 @@ class ExtTable:
         Args:
             param: the value. Its index is not stored; see `use_index`.
             by: the author of the change, if it is one.
-            moment: when the value came from the link.
+            moment: when the value arrived from the link.
         """
         name = param.name
         old = self.params.get(name)

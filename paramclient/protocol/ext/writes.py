@@ -94,7 +94,7 @@ class ExtWrite(Operation[ExtSetResult]):
         self.made: ExtParam | None = None  # the value that an earlier PARAM_EXT_SET has led to
         self.adjusted: ExtParam | None = None  # the other value that the component has accepted instead
         self.refusal: ExtSetRefused | None = None  # one that may belong to an earlier write
-        self.is_answered = False  # an acknowledgement that proves nothing came after the last PARAM_EXT_SET
+        self.is_answered = False  # an inconclusive acknowledgement followed the last PARAM_EXT_SET
         self.is_sent = False
         self.verify_at = math.inf
         self.read: ExtRead | None = None
@@ -370,8 +370,8 @@ class ExtWrites(Machine):
             return
         is_made_again = write.made is not None and write.made.same_value(actual)
         is_last = write.request.should_give_up(now)
-        is_told = write.is_answered or (write.adjusted is not None and write.adjusted.same_value(actual))
-        if (write.is_answered and is_made_again) or (is_last and is_told):
+        is_adjusted = write.is_answered or (write.adjusted is not None and write.adjusted.same_value(actual))
+        if (write.is_answered and is_made_again) or (is_last and is_adjusted):
             self._succeed(write, actual, now)
         elif is_last:
             self._fail(write, self._not_applied(write, actual), now)

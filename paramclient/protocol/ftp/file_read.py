@@ -99,7 +99,7 @@ class FileRead(FileTransferJob[bytes]):
         self._has_bursts = True
         self._start_anew()
         self._gap = BLOCK_GAP_DEFAULT
-        self._came = 0
+        self._blocks_received = 0
         self._lost = 0
         self._number = 0
         self._tokens = SEND_BURST
@@ -124,7 +124,7 @@ class FileRead(FileTransferJob[bytes]):
         self._early_blocks: list[Packet] = []  # received before the response to the open
         self._is_unproven = False  # whether that response was lost, so that the file may be another one
         self._is_silent = False  # silence since the last timed-out request was sent
-        self._asked: dict[int, tuple[int, float]] = {}  # unanswered reads by offset: how often, and when last
+        self._unanswered: dict[int, tuple[int, float]] = {}  # reads by offset: how often, and when last
 
     @property
     def received(self) -> int:
@@ -147,7 +147,7 @@ class FileRead(FileTransferJob[bytes]):
 
     def requested_again(self) -> list[tuple[int, int]]:
         """Return first byte and end of what the burst lost and single reads have requested, rising."""
-        offsets = {pending.offset for pending in tuple(self._pending_reads.values())} | set(self._asked)
+        offsets = {pending.offset for pending in tuple(self._pending_reads.values())} | set(self._unanswered)
         return [
             (at, min(at + self._read_size, last))
             for first, last in self._blocks.gaps
@@ -190,7 +190,7 @@ class FileRead(FileTransferJob[bytes]):
     def _shows_lost_open_reply(self, packet: Packet) -> bool:
         """Return whether this shows that the response to our open was lost: it belongs to the burst behind
         it."""
-        if packet.session != self.asked_session or packet.requested != Opcode.BURST_READ_FILE:
+        if packet.session != self.requested_session or packet.requested != Opcode.BURST_READ_FILE:
             return False
         if self._restarts < REOPENS_MAX and packet.opcode == Opcode.ACK and self._is_of_a_burst(packet):
             self._early_blocks.append(packet)
@@ -260,7 +260,7 @@ class FileRead(FileTransferJob[bytes]):
             earliest = min(earliest, self._quiet_at())
         elif self._pending_reads:
             earliest = min(earliest, *map(self._pending_deadline, self._pending_reads.values()))
-        if self._next_wanted() is not None:
+        if self._next_needed() is not None:
             earliest = min(earliest, self._next_read_at)
         return earliest
 
@@ -268,7 +268,7 @@ class FileRead(FileTransferJob[bytes]):
         super().resume(now)
         if self.session is not None and not self.is_ended:
             self._pending_reads.clear()
-            self._asked.clear()
+            self._unanswered.clear()
             self._burst_attempts.restart()
             self._burst_runs = False
             self._request_next(now)
@@ -299,7 +299,7 @@ class FileRead(FileTransferJob[bytes]):
         self._burst_attempts.sent(now)
         self._block_at = self._overtaken_at = math.inf
         self._first_block = None
-        session = self.asked_session if self.session is None else self.session
+        session = self.requested_session if self.session is None else self.session
         self._burst_session = session or 0
         self._line.send(
             Packet(
@@ -329,7 +329,7 @@ class FileRead(FileTransferJob[bytes]):
         skipped = packet.offset - self._blocks.reached
         if skipped > 0:
             self._lost += -(-skipped // self._read_size)
-        self._came += 1
+        self._blocks_received += 1
         self._measure(packet, now)
         if self._keep(packet, packet.offset, now):
             self._burst_attempts.restart()
@@ -427,7 +427,7 @@ class FileRead(FileTransferJob[bytes]):
                 self._give_up(sequence)
                 self._retries.timed_out(1)
         self._retries.answered(pending.sent_at, now, is_sure=pending.is_only)
-        self._asked.pop(pending.offset, None)
+        self._unanswered.pop(pending.offset, None)
         if packet.opcode == Opcode.ACK and packet.data:
             is_ahead = pending.offset >= self._blocks.reached
             self._keep(packet, pending.offset, now)
@@ -447,11 +447,11 @@ class FileRead(FileTransferJob[bytes]):
 
     def _record_timeout(self, pending: _PendingRead, now: float) -> None:
         """Record an unanswered read; those of one offset that were sent meanwhile count as one."""
-        attempts, counted_at = self._asked.get(pending.offset, (0, -math.inf))
-        if not self._is_wanted(pending.offset) or pending.sent_at < counted_at:
+        attempts, counted_at = self._unanswered.get(pending.offset, (0, -math.inf))
+        if not self._is_needed(pending.offset) or pending.sent_at < counted_at:
             return
         attempts += 1
-        self._asked[pending.offset] = attempts, now
+        self._unanswered[pending.offset] = attempts, now
         is_silence = self._line.received_at < pending.sent_at
         if not (is_silence and self._is_silent):  # a silence that all reads share counts once
             self._retries.timed_out(attempts)
@@ -462,11 +462,11 @@ class FileRead(FileTransferJob[bytes]):
     def _pending_deadline(self, pending: _PendingRead) -> float:
         return self._retries.due_at(pending.sent_at, pending.ahead, self._gap)
 
-    def _is_wanted(self, offset: int) -> bool:
+    def _is_needed(self, offset: int) -> bool:
         is_behind = self._blocks.end is None and offset >= self._blocks.reached
         return is_behind or self._blocks.is_missing(offset)
 
-    def _is_asked_for(self, offset: int) -> bool:
+    def _is_requested(self, offset: int) -> bool:
         return any(pending.offset == offset for pending in self._pending_reads.values())
 
     @property
@@ -488,7 +488,7 @@ class FileRead(FileTransferJob[bytes]):
         """When the pace allows another read."""
         return self._tokens_at + max(1.0 - self._tokens, 0.0) * self._interval
 
-    def _wanted(self) -> Iterator[int]:
+    def _needed_offsets(self) -> Iterator[int]:
         """Yield the offsets of useful single reads, the most useful first."""
         yield from self._blocks.missing(self._read_size)
         if self._blocks.end is None and not self._burst_runs:
@@ -506,30 +506,30 @@ class FileRead(FileTransferJob[bytes]):
         is_estimate = self._path_data.startswith(GENERATED_PREFIX)
         return UNKNOWN_SIZE if is_estimate or not self.size else self.size
 
-    def _next_wanted(self) -> int | None:
+    def _next_needed(self) -> int | None:
         """Return the next offset: an unrequested one, otherwise a copy, if that is worthwhile."""
         if len(self._pending_reads) >= self._window:
             return None
         copies: dict[int, int] = {}
         for pending in self._pending_reads.values():
             copies[pending.offset] = copies.get(pending.offset, 0) + 1
-        wanted = []
-        for offset in self._wanted():
+        candidates = []
+        for offset in self._needed_offsets():
             if offset not in copies:
                 return offset
-            wanted.append(offset)
-        if not wanted or self._burst_runs:
+            candidates.append(offset)
+        if not candidates or self._burst_runs:
             return None
-        fewest = min(wanted, key=copies.__getitem__)
+        fewest = min(candidates, key=copies.__getitem__)
         return fewest if copies[fewest] <= self._most_copies else None
 
     @property
     def _most_copies(self) -> int:
-        return self._retries.copies(self._came, self._lost)
+        return self._retries.copies(self._blocks_received, self._lost)
 
     def _read(self, offset: int, now: float) -> None:
         sequence = self._line.next_sequence()
-        is_only = not (self._burst_runs or offset in self._asked or self._is_asked_for(offset))
+        is_only = not (self._burst_runs or offset in self._unanswered or self._is_requested(offset))
         self._number += 1
         self._pending_reads[sequence] = _PendingRead(
             offset, self._number, now, len(self._pending_reads), is_only
@@ -548,7 +548,7 @@ class FileRead(FileTransferJob[bytes]):
             self._is_no_file(f"is longer than {self._limit} bytes", now)
             return False
         if self._blocks.pieces > PIECES_PER_BLOCK * self._limit // self._read_size + SPARE_PIECES:
-            self._is_no_file("comes in too many pieces", now)
+            self._is_no_file("arrives in too many pieces", now)
             return False
         return self._blocks.take(offset, packet.data)
 
@@ -602,7 +602,7 @@ class FileRead(FileTransferJob[bytes]):
             self._tokens_at = now
         if is_due:
             self._tokens = max(self._tokens, 1.0)  # otherwise rounding could make it due again and again
-        while self._tokens >= 1.0 and (offset := self._next_wanted()) is not None:
+        while self._tokens >= 1.0 and (offset := self._next_needed()) is not None:
             self._read(offset, now)
 
     def _is_worth_a_burst(self) -> bool:

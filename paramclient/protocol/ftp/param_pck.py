@@ -226,7 +226,7 @@ def _entries(
         if len(name) > NAME_LENGTH or not (text.isascii() and text.isprintable()):
             raise PackError(f"entry {place} has the name {text!r}", offset=at)
         if text in found:
-            raise PackError(f"{text} comes twice", offset=at)
+            raise PackError(f"{text} occurs twice", offset=at)
         bits = int.from_bytes(data[value_at : value_at + kind.size], "little")
         default = int.from_bytes(data[value_at + kind.size : end], "little") if flags else None
         found[text] = PackedParam(text, kind, bits, default)

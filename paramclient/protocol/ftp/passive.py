@@ -68,19 +68,19 @@ class ObservedReads:
     lost on board, and after `IDLE_TIMEOUT` without a response.
 
     Args:
-        is_wanted: whether the file of this path is to be assembled.
+        is_needed: whether the file of this path is to be assembled.
         size_max: bytes above which a file is given up.
         ended: called with each ended read and the time, also where nothing was received.
     """
 
     def __init__(
         self,
-        is_wanted: Callable[[str], bool],
+        is_needed: Callable[[str], bool],
         *,
         size_max: int,
         ended: Callable[[ObservedRead, float], None],
     ) -> None:
-        self._is_wanted = is_wanted
+        self._is_needed = is_needed
         self._size_max = size_max
         self._ended = ended
         self._openings: dict[tuple[Address, int], str | None] = {}
@@ -91,7 +91,7 @@ class ObservedReads:
         """The reads in progress."""
         return self._reads.values()
 
-    def request_heard(self, packet: Packet, station: Address, now: float) -> None:
+    def receive_request(self, packet: Packet, station: Address, now: float) -> None:
         """Process a request of a station to the server."""
         sequence = (packet.sequence + 1) & 0xFFFF
         if packet.opcode in _OPENINGS:
@@ -112,7 +112,7 @@ class ObservedReads:
                 if len(read.offsets) > OFFSETS_MAX:
                     del read.offsets[next(iter(read.offsets))]
 
-    def reply_heard(self, packet: Packet, addressee: Address, now: float) -> None:
+    def receive_reply(self, packet: Packet, addressee: Address, now: float) -> None:
         """Process a response of the server to a station; an id of 0 in the address means any."""
         if packet.opcode not in (Opcode.ACK, Opcode.NAK):
             return
@@ -157,7 +157,7 @@ class ObservedReads:
             return  # the response to a repeated request
         self._close(key, now)
         path = self._openings[station, packet.sequence]
-        if path is None or not self._is_wanted(path):
+        if path is None or not self._is_needed(path):
             return
         self._reads[key] = ObservedRead(station, path, packet.session, packet.sequence, now)
         if len(self._reads) > READS_MAX:

@@ -102,14 +102,14 @@ class FileTransferJob(Operation[Result]):
 
     Attributes:
         path: of the file or directory.
-        asked_at: when the opening of the file was requested last, except for repeats; infinity before.
+        requested_at: when the opening of the file was requested last, except for repeats; infinity before.
         is_over: whether the job needs the server no longer: nothing was begun, or its session is closed.
         is_of_caller: whether a caller waits that gets an error when the component is lost.
         yields: whether it ends with the server's refusal while another station has a file open, instead of
             waiting, and after few requests to a server that has never responded; to be set before any
             response.
         session: the number of its open session, or None.
-        asked_session: the requested session while it is unknown whether that is open, or None.
+        requested_session: the requested session while it is unknown whether that is open, or None.
     """
 
     def __init__(self, line: FtpChannel, path: str, now: float) -> None:
@@ -119,11 +119,11 @@ class FileTransferJob(Operation[Result]):
         self.is_of_caller = False
         self.yields = False
         self.session: int | None = None
-        self.asked_session: int | None = None
+        self.requested_session: int | None = None
         self.is_over = False
-        self.asked_at = math.inf
+        self.requested_at = math.inf
         self._path_data = path_bytes(path)
-        self._tell: Callable[[float], None] | None = None  # reports the end, once its session is closed
+        self._report_end: Callable[[float], None] | None = None  # reports the end, once its session is closed
         self._request: Packet | None = None
         self._on_response: Callable[[Packet, float], None] | None = None
         self._attempts = FileAttempts(line.retry, line)
@@ -150,7 +150,7 @@ class FileTransferJob(Operation[Result]):
     @property
     def is_ended(self) -> bool:
         """Whether the outcome is known; the session may still be open."""
-        return self._tell is not None
+        return self._report_end is not None
 
     @abstractmethod
     def begin(self, now: float) -> None:
@@ -165,16 +165,16 @@ class FileTransferJob(Operation[Result]):
 
         After silence (`NoReply`) the closing is sent and nothing is awaited.
         """
-        if isinstance(error, NoReply) and self._tell is None:
+        if isinstance(error, NoReply) and self._report_end is None:
             self._send_blind_close()
-            self.session = self.asked_session = None
+            self.session = self.requested_session = None
         self._close(lambda at: Operation.fail(self, error, at), now)
 
     def abandon(self, now: float) -> None:
         """End without a report and without waiting: the component has no server."""
         self.on_done.clear()
         self._send_blind_close()
-        self.session = self.asked_session = None
+        self.session = self.requested_session = None
         self._close(_ignore, now)
 
     def stop(self, now: float, error: Exception | None = None) -> None:
@@ -190,15 +190,15 @@ class FileTransferJob(Operation[Result]):
             Operation.fail(self, error, now)
         self._close(_ignore, now)
 
-    def _close(self, tell: Callable[[float], None], now: float) -> None:
+    def _close(self, report_end: Callable[[float], None], now: float) -> None:
         """Close the session, then report the end."""
-        if self._tell is not None:
+        if self._report_end is not None:
             return
-        self._tell = tell
+        self._report_end = report_end
         self._open_at = math.inf
         if self.session is not None:
             self._terminate(self.session, now)
-        elif self.asked_session is not None and self._request is not None:
+        elif self.requested_session is not None and self._request is not None:
             # An open is in flight. Its response says which session to close, as PX4 uses numbers of its own;
             # ArduPilot uses ours, so this closes the session even without that response.
             self._send_blind_close()
@@ -213,18 +213,18 @@ class FileTransferJob(Operation[Result]):
         )
 
     def _closed(self, now: float) -> None:
-        self._request = self._on_response = self.session = self.asked_session = None
+        self._request = self._on_response = self.session = self.requested_session = None
         self.is_over = True
-        assert self._tell is not None
-        self._tell(now)
+        assert self._report_end is not None
+        self._report_end(now)
 
     def _send_blind_close(self) -> None:
         """Send requests to close the session, without waiting for it; twice, as one may be lost."""
-        session = self.asked_session if self.session is None else self.session
+        session = self.requested_session if self.session is None else self.session
         if session is not None:
             self._line.close_session(session)
 
-    def server_heard(self, now: float) -> None:
+    def note_activity(self, now: float) -> None:
         """Note any response of the server to another station: the session in use stays open."""
         if self._open_at < math.inf:
             self._open_at = now + SESSION_IDLE_TIME
@@ -281,7 +281,7 @@ class FileTransferJob(Operation[Result]):
     ) -> None:
         """Send a request and repeat it until its response, which is passed to `on_response`.
 
-        With `is_slow`, the server works on it for a while, and the response tells nothing of the link.
+        With `is_slow`, the server works on it for a while, and the response shows nothing about the link.
         """
         sequence = self._line.next_sequence()
         self._request = Packet(sequence, session, opcode, data, offset=offset)
@@ -300,7 +300,7 @@ class FileTransferJob(Operation[Result]):
         def opened(packet: Packet, now: float) -> None:
             code = self._code(packet)
             if packet.opcode == Opcode.ACK:
-                self.session, self.asked_session = packet.session, None
+                self.session, self.requested_session = packet.session, None
                 if self.is_ended:
                     self._terminate(packet.session, now)
                 else:
@@ -312,7 +312,7 @@ class FileTransferJob(Operation[Result]):
             elif is_first and code == FileErrorCode.FAIL and self.attempts == 1 and not self._failures:
                 # no response was lost, so another station's session has this number
                 self._failures = 1
-                self.asked_session = None
+                self.requested_session = None
                 self.begin(now)
             elif code == FileErrorCode.FAIL and self._failures < self._attempts.open_failures_max:
                 # the open session may be that of an open whose response was lost
@@ -322,15 +322,15 @@ class FileTransferJob(Operation[Result]):
             else:
                 self._wait_or_refuse(packet, "does not open", now)
 
-        is_first = self.asked_at == math.inf
-        self.asked_at = now
-        number = self._line.next_session() if self.asked_session is None else self.asked_session
-        self.asked_session = number
+        is_first = self.requested_at == math.inf
+        self.requested_at = now
+        number = self._line.next_session() if self.requested_session is None else self.requested_session
+        self.requested_session = number
         self._ask(opcode, opened, now, data=self._path_data, session=number, copies=copies)
 
     def _take_session(self) -> None:
         """Take the requested session as open: the response to the open was lost, and is awaited no longer."""
-        self.session, self.asked_session = self.asked_session, None
+        self.session, self.requested_session = self.requested_session, None
         self._request = self._on_response = None
 
     def _wait_or_refuse(self, packet: Packet, what: str, now: float) -> None:
@@ -340,7 +340,7 @@ class FileTransferJob(Operation[Result]):
         if is_in_use and not self.yields:
             self._open_at = now + SESSION_IDLE_TIME
         else:
-            self.asked_session = None
+            self.requested_session = None
             self._refused(packet, what, now)
 
     def _may_reopen(self, packet: Packet) -> bool:

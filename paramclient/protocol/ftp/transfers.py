@@ -216,7 +216,7 @@ class FileTransfers(Machine):
         limit: int = FILE_SIZE_MAX,
         magics: tuple[bytes, ...] = (),
     ) -> FileRead:
-        """Read a whole file; `size` and `received` of the result tell the progress.
+        """Read a whole file; `size` and `received` of the result are the progress.
 
         Args:
             path: as the server names it, with a query where it takes one.
@@ -239,7 +239,7 @@ class FileTransfers(Machine):
         """Write a whole file, and replace an existing one.
 
         If it fails or is released, the part written so far stays on board; PX4 and ArduPilot then refuse a
-        param.pck as a whole. ArduPilot tells nothing of what it does with a param.pck, see `CommittedWrite`.
+        param.pck as a whole. ArduPilot does not report what it does with a param.pck, see `CommittedWrite`.
 
         Raises:
             UsageError: the path or the size of one piece is invalid.
@@ -319,7 +319,7 @@ class FileTransfers(Machine):
         """Process a FILE_TRANSFER_PROTOCOL of the component."""
         system, component = self._own
         if self._job is not None:
-            self._job.server_heard(now)
+            self._job.note_activity(now)
         if message.target_system not in (0, system) or message.target_component not in (0, component):
             self.foreign_at = now
             return

@@ -70,7 +70,7 @@ class BootValues(Machine):
         self._measured_at = self._read_at = now + MEASURING_TIME
         self._has_clock = by_clock
 
-    def clock_told(self, uptime: float, now: float) -> None:
+    def receive_clock(self, uptime: float, now: float) -> None:
         """Process a clock message, which the vehicle sends once its main loop runs.
 
         Args:

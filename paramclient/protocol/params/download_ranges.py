@@ -103,8 +103,8 @@ def split_bytes(
     bounds = _bounds(size, number)
     unreceived, again = _overlaps(bounds, gaps), _overlaps(bounds, requested)
     return tuple(
-        DownloadRange(last - first - lost, asked, lost - asked)
-        for (first, last), lost, asked in zip(pairwise(bounds), unreceived, again, strict=True)
+        DownloadRange(last - first - lost, repeated, lost - repeated)
+        for (first, last), lost, repeated in zip(pairwise(bounds), unreceived, again, strict=True)
     )
 
 

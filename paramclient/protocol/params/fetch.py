@@ -15,9 +15,9 @@ from paramclient.protocol.params.fetch_notes import (
     FILE_IN_USE,
     LEFT_OUT,
     NO_FILE,
-    NOT_ASKED,
     NOT_CONFIRMED,
     NOT_REFRESHED,
+    NOT_REQUESTED,
     NOT_RESUMED,
     NOT_SAMPLED,
     SAMPLED,
@@ -127,7 +127,7 @@ class Fetch(Operation[FetchResult]):
         self._hash_read: Read | None = None
         self._proof = HashCheck(table)
         self._repeated: DuplicateNameReads | None = None
-        self._was_asked_meanwhile = False
+        self._was_requested_meanwhile = False
         self._is_hash_unknown = False  # the vehicle answers other reads, but not that of the hash
         self.first_value_at = math.inf
         self._held_before = 0.0  # seconds waited for the turn before the download was restarted
@@ -177,7 +177,7 @@ class Fetch(Operation[FetchResult]):
         elif announced is not None and announced.is_fresh(now):
             self._compare(announced, now)
         else:
-            self._ask_hash(self._hash_came_first, now)
+            self._ask_hash(self._take_first_hash, now)
 
     def announced(self, announcement: Announcement) -> None:
         """Process a `_HASH_CHECK`: PX4 sends one at the head of its list."""
@@ -202,11 +202,11 @@ class Fetch(Operation[FetchResult]):
             if self.first_value_at > now:
                 self.first_value_at = now
             download.receive(message, now)
-            is_unheard = self._proof.before is None and not self._was_asked_meanwhile
-            if is_unheard and self._context.expects_hash and not self.done:
+            is_unanswered = self._proof.before is None and not self._was_requested_meanwhile
+            if is_unanswered and self._context.expects_hash and not self.done:
                 # the one at the head of the list was lost; requested now, it causes no delay later
-                self._was_asked_meanwhile = True
-                self._ask_hash(self._hash_came_meanwhile, now)
+                self._was_requested_meanwhile = True
+                self._ask_hash(self._take_hash_meanwhile, now)
 
     def tick(self, now: float) -> None:
         self.check_file(now)
@@ -288,7 +288,7 @@ class Fetch(Operation[FetchResult]):
             return
         self._held_before = queue_wait
         self._proof.forget()
-        self._was_asked_meanwhile = False
+        self._was_requested_meanwhile = False
         self._listed = False
         self._begin_download(now)
 
@@ -365,9 +365,9 @@ class Fetch(Operation[FetchResult]):
         if self.file is not None and (self.download is None or not self.file.is_awaited):
             return self.file.progress(now)
         received, total = (0, self._table.count) if self.download is None else self.download.progress
-        came = received - (0 if self.download is None else self.download.resumed)
+        downloaded = received - (0 if self.download is None else self.download.resumed)
         ranges = None if self.download is None else self.download.ranges
-        return Progress.after(received, total, came, now - self.first_value_at, ranges)
+        return Progress.after(received, total, downloaded, now - self.first_value_at, ranges)
 
     def _sample(self, sampled: Sampled, count: int, now: float) -> None:
         """Check the cached table by a sample of its parameters."""
@@ -399,13 +399,13 @@ class Fetch(Operation[FetchResult]):
 
         read.on_done.append(ended)
 
-    def _hash_came_meanwhile(self, read: Read) -> None:
+    def _take_hash_meanwhile(self, read: Read) -> None:
         self._proof.meanwhile = Announcement.answering(read)
         self._is_hash_unknown = isinstance(read.error, UnknownParameter)
         if self.download is not None and self.download.done:
             self._download_ended(self.download)
 
-    def _hash_came_first(self, read: Read) -> None:
+    def _take_first_hash(self, read: Read) -> None:
         if read.result is None:
             self._begin_download(read.ended_at)
         else:
@@ -435,9 +435,9 @@ class Fetch(Operation[FetchResult]):
         elif announced is not None and announced.is_fresh(now):
             self._resume_under(announced, now)
         else:
-            self._ask_hash(self._hash_came_to_resume, now)
+            self._ask_hash(self._take_hash_to_resume, now)
 
-    def _hash_came_to_resume(self, read: Read) -> None:
+    def _take_hash_to_resume(self, read: Read) -> None:
         if read.result is not None:
             self._resume_under(Announcement.of(read.result, read.ended_at), read.ended_at)
         elif isinstance(read.error, UnknownParameter):
@@ -469,7 +469,7 @@ class Fetch(Operation[FetchResult]):
         if self._listed or self._by_list or self._had_no_file or not may_use_file:
             self._begin_list(now)
             return
-        self._context.trace("%s/%s: the file is wanted, %s there", *self._target, len(present or ()))
+        self._context.trace("%s/%s: the file is requested, %s there", *self._target, len(present or ()))
         if self._context.expects_hash:
             # once and before the file, so that the response belongs to the time before it
             self._context.send(ParamRequestRead(*self._target, HASH_CHECK, -1))
@@ -498,7 +498,7 @@ class Fetch(Operation[FetchResult]):
             return math.inf
         if file.blocked_until is not None or self.download is not None or self._is_file_check:
             return math.inf
-        return self._open_retries.list_due_at(file.asked_at)
+        return self._open_retries.list_due_at(file.requested_at)
 
     def _measure_list(self, now: float) -> None:
         """Measure whether the list is faster than waiting for the end of another station's session."""
@@ -538,7 +538,7 @@ class Fetch(Operation[FetchResult]):
 
     def _begin_list(self, now: float) -> None:
         fetch_context, present = self._fetch_context, self._present
-        self._context.trace("%s/%s: the list is wanted, %s there", *self._target, len(present or ()))
+        self._context.trace("%s/%s: the list is requested, %s there", *self._target, len(present or ()))
         count, foreign_list = self._table.count, fetch_context.foreign_list
         if not self._listed and foreign_list.is_running(now):
             # another station has requested it: another request would restart it for both
@@ -558,10 +558,10 @@ class Fetch(Operation[FetchResult]):
             self._download_ended(download)
             return
         download.on_done.append(partial(self._download_ended, download))
-        if self._proof.before is None and self._context.expects_hash and not self._was_asked_meanwhile:
+        if self._proof.before is None and self._context.expects_hash and not self._was_requested_meanwhile:
             # in parallel to the list, so that a lost request of either kind shows at once
-            self._was_asked_meanwhile = True
-            self._ask_hash(self._hash_came_meanwhile, now)
+            self._was_requested_meanwhile = True
+            self._ask_hash(self._take_hash_meanwhile, now)
 
     def _file_ended(self, file: FileDownload) -> None:
         if self.file is not file:
@@ -579,7 +579,7 @@ class Fetch(Operation[FetchResult]):
             self._table.complete = True
             is_proven = self._proof.is_given(file.count or 0)
             if not is_proven and self._context.expects_hash and not self._is_hash_unknown:
-                self._ask_hash(partial(self._hash_came_after_file, file), now)
+                self._ask_hash(partial(self._take_hash_after_file, file), now)
                 return
             if not is_proven:
                 self._table.unconfirm()
@@ -593,7 +593,7 @@ class Fetch(Operation[FetchResult]):
             return
         self._had_no_file = True
         self.file_failed = True if file.is_useless else None
-        self._file_was_silent = file.is_unheard
+        self._file_was_silent = file.is_unanswered
         if not self._was_in_use:
             self._notes += (NO_FILE.format(file.error),)
         if self.download is not None:
@@ -605,7 +605,7 @@ class Fetch(Operation[FetchResult]):
         else:
             self._begin_download(now)
 
-    def _hash_came_after_file(self, file: FileDownload, read: Read) -> None:
+    def _take_hash_after_file(self, file: FileDownload, read: Read) -> None:
         """Settle the hash: the file is the vehicle's table at one moment, the hash may belong to a later
         one."""
         after = Announcement.answering(read)
@@ -625,7 +625,7 @@ class Fetch(Operation[FetchResult]):
             )
             return
         count, missing = table.gaps()
-        note = NOT_ASKED if self._fetch_policy is Policy.CACHE_ONLY else NOT_CONFIRMED
+        note = NOT_REQUESTED if self._fetch_policy is Policy.CACHE_ONLY else NOT_CONFIRMED
         self.finish(self._result("cache", count, missing, None, now, (note,)), now)
 
     def _download_ended(self, download: ListDownload) -> None:
@@ -689,10 +689,10 @@ class Fetch(Operation[FetchResult]):
         if after is not None and not download.missing:
             judged = self._proof.settle(after, download.count or 0, needs_proof=download.resumed > 0)
             if judged is None:
-                # values received earlier are not the vehicle's present ones, or cannot be told from them
+                # values received earlier may be outdated
                 self._notes = (NOT_RESUMED,)
                 self._proof.forget()
-                self._was_asked_meanwhile = False
+                self._was_requested_meanwhile = False
                 self._begin_download(now)
                 return
             notes += judged

@@ -6,8 +6,8 @@ __all__ = [
     "FILE_IN_USE",
     "CACHED_UNVERIFIED",
     "LEFT_OUT",
-    "MOVED",
-    "NOT_ASKED",
+    "CHANGED_MEANWHILE",
+    "NOT_REQUESTED",
     "NOT_CONFIRMED",
     "NOT_REFRESHED",
     "NOT_RESUMED",
@@ -24,12 +24,16 @@ UNPROVEN = (
     "a start from the cache reads every value again."
 )
 LEFT_OUT = "Skipped {!r}{}: no parameter file can contain this name."
-MOVED = "The table changed during the download and has no hash: the next session downloads it again."
+CHANGED_MEANWHILE = (
+    "The table changed during the download and has no hash: the next session downloads it again."
+)
 NO_HASH_BEFORE_DOWNLOAD = (
     "No hash was received before the download, and the parameters that this firmware excludes from it are "
     "not verified: the table has no hash, and the next session downloads it again."
 )
-NOT_ASKED = "The policy is cache-only: the values are the last known ones, without requests to the vehicle."
+NOT_REQUESTED = (
+    "The policy is cache-only: the values are the last known ones, without requests to the vehicle."
+)
 NOT_CONFIRMED = (
     "The vehicle's hash does not match the cached table, and the policy hash-only allows no download: "
     "the values are the last known ones."

@@ -34,7 +34,7 @@ class Fetches(Machine):
         last: the result of the last fetch, or None.
         file_works: whether this vehicle, with this firmware, serves its table as a file: None while unknown.
         is_same_firmware: whether the cache belongs to this very vehicle with this very firmware.
-        overheard: the table from the traffic of other stations, where nothing may be requested; otherwise
+        passive_table: the table from the traffic of other stations, where nothing may be requested; otherwise
             None.
     """
 
@@ -54,9 +54,9 @@ class Fetches(Machine):
         self._fetch_context = fetch_context
         self._sync = sync
         self._fetch_policy = sync_settings.policy
-        self.overheard: PassiveTable | None = None
+        self.passive_table: PassiveTable | None = None
         if sync_settings.listens_only:
-            self.overheard = PassiveTable(
+            self.passive_table = PassiveTable(
                 fetch_context, sync, whole=self._passive_ended, is_log=sync_settings.is_log
             )
         self._ended = ended
@@ -76,11 +76,11 @@ class Fetches(Machine):
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes on what was not taken from files that other stations read."""
-        return () if self.overheard is None else tuple(self.overheard.file.notes)
+        return () if self.passive_table is None else tuple(self.passive_table.file.notes)
 
     def may_use_file(self) -> bool:
-        """Return whether to request the file: the table has come as one, or the component says that it serves
-        it."""
+        """Return whether to request the file: the table was received as one, or the component says that it
+        serves it."""
         return self._fetch_context.context.serves_file if self.file_works is None else self.file_works
 
     def begin(
@@ -114,12 +114,12 @@ class Fetches(Machine):
         if fetch is None:
             self._sync.fetch_begins(now)
         may_sample = self.is_same_firmware and self._fetch_policy is Policy.AUTO and not self._sync.is_doubted
-        if fetch is None and self.overheard is not None:
-            fetch = self.current = PassiveFetch(self._fetch_context, self.overheard, now)
+        if fetch is None and self.passive_table is not None:
+            fetch = self.current = PassiveFetch(self._fetch_context, self.passive_table, now)
             if fetch.done:
-                self._overhearing_ended(fetch)
+                self._passive_fetch_ended(fetch)
             else:
-                fetch.on_done.append(partial(self._overhearing_ended, fetch))
+                fetch.on_done.append(partial(self._passive_fetch_ended, fetch))
         elif fetch is None:
             fetch = self.current = Fetch(
                 self._fetch_context,
@@ -151,15 +151,15 @@ class Fetches(Machine):
 
     def tick(self, now: float) -> None:
         """Do what is due of the fetch in progress, and of the files that other stations read."""
-        if self.overheard is not None:
-            self.overheard.file.tick(now)
+        if self.passive_table is not None:
+            self.passive_table.file.tick(now)
         if self.current is not None:
             self.current.tick(now)
 
     def next_deadline(self) -> float:
         """See `Machine`."""
         first = math.inf if self.current is None else self.current.next_deadline()
-        return first if self.overheard is None else min(first, self.overheard.file.next_deadline())
+        return first if self.passive_table is None else min(first, self.passive_table.file.next_deadline())
 
     def resume(self, now: float) -> None:
         """See `Machine`."""
@@ -179,8 +179,8 @@ class Fetches(Machine):
 
     def interrupt(self, now: float) -> None:
         """End the files that other stations read: the component is lost or restarts."""
-        if self.overheard is not None:
-            self.overheard.file.close(now)
+        if self.passive_table is not None:
+            self.passive_table.file.close(now)
 
     def seems_restarted(self, silent_since: float, now: float) -> bool:
         """Restart the fetch where the component may have restarted, before its clock shows that; see
@@ -195,9 +195,9 @@ class Fetches(Machine):
 
     def forget(self) -> None:
         """Forget everything: another vehicle uses the address."""
-        if self.overheard is not None:
-            self.overheard.file.forget()
-            self.overheard.forget()
+        if self.passive_table is not None:
+            self.passive_table.file.forget()
+            self.passive_table.forget()
         self.file_works = None
         self._sync_interval.forget()
         self.is_same_firmware = False
@@ -212,8 +212,8 @@ class Fetches(Machine):
     def over(self, now: float) -> None:
         """End the passive fetch: nothing more is received."""
         self.interrupt(now)
-        if self.overheard is not None:
-            self.overheard.is_over = True
+        if self.passive_table is not None:
+            self.passive_table.is_over = True
         if isinstance(self.current, PassiveFetch):
             self.current.over(now)
 
@@ -223,9 +223,9 @@ class Fetches(Machine):
         if self._sync.fetched(result, now):
             self._ended(result)
         if isinstance(self.current, PassiveFetch):
-            self.current.came(result, now)
+            self.current.table_received(result, now)
 
-    def _overhearing_ended(self, fetch: Fetch) -> None:
+    def _passive_fetch_ended(self, fetch: Fetch) -> None:
         self.current = None
         self.last = fetch.result or self.last
 

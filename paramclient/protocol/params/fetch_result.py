@@ -11,7 +11,7 @@ from paramclient.model.values import Param, Trust
 from paramclient.protocol.ftp import FileTransfers
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.download_ranges import DownloadRanges
-from paramclient.protocol.params.fetch_notes import MOVED
+from paramclient.protocol.params.fetch_notes import CHANGED_MEANWHILE
 from paramclient.protocol.params.foreign_list import ForeignList
 from paramclient.protocol.params.reads import Read, Reads
 from paramclient.protocol.params.sampling import Sample
@@ -126,12 +126,12 @@ class Progress:
         cls,
         received: int,
         total: int | None,
-        came: int,
+        downloaded: int,
         running: float,
         ranges: DownloadRanges | None = None,
     ) -> Progress:
-        """Return the progress when `came` of the received ones took `running` seconds."""
-        rate = came / running if came > 0 and running > 0 else 0.0
+        """Return the progress when `downloaded` of the received ones took `running` seconds."""
+        rate = downloaded / running if downloaded > 0 and running > 0 else 0.0
         left = (total - received) / rate if rate and total is not None else None
         return cls(received, total, rate, left, ranges)
 
@@ -187,10 +187,10 @@ class FetchResult:
         return self.sample is not None
 
     @property
-    def has_moved(self) -> bool:
+    def may_be_mixed(self) -> bool:
         """Whether the vehicle's hash shows that the table changed during the download: it may be a
         mixture."""
-        return MOVED in self.notes
+        return CHANGED_MEANWHILE in self.notes
 
     @property
     def is_confirmed(self) -> bool:

@@ -56,7 +56,7 @@ class FileDownload(Operation[None]):
         is_useless: whether the component does not have the file, or an unreadable one, which does not change
             with this firmware.
         left_out: the indices of entries whose names no parameter file can hold: they were not stored.
-        is_unheard: whether it ended without any response, though the component was not lost.
+        is_unanswered: whether it ended without any response, though the component was not lost.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class FileDownload(Operation[None]):
         self._list_admission = list_admission
         self._table = table
         self._changed = changed
-        self._heard: set[str] = set()
+        self._received_names: set[str] = set()
         self._received_count: int | None = None
         self._attempts = 0
         self._query = WITH_DEFAULTS
@@ -85,11 +85,11 @@ class FileDownload(Operation[None]):
         self._job: FileRead | None = None
         self._silent_at = math.inf
         self._doubts = table.doubts
-        self._asked_at = now
+        self._requested_at = now
         self.queue_time = 0.0
         self.is_useless = False
         self.is_in_use = False
-        self.is_unheard = False
+        self.is_unanswered = False
         self.left_out: tuple[int, ...] = ()
         self._count: int | None = None
         self._waits_since: float | None = now
@@ -106,9 +106,9 @@ class FileDownload(Operation[None]):
         return self._job is None or not self._job.received
 
     @property
-    def asked_at(self) -> float:
+    def requested_at(self) -> float:
         """When the opening of the file was requested; infinity while that waits for its turn."""
-        return math.inf if self._job is None else self._job.asked_at
+        return math.inf if self._job is None else self._job.requested_at
 
     @property
     def attempts(self) -> int:
@@ -117,7 +117,7 @@ class FileDownload(Operation[None]):
 
     def silence(self, now: float) -> NoReply:
         """Return the error for a file without a response."""
-        return NoReply(PARAMETER_FILE, attempts=self.attempts, waited=now - self.asked_at)
+        return NoReply(PARAMETER_FILE, attempts=self.attempts, waited=now - self.requested_at)
 
     @property
     def is_served(self) -> bool:
@@ -140,8 +140,8 @@ class FileDownload(Operation[None]):
 
     def seen(self) -> ListStatistics:
         """Return the statistics in messages: a burst that is repaired separately skips nothing."""
-        came = 0 if self._job is None else self._job.received // DATA_SIZE_MAX
-        return ListStatistics(came, came, 0.0, False)
+        blocks = 0 if self._job is None else self._job.received // DATA_SIZE_MAX
+        return ListStatistics(blocks, blocks, 0.0, False)
 
     def begin(self, now: float) -> None:
         """Begin: it is this file's turn."""
@@ -177,7 +177,7 @@ class FileDownload(Operation[None]):
 
     def receive(self, message: ParamValue) -> None:
         """Process a PARAM_VALUE of the component, after the table has stored it."""
-        self._heard.add(message.param_id)
+        self._received_names.add(message.param_id)
         if message.param_count <= PARAMETERS_MAX:
             self._received_count = message.param_count
 
@@ -198,17 +198,17 @@ class FileDownload(Operation[None]):
 
     def _read(self, now: float) -> None:
         self._attempts += 1
-        self._asked_at = now
+        self._requested_at = now
         self._silent_at = now + FILE_SILENCE_TIMEOUT
         self._doubts = self._table.doubts
-        self._heard.clear()
+        self._received_names.clear()
         self._received_count = None
         path = PARAMETER_FILE + self._query
         job = self._job = self._files.read(path, now, limit=PACK_SIZE_MAX, magics=MAGICS)
         job.yields = self._yields
-        job.on_done.append(partial(self._came, job))
+        job.on_done.append(partial(self._take_file, job))
 
-    def _came(self, job: FileRead) -> None:
+    def _take_file(self, job: FileRead) -> None:
         if self._job is not job:
             return
         self._job = None
@@ -224,12 +224,12 @@ class FileDownload(Operation[None]):
             else:
                 assert job.error is not None
                 is_there = self._doubts == self._table.doubts
-                self.is_unheard = is_there and isinstance(job.error, NoReply) and not job.received
+                self.is_unanswered = is_there and isinstance(job.error, NoReply) and not job.received
                 self._fails(job.error, now)
             return
         total = total_of(job.result)
         if self._doubts != self._table.doubts:
-            self._is_none(PackError("the vehicle was away meanwhile", offset=0), now)
+            self._is_none(PackError("the vehicle was lost meanwhile", offset=0), now)
             return
         if total is not None and self._received_count not in (None, total):
             self._is_none(
@@ -267,7 +267,7 @@ class FileDownload(Operation[None]):
 
     def _fill(self, pack: Pack) -> None:
         table = self._table
-        changes = table.take_pack(pack, self._asked_at, self._heard)
+        changes = table.take_pack(pack, self._requested_at, self._received_names)
         present = {entry.name for entry in pack.entries}
         self.left_out = tuple(
             index for index, entry in enumerate(pack.entries) if not is_portable_name(entry.name)

@@ -16,7 +16,7 @@ __all__ = ["ForeignList"]
 LIST_VALUES_MIN: Final = 10
 """Values by rising index that make a list: PX4 pushes up to a few changed parameters with their index, and
 another station may read some one by one."""
-HEARD_SHARE_MIN: Final = 0.5
+RECEIVED_SHARE_MIN: Final = 0.5
 """The share of the passed indices that a list brings, at least. When another station sets many parameters at
 once, PX4 pushes these by rising index too: 200 of 905."""
 
@@ -58,11 +58,11 @@ class ForeignList:
 
     def is_running(self, now: float) -> bool:
         """Return whether a list is running."""
-        came = len(self._names)
-        if came < LIST_VALUES_MIN or self._front >= self._count - 1:
+        received = len(self._names)
+        if received < LIST_VALUES_MIN or self._front >= self._count - 1:
             return False
         passed = self._front - next(iter(self._names)) + 1
-        is_list = came >= HEARD_SHARE_MIN * passed
+        is_list = received >= RECEIVED_SHARE_MIN * passed
         return is_list and now - self._received_at <= self._quiet
 
     def hand_over(self, reads: Reads) -> tuple[Mapping[int, str], int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from paramclient.model.px4_hash import find_volatile
-from paramclient.protocol.params.fetch_notes import MOVED, NO_HASH_BEFORE_DOWNLOAD, UNPROVEN
+from paramclient.protocol.params.fetch_notes import CHANGED_MEANWHILE, NO_HASH_BEFORE_DOWNLOAD, UNPROVEN
 from paramclient.protocol.params.fetch_result import Announcement
 from paramclient.protocol.params.table import Table
 
@@ -34,7 +34,7 @@ class HashCheck:
         self._is_old = False
 
     def doubt(self) -> None:
-        """Doubt the announcements: the vehicle was away, so they prove nothing on their own."""
+        """Doubt the announcements: the vehicle was lost, so they prove nothing on their own."""
         self.before = self.before if self.meanwhile is None else self.meanwhile
         self.meanwhile = None
         self._is_old = True
@@ -65,11 +65,11 @@ class HashCheck:
         if needs_proof and not is_proven:
             return None
         if after.count != count:
-            return (MOVED,)
+            return (CHANGED_MEANWHILE,)
         if is_proven or (self.before is not None and self.before.hash == after.hash):
             self._confirm(after, volatile, proven=is_proven)
             return () if is_proven else (UNPROVEN,)
-        return (NO_HASH_BEFORE_DOWNLOAD,) if self.before is None else (MOVED,)
+        return (NO_HASH_BEFORE_DOWNLOAD,) if self.before is None else (CHANGED_MEANWHILE,)
 
     def _confirm(self, announced: Announcement, volatile: frozenset[str], *, proven: bool) -> None:
         self._table.confirm(announced.hash, volatile, proven=proven)

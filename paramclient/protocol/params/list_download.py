@@ -126,7 +126,7 @@ class ListDownload(Operation[None]):
         self._empty_passes = 0
         self._count_changes = 0
         self._stream = ListStream(now)
-        self._asked: dict[int, Read] = {}
+        self._requested: dict[int, Read] = {}
         self._next = 0  # below it, every missing index was requested since the end of the list
         self._repeated_in_row = 0  # repeated values in a row
         self._is_streaming = True
@@ -249,7 +249,7 @@ class ListDownload(Operation[None]):
             self._start_over(count)
             self._ask_for_another_pass(now)
         elif count != self.count and self._count_changes < COUNT_CHANGES_MAX:
-            if index in self._asked or not self._is_streaming:
+            if index in self._requested or not self._is_streaming:
                 self._other_count = count
                 return
             self._start_over(count)
@@ -262,9 +262,9 @@ class ListDownload(Operation[None]):
             holes.pop(index, None)
         if self.given_up:
             self.given_up.discard(index)
-        if index not in self._asked:
+        if index not in self._requested:
             self._follow(index, is_repeated, now)
-        if (holes and self.held_since is None) or self._asked or not self._is_streaming:
+        if (holes and self.held_since is None) or self._requested or not self._is_streaming:
             self._ask_for_gaps(now)
             self._finish_if_complete(now)
 
@@ -273,7 +273,7 @@ class ListDownload(Operation[None]):
         stream, left = self._stream, (self.count or 0) - 1
         if index in self.names or index >= left or len(self.names) >= left or not self._is_streaming:
             return False
-        is_troubled = self._asked or stream.holes or self.given_up or self._empty_passes or self.resumed
+        is_troubled = self._requested or stream.holes or self.given_up or self._empty_passes or self.resumed
         return not (is_troubled or stream.is_awaited or self.done)
 
     def note_list_head(self, now: float) -> None:
@@ -284,7 +284,7 @@ class ListDownload(Operation[None]):
         if self.count is None and not self._is_head_counted:
             self._is_head_counted = True
             self._note_answer(now)
-            self._request.head_heard(now)
+            self._request.head_received(now)
             self._silent_at = self._request.due_at
 
     def request_missing(self, now: float) -> None:
@@ -324,7 +324,7 @@ class ListDownload(Operation[None]):
             return math.inf if self.gives_way else self._request.due_at
         if not self._is_streaming:
             return math.inf
-        return self._quiet_at if self._asked or self.gives_way else min(self._quiet_at, self._end_look_at)
+        return self._quiet_at if self._requested or self.gives_way else min(self._quiet_at, self._end_look_at)
 
     def resume(self, now: float) -> None:
         """Repeat what could not be sent: the link is back."""
@@ -413,7 +413,7 @@ class ListDownload(Operation[None]):
         self._ask_for_turn(now)
 
     def _follow(self, index: int, is_repeated: bool, now: float) -> None:
-        """Follow the list to an index, which may also come from a change that the vehicle pushed."""
+        """Follow the list to an index, which may also be that of a change that the vehicle pushed."""
         if is_repeated:
             self._repeated_in_row += 1
         else:
@@ -484,10 +484,10 @@ class ListDownload(Operation[None]):
                 return
             self._learn_pace()
             for index in self._stream.lost():
-                if len(self._asked) >= REQUESTED_INDICES_MAX:
+                if len(self._requested) >= REQUESTED_INDICES_MAX:
                     break
                 del self._stream.holes[index]
-                if index not in self._asked and index not in self.given_up:
+                if index not in self._requested and index not in self.given_up:
                     self._ask(index, now)
         elif self._ahead_at is not None or self._another_pass_is_faster(
             count - len(self.names) - len(self.given_up)
@@ -523,7 +523,7 @@ class ListDownload(Operation[None]):
         missing = [index for index in range(self.count or 0) if index not in self.names]
         passed_over = sum(index < front for index in missing)
         to_be_lost = round(self._stream_loss * (len(missing) - passed_over))
-        if self._asked or not self._another_pass_is_faster(passed_over + to_be_lost):
+        if self._requested or not self._another_pass_is_faster(passed_over + to_be_lost):
             self._read_missing_below(front, now)
         elif not self._is_parallel_to_file:
             self._ahead_at = now
@@ -531,10 +531,10 @@ class ListDownload(Operation[None]):
 
     def _read_missing_below(self, end: int, now: float) -> None:
         """Read what is missing below an index and was not requested."""
-        while len(self._asked) < REQUESTED_INDICES_MAX and self._next < end:
+        while len(self._requested) < REQUESTED_INDICES_MAX and self._next < end:
             index = self._next
             self._next += 1
-            if not (index in self.names or index in self.given_up or index in self._asked):
+            if not (index in self.names or index in self.given_up or index in self._requested):
                 self._ask(index, now)
 
     def _another_pass_is_faster(self, missing: int) -> bool:
@@ -545,7 +545,8 @@ class ListDownload(Operation[None]):
         trip = self._round_trip.smoothed or self._retry_policy.timeout
         by_pass = self.count * self._stream.gap + trip + self._time_to_read(missing * self._stream_loss)
         if self._reads.pace.is_batched:
-            by_pass += len(self._asked) / self._reads.pace.prospect  # the vehicle serves them before its list
+            # the vehicle serves them before its list
+            by_pass += len(self._requested) / self._reads.pace.prospect
         return self._time_to_read(missing) > RELIST_GAIN * by_pass
 
     @property
@@ -569,12 +570,12 @@ class ListDownload(Operation[None]):
         self._lost.add(index)
         if self._stream.front in self.names:
             self._reads.control = self._stream.front
-        read = self._asked[index] = self._reads.ask(index, now, urgent=False)
+        read = self._requested[index] = self._reads.ask(index, now, urgent=False)
 
         def ended() -> None:
-            if self._asked.get(index) is not read:
+            if self._requested.get(index) is not read:
                 return
-            del self._asked[index]
+            del self._requested[index]
             if index not in self.names and self._other_count is None:
                 self._unanswered(index, read)
             self._ask_for_gaps(read.ended_at)
@@ -604,7 +605,7 @@ class ListDownload(Operation[None]):
         return ReadRetries.is_dead_index(attempts, controls)
 
     def _finish_if_complete(self, now: float) -> None:
-        if self.done or self.count is None or self._is_streaming or self._asked:
+        if self.done or self.count is None or self._is_streaming or self._requested:
             return
         if self.gives_way and len(self.names) < self.count:
             return
@@ -627,8 +628,8 @@ class ListDownload(Operation[None]):
             self.given_up.update(index for index in range(self.count) if index not in self.names)
 
     def _forget_reads(self) -> None:
-        asked, self._asked = self._asked, {}
-        for read in asked.values():
+        open_reads, self._requested = self._requested, {}
+        for read in open_reads.values():
             self._reads.release(read)
 
     def _end_unanswered(self, now: float) -> None:

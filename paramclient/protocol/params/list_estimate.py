@@ -41,7 +41,7 @@ class ListPace(Operation[float]):
         super().__init__(now)
         self._reads = reads
         self._count = 0
-        self._came: list[float] = []
+        self._arrivals: list[float] = []
         self._judged_at = now + ESTIMATE_TIMEOUT
         self._open = [reads.ask(index, now) for index in range(ESTIMATE_READS)]
         for read in list(self._open):
@@ -68,15 +68,15 @@ class ListPace(Operation[float]):
         self._open.remove(read)
         if read.result is not None:
             self._count = read.result.param_count
-            self._came.append(read.ended_at)
+            self._arrivals.append(read.ended_at)
         if not self._open:
             self._judge(read.ended_at)
-        elif len(self._came) >= RESPONSES_MIN:
+        elif len(self._arrivals) >= RESPONSES_MIN:
             self._judged_at = min(self._judged_at, read.ended_at + BATCH_SPREAD)
 
     def _judge(self, now: float) -> None:
         self.cancel()
-        gaps = [after - before for before, after in zip(self._came, self._came[1:], strict=False)]
+        gaps = [after - before for before, after in zip(self._arrivals, self._arrivals[1:], strict=False)]
         gaps = sorted(gap for gap in gaps if gap <= BATCH_SPREAD)
         if not gaps:
             self.finish(math.inf, now)

@@ -22,7 +22,7 @@ BURSTY_SHARE: Final = 0.5
 
 
 class ListStream:
-    """The observed state of values that come by rising index.
+    """The observed state of values that arrive by rising index.
 
     Attributes:
         front: the highest index reached; -1 before the first.
@@ -33,7 +33,7 @@ class ListStream:
     """
 
     __slots__ = (
-        *("_advances", "_began", "_came_before", "_front_at", "_jump", "_longest", "_bursts"),
+        *("_advances", "_began", "_advances_before", "_front_at", "_jump", "_longest", "_bursts"),
         *("front", "gap", "received_at", "holes", "is_awaited"),
     )
 
@@ -47,7 +47,7 @@ class ListStream:
         self._jump = -1  # an index too far ahead to count at once
         self._advances = 0  # how often it advanced
         self._began = (0, now)  # where and when
-        self._came_before = 0  # how often other lists advanced before it
+        self._advances_before = 0  # how often other lists advanced before it
         self._bursts = 0  # values received together with the one before
         self._longest = 0.0  # the longest recent gap
 
@@ -59,7 +59,7 @@ class ListStream:
     @property
     def is_bursty(self) -> bool:
         """Whether most of its values are received together."""
-        return self._bursts >= BURSTY_SHARE * (self._advances - self._came_before)
+        return self._bursts >= BURSTY_SHARE * (self._advances - self._advances_before)
 
     def rewind(self) -> None:
         """Start at the beginning: the next value belongs to another pass, or to another count."""
@@ -74,7 +74,7 @@ class ListStream:
         if self.is_awaited:
             self.is_awaited = False
             self._began = (index, now)
-            self._came_before = self._advances
+            self._advances_before = self._advances
             self._bursts = 0
             self._advances += 1
             self.front = index
@@ -130,8 +130,8 @@ class ListStream:
         """Return the statistics since the request."""
         if self.is_awaited:
             return ListStatistics(0, 0, 0.0, False)
-        came = self._advances - self._came_before
-        return ListStatistics(came, self.front - self._began[0] + 1, self._longest, self.is_bursty)
+        advances = self._advances - self._advances_before
+        return ListStatistics(advances, self.front - self._began[0] + 1, self._longest, self.is_bursty)
 
     def measure(self) -> None:
         """Compute the pace; not done for each value."""

@@ -28,7 +28,7 @@ __all__ = ["PASSIVE_TIMEOUT", "PassiveTable", "PassiveFetch"]
 PASSIVE_TIMEOUT: Final = 20.0
 """Seconds, by default, in which another station may begin to request the list."""
 LIST_PAUSE_MAX: Final = 5.0
-"""Seconds without a new value after which a list counts as over: in PX4's low-bandwidth mode a value comes
+"""Seconds without a new value after which a list counts as over: in PX4's low-bandwidth mode a value arrives
 every 0.13 s, and a station that missed some requests them again within 1 to 2 s."""
 
 
@@ -68,7 +68,7 @@ class PassiveTable:
         self.new_index_at = -math.inf
         self.is_log = is_log
         self.is_over = False
-        self.file = FileObserver(self._file_came)
+        self.file = FileObserver(self._take_file)
         self._fetch_context = fetch_context
         self._table = fetch_context.table
         self._sync = sync
@@ -85,7 +85,7 @@ class PassiveTable:
         """Process a PARAM_VALUE of the component, after the table has stored it."""
         name, _, _, count, index = message
         if self.file.is_reading:
-            self.file.value_heard(message)
+            self.file.receive_value(message)
         if index >= count or count > PARAMETERS_MAX:
             return
         names = self.names
@@ -137,14 +137,14 @@ class PassiveTable:
         missing = tuple(index for index in range(self.count) if index not in self.names)
         return self._result("stream", missing, None, now, notes)
 
-    def _file_came(self, came: ObservedPack, now: float) -> None:
+    def _take_file(self, observed: ObservedPack, now: float) -> None:
         """Take the packed file, or its beginning, that another station has read."""
-        table, total = self._table, came.pack.total
+        table, total = self._table, observed.pack.total
         if table.count != total:
             if table.count is not None:
                 self._sync.count_changed(total - table.count, now)
             table.change_count(total)
-        entries = {index: entry.name for index, entry in came.entries()}
+        entries = {index: entry.name for index, entry in observed.entries()}
         is_all = len(entries) == total
         names = {index: name for index, name in entries.items() if is_portable_name(name)}
         if (
@@ -154,11 +154,13 @@ class PassiveTable:
         ):
             self.forget()
             self.count = total
-            self._began_at = came.began_at
+            self._began_at = observed.began_at
         was_whole = len(self.names) == total
         self.names |= names
         self.new_index_at = now
-        self._fetch_context.changed(table.take_pack(came.pack, came.began_at, came.newer, start=came.start))
+        self._fetch_context.changed(
+            table.take_pack(observed.pack, observed.began_at, observed.newer, start=observed.start)
+        )
         if len(self.names) == total and not was_whole:
             self._complete("ftp" if is_all else "stream", now)
 
@@ -211,8 +213,8 @@ class PassiveFetch(Fetch):
     only then the last values are known.
     """
 
-    def __init__(self, fetch_context: FetchContext, overheard: PassiveTable, now: float) -> None:
-        self._overheard = overheard
+    def __init__(self, fetch_context: FetchContext, passive_table: PassiveTable, now: float) -> None:
+        self._passive_table = passive_table
         super().__init__(
             fetch_context,
             now,
@@ -224,14 +226,14 @@ class PassiveFetch(Fetch):
             sampled=None,
         )
 
-    def came(self, result: FetchResult, now: float) -> None:
+    def table_received(self, result: FetchResult, now: float) -> None:
         """End with a table that is complete or confirmed."""
-        if not self._overheard.is_log:
+        if not self._passive_table.is_log:
             self.finish(result, now)
 
     def over(self, now: float) -> None:
         """End with the result so far: nothing more is received."""
-        result = self._overheard.result(now)
+        result = self._passive_table.result(now)
         if result is None:
             self.fail(self._nothing(now), now)
         else:
@@ -242,32 +244,32 @@ class PassiveFetch(Fetch):
             self.over(now)
 
     def next_deadline(self) -> float:
-        overheard = self._overheard
-        if overheard.is_log or overheard.file.is_reading or not overheard.names:
+        passive_table = self._passive_table
+        if passive_table.is_log or passive_table.file.is_reading or not passive_table.names:
             return math.inf
-        return max(overheard.new_index_at, self.begun_at) + LIST_PAUSE_MAX
+        return max(passive_table.new_index_at, self.begun_at) + LIST_PAUSE_MAX
 
     def partial(self, now: float, note: str) -> FetchResult:
-        result = self._overheard.result(now, (note,))
+        result = self._passive_table.result(now, (note,))
         if result is None:
             raise self._nothing(now)
         return result
 
     @property
     def is_silent(self) -> bool:
-        overheard = self._overheard
-        return not (overheard.names or overheard.file.is_reading or overheard.is_log)
+        passive_table = self._passive_table
+        return not (passive_table.names or passive_table.file.is_reading or passive_table.is_log)
 
     def progress(self, now: float) -> Progress:
-        overheard = self._overheard
-        ranges = None if overheard.count is None else DownloadRanges("parameters", overheard.split)
-        return Progress(len(overheard.names), overheard.count, 0.0, None, ranges)
+        passive_table = self._passive_table
+        ranges = None if passive_table.count is None else DownloadRanges("parameters", passive_table.split)
+        return Progress(len(passive_table.names), passive_table.count, 0.0, None, ranges)
 
     def _begin_download(self, now: float, present: Mapping[int, str] | None = None) -> None:
-        overheard = self._overheard
-        if overheard.is_over:
+        passive_table = self._passive_table
+        if passive_table.is_over:
             self.over(now)
-        elif not overheard.is_log and (result := overheard.settled(now)) is not None:
+        elif not passive_table.is_log and (result := passive_table.settled(now)) is not None:
             self.finish(result, now)
 
     def _nothing(self, now: float) -> NoReply:

@@ -49,15 +49,15 @@ class FileObserver:
     entries before the first gap are used: no entry depends on later ones.
 
     Args:
-        came: called with the proven part of each read, and the time.
+        file_read: called with the proven part of each read, and the time.
 
     Attributes:
         notes: what was not used, and why, since `clear_notes`.
     """
 
-    def __init__(self, came: Callable[[ObservedPack, float], None]) -> None:
+    def __init__(self, file_read: Callable[[ObservedPack, float], None]) -> None:
         self.notes: list[str] = []
-        self._came = came
+        self._file_read = file_read
         self._reads = ObservedReads(_is_parameter_file, size_max=PACK_SIZE_MAX, ended=self._ended)
         self._names: dict[ObservedRead, set[str]] = {}
         self._counts: dict[ObservedRead, int] = {}
@@ -67,18 +67,18 @@ class FileObserver:
         """Whether another station is reading the file."""
         return bool(self._reads.running)
 
-    def request_heard(self, message: FileTransfer, station: tuple[int, int], now: float) -> None:
+    def receive_request(self, message: FileTransfer, station: tuple[int, int], now: float) -> None:
         """Process a FILE_TRANSFER_PROTOCOL that a station has sent to the component."""
         packet = Packet.unpack(message.payload)
         if packet.opcode < Opcode.ACK:
-            self._reads.request_heard(packet, station, now)
+            self._reads.receive_request(packet, station, now)
 
-    def reply_heard(self, message: FileTransfer, now: float) -> None:
+    def receive_reply(self, message: FileTransfer, now: float) -> None:
         """Process a FILE_TRANSFER_PROTOCOL that the component has sent to a station."""
         addressee = (message.target_system, message.target_component)
-        self._reads.reply_heard(Packet.unpack(message.payload), addressee, now)
+        self._reads.receive_reply(Packet.unpack(message.payload), addressee, now)
 
-    def value_heard(self, message: ParamValue) -> None:
+    def receive_value(self, message: ParamValue) -> None:
         """Process a PARAM_VALUE of the component: it is newer than a file that was opened before."""
         for read in self._reads.running:
             self._names.setdefault(read, set()).add(message.param_id)
@@ -121,7 +121,7 @@ class FileObserver:
         except PackError as error:
             self._note(f"The {file} was not used: {error}.")
             return
-        self._came(ObservedPack(pack, _start_of(read.path), newer, read.began_at), now)
+        self._file_read(ObservedPack(pack, _start_of(read.path), newer, read.began_at), now)
         if len(pack.entries) < number:
             taken = f"{len(pack.entries)} of {number} parameters were taken from the {file}"
             self._note(f"{taken}: bytes from {len(data)} on are missing.")

@@ -81,7 +81,7 @@ Read: TypeAlias = ValueRead[ParamValue]
 
 
 class KnownParams(Protocol):
-    """The part of a table that tells an unknown parameter from a lost response."""
+    """The part of a table that distinguishes an unknown parameter from a lost response."""
 
     @property
     def params(self) -> Collection[str]:
@@ -104,7 +104,8 @@ class ValueReads(Machine, Generic[Response]):
     do not have. A silent read is therefore accompanied by a control read of an index that exists. If the
     control reads are answered, and a name that nothing has announced or an index that is not below the count
     is not, the link is not the cause: the parameter is unknown. An index that is not below a count which the
-    component has sent itself is unknown in any case: on a slow link, control reads may end too late to tell.
+    component has sent itself is unknown in any case: on a slow link, control reads may end too late to show
+        it.
 
     Args:
         context, table: the component's.
@@ -113,10 +114,10 @@ class ValueReads(Machine, Generic[Response]):
 
     Attributes:
         pace: the rate limit of requests.
-        asked, retries: reads so far, and repeated requests.
+        begun, retries: reads so far, and repeated requests.
         answered_at: when a read, or its control read, was answered last.
         list_runs_again: set while a list is sent another time: it may then contain the response to a read by
-            index, which tells nothing of the round trip.
+            index, which shows nothing about the round trip.
         is_idle: false while a list is received: then no request is sent twice to save time.
         list_until: until when values of an abandoned list may still arrive.
         control: the index of the control read, which is known to exist.
@@ -139,7 +140,7 @@ class ValueReads(Machine, Generic[Response]):
         self._reschedule = context.reschedule
         self._table = table
         self._trace = context.trace
-        self.asked = self.retries = 0
+        self.begun = self.retries = 0
         self.pace = Pace(context.round_trip, share)
         self._open: dict[Key, ValueRead[Response]] = {}
         self._in_flight: dict[Key, ValueRead[Response]] = {}
@@ -174,7 +175,7 @@ class ValueReads(Machine, Generic[Response]):
         read = self._open.get(key)
         if read is None:
             read = ValueRead(key, self._retry_policy, now)
-            self.asked += 1
+            self.begun += 1
             self._open[key] = read
             (self._caller_queue if urgent else self._fetch_queue).append(read)
         elif urgent and read in self._fetch_queue:
@@ -292,7 +293,7 @@ class ValueReads(Machine, Generic[Response]):
                 self._again.append(read)
                 continue
             may_be_in_list = self.list_runs_again and isinstance(read.key, int)
-            self._retries.timed_out(read.request, tells_loss=not may_be_in_list)
+            self._retries.timed_out(read.request, shows_loss=not may_be_in_list)
             if self._retries.should_give_up(read.request, now, is_known=self._is_known(read.key)):
                 self._drop(read)
                 self._trace("%s/%s %s: given up after try %s", *self._target, read.key, read.attempts)
@@ -322,7 +323,7 @@ class ValueReads(Machine, Generic[Response]):
             earliest = min(map(self._due_at, self._in_flight.values()))
         if self._again or self._caller_queue or self._fetch_queue:
             return min(earliest, self.pace.next_at())
-        if self._copy_wanted() is not None:
+        if self._needed_copy() is not None:
             return min(earliest, self.pace.next_at(COPY_RESERVE))
         return earliest
 
@@ -452,14 +453,14 @@ class ValueReads(Machine, Generic[Response]):
             self._transmit(read, now, is_charged=has_token)
         while (
             may_copy
-            and (read_again := self._copy_wanted()) is not None
+            and (read_again := self._needed_copy()) is not None
             and self.pace.may_send(now, COPY_RESERVE)
         ):
             read_again.request.copies += 1
             self.pace.sent(now)
             self._request(read_again, now)
 
-    def _copy_wanted(self) -> ValueRead[Response] | None:
+    def _needed_copy(self) -> ValueRead[Response] | None:
         """Return a read for which a copy is worthwhile while its response may be on the way."""
         if not self.is_idle or not self._in_flight:
             return None

@@ -88,7 +88,7 @@ class Sampling(Operation[Sample]):
         self._size = len(drawn)
         self._open = {index: reads.ask(index, now, urgent=False) for index in self._expected}
         for index, read in self._open.items():
-            read.on_done.append(partial(self._came, index, read))
+            read.on_done.append(partial(self._take_value, index, read))
 
     def cancel(self) -> None:
         """Cancel the reads."""
@@ -96,7 +96,7 @@ class Sampling(Operation[Sample]):
         for read in left.values():
             self._reads.release(read)
 
-    def _came(self, index: int, read: Read) -> None:
+    def _take_value(self, index: int, read: Read) -> None:
         if self._open.pop(index, None) is None:
             return
         now = read.ended_at

@@ -46,7 +46,7 @@ SETTLING_TIME: Final = 0.06
 FOREIGN_SETTLING_TIME: Final = 0.5
 """Seconds from the last change by the vehicle or another station to the check of the hash. Of 200 values that
 another station set at full speed, PX4 pushed 73 to 178 to this one; the others it had passed or saved before
-their turn came (measured)."""
+their turn (measured)."""
 FOREIGN_CHECK_INTERVAL: Final = 2.0
 """Seconds between two such checks, at least: values may change without end."""
 VOLATILE_SHARE: Final = 0.05
@@ -293,7 +293,7 @@ class Sync(Machine):
 
     # received messages
 
-    def hash_heard(self, message: ParamValue, now: float) -> Announcement:
+    def receive_hash(self, message: ParamValue, now: float) -> Announcement:
         """Process a `_HASH_CHECK`."""
         self.announced = Announcement.of(message, now)
         self._context.has_hash = True
@@ -328,7 +328,7 @@ class Sync(Machine):
     def count_changed(self, added: int, now: float, carrier: str = "") -> None:
         """Process a changed count: the table has changed.
 
-        Without a hash, the table is followed by reads, or fetched, by list where it does not come as a file.
+        Without a hash, the table is followed by reads, or fetched, by list where it is not served as a file.
 
         Args:
             added: parameters more than before; negative if there are fewer.
@@ -393,18 +393,18 @@ class Sync(Machine):
         self._count_changes = None
         self._last_switch = ""
         table = self._table
-        complete = result.complete and table.complete and not result.has_moved
+        complete = result.complete and table.complete and not result.may_be_mixed
         if result.hash is None:  # values from before the loss may have changed since
             complete = complete and not table.only_cached
         if not complete:
             self._mark_unsynced()
         self.synced = complete
         self._has_count_changed &= not complete
-        self._was_synced |= complete or result.has_moved
+        self._was_synced |= complete or result.may_be_mixed
         self._changed_only_by_us = result.hash is not None
         self._known_at = now if result.hash is not None else now - result.elapsed
         self._settled(now, self._known_at)
-        if result.has_moved and self._keeps_in_sync:
+        if result.may_be_mixed and self._keeps_in_sync:
             self._check_at = now + GAP_CHECK_INTERVAL
         if result.hash is not None:
             self._read_unhashed(result.hash, now)
@@ -435,7 +435,7 @@ class Sync(Machine):
         """Request the hash: ahead of a fetch, to save its round trip, or to detect a change."""
         if self._sync_settings.policy is not Policy.CACHE_ONLY:
             read = self._reads.ask(HASH_CHECK, now)
-            read.on_done.append(lambda: self._hash_came(read))
+            read.on_done.append(lambda: self._take_hash(read))
 
     def hold(self) -> None:
         """Begin no check until `release`: a set-up reads the table itself."""
@@ -604,7 +604,7 @@ class Sync(Machine):
                 interval = pace.interval(may_use_file=self._host.may_use_file)
                 self._check_at = max(known_at + interval, now + pace.shortest_pause)
 
-    def _hash_came(self, read: Read) -> None:
+    def _take_hash(self, read: Read) -> None:
         """Process a response to our own request for the hash, or its absence."""
         table, now = self._table, read.ended_at
         reads_volatile, self._reads_volatile = self._reads_volatile, False
@@ -706,12 +706,12 @@ class Sync(Machine):
         self._has_count_changed = False
         if self.expects_hash:
             read = self._proof_read = self._reads.ask(HASH_CHECK, now)
-            read.on_done.append(partial(self._proof_came, read))
+            read.on_done.append(partial(self._take_proof, read))
             return
         self.synced = True
         self._settled(now, self._known_at)
 
-    def _proof_came(self, read: Read) -> None:
+    def _take_proof(self, read: Read) -> None:
         """Take the table that the reads have shown if the hash proves it; otherwise check it as any other."""
         if self._proof_read is not read:
             return

@@ -67,7 +67,7 @@ class SyncInterval:
 
     @property
     def has_file(self) -> bool:
-        """Whether the table has come as a file."""
+        """Whether the table was received as a file."""
         return "ftp" in self._times
 
     @property

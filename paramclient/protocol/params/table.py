@@ -89,7 +89,7 @@ class Observation(NamedTuple):
     Attributes:
         param: the parameter with that value.
         by: the author of the change to that value, as in `Change`.
-        moment: when the value came from the link, in seconds of the core's clock.
+        moment: when the value arrived from the link, in seconds of the core's clock.
     """
 
     param: Param
@@ -100,8 +100,8 @@ class Observation(NamedTuple):
 class Table:
     """The parameters of one component.
 
-    Each value carries the moment at which it came from the link (`Params.moments`), in seconds of the core's
-    clock, whenever it is processed or written to the cache.
+    Each value carries the moment at which it arrived from the link (`Params.moments`), in seconds of the
+    core's clock, whenever it is processed or written to the cache.
 
     Args:
         encoding: how the component encodes values, as far as known.
@@ -160,7 +160,7 @@ class Table:
         self._hash_is_stale = False
         self._encoding = encoding
         self._wire: dict[str, bytes] = {}  # the 4 bytes as received, to decode them again in another encoding
-        self._filed: set[str] = set()  # values that came in a file, which does not depend on the encoding
+        self._filed: set[str] = set()  # values received in a file, which does not depend on the encoding
 
     @property
     def encoding(self) -> Encoding:
@@ -218,7 +218,7 @@ class Table:
         Args:
             message: the PARAM_VALUE.
             by: the author of the change, as in `Change`.
-            moment: when it came from the link, not before the previous one.
+            moment: when it arrived from the link, not before the previous one.
             is_exact: whether it repeats the value that was just written, so that it cannot be a rounded form
                 of a known integer.
         """

@@ -52,7 +52,7 @@ def reads_expected(changes: Iterable[CountChange]) -> int:
 
 
 def search_reads_expected(changes: Iterable[CountChange]) -> int:
-    """Return the same if nothing tells where the parameters are that stand side by side."""
+    """Return the same if nothing shows where the adjacent parameters are."""
     around = sum(2 * NEIGHBOURS + max(change.added, 0) for change in changes)
     return around + SPLITS * (SEARCH_ROUNDS - 1) + CONTROL_READS + 1
 
@@ -194,9 +194,9 @@ class TableShift(Operation[Mapping[int, str] | None]):
             return
         self._open = {index: self._reads.ask(index, now, urgent=False) for index in indices}
         for index, read in self._open.items():
-            read.on_done.append(partial(self._came, index, read))
+            read.on_done.append(partial(self._take_value, index, read))
 
-    def _came(self, index: int, read: Read) -> None:
+    def _take_value(self, index: int, read: Read) -> None:
         if self._open.get(index) is not read:
             return
         del self._open[index]

@@ -229,9 +229,9 @@ class ParamUpload(Operation[None]):
         self._spans.clear()
         job = self._files.read(_Span(first, last, False).path, now, limit=PACK_SIZE_MAX)
         job.yields = True
-        self._wait_for(job, lambda at: self._came(job, at))
+        self._wait_for(job, lambda at: self._take_file(job, at))
 
-    def _came(self, job: FileRead, now: float) -> None:
+    def _take_file(self, job: FileRead, now: float) -> None:
         """Compare the values of a part that was read."""
         if job.result is None:
             assert job.error is not None

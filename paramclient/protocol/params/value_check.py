@@ -19,7 +19,7 @@ __all__ = ["LATER_CHANGE_TIME", "READS_PAUSE", "REREADS_MAX", "Rereads", "ValueC
 
 AMBIGUITY_WINDOW: Final = 0.3
 """Seconds after a change in which a PARAM_VALUE with the previous value is ambiguous: ArduPilot takes the
-value of a read when it queues the response, and sends it up to 100 ms later. Jitter comes on top."""
+value of a read when it queues the response, and sends it up to 100 ms later. Jitter adds to that."""
 LATER_CHANGE_TIME: Final = 1.2
 """Seconds from the acknowledgement until a value is read again on PX4, whose modules clamp the value, or set
 other parameters, up to 1.1 s after it (measured)."""
@@ -116,7 +116,7 @@ class ValueChecks:
     The rule: a value that may be older than a change is not an observation of the present. Within
     `AMBIGUITY_WINDOW` of a change only the previous value is ambiguous: it may have been taken before the
     change, or be a change back. It is ignored, and the parameter is read again at the end of that time. Every
-    other value is news.
+    other value counts.
 
     This applies to responses to reads and to lists. During a file read, PARAM_VALUEs have precedence anyway.
     """
@@ -151,23 +151,25 @@ class ValueChecks:
         if len(self._replaced) > REPLACED_MAX:
             del self._replaced[next(iter(self._replaced))]
 
-    def ambiguous_until(self, message: ParamValue | ParamExtValue, now: float, *, is_wanted: bool) -> float:
+    def ambiguous_until(
+        self, message: ParamValue | ParamExtValue, now: float, *, is_requested: bool
+    ) -> float:
         """Return until when the value of a message may be older than the last change.
 
         Args:
             message: the PARAM_VALUE.
             now: the time.
-            is_wanted: whether it has the value of an active PARAM_SET. Then it counts, unless it may be the
-                response to an earlier read.
+            is_requested: whether it has the value of an active PARAM_SET. Then it counts, unless it may be
+                the response to an earlier read.
 
         Returns:
-            A time after `now`, or -infinity where the value is news.
+            A time after `now`, or -infinity if the value is not ambiguous.
         """
         values = self._replaced.get(message.param_id)
         until, was_read = -math.inf, True
         if values is not None:
             until, was_read = values.get((message.param_type, message.raw), (until, was_read))
-        return until if until > now and (was_read or not is_wanted) else -math.inf
+        return until if until > now and (was_read or not is_requested) else -math.inf
 
     def ask(self, name: str, at: float) -> None:
         """Plan to read a value again at a time, or at a later one that is already planned."""

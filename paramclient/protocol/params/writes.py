@@ -117,7 +117,7 @@ class Write(Operation[SetResult]):
         self.number = 0  # the type that was sent
         self.wanted: Param | None = None
         self.before: Param | None = None
-        self.is_answered = False  # a value other than the requested one came after the last PARAM_SET
+        self.is_answered = False  # a value other than the requested one was received after the last PARAM_SET
         self.seen_after_set: Param | None = None  # the value after an earlier PARAM_SET, if not the old one
         self.verify_at = math.inf
         self.read: Read | None = None
@@ -156,8 +156,9 @@ class Writes(Machine):
     type, wait for a PARAM_VALUE of the name. Only the requested value proves success. Another value may be
     the response to an old read, or part of a list: wait a little, read by name, then decide. A value that is
     neither the old nor the requested one may be the vehicle's adjustment, or a PARAM_SET of another station
-    that came between: the PARAM_SET is sent again, and an equal result is the adjustment. The old value means
-    that nothing was applied; the PARAM_SET may have been lost and is sent again until loss is unlikely.
+    that was received between: the PARAM_SET is sent again, and an equal result is the adjustment. The old
+    value means that nothing was applied; the PARAM_SET may have been lost and is sent again until loss is
+    unlikely.
 
     If the caller requests it, the value is watched for a while after that and then read once more: a
     different value is then the vehicle's adjustment. The write is acknowledged during this time, so that
@@ -173,7 +174,7 @@ class Writes(Machine):
     Attributes:
         queues: open writes by name, the active one first; no name has an empty queue.
         is_awaiting_permission: whether a write waits for the permission.
-        asked, retries: writes so far, and repeated PARAM_SETs.
+        begun, retries: writes so far, and repeated PARAM_SETs.
         against_non_finite: why NaN and infinity must not be sent to the vehicle; "" where they may.
         on_outcome_unknown: called with the name and the author of a write that ended with its outcome
             unknown.
@@ -195,7 +196,7 @@ class Writes(Machine):
         self._params: Mapping[str, Param] = table.params
         self._permission = permission
         self._trace = context.trace
-        self.asked = self.retries = 0
+        self.begun = self.retries = 0
         self.is_awaiting_permission = False
         self.against_non_finite = ""
         self.queues: dict[str, deque[Write]] = {}
@@ -229,7 +230,7 @@ class Writes(Machine):
         write = Write(
             *(name, value, self._retry_policy, now, author), settle=settle, is_forced=force, is_filed=filed
         )
-        self.asked += 1
+        self.begun += 1
         queue = self.queues.setdefault(name, deque())
         queue.append(write)
         self._context.is_writing = True

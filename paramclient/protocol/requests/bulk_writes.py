@@ -157,7 +157,7 @@ class BulkWrites(Operation[tuple[Outcome, ...]], ABC, Generic[Value, WriteT, Out
     A subclass begins them in `proceed`.
 
     Attributes:
-        ended: the outcomes so far, in the order in which they came.
+        ended: the outcomes so far, in the order in which they were received.
         failure: the error after which no further write is begun, or None.
         on_outcome: called after each outcome.
 

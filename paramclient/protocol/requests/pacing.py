@@ -62,13 +62,13 @@ class LinkBandwidth:
         each: requests per second for each of them.
     """
 
-    __slots__ = ("_best", "_best_rate", "_came", "_paces", "_sent", "_streams", "each")
+    __slots__ = ("_best", "_best_rate", "_paces", "_received", "_sent", "_streams", "each")
 
     def __init__(self) -> None:
         self._paces: set[Pace] = set()
         self._streams: dict[Pace, tuple[float, float]] = {}
         self._best: set[Pace] = set()  # with the lists of the best rate so far
-        self._best_rate = self._sent = self._came = 0.0  # the sums, as each request uses all of it
+        self._best_rate = self._sent = self._received = 0.0  # the sums, as each request uses all of it
         self.each = RATE_MAX
 
     def join(self, pace: Pace) -> None:
@@ -86,10 +86,10 @@ class LinkBandwidth:
         if pace in self._best:
             self._best.clear()  # from its earlier list
             self._best_rate = 0.0
-        sent, came = self._streams.get(pace, (0.0, 0.0))
+        sent, received = self._streams.get(pace, (0.0, 0.0))
         self._streams[pace] = rate, rate * (1.0 - loss)
         self._sent += rate - sent
-        self._came += rate * (1.0 - loss) - came
+        self._received += rate * (1.0 - loss) - received
         self._divide()
 
     def stream_ended(self, pace: Pace) -> None:
@@ -98,15 +98,15 @@ class LinkBandwidth:
             if self._rate() > self._best_rate:
                 self._best_rate = self._rate()
                 self._best = set(self._streams)
-            sent, came = self._streams.pop(pace)
+            sent, received = self._streams.pop(pace)
             self._sent = self._sent - sent if self._streams else 0.0
-            self._came = self._came - came if self._streams else 0.0
+            self._received = self._received - received if self._streams else 0.0
             self._divide()
 
     def _rate(self) -> float:
         """Return the values per second of the running lists: in parallel ones, lost values show no free
         bandwidth."""
-        return self._sent if len(self._streams) == 1 else self._came
+        return self._sent if len(self._streams) == 1 else self._received
 
     def _divide(self) -> None:
         values = max(self._best_rate, self._rate())
@@ -262,7 +262,7 @@ class Pace:
         self._share.stream_ended(self)
 
     def rest(self) -> None:
-        """Discard the present measurement: recent responses tell nothing."""
+        """Discard the present measurement: recent responses show nothing."""
         self._begin_epoch(math.inf)
 
     def idle(self) -> None:

@@ -220,7 +220,7 @@ class RetryPolicy:
     def answered(self, sent_at: float, now: float, attempts: int) -> None:
         """Record a response to a request that was sent `attempts` times, the last time at `sent_at`.
 
-        An infinite `sent_at`, as after an outage, tells nothing of the round trip.
+        An infinite `sent_at`, as after an outage, shows nothing about the round trip.
         """
         trip = self.round_trip
         self._timeout = None
@@ -456,7 +456,7 @@ VERSION_ATTEMPTS: Final = 4
 VERSION_DELAY: Final = 0.1
 """Seconds between the acknowledgement of the request and AUTOPILOT_VERSION; later, it counts as lost."""
 DOUBT_TIME_MIN: Final = 5.0
-"""Seconds, at least, for which a component that has sent it before is asked again: it may be booting."""
+"""Seconds, at least, of requests to a component that has sent it before: it may be booting."""
 DOUBT_REQUEST_INTERVAL: Final = 1.0
 """Seconds between two requests after the usual number of them."""
 LATER_REQUEST_INTERVAL: Final = 5.0
@@ -593,7 +593,7 @@ CONTROLS_CERTAIN: Final = 4
 """Answered control reads, at least, after which silence is due to the component and not to the link."""
 LOSS_RISK: Final = 1e-6
 """The probability of mere packet loss, by the outcome of the control reads, below which a silent parameter
-counts as unknown. Where many reads are silent, only control reads tell the link's loss."""
+counts as unknown. Where many reads are silent, only control reads show the link's loss."""
 DEAD_INDEX_RISK: Final = 1e-3
 """The probability of mere packet loss below which an index of a list is given up, by the reads answered while
 it stayed silent."""
@@ -640,7 +640,7 @@ class ReadRetries:
     """What all reads of one component show together: whether it answers reads at all, and what is unknown.
 
     Silence is not a response: a vehicle may be silent on a parameter that it does not have. The control reads
-    of an existing index, which accompany silent reads, tell that from packet loss.
+    of an existing index, which accompany silent reads, distinguish that from packet loss.
     """
 
     def __init__(self, policy: RetryPolicy) -> None:
@@ -664,10 +664,10 @@ class ReadRetries:
         """Forget what was in flight: the link is back."""
         self._control.sent_at = self._silent_since = math.inf
 
-    def timed_out(self, request: ReadAttempts, *, tells_loss: bool) -> None:
-        """Record that a request counts as lost; `tells_loss` unless something else may bring its value."""
+    def timed_out(self, request: ReadAttempts, *, shows_loss: bool) -> None:
+        """Record that a request counts as lost; `shows_loss` unless something else may bring its value."""
         self._silences += 1
-        if tells_loss:
+        if shows_loss:
             request.timed_out()
 
     @staticmethod
@@ -954,7 +954,7 @@ class ListAttempts(Attempts):
         self.count = 1
         self.wait = self._policy.repeat_timeout(1) + LIST_DELAY
 
-    def head_heard(self, now: float) -> None:
+    def head_received(self, now: float) -> None:
         """Record that the head of the list was received: the values follow."""
         self.sent_at = now
         self.wait = max(self.wait, LIST_SILENCE_MIN)
@@ -994,7 +994,7 @@ class ListAttempts(Attempts):
 
 # PARAM_EXT_REQUEST_LIST
 
-EXT_UNHEARD_ATTEMPTS: Final = 6
+EXT_UNANSWERED_ATTEMPTS: Final = 6
 """Requests for the list to a component that has never sent an extended parameter: with half of the exchanges
 lost, all of them are lost once in 60 times."""
 EXT_LISTS_MAX: Final = 3
@@ -1009,7 +1009,7 @@ class ExtListAttempts(ListAttempts):
     """The requests for a list of extended parameters, until its first value.
 
     Most components have no extended parameters, and do not say so: a component that has never sent one is
-    given up after a few attempts, and its silence tells nothing of the link. `ListAttempts` waits longer,
+    given up after a few attempts, and its silence shows nothing about the link. `ListAttempts` waits longer,
     for a vehicle that boots.
 
     Attributes:
@@ -1033,7 +1033,7 @@ class ExtListAttempts(ListAttempts):
         return lists < EXT_LISTS_MAX and missing > max(EXT_SINGLE_READS, EXT_SINGLE_READS_SHARE * count)
 
     def should_give_up(self, now: float) -> bool:
-        return super().should_give_up(now) if self.is_spoken else self.count >= EXT_UNHEARD_ATTEMPTS
+        return super().should_give_up(now) if self.is_spoken else self.count >= EXT_UNANSWERED_ATTEMPTS
 
     def timed_out(self) -> None:
         if self.is_spoken:
@@ -1062,10 +1062,10 @@ CLOSE_ATTEMPTS: Final = 4
 long ends by its own timeout: ArduPilot after 3 s, PX4 after 10 s."""
 CLOSE_COPIES_MAX: Final = 4
 """Copies of a close request on a lossy link: each has 12 bytes of payload."""
-UNHEARD_ATTEMPTS_MAX: Final = 16
+UNANSWERED_ATTEMPTS_MAX: Final = 16
 """Requests after which a server that has never responded counts as none: with two of three exchanges lost,
 all of them are lost once in 700 times."""
-UNHEARD_ATTEMPTS_WITHOUT_BACKOFF: Final = 2
+UNANSWERED_ATTEMPTS_WITHOUT_BACKOFF: Final = 2
 """Requests without backoff to a server that has not responded yet."""
 COMMIT_COPIES: Final = 2
 """Requests of each kind that are sent at once at the end of an uploaded param.pck: they are short, and if all
@@ -1094,12 +1094,12 @@ class FileAttempts(Attempts):
     """The attempts of one MAVFTP request, except for single reads of a file's blocks.
 
     Many components have no server, and do not say so: a server that has never responded is given up after
-    `UNHEARD_ATTEMPTS_MAX` requests, and its silence tells nothing of the link.
+    `UNANSWERED_ATTEMPTS_MAX` requests, and its silence shows nothing about the link.
 
     Args:
         policy: the component's.
         server: its server.
-        is_slow: whether the server works on the request for long, which tells nothing of the link.
+        is_slow: whether the server works on the request for long, which shows nothing about the link.
     """
 
     __slots__ = ("_begun_at", "_is_slow", "_server")
@@ -1117,9 +1117,9 @@ class FileAttempts(Attempts):
             doublings = min(max(self.count - SLOW_ATTEMPTS_WITHOUT_BACKOFF, 0), BACKOFF_DOUBLINGS_MAX)
             return min(policy.timeout * 2.0**doublings, max(TIMEOUT_MAX, policy.timeout))
         timeout = policy.repeat_timeout(self.count)
-        if self._is_unheard and policy.round_trip.smoothed is not None:
+        if self._is_unanswered and policy.round_trip.smoothed is not None:
             # the server may be busy with another station, whose burst nothing interrupts
-            doublings = min(max(self.count - UNHEARD_ATTEMPTS_WITHOUT_BACKOFF, 0), BACKOFF_DOUBLINGS_MAX)
+            doublings = min(max(self.count - UNANSWERED_ATTEMPTS_WITHOUT_BACKOFF, 0), BACKOFF_DOUBLINGS_MAX)
             return min(timeout * 2.0**doublings, max(TIMEOUT_MAX, timeout))
         return timeout
 
@@ -1156,7 +1156,7 @@ class FileAttempts(Attempts):
         self.count = min(self.count, 1)
 
     def timed_out(self) -> None:
-        if not self._is_unheard:
+        if not self._is_unanswered:
             super().timed_out()
 
     def should_give_up(self, now: float, *, yields: bool = False) -> bool:
@@ -1166,8 +1166,8 @@ class FileAttempts(Attempts):
             now: the time.
             yields: whether no caller waits, and the request is made again later.
         """
-        if self._is_unheard and not self._policy.is_silent_too_long(now):
-            return self.count >= (UNANSWERED_OPENS_MAX if yields else UNHEARD_ATTEMPTS_MAX)
+        if self._is_unanswered and not self._policy.is_silent_too_long(now):
+            return self.count >= (UNANSWERED_OPENS_MAX if yields else UNANSWERED_ATTEMPTS_MAX)
         if self._is_slow and now - self._begun_at >= SLOW_TIME_MAX:
             return self.count >= ATTEMPTS_MIN
         if self._is_slow and self.count < SLOW_ATTEMPTS_MIN:
@@ -1175,8 +1175,8 @@ class FileAttempts(Attempts):
         return super().should_give_up(now)
 
     @property
-    def _is_unheard(self) -> bool:
-        """Whether the server has never responded: nothing tells that there is one."""
+    def _is_unanswered(self) -> bool:
+        """Whether the server has never responded: nothing shows that there is one."""
         return self._server.received_at == -math.inf
 
     @property
@@ -1209,8 +1209,8 @@ FIRST_BLOCK_ROUND_TRIPS: Final = 2.5
 """The same in round trips."""
 BURST_SILENCE: Final = 0.5
 """Seconds without a message of the server after which a burst without a block is repeated. At 57600 baud its
-first block comes 0.1 s after the request, behind the banner (measured), and later behind telemetry. ArduPilot
-ends no burst for another one: repeated meanwhile, the whole file is sent twice."""
+first block arrives 0.1 s after the request, behind the banner (measured), and later behind telemetry.
+ArduPilot ends no burst for another one: repeated meanwhile, the whole file is sent twice."""
 SECOND_BLOCK_TIMEOUT: Final = 2.0
 """Seconds until the second block of a burst counts as late while the pace is unknown."""
 SILENT_GAPS: Final = 6
@@ -1344,14 +1344,14 @@ class BlockRetries:
         """
         return attempts >= ATTEMPTS_MAX or (is_silence and self._policy.should_give_up(attempts, now))
 
-    def copies(self, came: int, lost: int) -> int:
+    def copies(self, received: int, lost: int) -> int:
         """Return how many early copies of one read are worthwhile.
 
         Args:
-            came: received blocks of bursts.
+            received: received blocks of bursts.
             lost: lost blocks of bursts.
         """
-        passed = came / (came + lost) if came else 1.0
+        passed = received / (received + lost) if received else 1.0
         loss = max(self._policy.round_trip.seen_loss, 1.0 - passed * passed)
         if loss < COPY_RISK:
             return 0
@@ -1393,11 +1393,11 @@ class OpenRetries:
     def __init__(self, policy: RetryPolicy) -> None:
         self._policy = policy
 
-    def list_due_at(self, asked_at: float) -> float:
-        """Return when the list is requested as well, if the opening at `asked_at` stays unanswered."""
+    def list_due_at(self, requested_at: float) -> float:
+        """Return when the list is requested as well, if the opening at `requested_at` stays unanswered."""
         if self._policy.round_trip.smoothed is None:
-            return asked_at + FILE_OPEN_TIMEOUT_SILENT
-        return asked_at + max(FILE_OPEN_TIMEOUT, FILE_OPEN_TIMEOUT_FACTOR * self._policy.prompt_timeout)
+            return requested_at + FILE_OPEN_TIMEOUT_SILENT
+        return requested_at + max(FILE_OPEN_TIMEOUT, FILE_OPEN_TIMEOUT_FACTOR * self._policy.prompt_timeout)
 
     @staticmethod
     def should_give_up(attempts: int) -> bool:
@@ -1410,7 +1410,7 @@ class OpenRetries:
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """Requests at fixed times: no round trip is measured, or none would tell when the response is due.
+    """Requests at fixed times: no round trip is measured, or none would show when the response is due.
 
     Attributes:
         pauses: seconds after each request. The last one is the time for the response to the last request.
@@ -1473,7 +1473,7 @@ CLOCK_REQUEST_INTERVAL: Final = 0.25
 """Seconds between two requests at first. A booting ArduPilot acknowledges each, and sends SYSTEM_TIME when
 its main loop runs (measured: 1.8 to 2.6 s after it went off)."""
 CLOCK_FOLLOW_DELAY: Final = CLOCK_REQUEST_INTERVAL
-"""Seconds from a reboot command to the first request: its acknowledgement comes first."""
+"""Seconds from a reboot command to the first request: its acknowledgement arrives first."""
 FAST_REQUESTS_TIME: Final = 6.0
 """Seconds for which requests are sent at that pace."""
 SLOW_REQUEST_INTERVAL: Final = 1.0

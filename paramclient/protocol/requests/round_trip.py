@@ -17,7 +17,8 @@ class RoundTrip:
     """The round-trip estimate of RFC 6298 with Karn's rule, and the share of unanswered requests.
 
     There is one for each component, which all exchanges with it share. `RetryPolicy` feeds it and decides by
-    it: nothing here says when a request counts as lost. Samples come only from requests that were sent once.
+    it: nothing here says when a request counts as lost. Samples are taken only from requests that were sent
+        once.
 
     Args:
         first_timeout: the shortest timeout in seconds before the first sample. A request that was silent for
@@ -106,7 +107,7 @@ class RoundTrip:
         self._answered *= SAMPLE_WEIGHT
 
     def bound(self, longest: float) -> None:
-        """Record that a response came at most this many seconds after its request, which was repeated."""
+        """Record that a response arrived at most this many seconds after its request, which was repeated."""
         if self.smoothed is None:
             self.longest = min(self.longest, longest)
 

@@ -49,7 +49,7 @@ class SequenceCheck:
     both run in parallel, and the losses counted between them are corrected.
 
     A reboot within less than `NUMBERING_TIMEOUT`, whose first number happens to be ahead within `GAP_MAX`,
-    cannot be told from a loss. Nor can frames that a router filters out.
+    cannot be distinguished from a loss. Nor can frames that a router filters out.
 
     Attributes:
         lost: frames not received.
@@ -74,7 +74,7 @@ class SequenceCheck:
         )
         if gap <= CERTAIN_GAP:
             self._continue(nearest, sequence, gap)
-        elif not self._came_late(sequence):
+        elif not self._is_late(sequence):
             self._begin(sequence, silence)
 
     def _continue(self, index: int, sequence: int, gap: int) -> None:
@@ -97,7 +97,7 @@ class SequenceCheck:
                 before = before.before
         self._numberings = [numbering, *(other for other in self._numberings if other not in over)]
 
-    def _came_late(self, sequence: int) -> bool:
+    def _is_late(self, sequence: int) -> bool:
         for each in self._numberings:
             behind = (each.last - sequence) % 256
             if behind <= REORDER_DEPTH:

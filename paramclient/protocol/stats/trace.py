@@ -1,4 +1,4 @@
-"""Trace lines of the core's steps for debugging, formatted only where they are wanted."""
+"""Trace lines of the core's steps for debugging, formatted only where tracing is on."""
 
 from __future__ import annotations
 

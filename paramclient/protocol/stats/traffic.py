@@ -291,7 +291,7 @@ class _Source:
 
     def report(self, began: float, now: float) -> ComponentTraffic:
         system, component = self._address
-        came = self._frames.recent_total(now) - self._repeated.recent_total(now)
+        received = self._frames.recent_total(now) - self._repeated.recent_total(now)
         lost = max(self._lost.recent_total(now), 0)
         messages = [
             MessageTraffic(message_name(number), number, each.total, each.rate(began, now))
@@ -309,7 +309,7 @@ class _Source:
             frame_rate=self._frames.rate(began, now),
             byte_rate=self._bytes.rate(began, now),
             lost=self._lost.total,
-            loss=lost / (came + lost) if came > 0 else None,
+            loss=lost / (received + lost) if received > 0 else None,
             repeated=self._repeated.total,
             late=self._late + sum(check.late for check in self._checks.values()),
             signed=self._signed,

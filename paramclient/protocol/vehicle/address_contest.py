@@ -37,7 +37,7 @@ PATH_SILENCE: Final = 1.5
 """Seconds of silence after which requests use another path to the same vehicle: a heartbeat was lost."""
 RESTART_SILENCE: Final = 1.5
 """Seconds of silence after which the address goes to a peer with the same hardware id and a later boot: a
-vehicle that comes back from another port."""
+vehicle that returns from another port."""
 COMMANDED_SILENCE: Final = 0.5
 """The same while a reboot on command is awaited, which verifies the vehicle anyway."""
 RESTART_SLACK: Final = 1.0
@@ -180,7 +180,7 @@ class ComponentPeers:
         return claim is not None and claim.verdict is not PeerRelation.SAME
 
     def accepts(self, peer: Peer, now: float) -> bool:
-        """Return whether to accept a message that cannot tell vehicles apart, such as PARAM_VALUE."""
+        """Return whether to accept a message that cannot distinguish vehicles, such as PARAM_VALUE."""
         self._home_claim_or(peer, now)
         if peer == self.home:
             self.received_at = now
@@ -190,7 +190,7 @@ class ComponentPeers:
         return self._is_path(self._claim_of(peer, now))
 
     def accepts_identifying(self, message: Message, peer: Peer, now: float) -> bool:
-        """Record a message that may tell vehicles apart; return whether to accept it."""
+        """Record a message that may distinguish vehicles; return whether to accept it."""
         home_claim = self._home_claim_or(peer, now)
         claim = home_claim if peer == self.home else self._claim_of(peer, now)
         if claim is None:
@@ -235,7 +235,7 @@ class ComponentPeers:
             self._host.reschedule()
 
     def forget(self) -> None:
-        """Forget all peers: the link is down, and comes back with other peers."""
+        """Forget all peers: the link is down, and has other peers after the reconnection."""
         self._others.clear()
         self.home, self.speaker, self._home_claim = NO_PEER, NO_PEER, None
         self.has_left = False
@@ -315,12 +315,12 @@ class ComponentPeers:
             return ""
         is_over = claim.verdict is PeerRelation.OTHER or self._is_over(claim, now)
         claim.verdict, difference = compare(home_claim, claim, is_over=is_over, may_ask=self._may_ask)
-        tells_nothing_else = claim.kind.current == home_claim.kind.current and claim.uid.current in (
+        is_otherwise_equal = claim.kind.current == home_claim.kind.current and claim.uid.current in (
             None,
             home_claim.uid.current,
         )
         is_unproven = claim.verdict is PeerRelation.OPEN or (
-            claim.verdict is PeerRelation.OTHER and tells_nothing_else
+            claim.verdict is PeerRelation.OTHER and is_otherwise_equal
         )
         if (
             is_unproven
@@ -484,7 +484,7 @@ class ComponentPeers:
             self._request(claim, AUTOPILOT_VERSION_ID)
 
     def _request(self, claim: Claim, message_id: int, *, also_otherwise: bool = False) -> None:
-        """Request a message from a peer, also with the other commands for it if that is wanted."""
+        """Request a message from a peer, also with the other commands for it if requested."""
         ways = message_requests(self._target, message_id)
         for message in ways if also_otherwise else ways[:1]:
             self._host.send_to(message, claim.peer)

@@ -54,7 +54,7 @@ class BootTimeRequests(Machine):
             self._begin(now, ClockSchedule(now))
 
     def follow(self, now: float) -> None:
-        """Request the clock again and again: the component was told to reboot."""
+        """Request the clock again and again: the component was commanded to reboot."""
         self._begin(now, ClockSchedule(now + CLOCK_FOLLOW_DELAY))
         self._is_following = True
 
@@ -76,8 +76,8 @@ class BootTimeRequests(Machine):
         """Send a request that is due."""
         if self.next_deadline() > now:
             return
-        is_told = self._presence.clock_at > self._requested_after
-        if not self._is_following and (is_told or self._schedule.is_over(now)):
+        is_received = self._presence.clock_at > self._requested_after
+        if not self._is_following and (is_received or self._schedule.is_over(now)):
             self._request_at = math.inf
             return
         is_baseline = self._requested_after == -math.inf and not self._is_following

@@ -19,7 +19,7 @@ class BootTimeSampling:
     clock as well as in the first.
 
     Args:
-        choose: called with whether frames with clocks are wanted, at each change.
+        choose: called with whether frames with clocks are needed, at each change.
     """
 
     def __init__(self, choose: Callable[[bool], None]) -> None:

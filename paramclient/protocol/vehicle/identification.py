@@ -37,7 +37,7 @@ HEARTBEAT_WAIT: Final = 3.0
 """Seconds for which the encoding stays open after a version without encoding bits and before a heartbeat:
 autopilots send one every second."""
 ENCODING_CAPABILITIES: Final = CAPABILITY_PARAM_ENCODE_BYTEWISE | CAPABILITY_PARAM_ENCODE_C_CAST
-"""The capability bits that tell the encoding."""
+"""The capability bits that show the encoding."""
 
 
 def judge_encoding(
@@ -106,7 +106,7 @@ class Identification(Machine):
         self.vehicle_type: int | None = None
         self.capabilities: int | None = None
         self.doubted_at = -math.inf
-        self._beat_awaited_until = math.inf  # while a heartbeat may still tell the encoding
+        self._beat_awaited_until = math.inf  # while a heartbeat may still show the encoding
         self._received_at = -math.inf
         self._was_doubted = False  # since the last version
         self._is_high_latency = False
@@ -174,7 +174,7 @@ class Identification(Machine):
 
     @property
     def has_response(self) -> bool:
-        """Whether it has sent a heartbeat or its version, or was asked without success."""
+        """Whether it has sent a heartbeat or its version, or its version was requested without success."""
         return self.vehicle_type is not None or self.settled
 
     @property
@@ -303,13 +303,14 @@ class Identification(Machine):
 
     @property
     def _was_never_answered(self) -> bool:
-        """Whether an autopilot was asked without any response, as where the link was dead in one direction.
+        """Whether an autopilot was sent requests without any response, as where the link was dead in one
+        direction.
 
         Cameras and radios often have no version. Requests over a satellite link cost money.
         """
-        is_asked = self.settled and self.known_at == -math.inf and not self._context.is_identifying
+        is_requested = self.settled and self.known_at == -math.inf and not self._context.is_identifying
         may_ask = self._may_ask and not self._is_high_latency and not self._attempts.is_denied
-        return is_asked and may_ask and self.is_autopilot
+        return is_requested and may_ask and self.is_autopilot
 
     def _ask(self, now: float) -> None:
         """Begin to request the identity, or begin again."""

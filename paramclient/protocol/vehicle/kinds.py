@@ -22,7 +22,7 @@ _VEHICLES: Final = {1: "plane", MAV_TYPE_GCS: "ground station", 10: "rover", 11:
 
 
 def kind_in_words(autopilot: int | None, kind: int | None) -> str:
-    """Return autopilot and vehicle type as text, `PX4 quadrotor`; "" where neither is known or tells
+    """Return autopilot and vehicle type as text, `PX4 quadrotor`; "" where neither is known or says
     anything.
 
     Args:

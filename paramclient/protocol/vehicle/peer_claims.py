@@ -248,7 +248,7 @@ class Claim:
         return bool(self.uid.current) and not is_sitl_uid(self.uid.current)
 
     @property
-    def tells_clock(self) -> bool:
+    def reports_clock(self) -> bool:
         """Whether it has sent its time since boot."""
         return bool(self._clocks)
 
@@ -298,7 +298,7 @@ def compare(home: Claim, other: Claim, *, is_over: bool, may_ask: bool) -> tuple
 
     Args:
         home, other: the claims.
-        is_over: whether all requests that could tell more were sent.
+        is_over: whether all requests that could show more were sent.
         may_ask: whether requests may be sent at all.
     """
     kinds = home.kind.current, other.kind.current
@@ -312,14 +312,14 @@ def compare(home: Claim, other: Claim, *, is_over: bool, may_ask: bool) -> tuple
         return PeerRelation.OTHER, "the time since boot"
     uid = uids[0] if uids[0] == uids[1] else None
     # an id is sent in clear: a peer that repeats it, and no clock, is not the vehicle that sends one
-    has_equal_clocks = home.tells_clock == other.tells_clock or not may_ask
+    has_equal_clocks = home.reports_clock == other.reports_clock or not may_ask
     is_enough = is_over and has_equal_clocks and uid is not None and not is_sitl_uid(uid)
     if kinds[0] == kinds[1] and uid and (have_one_start or is_enough):
         return PeerRelation.SAME, ""
     if not is_over:
         return PeerRelation.OPEN, ""
     if kinds[0] == kinds[1] and uids[0] == uids[1]:
-        no_clock = not (home.tells_clock or other.tells_clock)
+        no_clock = not (home.reports_clock or other.reports_clock)
         if have_one_start or (no_clock and not uid):
             return PeerRelation.SAME, ""
     if kinds[0] == kinds[1] and have_one_start and not may_ask:
@@ -344,8 +344,8 @@ def compare_in_turn(home: Claim, other: Claim, *, may_ask: bool) -> PeerRelation
     if home.uid.current == other.uid.current:
         return PeerRelation.SAME if home.has_own_uid else PeerRelation.OPEN
     if other.uid.current is None:
-        is_heard = not may_ask and kinds[0] == kinds[1] and home.has_one_start(other)
-        return PeerRelation.SAME if is_heard else PeerRelation.OPEN
+        is_same = not may_ask and kinds[0] == kinds[1] and home.has_one_start(other)
+        return PeerRelation.SAME if is_same else PeerRelation.OPEN
     return PeerRelation.OTHER if home.uid.current or other.uid.current else PeerRelation.OPEN
 
 

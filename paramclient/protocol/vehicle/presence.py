@@ -16,7 +16,7 @@ LOST_INTERVALS: Final = 3.0
 """The heartbeat timeout of a component with a known longer interval, in its own intervals."""
 LOST_AFTER_MAX: Final = 60.0
 """The longest heartbeat timeout in seconds: two heartbeats far apart may also be those of a component that
-was away between them."""
+was silent between them."""
 HEARTBEAT_INTERVAL_STANDARD: Final = 1.0
 """Seconds between two heartbeats, by the standard."""
 GAP_INTERVALS: Final = 2.5
@@ -113,7 +113,7 @@ class Presence(RebootDetection):
         return self._status(message.system_status, now)
 
     def high_latency(self) -> None:
-        """Process HIGH_LATENCY2: further ones come every few seconds."""
+        """Process HIGH_LATENCY2: further ones arrive every few seconds."""
         self.is_high_latency = True
         self.base_mode = None
 
@@ -121,7 +121,7 @@ class Presence(RebootDetection):
         """Return when it will be lost without a message; infinity while it is lost."""
         return math.inf if self.is_lost else self.received_at + self.heartbeat_timeout
 
-    def was_away(self, silence: float) -> bool:
+    def was_silent(self, silence: float) -> bool:
         """Return whether another vehicle may have taken its place in this many seconds."""
         timeout = self.heartbeat_timeout
         return silence >= (timeout if timeout < math.inf else LOST_AFTER)

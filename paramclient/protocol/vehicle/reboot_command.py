@@ -31,7 +31,7 @@ BOOT_TIME_STEP: Final = 0.15
 messages differs."""
 DOWN_DELAY: Final = 0.3
 """Seconds from the acknowledgement until a vehicle is certainly off: ArduPilot goes off after 0.2 s, and the
-first frame of its new run comes 0.31 s after the acknowledgement at the earliest (measured)."""
+first frame of its new run arrives 0.31 s after the acknowledgement at the earliest (measured)."""
 CLOCK_SILENCE: Final = 0.25
 """Seconds without a clock from a vehicle before its frame numbering counts: with telemetry the numbers pass 0
 all the time."""
@@ -158,7 +158,7 @@ class Reboot(Operation[None]):
         saved_at: when the vehicle has saved all written values.
         restarted: called when the component has rebooted and nothing else has detected it; calls `rebooted`.
         boot_time_requests: the component's.
-        returns: whether it comes back under its address. Otherwise it ends with the acknowledgement, or with
+        returns: whether it returns under its address. Otherwise it ends with the acknowledgement, or with
             the silence.
         now: the time.
 
@@ -323,9 +323,11 @@ class Reboot(Operation[None]):
 
     def _judge_silence(self, now: float) -> None:
         """Decide about the silence: the clock has had the time to show its cause."""
-        heard_again_at, self._received_again_at = self._received_again_at, None
-        assert heard_again_at is not None
-        if self._presence.clock_at < heard_again_at:  # a clock that had gone back would have ended the wait
+        received_again_at, self._received_again_at = self._received_again_at, None
+        assert received_again_at is not None
+        if (
+            self._presence.clock_at < received_again_at
+        ):  # a clock that had gone back would have ended the wait
             self._restarted(now)
 
     def _clock_shows_it(self, sent_at: float) -> bool:

@@ -18,7 +18,7 @@ const FILTERS = {
   changed: { text: "Changed from default", has: (row) => row.isChanged === true },
   differs: { text: "Differs", has: (row) => ["differs", "here"].includes(store.table.comparison(row)) },
   pending: { text: "Staged", has: (row) => store.table.pending.has(row.name) },
-  news: { text: "Changed by others", has: (row) => row.news !== null },
+  recent: { text: "Changed by others", has: (row) => row.recent !== null },
 };
 
 const shown = { words: [], group: "", filter: "all" };
@@ -266,9 +266,9 @@ store.on("armed", (component) =>
 );
 store.on("lost", (component) => announce(`${nameOf(component)} ${component.is_lost ? "is lost" : "is heard again"}.`));
 
-/** Describes news of one or several rows in one sentence for each kind. */
-function wordsOf(news) {
-  const of = (kind) => news.filter((each) => each.kind === kind);
+/** Describes recent changes of one or several rows in one sentence for each kind. */
+function wordsOf(recent) {
+  const of = (kind) => recent.filter((each) => each.kind === kind);
   const said = ["changed", "added", "removed"].map((kind) => {
     const all = of(kind);
     const [first] = all;
@@ -279,20 +279,20 @@ function wordsOf(news) {
   return said.filter(Boolean).join(" ");
 }
 
-const news = [];
-store.on("news", ({ key, row }) => {
+const recent = [];
+store.on("recent", ({ key, row }) => {
   if (key !== store.selected) return;
-  if (!news.length) {
+  if (!recent.length) {
     setTimeout(() => {
-      announce(wordsOf(news));
-      news.length = 0;
+      announce(wordsOf(recent));
+      recent.length = 0;
     }, 1000);
   }
-  news.push({ name: row.name, text: row.text, ...row.news });
+  recent.push({ name: row.name, text: row.text, ...row.recent });
 });
 setInterval(() => {
   for (const table of store.tables.values())
-    for (const row of table.rows.values()) if (row.news && Date.now() - row.news.at > HIGHLIGHT_TIME) row.news = null;
+    for (const row of table.rows.values()) if (row.recent && Date.now() - row.recent.at > HIGHLIGHT_TIME) row.recent = null;
   draw();
 }, 60_000);
 

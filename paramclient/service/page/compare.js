@@ -65,7 +65,7 @@ export async function chooseOther(file = null) {
 /** Sets the compared set, or null for no comparison. */
 export function setOther(other) {
   store.table.other = other;
-  store.tell("other");
+  store.emit("other");
   if (other) announce(`Compared with ${other.label}.`);
 }
 
@@ -291,8 +291,8 @@ export async function takeOver() {
     summary.textContent = `${outcomesText(outcomes)}${late.length ? ` Takes effect after a reboot of the vehicle: ${late.join(", ")}.` : ""}`;
     fault.textContent = result.error ?? ended.problem?.detail ?? "";
     announce(summary.textContent);
-    store.tell("pending");
-    store.tell("table");
+    store.emit("pending");
+    store.emit("table");
   }
 
   async function replan() {
@@ -310,10 +310,10 @@ export async function takeOver() {
     body.replaceChildren();
     summary.textContent = "Planning the changes …";
     refresh();
-    const asked = { wanted: other.source, renames };
+    const planRequest = { wanted: other.source, renames };
     try {
-      const plan = await request("POST", at(component, "/plan"), asked, { timeout: PLAN_TIMEOUT });
-      if (asked.renames !== renames) return; // another file was chosen meanwhile
+      const plan = await request("POST", at(component, "/plan"), planRequest, { timeout: PLAN_TIMEOUT });
+      if (planRequest.renames !== renames) return; // another file was chosen meanwhile
       lines = linesOf(plan, table, other, refresh);
       body.replaceChildren(...lines.map((line) => line.element));
       const count = lines.filter((line) => line.status === "set").length;
@@ -409,11 +409,11 @@ function linesOf(plan, table, other, refresh) {
 }
 
 /** Polls a job until its end, also while the service is unreachable. */
-async function followJob(begun, tell) {
+async function followJob(begun, report) {
   for (;;) {
     try {
       const job = await get(`/jobs/${encodeURIComponent(begun.id)}`);
-      tell(job.progress);
+      report(job.progress);
       if (job.state !== "running") return job;
     } catch (error) {
       if (error.status !== 0) throw error;

@@ -4,7 +4,7 @@ import { at, get } from "./api.js";
 import { button, byId, el, isNarrow } from "./dom.js";
 import { editorOf } from "./editor.js";
 import { authorOf, store } from "./store.js";
-import { defaultOf, defaultSourceOf, meaningOf, moment, newsText, numberText, parse, rangeOf, span, textOf } from "./values.js";
+import { defaultOf, defaultSourceOf, meaningOf, moment, recentText, numberText, parse, rangeOf, span, textOf } from "./values.js";
 
 /** History entries shown, at most. */
 const HISTORY_ENTRIES_MAX = 20;
@@ -106,10 +106,10 @@ export class Details {
     this.value.replaceChildren(
       el("b", { text: row.text }),
       el("span", { text: row.meaning || info?.units || "" }),
-      !row.news
+      !row.recent
         ? ""
         : el("em", {
-            text: newsText(row.news, `${span((Date.now() - row.news.at) / 1000)} ago`),
+            text: recentText(row.recent, `${span((Date.now() - row.recent.at) / 1000)} ago`),
           }),
     );
     const standard = defaultOf(known);
@@ -131,8 +131,8 @@ export class Details {
     this.facts.replaceChildren(
       ...shown.flatMap(([word, text, title]) => [el("dt", { text: word }), el("dd", { text: String(text), title })]),
     );
-    if (row.news && row.news.at !== this.newsAt) {
-      this.newsAt = row.news.at;
+    if (row.recent && row.recent.at !== this.recentAt) {
+      this.recentAt = row.recent.at;
       this.loadPast(row);
     }
   }

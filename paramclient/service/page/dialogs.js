@@ -35,7 +35,7 @@ export function openDialog(title, content, buttons, { isHeld = () => false, kind
   });
 }
 
-/** Closes it at once: the browser's event comes when another dialog may be open. */
+/** Closes it at once: the browser's event arrives when another dialog may be open. */
 export function closeDialog() {
   byId("dialog").close();
   end();

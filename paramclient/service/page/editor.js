@@ -16,7 +16,7 @@ export function editorOf(row, pending, { stage, leave, isCompact = true }) {
   const hint = el("p", { class: "hint", id: `hint-${isCompact ? "cell" : "sheet"}`, text: hints(row) });
   const fault = el("p", { class: "fault", role: "alert" });
   const doubts = el("p", { class: "doubt", role: "status" });
-  const news = el("p", { class: "doubt", role: "status" });
+  const recent = el("p", { class: "doubt", role: "status" });
   const report = (read) => {
     fault.textContent = read.error ?? "";
     doubts.textContent = read.error ? "" : warningOf(read.text, info, type);
@@ -52,7 +52,7 @@ export function editorOf(row, pending, { stage, leave, isCompact = true }) {
     hint,
     fault,
     doubts,
-    news,
+    recent,
     el(
       "div",
       { class: "buttons" },
@@ -65,7 +65,7 @@ export function editorOf(row, pending, { stage, leave, isCompact = true }) {
   form.first = input.first;
   form.refresh = (now) => {
     if (!sameText(now.text, before, type))
-      news.textContent = `The vehicle now has ${now.text}${now.news ? `, by ${now.news.by}` : ""}.`;
+      recent.textContent = `The vehicle now has ${now.text}${now.recent ? `, by ${now.recent.by}` : ""}.`;
   };
   return form;
 }

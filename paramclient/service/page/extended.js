@@ -87,7 +87,7 @@ class Line {
     this.text = this.field.value; // the browser normalizes line ends
   }
 
-  tell(text, kind = "quiet") {
+  report(text, kind = "quiet") {
     this.remark.className = `remark outcome ${kind}`;
     this.remark.textContent = text;
   }
@@ -154,7 +154,7 @@ export async function showExtended() {
       take(event.new);
       const by = authorOf(event.by);
       const isValue = event.old && (event.old.hex !== event.new.hex || event.old.type !== event.new.type);
-      if (isValue && by !== "you") lines.get(event.name).tell(`now ${textOf(event.new)}, by ${by}`, "warn");
+      if (isValue && by !== "you") lines.get(event.name).report(`now ${textOf(event.new)}, by ${by}`, "warn");
     }
     refresh();
   }
@@ -194,11 +194,11 @@ export async function showExtended() {
   async function send(line) {
     const { param, field } = line;
     const { send: value, error } = read(field.value, param.type);
-    if (error) return line.tell(error, "bad");
+    if (error) return line.report(error, "bad");
     if (armed.forbids || line.isSending) return undefined;
     line.isSending = true;
     refresh();
-    line.tell("Sending …");
+    line.report("Sending …");
     try {
       const body = { values: { [param.name]: value } };
       const answer = await request("PATCH", at(component, "/extended/params"), body, { timeout: EXTENDED_TIMEOUT });
@@ -220,7 +220,7 @@ export async function showExtended() {
   function end(line, status, reason) {
     const word = OUTCOMES[status] ?? { text: status, kind: "warn" };
     const said = word.text + (reason ? `: ${reason}` : "");
-    line.tell(said, word.kind);
+    line.report(said, word.kind);
     announce(`${line.param.name}: ${said}`);
   }
 

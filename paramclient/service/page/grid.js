@@ -3,7 +3,7 @@
  */
 
 import { byId, el, isNarrow, setAttribute, setText } from "./dom.js";
-import { defaultOf, defaultSourceOf, newsText, textOf } from "./values.js";
+import { defaultOf, defaultSourceOf, recentText, textOf } from "./values.js";
 
 /** Rows rendered above and below the visible ones. */
 const OVERSCAN_ROWS = 10;
@@ -145,7 +145,7 @@ export class Grid {
     const states = [
       "row",
       pending && "pending",
-      row.news && "news",
+      row.recent && "recent",
       row.isChanged && "changed",
       comparison === "differs" && "differs",
       comparison === "here" && "differs",
@@ -159,9 +159,9 @@ export class Grid {
     setAttribute(
       element,
       "title",
-      row.news?.kind === "changed"
-        ? `${row.news.before} → ${textOf(row.document)}, changed by ${row.news.by}`
-        : (row.news?.kind ?? null),
+      row.recent?.kind === "changed"
+        ? `${row.recent.before} → ${textOf(row.document)}, changed by ${row.recent.by}`
+        : (row.recent?.kind ?? null),
     );
   }
 
@@ -230,7 +230,7 @@ function rowDescription(row, pending) {
   const words = [
     pending && `staged: ${pending.text}`,
     row.isChanged && "changed from default",
-    row.news && newsText(row.news),
+    row.recent && recentText(row.recent),
     row.document.trust === "cached" && "from the cache, not confirmed",
   ];
   return words.filter(Boolean).join("; ") || null;

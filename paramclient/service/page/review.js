@@ -107,7 +107,7 @@ export async function review() {
     lines.get(name).element.remove();
     lines.delete(name);
     table.pending.delete(name);
-    store.tell("pending");
+    store.emit("pending");
     refresh();
     if (!lines.size) closeDialog();
     else send.focus();
@@ -124,8 +124,8 @@ export async function review() {
     while (queue.length) sent.outcomes.push(...(await sendBatch(component, queue.splice(0, VALUES_PER_REQUEST))));
     for (const each of sent.outcomes) if (each.isTaken) table.pending.delete(each.name);
     isSending = false;
-    store.tell("pending");
-    store.tell("table");
+    store.emit("pending");
+    store.emit("table");
     const said = outcomesText(sent.outcomes);
     summary.textContent = said;
     announce(said);

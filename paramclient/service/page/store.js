@@ -19,7 +19,7 @@ export const keyOf = (component) => `${component.link} ${component.system}/${com
 /** One parameter: the document of the service, and derived values. */
 class Row {
   constructor(document) {
-    this.news = null;
+    this.recent = null;
     this.take(document);
   }
 
@@ -109,7 +109,7 @@ class Table {
     if (event.new === null) {
       this.rows.delete(event.name);
       this.forget();
-      if (row) row.news = { at: Date.now(), by: authorOf(event.by), kind: "removed" };
+      if (row) row.recent = { at: Date.now(), by: authorOf(event.by), kind: "removed" };
       return row ?? null;
     }
     const document = { name: event.name, ...event.new };
@@ -118,14 +118,14 @@ class Table {
       this.rows.set(event.name, added);
       this.forget();
       if (event.kind !== "added") return null;
-      added.news = { at: Date.now(), by: authorOf(event.by), kind: "added" };
+      added.recent = { at: Date.now(), by: authorOf(event.by), kind: "added" };
       return added;
     }
     const before = row.text;
     const isTrust = event.old && sameText(textOf(event.old), textOf(event.new), row.type);
     row.take(document);
     if (isTrust || sameText(before, row.text, row.type)) return null;
-    row.news = { at: Date.now(), by: authorOf(event.by), kind: "changed", before };
+    row.recent = { at: Date.now(), by: authorOf(event.by), kind: "changed", before };
     return row;
   }
 
@@ -169,7 +169,7 @@ class Store {
     const end = this.on(kind, (what) => (element.isConnected ? listener(what) : end()));
   }
 
-  tell(kind, what) {
+  emit(kind, what) {
     for (const listener of this.listeners.get(kind) ?? []) listener(what);
   }
 
@@ -180,8 +180,8 @@ class Store {
 
   /** Cached components that are on no link, the last heard first. */
   get unheard() {
-    const heard = new Set([...this.components.values()].map((each) => `${each.component} ${each.key}`));
-    return [...this.kept.values()].filter((each) => !heard.has(`${each.component} ${each.key}`));
+    const present = new Set([...this.components.values()].map((each) => `${each.component} ${each.key}`));
+    return [...this.kept.values()].filter((each) => !present.has(`${each.component} ${each.key}`));
   }
 
   get table() {
@@ -213,8 +213,8 @@ class Store {
     this.early = null;
     for (const event of early) this.take(event);
     if (!this.component) this.selected = first(this.components);
-    this.tell("all");
-    this.tell("extended", null);
+    this.emit("all");
+    this.emit("extended", null);
     await Promise.all([this.selected && this.loadTable(this.selected), this.loadKept()]);
   }
 
@@ -228,12 +228,12 @@ class Store {
     }
     const found = vehicles.flatMap((vehicle) => vehicle.components.map((each) => asCached(vehicle, each)));
     this.kept = new Map(found.map((each) => [keyOf(each), each]));
-    this.tell("components");
+    this.emit("components");
   }
 
   async select(key) {
     this.selected = key;
-    this.tell("all");
+    this.emit("all");
     if (!this.table.isLoaded) await this.loadTable(key);
   }
 
@@ -256,7 +256,7 @@ class Store {
     }
     if (load !== table.loads) return;
     table.load(found.params, found.seq ?? -1);
-    if (key === this.selected) this.tell("table");
+    if (key === this.selected) this.emit("table");
   }
 
   /** After a failed load, the table stays, with later events applied, and is loaded again. */
@@ -264,7 +264,7 @@ class Store {
     const table = this.tableOf(key);
     table.keep();
     if (key !== this.selected) return;
-    this.tell("table");
+    this.emit("table");
     const load = table.loads;
     const again = () => load === table.loads && key === this.selected && this.loadTable(key).catch(() => {});
     if (mayWork) setTimeout(again, RELOAD_DELAY);
@@ -283,7 +283,7 @@ class Store {
     if (event.type === "link") {
       const name = event.link ?? event.name;
       this.links.set(name, { ...this.links.get(name), name, state: event.state, error: event.error });
-      this.tell("components");
+      this.emit("components");
       return;
     }
     const key = keyOf(event);
@@ -294,8 +294,8 @@ class Store {
     } else if (event.type === "progress") {
       const component = this.components.get(key);
       if (component) component.fetch = event.done ? null : event;
-      this.tell("components");
-    } else if (event.type.startsWith("extended_")) this.tell("extended", event);
+      this.emit("components");
+    } else if (event.type.startsWith("extended_")) this.emit("extended", event);
   }
 
   takeComponent(key, event) {
@@ -311,28 +311,28 @@ class Store {
       const document = event.component_doc;
       const before = this.components.get(key);
       this.components.set(key, document);
-      if (before && Boolean(before.is_armed) !== Boolean(document.is_armed)) this.tell("armed", document);
-      if (before && before.is_lost !== document.is_lost) this.tell("lost", document);
+      if (before && Boolean(before.is_armed) !== Boolean(document.is_armed)) this.emit("armed", document);
+      if (before && before.is_lost !== document.is_lost) this.emit("lost", document);
     }
     const isBack = key === this.selected && event.why !== "forgotten" && !this.table.isLoaded && !this.table.isLoading;
     if (isBack) this.loadTable(key).catch(() => {});
     if (!this.component) {
       const key = first(this.components);
       if (key) this.select(key);
-      else this.tell("all");
-    } else this.tell("components");
+      else this.emit("all");
+    } else this.emit("components");
   }
 
   takeChange(key, event) {
     const table = this.tables.get(key);
     if (!table) return;
     const row = table.change(event);
-    if (row?.info?.is_volatile) row.news = null;
+    if (row?.info?.is_volatile) row.recent = null;
     else if (row) {
-      if (event.by?.includes(AUTHOR)) row.news = null;
-      else this.tell("news", { key, row });
+      if (event.by?.includes(AUTHOR)) row.recent = null;
+      else this.emit("recent", { key, row });
     }
-    if (key === this.selected) this.tell("table");
+    if (key === this.selected) this.emit("table");
   }
 
   /** Combines simultaneous loads of a table. */
@@ -347,16 +347,16 @@ class Store {
     if (!row) return;
     if (sameText(text, row.text, row.type)) this.table.pending.delete(name);
     else this.table.pending.set(name, { name, text, send, before: row.text });
-    this.tell("pending");
+    this.emit("pending");
   }
 
   unstage(name) {
-    if (this.table.pending.delete(name)) this.tell("pending");
+    if (this.table.pending.delete(name)) this.emit("pending");
   }
 
   unstageAll() {
     this.table.pending.clear();
-    this.tell("pending");
+    this.emit("pending");
   }
 }
 

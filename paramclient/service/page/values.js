@@ -168,9 +168,9 @@ export function moment(at) {
 }
 
 /** Describes what happened to a parameter; `when` is such as "5 s ago". */
-export function newsText(news, when = "") {
+export function recentText(recent, when = "") {
   const ago = when && ` ${when}`;
-  return news.kind === "changed" ? `was ${news.before}, changed${ago} by ${news.by}` : `${news.kind}${ago}`;
+  return recent.kind === "changed" ? `was ${recent.before}, changed${ago} by ${recent.by}` : `${recent.kind}${ago}`;
 }
 
 export const many = (count, what) => `${count} ${what}${count === 1 ? "" : "s"}`;

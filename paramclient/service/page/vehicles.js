@@ -124,8 +124,8 @@ function drawChoice(components, unheard) {
   const wanted = [live, unheard.map((each) => [keyOf(each), named(each)])];
   if (JSON.stringify(wanted) !== choice.dataset.shown) {
     choice.dataset.shown = JSON.stringify(wanted);
-    const [heard, kept] = wanted.map((each) => each.map(([value, text]) => el("option", { value, text })));
-    choice.replaceChildren(...heard, ...(kept.length ? [el("optgroup", { label: "Not connected" }, kept)] : []));
+    const [present, kept] = wanted.map((each) => each.map(([value, text]) => el("option", { value, text })));
+    choice.replaceChildren(...present, ...(kept.length ? [el("optgroup", { label: "Not connected" }, kept)] : []));
   }
   choice.hidden = !choice.options.length;
   choice.value = store.selected ?? "";

@@ -387,7 +387,7 @@ def _begin(
     """
     for other in hub.jobs.all:
         if other.state == "running" and other.kind != "fetch" and other.followed is target:
-            what = f"{other.asked_by} is already setting up this component in job {other.id}."
+            what = f"{other.requested_by} is already setting up this component in job {other.id}."
             raise ServiceError(409, "busy", what, job=other.id)
     system, component = target.address
 

@@ -306,12 +306,12 @@ async def _fleet_diff(hub: Hub, body: FleetDiffRequest) -> Response:
         wanted = dict(chosen)
     elif body.values is not None:
         wanted = {name: WrittenParam(check_name(name), value) for name, value in body.values.items()}
-    asked = tuple(wanted if wanted is not None else map(check_name, body.names or ()))
-    if not asked:
+    requested = tuple(wanted if wanted is not None else map(check_name, body.names or ()))
+    if not requested:
         raise UsageError("give the names of the parameters to compare")
     await flush_cache(hub)
     await hub.run_in_thread(cache.components)  # raises an error for an unreadable cache
-    patterns = asked if wanted is None else ()
+    patterns = requested if wanted is None else ()
     vehicles, names = await read_cache(hub, lambda: cache.fleet_names(patterns, component=number))
     names = names if wanted is None else list(wanted)
     if vehicles * len(names) > FLEET_CELLS_MAX:

@@ -181,7 +181,7 @@ def test_reads_by_name_and_index(loss: float) -> None:
     assert session.is_idle
 
 
-def test_an_unknown_name_is_told_from_a_lost_response() -> None:
+def test_an_unknown_name_is_distinguished_from_a_lost_response() -> None:
     camera = Camera()
     session = CameraSession(camera)
     session.fetch_ext()
@@ -216,7 +216,7 @@ def test_the_last_holder_cancels_a_fetch() -> None:
     session.camera.ext.fetches.end(fetch)
     assert session.is_idle
     session.run(1.0)
-    assert len(session.params) == 300, "what still comes is taken"
+    assert len(session.params) == 300, "what still arrives is taken"
 
 
 def test_a_complete_list_removes_parameters_that_are_gone() -> None:
@@ -357,7 +357,7 @@ def test_counts_and_indices_that_cannot_be(count: int, index: int) -> None:
     assert not table.complete
 
 
-def heard_values(count: int, indices: Iterable[int]) -> tuple[ExtendedParams, ExtFetch]:
+def received_values(count: int, indices: Iterable[int]) -> tuple[ExtendedParams, ExtFetch]:
     """The extended parameters of a component that has sent these of a list."""
     host: Any = SimpleNamespace(is_recipient_certain=True, ext_changed=lambda change: None)
     params = ExtendedParams(Context((1, 100), lambda message: None), host)
@@ -379,15 +379,15 @@ def test_the_values_of_a_list_are_counted_and_each_index_is_looked_at_only_at_th
 
     missing = ExtFetches._missing
     monkeypatch.setattr(ExtFetches, "_missing", look)
-    _, fetch = heard_values(2_000, range(1_999))
+    _, fetch = received_values(2_000, range(1_999))
     assert looks == 0
-    _, fetch = heard_values(2_000, range(2_000))
+    _, fetch = received_values(2_000, range(2_000))
     assert fetch.done
     assert looks < 5
 
 
 def test_of_many_missing_indices_few_are_read_at_a_time() -> None:
-    params, fetch = heard_values(PARAMETERS_MAX, [0])
+    params, fetch = received_values(PARAMETERS_MAX, [0])
     now = 0.1
     for _ in range(2_000):
         now = max(now, params.next_deadline())
@@ -398,8 +398,8 @@ def test_of_many_missing_indices_few_are_read_at_a_time() -> None:
     assert len(fetch.reads) == REQUESTED_INDICES_MAX
 
 
-def test_at_a_count_that_alternates_only_the_indices_heard_since_are_forgotten() -> None:
-    params, _ = heard_values(100, range(100))
+def test_at_a_count_that_alternates_only_the_indices_received_since_are_forgotten() -> None:
+    params, _ = received_values(100, range(100))
     replaced = 0
 
     class Table(dict[str, ExtParam]):

@@ -29,7 +29,7 @@ from tests.protocol.ext.camera import CameraSession, lossy
 
 
 def acknowledge(session: CameraSession, name: str, value: bytes, number: int, result: int) -> None:
-    """Let an acknowledgement come, whoever has sent it."""
+    """Receive an acknowledgement from any sender."""
     message = ParamExtAck(name, value, number, result)
     data = wire.encode(message, system=1, component=100, sequence=0)
     session.station.receive(data, "the only peer", session.now)

@@ -61,7 +61,7 @@ def test_nothing_behind_the_end_is_taken() -> None:
     assert blocks.content == b"abcd"
 
 
-def test_the_end_only_comes_nearer() -> None:
+def test_the_end_is_never_postponed() -> None:
     blocks = Blocks()
     blocks.take(0, b"ab")
     blocks.ends_at(6)

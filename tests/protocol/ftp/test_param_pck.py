@@ -61,17 +61,19 @@ class TestTheRealFiles:
         assert all(each.default is None for each in decode(PLAIN).entries)
         pack = decode(WITH_DEFAULTS)
         assert pack.with_defaults
-        told = {each.name: each.default for each in pack.entries if each.default is not None}
-        assert len(told) == 42
+        reported = {each.name: each.default for each in pack.entries if each.default is not None}
+        assert len(reported) == 42
         # SIM_OH_RELAY_MSK is one of them: -1 as an INT16, and 65535 in the firmware's source
         for row in csv.DictReader(TABLE.read_text(encoding="ascii").splitlines()):
             if float(row["value"]) == float(row["default"]):
-                assert row["name"] not in told
+                assert row["name"] not in reported
             elif ParamType[row["type"]].is_integer:
                 size = ParamType[row["type"]].size
-                assert told[row["name"]] == int(row["default"]) & (1 << 8 * size) - 1
+                assert reported[row["name"]] == int(row["default"]) & (1 << 8 * size) - 1
             else:
-                assert told[row["name"]] == struct.unpack("<I", struct.pack("<f", float(row["default"])))[0]
+                assert (
+                    reported[row["name"]] == struct.unpack("<I", struct.pack("<f", float(row["default"])))[0]
+                )
 
     def test_encoding_gives_the_same_bytes(self) -> None:
         assert encode(decode(PLAIN).entries) == PLAIN
@@ -128,7 +130,7 @@ class TestTheFormat:
     def test_padding_may_stand_before_any_entry(self) -> None:
         assert decode(packed(b"\0\0\0" + entry("A"), b"\0" * 50 + entry("B"))).total == 2
 
-    def test_defaults_are_given_when_asked_for(self) -> None:
+    def test_defaults_are_given_when_requested(self) -> None:
         assert decode(encode([A, B], with_defaults=True)) == Pack((A, B), 2, True)
         assert decode(encode([A, B])) == Pack((A, B._replace(default=None)), 2, False)
 
@@ -143,8 +145,8 @@ class TestTheFormat:
             (packed(entry("A"), b"\0\0\0\0", number=2), "cut off: 1 of 2 entries"),
             (packed(entry("A"), entry("B"), number=1), "4 bytes are left over"),
             (packed(entry("A"), b"\0", number=1), "1 bytes are left over"),
-            (packed(entry("A"), entry("A")), "A comes twice"),
-            (packed(entry("AB"), entry("AB", shared=1)), "AB comes twice"),
+            (packed(entry("A"), entry("A")), "A occurs twice"),
+            (packed(entry("AB"), entry("AB", shared=1)), "AB occurs twice"),
             (packed(entry("A", kind=5)), "entry 0 begins with 0x05"),
             (packed(entry("A", kind=0x10)), "entry 0 begins with 0x10"),
             (packed(entry("A", b"\1\2", kind=0x11)), "entry 0 begins with 0x11"),

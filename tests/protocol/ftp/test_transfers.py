@@ -31,8 +31,8 @@ from paramclient.protocol.requests.retry import (
     SESSION_IDLE_TIME,
     SLOW_TIME_MAX,
     TIMEOUT_MAX,
+    UNANSWERED_ATTEMPTS_MAX,
     UNANSWERED_OPENS_MAX,
-    UNHEARD_ATTEMPTS_MAX,
     RetryPolicy,
 )
 from paramclient.protocol.wire import FileTransfer, Message
@@ -135,7 +135,7 @@ class Desk:
                 return
             self.now = max(deadline, self.now)
             self.transfers.tick(self.now)
-        raise AssertionError("it does not come to an end")
+        raise AssertionError("it does not end")
 
     def opened(self, path: str = "a.txt", *, size: int = 1000, **options: Any) -> tuple[FileRead, Packet]:
         """A read whose file is open in session 9, and the request for its burst."""
@@ -181,7 +181,7 @@ class TestReading:
         assert read.done
         assert read.result == b"a" * 239 + b"b" * 61
 
-    def test_only_a_server_that_keeps_to_our_number_is_asked_for_a_burst_with_it(self) -> None:
+    def test_only_a_server_that_keeps_our_session_number_gets_an_early_burst_request(self) -> None:
         for keeps_session, requests in (
             (True, [Opcode.OPEN_FILE_RO] * 2 + [Opcode.BURST_READ_FILE]),
             (False, [Opcode.OPEN_FILE_RO]),
@@ -235,7 +235,7 @@ class TestReading:
         desk.closed()
         assert read.result == b"a" * 100 + b"b" * 100 + b"c" * 100
 
-    def test_an_end_that_is_lost_is_asked_for(self) -> None:
+    def test_an_end_that_is_lost_is_requested(self) -> None:
         desk = Desk()
         read, burst = desk.opened(size=480)
         desk.now += 0.1
@@ -244,10 +244,10 @@ class TestReading:
         desk.answer(burst, b"b" * 239, offset=239, nth=2)
         assert desk.take() == []
         desk.pass_time(0.2)
-        asked = desk.take()
-        assert [packet.opcode for packet in asked] == [Opcode.READ_FILE] * len(asked)
-        assert asked[0].offset == 478
-        desk.answer(asked[0], code=FileErrorCode.EOF)
+        requested = desk.take()
+        assert [packet.opcode for packet in requested] == [Opcode.READ_FILE] * len(requested)
+        assert requested[0].offset == 478
+        desk.answer(requested[0], code=FileErrorCode.EOF)
         desk.closed()
         assert read.result == b"a" * 239 + b"b" * 239
 
@@ -259,10 +259,10 @@ class TestReading:
         desk.now += 0.01
         desk.answer(burst, b"b" * 239, offset=239, nth=2)
         desk.pass_time(0.1)
-        asked = {packet.offset: packet for packet in desk.take()}
-        desk.answer(asked[717], code=FileErrorCode.EOF)
+        requested = {packet.offset: packet for packet in desk.take()}
+        desk.answer(requested[717], code=FileErrorCode.EOF)
         assert not read.done
-        desk.answer(asked[478], b"c" * 100, offset=478)
+        desk.answer(requested[478], b"c" * 100, offset=478)
         rest = next(packet for packet in desk.take() if packet.offset == 578)
         desk.answer(rest, code=FileErrorCode.EOF)
         desk.closed()
@@ -274,9 +274,9 @@ class TestReading:
         desk.answer(burst, b"a" * 239)
         desk.answer(burst, code=FileErrorCode.EOF, offset=0, nth=2)
         assert not read.done
-        asked = desk.take()
-        assert asked[0].offset == 239
-        desk.answer(asked[0], code=FileErrorCode.EOF)
+        requested = desk.take()
+        assert requested[0].offset == 239
+        desk.answer(requested[0], code=FileErrorCode.EOF)
         desk.closed()
         assert read.result == b"a" * 239
 
@@ -290,7 +290,7 @@ class TestReading:
         assert read.result == b"a" * 239
 
     @given(st.floats(5.0, 1e6), st.floats(1e-9, 1e-6))
-    def test_blocks_that_are_nanoseconds_apart_set_no_pace_that_the_clock_cannot_tell(
+    def test_blocks_that_are_nanoseconds_apart_set_no_pace_below_the_resolution_of_the_clock(
         self, start: float, gap: float
     ) -> None:
         desk = Desk()
@@ -318,7 +318,7 @@ class TestReading:
         desk.closed()
         assert read.result == b"a" * 239 + b"b" * 239
 
-    def test_a_burst_that_falls_silent_in_the_middle_is_asked_for_again(self) -> None:
+    def test_a_burst_that_falls_silent_in_the_middle_is_requested_again(self) -> None:
         desk = Desk()
         read, burst = desk.opened(size=50_000)
         for block in range(10):
@@ -353,7 +353,7 @@ class TestReading:
         desk.closed()
         assert read.result == b"x" * 1195
 
-    def test_a_burst_of_which_nothing_comes_behind_the_answer_to_a_read_is_requested_again(self) -> None:
+    def test_a_burst_of_which_nothing_arrives_behind_the_answer_to_a_read_is_requested_again(self) -> None:
         desk = Desk()
         desk.lose_some()
         desk.transfers.read("a", desk.now)
@@ -398,7 +398,7 @@ class TestReading:
         desk.closed()
         assert read.result == b"x" * 300
 
-    def test_a_burst_that_goes_on_after_a_pause_is_not_asked_for_again(self) -> None:
+    def test_a_burst_that_goes_on_after_a_pause_is_not_requested_again(self) -> None:
         desk = Desk()
         read, burst = desk.opened(size=50_000)
         for block in range(10):
@@ -412,7 +412,7 @@ class TestReading:
         assert read.result == b"x" * 2629
         assert not [packet for packet in desk.take() if packet.opcode == Opcode.BURST_READ_FILE]
 
-    def test_an_answer_that_comes_when_it_counts_as_lost_is_taken(self) -> None:
+    def test_a_response_at_the_moment_of_the_timeout_is_taken(self) -> None:
         desk = Desk()
         read, burst = desk.opened()
         desk.answer(burst, b"b" * 239, offset=239)
@@ -439,7 +439,7 @@ class TestReading:
             desk.pass_time(0.01)
         assert read.result == content
 
-    def test_blocks_that_are_shorter_than_asked_for(self) -> None:
+    def test_blocks_that_are_shorter_than_requested(self) -> None:
         """As boards with little memory give them."""
         desk = Desk()
         read, burst = desk.opened(size=100)
@@ -531,7 +531,7 @@ class TestWhatIsNotForUs:
             assert read.done
         assert sessions == set(range(1, 256))
 
-    def test_the_first_block_of_a_burst_tells_of_the_round_trip(self) -> None:
+    def test_the_first_block_of_a_burst_measures_the_round_trip(self) -> None:
         desk = Desk()
         _, burst = desk.opened()
         smoothed = desk.round_trip.smoothed
@@ -701,14 +701,14 @@ class TestSilence:
             Opcode.TERMINATE_SESSION,
         ]
 
-    def test_a_burst_that_never_comes(self) -> None:
+    def test_a_burst_that_never_arrives(self) -> None:
         desk = Desk()
         read, _ = desk.opened()
         desk.pass_time()
         assert isinstance(read.error, NoReply)
         assert Opcode.TERMINATE_SESSION in [packet.opcode for packet in desk.take()]
 
-    def test_a_block_that_never_comes(self) -> None:
+    def test_a_block_that_never_arrives(self) -> None:
         desk = Desk()
         read, burst = desk.opened()
         desk.answer(burst, b"x" * 239, offset=239)
@@ -787,7 +787,7 @@ class TestSilence:
         desk.closed()
         assert read.error is gone
 
-    def test_a_link_that_is_back_is_asked_again(self) -> None:
+    def test_the_metadata_is_requested_again_after_a_reconnection(self) -> None:
         desk = Desk()
         read = desk.transfers.read("a", desk.now)
         first = desk.opening()
@@ -801,15 +801,15 @@ class TestSilence:
             desk.answer(burst, b"x" * 239, offset=239 * block, nth=block + 1)
         desk.now += 100
         desk.transfers.resume(desk.now)
-        asked = desk.next(Opcode.READ_FILE)
-        assert asked.offset == 717
-        desk.answer(asked, code=FileErrorCode.EOF)
+        requested = desk.next(Opcode.READ_FILE)
+        assert requested.offset == 717
+        desk.answer(requested, code=FileErrorCode.EOF)
         desk.closed()
         assert read.result == b"x" * 717
 
 
 class TestNoServer:
-    """Many vehicles have none, and say nothing when it is asked."""
+    """Many vehicles have none, and say nothing on request."""
 
     @staticmethod
     def desk_on_a_bad_link() -> Desk:
@@ -822,14 +822,14 @@ class TestNoServer:
         assert desk.retry.timeout > 1.0
         return desk
 
-    def test_a_caller_is_told_so_in_a_bounded_time_however_bad_the_link(self) -> None:
+    def test_a_missing_server_is_reported_in_a_bounded_time_at_any_loss(self) -> None:
         desk = self.desk_on_a_bad_link()
         began = desk.now
         read = desk.transfers.read("a.txt", desk.now)
         desk.pass_time()
         assert isinstance(read.error, NoReply)
-        assert read.error.attempts == UNHEARD_ATTEMPTS_MAX
-        assert read.ended_at - began <= UNHEARD_ATTEMPTS_MAX * TIMEOUT_MAX
+        assert read.error.attempts == UNANSWERED_ATTEMPTS_MAX
+        assert read.ended_at - began <= UNANSWERED_ATTEMPTS_MAX * TIMEOUT_MAX
         assert desk.transfers.is_idle
 
     def test_a_check_for_which_no_caller_waits_ends_sooner(self) -> None:
@@ -973,7 +973,7 @@ class TestHaste:
         assert read.result == b"abcde"
 
     def test_nor_where_requests_were_repeated_and_nothing_was_measured(self) -> None:
-        """The round trip is longer than the first time-out: what came before got its answer too late."""
+        """The round trip is longer than the first time-out: what arrived before got its answer too late."""
         desk = Desk()
         desk.retry.answered(2.0, 2.5, 3)
         read = desk.transfers.read("a", desk.now)
@@ -987,7 +987,7 @@ class TestHaste:
         desk.closed(first.session)
         assert read.result == b"abcde"
 
-    def test_a_server_that_gives_another_session_is_asked_anew(self) -> None:
+    def test_a_burst_is_requested_again_if_the_server_gives_another_session(self) -> None:
         desk = self.known_link()
         read = desk.transfers.read("a", desk.now)
         first, _, early = desk.take()
@@ -999,7 +999,7 @@ class TestHaste:
         desk.closed(session=0)
         assert read.result == b""
 
-    def test_a_burst_that_overtook_the_open_is_asked_for_anew(self) -> None:
+    def test_a_burst_that_overtook_the_open_is_requested_anew(self) -> None:
         desk = self.known_link()
         read = desk.transfers.read("a", desk.now)
         first, _, early = desk.take()
@@ -1172,10 +1172,10 @@ class TestHaste:
         desk.pass_time(0.04)
         assert Opcode.BURST_READ_FILE in [packet.opcode for packet in desk.take()]
 
-    def test_a_read_that_was_overtaken_twice_is_asked_for_at_once(self) -> None:
+    def test_a_read_that_was_overtaken_twice_is_requested_at_once(self) -> None:
         desk = Desk()
         _, burst = desk.opened()
-        for block in range(1000):  # so many that the loss is small, and nothing is asked for twice
+        for block in range(1000):  # so many that the loss is small, and nothing is requested twice
             desk.answer(burst, b"x" * 239, offset=239 * (block + 3), nth=block + 1)
         first, second, third = desk.take()
         desk.answer(burst, code=FileErrorCode.EOF, offset=239 * 1003, nth=1001)
@@ -1504,7 +1504,7 @@ class Ground:
         self.exchange()
         while not condition():
             self.now = self._next()
-            assert self.now <= end, f"nothing came of it in {limit} s"
+            assert self.now <= end, f"no result in {limit} s"
             self.air.tick(self.now)
             self.exchange()
 
@@ -1525,7 +1525,7 @@ class Ground:
         return result
 
     def settle(self) -> None:
-        """Everything is closed, and nothing more is asked for.
+        """Everything is closed, and nothing more is requested.
 
         An open that was repeated may be overtaken by the close that followed: the server, which lives through
         that with every station, gives up what it has opened once more by itself.
@@ -1596,7 +1596,7 @@ class TestOnTheAir:
         assert ground.read("a") == content
         ground.settle()
 
-    def test_the_tail_of_a_large_file_comes_by_bursts(self) -> None:
+    def test_the_tail_of_a_large_file_is_read_by_bursts(self) -> None:
         vehicle = PX4Vehicle()
         vehicle.files["log/1.ulg"] = bytes(number * 7 % 251 for number in range(600_000))
         ground = Ground(vehicle, delay=0.05)
@@ -1737,7 +1737,7 @@ class TestOnTheAir:
         assert param_pck.decode(ground.outcome(read) or b"").total == 1382
         ground.settle()
 
-    def test_a_close_is_not_repeated_while_the_burst_still_comes(self) -> None:
+    def test_a_close_is_not_repeated_while_the_burst_still_arrives(self) -> None:
         ground = Ground(ardupilot(ftp_rate=5760.0), delay=0.01)
         read = ground.transfers.read(PARAMS, ground.now)
         ground.run(1.0)
@@ -1760,7 +1760,7 @@ class TestOnTheAir:
 
     @thorough
     @given(faults, st.floats(0.0, 1.5), st.booleans(), st.booleans())
-    def test_a_session_is_closed_before_anybody_is_told(
+    def test_a_session_is_closed_before_the_end_is_reported(
         self, faults: dict[str, Any], after: float, px4: bool, is_released: bool
     ) -> None:
         vehicle = PX4Vehicle(ftp=True) if px4 else ardupilot()
@@ -1822,7 +1822,7 @@ class TestSpeed:
     def test_a_serial_port_carries_the_file_once_however_short_the_round_trip(
         self, round_trip: float, delay: float
     ) -> None:
-        """Short messages have a short round trip at 57600 baud, and a block comes behind the banner."""
+        """Short messages have a short round trip at 57600 baud, and a block arrives behind the banner."""
         ground = Ground(ardupilot(ftp_rate=5760.0), round_trip=round_trip, delay=delay, rate=5760)
         ground.run(0.5)
         start, sent = ground.now, ground.air.downlink.sent

@@ -91,7 +91,7 @@ def test_without_a_part_nothing_can_be_split() -> None:
 # the list
 
 
-def test_a_list_tells_what_was_received_requested_again_and_is_missing() -> None:
+def test_the_ranges_of_a_list_show_what_was_received_requested_again_and_is_missing() -> None:
     desk = Desk()
     assert is_so(desk.download.ranges is None)
     desk.stream([*range(10), *range(12, 50)])
@@ -136,7 +136,7 @@ def test_a_list_on_a_link_that_loses_packets(vehicle: type[PX4Vehicle | ArduPilo
 # the file
 
 
-def test_a_file_tells_what_the_burst_lost() -> None:
+def test_the_ranges_of_a_file_show_what_the_burst_lost() -> None:
     session = Simulation(air=Air.symmetric([ArduPilotVehicle(live_period=0)], loss=0.2, seed=1))
     fetch = session.meet().begin_fetch(session.now)
     seen = []
@@ -159,7 +159,7 @@ def test_a_file_tells_what_the_burst_lost() -> None:
 # extended parameters
 
 
-def test_a_list_of_extended_parameters_tells_the_same() -> None:
+def test_a_list_of_extended_parameters_has_the_same_ranges() -> None:
     table = {f"PARAM_{number:03}": number for number in range(300)}
     session = CameraSession(air=Air.symmetric([Camera(table)], loss=0.2, seed=3))
     fetches = session.camera.ext.fetches
@@ -179,9 +179,9 @@ def test_a_list_of_extended_parameters_tells_the_same() -> None:
 # the cost
 
 
-def test_nothing_is_counted_before_somebody_reads_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_counted_before_the_statistics_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> tuple[DownloadRange, ...]:
-        raise AssertionError("counted, and nobody has read it")
+        raise AssertionError("counted, and not read")
 
     monkeypatch.setattr(list_download, "split_indices", refuse)
     monkeypatch.setattr(file_download, "split_bytes", refuse)

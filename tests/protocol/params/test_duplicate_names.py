@@ -101,7 +101,7 @@ def test_while_another_station_lists_all_the_time(kind: Callable[..., Vehicle]) 
     assert {name: param.value for name, param in result.params.items()} == vehicle.values
 
 
-def test_a_name_that_is_repeated_no_longer_is_asked_for() -> None:
+def test_a_name_that_is_repeated_no_longer_is_requested() -> None:
     vehicle = PX4Vehicle(table=[*ROWS, SimParam("A", ParamType.INT32, 0)], repeated_names=True)
     world = Simulation(vehicle)
     world.fetch()
@@ -137,7 +137,7 @@ def test_the_last_one_who_waits_ends_it() -> None:
     assert fetch._repeated is not None
     (read,) = fetch._repeated._open.values()
     machine.end_fetch(fetch, world.now)
-    assert read.holders <= 1  # a value that has changed twice is asked for too
+    assert read.holders <= 1  # a value that has changed twice is requested too
     world.run(60.0)
     assert len(machine.reads) == 0
     assert not fetch.done
@@ -161,7 +161,7 @@ def answer(desk: Desk, asking: DuplicateNameReads, name: str, index: int) -> Non
         asking.tick(next_at)
 
 
-def test_late_values_that_come_in_one_moment_are_one_answer() -> None:
+def test_late_values_that_arrive_in_one_moment_are_one_answer() -> None:
     desk = Desk("A")
     asking, table = repeated(desk, A=(3, 5))
     for _ in range(EQUAL_RESPONSES_MIN):

@@ -23,7 +23,7 @@ Make: TypeAlias = Callable[..., Vehicle]
 
 LOSSES = pytest.mark.parametrize("loss", [0.0, 0.1], ids=["clean", "10 %"])
 UPTIME = 12.0
-"""Seconds that a vehicle runs before it is asked for anything: longer than it takes to know it."""
+"""Seconds that a vehicle runs before the first request: longer than its identification takes."""
 
 MEASURED = {
     *(f"INS_{sensor}OFFS_{axis}" for sensor in ("GYR", "GYR2") for axis in "XYZ"),
@@ -82,7 +82,7 @@ def differing(world: Simulation, vehicle: Vehicle) -> set[str]:
     return {name for name, param in world.machine.table.params.items() if param.value != values[name]}
 
 
-def nothing_is_asked_any_more(world: Simulation, seconds: float = 16.0) -> None:
+def assert_no_more_requests(world: Simulation, seconds: float = 16.0) -> None:
     """No request is without an end: once what changed was looked at, there are heartbeats and little else."""
     world.run(10.0)
     assert not world.station.is_waiting
@@ -114,7 +114,7 @@ class TestDeadIndices:
             world = world_of(vehicle, loss=loss, seed=seed)
             check(world, vehicle, world.fetch(limit=within_lossy if loss else within), *indices)
             assert world.machine.state == "partial"
-            nothing_is_asked_any_more(world)
+            assert_no_more_requests(world)
 
     @EVERY_KIND
     def test_by_the_dozen(self, kind: Make, loss: float) -> None:
@@ -152,7 +152,7 @@ class TestAListThatStops:
         world = world_of(vehicle, loss=loss)
         check(world, vehicle, world.fetch(limit=45.0))
         assert vehicle.requests["PARAM_REQUEST_LIST"] <= 12
-        nothing_is_asked_any_more(world)
+        assert_no_more_requests(world)
 
     @EVERY_KIND
     def test_before_its_first_value(self, kind: Make, loss: float) -> None:
@@ -161,7 +161,7 @@ class TestAListThatStops:
         world = world_of(vehicle, loss=loss)
         with pytest.raises(NoReply, match="the parameter list of 1/1"):
             world.fetch(limit=30.0)
-        nothing_is_asked_any_more(world)
+        assert_no_more_requests(world)
 
 
 @LOSSES
@@ -252,8 +252,8 @@ class TestTheCountMoves:
         check(world, vehicle, replace(result, params=world.machine.table.params.copy()))
 
     @BOTH_AUTOPILOTS
-    def test_while_it_is_away_from_the_vehicle_it_is_noticed_later(self, kind: Make, loss: float) -> None:
-        """The update that tells of it is lost; the next value of any kind carries the new count."""
+    def test_a_change_during_a_link_loss_is_detected_later(self, kind: Make, loss: float) -> None:
+        """The update that reports it is lost; the next value of any kind carries the new count."""
         vehicle = kind()
         world = world_of(vehicle, loss=loss)
         world.fetch(limit=10.0)
@@ -267,7 +267,7 @@ class TestTheCountMoves:
 
 
 class TestArduPilotStartsAgainInAFetch:
-    """It is off for 1.04 s, and tells its clock 1.4 s after its first heartbeat (measured)."""
+    """It is off for 1.04 s, and sends its clock 1.4 s after its first heartbeat (measured)."""
 
     @pytest.mark.parametrize(
         ("kind", "at"), [("copter", 30), ("copter", 1350), ("plane", 400), ("rover", 1000)]
@@ -277,7 +277,7 @@ class TestArduPilotStartsAgainInAFetch:
         name = vehicle.listed[2].name
 
         def reboot() -> None:
-            entry = vehicle._entry(name)  # it has come before: only a new list can bring it
+            entry = vehicle._entry(name)  # it has arrived before: only a new list can bring it
             entry.store(entry.bits ^ 1)
             vehicle.reboot(down=1.04)
 
@@ -308,7 +308,8 @@ class TestArduPilotStartsAgainInAFetch:
         assert differing(world, vehicle) == set()
 
     def test_a_long_list_waits_for_the_clock(self) -> None:
-        """On a radio more would be repeated than the clock takes, where the numbers tell of no restart."""
+        """On a radio, more would be repeated than the clock takes, as the sequence numbers show no
+        restart."""
         vehicle = ardupilot(burst=1, period=0.025)
         vehicle.when_listed(400, lambda: vehicle.reboot(down=1.04))
         world = world_of(vehicle, loss=0.0)
@@ -328,7 +329,7 @@ class TestAReboot:
         name = vehicle.listed[2].name
 
         def reboot() -> None:
-            entry = vehicle._entry(name)  # it has come before: only a new start of the fetch can bring it
+            entry = vehicle._entry(name)  # it has arrived before: only a new start of the fetch can bring it
             entry.store(entry.bits ^ 1)
             vehicle.reboot(down=down)
 
@@ -362,7 +363,7 @@ class TestAReboot:
         world.until(lambda: fetch.done, limit=200.0)
         assert fetch.error is None or isinstance(fetch.error, NoReply)
         machine.end_fetch(fetch, world.now)
-        nothing_is_asked_any_more(world)
+        assert_no_more_requests(world)
 
     @EVERY_KIND
     def test_for_good(self, kind: Make, loss: float) -> None:
@@ -372,13 +373,13 @@ class TestAReboot:
         result = world.fetch(limit=120.0)
         assert len(result.missing) >= len(vehicle.listed) - 150
         assert world.machine.state == "lost"
-        nothing_is_asked_any_more(world)
+        assert_no_more_requests(world)
 
 
 @LOSSES
 @BOTH_AUTOPILOTS
 def test_the_list_after_a_boot(kind: Make, loss: float) -> None:
-    """ArduPilot ignores what comes in its first seconds, PX4 answers then."""
+    """ArduPilot ignores what arrives in its first seconds, PX4 answers then."""
     vehicle = kind(boot_time=UPTIME + 5.0)
     world = world_of(vehicle, loss=loss)
     check(world, vehicle, world.fetch(limit=20.0))
@@ -419,7 +420,7 @@ def test_a_satellite_link_keeps_the_list_to_itself(loss: float) -> None:
 @LOSSES
 @EVERY_KIND
 def test_an_update_that_is_lost(kind: Make, loss: float) -> None:
-    """Nothing repeats it. Where there is a hash, the next look at that tells; elsewhere the next fetch."""
+    """Nothing repeats it. Where there is a hash, the next hash shows it; elsewhere the next fetch."""
     vehicle = kind()
     world = world_of(vehicle, loss=loss)
     world.fetch(limit=10.0)

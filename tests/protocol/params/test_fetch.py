@@ -89,7 +89,7 @@ def test_a_first_fetch_from_px4() -> None:
     assert {param.trust for param in result.params.values()} == {Trust.LIVE}
 
 
-def test_a_first_fetch_from_ardupilot_asks_for_no_hash() -> None:
+def test_a_first_fetch_from_ardupilot_requests_no_hash() -> None:
     vehicle = listing_ardupilot()
     world = Simulation(vehicle)
     result = world.fetch()
@@ -112,15 +112,15 @@ def test_a_first_fetch_of_something_generic() -> None:
             assert result.params[name].value == param.value
 
 
-def test_the_hash_that_is_lost_at_the_head_is_asked_for_meanwhile() -> None:
+def test_the_hash_that_is_lost_at_the_head_is_requested_meanwhile() -> None:
     vehicle = Headless(table=SMALL)
     world = Simulation(vehicle)
     result = world.fetch()
     assert result.hash == vehicle.announced_hash()
     assert names_read(world) == [HASH_CHECK]
     assert result.notes == ()
-    asked = {type(message): at for at, message in world.sent if not isinstance(message, wire.Heartbeat)}
-    assert asked[ParamRequestRead] - asked[ParamRequestList] < 0.02 < result.elapsed
+    requested = {type(message): at for at, message in world.sent if not isinstance(message, wire.Heartbeat)}
+    assert requested[ParamRequestRead] - requested[ParamRequestList] < 0.02 < result.elapsed
 
 
 def test_a_vehicle_whose_hash_is_switched_off() -> None:
@@ -137,22 +137,22 @@ def test_a_vehicle_whose_hash_is_switched_off() -> None:
     assert result.complete
 
 
-def test_a_hash_that_the_vehicle_keeps_silent_on_is_asked_for_once() -> None:
+def test_a_hash_that_the_vehicle_keeps_silent_on_is_requested_once() -> None:
     vehicle = PX4Vehicle(table=SMALL, hash_check=False)
     world = Simulation(vehicle)
     reads = world.meet().reads
-    asked: list[object] = []
+    requested: list[object] = []
     ask = reads.ask
 
     def spy(key: str | int, now: float, *, urgent: bool = True) -> Read:
-        asked.append(key)
+        requested.append(key)
         return ask(key, now, urgent=urgent)
 
     reads.ask = spy  # type: ignore[method-assign]  # only looks on
     result = world.fetch()
     assert result.hash is None
     assert result.complete
-    assert asked == [HASH_CHECK]
+    assert requested == [HASH_CHECK]
 
 
 # the next time
@@ -218,7 +218,7 @@ def test_a_hit_without_anything_volatile_refreshes_nothing() -> None:
     assert world.machine.refresh is None
 
 
-def test_a_hash_that_was_asked_for_ahead_costs_nothing_more() -> None:
+def test_a_hash_that_was_requested_ahead_costs_nothing_more() -> None:
     world = Simulation(air=Air.symmetric([PX4Vehicle(table=SMALL)], delay=0.1))
     world.fetch()
     go_on(world)
@@ -241,7 +241,7 @@ def test_a_change_since_leads_to_the_list() -> None:
     world = Simulation(vehicle)
     world.fetch()
     go_on(world)
-    world.next_session()  # nobody hears of it
+    world.next_session()  # no station receives it
     vehicle.set_param("P05", 500)
     world.run(2.0)
     memory = memory_of_cache(SMALL)
@@ -317,32 +317,32 @@ def test_a_change_that_the_stream_still_brings() -> None:
     assert result.hash == vehicle.announced_hash()
 
 
-@pytest.mark.parametrize("change_what_is_to_come", [False, True])
-def test_a_change_behind_the_streams_back(change_what_is_to_come: bool) -> None:
+@pytest.mark.parametrize("changes_unsent_value", [False, True])
+def test_a_change_behind_the_streams_back(changes_unsent_value: bool) -> None:
     vehicle = PX4Vehicle()
     world = Simulation(vehicle)
     before = vehicle.announced_hash()
     fetch = world.meet().begin_fetch(world.now)
     world.run(0.4)
-    vehicle._entry("BAT1_N_CELLS").store(9)  # has been sent, and nobody is told
-    if change_what_is_to_come:
+    vehicle._entry("BAT1_N_CELLS").store(9)  # has been sent, and no message reports it
+    if changes_unsent_value:
         vehicle._entry("SYS_AUTOSTART").store(4999)
     vehicle._hash = None
     result = world.outcome(fetch)
     assert result.complete
-    if change_what_is_to_come:
+    if changes_unsent_value:
         assert result.hash is None
         assert "changed during the download" in result.notes[0]
     else:
         assert result.hash == before != vehicle.announced_hash()
 
 
-def test_after_a_table_that_moved_our_own_write_does_not_confirm_it() -> None:
+def test_after_a_table_that_changed_our_own_write_does_not_confirm_it() -> None:
     vehicle = PX4Vehicle(table=STRANGE)
     world = Simulation(vehicle)
     fetch = world.meet().begin_fetch(world.now)
     world.until(lambda: fetch.download is not None and fetch.download.received > 5)
-    vehicle._entry("P00").store(77)  # nobody is told
+    vehicle._entry("P00").store(77)  # no message reports it
     vehicle._hash = None
     result = world.outcome(fetch)
     assert result.hash is None
@@ -374,7 +374,7 @@ def test_parameters_that_come_into_use_during_the_download() -> None:
     assert result.hash == vehicle.announced_hash()
 
 
-def test_a_group_that_comes_during_the_download() -> None:
+def test_a_group_that_appears_during_the_download() -> None:
     vehicle = listing_ardupilot()
     world = Simulation(vehicle)
     fetch = world.meet().begin_fetch(world.now)
@@ -383,7 +383,7 @@ def test_a_group_that_comes_during_the_download() -> None:
     world.run(0.1)
     world.other_station(wire.ParamRequestRead(1, 1, "", 3))  # its answer shows the new count
     result = world.outcome(fetch)
-    assert result.count in (1382, 1434)  # as the last ones that came have said
+    assert result.count in (1382, 1434)  # the count of the last received values
     result = world.fetch()
     assert result.count == 1434
     assert result.complete
@@ -438,7 +438,7 @@ def test_after_a_hit_with_an_unproven_hash_everything_is_read_afresh() -> None:
     world = Simulation(vehicle)
     world.fetch()
     go_on(world)
-    vehicle._entry("P03").store(77)  # no hash tells of it
+    vehicle._entry("P03").store(77)  # no hash reports it
     result = world.fetch()
     assert {param.trust for param in result.params.values()} == {Trust.CACHED}
     refresh = world.machine.refresh
@@ -514,7 +514,8 @@ def test_after_our_own_write_the_next_session_hits() -> None:
 
 
 def test_after_our_own_write_an_unproven_hash_is_not_believed() -> None:
-    """It cannot be computed here, so it may stand for more than our write: for what was not heard as well."""
+    """It cannot be computed here, so it may stand for more than our write: for what was not received as
+    well."""
     vehicle = PX4Vehicle(table=STRANGE)
     world = Simulation(vehicle)
     world.fetch()
@@ -554,7 +555,7 @@ def test_a_write_that_brings_parameters_into_use() -> None:
     assert result.hash == vehicle.announced_hash()
 
 
-# what does not come
+# what does not arrive
 
 
 def test_indices_that_are_never_received_are_missing() -> None:
@@ -663,7 +664,7 @@ def test_the_last_one_who_waits_ends_it() -> None:
     assert world.fetch().complete
 
 
-def test_cancelling_while_the_hash_is_asked_for() -> None:
+def test_cancelling_while_the_hash_is_requested() -> None:
     world = Simulation(air=Air.symmetric([PX4Vehicle(table=SMALL)], delay=0.1))
     world.fetch()
     go_on(world)
@@ -753,7 +754,7 @@ def test_a_fetch_goes_on_when_the_link_is_back() -> None:
     assert world.outcome(fetch).complete
 
 
-def test_a_question_for_the_hash_is_asked_again_when_the_link_is_back() -> None:
+def test_the_hash_is_requested_again_after_a_reconnection() -> None:
     world = Simulation(air=Air.symmetric([PX4Vehicle(table=SMALL)], delay=0.1))
     world.fetch()
     go_on(world)
@@ -810,11 +811,11 @@ def test_a_write_while_everything_is_read_afresh_leaves_the_question_open() -> N
     assert refresh is not None
     world.until(lambda: refresh.done)
     world.machine.write("P20", 5, world.now)
-    world.run(0.09)  # the hash comes before the write is done
+    world.run(0.09)  # the hash arrives before the write is done
     assert not world.machine.table.volatile_known
 
 
-def test_changes_are_told_in_order() -> None:
+def test_changes_are_reported_in_order() -> None:
     world = Simulation(PX4Vehicle(table={"A": 1, "B": 2}))
     world.fetch()
     changes = [event.change for event in world.events if isinstance(event, ParamChanged)]

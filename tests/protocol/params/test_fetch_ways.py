@@ -1,4 +1,5 @@
-"""Which way a table comes, by file or by list, where sessions are in use and first answers are lost."""
+"""Which way a table is downloaded, by file or by list, where sessions are in use and first responses are
+lost."""
 
 from __future__ import annotations
 
@@ -28,7 +29,7 @@ from tests.shell import Tap, bits
 from tests.simulation import Simulation
 
 LEFT_OPEN = FileTransfer(0, 1, 1, Packet(2, 200, Opcode.OPEN_FILE_RO, b"a").pack())
-"""What another station has asked for that ended without closing its session."""
+"""The requests of another station that ended without closing its session."""
 
 
 class Uplink(Tap):
@@ -36,7 +37,7 @@ class Uplink(Tap):
 
     Attributes:
         loses: says of each request whether it is lost.
-        arrived: what came to the vehicle.
+        arrived: the messages that arrived at the vehicle.
     """
 
     def __init__(self, vehicle: ArduPilotVehicle | PX4Vehicle) -> None:
@@ -99,7 +100,7 @@ def leave_open(session: Simulation) -> None:
 # Before the first answer
 
 
-def test_the_file_is_asked_for_beside_the_version() -> None:
+def test_the_file_is_requested_beside_the_version() -> None:
     vehicle = ardupilot()
     session = Simulation(air=Air.symmetric([vehicle], delay=0.05))
     fetch = begin_at_heartbeat(session)
@@ -142,7 +143,7 @@ def test_a_version_that_names_no_files_leads_to_the_list_at_once() -> None:
     assert len(after) == 2
 
 
-def test_a_version_that_is_repeated_is_asked_for_both_ways() -> None:
+def test_a_repeated_version_request_uses_both_messages() -> None:
     uplink = Uplink(ardupilot(ftp=False))
     uplink.loses = LosesFirst(1, CommandLong)
     session = Simulation(air=Air.symmetric([uplink], delay=0.05))
@@ -189,12 +190,12 @@ def test_a_list_that_has_begun_gives_way_to_a_file_that_is_served() -> None:
     session.air.downlink = FaultyLink(delay=0.05)
     result = session.outcome(fetch)
     assert (result.source, result.notes, bits(result.params)) == ("ftp", (), bits(vehicle.params))
-    assert len(set(times_of(session, ParamRequestList))) == 1, "asked for once, in copies as files are lost"
+    assert len(set(times_of(session, ParamRequestList))) == 1, "requested once, in copies as files are lost"
     assert times_of(session, ParamRequestRead) == []
     assert not vehicle.open_files
 
 
-def test_a_late_version_that_says_that_no_file_will_come_lets_the_list_begin() -> None:
+def test_a_late_version_without_file_support_lets_the_list_begin() -> None:
     vehicle = ardupilot()
     assert vehicle._ftp is not None
     vehicle._ftp.params = lambda: None
@@ -224,7 +225,7 @@ def test_a_complete_list_ends_the_fetch_without_the_file() -> None:
     assert not vehicle.open_files
 
 
-def test_px4_is_asked_for_list_and_hash_together() -> None:
+def test_list_and_hash_of_px4_are_requested_together() -> None:
     uplink = Uplink(PX4Vehicle())
     session = Simulation(air=Air.symmetric([uplink], delay=0.05))
     fetch = begin_at_heartbeat(session)
@@ -275,15 +276,15 @@ def test_on_a_radio_the_end_of_the_session_is_waited_for() -> None:
     result = session.outcome(fetch)
     assert (result.source, result.notes) == ("ftp", ())
     assert times_of(session, ParamRequestList) == []
-    asked = sorted({at for at, opcode in requests_to_server(session) if opcode is Opcode.OPEN_FILE_RO})
-    assert len(asked) == 2
-    assert asked[0] == began
-    assert SESSION_IDLE_TIME < asked[1] - began < SESSION_IDLE_TIME + 0.4
+    requested = sorted({at for at, opcode in requests_to_server(session) if opcode is Opcode.OPEN_FILE_RO})
+    assert len(requested) == 2
+    assert requested[0] == began
+    assert SESSION_IDLE_TIME < requested[1] - began < SESSION_IDLE_TIME + 0.4
     assert result.elapsed < SESSION_IDLE_TIME + 4.5
 
 
 def test_nothing_is_sent_while_another_station_reads() -> None:
-    """On a link that is shared its replies are heard: each one lets its session live on."""
+    """On a shared link its replies are received: each one keeps its session open."""
     vehicle = ArduPilotVehicle(live_period=0, burst=1, period=0.025, ftp_rate=5760.0)
     vehicle.files["a"] = b"a" * 40_000
     session = Simulation(air=Air.symmetric([vehicle], delay=0.02, rate=5760.0, queue=4096))
@@ -294,9 +295,9 @@ def test_nothing_is_sent_while_another_station_reads() -> None:
     session.other_station(FileTransfer(0, 1, 1, burst.pack()))
     session.run(1.0)
     sent = len(requests_to_server(session))
-    heard: list[float] = []
+    received: list[float] = []
     session.until(lambda: fetch.done or len(requests_to_server(session)) > sent)
     assert not fetch.done
-    heard.append(session.now)
+    received.append(session.now)
     assert session.now > SESSION_IDLE_TIME + 6.0  # the other one's file took 7 s
     assert session.outcome(fetch).source == "ftp"

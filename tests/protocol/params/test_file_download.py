@@ -33,7 +33,7 @@ class Server(Tap):
 
     Attributes:
         swallows: says of each request whether it is lost.
-        opened: the paths of the files that were asked for, each copy of a request counted once.
+        opened: the paths of the files that were requested, each copy of a request counted once.
     """
 
     def __init__(self, vehicle: ArduPilotVehicle | PX4Vehicle) -> None:
@@ -60,7 +60,7 @@ def begin(session: Simulation, **options: Any) -> Fetch:
 
 
 def in_the_middle(session: Simulation) -> Fetch:
-    """A fetch of which some of the file has come."""
+    """A fetch that has received a part of the file."""
     fetch = begin(session)
     session.until(lambda: fetch.progress(session.now).received > 0)
     assert fetch.file is not None
@@ -126,7 +126,7 @@ def test_every_parameter_has_its_default() -> None:
     assert (now.default, now.is_changed) == (before.default, False)
 
 
-def test_a_hash_is_asked_for_first_and_proves_the_file() -> None:
+def test_a_hash_is_requested_first_and_proves_the_file() -> None:
     vehicle = PX4Vehicle(ftp=True)
     server = Server(vehicle)
     session = Simulation(server)
@@ -143,16 +143,16 @@ def test_a_hash_is_asked_for_first_and_proves_the_file() -> None:
     assert server.opened == []
     vehicle.set_param("MC_ROLL_P", 3.25)
     vehicle.tick(session.now + 1.0)
-    vehicle.data_to_send()  # nobody hears of it
+    vehicle.data_to_send()  # no station receives it
     session.next_session()
     session.run(1.0)
     session.meet().use_cached(now=session.now, **memory)
-    moved = session.fetch()
-    assert (moved.source, moved.hash) == ("ftp", vehicle.announced_hash())
-    assert moved.params["MC_ROLL_P"].value == 3.25
+    changed = session.fetch()
+    assert (changed.source, changed.hash) == ("ftp", vehicle.announced_hash())
+    assert changed.params["MC_ROLL_P"].value == 3.25
 
 
-def test_px4_1_17_is_not_asked() -> None:
+def test_no_file_is_requested_from_px4_1_17() -> None:
     server = Server(PX4Vehicle())
     session = Simulation(server)
     result = session.fetch()
@@ -160,23 +160,22 @@ def test_px4_1_17_is_not_asked() -> None:
     assert server.opened == []
 
 
-def test_a_vehicle_that_does_not_say_so_is_not_asked() -> None:
+def test_no_file_is_requested_from_a_vehicle_without_the_capability() -> None:
     server = Server(listing_ardupilot())
     assert Simulation(server).fetch().source == "stream"
     assert server.opened == []
 
 
-# What comes meanwhile
+# What arrives meanwhile
 
 
-def test_values_that_are_heard_while_the_file_comes_win() -> None:
+def test_values_received_during_the_file_read_win() -> None:
     server = Server(vehicle := ArduPilotVehicle(live_period=0))
     session = Simulation(server, air=Air.symmetric([server], delay=0.05))
     fetch = in_the_middle(session)
     session.until(lambda: fetch.progress(session.now).received > 150)
-    name = (
-        "RELAY1_FUNCTION"  # in what has come; it is not the default now nor then, so the file stays as long
-    )
+    # already received; it is not the default now nor then, so the size of the file stays
+    name = "RELAY1_FUNCTION"
     assert vehicle.param(name).value == 1
     session.set(name, 2)
     result = session.outcome(fetch)
@@ -193,8 +192,8 @@ def test_large_integers_are_exact_and_stay_so() -> None:
     session = Simulation(vehicle)
     fetch = begin(session)
     session.run(0.1)
-    heard = session.get(name)  # rounded, while the file comes
-    assert heard.value not in (EXACT, None)
+    received = session.get(name)  # rounded, while the file is read
+    assert received.value not in (EXACT, None)
     assert session.outcome(fetch).params[name].value == EXACT
     assert session.get(name).value == EXACT
     session.machine.fetches.file_works = False
@@ -206,7 +205,7 @@ def test_large_integers_are_exact_and_stay_so() -> None:
     assert session.get(name).value != EXACT
 
 
-def test_a_count_that_moves_makes_it_read_again() -> None:
+def test_a_count_that_changes_makes_it_read_again() -> None:
     server = Server(vehicle := ArduPilotVehicle(live_period=0))
     session = Simulation(server)
     session.fetch()
@@ -224,7 +223,7 @@ def test_a_count_that_moves_makes_it_read_again() -> None:
     assert session.machine.state == "synced"
 
 
-def test_a_count_that_moves_each_time_ends_in_a_list() -> None:
+def test_a_count_that_changes_each_time_ends_in_a_list() -> None:
     server = Server(vehicle := ArduPilotVehicle(live_period=0))
     session = Simulation(server)
     fetch = in_the_middle(session)
@@ -305,7 +304,7 @@ def older_ardupilot() -> ArduPilotVehicle:
     return vehicle
 
 
-def test_an_older_server_without_the_file_is_asked_without_the_query_too() -> None:
+def test_a_file_that_an_older_server_lacks_is_requested_without_the_query_too() -> None:
     vehicle = older_ardupilot()
     assert vehicle._ftp is not None
     vehicle._ftp.params = lambda: None
@@ -314,7 +313,7 @@ def test_an_older_server_without_the_file_is_asked_without_the_query_too() -> No
     assert (result.source, server.opened) == ("stream", [FULL_PATH, PARAMETER_FILE])
 
 
-def test_an_older_server_that_knows_no_query_is_asked_without() -> None:
+def test_the_file_of_an_older_server_is_requested_without_the_query() -> None:
     server = Server(vehicle := older_ardupilot())
     assert vehicle._ftp is not None
     serve = vehicle._ftp._open_file
@@ -330,7 +329,7 @@ def test_an_older_server_that_knows_no_query_is_asked_without() -> None:
     assert {param.default for param in result.params.values()} == {None}
 
 
-def test_a_server_that_keeps_silent_is_remembered_once_the_list_has_come() -> None:
+def test_a_server_that_keeps_silent_is_remembered_once_the_list_has_arrived() -> None:
     server = Server(vehicle := ArduPilotVehicle(live_period=0))
     server.swallows = lambda request: True
     session = Simulation(server)
@@ -343,7 +342,7 @@ def test_a_server_that_keeps_silent_is_remembered_once_the_list_has_come() -> No
     assert len(server.opened) == opened
 
 
-def test_a_server_that_is_busy_is_asked_again_next_time() -> None:
+def test_a_file_of_a_busy_server_is_requested_at_the_next_fetch() -> None:
     """Another station has left its session open, which ends by its timeout."""
     server = Server(vehicle := ArduPilotVehicle(live_period=0))
     session = Simulation(server)
@@ -359,7 +358,7 @@ def test_a_server_that_is_busy_is_asked_again_next_time() -> None:
     assert session.fetch().source == "ftp"
 
 
-def test_another_vehicle_is_asked_for_the_file_again() -> None:
+def test_the_file_of_another_vehicle_is_requested_again() -> None:
     vehicle = ArduPilotVehicle(live_period=0)
     assert vehicle._ftp is not None
     vehicle._ftp.params = lambda: None
@@ -375,7 +374,7 @@ def test_another_vehicle_is_asked_for_the_file_again() -> None:
     assert remembered(session) is True
 
 
-def test_another_firmware_is_asked_for_the_file_again_and_has_new_defaults() -> None:
+def test_the_file_of_another_firmware_is_requested_again_and_has_new_defaults() -> None:
     vehicle = ArduPilotVehicle(live_period=0)
     session = Simulation(vehicle)
     session.fetch()
@@ -416,7 +415,7 @@ def test_blocks_received_before_an_outage_are_read_again() -> None:
     fetch = in_the_middle(session)
     session.until(lambda: fetch.progress(session.now).received > 150)
     session.station.pause()
-    vehicle.set_param("RELAY1_FUNCTION", 2)  # in what has come, and nobody hears of it
+    vehicle.set_param("RELAY1_FUNCTION", 2)  # in what has arrived, and no station receives it
     session.now += 8.0
     vehicle.tick(session.now)
     server.data_to_send()
@@ -427,7 +426,7 @@ def test_blocks_received_before_an_outage_are_read_again() -> None:
     assert is_whole(result, vehicle)
 
 
-def test_a_vehicle_that_stays_away_is_given_up() -> None:
+def test_a_vehicle_that_stays_lost_is_given_up() -> None:
     server = Server(ArduPilotVehicle(live_period=0))
     session = Simulation(server)
     fetch = in_the_middle(session)
@@ -436,7 +435,7 @@ def test_a_vehicle_that_stays_away_is_given_up() -> None:
     assert remembered(session) is None
 
 
-def test_a_link_that_was_away_goes_on() -> None:
+def test_a_link_that_was_disconnected_goes_on() -> None:
     vehicle = ArduPilotVehicle(live_period=0)
     session = Simulation(vehicle)
     fetch = in_the_middle(session)
@@ -534,7 +533,7 @@ def test_a_time_limit_in_the_middle_names_all_as_missing() -> None:
 # Several on one link
 
 
-def test_a_list_is_not_asked_of_all_where_one_may_give_the_file() -> None:
+def test_no_common_list_is_requested_if_one_component_may_have_the_file() -> None:
     server = Server(vehicle := ArduPilotVehicle(live_period=0))
     camera = GenericVehicle({"A": 1.0, "B": 2}, component=100, autopilot=wire.MAV_AUTOPILOT_INVALID)
     session = Simulation(server, camera)
@@ -599,7 +598,7 @@ def upkept(server: Server) -> Simulation:
     return session
 
 
-def test_a_file_that_comes_quickly_is_read_again_every_half_minute() -> None:
+def test_a_file_that_arrives_quickly_is_read_again_every_half_minute() -> None:
     server = Server(vehicle := ArduPilotVehicle(live_period=0))
     session = upkept(server)
     session.fetch()
@@ -628,19 +627,19 @@ def test_a_file_that_takes_long_is_not_read_unasked() -> None:
     assert lists(session) == 0
 
 
-def test_values_that_move_by_themselves_and_say_so_are_no_news_of_the_watch() -> None:
+def test_values_that_the_vehicle_changes_and_sends_are_no_finding_of_the_watch() -> None:
     server = Server(vehicle := ArduPilotVehicle(live_period=11.0))
     session = upkept(server)
     session.fetch()
     session.events.clear()
     session.run(200.0)
     assert len(server.opened) > 5
-    moved = {event.change.name for event in session.events if isinstance(event, ParamChanged)}
-    assert moved == {"STAT_RUNTIME", "BARO1_GND_PRESS"} & vehicle.params.keys()
+    changed = {event.change.name for event in session.events if isinstance(event, ParamChanged)}
+    assert changed == {"STAT_RUNTIME", "BARO1_GND_PRESS"} & vehicle.params.keys()
     assert not [event for event in session.events if isinstance(event, TableResynced)]
 
 
-def test_a_value_whose_update_was_lost_is_told_once() -> None:
+def test_a_value_whose_update_was_lost_is_reported_once() -> None:
     server = Server(vehicle := ArduPilotVehicle(live_period=0))
     session = upkept(server)
     session.fetch()
@@ -649,8 +648,8 @@ def test_a_value_whose_update_was_lost_is_told_once() -> None:
     session.run(0.1)
     server.is_mute = False
     session.run(100.0)
-    told = [event.changed for event in session.events if isinstance(event, TableResynced)]
-    assert told == [("STAT_RUNTIME",)]
+    reported = [event.changed for event in session.events if isinstance(event, TableResynced)]
+    assert reported == [("STAT_RUNTIME",)]
 
 
 def _with_open(server: Any, opens: Any) -> Any:

@@ -81,19 +81,19 @@ class Desk:
             self.now = max(deadline, self.now)
             self.reads.tick(self.now)
             self.download.tick(self.now)
-        raise AssertionError("it does not come to an end")
+        raise AssertionError("it does not end")
 
     def take(self) -> list[int | str]:
-        """What was sent, in short: "list", or the index that was asked for."""
+        """What was sent, in short: "list", or the index that was requested."""
         sent, self.sent[:] = list(self.sent), []
         return [message.param_index if isinstance(message, ParamRequestRead) else "list" for message in sent]
 
     def answer(self, *, count: int = 100, silent: Iterable[int] = (), limit: float = 300.0) -> None:
         """Answer reads after 20 ms, and no lists, until it ends."""
         while not self.download.done and self.now < limit:
-            asked = [each for each in self.take() if isinstance(each, int) and each not in silent]
+            requested = [each for each in self.take() if isinstance(each, int) and each not in silent]
             self.pass_time(0.02)
-            for index in asked:
+            for index in requested:
                 self.hear(index, count=count)
         assert self.download.done
 
@@ -124,7 +124,7 @@ def test_a_single_parameter() -> None:
     assert desk.download.done
 
 
-def test_the_list_is_asked_for_again_as_long_as_nothing_comes() -> None:
+def test_the_list_is_requested_again_as_long_as_nothing_arrives() -> None:
     desk = Desk(round_trip=None)
     desk.pass_time(FIRST_TIMEOUT - 0.01)
     assert desk.take() == ["list"]
@@ -142,7 +142,7 @@ def test_the_list_is_asked_for_again_as_long_as_nothing_comes() -> None:
     assert desk.take() == []
 
 
-def test_the_head_of_the_list_shows_that_it_was_heard() -> None:
+def test_the_head_of_the_list_acknowledges_the_request() -> None:
     desk = Desk(round_trip=None)
     desk.now = 0.2
     desk.download.note_list_head(desk.now)
@@ -153,7 +153,7 @@ def test_the_head_of_the_list_shows_that_it_was_heard() -> None:
     desk.stream(range(100))
     desk.download.note_list_head(desk.now)
     assert desk.download.done
-    assert desk.trip.smoothed == pytest.approx(0.2)  # when the head came, not what followed it
+    assert desk.trip.smoothed == pytest.approx(0.2)  # at the head, not at the values that followed
 
 
 def test_a_slow_stream_gets_time_for_its_first_value() -> None:
@@ -176,10 +176,10 @@ def test_silence_ends_with_no_reply() -> None:
     assert desk.reads.is_idle
 
 
-def test_a_list_that_is_lost_often_is_asked_for_often_enough() -> None:
+def test_a_list_that_is_lost_often_is_requested_often_enough() -> None:
     desk = Desk(round_trip=3.0)
     desk.pass_time(LIST_TIMEOUT + 5.0)
-    assert not desk.download.done, "not before it was asked for often enough"
+    assert not desk.download.done, "not before it was requested often enough"
     desk.pass_time()
     assert desk.download.lists == LIST_ATTEMPTS_MIN
 
@@ -203,7 +203,7 @@ def test_another_pass_is_requested_twice_on_a_lossy_link() -> None:
     assert desk.take().count("list") == LIST_COPIES_MAX
 
 
-def test_on_a_slow_link_the_list_is_not_asked_for_while_the_answer_is_on_its_way() -> None:
+def test_on_a_slow_link_the_list_is_not_requested_while_the_answer_is_on_its_way() -> None:
     desk = Desk(round_trip=8.0)
     desk.pass_time(7.9)
     assert desk.take() == ["list"]
@@ -217,7 +217,7 @@ def test_a_list_requested_by_another_station_is_awaited_first() -> None:
     assert "list" in desk.take()
 
 
-def test_the_first_answer_tells_the_round_trip() -> None:
+def test_the_first_response_measures_the_round_trip() -> None:
     desk = Desk(round_trip=None)
     desk.now = 0.3
     desk.hear(0)
@@ -241,7 +241,7 @@ def test_values_with_an_impossible_index_or_count_are_ignored(index: int, count:
 # gaps
 
 
-def test_a_gap_is_asked_for_while_the_stream_runs() -> None:
+def test_a_gap_is_requested_while_the_stream_runs() -> None:
     desk = Desk()
     desk.stream([0, 1, 4])
     assert desk.take() == ["list"]
@@ -269,7 +269,7 @@ def test_the_pace_of_the_stream_bounds_that_of_the_reads(lost: set[int]) -> None
     assert desk.reads.pace.rate < before
 
 
-def test_ardupilot_is_asked_for_as_many_values_as_its_list_brings_over_a_radio() -> None:
+def test_reads_of_ardupilot_over_a_radio_have_the_rate_of_its_list() -> None:
     """Its list leaves two thirds of the port free, and its reads are answered from there."""
     desk = Desk()
     desk.reads.pace.is_batched = True
@@ -309,7 +309,7 @@ def test_values_missing_at_the_end_are_read_after_a_pause() -> None:
     assert desk.download.missing == ()
 
 
-def test_a_stream_that_goes_on_after_a_pause_answers_what_was_asked_for_meanwhile() -> None:
+def test_a_stream_that_goes_on_after_a_pause_answers_what_was_requested_meanwhile() -> None:
     desk = Desk()
     desk.stream(range(90))
     desk.pass_time(0.3)
@@ -366,7 +366,7 @@ def test_an_index_that_is_answered_with_nonsense_is_given_up(count: int) -> None
     assert desk.download.given_up == {7}
 
 
-def test_no_more_is_asked_for_at_a_time_than_is_bounded() -> None:
+def test_the_number_of_requested_indices_is_bounded() -> None:
     desk = Desk()
     desk.download.resume(0.0)
     desk.stream([0, *range(30_000, 30_100)], count=60_000)
@@ -380,15 +380,15 @@ def test_a_large_table_read_one_by_one_takes_linear_time() -> None:
     desk.stream([0], count=count)
     for _ in range(EMPTY_LISTS_MAX + 2):
         desk.pass_time(1.0)
-    asked = 0
+    requested = 0
     while not desk.download.done:
         for each in desk.take():
             if isinstance(each, int):
-                asked += 1
+                requested += 1
                 desk.hear(each, count=count)
         desk.pass_time(0.05)
     assert desk.download.missing == ()
-    assert asked < 3 * count
+    assert requested < 3 * count
 
 
 # pushes into the stream
@@ -425,13 +425,13 @@ def test_a_push_at_the_very_start() -> None:
     assert desk.take() == ["list"]
 
 
-def test_lost_is_what_had_to_be_asked_for_each_index_once() -> None:
+def test_lost_counts_each_requested_index_once() -> None:
     desk = Desk()
-    desk.stream([0, 2, 1, *range(4, 40), *range(41, 90)])  # 1 comes late, 3 and 40 do not come
+    desk.stream([0, 2, 1, *range(4, 40), *range(41, 90)])  # 1 arrives late, 3 and 40 do not arrive
     assert desk.download.lost == 2
     desk.pass_time(0.3)
     assert desk.download.lost == 12
-    desk.pass_time(2.0)  # asked for again and again, they are lost once
+    desk.pass_time(2.0)  # requested again and again, they are lost once
     desk.answer()
     assert (desk.download.lost, desk.download.missing) == (12, ())
 
@@ -475,7 +475,7 @@ def test_a_list_that_starts_again_for_ever_does_not_hold_it_up() -> None:
     assert desk.download.missing == ()
 
 
-def test_a_stream_that_stops_is_asked_for_once_more_when_that_is_faster() -> None:
+def test_a_stream_that_stops_is_requested_once_more_when_that_is_faster() -> None:
     desk = Desk()
     desk.stream(range(30), count=1000)
     desk.take()
@@ -497,7 +497,7 @@ def test_a_little_is_always_read_one_by_one() -> None:
     assert "list" not in desk.take()
 
 
-def test_lists_that_bring_nothing_are_not_asked_for_for_ever() -> None:
+def test_requests_for_lists_that_bring_nothing_end() -> None:
     desk = Desk()
     desk.stream(range(30), count=1000)
     desk.take()
@@ -543,7 +543,7 @@ def test_gaps_that_stay_silent_do_not_end_a_stream_that_runs() -> None:
         desk.stream([at], count=4000)
         desk.pass_time(0.05)
         at += 1
-    assert desk.download.given_up == set()  # nothing tells whether it is the link that is to blame
+    assert desk.download.given_up == set()  # the link may be the cause
     desk.stream(range(at, 4000), count=4000)
     assert is_so(not desk.download.done)
     desk.answer(count=4000, silent=(2, 3, 4))
@@ -553,12 +553,12 @@ def test_gaps_that_stay_silent_do_not_end_a_stream_that_runs() -> None:
 def test_a_vehicle_that_answers_hardly_anything_is_not_given_up() -> None:
     desk = Desk()
     desk.stream(range(80))
-    asked = 0
+    requested = 0
     while not desk.download.done and desk.now < 1000.0:
         desk.pass_time(0.05)
         for each in desk.take():
-            asked += 1
-            if isinstance(each, int) and asked % 40 == 0:
+            requested += 1
+            if isinstance(each, int) and requested % 40 == 0:
                 desk.hear(each)
     assert desk.download.missing == ()
 
@@ -575,7 +575,7 @@ def test_dead_indices_are_given_up_soon_even_the_usual_control(silent: tuple[int
 # the count moves
 
 
-def test_a_count_that_moves_makes_everything_count_again() -> None:
+def test_a_count_that_changes_makes_everything_count_again() -> None:
     desk = Desk()
     desk.stream(range(50), count=90)
     desk.stream(range(50, 100), count=100)
@@ -600,7 +600,7 @@ def test_an_answer_with_another_count_is_settled_by_another_pass() -> None:
     desk = Desk()
     desk.stream([*range(7), *range(8, 20)])
     assert desk.take() == ["list", 7]
-    desk.hear(7, count=104)  # single reads tell the count of now, the stream that of its beginning
+    desk.hear(7, count=104)  # single reads report the count of now, the stream that of its beginning
     assert desk.download.count == 100
     desk.stream(range(20, 100))
     assert desk.download.count == 104
@@ -611,7 +611,7 @@ def test_an_answer_with_another_count_is_settled_by_another_pass() -> None:
     assert desk.download.missing == ()
 
 
-def test_two_counts_that_alternate_come_to_an_end() -> None:
+def test_two_counts_that_alternate_end() -> None:
     desk = Desk()
     for index in range(100):
         desk.stream([index], count=100 + index % 2)
@@ -637,7 +637,7 @@ def test_once_the_count_is_taken_as_it_is_what_lies_beyond_it_is_passed_over() -
     assert 150 not in desk.download.names
 
 
-def test_when_the_list_was_asked_for_often_enough_another_count_is_settled_by_reads(
+def test_after_enough_list_requests_another_count_is_settled_by_reads(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(room, "LISTS_MAX", 1)
@@ -698,7 +698,7 @@ def test_an_index_whose_read_is_open_is_not_read_again_by_the_next_pass() -> Non
     assert desk.reads._open[11].holders == 1
 
 
-def test_a_vehicle_whose_count_never_rests_comes_to_an_end() -> None:
+def test_the_fetch_of_a_vehicle_whose_count_never_rests_ends() -> None:
     desk = Desk()
     count = 100
     for _ in range(5000):
@@ -746,7 +746,7 @@ def test_the_end_of_the_link_while_a_read_is_open() -> None:
     assert len(desk.reads) == 0
 
 
-def test_when_the_link_is_back_the_list_is_asked_for_at_once_and_anew() -> None:
+def test_when_the_link_is_back_the_list_is_requested_at_once_and_anew() -> None:
     desk = Desk()
     desk.pass_time(LIST_TIMEOUT - 1)
     desk.take()
@@ -851,7 +851,7 @@ def test_a_vehicle_that_dies_in_the_middle(
     assert len(world.machine.reads) == 0
 
 
-def test_a_vehicle_that_hears_nothing_any_more_but_still_beats() -> None:
+def test_a_vehicle_that_receives_nothing_and_still_sends_heartbeats() -> None:
     vehicle = PX4Vehicle()
     world = Simulation(vehicle)
     fetch = world.meet().begin_fetch(world.now)

@@ -161,7 +161,7 @@ def test_without_its_control_a_window_is_sent_again_and_given_up_in_the_end() ->
     assert desk.now < 2.0
 
 
-def test_while_a_list_comes_an_index_is_no_answer_to_a_control() -> None:
+def test_while_a_list_arrives_an_index_is_no_answer_to_a_control() -> None:
     desk = Desk()
     desk.reads.is_idle = False
     search = desk.searches.begin(["A"], 0.0)
@@ -220,7 +220,7 @@ def test_a_search_ends_when_the_component_is_lost_or_the_link_fails() -> None:
     assert desk.searches.next_deadline() == math.inf
 
 
-def test_without_a_count_the_index_heard_last_is_the_control() -> None:
+def test_without_a_count_the_index_received_last_is_the_control() -> None:
     desk = Desk()
     desk.count = None
     search = desk.searches.begin(["A"], 0.0)
@@ -237,7 +237,7 @@ UNUSED = ["MC_ROLL_P", "MC_PITCH_P", "RTL_RETURN_ALT"]
     ("make", "hidden"), [(ArduPilotVehicle, HIDDEN), (partial(PX4Vehicle, not_in_use=UNUSED), UNUSED)]
 )
 @pytest.mark.parametrize(("loss", "most"), [(0.0, 0.5), (0.1, 5.0)])
-def test_vehicles_tell_the_hidden_from_the_unknown(
+def test_vehicles_distinguish_the_hidden_from_the_unknown(
     make: Callable[[], ArduPilotVehicle | PX4Vehicle], hidden: list[str], loss: float, most: float
 ) -> None:
     unknown = {f"NO_SUCH_{number}" for number in range(10)}

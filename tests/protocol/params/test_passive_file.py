@@ -92,14 +92,20 @@ EXPECTED = [
 
 def assert_whole(log: FileLog, tmp_path: Path) -> ImportedTable:
     """Import and replay of a log give the whole table, of 1/1 only."""
-    [told] = imported(log, tmp_path)
-    assert (told.system, told.component, told.params, told.complete, told.notes) == (1, 1, COUNT, True, ())
-    assert as_rows(kept(tmp_path, told.key)) == EXPECTED
+    [reported] = imported(log, tmp_path)
+    assert (reported.system, reported.component, reported.params, reported.complete, reported.notes) == (
+        1,
+        1,
+        COUNT,
+        True,
+        (),
+    )
+    assert as_rows(kept(tmp_path, reported.key)) == EXPECTED
     result, client = anyio.run(replayed, tmp_path / "flight.tlog")
     assert as_rows(dict(result.params)) == EXPECTED
     assert (result.source, result.missing, result.notes, result.count) == ("ftp", (), (), COUNT)
     assert [address for address in client.components if address[0] == 1] == [(1, 1)]
-    return told
+    return reported
 
 
 def a_read(data: bytes = FILE) -> FileLog:
@@ -113,10 +119,10 @@ def a_read(data: bytes = FILE) -> FileLog:
 def test_a_log_of_mavproxy_gives_the_vehicle_with_types_and_defaults(tmp_path: Path) -> None:
     log = FileLog().beat().open().burst(FILE)
     log.made_up([(name, float(number)) for number, name in enumerate(NAMES)]).close().wait(1.0).beat()
-    told = assert_whole(log, tmp_path)
-    assert told.autopilot == wire.MAV_AUTOPILOT_ARDUPILOTMEGA
+    reported = assert_whole(log, tmp_path)
+    assert reported.autopilot == wire.MAV_AUTOPILOT_ARDUPILOTMEGA
     with ParamCache(tmp_path / "cache") as cache:
-        assert cache.history(told.key) == []
+        assert cache.history(reported.key) == []
         assert {(each.system, each.component) for each in cache.components()} == {(1, 1)}
 
 
@@ -140,9 +146,15 @@ def test_synthetic_values_of_a_station_with_the_vehicles_system_id_make_no_compo
     beat = wire.Heartbeat(wire.MAV_TYPE_GCS, wire.MAV_AUTOPILOT_INVALID)
     log = FileLog().say(beat, component=190).beat().open(station=station).burst(FILE, station=station)
     log.made_up([(name, float(number)) for number, name in enumerate(NAMES)]).close(station=station)
-    [told] = imported(log.wait(1.0).say(beat, component=190).beat(), tmp_path)
-    assert (told.system, told.component, told.params, told.complete, told.notes) == (1, 1, COUNT, True, ())
-    assert as_rows(kept(tmp_path, told.key)) == EXPECTED
+    [reported] = imported(log.wait(1.0).say(beat, component=190).beat(), tmp_path)
+    assert (reported.system, reported.component, reported.params, reported.complete, reported.notes) == (
+        1,
+        1,
+        COUNT,
+        True,
+        (),
+    )
+    assert as_rows(kept(tmp_path, reported.key)) == EXPECTED
 
     async def replay() -> None:
         async with ParamClient(f"replay:{tmp_path / 'flight.tlog'}?speed=0") as client:
@@ -153,7 +165,7 @@ def test_synthetic_values_of_a_station_with_the_vehicles_system_id_make_no_compo
     anyio.run(replay)
 
 
-def test_a_ground_station_has_the_parameters_that_it_sends_to_a_client_that_asks() -> None:
+def test_a_ground_station_has_the_parameters_that_it_sends_on_request() -> None:
     station = Station(link="link", is_stream=False)
     beat = wire.Heartbeat(wire.MAV_TYPE_GCS, wire.MAV_AUTOPILOT_INVALID)
     for message in (beat, param_value("A", 7, index=0, count=1, kind=ParamType.INT32)):
@@ -174,8 +186,8 @@ def test_a_recording_gives_the_file_that_was_read(speed: str, tmp_path: Path) ->
         (name, kind, bits, bits if default is None else default)
         for name, kind, bits, default in expected.entries
     ]
-    [told] = imported(path, tmp_path)
-    assert (told.params, told.complete, told.notes) == (1382, True, ())
+    [reported] = imported(path, tmp_path)
+    assert (reported.params, reported.complete, reported.notes) == (1382, True, ())
 
     def bits(params: dict[str, Param]) -> list[tuple[str, object, int, int]]:
         found = sorted((each.index or 0, each) for each in params.values())
@@ -194,14 +206,20 @@ def test_a_recording_gives_the_file_that_was_read(speed: str, tmp_path: Path) ->
             assert bits(dict(result.params)) == rows
             assert component.sync_state is SyncState.SYNCED
 
-    assert bits(kept(tmp_path, told.key)) == rows
+    assert bits(kept(tmp_path, reported.key)) == rows
     replay()
 
 
 def test_a_recording_of_mavproxy_gives_the_vehicle_with_types_and_defaults(tmp_path: Path) -> None:
     """MAVProxy 1.8.75 beside ArduCopter; of the 1,382 made-up values the first 600 are kept."""
-    [told] = imported(MAVPROXY, tmp_path)
-    assert (told.system, told.component, told.params, told.complete, told.notes) == (1, 1, 1382, True, ())
+    [reported] = imported(MAVPROXY, tmp_path)
+    assert (reported.system, reported.component, reported.params, reported.complete, reported.notes) == (
+        1,
+        1,
+        1382,
+        True,
+        (),
+    )
     expected = [
         (name, kind, bits if default is None else default)
         for name, kind, bits, default in decode(
@@ -211,7 +229,7 @@ def test_a_recording_of_mavproxy_gives_the_vehicle_with_types_and_defaults(tmp_p
     result, client = anyio.run(replayed, MAVPROXY)
     assert (result.source, result.missing, result.notes) == ("ftp", (), ())
     assert set(client.components) == {(1, 1), STATION}
-    for params in (kept(tmp_path, told.key), dict(result.params)):
+    for params in (kept(tmp_path, reported.key), dict(result.params)):
         rows = sorted((param.index or 0, param) for param in params.values())
         assert [
             (param.name, param.type, bits_of(param.default, param.type))
@@ -223,16 +241,16 @@ def test_a_recording_of_mavproxy_gives_the_vehicle_with_types_and_defaults(tmp_p
 @pytest.mark.parametrize("path", RECORDINGS, ids=lambda path: path.stem)
 def test_every_recording_of_a_read_gives_the_whole_table(path: Path, tmp_path: Path) -> None:
     """Left open, closed by others, beside a list, several in a row, by another program."""
-    [told] = imported(path, tmp_path)
-    assert (told.component, told.params, told.complete, told.notes) == (1, 1382, True, ())
-    kinds = {param.type for param in kept(tmp_path, told.key).values()}
+    [reported] = imported(path, tmp_path)
+    assert (reported.component, reported.params, reported.complete, reported.notes) == (1, 1382, True, ())
+    kinds = {param.type for param in kept(tmp_path, reported.key).values()}
     assert kinds == {ParamType.INT8, ParamType.INT16, ParamType.INT32, ParamType.REAL32}
     result, _ = anyio.run(replayed, path)
     assert (result.source, result.complete, result.count) == ("ftp", True, 1382)
 
 
 class LossyFiles(Tap):
-    """A way to a vehicle on which every seventh message of MAVFTP is lost, and every fifth comes twice."""
+    """A path to a vehicle on which every seventh message of MAVFTP is lost, and every fifth arrives twice."""
 
     def __init__(self, endpoint: Endpoint) -> None:
         super().__init__(endpoint)
@@ -307,7 +325,7 @@ def another_station_on_the_same_session(log: FileLog) -> FileLog:
     return log.close(session=11, station=OTHER).burst(FILE, [])
 
 
-def end_not_heard(log: FileLog) -> FileLog:
+def without_end(log: FileLog) -> FileLog:
     return log.burst(FILE, is_ended=False)
 
 
@@ -331,7 +349,7 @@ def slow(log: FileLog) -> FileLog:
         opened_twice,
         other_files_between,
         another_station_on_the_same_session,
-        end_not_heard,
+        without_end,
         numbers_wrap,
         slow,
     ],
@@ -341,14 +359,14 @@ def test_however_the_file_was_read_it_is_put_together(
 ) -> None:
     log = reading(FileLog().beat().open()).close().wait(1.0).beat()
     if reading is another_station_on_the_same_session:
-        [told] = imported(log, tmp_path)
-        assert as_rows(kept(tmp_path, told.key)) == EXPECTED  # the one that ended last
+        [reported] = imported(log, tmp_path)
+        assert as_rows(kept(tmp_path, reported.key)) == EXPECTED  # the one that ended last
         return
     assert_whole(log, tmp_path)
 
 
 def test_a_log_that_begins_with_the_file(tmp_path: Path) -> None:
-    """Nothing has been heard of the vehicle, and a station is reading."""
+    """Nothing was received from the vehicle, and a station is reading."""
     assert_whole(FileLog().open().burst(FILE).close().wait(1.0).beat(), tmp_path)
 
 
@@ -357,9 +375,9 @@ def test_parts_of_the_file_make_up_the_whole(tmp_path: Path) -> None:
     for start in range(0, COUNT, 90):
         part = encode(table()[start : start + 90], total=COUNT, with_defaults=True)
         log.open(f"@PARAM/param.pck?start={start}&count=90&withdefaults=1").burst(part).close()
-    [told] = imported(log.wait(1.0).beat(), tmp_path)
-    assert (told.complete, told.notes) == (True, ())
-    assert as_rows(kept(tmp_path, told.key)) == EXPECTED
+    [reported] = imported(log.wait(1.0).beat(), tmp_path)
+    assert (reported.complete, reported.notes) == (True, ())
+    assert as_rows(kept(tmp_path, reported.key)) == EXPECTED
 
 
 # times
@@ -373,18 +391,18 @@ def test_values_have_the_time_at_which_the_file_was_opened(tmp_path: Path) -> No
     log.burst(packed(table(**{NAMES[5]: 50, NAMES[6]: 60})), session=12, gap=0.1)
     second = log.close(session=12).at
     log.wait(500.0).beat()
-    [told] = imported(log, tmp_path)
+    [reported] = imported(log, tmp_path)
     with ParamCache(tmp_path / "cache") as cache:
-        found = cache.component(told.key)
+        found = cache.component(reported.key)
         assert found.synced_at == pytest.approx(second, abs=0.3)
         assert found.heard_at[NAMES[4]] == pytest.approx(opened, abs=1e-3)
         assert [
             (each.name, each.old.value, each.new and each.new.value, round(each.at - first))
-            for each in cache.history(told.key)
+            for each in cache.history(reported.key)
         ] == [(NAMES[5], 5, 50, 100), (NAMES[6], 6, 60, round(opened - first))]
-    before = [lines_of(tmp_path, told.key), repr(kept(tmp_path, told.key))]
+    before = [lines_of(tmp_path, reported.key), repr(kept(tmp_path, reported.key))]
     imported(log, tmp_path)
-    assert [lines_of(tmp_path, told.key), repr(kept(tmp_path, told.key))] == before
+    assert [lines_of(tmp_path, reported.key), repr(kept(tmp_path, reported.key))] == before
 
 
 def lines_of(tmp_path: Path, key: str) -> str:
@@ -395,34 +413,34 @@ def lines_of(tmp_path: Path, key: str) -> str:
 def test_a_value_received_during_the_file_read_is_newer(tmp_path: Path) -> None:
     log = FileLog().beat().open().burst(FILE, range(2), is_ended=False)
     log.value(NAMES[1], 77, count=COUNT).burst(FILE, range(2, BLOCKS)).close().wait(1.0).beat()
-    [told] = imported(log, tmp_path)
-    found = kept(tmp_path, told.key)
-    assert told.complete
+    [reported] = imported(log, tmp_path)
+    found = kept(tmp_path, reported.key)
+    assert reported.complete
     assert (found[NAMES[1]].value, found[NAMES[1]].default, found[NAMES[1]].index) == (77, 1, 1)
 
 
-def test_a_value_that_was_heard_before_is_older(tmp_path: Path) -> None:
+def test_a_value_that_was_received_before_is_older(tmp_path: Path) -> None:
     log = FileLog().beat().value(NAMES[1], 77, count=COUNT).wait(1.0).open().burst(FILE).close().wait(1.0)
-    [told] = imported(log.beat(), tmp_path)
-    assert kept(tmp_path, told.key)[NAMES[1]].value == 1
+    [reported] = imported(log.beat(), tmp_path)
+    assert kept(tmp_path, reported.key)[NAMES[1]].value == 1
 
 
-def test_a_value_that_is_heard_before_the_first_heartbeat_is_read_as_the_vehicle_means_it(
+def test_a_value_that_is_received_before_the_first_heartbeat_is_read_as_the_vehicle_means_it(
     tmp_path: Path,
 ) -> None:
     log = FileLog().value("A", 5, count=1).wait(5.0).beat().wait(1.0).beat()
-    [told] = imported(log, tmp_path)
-    assert kept(tmp_path, told.key)["A"].value == 5
-    assert lines_of(tmp_path, told.key) == "[]"
+    [reported] = imported(log, tmp_path)
+    assert kept(tmp_path, reported.key)["A"].value == 5
+    assert lines_of(tmp_path, reported.key) == "[]"
 
 
 def test_a_read_that_stops_has_the_time_at_which_it_stopped(tmp_path: Path) -> None:
     log = FileLog().beat().open().burst(FILE, is_ended=False)
     at = log.at
     log.wait(3600.0).say(wire.Heartbeat(6, 8, system_status=4), system=255, component=230)
-    [told] = imported(log, tmp_path)
+    [reported] = imported(log, tmp_path)
     with ParamCache(tmp_path / "cache") as cache:
-        assert cache.component(told.key).synced_at == pytest.approx(at, abs=0.3)
+        assert cache.component(reported.key).synced_at == pytest.approx(at, abs=0.3)
 
 
 # gaps
@@ -434,13 +452,13 @@ def test_of_a_file_with_a_gap_what_stands_before_it_is_taken(missing: int, tmp_p
     log = FileLog().beat().open().burst(FILE, blocks).close().wait(1.0).beat()
     pack, number = decode_prefix(FILE[: missing * BLOCK])
     assert (0 < len(pack.entries) < COUNT, number) == (True, COUNT)
-    [told] = imported(log, tmp_path)
+    [reported] = imported(log, tmp_path)
     note = (
         f"{len(pack.entries)} of {COUNT} parameters were taken from the parameter file that station 255/230 "
         f"read: bytes from {missing * BLOCK} on are missing."
     )
-    assert (told.params, told.complete, told.notes) == (len(pack.entries), False, (note,))
-    assert as_rows(kept(tmp_path, told.key)) == EXPECTED[: len(pack.entries)]
+    assert (reported.params, reported.complete, reported.notes) == (len(pack.entries), False, (note,))
+    assert as_rows(kept(tmp_path, reported.key)) == EXPECTED[: len(pack.entries)]
     result, _ = anyio.run(replayed, tmp_path / "flight.tlog")
     assert (result.complete, result.received, result.count) == (False, len(pack.entries), COUNT)
     assert result.notes == (note,)
@@ -466,9 +484,9 @@ def test_a_read_ends_in_many_ways(end: str, tmp_path: Path) -> None:
         log.say(wire.Heartbeat(2, wire.MAV_AUTOPILOT_ARDUPILOTMEGA, system_status=wire.MAV_STATE_BOOT))
     if end != "nothing":
         log.beat().burst(FILE, range(4, BLOCKS))  # of that nothing belongs to the file any more
-    [told] = imported(log.wait(1.0).beat(), tmp_path)
-    assert (told.complete, len(told.notes)) == (False, 1)
-    assert told.params == len(decode_prefix(FILE[: 4 * BLOCK])[0].entries)
+    [reported] = imported(log.wait(1.0).beat(), tmp_path)
+    assert (reported.complete, len(reported.notes)) == (False, 1)
+    assert reported.params == len(decode_prefix(FILE[: 4 * BLOCK])[0].entries)
 
 
 @pytest.mark.parametrize(
@@ -490,19 +508,19 @@ def test_a_read_ends_in_many_ways(end: str, tmp_path: Path) -> None:
     ],
 )
 def test_of_what_cannot_be_trusted_nothing_is_taken(log: FileLog, note: str, tmp_path: Path) -> None:
-    [told] = imported(log.wait(1.0).beat(), tmp_path)
-    assert not told.complete
-    [said] = told.notes
+    [reported] = imported(log.wait(1.0).beat(), tmp_path)
+    assert not reported.complete
+    [said] = reported.notes
     assert said.startswith("The parameter file that station 255/230 read was not used: ")
     assert note in said
-    if told.params:
-        assert kept(tmp_path, told.key).keys() == {"A"}
+    if reported.params:
+        assert kept(tmp_path, reported.key).keys() == {"A"}
 
 
 @pytest.mark.parametrize(
     "log",
     [
-        FileLog().beat().burst(FILE).close(),  # what file that is was not heard
+        FileLog().beat().burst(FILE).close(),  # what file that is was not received
         FileLog().beat().open("APM/param.pck").burst(FILE).close(),
         FileLog().beat().open("@PARAM/param.pck2").burst(FILE).close(),
         FileLog().beat().open(),
@@ -521,19 +539,19 @@ def test_a_later_whole_file_makes_up_for_one_with_gaps(tmp_path: Path) -> None:
 
 def test_a_whole_file_takes_out_what_the_vehicle_no_longer_has(tmp_path: Path) -> None:
     log = a_read().wait(10.0).open().burst(packed(table()[:-1])).close().wait(1.0).beat()
-    [told] = imported(log, tmp_path)
-    assert (told.params, told.complete) == (COUNT - 1, True)
-    assert NAMES[-1] not in kept(tmp_path, told.key)
+    [reported] = imported(log, tmp_path)
+    assert (reported.params, reported.complete) == (COUNT - 1, True)
+    assert NAMES[-1] not in kept(tmp_path, reported.key)
 
 
 def test_the_command_says_what_is_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = FileLog().beat().open().burst(FILE, range(3)).close().wait(1.0).beat().write(tmp_path / "f.tlog")
     cache = str(tmp_path / "cache")
     assert run(["import", str(path), "--cache", cache, "--json"]) == 0
-    told = capsys.readouterr()
-    [found] = json.loads(told.out)["tables"]
+    reported = capsys.readouterr()
+    [found] = json.loads(reported.out)["tables"]
     assert (found["complete"], len(found["notes"])) == (False, 1)
-    assert f"f.tlog, 1/1: {found['notes'][0]}" in told.err
+    assert f"f.tlog, 1/1: {found['notes'][0]}" in reported.err
     nothing = FileLog().beat().open().burst(FILE, [1]).close().wait(1.0).beat().write(tmp_path / "n.tlog")
     assert run(["import", str(nothing), "--cache", cache]) == 0
     assert "its first bytes were not received" in capsys.readouterr().err
@@ -600,7 +618,7 @@ def test_a_file_that_stops_coming_ends_the_fetch_with_what_there_is() -> None:
 
 
 class Followed:
-    """`ObservedReads` and what has come of it."""
+    """`ObservedReads` and its results."""
 
     def __init__(self, size_max: int = 10_000_000) -> None:
         self.ended: list[tuple[ObservedRead, float]] = []
@@ -611,13 +629,13 @@ class Followed:
         )
 
     def open(self, session: int, sequence: int = 0, path: bytes = b"file") -> None:
-        self.reads.request_heard(Packet(sequence, session, Opcode.OPEN_FILE_RO, path), STATION, 0.0)
+        self.reads.receive_request(Packet(sequence, session, Opcode.OPEN_FILE_RO, path), STATION, 0.0)
         reply = Packet(sequence + 1, session, Opcode.ACK, requested=Opcode.OPEN_FILE_RO)
-        self.reads.reply_heard(reply, STATION, 0.0)
+        self.reads.receive_reply(reply, STATION, 0.0)
 
     def block(self, session: int, offset: int, data: bytes, now: float = 0.0) -> None:
         packet = Packet(9, session, Opcode.ACK, data, offset=offset, requested=Opcode.BURST_READ_FILE)
-        self.reads.reply_heard(packet, (255, 0), now)
+        self.reads.receive_reply(packet, (255, 0), now)
 
 
 def test_no_more_is_kept_than_a_file_can_have() -> None:
@@ -628,7 +646,7 @@ def test_no_more_is_kept_than_a_file_can_have() -> None:
     assert not followed.reads.running
     followed.open(1, sequence=5)
     end = Packet(9, 1, Opcode.NAK, b"\x06", offset=2_000, requested=Opcode.BURST_READ_FILE)
-    followed.reads.reply_heard(end, STATION, 0.0)  # of no file that is wanted
+    followed.reads.receive_reply(end, STATION, 0.0)  # of no file that is wanted
     [read] = followed.reads.running
     assert read.blocks.end is None
 
@@ -639,10 +657,10 @@ def test_a_single_read_has_the_offset_of_its_request() -> None:
     followed.open(1)
     for sequence, offset, data in ((20, 3, b"def"), (22, 0, b"abc"), (24, 6, b"")):
         request = Packet(sequence, 1, Opcode.READ_FILE, size=3, offset=offset)
-        followed.reads.request_heard(request, STATION, 0.0)
+        followed.reads.receive_request(request, STATION, 0.0)
         opcode = Opcode.ACK if data else Opcode.NAK
         reply = Packet(sequence + 1, 1, opcode, data or b"\x06", requested=Opcode.READ_FILE)
-        followed.reads.reply_heard(reply, STATION, 0.0)
+        followed.reads.receive_reply(reply, STATION, 0.0)
     [(read, _)] = followed.ended
     assert (read.blocks.prefix, read.blocks.is_complete) == (b"abcdef", True)
 
@@ -654,14 +672,14 @@ def test_the_number_of_reads_openings_offsets_and_pieces_is_bounded() -> None:
     assert len(followed.reads.running) == READS_MAX
     assert [read.session for read, _ in followed.ended] == [0, 1, 2]
     for sequence in range(1000, 1000 + OPENINGS_MAX + 1):
-        followed.reads.request_heard(Packet(sequence, 99, Opcode.OPEN_FILE_RO, b"file"), STATION, 0.0)
+        followed.reads.receive_request(Packet(sequence, 99, Opcode.OPEN_FILE_RO, b"file"), STATION, 0.0)
     oldest = Packet(1001, 99, Opcode.ACK, requested=Opcode.OPEN_FILE_RO)
-    followed.reads.reply_heard(oldest, STATION, 0.0)
+    followed.reads.receive_reply(oldest, STATION, 0.0)
     assert 99 not in {read.session for read in followed.reads.running}
     last = READS_MAX + 2
     [read] = [each for each in followed.reads.running if each.session == last]
     for sequence in range(OFFSETS_MAX + 5):
-        followed.reads.request_heard(Packet(sequence, last, Opcode.READ_FILE, offset=7), STATION, 0.0)
+        followed.reads.receive_request(Packet(sequence, last, Opcode.READ_FILE, offset=7), STATION, 0.0)
     assert len(read.offsets) == OFFSETS_MAX
     for offset in range(PIECES_MAX + 1):
         followed.block(last, offset, b"x")

@@ -1,4 +1,5 @@
-"""Reads, one message at a time: what is asked when, who gets the answer, and when patience ends."""
+"""Reads, one message at a time: what is requested when, which request gets the response, and when they time
+out."""
 
 from __future__ import annotations
 
@@ -35,7 +36,7 @@ BURST = int(BURST_MIN)
 
 
 class Desk:
-    """Reads of component 1/1, with everything they send; `known` are the names that have been heard of."""
+    """Reads of component 1/1, with everything they send; `known` are the names that are known."""
 
     def __init__(self, *known: str, count: int = 100) -> None:
         self.now = 0.0
@@ -78,7 +79,7 @@ class Desk:
                 return
             self.now = max(deadline, self.now)
             self.reads.tick(self.now)
-        raise AssertionError("it does not come to an end")
+        raise AssertionError("it does not end")
 
     def measure(self, round_trip: float = 0.02, answers: int = 60) -> None:
         """Let the link be known as a good one."""
@@ -121,7 +122,7 @@ def test_one_value_may_answer_two_reads() -> None:
     assert by_index.done
 
 
-def test_a_read_that_is_asked_for_anew_while_its_answer_is_handed_out_waits_for_another() -> None:
+def test_a_read_that_is_requested_anew_while_its_answer_is_handed_out_waits_for_another() -> None:
     desk = Desk()
     again: list[Read] = []
     desk.ask("A").on_done.append(lambda: again.extend((desk.ask("A"), desk.ask(3))))
@@ -231,7 +232,7 @@ def test_a_lost_request_is_sent_again_after_the_time_out() -> None:
     assert desk.round_trip.smoothed is None  # it may be the answer to either
 
 
-def test_an_answer_that_comes_before_its_second_request_is_no_sample() -> None:
+def test_a_response_before_the_second_request_is_no_sample() -> None:
     desk = Desk("A")
     desk.reads.is_idle = False
     for index in range(1, BURST + 1):
@@ -239,11 +240,11 @@ def test_an_answer_that_comes_before_its_second_request_is_no_sample() -> None:
     desk.ask("A")
     desk.pass_time(FIRST_TIMEOUT + 0.05)
     assert desk.sent.count(1) == 2
-    desk.hear("X", index=10)  # timed out, and its turn has not come again or just has
+    desk.hear("X", index=10)  # timed out, and is repeated now or later
     assert desk.round_trip.smoothed is None
 
 
-def test_a_refusal_that_comes_late_does_not_spoil_the_round_trip() -> None:
+def test_a_refusal_that_is_late_does_not_spoil_the_round_trip() -> None:
     desk = Desk()
     reads = [desk.ask(index) for index in range(BURST * 3)]
     desk.pass_time(0.5)
@@ -265,7 +266,7 @@ def test_on_an_idle_link_that_loses_a_request_is_doubled() -> None:
         desk.retry.timed_out(1)
     desk.ask("A")
     assert desk.take() == ["A"]
-    desk.reads.tick(desk.now)  # when everything is asked for that is wanted at this moment
+    desk.reads.tick(desk.now)  # when everything needed at this moment is requested
     assert 1 <= desk.take().count("A") <= READ_COPIES_MAX
     assert len(desk.reads) == 1
 
@@ -284,7 +285,7 @@ def test_to_a_vehicle_that_is_silent_throughout_nothing_is_doubled_any_more() ->
     assert len([each for each in desk.take() if each != CONTROL_INDEX]) == more
 
 
-def test_while_a_list_comes_nothing_is_doubled() -> None:
+def test_while_a_list_arrives_nothing_is_doubled() -> None:
     desk = Desk("A")
     desk.measure(0.5)
     for _ in range(30):
@@ -371,7 +372,7 @@ def test_of_what_is_known_silence_is_silence(key: Key) -> None:
     assert desk.sent.count(CONTROL_INDEX) > 0
 
 
-def test_where_much_is_silent_the_controls_tell_how_good_the_link_is() -> None:
+def test_where_much_is_silent_the_control_reads_measure_the_loss() -> None:
     desk = Desk()
     desk.measure()
     for _ in range(60):  # other reads in vain have made the link look bad
@@ -404,7 +405,7 @@ def test_without_answered_controls_nothing_is_called_unknown() -> None:
     read = desk.ask("NOWHERE")
     desk.pass_time()
     assert isinstance(read.error, NoReply)
-    assert desk.sent.count(CONTROL_INDEX) > 1  # asked for again as well
+    assert desk.sent.count(CONTROL_INDEX) > 1  # requested again as well
 
 
 def test_a_control_that_was_lost_is_not_answered_by_what_passes_by_much_later() -> None:
@@ -421,7 +422,7 @@ def test_a_control_that_was_lost_is_not_answered_by_what_passes_by_much_later() 
 
 
 @pytest.mark.parametrize(("count", "control"), [(20, 7), (5, CONTROL_INDEX)])
-def test_the_index_heard_last_is_the_control_as_long_as_there_is_one(count: int, control: int) -> None:
+def test_the_index_received_last_is_the_control_as_long_as_there_is_one(count: int, control: int) -> None:
     desk = Desk(count=count)
     desk.reads.is_idle = False
     desk.ask("B", urgent=True)
@@ -436,7 +437,7 @@ def test_the_index_heard_last_is_the_control_as_long_as_there_is_one(count: int,
     assert {key for key in desk.take() if key != "A"} == {control}
 
 
-def test_index_0_has_the_index_heard_last_as_its_control() -> None:
+def test_index_0_has_the_index_received_last_as_its_control() -> None:
     desk = Desk()
     desk.reads.is_idle = False
     desk.hear("B", index=7)
@@ -453,7 +454,7 @@ def test_index_0_has_the_index_heard_last_as_its_control() -> None:
 
 
 def test_answered_controls_end_what_stays_silent_soon() -> None:
-    """Many silent indices look like a link that loses half; what else is asked for says that it does not."""
+    """Many silent indices look like a link that loses half; the other requests show that it does not."""
     desk = answering_desk()
     silent = [desk.ask(index) for index in range(20, 50)]
     desk.pass_time()
@@ -471,7 +472,7 @@ def test_index_0_needs_no_other_control() -> None:
 
 
 def test_earlier_timeouts_do_not_count_against_later_reads() -> None:
-    """A vehicle that was away for long and is back: each read has its tries again."""
+    """A vehicle that was lost for long and is found: each read has all its attempts again."""
     desk = Desk("A", count=ATTEMPTS_MAX)
     gone = [desk.ask(index) for index in range(ATTEMPTS_MAX)]
     desk.pass_time()
@@ -561,10 +562,10 @@ def test_the_reason_of_a_refusal(code: int, kind: type[Exception]) -> None:
         assert read.error.reason == ("read fail" if code == 8 else "error code 77")
 
 
-# the link goes and comes
+# the link is lost and reconnected
 
 
-def test_when_the_link_is_back_what_was_in_flight_is_asked_for_again() -> None:
+def test_when_the_link_is_back_what_was_in_flight_is_requested_again() -> None:
     desk = Desk("A")
     reads = [desk.ask(index) for index in range(BURST + 3)]
     desk.pass_time(1.02)
@@ -614,7 +615,7 @@ def test_a_read_that_ends_may_take_others_with_it_while_time_passes() -> None:
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.01, 0.05, 0.3], ids=lambda delay: f"{2 * delay:g}s")
-def test_ardupilot_is_asked_once_for_each_of_many_parameters_on_a_clean_link(delay: float) -> None:
+def test_on_a_clean_link_each_parameter_of_ardupilot_is_requested_once(delay: float) -> None:
     vehicle = ArduPilotVehicle()
     session = Simulation(vehicle, air=Air.symmetric([vehicle], delay=delay))
     machine = session.meet()
@@ -671,7 +672,7 @@ def test_background_reads_keep_to_the_pace() -> None:
 
 
 @pytest.mark.parametrize("seed", range(30))
-def test_an_index_beyond_the_count_is_unknown_also_where_control_reads_come_too_late(seed: int) -> None:
+def test_an_index_beyond_the_count_is_unknown_also_with_late_control_reads(seed: int) -> None:
     """With 0.3 s of delay and of jitter, the attempts may end before enough control reads are answered."""
     vehicle = ArduPilotVehicle(table={f"P_{number}": number for number in range(6)}, live=(), ftp=False)
     world = Simulation(air=Air.symmetric([vehicle], delay=0.3, jitter=0.3, seed=seed))
@@ -681,7 +682,7 @@ def test_an_index_beyond_the_count_is_unknown_also_where_control_reads_come_too_
 
 
 def test_an_index_beyond_the_count_of_the_cache_may_exist() -> None:
-    """The vehicle may have more parameters by now: a dead link does not tell."""
+    """The vehicle may have more parameters by now: a dead link does not show it."""
     desk = Desk(count=5)
     read = desk.ask(7)
     desk.pass_time(120.0)
@@ -695,7 +696,7 @@ def test_an_index_beyond_the_count_of_the_cache_may_exist() -> None:
 # the time of a response
 
 
-def test_a_read_with_copies_tells_how_long_its_response_took() -> None:
+def test_a_read_with_copies_measures_the_round_trip() -> None:
     """Which copy was answered is unknown, so that it is no sample of the round trip."""
     desk = Desk("A")
     desk.measure(0.3)
@@ -711,7 +712,7 @@ def test_a_read_with_copies_tells_how_long_its_response_took() -> None:
     assert desk.round_trip.response_time == pytest.approx(0.25)
 
 
-def test_a_read_that_was_repeated_tells_nothing_of_it() -> None:
+def test_a_repeated_read_is_no_round_trip_sample() -> None:
     desk = Desk("A")
     desk.ask("A")
     desk.pass_time(FIRST_TIMEOUT + 0.01)

@@ -29,7 +29,8 @@ both = pytest.mark.parametrize("kind", MAKES)
 
 
 def cancelled(vehicle: Vehicle, received: int = SIZE // 2, *, delay: float = 0.01) -> Simulation:
-    """A session whose fetch was cancelled when so much had come; the vehicle has stopped its list."""
+    """A session whose fetch was cancelled after the given number of values; the vehicle has stopped its
+    list."""
     world = Simulation(air=Air.symmetric([vehicle], delay=delay))
     machine = world.meet()
     fetch = machine.begin_fetch(world.now)
@@ -187,7 +188,7 @@ def test_a_vehicle_that_is_gone_gives_no_reply_though_nothing_is_missing(kind: s
     assert not machine.sync.synced
 
 
-def test_when_the_count_has_moved_nothing_is_gone_on_with() -> None:
+def test_after_a_changed_count_no_download_is_resumed() -> None:
     vehicle = ArduPilotVehicle(
         ftp=False, table=TABLE, groups={"P001": {"GROUP_A": 1, "GROUP_B": 2}}, burst=1, period=0.01
     )
@@ -195,7 +196,7 @@ def test_when_the_count_has_moved_nothing_is_gone_on_with() -> None:
     world = cancelled(vehicle, 180)
     vehicle.set_param("P001", 1)
     vehicle.tick(world.now)
-    vehicle.data_to_send()  # of which nothing is heard
+    vehicle.data_to_send()  # of which nothing is received
     result = world.fetch()
     assert is_right(result, vehicle)
     assert result.resumed == 0
@@ -203,7 +204,7 @@ def test_when_the_count_has_moved_nothing_is_gone_on_with() -> None:
     assert result.count == SIZE + 2
 
 
-def test_when_a_moved_count_was_heard_indices_of_before_are_worth_nothing() -> None:
+def test_earlier_indices_do_not_count_after_a_changed_count() -> None:
     vehicle = ArduPilotVehicle(
         ftp=False, table=TABLE, groups={"P001": {"GROUP_A": 1, "GROUP_B": 2}}, burst=1, period=0.01
     )
@@ -291,7 +292,7 @@ def test_without_a_hash_earlier_values_stay_what_they_are() -> None:
     assert not world.machine.sync.synced
     assert world.machine.state == "cached"
     assert sum(param.trust is Trust.CACHED for param in result.params.values()) == there - 1, (
-        "one was asked for"
+        "one was requested"
     )
     again = world.fetch(refresh=True)
     assert again.is_confirmed
@@ -390,7 +391,7 @@ def test_after_a_killed_process_only_what_is_missing_is_fetched(
             assert result.resumed == there
             count = len(vehicle.params)
             assert vehicle.requests["PARAM_REQUEST_LIST"] == 0
-            assert vehicle.requests["PARAM_REQUEST_READ"] < 1.5 * (count - there), "some are asked for twice"
+            assert vehicle.requests["PARAM_REQUEST_READ"] < 1.5 * (count - there), "some are requested twice"
             assert bits(result.params) == bits(vehicle.params)
             assert (result.hash == vehicle.announced_hash()) if isinstance(vehicle, PX4Vehicle) else True
         with ParamCache(path) as cache:

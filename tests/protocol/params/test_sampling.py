@@ -161,7 +161,7 @@ def test_another_firmware_after_a_reboot_is_not_sampled() -> None:
     vehicle = ArduPilotVehicle(live_period=0)
     first = Simulation(vehicle)
     first.fetch()
-    for sampled_at in ("once it is heard", "while it is asked who it is"):
+    for sampled_at in ("once it is found", "while it is identified"):
         session = Simulation(air=Air.symmetric([vehicle], delay=0.05))
         machine = session.meet()
         session.run(5.0)
@@ -170,7 +170,7 @@ def test_another_firmware_after_a_reboot_is_not_sampled() -> None:
         version = vehicle._version
         assert version is not None
         vehicle._version = replace(version, git_hash=version.git_hash[::-1])
-        if sampled_at == "once it is heard":
+        if sampled_at == "once it is found":
             vehicle.reboot(session.now, down=1.0)
             session.until(lambda: machine.identification.is_doubted)  # noqa: B023 - called at once
         else:

@@ -77,19 +77,19 @@ class World(Simulation):
         self.run(seconds)
         self.tap.is_mute = self.tap.is_deaf = False
 
-    def unheard(self, vehicle: PX4Vehicle | ArduPilotVehicle, **values: int) -> None:
-        """Values change on board, and what the vehicle tells of it is lost on the air."""
+    def change_silently(self, vehicle: PX4Vehicle | ArduPilotVehicle, **values: int) -> None:
+        """Values change on board, and the messages that report it are lost."""
         self.tap.is_mute = True
         for name, value in values.items():
             vehicle.set_param(name, value)
         self.run(0.2)
         self.tap.is_mute = False
 
-    def told(self, *kinds: type) -> list[Event]:
+    def reported(self, *kinds: type) -> list[Event]:
         return [event for event in self.events if isinstance(event, kinds)]
 
     def hashes(self, since: float = 0.0) -> list[float]:
-        """When the hash was asked for."""
+        """When the hash was requested."""
         return [
             now
             for now, message in self.sent
@@ -135,13 +135,13 @@ def trusts(machine: ComponentMachine) -> set[Trust]:
 
 def test_an_update_that_was_lost_is_found_within_one_interval() -> None:
     world, vehicle = fetched()
-    world.unheard(vehicle, P07=700, P09=900)
+    world.change_silently(vehicle, P07=700, P09=900)
     assert world.machine.table.params["P07"].value == 7
-    assert state(world) is SyncState.SYNCED, "nobody can know yet"
+    assert state(world) is SyncState.SYNCED, "nothing shows it yet"
     world.run(INTERVAL)
     assert world.machine.table.params["P07"].value == 700
     assert resynced(world) == [("P07", "P09")]
-    (event,) = world.told(TableResynced)
+    (event,) = world.reported(TableResynced)
     assert isinstance(event, TableResynced)
     assert event.hash == vehicle.announced_hash() == world.machine.table.hash
     changes = [event.change.name for event in world.events if isinstance(event, ParamChanged)]
@@ -152,14 +152,14 @@ def test_an_update_that_was_lost_is_found_within_one_interval() -> None:
 
 def test_changes_are_reported_before_the_table_is_in_sync() -> None:
     world, vehicle = fetched()
-    world.unheard(vehicle, P07=700)
+    world.change_silently(vehicle, P07=700)
     states: list[SyncState] = []
     world.until(lambda: states.append(world.machine.sync_state) or bool(resynced(world)))  # type: ignore[func-returns-value]  # collects on the way
     assert dict.fromkeys(states) == dict.fromkeys([SyncState.SYNCED, SyncState.RESYNCING, SyncState.SYNCED])
     assert [type(event) for event in world.events] == [ParamChanged, TableResynced, Fetched]
 
 
-def test_as_long_as_nothing_moves_an_interval_costs_one_question_and_the_volatile_values() -> None:
+def test_without_changes_an_interval_costs_one_hash_request_and_the_volatile_values() -> None:
     world, _ = fetched()
     last = world.machine.fetches.last
     assert last is not None
@@ -172,13 +172,13 @@ def test_as_long_as_nothing_moves_an_interval_costs_one_question_and_the_volatil
     assert world.events == []
 
 
-def test_without_a_watch_nothing_is_asked() -> None:
+def test_without_a_watch_nothing_is_requested() -> None:
     world, vehicle = fetched(sync_settings=SyncSettings())
-    world.unheard(vehicle, P07=700)
+    world.change_silently(vehicle, P07=700)
     world.away(4.0)
     world.run(500.0)
     assert world.requests() == 0
-    assert state(world) is SyncState.SYNCED, "no sign has come"
+    assert state(world) is SyncState.SYNCED, "no sign has arrived"
 
 
 def test_a_table_that_was_never_fetched_is_not_kept_up() -> None:
@@ -190,7 +190,7 @@ def test_a_table_that_was_never_fetched_is_not_kept_up() -> None:
     assert state(world) is SyncState.UNSYNCED
 
 
-def test_nothing_is_asked_while_the_link_is_busy() -> None:
+def test_nothing_is_requested_while_the_link_is_busy() -> None:
     world = World(PX4Vehicle(table=TABLE), GenericVehicle(table=PLAIN, system=2))
     world.fetch()
     fetched_at = world.now  # the fetch itself asks for the hash beside the list
@@ -206,7 +206,7 @@ def test_nothing_is_asked_while_the_link_is_busy() -> None:
     assert len(world.hashes(fetched_at)) == 1
 
 
-def test_nothing_is_asked_in_high_latency_mode() -> None:
+def test_nothing_is_requested_in_high_latency_mode() -> None:
     world, vehicle = fetched()
     vehicle.high_latency = True
     world.run(10 * INTERVAL)
@@ -218,9 +218,9 @@ def test_nothing_is_asked_in_high_latency_mode() -> None:
     assert len(world.hashes()) >= 1
 
 
-def test_nothing_is_asked_in_low_bandwidth_mode() -> None:
+def test_nothing_is_requested_in_low_bandwidth_mode() -> None:
     world, vehicle = fetched(burst=1, period=0.125)
-    world.unheard(vehicle, P07=700)
+    world.change_silently(vehicle, P07=700)
     world.away(4.0)
     world.run(10 * INTERVAL)
     assert world.requests() == 0
@@ -247,9 +247,9 @@ def test_a_vehicle_without_a_hash(sync_settings: SyncSettings) -> None:
         assert lists == 0
         return
     assert lists == 2
-    assert resynced(world) == [], "nothing had moved"
+    assert resynced(world) == [], "nothing had changed"
     assert state(world) is SyncState.SYNCED
-    world.unheard(vehicle, P07=700)
+    world.change_silently(vehicle, P07=700)
     world.run(INTERVAL)
     assert resynced(world) == [("P07",)]
     assert world.machine.table.params["P07"].value == 700
@@ -296,7 +296,7 @@ def test_a_resync_that_fails_is_tried_again() -> None:
     assert resynced(world) == [("P07",)]
 
 
-def test_of_one_that_was_lost_during_its_fetch_nothing_is_asked() -> None:
+def test_nothing_is_requested_from_a_component_that_was_lost_during_its_fetch() -> None:
     world = World(
         ArduPilotVehicle(ftp=False, table=PLAIN), sync_settings=SyncSettings(INTERVAL, without_hash=True)
     )
@@ -311,7 +311,7 @@ def test_of_one_that_was_lost_during_its_fetch_nothing_is_asked() -> None:
     assert world.requests() == 0
 
 
-def test_a_table_that_came_as_a_file_is_kept_up_by_its_hash_alone() -> None:
+def test_a_table_received_as_a_file_is_kept_in_sync_by_its_hash_alone() -> None:
     unknown = [SimParam(row.name, row.type, row.value, volatile=row.name in NAMES[::9]) for row in TABLE]
     vehicle = PX4Vehicle(ftp=True, table=unknown)
     world = World(air=Air.symmetric([vehicle], delay=0.05), sync_settings=SyncSettings(INTERVAL))
@@ -351,7 +351,7 @@ def test_another_count_leads_to_a_check_at_once() -> None:
 # gaps
 
 
-def test_after_a_gap_in_the_heartbeats_it_is_asked() -> None:
+def test_after_a_gap_in_the_heartbeats_the_hash_is_requested() -> None:
     world, vehicle = fetched()
     vehicle.set_param("P07", 700)
     world.away(3.0)
@@ -359,10 +359,10 @@ def test_after_a_gap_in_the_heartbeats_it_is_asked() -> None:
     world.run(1.5)
     assert len(world.hashes()) == 1
     assert resynced(world) == [("P07",)]
-    assert world.told(ComponentLost) == []
+    assert world.reported(ComponentLost) == []
 
 
-def test_a_gap_counts_whatever_is_heard_first_after_it() -> None:
+def test_a_gap_counts_whichever_message_follows_it() -> None:
     world, _ = fetched()
     world.away(3.5)
     world.station.receive(
@@ -405,7 +405,7 @@ def test_gaps_are_many_on_a_bad_link_and_checks_are_not() -> None:
     assert min(apart) > GAP_CHECK_INTERVAL - 1e-6
     assert max(apart) <= INTERVAL + 5.0
     assert state(world) is SyncState.SYNCED
-    assert len(world.told(TableResynced)) == len(world.told(ComponentLost))
+    assert len(world.reported(TableResynced)) == len(world.reported(ComponentLost))
 
 
 def test_gaps_lead_to_one_check_in_five_seconds() -> None:
@@ -438,7 +438,7 @@ def test_a_component_with_a_slow_heartbeat_is_not_lost_again_and_again() -> None
     world.run(0.5)
     world.fetch()
     world.run(300.0)
-    assert len(world.told(ComponentLost)) <= 1, "before it was known how rarely it beats"
+    assert len(world.reported(ComponentLost)) <= 1, "before it was known how rarely it beats"
     assert len(world.hashes()) <= 300.0 / DUE + 2, "and what lies between its heartbeats is no gap"
 
 
@@ -458,7 +458,7 @@ def test_a_component_without_heartbeats_is_never_lost() -> None:
         world.now,
     )
     world.run(60.0)
-    assert world.told(ComponentLost) == []
+    assert world.reported(ComponentLost) == []
     assert world.get("P07").value == 7
     assert world.machine.state != "lost"
 
@@ -502,7 +502,7 @@ def test_a_component_with_a_slow_heartbeat_is_found_again_in_high_latency_mode()
     hear(wire.HighLatency2(2, wire.MAV_AUTOPILOT_PX4), 20.0)
     hear(wire.HighLatency2(2, wire.MAV_AUTOPILOT_PX4), 42.0)
     machine = world.machine
-    assert world.told(ComponentLost, ComponentFound)[-2:] == [
+    assert world.reported(ComponentLost, ComponentFound)[-2:] == [
         ComponentLost(machine, 20.0),
         ComponentFound(machine, 22.0),
     ]
@@ -518,14 +518,14 @@ def test_after_five_seconds_without_a_word_it_is_lost() -> None:
     world.tap.is_mute = True
     world.until(lambda: machine.presence.is_lost)
     assert world.now == last + LOST_AFTER
-    (lost,) = world.told(ComponentLost)
+    (lost,) = world.reported(ComponentLost)
     assert lost == ComponentLost(machine, LOST_AFTER)
     assert machine.state == "lost"
     assert state(world) is SyncState.LOST
     assert [param.value for param in listed(machine.table)][2:4] == [0, 1]
     assert trusts(machine) == {Trust.CACHED}
     world.run(100.0)
-    assert world.told(ComponentLost) == [lost], "once"
+    assert world.reported(ComponentLost) == [lost], "once"
     world.sent.clear()
     world.run(100.0)
     assert world.requests() == 0
@@ -586,7 +586,7 @@ def test_back_with_the_same_table() -> None:
     world.sent.clear()
     began = world.now
     world.until(lambda: not machine.presence.is_lost)
-    (found,) = world.told(ComponentFound)
+    (found,) = world.reported(ComponentFound)
     assert isinstance(found, ComponentFound)
     assert 9.0 <= found.silence <= 10.1
     assert state(world) is SyncState.CHECKING
@@ -595,7 +595,7 @@ def test_back_with_the_same_table() -> None:
     assert world.now < began + 2.5
     commands = [now for now, message in world.sent if isinstance(message, CommandLong)]
     assert commands, "who it is"
-    assert commands[0] <= world.hashes()[0], "comes before what it has"
+    assert commands[0] <= world.hashes()[0], "the command is sent before the hash request"
     assert resynced(world) == [()]
     assert state(world) is SyncState.SYNCED
     volatile = vehicle.params.keys() - set(NAMES)
@@ -639,7 +639,7 @@ def test_a_table_that_is_not_whole_any_more_is_checked_after_a_reboot_too() -> N
     world.machine.receive(wire.ParamValue("P00", bytes(4), ParamType.INT32, 44, 65535), world.now)
     vehicle.reboot(world.now, down=1.5)
     world.run(2.1)
-    assert len(world.told(ComponentRebooted)) == 1
+    assert len(world.reported(ComponentRebooted)) == 1
     assert world.hashes(fetched_at) == []
     world.taps[1].is_deaf = False
     world.run(3.0)
@@ -717,7 +717,7 @@ def test_another_vehicle_has_taken_the_place(is_alike: bool) -> None:
     assert result.params.keys() == {row.name for row in rows}
 
 
-def test_a_hash_that_was_asked_for_before_the_loss_confirms_nothing_after_it() -> None:
+def test_a_hash_that_was_requested_before_the_loss_confirms_nothing_after_it() -> None:
     berth = Berth(PX4Vehicle(table=TABLE, uid=1))
     world = World(air=Air.symmetric([berth], delay=0.1))
     world.fetch()
@@ -734,7 +734,7 @@ def test_a_hash_that_was_asked_for_before_the_loss_confirms_nothing_after_it() -
     assert resynced(world) == [], "the other one has the same hash"
 
 
-def test_while_it_is_away_the_fetch_under_way_waits_for_it() -> None:
+def test_a_running_fetch_waits_for_a_lost_vehicle() -> None:
     world, vehicle = fetched(burst=1, period=0.05)
     fetch = world.machine.begin_fetch(world.now, refresh=True)
     world.run(1.0)
@@ -746,14 +746,14 @@ def test_while_it_is_away_the_fetch_under_way_waits_for_it() -> None:
     result = world.outcome(fetch)
     assert result.complete
     assert result.params["P07"].value == 700
-    assert len(world.told(ComponentRebooted)) == 1
+    assert len(world.reported(ComponentRebooted)) == 1
     assert state(world) is SyncState.SYNCED
     assert trusts(world.machine) == {Trust.LIVE}
 
 
 @pytest.mark.parametrize("has_hash", [True, False])
 def test_a_fade_in_the_middle_of_a_fetch(has_hash: bool) -> None:
-    """What came before it may have moved in it: only a hash can tell that it has not."""
+    """What arrived before it may have changed in it: only a hash can show that it has not."""
     vehicle: PX4Vehicle | ArduPilotVehicle = (
         PX4Vehicle(table=TABLE, burst=1, period=0.05)
         if has_hash
@@ -781,7 +781,7 @@ def test_a_fade_in_the_middle_of_a_fetch(has_hash: bool) -> None:
 # the link itself
 
 
-def test_a_link_that_was_away_for_long_is_checked_like_a_loss() -> None:
+def test_a_link_that_was_disconnected_for_long_is_checked_like_a_loss() -> None:
     world, vehicle = fetched()
     vehicle.set_param("P07", 700)
     world.station.pause()
@@ -792,10 +792,10 @@ def test_a_link_that_was_away_for_long_is_checked_like_a_loss() -> None:
     assert trusts(world.machine) == {Trust.CACHED}
     world.run(3.0)
     assert resynced(world) == [("P07",)]
-    assert world.told(ComponentLost, ComponentFound)[-2:] == []
+    assert world.reported(ComponentLost, ComponentFound)[-2:] == []
 
 
-def test_a_link_that_was_away_for_a_moment_is_a_gap() -> None:
+def test_a_link_that_was_disconnected_for_a_moment_is_a_gap() -> None:
     world, vehicle = fetched()
     vehicle.set_param("P07", 700)
     world.station.pause()
@@ -807,7 +807,7 @@ def test_a_link_that_was_away_for_a_moment_is_a_gap() -> None:
     assert resynced(world) == [("P07",)]
 
 
-def test_lost_before_the_link_was_away_and_found_after_it() -> None:
+def test_lost_before_the_link_was_disconnected_and_found_after_it() -> None:
     world, _ = fetched()
     world.away(6.0)
     assert world.machine.presence.is_lost
@@ -816,7 +816,7 @@ def test_lost_before_the_link_was_away_and_found_after_it() -> None:
     world.station.resume(world.now)
     world.sent.clear()
     world.until(lambda: not world.machine.presence.is_lost)
-    (found,) = world.told(ComponentFound)
+    (found,) = world.reported(ComponentFound)
     assert isinstance(found, ComponentFound)
     assert found.silence > 15.0
     world.run(2.0)
@@ -827,7 +827,7 @@ def test_lost_before_the_link_was_away_and_found_after_it() -> None:
 # writes wait for it
 
 
-def test_a_write_waits_until_it_is_known_whom_it_reaches() -> None:
+def test_a_write_waits_for_the_identity_of_the_vehicle() -> None:
     berth = Berth(PX4Vehicle(table=TABLE, uid=1))
     world = World(air=Air.symmetric([berth], delay=0.2))
     world.fetch()
@@ -903,12 +903,12 @@ def test_writes_to_a_camera_wait_for_its_vehicle() -> None:
 # reboots
 
 
-def test_a_reboot_is_told_and_the_table_checked() -> None:
+def test_a_reboot_is_reported_and_the_table_checked() -> None:
     world, vehicle = fetched()
     vehicle.reboot(world.now, down=2.0)
     world.run(3.0)
-    assert world.told(ComponentRebooted) == [ComponentRebooted(world.machine)]
-    assert world.told(ComponentLost) == []
+    assert world.reported(ComponentRebooted) == [ComponentRebooted(world.machine)]
+    assert world.reported(ComponentLost) == []
     world.run(2.0)
     assert resynced(world) == [()]
     assert state(world) is SyncState.SYNCED
@@ -980,7 +980,7 @@ def test_cache_only_sends_nothing() -> None:
     assert state(world) is SyncState.UNSYNCED
     assert machine.state == "cached"
     assert trusts(machine) == {Trust.CACHED}
-    assert world.told(Fetched) == []
+    assert world.reported(Fetched) == []
     vehicle.set_param("P07", 1)  # two changes in a short while, of which one may be an old one
     world.run(0.5)
     vehicle.set_param("P07", 2)
@@ -1013,7 +1013,7 @@ def test_cache_only_gives_what_there_is_of_a_component_that_is_lost() -> None:
     assert len(fetch.result.params) == 42
 
 
-def test_hash_only_asks_for_the_hash_and_nothing_more() -> None:
+def test_hash_only_requests_the_hash_and_nothing_more() -> None:
     memory, vehicle = the_memory()
     world = offline(memory, vehicle, Policy.HASH_ONLY)
     result = world.fetch()
@@ -1033,7 +1033,7 @@ def test_hash_only_says_when_the_hash_is_another_one() -> None:
     memory, vehicle = the_memory()
     world = offline(memory, vehicle, Policy.HASH_ONLY)
     assert world.fetch().hash is not None
-    world.unheard(vehicle, P07=700)
+    world.change_silently(vehicle, P07=700)
     world.run(1.0)
     result = world.fetch()
     assert (result.source, result.hash, result.params["P07"].value) == ("cache", None, 7)
@@ -1046,7 +1046,7 @@ def test_hash_only_says_when_the_hash_is_another_one() -> None:
     world.away(9.0)
     world.run(5.0)
     assert state(world) is SyncState.UNSYNCED
-    assert world.requests() == len(world.hashes()) == 3, "on return the hash is asked for once"
+    assert world.requests() == len(world.hashes()) == 3, "on return the hash is requested once"
 
 
 def test_hash_only_on_return() -> None:
@@ -1084,8 +1084,8 @@ def test_sync_settings_of_interval_and_policy() -> None:
             SyncSettings.chosen(interval, policy)
 
 
-def test_a_table_that_moved_while_it_came_is_fetched_again() -> None:
-    """The hash of its beginning proves the table; what moved after that is fetched then."""
+def test_a_table_that_changed_during_its_download_is_fetched_again() -> None:
+    """The hash of its beginning proves the table; what changed after that is fetched then."""
     names = ["A_LATE", "SWITCH", *list(PLAIN)[:12]]
     rows = [SimParam(name, ParamType.INT32, number) for number, name in enumerate(names)]
     vehicle = PX4Vehicle(table=rows, late_use={"SWITCH": ["A_LATE"]})

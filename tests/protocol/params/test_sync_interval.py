@@ -52,7 +52,7 @@ def watched(
 
 
 def packets(world: World, opcode: Opcode) -> list[tuple[float, Packet]]:
-    """What was asked of the server of files, with the time."""
+    """The requests to the MAVFTP server, with their times."""
     unpacked = [
         (at, Packet.unpack(each.payload)) for at, each in world.sent if isinstance(each, FileTransfer)
     ]
@@ -60,23 +60,23 @@ def packets(world: World, opcode: Opcode) -> list[tuple[float, Packet]]:
 
 
 def openings(world: World) -> list[float]:
-    """When the opening of a file was asked for; it is asked for twice at once."""
+    """When the opening of a file was requested; it is requested twice at once."""
     return list(dict.fromkeys(at for at, _ in packets(world, Opcode.OPEN_FILE_RO)))
 
 
 class Other:
     """Another station at the files of a vehicle. Where it is on another link, it is not heard on ours."""
 
-    def __init__(self, world: World, *, is_heard: bool) -> None:
+    def __init__(self, world: World, *, is_received: bool) -> None:
         self.world = world
-        self.is_heard = is_heard
+        self.is_received = is_received
         self.sequence = 1000
 
     def ask(self, opcode: Opcode, data: bytes = b"", *, size: int = 0) -> None:
         self.sequence += 2
         packet = Packet(self.sequence, 7, opcode, data, size)
         tap = self.world.tap
-        was_mute, tap.is_mute = tap.is_mute, not self.is_heard
+        was_mute, tap.is_mute = tap.is_mute, not self.is_received
         self.world.other_station(FileTransfer(0, 1, 1, packet.pack()))
         self.world.run(0.05)
         tap.is_mute = was_mute
@@ -86,7 +86,7 @@ class Other:
 
 
 class WithoutServer(Tap):
-    """An ArduPilot that says that it serves files, and is silent when it is asked for one."""
+    """An ArduPilot that says that it serves files, and does not respond to requests for one."""
 
     def receive(self, data: bytes, now: float) -> None:
         if not any(frame.message_id == 110 for frame in Framer(DECODED_IDS, stream=False).receive(data)):
@@ -124,7 +124,7 @@ def test_one_file_that_takes_long_does_not_end_the_watch() -> None:
     assert result is not None
     assert result.elapsed > 1.5
     assert state(world) is SyncState.SYNCED
-    world.unheard(vehicle, P07=700)
+    world.change_silently(vehicle, P07=700)
     world.run(INTERVAL + 1.0)
     assert resynced(world) == [("P07",)]
 
@@ -142,7 +142,7 @@ def test_a_slow_link_is_looked_at_less_often_and_not_never(rate: float) -> None:
     assert min(apart[1:]) > 15.0 * last.elapsed > INTERVAL
     assert max(apart[1:]) < 30.0 * last.elapsed
     assert world.sent_of(ParamRequestList) == []
-    world.unheard(vehicle, P07=700)
+    world.change_silently(vehicle, P07=700)
     world.run(1.3 * max(apart))
     assert resynced(world) == [("P07",)]
 
@@ -165,7 +165,7 @@ def test_the_first_of_all_fetches_does_not_settle_how_often_it_is_looked() -> No
     assert len(openings(world)) >= 9
 
 
-def test_a_check_whose_file_does_not_come_downloads_no_list() -> None:
+def test_a_check_whose_file_does_not_arrive_downloads_no_list() -> None:
     world, vehicle = watched(ArduPilotVehicle(table=PLAIN))
     files, vehicle._ftp = vehicle._ftp, None
     world.run(2 * INTERVAL)
@@ -173,7 +173,7 @@ def test_a_check_whose_file_does_not_come_downloads_no_list() -> None:
     assert world.sent_of(ParamRequestList) == []
     assert state(world) is SyncState.SYNCED
     vehicle._ftp = files
-    world.unheard(vehicle, P07=700)
+    world.change_silently(vehicle, P07=700)
     world.run(2 * INTERVAL)
     assert resynced(world) == [("P07",)], "the watch goes on"
 
@@ -185,32 +185,32 @@ def test_a_chosen_interval_lists_where_there_is_no_file_half_of_the_time_at_most
     assert 13 <= len(world.sent_of(ParamRequestList)) <= 16, "the list takes 3.2 s"
 
 
-def test_a_count_that_moves_all_the_time_is_followed_once_a_second() -> None:
+def test_a_count_that_changes_all_the_time_is_followed_once_a_second() -> None:
     world, vehicle = watched(
         ArduPilotVehicle(table={**PLAIN, "X_ENABLE": 0}, groups={"X_ENABLE": {"X_A": 1}})
     )
     for number in range(200):
         vehicle.set_param("X_ENABLE", number % 2)
-        vehicle.set_param("P01", number)  # tells the count
+        vehicle.set_param("P01", number)  # reports the count
         world.run(0.05)
     times = openings(world)
-    assert 5 <= len(times) <= 2 * 10.0 / PAUSE_MIN, "some are read twice, as the count has moved meanwhile"
+    assert 5 <= len(times) <= 2 * 10.0 / PAUSE_MIN, "some are read twice, as the count has changed meanwhile"
 
 
 # other stations' files
 
 
-@pytest.mark.parametrize("is_heard", [True, False], ids=["heard", "on another link"])
+@pytest.mark.parametrize("is_received", [True, False], ids=["heard", "on another link"])
 @pytest.mark.parametrize("sync_settings", [SyncSettings(INTERVAL), SyncSettings(INTERVAL, without_hash=True)])
 def test_while_another_station_has_a_file_open_a_check_skips_its_turn(
-    is_heard: bool, sync_settings: SyncSettings
+    is_received: bool, sync_settings: SyncSettings
 ) -> None:
     world, vehicle = watched(ArduPilotVehicle(table=PLAIN), sync_settings=sync_settings)
-    other = Other(world, is_heard=is_heard)
+    other = Other(world, is_received=is_received)
     world.run(INTERVAL - 20.0)
     other.ask(Opcode.OPEN_FILE_RO, PATH)
     assert vehicle.open_files
-    world.unheard(vehicle, P07=700)
+    world.change_silently(vehicle, P07=700)
     world.sent.clear()
     for _ in range(60):
         other.ask(Opcode.READ_FILE, size=20)
@@ -219,12 +219,12 @@ def test_while_another_station_has_a_file_open_a_check_skips_its_turn(
     closing = (Opcode.RESET_SESSIONS, Opcode.TERMINATE_SESSION)
     assert [packets(world, opcode) for opcode in closing] == [[], []], "which may close what others have open"
     times = openings(world)
-    assert is_heard == (not times)
+    assert is_received == (not times)
     assert len(times) <= 60.0 / FILE_IN_USE_RETRY + 2, "with another number where the first one was in use"
     assert resynced(world) == []
     assert vehicle.open_files == [PATH.decode()]
     other.ask(Opcode.TERMINATE_SESSION)
-    world.run((INTERVAL if is_heard else 2 * FILE_IN_USE_RETRY) + 1.0)
+    world.run((INTERVAL if is_received else 2 * FILE_IN_USE_RETRY) + 1.0)
     assert resynced(world) == [("P07",)]
     world.sent.clear()
     world.run(3 * INTERVAL)
@@ -233,7 +233,7 @@ def test_while_another_station_has_a_file_open_a_check_skips_its_turn(
 
 def test_a_caller_that_joins_a_check_gets_the_list_where_the_file_is_in_use() -> None:
     world, _ = watched(ArduPilotVehicle(table=PLAIN))
-    other = Other(world, is_heard=False)
+    other = Other(world, is_received=False)
     other.ask(Opcode.OPEN_FILE_RO, PATH)
     machine = world.machine
     check = machine.begin_fetch(world.now, refresh=True, check=Check(may_list=False))
@@ -250,7 +250,7 @@ def test_start_values_are_read_singly_while_another_station_has_a_file_open() ->
     world, vehicle = watched(ArduPilotVehicle())
     vehicle.reboot(world.now, down=0.5)
     world.run(3.0)
-    other = Other(world, is_heard=True)
+    other = Other(world, is_received=True)
     other.ask(Opcode.OPEN_FILE_RO, PATH)
     world.sent.clear()
     for _ in range(6):
@@ -300,7 +300,7 @@ def test_a_chosen_interval_is_stretched_less() -> None:
     assert pace.interval(may_use_file=False) == 6.5
 
 
-def test_the_hash_is_asked_for_so_early_that_a_fetch_ends_within_the_interval() -> None:
+def test_the_hash_is_requested_so_early_that_a_fetch_ends_within_the_interval() -> None:
     pace = SyncInterval(30.0, is_chosen=False)
     assert pace.hash_interval == 28.5
     for _ in range(3):
@@ -361,7 +361,7 @@ def wrong(world: World, vehicle: PX4Vehicle | ArduPilotVehicle) -> int:
 
 @pytest.mark.parametrize("pause", [0.0002, 0.001, 0.002, 0.005])
 def test_values_set_by_another_station_at_full_speed_are_corrected_after_the_last_one(pause: float) -> None:
-    """On a link of its own: ours is told of a part only."""
+    """On a link of its own: ours receives a part only."""
     world, vehicle = quad()
     rows = [row for row in px4_table() if row.type is ParamType.REAL32 and not row.volatile]
     random.Random(1).shuffle(rows)
@@ -369,7 +369,7 @@ def test_values_set_by_another_station_at_full_speed_are_corrected_after_the_las
         world.run(pause)
         vehicle.set_param(row.name, float(row.value) + 1.0)
     world.run(FOREIGN_SETTLING_TIME - 0.1)
-    assert wrong(world, vehicle) > 5, "PX4 does not tell all"
+    assert wrong(world, vehicle) > 5, "PX4 does not report all changes"
     world.run(1.6)
     assert wrong(world, vehicle) == 0
     assert state(world) is SyncState.SYNCED
@@ -436,7 +436,7 @@ def test_a_storage_reset_by_another_station_is_found_within_one_interval() -> No
 
 def test_volatile_values_are_read_again_in_each_interval() -> None:
     world, vehicle = fetched()
-    world.unheard(vehicle, COM_FLIGHT_UUID=8)
+    world.change_silently(vehicle, COM_FLIGHT_UUID=8)
     world.run(INTERVAL)
     assert world.machine.table.params["COM_FLIGHT_UUID"].value == 8
     assert resynced(world) == []
@@ -489,7 +489,7 @@ def test_the_volatile_values_of_one_vehicle_keep_no_other_from_its_check() -> No
 @pytest.mark.parametrize(
     "sync_settings", [SyncSettings(), replace(SyncSettings(INTERVAL), interval=math.inf)]
 )
-def test_without_a_watch_nothing_is_asked_after_foreign_values(sync_settings: SyncSettings) -> None:
+def test_without_a_watch_nothing_is_requested_after_foreign_values(sync_settings: SyncSettings) -> None:
     world, vehicle = fetched(sync_settings=sync_settings)
     world.run(2.0)
     vehicle.set_param("P07", 700)
@@ -497,7 +497,7 @@ def test_without_a_watch_nothing_is_asked_after_foreign_values(sync_settings: Sy
     assert world.requests() == 0
 
 
-def test_nothing_is_asked_after_foreign_values_in_high_latency_mode() -> None:
+def test_nothing_is_requested_after_foreign_values_in_high_latency_mode() -> None:
     world, vehicle = fetched()
     world.run(2.0)
     vehicle.set_param("P07", 700)

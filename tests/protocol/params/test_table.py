@@ -69,7 +69,7 @@ def test_a_change_of_type_is_a_change() -> None:
     assert table.params["A"].value == 0
 
 
-def test_another_encoding_goes_by_the_type_that_came_last() -> None:
+def test_another_encoding_uses_the_type_received_last() -> None:
     table = Table()
     table.store_value(param_value("A", 5.0, index=0), "vehicle")
     raw = param_value("A", 5.0, index=0).raw
@@ -148,7 +148,7 @@ def test_a_type_that_mavlink_does_not_define_is_kept() -> None:
 # what the cache knows
 
 
-def test_the_cache_fills_in_what_was_not_heard() -> None:
+def test_the_cache_fills_in_what_was_not_received() -> None:
     table = Table()
     table.store_value(param_value("A", 9.0, index=0), "vehicle")
     changes = table.fill({"A": known("A", 1.0), "B": known("B", 2.0, index=1)})
@@ -158,7 +158,7 @@ def test_the_cache_fills_in_what_was_not_heard() -> None:
     assert "B" not in table.take_dirty()
 
 
-def test_a_cached_value_that_is_heard_becomes_live() -> None:
+def test_a_cached_value_that_is_received_becomes_live() -> None:
     table = Table()
     table.fill({"A": known("A", 1.0, index=4)})
     assert table.store_value(param_value("A", 1.0, index=4), "vehicle") is None
@@ -214,7 +214,7 @@ def hashed(*, proven: bool) -> Table:
     return table
 
 
-def test_a_hash_moves_with_the_values_once_it_is_known_what_it_covers() -> None:
+def test_a_hash_follows_the_values_once_it_is_known_what_it_covers() -> None:
     table = hashed(proven=True)
     before = table.hash
     table.store_value(param_value("A", 2.0, index=0), "us")
@@ -240,7 +240,7 @@ def test_a_volatile_value_does_not_change_the_hash() -> None:
     assert table.hash == before
 
 
-def test_a_parameter_that_goes_away_moves_it() -> None:
+def test_a_removed_parameter_changes_the_hash() -> None:
     table = hashed(proven=True)
     table.remove(lambda param: param.name == "A")
     assert table.hash == hash_params(listed(table), leave_out="V")
@@ -322,12 +322,12 @@ def test_file_entries_are_independent_of_the_encoding(first: Encoding) -> None:
     changes = table.use_encoding(second)
     assert {change.name for change in changes} == {"C"}
     assert [table.params[name].value for name in "ABC"] == [BIG, 5, 6]
-    heard = ParamValue("A", as_sent(BIG, ParamType.INT32, second), ParamType.INT32, 3, 0)
-    assert table.store_value(heard, "vehicle") is None
+    received = ParamValue("A", as_sent(BIG, ParamType.INT32, second), ParamType.INT32, 3, 0)
+    assert table.store_value(received, "vehicle") is None
     assert table.params["A"].value == BIG
 
 
-def test_the_cache_adds_what_a_message_that_came_before_it_did_not_say() -> None:
+def test_the_cache_adds_what_an_earlier_message_lacks() -> None:
     cached = {
         "A": Param("A", BIG, ParamType.INT32, 0, BIG, Trust.CACHED, 7),
         "B": Param("B", 5, ParamType.INT32, 1, 5, Trust.CACHED, 5),
@@ -365,7 +365,7 @@ def test_a_value_received_during_the_file_download_wins() -> None:
     assert table.params["B"].value == BIG, "the message may have rounded it"
 
 
-def test_a_file_moves_the_hash() -> None:
+def test_a_file_updates_the_hash() -> None:
     table = Table()
     table.store_file_entry("A", ParamType.INT32, 1, 0, None, is_older=False)
     table.confirm(5, frozenset(), proven=False)
@@ -397,8 +397,8 @@ def rows_of(table: Table) -> dict[str, int | None]:
     """The defaults that the cache makes of all that it is given of a table."""
     overwritten = [StoredParam(each.param, 1.0, by=each.by) for each in table.overwritten]
     times = UnixTimes(1.0)
-    heard = ObservedParams(table.params.copy(), times, volatile=None, by={}, overwritten=overwritten)
-    return {f"{item.name} {item.type}": item.default_bits for item in heard}
+    received = ObservedParams(table.params.copy(), times, volatile=None, by={}, overwritten=overwritten)
+    return {f"{item.name} {item.type}": item.default_bits for item in received}
 
 
 def test_an_overwritten_value_keeps_the_default_of_its_type() -> None:
@@ -419,7 +419,7 @@ def test_an_overwritten_value_keeps_the_default_of_its_type() -> None:
     assert rows_of(table) == {"A 9": HALF, "A 2": None}
 
 
-def test_an_older_file_tells_no_default_of_another_type() -> None:
+def test_a_default_of_an_older_file_with_another_type_is_ignored() -> None:
     table = Table()
     table.store_value(param_value("A", 5, index=0, kind=ParamType.INT8), "vehicle")
     assert table.store_file_entry("A", ParamType.REAL32, HALF, 3, HALF, is_older=True) is None

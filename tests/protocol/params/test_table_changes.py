@@ -1,4 +1,5 @@
-"""Parameters that come and go on a vehicle while its table is in sync: what is told of them, and how soon."""
+"""Parameters that appear and disappear on a vehicle while its table is in sync: which events report them, and
+how soon."""
 
 from __future__ import annotations
 
@@ -56,12 +57,12 @@ def in_sync(
 
 
 def changes(world: World, kind: type[Change]) -> list[Change]:
-    told = [event.change for event in world.events if isinstance(event, ParamChanged)]
-    return [change for change in told if type(change) is kind]
+    reported = [event.change for event in world.events if isinstance(event, ParamChanged)]
+    return [change for change in reported if type(change) is kind]
 
 
 @pytest.mark.parametrize("ftp", [True, False], ids=["file", "list"])
-def test_a_group_that_is_switched_on_and_off_is_told_within_a_second(ftp: bool) -> None:
+def test_a_group_that_is_switched_on_and_off_is_reported_within_a_second(ftp: bool) -> None:
     world = in_sync(board := vehicle(ftp=ftp))
     began = world.now
     assert world.set("GRIP_ENABLE", 1).actual == 1
@@ -107,7 +108,7 @@ def test_a_parameter_that_has_just_appeared_is_set_at_once() -> None:
     assert sorted(each.name for each in changes(world, Added)) == sorted(GROUP)
 
 
-def test_a_list_after_a_changed_count_that_does_not_come_is_requested_again() -> None:
+def test_a_list_after_a_changed_count_that_does_not_arrive_is_requested_again() -> None:
     world = in_sync(board := vehicle(ftp=False))
     world.tap.is_deaf = True
     board.set_param("GRIP_ENABLE", 1)
@@ -138,7 +139,7 @@ def test_a_slow_list_is_requested_half_of_the_time_at_most() -> None:
     assert 5 <= len(world.sent_of(ParamRequestList)) <= 17, "the list takes 3.3 s"
 
 
-def test_a_kind_of_change_is_told_by_its_class() -> None:
+def test_a_kind_of_change_is_recognized_by_its_class() -> None:
     world = in_sync(board := vehicle())
     board.set_param("GRIP_ENABLE", 1)
     world.until(lambda: bool(changes(world, Added)))
@@ -236,14 +237,14 @@ def test_values_that_stay_keep_their_moment() -> None:
     assert downloads(world) == 0
 
 
-def test_the_changes_of_followed_reads_are_told_once() -> None:
+def test_the_changes_of_followed_reads_are_reported_once() -> None:
     world = in_sync(board := slow())
     world.set("GRIP_ENABLE", 1)
     followed(world, board)
-    assert [event.changed for event in world.told(TableResynced) if isinstance(event, TableResynced)] == [
+    assert [event.changed for event in world.reported(TableResynced) if isinstance(event, TableResynced)] == [
         ("GRIP_ENABLE", *GROUP)
     ]
-    assert world.told(Fetched) == []
+    assert world.reported(Fetched) == []
     dirty = world.machine.table.take_dirty()
     assert dirty.keys() >= {*GROUP, *(name for name in LARGE if name.startswith("Z"))}, "for the cache"
 
@@ -274,7 +275,7 @@ def test_two_switches_in_a_row_are_followed_together() -> None:
     assert downloads(world) == 0
 
 
-def test_a_count_that_moves_again_during_the_reads_begins_them_anew() -> None:
+def test_a_count_that_changes_again_during_the_reads_begins_them_anew() -> None:
     world = in_sync(board := slow(groups=NESTED))
     world.set("GRIP_ENABLE", 1)
     world.run(0.15)
@@ -287,7 +288,7 @@ def test_a_count_that_moves_again_during_the_reads_begins_them_anew() -> None:
     assert downloads(world) == 0
 
 
-def test_a_group_that_comes_and_goes_at_once_is_fetched() -> None:
+def test_a_group_that_appears_and_disappears_at_once_is_fetched() -> None:
     world = in_sync(board := slow(groups=NESTED))
     world.set("GRIP_ENABLE", 1)
     world.run(0.15)
@@ -404,10 +405,10 @@ def test_a_large_group_is_fetched_at_once() -> None:
     assert len(world.sent_of(ParamRequestRead)) <= 1
 
 
-def test_a_switch_that_others_set_unheard_is_found_by_the_next_value() -> None:
+def test_a_switch_that_others_set_without_a_message_is_found_by_the_next_value() -> None:
     board = real_size(ftp=False)
     world = in_sync(board)
-    world.unheard(board, GRIP_ENABLE=1)
+    world.change_silently(board, GRIP_ENABLE=1)
     world.sent.clear()
     board.set_param("RTL_ALT", 1600)
     followed(world, board)

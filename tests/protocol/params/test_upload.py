@@ -209,7 +209,7 @@ def test_values_go_by_param_set_while_another_station_has_a_file_open() -> None:
     assert ground.requests("PARAM_SET") == COUNT
 
 
-def test_a_vehicle_that_refuses_an_upload_is_not_asked_again() -> None:
+def test_an_upload_that_the_vehicle_refuses_is_not_repeated() -> None:
     ground = Ground(vehicle())
     server = ground.vehicle._ftp
     assert server is not None
@@ -247,7 +247,7 @@ def test_a_cancelled_call_leaves_all_values_or_none_and_no_open_session(moment: 
 
 
 @pytest.mark.parametrize("moment", [0.06, 0.2, 0.33])
-def test_the_timeout_of_a_call_tells_what_may_have_been_set(moment: float) -> None:
+def test_the_timeout_of_a_call_names_what_may_have_been_set(moment: float) -> None:
     ground = Ground(vehicle(), delay=0.05)
     batch = ground.begin(WANTED)
     ground.run(moment)
@@ -352,7 +352,7 @@ def test_the_quicker_way_is_taken(values: int, options: dict[str, float], by_fil
 
 
 def test_a_link_that_is_not_measured_is_left_to_param_set() -> None:
-    """The file was too short to tell the rate of the link."""
+    """The file was too short to show the rate of the link."""
     ground = Ground(ArduPilotVehicle(table=dict(list(VALUES.items())[:40])), way=WriteWay.QUICKEST, delay=0.3)
     ground.write(dict(list(WANTED.items())[:40]))
     assert ground.requests("PARAM_SET") == 40

@@ -43,7 +43,7 @@ def are_done(operations: Sequence[Read] | Sequence[Write]) -> bool:
 
 
 class Desk:
-    """An ArduPilot 1/1 with A = 1 and B = 1, heard long ago, and all that is sent to it."""
+    """An ArduPilot 1/1 with A = 1 and B = 1, received long ago, and all that is sent to it."""
 
     def __init__(
         self, autopilot: int = MAV_AUTOPILOT_ARDUPILOTMEGA, sync_settings: SyncSettings | None = None
@@ -139,7 +139,7 @@ def test_the_new_value_ends_a_read_that_was_to_be_sent_again() -> None:
     assert read.done
 
 
-def test_another_value_is_news_at_once() -> None:
+def test_another_value_counts_at_once() -> None:
     desk = Desk()
     desk.set(2.0)
     desk.hear("A", 3.0)
@@ -202,7 +202,7 @@ def test_px4_has_no_old_values_on_the_way() -> None:
     assert desk.values == [2.0, 1.0]
 
 
-def test_where_nothing_may_be_asked_the_value_is_no_longer_live() -> None:
+def test_where_nothing_may_be_requested_the_value_is_no_longer_live() -> None:
     desk = Desk(
         sync_settings=SyncSettings(
             listens_only=True, policy=SyncSettings.chosen(None, "auto", listen_only=True).policy
@@ -261,9 +261,9 @@ def test_remembered_replaced_values_are_bounded() -> None:
         name = f"P{number}"
         checks.replaced(name, ParamType.REAL32, bytes(4), param_value(name, 1.0), 0.0, -1.0)
     message = param_value("P0", 0.0)
-    assert checks.ambiguous_until(message, 0.1, is_wanted=False) < 0.0
+    assert checks.ambiguous_until(message, 0.1, is_requested=False) < 0.0
     message = param_value(name, 0.0)
-    assert checks.ambiguous_until(message, 0.1, is_wanted=False) == pytest.approx(AMBIGUITY_WINDOW)
+    assert checks.ambiguous_until(message, 0.1, is_requested=False) == pytest.approx(AMBIGUITY_WINDOW)
     checks.forget(AMBIGUITY_WINDOW)
     assert not checks
 
@@ -302,9 +302,9 @@ def test_a_simulated_ardupilot_takes_the_value_of_a_read_when_it_is_queued() -> 
     session.run(1.0)
     name = NAMES[0]
     first = session.get(name).value
-    heard: list[tuple[float, object]] = []
+    received: list[tuple[float, object]] = []
     receive = machine.table.hear_index
-    machine.table.hear_index = lambda message: (heard.append((session.now, message)), receive(message))[1]  # type: ignore[method-assign, func-returns-value]  # to see what is not believed
+    machine.table.hear_index = lambda message: (received.append((session.now, message)), receive(message))[1]  # type: ignore[method-assign, func-returns-value]  # to see what is not believed
     read = machine.read(name, session.now)
     session.run(0.001)
     acknowledged = session.set(name, 0.2)
@@ -312,8 +312,8 @@ def test_a_simulated_ardupilot_takes_the_value_of_a_read_when_it_is_queued() -> 
     assert read.done
     session.run(BATCH_INTERVAL)
     assert acknowledged.actual == pytest.approx(0.2)
-    assert len(heard) == 1
-    assert 0.0 < heard[0][0] - at <= BATCH_INTERVAL
+    assert len(received) == 1
+    assert 0.0 < received[0][0] - at <= BATCH_INTERVAL
     assert first != acknowledged.actual
 
 
@@ -321,7 +321,7 @@ def test_a_simulated_ardupilot_takes_the_value_of_a_read_when_it_is_queued() -> 
 
 
 @pytest.mark.parametrize("fetched", [True, False], ids=["whole", "unfetched"])
-def test_a_change_after_the_acknowledgement_is_found_although_nothing_tells_of_it(fetched: bool) -> None:
+def test_an_unreported_change_after_the_acknowledgement_is_found(fetched: bool) -> None:
     vehicle = PX4Vehicle()
     sync_settings = SyncSettings.chosen(None, "auto")
     station = Station(link="sim:test", is_stream=False, sync_settings=sync_settings)

@@ -43,7 +43,7 @@ def test_the_note_on_a_change_that_px4_does_not_save(before: Param, after: Param
 
 
 @pytest.mark.parametrize("vehicle", [PX4Vehicle, ArduPilotVehicle])
-def test_a_set_tells_it_of_px4_alone(vehicle: type[PX4Vehicle] | type[ArduPilotVehicle]) -> None:
+def test_a_set_resolves_the_type_of_px4_alone(vehicle: type[PX4Vehicle] | type[ArduPilotVehicle]) -> None:
     simulation = Simulation(vehicle(table={"A": 0.5}))
     done = simulation.set("A", SMALL)
     assert done.status == "accepted"

@@ -62,7 +62,7 @@ class Desk:
         self.reads.receive(message, self.now)
 
     def knows(self, name: str, value: WireValue, kind: int = ParamType.REAL32) -> None:
-        """Let a value have been heard before."""
+        """Receive a value first."""
         self.hear(name, value, kind)
 
     def pass_time(self, seconds: float = math.inf) -> None:
@@ -76,7 +76,7 @@ class Desk:
             self.now = max(deadline, self.now)
             self.reads.tick(self.now)
             self.writes.tick(self.now)
-        raise AssertionError("it does not come to an end")
+        raise AssertionError("it does not end")
 
     def take(self) -> list[str]:
         """What was sent, in short: `set NAME value TYPE`, `read NAME`, `read index`."""
@@ -129,11 +129,11 @@ def test_each_write_to_one_name_has_its_own_author() -> None:
     desk = Desk()
     desk.knows("A", 1.0)
     writes = [desk.set("A", 2.0, "first"), desk.set("A", 3.0), desk.set("A", 4.0, "third")]
-    told = []
+    reported = []
     for value in (2.0, 3.0, 4.0):
-        told.append(desk.writes.author("A"))
+        reported.append(desk.writes.author("A"))
         desk.hear("A", value)
-    assert told == ["us for first", "us", "us for third"]
+    assert reported == ["us for first", "us", "us for third"]
     assert all(write.done and write.error is None for write in writes)
     assert desk.writes.author("A") is None
 
@@ -157,7 +157,7 @@ def test_held_writes_are_reported_until_they_begin(is_known: bool) -> None:
         desk.knows("A", 1.0)
         desk.may_be_written = False
         desk.set("A", 2.5)
-    else:  # it becomes uncertain while the type is asked for
+    else:  # it becomes uncertain while the type is requested
         desk.set("A", 2.5)
         assert desk.take() == ["read A"]
         desk.may_be_written = False
@@ -170,7 +170,7 @@ def test_held_writes_are_reported_until_they_begin(is_known: bool) -> None:
     assert not desk.writes.is_awaiting_permission
 
 
-def test_a_value_that_comes_while_nothing_may_be_sent_again_leaves_the_time_outs_as_they_are() -> None:
+def test_a_value_that_arrives_while_nothing_may_be_sent_again_leaves_the_time_outs_as_they_are() -> None:
     desk = Desk()
     desk.knows("A", 1.0)
     write = desk.set("A", 2.5)
@@ -299,7 +299,7 @@ def test_a_stale_answer_to_an_earlier_read_proves_nothing() -> None:
     desk.knows("A", 1.0)
     read = desk.reads.ask("A", desk.now)
     write = desk.set("A", 2.0)
-    desk.hear("A", 1.0, at=0.1)  # sent before the write had come
+    desk.hear("A", 1.0, at=0.1)  # sent before the write had arrived
     assert read.done
     assert not write.done
     desk.hear("A", 2.0, at=0.15)
@@ -310,7 +310,7 @@ def test_a_lost_write_is_seen_by_a_read_and_sent_again() -> None:
     desk = Desk()
     desk.knows("A", 1.0)
     write = desk.set("A", 2.0)
-    desk.hear("A", 1.0, at=0.1)  # something asked for by others
+    desk.hear("A", 1.0, at=0.1)  # requested by another station
     desk.pass_time(0.6)
     assert desk.take() == ["set A 2.0 REAL32", "read A"]
     desk.hear("A", 1.0)
@@ -329,7 +329,7 @@ def test_a_write_without_an_answer_is_sent_again_after_the_time_out() -> None:
     assert desk.take() == ["set A 2.0 REAL32"] * 3 + ["read A"]
 
 
-def test_the_read_that_decides_may_bring_the_wanted_value() -> None:
+def test_the_read_that_decides_may_bring_the_requested_value() -> None:
     desk = Desk()
     desk.knows("A", 1.0)
     write = desk.set("A", 2.0)
@@ -340,7 +340,7 @@ def test_the_read_that_decides_may_bring_the_wanted_value() -> None:
     assert len(desk.reads) == 0
 
 
-def test_the_answer_to_that_read_does_not_tell_how_long_the_write_took() -> None:
+def test_the_response_to_that_read_is_no_round_trip_sample_of_the_write() -> None:
     desk = Desk()
     desk.knows("A", 1.0)
     write = desk.set("A", 2.0)
@@ -646,9 +646,9 @@ def test_cancelling_one_that_waits() -> None:
     assert len(desk.writes) == 0
 
 
-def test_a_cancelled_write_is_not_sent_when_the_type_comes() -> None:
+def test_a_cancelled_write_is_not_sent_when_the_type_arrives() -> None:
     desk = Desk()
-    read = desk.reads.ask("A", desk.now)  # somebody else wants the value
+    read = desk.reads.ask("A", desk.now)  # another caller requests the value
     write = desk.set("A", 1.0)
     desk.writes.cancel(write, desk.now)
     desk.hear("A", 0.0)
@@ -663,7 +663,7 @@ def test_cancelling_gives_the_read_back() -> None:
     assert len(desk.reads) == 0
 
 
-# the link goes and comes
+# the link is lost and reconnected
 
 
 def test_when_the_link_is_back_writes_are_sent_again() -> None:
@@ -840,7 +840,7 @@ def test_a_watch_that_cannot_be_ended_says_that_the_value_was_acknowledged() -> 
     desk.pass_time()
     assert isinstance(unanswered.error, NoReply)
     assert "acknowledged" in str(unanswered.error)
-    assert left == []  # nobody has to guess who changes the value now
+    assert left == []  # the author of later changes is certain
 
 
 # NaN and infinity

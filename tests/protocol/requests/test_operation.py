@@ -10,22 +10,22 @@ from paramclient.protocol.requests.operation import Operation
 
 def test_an_operation_ends_with_a_result() -> None:
     operation = Operation[int](1.0)
-    told: list[str] = []
-    operation.on_done += [lambda: told.append("first"), lambda: told.append("second")]
+    reported: list[str] = []
+    operation.on_done += [lambda: reported.append("first"), lambda: reported.append("second")]
     assert (operation.begun_at, operation.ended_at, operation.done) == (1.0, math.inf, False)
     operation.finish(5, 2.0)
     assert (operation.done, operation.result, operation.error, operation.ended_at) == (True, 5, None, 2.0)
-    assert told == ["first", "second"]
+    assert reported == ["first", "second"]
 
 
 def test_the_first_end_counts() -> None:
     error = NoReply("x", attempts=1, waited=1.0)
     operation = Operation[int](1.0)
-    told: list[bool] = []
-    operation.on_done.append(lambda: told.append(operation.done))
+    reported: list[bool] = []
+    operation.on_done.append(lambda: reported.append(operation.done))
     operation.on_done.append(lambda: operation.finish(7, 3.0))
     operation.fail(error, 2.0)
     operation.fail(NoReply("y", attempts=1, waited=1.0), 4.0)
     operation.finish(5, 4.0)
     assert (operation.result, operation.error, operation.ended_at) == (None, error, 2.0)
-    assert told == [True]
+    assert reported == [True]

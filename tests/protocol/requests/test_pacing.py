@@ -1,4 +1,4 @@
-"""How fast a component may be asked."""
+"""The rate of requests to a component."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ def burst(pace: Pace, now: float) -> int:
 
 
 def serve(pace: Pace, seconds: float, delay: float, *, rate: float = 1e9, since: float = 0.0) -> float:
-    """Ask as fast as allowed; answers come after `delay`, at `rate` at the most. Gives the end."""
+    """Ask as fast as allowed; answers arrive after `delay`, at `rate` at the most. Gives the end."""
     now = since
     answers: list[tuple[float, float]] = []
     free_at = since
     while now < since + seconds:
-        for at, asked_at in [answer for answer in answers if answer[0] <= now]:
-            answers.remove((at, asked_at))
-            pace.answered(now - asked_at, now)
+        for at, requested_at in [answer for answer in answers if answer[0] <= now]:
+            answers.remove((at, requested_at))
+            pace.answered(now - requested_at, now)
         while pace.may_send(now):
             pace.sent(now)
             free_at = max(free_at, now) + 1 / rate
@@ -117,7 +117,7 @@ def test_a_little_too_few_answers_count_when_they_are_late_as_well(late: float, 
     now = 0.0
     for _ in range(8):
         burst(pace, now)
-        now += 0.028  # 36 a second: 7 of 10 asked for
+        now += 0.028  # 36 a second: 7 of 10 requested
         pace.answered(0.1 * late, now)
     assert (pace.rate > FIRST_RATE) is is_believed
 
@@ -132,7 +132,7 @@ def test_without_requests_that_wait_nothing_is_concluded() -> None:
     assert pace.rate == FIRST_RATE
 
 
-def test_an_answer_to_what_was_asked_for_twice_tells_no_delay() -> None:
+def test_a_response_to_a_repeated_request_is_no_delay_sample() -> None:
     pace = Pace(RoundTrip())
     now = 0.0
     for _ in range(200):
@@ -155,7 +155,7 @@ def test_the_rate_is_a_share_of_the_list_rate() -> None:
 
 
 @pytest.mark.parametrize("gap", [0.125, 0.2, 1.0, 60.0])
-def test_something_may_always_be_asked_even_on_the_slowest_link(gap: float) -> None:
+def test_a_request_is_always_allowed_even_on_the_slowest_link(gap: float) -> None:
     pace = Pace(RoundTrip())
     burst(pace, 0.0)
     pace.stream_seen(gap)
@@ -194,7 +194,7 @@ def test_answers_that_were_not_counted_slow_nothing_down() -> None:
     pace = Pace(RoundTrip())
     now = serve(pace, 0.5, 0.02)
     before = pace.rate
-    while now < 3.0:  # a list answers, and what is asked for meanwhile is not counted
+    while now < 3.0:  # a list answers, and what is requested meanwhile is not counted
         while pace.may_send(now):
             pace.sent(now)
         now += 0.01
@@ -216,7 +216,7 @@ def test_components_share_what_reads_may_take_of_the_link() -> None:
     assert one.rate == pytest.approx(total)
 
 
-def test_lists_that_run_beside_each_other_show_the_link_by_what_came_of_them() -> None:
+def test_parallel_lists_show_the_rate_of_the_link_by_received_values() -> None:
     share = LinkBandwidth()
     one, two = Pace(RoundTrip(), share), Pace(RoundTrip(), share)
     one.stream_seen(0.1, 0.5)
@@ -231,7 +231,7 @@ def test_lists_that_run_beside_each_other_show_the_link_by_what_came_of_them() -
     two.stream_ended()
     assert one.rate == pytest.approx(37 * 15 * UPSTREAM_SHARE / 16), "that still holds"
     one.stream_seen(0.2)
-    assert one.rate < 37 * 10 * UPSTREAM_SHARE / 16, "until one of them comes anew"
+    assert one.rate < 37 * 10 * UPSTREAM_SHARE / 16, "until one of them is received again"
 
 
 def test_a_stream_of_bursts_shows_a_faster_link() -> None:

@@ -48,7 +48,7 @@ def test_samples_are_smoothed() -> None:
     assert policy.round_trip.variation == pytest.approx(0.25 + (0.8 - 0.25) / 4)
 
 
-def test_a_steady_link_is_not_asked_sooner_than_a_vehicle_answers() -> None:
+def test_on_a_steady_link_no_request_is_repeated_before_a_vehicle_responds() -> None:
     assert measured(0.001, 100).timeout == TIMEOUT_MIN
     steady = measured(0.3, 100)
     assert 0.3 < steady.timeout < 0.35
@@ -168,10 +168,10 @@ def test_enough_is_enough() -> None:
     for _ in range(50):
         policy.timed_out(1)
     assert policy.tries > ATTEMPTS_MIN
-    assert not policy.should_give_up(ATTEMPTS_MIN, 1e9)  # nobody keeps its `received_at`
+    assert not policy.should_give_up(ATTEMPTS_MIN, 1e9)  # nothing updates its `received_at`
 
 
-def test_a_component_that_is_gone_is_not_asked_for_ever() -> None:
+def test_requests_to_a_lost_component_end() -> None:
     policy = RetryPolicy()
     for _ in range(50):
         policy.timed_out(1)
@@ -181,7 +181,7 @@ def test_a_component_that_is_gone_is_not_asked_for_ever() -> None:
     assert not policy.should_give_up(ATTEMPTS_MIN - 1, 100.0 + SILENCE_MAX)
 
 
-def test_an_answer_to_what_was_sent_at_no_known_time_tells_nothing_of_the_round_trip() -> None:
+def test_a_response_to_a_request_of_unknown_time_is_no_round_trip_sample() -> None:
     """One such number would make every time-out none."""
     for known in (False, True):
         policy = RetryPolicy()

@@ -83,7 +83,7 @@ def test_a_frame_is_seen_with_all_that_counts() -> None:
     assert (seen.version, seen.size, seen.is_signed, seen.is_known) == (2, 53, True, True)
 
 
-def test_names_and_words_come_from_the_dialect() -> None:
+def test_names_and_words_are_those_of_the_dialect() -> None:
     assert wire.message_name(0) == "HEARTBEAT"
     assert wire.message_name(UNKNOWN) == f"UNKNOWN_{UNKNOWN}"
     assert wire.enum_word("MAV_TYPE", 1) == "fixed wing"
@@ -166,27 +166,27 @@ def check_of(sequence: Iterable[int], *, period: float = 0.02) -> SequenceCheck:
 
 @given(st.integers(0, 255), st.lists(st.booleans(), max_size=1500))
 def test_any_loss_of_few_in_a_row_is_counted_exactly(start: int, arrives: list[bool]) -> None:
-    heard = [start]
+    received = [start]
     lost = run = 0
-    for offset, came in enumerate(arrives, start=1):
-        if came or run == CERTAIN_GAP:
-            heard.append(start + offset)
+    for offset, has_arrived in enumerate(arrives, start=1):
+        if has_arrived or run == CERTAIN_GAP:
+            received.append(start + offset)
             lost += run
             run = 0
         else:
             run += 1
-    check = check_of(heard)
+    check = check_of(received)
     assert (check.lost, check.repeated, check.late) == (lost, 0, 0)
 
 
 @given(st.integers(0, 255), st.lists(st.tuples(st.integers(0, GAP_MAX), st.integers(0, 300)), max_size=8))
 def test_a_long_gap_is_counted_exactly(start: int, gaps: list[tuple[int, int]]) -> None:
     number = start
-    heard = [number]
+    received = [number]
     for gap, run in gaps:
-        heard += range(number + gap + 1, number + gap + 1 + NUMBERING_CONFIRMATION_FRAMES + 1 + run)
-        number = heard[-1]
-    check = check_of(heard)
+        received += range(number + gap + 1, number + gap + 1 + NUMBERING_CONFIRMATION_FRAMES + 1 + run)
+        number = received[-1]
+    check = check_of(received)
     assert (check.lost, check.repeated, check.late) == (sum(gap for gap, _ in gaps), 0, 0)
 
 
@@ -225,7 +225,7 @@ def test_a_sender_that_starts_anew_has_lost_nothing(before: int, first: int, aft
 
 
 @given(st.integers(0, 2000), st.integers(0, 255), st.integers(1, 600))
-def test_after_a_silence_a_jump_tells_of_nothing(before: int, first: int, after: int) -> None:
+def test_after_a_silence_a_jump_of_sequence_numbers_is_no_loss(before: int, first: int, after: int) -> None:
     check = check_of(range(before + 1))
     now = before * 0.02 + NUMBERING_TIMEOUT + 0.1
     for count in range(after):
@@ -265,19 +265,19 @@ def test_two_numberings_side_by_side_have_lost_nothing(first: int, second: int, 
         < 256 - REORDER_DEPTH - NUMBERING_CONFIRMATION_FRAMES
     ):
         at = [first, second]
-        heard = [first, second]
+        received = [first, second]
         for turn in [False, True, *turns]:
             at[turn] += 1
-            heard.append(at[turn])
+            received.append(at[turn])
         check = SequenceCheck()
-        for number in heard:
+        for number in received:
             check.receive(number % 256, 0.0)
         assert check.lost == 0
 
 
 def test_losses_are_counted_in_each_of_two_numberings() -> None:
-    heard = [number for each in range(200) for number in (each, each + 120) if number not in (50, 51, 190)]
-    assert check_of(heard).lost == 4  # 190 comes in both
+    received = [number for each in range(200) for number in (each, each + 120) if number not in (50, 51, 190)]
+    assert check_of(received).lost == 4  # 190 is in both
 
 
 def test_many_numberings_are_forgotten_again() -> None:
@@ -349,14 +349,14 @@ def test_repeated_frames_do_not_hide_losses() -> None:
     assert component.loss == pytest.approx(0.5, abs=0.01)
 
 
-def test_a_frame_that_comes_late_makes_no_loss_negative() -> None:
+def test_a_frame_that_is_late_makes_no_loss_negative() -> None:
     traffic = Traffic(is_stream=False)
     for sequence, now in ((0, 0.0), (2, 0.1), (1, 4 * RATE_WINDOW), (3, 4 * RATE_WINDOW)):
         traffic.receive(frame(30, sequence), "peer", now)
     assert only(traffic.report(4 * RATE_WINDOW)).loss == 0.0
 
 
-def test_a_heartbeat_in_a_format_to_come_is_not_read() -> None:
+def test_a_heartbeat_in_a_future_format_is_not_read() -> None:
     traffic = Traffic(is_stream=False)
     traffic.receive(heartbeat(0), "peer", 0.0)
     strange = bytearray(heartbeat(1) + bytes(13))
@@ -394,7 +394,7 @@ def test_a_vehicle_that_is_heard_over_two_links_counts_for_each() -> None:
     assert (component.frames, component.lost, component.repeated, component.late) == (200, 0, 0, 0)
 
 
-def test_a_radio_tells_of_itself() -> None:
+def test_a_radio_reports_its_status() -> None:
     traffic = Traffic(is_stream=False)
     payload = struct.pack("<HHBBBBB", 3, 2, 200, 190, 96, 40, 42)
     data = wire.build_frame(109, payload, system=51, component=68, sequence=0)
@@ -441,7 +441,7 @@ def test_counted_components_messages_and_peers_are_bounded(monkeypatch: pytest.M
 # the hook
 
 
-def test_a_station_counts_only_where_that_is_wanted() -> None:
+def test_a_station_counts_only_if_counting_is_on() -> None:
     assert Station(link="x", is_stream=False).traffic is None
     station = Station(link="x", is_stream=False, counts_traffic=True)
     assert station.traffic is not None
@@ -455,7 +455,7 @@ def test_a_station_counts_only_where_that_is_wanted() -> None:
     assert station.bytes_sent > 21
 
 
-def test_a_link_that_comes_back_begins_anew() -> None:
+def test_a_reconnected_link_begins_anew() -> None:
     station = Station(link="x", is_stream=True, counts_traffic=True)
     assert station.traffic is not None
     station.receive(heartbeat(1)[:10], "peer", 0.0)
@@ -472,14 +472,14 @@ def test_counted_losses_agree_with_the_faulty_link(loss: float) -> None:
     assert simulation.station.traffic is not None
     component = only(simulation.station.traffic.report(simulation.now))
     assert faulty.lost > 100
-    # of what is lost before the first frame and after the last one, nothing tells
+    # of what is lost before the first frame and after the last one, nothing is known
     assert faulty.lost - 5 <= component.lost <= faulty.lost
     assert component.frames - component.repeated + component.lost == pytest.approx(60 * 52, rel=0.02)
     assert component.loss == pytest.approx(loss, abs=0.1)
 
 
 @pytest.mark.asyncio
-async def test_a_client_tells_what_it_hears() -> None:
+async def test_a_client_reports_events() -> None:
     air = Air.symmetric([PX4Vehicle(telemetry=100)], duplicate=0.2, seed=1)
     async with ParamClient(air, cache=False, traffic=True) as client:
         vehicle = await client.component()

@@ -42,13 +42,13 @@ ARDUPILOT = Heartbeat(2, MAV_AUTOPILOT_ARDUPILOTMEGA)
 
 
 class Speaker:
-    """One that sends heartbeats from a peer, and answers what it is asked, under the address 1/1.
+    """One that sends heartbeats from a peer, and answers what is requested of it, under the address 1/1.
 
     Args:
         heartbeats: what it sends, in turn.
         every: seconds from one to the next.
         uid: its hardware id; None where it does not answer AUTOPILOT_VERSION, 0 where it has none.
-        booted_at: when it has started; None where it tells no time.
+        booted_at: when it has started; None where it sends no clock.
         value: of the parameter P.
         obeys: whether it answers a PARAM_SET.
         start, end: when it speaks.
@@ -66,7 +66,7 @@ class Speaker:
         end: float = 1e9,
         system: int = 1,
     ) -> None:
-        self.heard: list[Message] = []
+        self.received: list[Message] = []
         self.uid, self.booted_at, self.value = uid, booted_at, value
         self.start, self.end = start, end
         self._heartbeats = heartbeats or (PX4,)
@@ -92,7 +92,7 @@ class Speaker:
         for frame in self._framer.receive(data):
             message = wire.decode(frame)
             assert message is not None
-            self.heard.append(message)
+            self.received.append(message)
             if isinstance(message, CommandLong) and message.command == MAV_CMD_REQUEST_MESSAGE:
                 if message.params[0] == wire.AUTOPILOT_VERSION_ID and self.uid is not None:
                     self.say(AutopilotVersion(0, uid=self.uid))
@@ -137,8 +137,10 @@ class Net:
             self.events += self.station.events()
 
     def kinds(self) -> list[str]:
-        told = [each for each in self.events if isinstance(each, ComponentContested | ComponentUncontested)]
-        return [type(each).__name__.removeprefix("Component") for each in told]
+        reported = [
+            each for each in self.events if isinstance(each, ComponentContested | ComponentUncontested)
+        ]
+        return [type(each).__name__.removeprefix("Component") for each in reported]
 
 
 def silent_after(at: float, **how: object) -> Speaker:
@@ -197,12 +199,12 @@ def test_waiting_callers_get_the_error() -> None:
 
 
 @pytest.mark.parametrize("other", [{"uid": 2}, {"uid": None}, {"booted_at": -40.0}, {"uid": 0}])
-def test_two_of_one_kind_are_told_apart_by_id_and_clock(other: dict[str, object]) -> None:
+def test_two_of_one_kind_are_distinguished_by_id_and_clock(other: dict[str, object]) -> None:
     net = Net(a=Speaker(PX4), b=Speaker(PX4, start=0.5, **other))  # type: ignore[arg-type]
     net.run(PEER_REQUESTS.duration + 2.0)
     assert net.kinds() == ["Contested"]
     net.run(20.0)
-    assert net.kinds() == ["Contested"], "told once"
+    assert net.kinds() == ["Contested"], "reported once"
 
 
 def test_the_id_that_every_simulated_px4_has_shows_nothing() -> None:
@@ -219,7 +221,8 @@ def test_the_id_that_every_simulated_px4_has_shows_nothing() -> None:
 
 
 def test_heartbeats_at_20_hz_divert_no_request() -> None:
-    """The forger sends the vehicle's heartbeats and confirms each set; the vehicle is not asked by it."""
+    """The forger sends the vehicle's heartbeats and confirms each set; nothing is requested from the vehicle
+    for it."""
     forger = Speaker(PX4, every=0.05, uid=None, booted_at=None, start=1.0)
     vehicle = Speaker(PX4, obeys=False)
     net = Net(vehicle=vehicle, forger=forger)
@@ -228,21 +231,21 @@ def test_heartbeats_at_20_hz_divert_no_request() -> None:
     net.run(0.6)
     write = net.machine.write("P", 5.0, net.now)
     net.run(2.0)
-    assert not any(isinstance(each, ParamSetMessage) for each in forger.heard)
-    assert any(isinstance(each, ParamSetMessage) for each in vehicle.heard)
+    assert not any(isinstance(each, ParamSetMessage) for each in forger.received)
+    assert any(isinstance(each, ParamSetMessage) for each in vehicle.received)
     forger.say(param_value("P", 5.0, index=0, count=1))
     forger.say(CommandAck(400, 0, 255, 190))
     net.run(0.2)
     assert write.result is None, "its answer does not count"
     net.run(PEER_REQUESTS.duration)
     assert net.kinds() == ["Contested"]
-    asked = [each for each in forger.heard if isinstance(each, CommandLong)]
-    assert len(asked) <= 3 * PEER_REQUESTS_MAX
+    requested = [each for each in forger.received if isinstance(each, CommandLong)]
+    assert len(requested) <= 3 * PEER_REQUESTS_MAX
     assert net.machine.table.params["P"].value == 1.0
 
 
 @pytest.mark.parametrize("is_first", [False, True])
-def test_a_peer_that_repeats_the_id_and_tells_no_time_is_no_path_to_the_vehicle(is_first: bool) -> None:
+def test_a_peer_that_repeats_the_id_without_a_clock_is_no_path_to_the_vehicle(is_first: bool) -> None:
     """The id is sent in clear. When the vehicle is silent for 2 s, such a path would get its writes."""
     start = 0.0 if is_first else 1.0
     forger, vehicle = Speaker(every=0.05, booted_at=None, start=start), Speaker(start=1.0 - start)
@@ -255,7 +258,7 @@ def test_a_peer_that_repeats_the_id_and_tells_no_time_is_no_path_to_the_vehicle(
 
 
 def test_requests_go_to_the_peer_that_gives_the_hardware_id() -> None:
-    """Also where the forger was heard first."""
+    """Also if the forger was received first."""
     vehicle = Speaker(PX4, start=0.4)
     net = Net(forger=Speaker(PX4, uid=None, booted_at=None, every=0.05), vehicle=vehicle)
     net.run(1.0)
@@ -362,7 +365,7 @@ def test_two_paths_to_one_vehicle_stay_as_they_were() -> None:
     assert net.kinds() == []
     second.say(param_value("Q", 3.0, index=1, count=2))
     net.run(0.1)
-    assert net.machine.table.params["Q"].value == 3.0, "what comes over the second path counts"
+    assert net.machine.table.params["Q"].value == 3.0, "what arrives over the second path counts"
     first.end = net.now
     net.run(room.PATH_SILENCE + 1.5)
     assert net.machine.peers.home == "b"
@@ -375,7 +378,7 @@ def test_two_paths_to_one_vehicle_stay_as_they_were() -> None:
 
 
 def test_a_path_that_could_not_answer_at_first_is_proven_later(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A second radio that hears nothing for some seconds: it is asked on, and the contest ends."""
+    """A second radio that receives nothing for some seconds: requests continue, and the contest ends."""
     second = Speaker(start=0.4)
     net = Net(a=Speaker(), b=second)
     with monkeypatch.context() as deaf:
@@ -389,19 +392,19 @@ def test_a_path_that_could_not_answer_at_first_is_proven_later(monkeypatch: pyte
     assert net.kinds() == ["Contested", "Uncontested"]
 
 
-def test_an_unidentified_peer_stays_contested_and_is_asked_rarely() -> None:
+def test_an_unidentified_peer_stays_contested_and_is_requested_rarely() -> None:
     stranger = Speaker(uid=None, booted_at=None, every=0.5)
     net = Net(a=Speaker(), b=stranger)
     net.run(PEER_REQUESTS.duration + 1.0)
-    stranger.heard.clear()
+    stranger.received.clear()
     net.run(60.0)
     assert net.kinds() == ["Contested"]
-    asked = [message for message in stranger.heard if isinstance(message, wire.CommandLong)]
-    assert len(asked) <= 3 * (60.0 / PEER_REQUESTS.later + 1)
+    requested = [message for message in stranger.received if isinstance(message, wire.CommandLong)]
+    assert len(requested) <= 3 * (60.0 / PEER_REQUESTS.later + 1)
 
 
 def test_a_vehicle_without_id_and_clock_may_have_two_paths() -> None:
-    """Nothing tells the two apart, and nothing ever will."""
+    """Nothing distinguishes the two."""
     camera = Heartbeat(30, MAV_AUTOPILOT_GENERIC)
     net = Net(
         a=Speaker(camera, uid=None, booted_at=None),
@@ -415,7 +418,7 @@ def test_a_vehicle_that_starts_again_behind_two_paths_is_no_contest() -> None:
     first, second = Speaker(), Speaker(start=0.4)
     net = Net(a=first, b=second)
     net.run(5.0)
-    for at, speaker in ((5.5, first), (7.0, second)):  # the second path tells of it later
+    for at, speaker in ((5.5, first), (7.0, second)):  # the second path reports it later
         net.run(at - net.now)
         speaker.booted_at = 5.3
         speaker.say(SystemTime(0, int(1000 * (net.now - 5.3))))
@@ -433,7 +436,7 @@ def test_ground_stations_with_one_address_are_no_contest() -> None:
     assert net.kinds() == []
 
 
-def test_a_vehicle_in_place_of_a_ground_station_is_heard() -> None:
+def test_a_vehicle_in_place_of_a_ground_station_is_found() -> None:
     net = Net(a=Speaker(Heartbeat(MAV_TYPE_GCS, 8), uid=None, booted_at=None))
     net.run(2.0)
     net.peers["b"] = Speaker()
@@ -443,7 +446,7 @@ def test_a_vehicle_in_place_of_a_ground_station_is_heard() -> None:
     assert net.kinds() == []
 
 
-def test_components_of_one_system_may_come_from_several_peers() -> None:
+def test_components_of_one_system_may_have_several_peers() -> None:
     net = Net(a=Speaker())
     net.run(2.0)
     camera = wire.encode(Heartbeat(30, 8), system=1, component=100, sequence=0)
@@ -470,7 +473,7 @@ def test_a_heartbeat_from_a_forged_address_brings_that_seven_requests_and_no_mor
 # A peer in place of another
 
 
-def test_a_vehicle_that_comes_back_from_another_port_takes_its_address() -> None:
+def test_a_vehicle_that_returns_from_another_port_takes_its_address() -> None:
     net = Net(a=silent_after(3.0), b=Speaker(start=3.6, booted_at=3.3))
     net.run(3.0 + room.RESTART_SILENCE + 0.5)
     assert net.machine.peers.home == "b"
@@ -479,7 +482,7 @@ def test_a_vehicle_that_comes_back_from_another_port_takes_its_address() -> None
     assert net.machine.presence.started_at == pytest.approx(3.3, abs=0.1)
 
 
-def test_one_whose_port_changes_on_the_way_is_heard_at_once() -> None:
+def test_a_vehicle_whose_port_changes_is_accepted_at_once() -> None:
     """As behind a mobile network's address translation: the vehicle goes on."""
     net = Net(a=silent_after(3.0), b=Speaker(start=3.1))
     net.run(3.5)
@@ -559,7 +562,7 @@ def test_a_split_component_that_is_forgotten_leaves_the_other_one(monkeypatch: p
 
 @pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle])
 def test_simulated_vehicles_behind_two_paths(make: Callable[[], Endpoint]) -> None:
-    """Each message comes twice, as from a router with two ways to one vehicle."""
+    """Each message arrives twice, as from a router with two ways to one vehicle."""
     vehicle = make()
     station = Station(link="udpin:test", is_stream=False)
     now = 0.0
@@ -606,7 +609,7 @@ def test_a_second_vehicle_that_gives_its_id_first_takes_nothing_over() -> None:
     assert not net.machine.table.complete
 
 
-def test_an_id_that_comes_over_a_second_path_first_changes_nothing() -> None:
+def test_an_id_that_arrives_over_a_second_path_first_changes_nothing() -> None:
     net = Net(a=Speaker(uid=None), b=Speaker(start=0.2, uid=1))
     net.run(0.2)
     hold(net, "P")
@@ -643,7 +646,7 @@ def test_a_peer_that_replaces_a_silent_one_without_an_id_is_another_vehicle() ->
     write = net.machine.write("P", 5.0, net.now)
     net.run(3.5 + PEER_REQUESTS.duration + 1.0 - net.now)
     assert isinstance(write.error, NoReply)
-    assert not any(isinstance(each, ParamSetMessage) for each in net.peers["b"].heard)
+    assert not any(isinstance(each, ParamSetMessage) for each in net.peers["b"].received)
     assert net.machine.peers.home == "b"
     assert not net.machine.identification.identity.uid
     assert dict(net.machine.table.params) == {}
@@ -671,10 +674,10 @@ def test_nothing_is_written_to_a_peer_without_an_id_while_another_may_be_the_veh
     net.run(PEER_REQUESTS.duration + 1.0)
     assert isinstance(write.error, ContestedAddress)
     for peer in net.peers.values():
-        assert not any(isinstance(each, ParamSetMessage) for each in peer.heard)
+        assert not any(isinstance(each, ParamSetMessage) for each in peer.received)
 
 
-def test_a_vehicle_whose_first_path_has_lost_its_id_is_asked_again_and_written_to() -> None:
+def test_a_vehicle_whose_first_path_has_lost_its_id_is_identified_again_and_written_to() -> None:
     net = Net(a=Speaker(uid=None), b=Speaker(uid=7, start=15.0))
     net.run(14.9)
     hold(net, "P", "Q")
@@ -700,12 +703,12 @@ def test_a_write_does_not_go_to_the_peers_that_are_left_where_a_connection_ends(
     station.receive(b"", "a", net.now)
     net.peers["a"].end = net.now
     net.run(1.9)
-    assert {type(each) for each in other.heard} == {Heartbeat}
+    assert {type(each) for each in other.received} == {Heartbeat}
     net.run(0.5)
     assert net.machine.peers.home == "b", "what has ended needs no further silence"
     net.run(8.0)
     assert isinstance(write.error, NoReply)
-    assert not any(isinstance(each, ParamSetMessage) for each in net.peers["b"].heard)
+    assert not any(isinstance(each, ParamSetMessage) for each in net.peers["b"].received)
     assert net.machine.identification.identity.uid == f"{2:016x}"
 
 
@@ -729,7 +732,7 @@ def test_a_vehicle_that_connects_anew_goes_on() -> None:
 
 
 def test_a_component_that_no_longer_identifies_itself_is_not_written_to() -> None:
-    """At a serial port nothing but the id tells whether it is the vehicle that was there before."""
+    """At a serial port only the id shows whether it is the vehicle that was there before."""
     speaker = Speaker(end=3.0)
     net = Net(port=speaker)
     net.run(2.0)
@@ -740,14 +743,14 @@ def test_a_component_that_no_longer_identifies_itself_is_not_written_to() -> Non
     write = net.machine.write("P", 5.0, net.now)
     net.run(6.0)
     assert isinstance(write.error, NoReply)
-    assert "has not said since it was away which vehicle it is" in str(write.error)
+    assert "has not identified itself since it was silent" in str(write.error)
     again = net.machine.write("P", 5.0, net.now)
     net.run(0.5)
     assert not again.done
     speaker.uid = 1
     net.run(2.0)
     assert again.result is not None
-    assert len([each for each in speaker.heard if isinstance(each, ParamSetMessage)]) == 1
+    assert len([each for each in speaker.received if isinstance(each, ParamSetMessage)]) == 1
 
 
 def test_another_vehicle_type_through_one_peer_is_identified() -> None:
@@ -777,7 +780,9 @@ def test_another_vehicle_type_without_an_id_is_not_written_to() -> None:
     port._heartbeats, port.uid = (PX4,), 1
     net.run(PEER_REQUESTS.later + 3.0)
     assert not net.station.is_doubted(net.machine)
-    assert any(isinstance(each, ComponentReplaced) for each in net.events), "what came meanwhile is not its"
+    assert any(isinstance(each, ComponentReplaced) for each in net.events), (
+        "values received meanwhile are not those of the vehicle"
+    )
 
 
 @pytest.mark.parametrize("first", [None, 0])
@@ -801,7 +806,7 @@ def test_a_vehicle_that_could_not_answer_for_a_while_is_confirmed_later() -> Non
     port = Speaker(end=3.0)
     net = Net(port=port)
     net.run(9.0)
-    port.end, port.uid = 1e9, None  # its radio hears nothing
+    port.end, port.uid = 1e9, None  # its radio receives nothing
     net.run(20.0)
     assert net.station.is_doubted(net.machine)
     port.uid = 1
@@ -809,7 +814,7 @@ def test_a_vehicle_that_could_not_answer_for_a_while_is_confirmed_later() -> Non
     assert not net.station.is_doubted(net.machine)
 
 
-def test_two_of_one_kind_behind_one_radio_are_told_apart_by_their_clocks() -> None:
+def test_two_of_one_kind_behind_one_radio_are_distinguished_by_their_clocks() -> None:
     radio = Speaker()
     net = Net(radio=radio)
     net.run(5.0)
@@ -872,7 +877,7 @@ def test_a_restart_at_a_new_port_may_take_its_time_to_answer() -> None:
 
 
 def camera(net: Net, peer: str, value: float) -> ComponentMachine:
-    """One of the same system, which has told a value."""
+    """One of the same system, which has reported a value."""
     for message in (Heartbeat(30, 8), param_value("CAM", value, index=0, count=1)):
         net.station.receive(wire.encode(message, system=1, component=100, sequence=0), peer, net.now)
     net.run(STEP)
@@ -904,7 +909,7 @@ def test_a_component_at_the_peer_of_a_rival_is_neither_kept_nor_written_to() -> 
     assert net.station.is_doubted(other)
     net.run(15.0)
     assert net.machine.identification.identity.uid == f"{1:016x}"
-    assert dict(other.table.params) == {}, "it was heard from the rival's peer"
+    assert dict(other.table.params) == {}, "it was received from the rival's peer"
 
 
 def test_the_components_of_an_unidentified_autopilot_are_not_written_to() -> None:
@@ -919,4 +924,4 @@ def test_the_components_of_an_unidentified_autopilot_are_not_written_to() -> Non
     write = other.write("CAM", 5.0, net.now)
     net.run(15.0)
     assert isinstance(write.error, NoReply)
-    assert not any(isinstance(each, ParamSetMessage) for each in port.heard)
+    assert not any(isinstance(each, ParamSetMessage) for each in port.received)

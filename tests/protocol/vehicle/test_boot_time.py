@@ -80,15 +80,15 @@ class Requests:
         self.now = until
         return self.sent.copy()
 
-    def tell(self, boot_ms: int) -> None:
+    def report(self, boot_ms: int) -> None:
         self.presence.system_time(SystemTime(0, boot_ms), self.now)
 
 
-def test_a_component_without_a_clock_is_asked_for_a_baseline() -> None:
+def test_a_baseline_is_requested_from_a_component_without_a_clock() -> None:
     desk = Requests()
     desk.requests.want_baseline(desk.now)
     assert desk.run(BASELINE_DELAY + 0.1) == [BASELINE_DELAY]
-    desk.tell(5_000)
+    desk.report(5_000)
     assert desk.run(60.0) == []
 
 
@@ -102,15 +102,15 @@ def test_requests_for_a_baseline_are_slow() -> None:
     assert desk.run(60.0) == times
 
 
-def test_a_component_that_tells_its_clock_is_not_asked_for_a_baseline() -> None:
+def test_no_baseline_is_requested_from_a_component_that_sends_its_clock() -> None:
     desk = Requests()
     desk.requests.want_baseline(desk.now)
     desk.run(1.0)
-    desk.tell(5_000)
+    desk.report(5_000)
     assert desk.run(60.0) == []
 
 
-def test_a_clock_that_does_not_come_is_given_up() -> None:
+def test_a_clock_that_does_not_arrive_is_given_up() -> None:
     desk = Requests()
     desk.requests.want(desk.now)
     assert desk.run(60.0) == [
@@ -118,24 +118,24 @@ def test_a_clock_that_does_not_come_is_given_up() -> None:
     ]
 
 
-def test_a_clock_of_before_is_not_the_one_that_is_wanted() -> None:
+def test_a_clock_from_before_the_request_is_no_response() -> None:
     desk = Requests()
-    desk.tell(5_000)
+    desk.report(5_000)
     desk.run(10.0)
     desk.requests.want(desk.now)
     assert desk.run(10.1) == [10.0]
-    desk.tell(300)
+    desk.report(300)
     assert desk.run(60.0) == []
 
 
-def test_after_the_command_to_restart_it_is_asked_until_it_is_back() -> None:
+def test_after_a_reboot_command_the_clock_is_requested_until_the_vehicle_returns() -> None:
     desk = Requests()
     desk.requests.follow(desk.now)
     sent = desk.run(20.0)
     assert sent[0] == CLOCK_REQUEST_INTERVAL
     assert sent[:20] == [CLOCK_REQUEST_INTERVAL * (turn + 1) for turn in range(20)]
     assert sent[-1] - sent[-2] == SLOW_REQUEST_INTERVAL
-    desk.tell(100_000)  # it is still there: that is not the end
+    desk.report(100_000)  # it is still there: that is not the end
     assert desk.run(22.5) != []
     desk.requests.want(desk.now)  # joins what is going on
     desk.requests.stop_following()
@@ -151,7 +151,7 @@ def test_a_clock_request_waits_for_another_message_request() -> None:
     assert desk.run(1.1) == [1.0]
 
 
-def test_nothing_is_asked_where_nothing_is_sent() -> None:
+def test_nothing_is_requested_where_nothing_is_sent() -> None:
     desk = Requests(may_send=False)
     desk.requests.want(desk.now)
     desk.requests.follow(desk.now)
@@ -202,7 +202,7 @@ class Desk:
             self.machine.tick(self.now)
         self.now = until
 
-    def run_heard(self, until: float) -> None:
+    def run_connected(self, until: float) -> None:
         """Let time pass in which it sends a STATUSTEXT a second, so that it is not lost."""
         while self.now < until:
             self.run(min(self.now + 1.0, until))
@@ -225,7 +225,7 @@ class Desk:
 
 def test_numbers_that_begin_anew_have_the_clock_requested() -> None:
     desk = Desk()
-    desk.run_heard(100.0)
+    desk.run_connected(100.0)
     desk.take()
     desk.hear(COPTER, sequence=0)
     desk.run(100.3)
@@ -245,7 +245,7 @@ def test_numbers_that_begin_anew_have_the_clock_requested() -> None:
 def test_a_changed_mav_state_leads_to_a_clock_request() -> None:
     """As ArduCopter says ACTIVE for two seconds after a start, and PX4 UNINIT."""
     desk = Desk()
-    desk.run_heard(100.0)
+    desk.run_connected(100.0)
     desk.take()
     desk.hear(COPTER, sequence=101)
     desk.run(100.5)
@@ -267,9 +267,9 @@ ACCEPTED = CommandAck(wire.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, wire.MAV_RESULT_AC
 
 
 def test_an_accepted_restart_shows_in_the_numbers_of_the_frames() -> None:
-    """ArduCopter: heard 1.2 s after it has accepted, and sends its clock 1.4 s later."""
+    """ArduCopter: received 1.2 s after it has accepted, and sends its clock 1.4 s later."""
     desk = Desk()
-    desk.run_heard(100.0)
+    desk.run_connected(100.0)
     restart = desk.machine.begin_reboot(desk.now)
     desk.run(100.01)
     desk.hear(ACCEPTED, sequence=31)
@@ -293,7 +293,7 @@ def test_an_accepted_restart_shows_in_the_numbers_of_the_frames() -> None:
 def test_numbers_that_prove_nothing(after: float, sequence: int) -> None:
     """Before it can have gone off, or in the middle: that waits for the clock."""
     desk = Desk()
-    desk.run_heard(100.0)
+    desk.run_connected(100.0)
     restart = desk.machine.begin_reboot(desk.now)
     desk.hear(ACCEPTED, sequence=31)
     desk.run(100.0 + after)
@@ -306,7 +306,7 @@ def test_numbers_that_prove_nothing(after: float, sequence: int) -> None:
 
 def test_numbers_prove_nothing_while_a_clock_goes_on() -> None:
     desk = Desk()
-    desk.run_heard(100.0)
+    desk.run_connected(100.0)
     restart = desk.machine.begin_reboot(desk.now)
     desk.hear(ACCEPTED, sequence=31)
     desk.run(100.5)
@@ -326,7 +326,7 @@ def test_values_measured_at_each_start_are_read_again_after_a_reboot() -> None:
     measured = {"INS_GYR1_CALTEMP", "BARO1_GND_PRESS", "ARSPD_OFFSET", "RC1_DZ"}
     for name in (*sorted(measured), "ATC_RAT_RLL_P", "INS_TCAL1_TMIN"):
         desk.value(name)
-    desk.run_heard(100.0)
+    desk.run_connected(100.0)
     desk.hear(SystemTime(0, 2_000))
     assert desk.reboots == 1
     desk.hear(AutopilotVersion(0, uid=7))
@@ -345,11 +345,11 @@ def test_values_measured_at_each_start_are_read_again_after_a_reboot() -> None:
 def test_boot_values_are_read_after_a_set_up() -> None:
     desk = Desk()
     desk.value("BARO1_GND_PRESS")
-    desk.run_heard(100.0)
+    desk.run_connected(100.0)
     desk.hear(SystemTime(0, 2_000))
     desk.hear(AutopilotVersion(0, uid=7))
     desk.machine.sync.hold()
-    desk.run_heard(110.0)
+    desk.run_connected(110.0)
     assert desk.names_read() == set()
     desk.machine.sync.release()
     desk.run(110.2)
@@ -360,7 +360,7 @@ def test_measuring_counts_from_the_first_clock() -> None:
     """A restart that shows in the heartbeat is noticed before the main loop runs."""
     desk = Desk()
     desk.value("BARO1_GND_PRESS")
-    desk.run_heard(100.0)
+    desk.run_connected(100.0)
     desk.hear(Heartbeat(2, MAV_AUTOPILOT_ARDUPILOTMEGA, system_status=wire.MAV_STATE_BOOT))
     assert desk.reboots == 1
     desk.hear(AutopilotVersion(0, uid=7))
@@ -384,9 +384,9 @@ def test_a_vehicle_that_is_met_soon_after_its_start(uptime: float, is_young: boo
 
 
 @pytest.mark.parametrize("desk", [Desk(interval=math.inf), Desk(PX4)], ids=["no sync_settings", "a hash"])
-def test_boot_values_are_not_read_where_that_is_not_wanted_or_needed(desk: Desk) -> None:
+def test_boot_values_are_not_read_where_that_is_not_allowed_or_needed(desk: Desk) -> None:
     desk.value("BARO1_GND_PRESS")
-    desk.run_heard(100.0)
+    desk.run_connected(100.0)
     desk.hear(SystemTime(0, 2_000))
     desk.hear(AutopilotVersion(0, uid=7))
     desk.take()

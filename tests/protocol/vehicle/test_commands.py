@@ -129,7 +129,7 @@ def test_one_in_progress_is_waited_for_and_not_sent_again() -> None:
     assert desk.round_trip.smoothed == pytest.approx(0.1)
 
 
-def test_one_in_progress_of_which_nothing_more_is_heard_ends() -> None:
+def test_a_command_in_progress_without_further_messages_ends() -> None:
     desk = Desk()
     command = desk.commands.begin(NUMBER, (), 0.0)
     desk.acknowledge(CommandResult.IN_PROGRESS, 0.1)
@@ -144,7 +144,7 @@ def test_answers_to_others_are_not_for_us() -> None:
     desk.acknowledge(CommandResult.DENIED, 0.1, to=(254, 190))
     desk.acknowledge(CommandResult.DENIED, 0.1, number=OTHER)
     assert is_so(not command.done)
-    desk.acknowledge(CommandResult.ACCEPTED, 0.2, to=(0, 0))  # who says to nobody says it to all
+    desk.acknowledge(CommandResult.ACCEPTED, 0.2, to=(0, 0))  # target 0/0 is a broadcast
     assert command.done
     assert command.error is None
     desk.acknowledge(CommandResult.DENIED, 0.3)  # once more, for nothing that is open

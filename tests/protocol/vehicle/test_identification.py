@@ -122,7 +122,7 @@ def test_the_first_evidence_there_is_decides(
     assert reason in why
 
 
-def test_evidence_as_it_comes_in() -> None:
+def test_evidence_in_order_of_arrival() -> None:
     desk = Desk()
     assert is_so(desk.who.encoding is Encoding.BYTEWISE)
     desk.beat(ARDUPILOT)
@@ -154,7 +154,7 @@ def test_when_the_encoding_is_certain() -> None:
     ("heartbeat", "has_parameters", "is_autopilot"),
     [(PX4, True, True), (Heartbeat(2, 0), True, True), (CAMERA, True, False), (GCS, False, False)],
 )
-def test_the_heartbeat_tells_autopilot_and_type(
+def test_the_heartbeat_has_autopilot_and_type(
     heartbeat: Heartbeat, has_parameters: bool, is_autopilot: bool
 ) -> None:
     desk = Desk()
@@ -210,7 +210,7 @@ def test_both_version_requests_alternate_until_the_component_is_given_up() -> No
     assert desk.commands() == []
 
 
-def test_an_autopilot_that_has_answered_nothing_is_asked_again_less_and_less_often() -> None:
+def test_an_autopilot_without_any_response_is_requested_with_backoff() -> None:
     """The link may have carried nothing to it at first."""
     desk = Desk()
     desk.beat(PX4)
@@ -244,7 +244,7 @@ def test_the_first_response_of_any_kind_has_the_identity_requested_at_once() -> 
 
 
 @pytest.mark.parametrize("kind", ["camera", "high latency", "refuses"])
-def test_a_component_that_has_no_version_is_not_asked_again(kind: str) -> None:
+def test_the_version_of_a_component_without_one_is_not_requested_again(kind: str) -> None:
     desk = Desk()
     heartbeat = CAMERA if kind == "camera" else PX4
     desk.beat(heartbeat)
@@ -285,7 +285,7 @@ def test_a_refusal_to_another_station_means_nothing() -> None:
     assert desk.next_deadline() == 0.1
 
 
-def test_refusals_of_other_things_and_refusals_that_come_late_mean_nothing() -> None:
+def test_refusals_of_other_commands_and_late_refusals_are_ignored() -> None:
     desk = Desk()
     desk.beat(PX4)
     before = desk.next_deadline()
@@ -298,14 +298,14 @@ def test_refusals_of_other_things_and_refusals_that_come_late_mean_nothing() -> 
     assert len(desk.commands()) == 1
 
 
-def test_a_version_that_others_have_asked_for_is_taken() -> None:
+def test_a_version_that_others_have_requested_is_taken() -> None:
     desk = Desk()
     desk.who.version(AutopilotVersion(0, uid=7), 0.2)
     assert desk.who.settled
     assert desk.trip.smoothed is None
 
 
-def test_a_version_that_comes_before_the_heartbeat_learns_the_autopilot_from_it() -> None:
+def test_a_version_that_arrives_before_the_heartbeat_learns_the_autopilot_from_it() -> None:
     desk = Desk()
     desk.who.version(AutopilotVersion(0, uid=7), 0.2)
     desk.beat(ARDUPILOT, 0.3)
@@ -325,7 +325,7 @@ def settled(uid: int) -> Desk:
     return desk
 
 
-def test_a_version_that_tells_no_encoding_waits_for_a_heartbeat() -> None:
+def test_a_version_without_an_encoding_waits_for_a_heartbeat() -> None:
     """ArduPilot's version before its heartbeat: the standard's encoding would write a wrong value."""
     for heartbeat, encoding in ((ARDUPILOT, Encoding.C_CAST), (None, Encoding.BYTEWISE)):
         desk = Desk()
@@ -344,7 +344,7 @@ def test_a_version_that_tells_no_encoding_waits_for_a_heartbeat() -> None:
         assert desk.next_deadline() == math.inf
 
 
-def test_a_version_that_tells_the_encoding_waits_for_no_heartbeat() -> None:
+def test_a_version_with_the_encoding_waits_for_no_heartbeat() -> None:
     desk = Desk()
     desk.who.receive(10.0)
     desk.who.version(AutopilotVersion(CAPABILITY_PARAM_ENCODE_BYTEWISE), 10.1)
@@ -374,13 +374,13 @@ def test_a_vehicle_that_gave_no_id_before_is_not_another_one() -> None:
     assert desk.who.identity.key == "uid:0000000000000008"
 
 
-def test_ids_that_name_no_single_vehicle_do_not_tell_them_apart() -> None:
+def test_ids_of_no_single_vehicle_do_not_distinguish_vehicles() -> None:
     desk = settled(5283920058631409231)  # every simulated PX4 has it
     assert desk.who.version(AutopilotVersion(0, uid=5283920058631409231), 30.0) is False
     assert desk.who.version(AutopilotVersion(0, uid=9), 31.0) is True
 
 
-def test_an_answer_that_never_comes_again_leaves_what_is_known() -> None:
+def test_a_missing_response_leaves_what_is_known() -> None:
     desk = settled(7)
     desk.who.doubt(30.0)
     desk.let_it_be()
@@ -389,7 +389,7 @@ def test_an_answer_that_never_comes_again_leaves_what_is_known() -> None:
     assert desk.who.settled
 
 
-def test_a_component_that_returns_is_asked_for_five_seconds_at_most_once_a_second_in_the_end() -> None:
+def test_a_returning_component_is_requested_for_5_s_finally_once_a_second() -> None:
     desk = settled(7)
     for _ in range(50):
         desk.retry.answered(0.0, 0.02, 1)  # a quick link, on which five tries take half a second

@@ -56,8 +56,8 @@ def test_a_component_without_heartbeats_is_never_lost() -> None:
     assert not presence.has_beaten
     assert presence.heartbeat_timeout == math.inf
     assert presence.lost_at() == math.inf
-    assert not presence.was_away(LOST_AFTER - 0.1)
-    assert presence.was_away(LOST_AFTER), "another vehicle may speak now all the same"
+    assert not presence.was_silent(LOST_AFTER - 0.1)
+    assert presence.was_silent(LOST_AFTER), "another vehicle may speak now all the same"
 
 
 def test_five_seconds_after_the_last_word_it_is_lost() -> None:
@@ -82,7 +82,7 @@ def test_the_heartbeat_timeout_is_three_intervals_of_a_slow_heartbeat() -> None:
     assert presence.gap == 25.0, "no gap after each of its heartbeats"
 
 
-def test_heartbeats_that_came_twice_tell_of_no_quicker_rhythm() -> None:
+def test_repeated_heartbeats_show_no_quicker_rhythm() -> None:
     presence = beating(0.0, 0.01, 10.0, 10.01, 20.0, 20.01)
     assert presence.heartbeat_timeout == pytest.approx(29.97)
 
@@ -120,14 +120,14 @@ def test_a_component_first_received_in_high_latency_mode_can_be_lost() -> None:
 
 
 def reboots(clock: Sequence[tuple[float, int]]) -> list[float]:
-    """When a SYSTEM_TIME shows a reboot: each comes at a time in seconds, and says so many milliseconds."""
+    """When a SYSTEM_TIME shows a reboot: pairs of a time in seconds and a value in milliseconds."""
     presence = Presence()
     return [now for now, boot_ms in clock if presence.system_time(SystemTime(0, boot_ms), now)]
 
 
 def test_a_clock_that_begins_anew_is_a_reboot() -> None:
     assert reboots([(0.0, 500_000), (1.0, 501_000), (6.0, 1_200), (7.0, 2_200)]) == [6.0]
-    assert reboots([(0.0, 50_000), (60.0, 40_000)]) == [60.0], "it was away for a minute"
+    assert reboots([(0.0, 50_000), (60.0, 40_000)]) == [60.0], "it was silent for a minute"
     assert reboots([(0.0, 3 * BOOT_CLOCK_WRAP // 4), (9.0, 3_000)]) == [9.0], "after weeks"
 
 
@@ -179,7 +179,7 @@ def test_a_late_copy_of_a_booting_heartbeat_is_no_second_reboot() -> None:
     assert states((0.0, ACTIVE), (5.0, BOOT), (6.0, ACTIVE), (6.5, BOOT), (7.0, ACTIVE)) == [5.0]
 
 
-def test_clock_and_heartbeat_tell_of_one_reboot_only() -> None:
+def test_clock_and_heartbeat_report_one_reboot_only() -> None:
     presence = beating(0.0, 1.0)
     assert not presence.system_time(SystemTime(0, 90_000), 1.0)
     assert presence.heartbeat(BOOT, 6.0)
@@ -219,7 +219,7 @@ def test_clocks_of_different_messages_are_not_compared() -> None:
 
 
 def test_late_frames_of_the_run_before_are_no_second_reboot() -> None:
-    """They come over a slower way, after those of the new run."""
+    """They arrive over a slower way, after those of the new run."""
     clock = [(0.0, 60_000), (2.0, 400), (2.1, 61_000), (2.2, 600), (4.0, 61_500), (4.1, 2_500), (9.0, 7_400)]
     assert telemetry_reboots([(now, ATTITUDE_ID, boot_ms) for now, boot_ms in clock]) == [2.0]
 
@@ -229,7 +229,7 @@ def test_a_second_reboot_soon_after_the_first_one_counts() -> None:
     assert telemetry_reboots([(now, ATTITUDE_ID, boot_ms) for now, boot_ms in clock]) == [2.0, 8.0, 14.0]
 
 
-def test_clocks_of_telemetry_may_wrap_and_come_over_two_ways() -> None:
+def test_clocks_of_telemetry_may_wrap_and_arrive_over_two_paths() -> None:
     wrapping = [
         (now, ATTITUDE_ID, (BOOT_CLOCK_WRAP - 3_000 + int(1000 * now)) % BOOT_CLOCK_WRAP or 1)
         for now in range(10)
@@ -240,7 +240,7 @@ def test_clocks_of_telemetry_may_wrap_and_come_over_two_ways() -> None:
     assert telemetry_reboots(ways) == []
 
 
-def test_the_clock_is_told_by_any_message() -> None:
+def test_the_clock_is_taken_from_any_message() -> None:
     presence = Presence()
     assert presence.started_at is None
     presence.boot_clock(ATTITUDE_ID, 4_000, 10.0)
@@ -263,7 +263,7 @@ def test_message_ids_with_clocks_are_bounded() -> None:
 
 def test_a_numbering_that_begins_is_noticed() -> None:
     presence = Presence()
-    assert not presence.numbering_begins(0), "the first frame that is heard"
+    assert not presence.numbering_begins(0), "the first frame that is received"
     presence.numbering_begins(200)
     assert presence.numbering_begins(1)
     assert not presence.numbering_begins(2)

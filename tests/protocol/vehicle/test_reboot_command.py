@@ -69,17 +69,17 @@ async def known(client: ParamClient, uptime: float = 10.0) -> Component:
     return component
 
 
-def tells_clock(data: bytes) -> bool:
+def reports_clock(data: bytes) -> bool:
     """Whether a datagram has the time since boot in it."""
     frames = wire.Framer(stream=False).receive(data)
     return any(frame.message_id in wire.BOOT_CLOCK_OFFSETS for frame in frames)
 
 
 class Clockless(Tap):
-    """An endpoint whose time since boot is never heard."""
+    """An endpoint whose time since boot is never received."""
 
     def data_to_send(self) -> list[bytes]:
-        return [data for data in super().data_to_send() if not tells_clock(data)]
+        return [data for data in super().data_to_send() if not reports_clock(data)]
 
 
 class Exchanged(Tap):
@@ -111,7 +111,7 @@ class LateClock(Tap):
         now = anyio.current_time()
         sent: list[bytes] = []
         for data in super().data_to_send():
-            if tells_clock(data):
+            if reports_clock(data):
                 self._late.append((now + self.by, data))
             else:
                 sent.append(data)
@@ -181,7 +181,7 @@ async def test_a_command_that_is_lost_is_sent_again(make: Make) -> None:
 
 
 @in_simulated_time
-async def test_a_vehicle_that_hears_nothing_is_given_up() -> None:
+async def test_a_vehicle_that_receives_nothing_is_given_up() -> None:
     tap = Tap(generic())
     async with a_client(tap) as client:
         component = await known(client)
@@ -224,8 +224,8 @@ async def test_a_vehicle_without_a_clock(make: Make, down: float, longest: float
 @pytest.mark.parametrize("down", [0.8, 1.0, 1.3, 2.0])
 @MAKES
 @in_simulated_time
-async def test_a_clock_that_is_heard_after_the_heartbeat(make: Make, down: float) -> None:
-    """The first heartbeat of the new start is no reason to tell it again."""
+async def test_a_clock_that_is_received_after_the_heartbeat(make: Make, down: float) -> None:
+    """The first heartbeat after the reboot does not report it again."""
     vehicle = make(reboot_down=down, reboot_ack=False)
     starts = counted(vehicle)
     async with a_client(LateClock(vehicle)) as client:
@@ -237,7 +237,7 @@ async def test_a_clock_that_is_heard_after_the_heartbeat(make: Make, down: float
 
 @in_simulated_time
 async def test_a_silence_alone_is_no_restart() -> None:
-    """The command is lost, and so is everything for a while; the clock goes on, so it is told again."""
+    """The command is lost, and so is everything for a while; the clock goes on, so it is commanded again."""
     vehicle = generic()
     starts = counted(vehicle)
     tap = Tap(vehicle)
@@ -259,10 +259,10 @@ async def test_a_reboot_waits_until_px4_has_saved_the_last_write() -> None:
         await component.set("A", 2)
         written = anyio.current_time()
         await component.reboot()
-        [told] = [
-            now for now, _, each in tap.heard if isinstance(each, wire.CommandLong) and each.command == 246
+        [reported] = [
+            now for now, _, each in tap.received if isinstance(each, wire.CommandLong) and each.command == 246
         ]
-        assert SAVING_TIME - 0.01 <= told - written < SAVING_TIME + 0.1
+        assert SAVING_TIME - 0.01 <= reported - written < SAVING_TIME + 0.1
         assert (await component.get("A")).value == 2
 
 
@@ -321,7 +321,7 @@ async def test_a_vehicle_that_does_not_return_is_no_reply(
         assert error.attempts == 1
         assert residue(component) == []
         await asyncio.sleep(6.0)
-        assert component.is_armed is None  # nobody knows
+        assert component.is_armed is None  # unknown
         assert isinstance(await outcome(component.reboot()), NoReply)  # it is lost
 
 
@@ -350,7 +350,7 @@ async def test_another_vehicle_after_the_reboot_raises_another_vehicle(
         assert error.found in str(error)
         assert error.expected != error.found
         assert residue(component) == []
-        # the one that is there now can be told, too
+        # the one that is there now can be commanded, too
         assert await component.reboot() is component
 
 
@@ -453,12 +453,12 @@ async def test_px4_takes_its_system_id_with_the_start() -> None:
         await component.set("MAV_SYS_ID", 9)
         await asyncio.sleep(5.0)
         assert set(client.components) == {(1, 1)}
-        moved = await component.reboot(system=9)
-        assert (moved.system, moved.component) == (9, 1)
-        assert moved.identity.uid == component.identity.uid
-        assert (await moved.get("MAV_SYS_ID")).value == 9
-        assert residue(component) == residue(moved) == []
-        assert await moved.reboot(system=9) is moved
+        changed = await component.reboot(system=9)
+        assert (changed.system, changed.component) == (9, 1)
+        assert changed.identity.uid == component.identity.uid
+        assert (await changed.get("MAV_SYS_ID")).value == 9
+        assert residue(component) == residue(changed) == []
+        assert await changed.reboot(system=9) is changed
         assert vehicle.system == 9
 
 
@@ -498,11 +498,11 @@ async def test_plane_and_rover_take_it_at_once() -> None:
         await component.fetch_all()
         await component.set("SYSID_THISMAV", 9)
         began = anyio.current_time()
-        moved = await client.successor(component, 9)
-        assert moved.system == 9
+        changed = await client.successor(component, 9)
+        assert changed.system == 9
         assert anyio.current_time() - began < 2.0
-        assert moved.identity.uid == component.identity.uid
-        result = await moved.fetch_all()
+        assert changed.identity.uid == component.identity.uid
+        result = await changed.fetch_all()
         assert result.complete
 
 
@@ -514,15 +514,16 @@ async def test_copter_takes_it_with_the_next_start() -> None:
         await component.set("SYSID_THISMAV", 9)
         await asyncio.sleep(5.0)
         assert set(client.components) == {(1, 1)}
-        moved = await component.reboot(system=9)
-        assert moved.system == 9
-        assert (await moved.get("SYSID_THISMAV")).value == 9
+        changed = await component.reboot(system=9)
+        assert changed.system == 9
+        assert (await changed.get("SYSID_THISMAV")).value == 9
 
 
 @pytest.mark.parametrize("seed", range(6))
 @in_simulated_time
 async def test_a_copter_whose_acknowledgement_is_lost_starts_once(seed: int) -> None:
-    """It is heard again 1.2 s later, and tells its clock 1.4 s after that: it is not told again meanwhile."""
+    """It is received again 1.2 s later, and sends its clock 1.4 s after that: it is not commanded again
+    meanwhile."""
     vehicle = ardupilot(reboot_down=0.8 + 0.1 * seed, reboot_ack=False)
     starts = counted(vehicle)
     async with a_client(vehicle) as client:
@@ -534,7 +535,7 @@ async def test_a_copter_whose_acknowledgement_is_lost_starts_once(seed: int) -> 
 
 @in_simulated_time
 async def test_a_copter_is_back_as_soon_as_it_is_heard() -> None:
-    """Its first frame has number 0; its clock comes 1.4 s later."""
+    """Its first frame has number 0; its clock arrives 1.4 s later."""
     vehicle = ardupilot()
     starts = counted(vehicle)
     async with a_client(vehicle) as client:
@@ -558,7 +559,7 @@ async def test_a_reboot_by_another_station_is_detected(make: Make) -> None:
 
 
 @in_simulated_time
-async def test_without_a_hardware_id_the_silence_of_the_old_one_tells() -> None:
+async def test_without_a_hardware_id_the_silence_of_the_old_vehicle_decides() -> None:
     first, second = generic(uid=0), generic(uid=0, system=9)
     air = Air.symmetric([first, second])
     async with a_client(air) as client:
@@ -568,8 +569,8 @@ async def test_without_a_hardware_id_the_silence_of_the_old_one_tells() -> None:
         assert isinstance(error, NoReply)  # both speak: they are two
         silent_from = anyio.current_time()
         first.reboot(down=math.inf)
-        moved = await client.successor(component, 9)
-        assert moved.system == 9
+        changed = await client.successor(component, 9)
+        assert changed.system == 9
         assert OLD_ID_SILENCE_MIN - 1.1 <= anyio.current_time() - silent_from <= OLD_ID_SILENCE_MIN + 1.0
 
 
@@ -596,7 +597,7 @@ async def test_a_successor_that_never_speaks() -> None:
 
 
 @in_simulated_time
-async def test_an_unidentified_successor_is_asked_again() -> None:
+async def test_the_identity_of_a_successor_is_requested_again() -> None:
     vehicle = ardupilot(kind="plane")
     tap = Tap(vehicle)
     async with a_client(tap) as client:
@@ -604,5 +605,5 @@ async def test_an_unidentified_successor_is_asked_again() -> None:
         await component.set("SYSID_THISMAV", 9)
         tap.is_deaf = True
         asyncio.get_running_loop().call_later(15.0, setattr, tap, "is_deaf", False)
-        moved = await client.successor(component, 9, timeout=30.0)
-        assert moved.identity.uid == component.identity.uid
+        changed = await client.successor(component, 9, timeout=30.0)
+        assert changed.identity.uid == component.identity.uid

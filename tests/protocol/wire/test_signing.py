@@ -1,4 +1,4 @@
-"""Signatures: keys that tell nothing, frames beside pymavlink's, what is refused, and signed sessions."""
+"""Signatures: keys whose repr hides them, frames beside pymavlink's, what is refused, and signed sessions."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_a_key_has_32_bytes_that_are_not_all_zero() -> None:
         SigningKey(bytes(32))
 
 
-def test_a_key_comes_as_hexadecimal_digits_base64_or_a_passphrase() -> None:
+def test_a_key_is_given_as_hexadecimal_digits_base64_or_a_passphrase() -> None:
     assert SigningKey.from_text(SECRET.hex()) == KEY
     assert SigningKey.from_text(f"  {SECRET.hex().upper()}\n") == KEY
     assert SigningKey.from_text(base64.b64encode(SECRET).decode() + "\n") == KEY
@@ -121,7 +121,7 @@ def test_an_invalid_key_is_refused_without_printing_it(text: str) -> None:
     assert caught.value.__context__ is None
 
 
-def test_a_key_tells_nothing_of_itself() -> None:
+def test_the_repr_of_a_key_does_not_show_it() -> None:
     forms = [SECRET, SECRET.hex().encode(), base64.b64encode(SECRET), repr(SECRET)[2:-1].encode()]
     shown = [repr(KEY), str(KEY), f"{KEY}", f"{KEY!a}", repr(SetupSigning(1, 1, KEY, NOW)), KEY.fingerprint]
     shown += [repr(Signer(KEY, timestamp=NOW)), repr(a_verifier()), repr(a_verifier().report())]
@@ -134,7 +134,7 @@ def test_a_key_tells_nothing_of_itself() -> None:
     assert copy.copy(KEY) is copy.deepcopy(KEY) is KEY
 
 
-def test_keys_are_equal_by_their_bytes_and_told_apart_by_their_fingerprints() -> None:
+def test_keys_are_equal_by_their_bytes_and_distinguished_by_their_fingerprints() -> None:
     assert SigningKey(SECRET) == KEY != OTHER_KEY
     assert KEY != SECRET
     assert len({SigningKey(SECRET), KEY, OTHER_KEY}) == 2
@@ -202,7 +202,7 @@ def test_frames_are_refused_as_by_pymavlink() -> None:
         encode(VALUE, system=6, component=1, sequence=0),
         encode(VALUE, system=6, component=1, sequence=0, version=1),
     ]
-    # its clock, unlike ours, has not begun to run: both stand at the last timestamp that they have heard
+    # its clock, unlike ours, has not begun to run: both stand at the last timestamp that they have received
     verifier = a_verifier(timestamp=NOW)
     theirs = pymavlink(timestamp=NOW)
     judged = [verifier.accepts(frame) for frame in frames]
@@ -393,7 +393,7 @@ def test_a_guarded_framer_finds_what_another_finds(chunk: int, wanted: bool) -> 
     pieces = [stream[at : at + chunk] for at in range(0, len(stream), chunk)]
     assert [guarded.receive(piece) for piece in pieces] == [plain.receive(piece) for piece in pieces]
     assert guarded.flush() == plain.flush()
-    assert seen == frames, "the guard is asked of each frame, wanted or not"
+    assert seen == frames, "the guard is called for each frame, wanted or not"
     assert (guarded.frames, guarded.skipped) == (plain.frames, plain.skipped)
 
 
@@ -468,7 +468,7 @@ def test_over_usb_a_vehicle_with_a_key_answers_all() -> None:
     assert Simulation(vehicle, station=a_station(None)).fetch().complete
 
 
-def test_a_vehicle_whose_timestamps_are_old_takes_ours_and_is_heard() -> None:
+def test_a_vehicle_with_old_timestamps_takes_ours_and_is_accepted() -> None:
     """A clock that was never set; our heartbeat brings it to our time."""
     vehicle = small_px4(signing_key=KEY, signing_timestamp=1)
     simulation = Simulation(vehicle, station=a_station())
@@ -488,7 +488,7 @@ def test_a_vehicle_that_is_ahead_takes_us_along() -> None:
     assert vehicle.signing_report.streams[0].timestamp > ahead
 
 
-def test_a_vehicle_that_starts_again_is_heard_again() -> None:
+def test_frames_of_a_vehicle_that_starts_again_are_accepted_again() -> None:
     vehicle = small_px4(signing_key=KEY)
     simulation = Simulation(vehicle, station=a_station())
     simulation.fetch()
@@ -497,7 +497,7 @@ def test_a_vehicle_that_starts_again_is_heard_again() -> None:
     assert simulation.set("PARAM_04", 5).actual == 5
 
 
-def test_a_vehicle_that_has_lost_its_time_is_heard_again() -> None:
+def test_frames_of_a_vehicle_that_has_lost_its_time_are_accepted_again() -> None:
     """PX4 keeps the timestamp of its set-up alone, and begins there after each start."""
     simulation = Simulation(small_px4(signing_key=KEY, signing_timestamp=NOW), station=a_station())
     simulation.fetch()

@@ -130,7 +130,7 @@ def one_frame(data: bytes) -> Frame:
 
 
 def take(framer: Framer, chunks: list[bytes]) -> list[Frame]:
-    """All frames that come out, with a flush at the end."""
+    """All parsed frames, with a flush at the end."""
     return [frame for chunk in chunks for frame in framer.receive(chunk)] + framer.flush()
 
 
@@ -375,7 +375,7 @@ def sample_frames() -> list[bytes]:
 
 
 def read_by_pymavlink(stream: bytes) -> list[Frame]:
-    """What pymavlink's parser finds. Ids that its dialect lacks come as MAVLink_unknown, their checksum
+    """What pymavlink's parser finds. Ids that its dialect lacks are MAVLink_unknown, their checksum
     unproven: PX4 sends 8, 380, 410 and 411. They are left out, as `Framer` leaves them out."""
     parser = dialect.MAVLink(None)
     parser.robust_parsing = True
@@ -470,7 +470,7 @@ def test_a_signature_is_stepped_over() -> None:
 
 
 @pytest.mark.parametrize("stream", [True, False])
-def test_only_what_is_wanted_comes_out_and_all_is_counted(stream: bool) -> None:
+def test_only_messages_of_requested_types_are_decoded_and_all_are_counted(stream: bool) -> None:
     framer = Framer({22, 345}, stream=stream)
     data = b"noise" + HEARTBEAT + PV + PV_V1 + STATUS + PV_SIGNED + b"\xfd"
     assert [frame.version for frame in framer.receive(data)] == [2, 1, 2]
@@ -544,7 +544,8 @@ def test_a_cut_off_frame_does_not_hide_the_next_ones(frame: bytes) -> None:
 
 
 def test_a_cut_off_signature_is_filled_with_what_follows() -> None:
-    """Without the key nothing tells a signature from other bytes: the frame counts and takes its 13."""
+    """Without the key nothing distinguishes a signature from other bytes: the frame counts and takes its
+    13."""
     for cut in range(len(PV_SIGNED) - 13, len(PV_SIGNED)):
         found = take(Framer(), [PV_SIGNED[:cut] + HEARTBEAT + PV])
         assert found == [one_frame(PV_SIGNED), one_frame(PV)]
@@ -815,7 +816,7 @@ def test_requests_and_times_of_applications_are_no_clocks() -> None:
     assert BOOT_CLOCK_OFFSETS.keys().isdisjoint({84, 86, 251, 252, 254, 263})
 
 
-def test_occasional_ids_are_given_out_while_they_are_wanted() -> None:
+def test_occasional_ids_are_decoded_while_they_are_requested() -> None:
     attitude = build_frame(30, bytes(28), system=1, component=1, sequence=0)
     heartbeat = encode(Heartbeat(2, 12), system=1, component=1, sequence=1)
     for guard in (None, lambda frame: True):
