@@ -144,7 +144,9 @@ class Connection:
                         if is_write and failure.may_be_done:
                             raise self._unknown(awaited, failure) from failure.error.__cause__
                         now = anyio.current_time()
-                        if now - requested_at > reconnect_delays.LINK_TIMEOUT:  # the request had been connected
+                        if (
+                            now - requested_at > reconnect_delays.LINK_TIMEOUT
+                        ):  # the request had been connected
                             failing_since = now
                         failing_since = min(failing_since, now)
                         if now - failing_since >= reconnect_delays.LINK_TIMEOUT:
