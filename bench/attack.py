@@ -894,8 +894,8 @@ async def killed_apply(rows: list[Row], quick: bool) -> None:
         async with serving(rows, *link, tokens=False, folder=folder) as service:
             service.attack = "kill -9 in an apply"
             jobs = json.loads((await service.ask("GET", "/api/v1/jobs"))[1])["jobs"]
-            is_told = any(job["id"] == name and job["state"] == "cut-off" for job in jobs)
-            service.note("missing in the job list", 0, not is_told, "")
+            is_reported = any(job["id"] == name and job["state"] == "cut-off" for job in jobs)
+            service.note("missing in the job list", 0, not is_reported, "")
             service.note("missing in the log", 0, "was cut off" not in service.log, "")
     finally:
         shutil.rmtree(folder, ignore_errors=True)

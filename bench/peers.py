@@ -147,11 +147,11 @@ class Case:
         Yields the port that it sends to, and a shared number: the time of the first request for list or file.
         """
         port = free_port()
-        asked_at = spawn.Value("d", math.inf)
-        process = spawn.Process(target=fly, args=(self, seed, port, asked_at))
+        requested_at = spawn.Value("d", math.inf)
+        process = spawn.Process(target=fly, args=(self, seed, port, requested_at))
         process.start()
         try:
-            yield port, asked_at
+            yield port, requested_at
         finally:
             process.kill()
             process.join()
@@ -219,8 +219,8 @@ class LiveField:
     @property
     def value(self) -> float:
         """The time of the first request for list or file; infinite before."""
-        asked_at = self.relay.counts().first_request_at
-        return math.inf if asked_at is None else asked_at
+        requested_at = self.relay.counts().first_request_at
+        return math.inf if requested_at is None else requested_at
 
     def cases(self) -> list[Case]:
         """Return the rows for this vehicle."""
@@ -395,25 +395,25 @@ def free_port() -> int:
     return port
 
 
-def fly(case: Case, seed: int, port: int, asked_at: Any) -> None:
+def fly(case: Case, seed: int, port: int, requested_at: Any) -> None:
     """Run the vehicle, sending to a port, until the process is ended."""
-    anyio.run(serve_endpoint, Watched(case.air(seed), asked_at), create_link(f"udpout:127.0.0.1:{port}"))
+    anyio.run(serve_endpoint, Watched(case.air(seed), requested_at), create_link(f"udpout:127.0.0.1:{port}"))
 
 
 class Watched:
     """An endpoint that records the time of the first request for list or file, before any packet loss."""
 
-    def __init__(self, air: Air, asked_at: Any) -> None:
+    def __init__(self, air: Air, requested_at: Any) -> None:
         self._air = air
-        self._asked_at = asked_at
+        self._requested_at = requested_at
         self._framer = wire.Framer({21, 110}, stream=False)
         self.tick = air.tick
         self.next_deadline = air.next_deadline
         self.data_to_send = air.data_to_send
 
     def receive(self, data: bytes, now: float) -> None:
-        if self._asked_at.value == math.inf and self._framer.receive(data):
-            self._asked_at.value = time.monotonic()
+        if self._requested_at.value == math.inf and self._framer.receive(data):
+            self._requested_at.value = time.monotonic()
         self._air.receive(data, now)
 
 
@@ -564,7 +564,7 @@ class MavProxy:
     def run(self, case: Case, seed: int, limit: float) -> Outcome:
         if installed("MAVProxy") == "not installed":
             return Outcome(math.inf, "not installed")
-        with tempfile.TemporaryDirectory() as folder, case.flying(seed) as (port, asked_at):
+        with tempfile.TemporaryDirectory() as folder, case.flying(seed) as (port, requested_at):
             # with its module for MAVFTP it always tries the file first, without it downloads by list
             modules = "ftp,param" if case.by_file else "param"
             command = [sys.executable, "-m", "MAVProxy.mavproxy", f"--master=udpin:127.0.0.1:{port}"]
@@ -587,17 +587,17 @@ class MavProxy:
                 watchdog = threading.Timer(limit + START_TIMEOUT, process.kill)
                 watchdog.start()
                 try:
-                    return self._follow(process, case, asked_at, limit)
+                    return self._follow(process, case, requested_at, limit)
                 finally:
                     watchdog.cancel()
                     process.kill()
 
-    def _follow(self, process: subprocess.Popen[str], case: Case, asked_at: Any, limit: float) -> Outcome:
+    def _follow(self, process: subprocess.Popen[str], case: Case, requested_at: Any, limit: float) -> Outcome:
         assert process.stdout is not None
         seconds = math.inf
         for line in process.stdout:
             if re.search(r"Received \d+ parameters", line):
-                seconds = time.monotonic() - asked_at.value
+                seconds = time.monotonic() - requested_at.value
             saved = re.search(r"Saved \d+ parameters to (.+)", line)
             if saved:
                 text = Path(saved[1].strip()).read_text(encoding="utf-8")
@@ -605,7 +605,9 @@ class MavProxy:
                     name: float(value) for name, value in re.findall(r"^(\w+)\s+(\S+)$", text, re.MULTILINE)
                 }
                 return judge(case, seconds, values, limit)
-        return Outcome(math.inf, f"> {limit:.0f}" if asked_at.value < math.inf else "ended without a result")
+        return Outcome(
+            math.inf, f"> {limit:.0f}" if requested_at.value < math.inf else "ended without a result"
+        )
 
 
 CLIENTS: dict[str, PythonClient | MavProxy] = {

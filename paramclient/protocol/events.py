@@ -172,7 +172,7 @@ class EventMaker:
     def __init__(self, emit: Callable[[Event], None]) -> None:
         self._emit = emit
 
-    def heard(self, machine: ComponentMachine) -> None:
+    def discovered(self, machine: ComponentMachine) -> None:
         """Report a new component."""
         self._emit(ComponentDiscovered(machine))
 

@@ -624,7 +624,7 @@ class Station:
         )
         self.components[address] = machine
         self.scheduler.add(machine)
-        self._reporter.heard(machine)
+        self._reporter.discovered(machine)
         for request, station in self._early_requests:
             if _is_for(request, sender):
                 machine.foreign_file_request(request, station, now)

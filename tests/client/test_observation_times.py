@@ -67,7 +67,7 @@ def test_overwritten_values_keep_their_observation_times() -> None:
     assert table.take_overwritten() == []
 
 
-def test_a_change_that_is_heard_again_keeps_the_moment_of_the_change() -> None:
+def test_a_change_that_is_received_again_keeps_the_moment_of_the_change() -> None:
     table = Table()
     receive(table, 1, "vehicle", 1.0)
     table.take_dirty()

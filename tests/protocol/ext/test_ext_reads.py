@@ -140,7 +140,7 @@ def test_which_components_speak_it() -> None:
     assert session.camera.ext.is_spoken
 
 
-def test_a_component_that_is_heard_by_a_value_alone() -> None:
+def test_a_component_that_sends_only_a_value() -> None:
     station = Station(link="sim:test", is_stream=False)
     message = ParamExtValue("A", b"\7", 1, 1, 0)
     data = wire.encode(message, system=1, component=33, sequence=0)

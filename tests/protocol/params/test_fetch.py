@@ -260,7 +260,7 @@ def memory_of_cache(rows: list[SimParam]) -> Memory:
     return world.memory()
 
 
-def test_a_change_that_is_heard_before_the_fetch_leads_to_no_list() -> None:
+def test_a_change_that_is_received_before_the_fetch_leads_to_no_list() -> None:
     vehicle = PX4Vehicle(table=SMALL)
     world = Simulation(vehicle)
     world.fetch()

@@ -534,7 +534,7 @@ async def test_a_copter_whose_acknowledgement_is_lost_starts_once(seed: int) -> 
 
 
 @in_simulated_time
-async def test_a_copter_is_back_as_soon_as_it_is_heard() -> None:
+async def test_a_copter_is_back_with_its_first_message() -> None:
     """Its first frame has number 0; its clock arrives 1.4 s later."""
     vehicle = ardupilot()
     starts = counted(vehicle)
