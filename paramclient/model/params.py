@@ -33,6 +33,7 @@ __all__ = [
     "number_of",
     "param_of",
     "unpack_fields",
+    "has_index",
     "with_index",
     "same_compact",
     "pack_fields",
@@ -208,6 +209,12 @@ def with_trust_number(compact: CompactParam, trust: int) -> CompactParam:
 def is_listed(compact: CompactParam) -> bool:
     """Return whether a compact parameter has an index."""
     return compact[_INDEX_AT:] != _NO_INDEX
+
+
+def has_index(compact: CompactParam, place: int) -> bool:
+    """Return whether a compact parameter has this index."""
+    place_of: int = unpack_fields(compact)[4]
+    return place_of == place
 
 
 def with_index(compact: CompactParam, place: int) -> CompactParam:

@@ -26,8 +26,8 @@ __all__ = ["COMPACT_SEPARATORS", "Batch", "EventFeed", "Listener", "EventPositio
 COMPACT_SEPARATORS: Final = (",", ":")
 """JSON separators without spaces."""
 EVENTS_KEPT_MAX: Final = 16_384
-"""Number of kept events for slow and reconnecting listeners: ten whole tables. An event takes about 1 kB, and
-0.6 kB once it is encoded."""
+"""Number of kept events for slow and reconnecting listeners: ten whole tables. An event takes about
+0.6 kB, that of a value 1 kB until it is encoded."""
 BATCH_INTERVAL_MAX: Final = 0.1
 """Maximum delay in seconds before listeners are woken again. A download causes hundreds of events per second;
 waking 200 listeners for each would take longer than the download."""
@@ -39,6 +39,7 @@ batches. Events after the batch can still be lost."""
 SHARED_BATCHES_MAX: Final = 32
 """Number of encoded batches kept for listeners with the same position and filter."""
 
+_encode: Final = json.JSONEncoder(allow_nan=False, separators=COMPACT_SEPARATORS).encode
 _POSITION: Final = re.compile(r"([0-9a-f]{16})-([0-9]{1,18})")
 
 
@@ -90,7 +91,11 @@ class EventFilter(NamedTuple):
 
 @dataclass(slots=True)
 class FeedEvent:
-    """One event. It is encoded on first use, which releases `members`."""
+    """One event.
+
+    Attributes:
+        text: the event as JSON; or, until it is first used, what its members are encoded from.
+    """
 
     seq: int
     kind: str
@@ -98,8 +103,7 @@ class FeedEvent:
     system: int | None
     component: int | None
     at: float
-    members: dict[str, Any] | Callable[[], str]
-    text: str = ""
+    text: str | Callable[[], str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,14 +171,17 @@ class EventFeed:
 
         Args:
             kind: type of the event.
-            members: further members, as a dict for `json.dumps`; or a function that returns them as JSON
-                without the braces, called on first use.
+            members: further members, as a dict for `json.dumps`, encoded now: garbage collections would visit
+                the dicts of all kept events. Or a function that returns them as JSON without the braces,
+                called on first use.
             link: name of the link, or None.
             system: system id, or None.
             component: component id, or None.
         """
         self.seq += 1
-        self._events.append(FeedEvent(self.seq, kind, link, system, component, self._clock(), members))
+        event = FeedEvent(self.seq, kind, link, system, component, self._clock(), "")
+        event.text = members if callable(members) else self._event_text(event, _encode(members)[1:-1])
+        self._events.append(event)
         self._has_new.set()
         return self.seq
 
@@ -204,26 +211,23 @@ class EventFeed:
 
     def event_json(self, event: FeedEvent) -> str:
         """Return an event as JSON."""
-        if not event.text:
-            head = json.dumps(
-                {
-                    "run": self.run,
-                    "seq": event.seq,
-                    "at": round(event.at, 3),
-                    "type": event.kind,
-                    **({} if event.link is None else {"link": event.link}),
-                    **({} if event.system is None else {"system": event.system}),
-                    **({} if event.component is None else {"component": event.component}),
-                },
-                separators=COMPACT_SEPARATORS,
-            )
-            members, event.members = event.members, {}
-            if callable(members):
-                more = members()
-            else:
-                more = json.dumps(members, allow_nan=False, separators=COMPACT_SEPARATORS)[1:-1]
-            event.text = f"{head[:-1]},{more}}}" if more else head
+        if not isinstance(event.text, str):
+            event.text = self._event_text(event, event.text())
         return event.text
+
+    def _event_text(self, event: FeedEvent, members: str) -> str:
+        """Return an event with its further members, which are JSON without the braces, as JSON."""
+        head: dict[str, Any] = {
+            "run": self.run,
+            "seq": event.seq,
+            "at": round(event.at, 3),
+            "type": event.kind,
+        }
+        for name in ("link", "system", "component"):
+            if (value := getattr(event, name)) is not None:
+                head[name] = value
+        text = _encode(head)
+        return f"{text[:-1]},{members}}}" if members else text
 
     def _batch_after(self, seq: int, event_filter: EventFilter) -> tuple[Batch, bytes]:
         """Return the batch after a number for this filter, also as server-sent events."""
@@ -310,4 +314,4 @@ class Listener:
         """Return an event for this listener only, with the number of its position."""
         at = round(self._feed._clock(), 3)
         event = {"run": self.position.run, "seq": self.position.seq, "at": at, "type": kind, **members}
-        return json.dumps(event, separators=COMPACT_SEPARATORS)
+        return _encode(event)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import anyio
@@ -15,7 +16,7 @@ from paramclient.client.subscription import Changes
 from paramclient.documents.component import ComponentDoc, ProgressDoc
 from paramclient.documents.param import ParamDoc
 from paramclient.errors import NoReply, ParamClientError
-from paramclient.model.params import as_params, compact_param
+from paramclient.model.params import CACHED, as_params, compact_param, trust_of
 from paramclient.model.values import Param, Trust
 from paramclient.protocol.params.change import Added, Change
 from paramclient.service.followed_extended import FollowedExtended
@@ -272,28 +273,28 @@ class FollowedComponent:
 
     def _record_all_received(self) -> None:
         """Record that the vehicle has sent or confirmed all trusted values now."""
-        now = _now()
-        for name, param in self.component.params.items():
-            if param.trust is not Trust.CACHED:
-                self._received_at[name] = now
+        compact = as_params(self.component.params).compact
+        trusted = (name for name, each in compact.items() if trust_of(each) != CACHED)
+        self._received_at.update(dict.fromkeys(trusted, _now()))
         self._texts.clear()
 
     def _publish_change(
         self, old: Param | None, new: Param | None, by: str, *, is_added: bool = False
     ) -> None:
         kind = "removed" if new is None else "added" if is_added else "changed"
-        received_at = None if new is None else self._received_at.get(new.name)
-
-        def write() -> str:
-            before = "null" if old is None else self._encode(old, None)
-            after = "null" if new is None else self._encode(new, received_at)
-            members = f'"name":{json.dumps(name)},"old":{before},"new":{after},"by":{json.dumps(by)}'
-            return f'{members},"kind":"{kind}"'
-
         known = new or old
         assert known is not None, "a change has an old or a new value"
-        name = known.name
-        self.publish("change", write)
+        received_at = None if new is None else self._received_at.get(known.name)
+        self.publish("change", partial(self._change_json, known.name, old, new, received_at, by, kind))
+
+    def _change_json(
+        self, name: str, old: Param | None, new: Param | None, received_at: float | None, by: str, kind: str
+    ) -> str:
+        """Return the members of a change as JSON without the braces."""
+        before = "null" if old is None else self._encode(old, None)
+        after = "null" if new is None else self._encode(new, received_at)
+        members = f'"name":{json.dumps(name)},"old":{before},"new":{after},"by":{json.dumps(by)}'
+        return f'{members},"kind":"{kind}"'
 
     def _state_key(self) -> tuple[object, ...]:
         """Return the state whose changes are published; the identity is the first item."""

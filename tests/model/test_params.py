@@ -17,6 +17,7 @@ from paramclient.model.params import (
     Params,
     as_params,
     compact_param,
+    has_index,
     is_listed,
     pack_fields,
     param_of,
@@ -122,6 +123,8 @@ def test_setting_index_or_trust_changes_nothing_else() -> None:
     held = compact_param(param)
     assert param_of("A", with_index(held, 7)) == Param("A", -5, ParamType.INT16, 7, 0xFFFB, Trust.VERIFIED)
     assert param_of("A", with_index(held, COMPACT_NO_INDEX)).index is None
+    assert has_index(with_index(held, 7), 7)
+    assert not has_index(with_index(held, 7), 8)
     assert param_of("A", with_trust_number(held, CACHED)) == param.with_trust(Trust.CACHED)
     assert same_compact(held, with_trust_number(with_index(held, 9), CACHED))
 

@@ -4,6 +4,7 @@ ones."""
 from __future__ import annotations
 
 import asyncio
+import gc
 import json
 import weakref
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -129,6 +130,21 @@ async def test_a_listener_receives_every_event_once_and_in_order() -> None:
         again = feed.listen(EventPosition(feed.run, 5))
         assert again.is_resumed
         assert (await taken(again))[0] == 6
+
+
+@in_simulated_time
+async def test_kept_events_hold_no_dicts_that_garbage_collections_visit() -> None:
+    async with a_feed() as feed:
+        listener = feed.listen()
+        members = {"doc": {"state": "new"}}
+        feed.publish("component", members, link="l", system=1, component=2)
+        (event,) = feed._events
+        assert not any(isinstance(each, dict) for each in gc.get_referents(event))
+        members["doc"]["state"] = "lost"
+        batch = await listener.next(0.01)
+        assert batch is not None
+        ((_, text),) = batch[0].texts
+        assert json.loads(text)["doc"] == {"state": "new"}
 
 
 @in_simulated_time

@@ -16,6 +16,7 @@ from paramclient.model.params import (
     CompactParam,
     Params,
     as_params,
+    has_index,
     is_listed,
     number_of,
     pack_fields,
@@ -270,7 +271,7 @@ class Table:
         name, _, _, count, given = message
         compact = self._compact[name]
         is_index = given < count <= PARAMETERS_MAX and given not in self.duplicate_indices.get(name, ())
-        if is_index and with_index(compact, given) != compact:
+        if is_index and not has_index(compact, given):
             self._compact[name] = with_index(compact, given)
             self.dirty.setdefault(name, "vehicle")
 
@@ -279,14 +280,15 @@ class Table:
     ) -> Change | None:
         """Store a PARAM_VALUE of a known parameter."""
         _, raw, number, count, given = message
-        old_bits, old_number, old_is_raw, _, place = unpack_fields(old)
+        old_bits, old_number, old_is_raw, _, old_place = unpack_fields(old)
+        place = old_place
         if given != NO_INDEX:
             place = COMPACT_NO_INDEX if given >= count or count > PARAMETERS_MAX else given
         seen_at = self._moments.get(name, moment)
         self._moments[name] = moment
         is_same_type = old_number == number
         if is_same_type and self._wire.get(name) == raw and not is_exact:
-            if with_index(old, place) != old:
+            if place != old_place:
                 self._compact[name] = pack_fields(old_bits, number, old_is_raw, LIVE, place)
                 self.dirty.setdefault(name, by)
             return None
@@ -299,7 +301,7 @@ class Table:
         new = self._compact[name] = pack_fields(bits, number, is_raw, LIVE, place)
         self._wire[name] = raw
         if same_compact(old, new):
-            if with_index(old, place) != old:
+            if place != old_place:
                 self.dirty.setdefault(name, by)
             return None
         self._record_change(name, old, by, before, seen_at)
@@ -353,7 +355,7 @@ class Table:
         new = self._compact[name] = pack_fields(bits, number, is_raw, LIVE, index)
         self._wire[name] = raw
         self._filed.add(name)
-        if old is None or with_index(old, index) != old or initial != before:
+        if old is None or not has_index(old, index) or initial != before:
             self.dirty.setdefault(name, "vehicle")
         if old is not None and same_compact(old, new):
             return None
@@ -552,9 +554,8 @@ class Table:
             compact = everything.get(name)
             if compact is None or (duplicate_indices and index in duplicate_indices.get(name, ())):
                 continue
-            now = with_index(compact, index)
-            if now != compact:
-                everything[name] = now
+            if not has_index(compact, index):
+                everything[name] = with_index(compact, index)
                 self.dirty.setdefault(name, "vehicle")
 
     def settle(self, names: Mapping[int, str]) -> list[Change]:
