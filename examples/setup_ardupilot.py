@@ -11,7 +11,15 @@ import tempfile
 import time
 from pathlib import Path
 
-from paramclient import Component, NoReply, ParamClient, ParamClientError, ParamSet, WrittenParam, read_file
+from paramclient import (
+    Component,
+    ParamClient,
+    ParamClientError,
+    ParamSet,
+    UsageError,
+    WrittenParam,
+    read_file,
+)
 from paramclient.provision import apply_all, overlay, restore, verify_all
 
 FILE = Path(__file__).parent / "parameters/ardupilot/copter.param"
@@ -35,11 +43,9 @@ async def main(link: str, file: Path) -> bool:
 
     started = time.strftime("%Y%m%dT%H%M%S")
     async with ParamClient(link) as client:
-        await client.component()
-        await asyncio.sleep(1.5)  # each vehicle sends a heartbeat once a second
-        vehicles = [each for each in client.autopilots if each.autopilot == "ardupilot"]
+        vehicles = [each for each in await client.find_autopilots() if each.autopilot == "ardupilot"]
         if not vehicles:
-            raise NoReply("an ArduPilot", attempts=0, waited=1.5)
+            raise UsageError(f"{link} has no ArduPilot")
         applied = await apply_all(vehicles, wanted, reboot=True, backup=backup)
         for (system, _), error in applied.errors.items():
             print(f"{system}: nothing was set: {error}")
