@@ -81,7 +81,7 @@ OF_A_FILE = {
 }
 
 
-def tests_of(module: ModuleType) -> dict[str, object]:
+def shared_tests(module: ModuleType) -> dict[str, object]:
     return {
         name: each
         for name, each in vars(module).items()
@@ -89,16 +89,14 @@ def tests_of(module: ModuleType) -> dict[str, object]:
     }
 
 
-globals().update(
-    tests_of(test_cache) | tests_of(test_file_table) | tests_of(test_fleet) | tests_of(test_snapshots)
-)
-globals().update(tests_of(test_ext_tables))
+SHARED = (test_cache, test_file_table, test_fleet, test_snapshots, test_ext_tables)
+for module in SHARED:
+    globals().update(shared_tests(module))
 three = test_cache.three
 
 
 def test_the_tests_that_are_left_out_exist() -> None:
-    rooms = (test_cache, test_file_table, test_fleet, test_snapshots, test_ext_tables)
-    assert {name for room in rooms for name in vars(room)} >= OF_A_FILE
+    assert {name for module in SHARED for name in vars(module)} >= OF_A_FILE
 
 
 @pytest.fixture(scope="session")

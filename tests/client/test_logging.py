@@ -39,7 +39,7 @@ async def test_each_step_is_reported_in_one_line(caplog: pytest.LogCaptureFixtur
     steps = reported(caplog)
     for step in (
         r"to system 1: COMMAND_LONG 512 \(148\)",
-        r"1/1: the list is wanted, 0 there",
+        r"1/1: the list is requested, 0 there",
         r"to system 1: PARAM_REQUEST_LIST",
         r"1/1: <FetchResult 1/1 25 params from stream in [0-9.]+ s>",
         r"to system 1: PARAM_REQUEST_READ PARAM_01",

@@ -493,6 +493,55 @@ def test_parameters_that_appear_and_disappear_are_announced(
 
 
 @needs_browser
+def test_changes_that_a_load_overtakes_are_announced(sight: Sight) -> None:
+    """Their events arrive while the table is loaded, or after a load that includes them."""
+    announced = sight.page.evaluate(
+        """async () => {
+            const { store } = await import("/page/store.js");
+            const { table, selected } = store;
+            const said = [];
+            store.on("recent", ({ row }) => said.push(`${row.name} ${row.recent.kind}`));
+            const change = (seq, name, kind) => {
+                const param = { name, value: 1, type: "INT32" };
+                const [before, now] = kind === "removed" ? [param, null] : [null, param];
+                store.takeChange(selected, { seq, name, kind, old: before, new: now, by: "vehicle" });
+            };
+            table.isLoaded = false;
+            table.early = [];
+            change(table.seq + 1, "MC_ROLL_P", "removed");
+            change(table.seq + 2, "NEW_ONE", "added");
+            table.keep();
+            store.catchUp(selected);
+            change(table.seq, "GONE_ONE", "removed");
+            change(table.seq, "MC_PITCH_P", "added");
+            change(table.seq, "MC_YAW_P", "changed");
+            return [said, table.rows.has("MC_ROLL_P"), table.rows.has("NEW_ONE")];
+        }"""
+    )
+    said = ["MC_ROLL_P removed", "NEW_ONE added", "GONE_ONE removed", "MC_PITCH_P added"]
+    assert announced == [said, False, True]
+
+
+@needs_browser
+def test_each_table_is_loaded_again_by_its_own_events(sight: Sight) -> None:
+    """Also one that is being loaded: the response may lack what the event reports."""
+    loaded = sight.page.evaluate(
+        """async () => {
+            const { store } = await import("/page/store.js");
+            const loaded = [];
+            store.loadTable = async (key) => loaded.push(key);
+            store.tableOf("one").isLoaded = true;
+            store.tableOf("two").isLoading = true;
+            store.tableOf("three");
+            for (const key of ["one", "two", "one", "three", "unknown"]) store.reload(key);
+            await new Promise((resolve) => setTimeout(resolve, 400));
+            return loaded.sort();
+        }"""
+    )
+    assert loaded == ["one", "two"]
+
+
+@needs_browser
 def test_a_stale_edit_says_so_in_the_review(sight: Sight, bench: Bench) -> None:
     sight.stage("MC_ROLLRATE_P", "0.2")
     bench.do(bench.px4.set_param, "MC_ROLLRATE_P", 0.25)
@@ -797,7 +846,7 @@ def test_a_vehicle_of_yesterday_is_looked_at(visit: Callable[..., Sight], tmp_pa
         assert "9\t1\tPARAM_01\t77\t" in saved.value.path().read_text()
         sight.page.keyboard.press("Escape")
         sight.choose("PX4 1/1")
-        expect(sight.page.get_by_role("button", name="Fetch")).to_be_visible()
+        expect(sight.page.get_by_role("button", name="Fetch all parameters")).to_be_visible()
 
 
 def _keep_yesterdays(folder: Path) -> None:

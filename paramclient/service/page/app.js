@@ -8,7 +8,7 @@ import { announce, button, byId, el, isNarrow, onceAFrame, setText } from "./dom
 import { CellEditor } from "./editor.js";
 import { hasExtended } from "./extended.js";
 import { Grid } from "./grid.js";
-import { nameOf, outcomesText, review, undo } from "./review.js";
+import { nameOf, outcomesText, review, undo, undoButton } from "./review.js";
 import { HIGHLIGHT_TIME, OTHERS, store } from "./store.js";
 import { defaultOf, many, parse } from "./values.js";
 import { drawActions, drawVehicles, offerDescriptions, showError } from "./vehicles.js";
@@ -142,11 +142,7 @@ function drawChips() {
     counts[kind] = kind === "all" ? rows.length : rows.reduce((sum, row) => sum + Number(FILTERS[kind].has(row)), 0);
   const kinds = Object.keys(FILTERS).filter(
     (kind) =>
-      kind === "all" ||
-      kind === "changed" ||
-      kind === shown.filter ||
-      counts[kind] ||
-      (kind === "differs" && table.other),
+      ["all", "changed", shown.filter].includes(kind) || counts[kind] || (kind === "differs" && table.other),
   );
   const key = JSON.stringify([shown.filter, kinds.map((kind) => [kind, counts[kind]])]);
   const box = byId("chips");
@@ -214,17 +210,14 @@ function drawBar() {
       button("Review …", review, { kind: "strong" }),
     );
   } else if (sent) {
+    const forget = () => {
+      store.table.sent = null;
+      draw();
+    };
     bar.replaceChildren(
       el("span", { text: `Sent: ${outcomesText(sent.outcomes)}` }),
-      sent.outcomes.some((each) => each.isTaken) ? button("Undo …", undo, { kind: "quiet", drawing: "undo" }) : "",
-      button(
-        "",
-        () => {
-          store.table.sent = null;
-          draw();
-        },
-        { kind: "quiet only", drawing: "close", label: "Close" },
-      ),
+      undoButton(sent),
+      button("", forget, { kind: "quiet only", drawing: "close", label: "Close" }),
     );
   }
 }

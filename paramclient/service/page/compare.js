@@ -1,7 +1,7 @@
 /** Comparison with a file, an earlier state or another vehicle, and applying values from it. */
 
 import { Problem, at, get, request } from "./api.js";
-import { announce, button, byId, el, setText } from "./dom.js";
+import { announce, button, byId, changesTable, el, faultText, setText } from "./dom.js";
 import { closeDialog, openDialog } from "./dialogs.js";
 import { valueText } from "./details.js";
 import { Caution, OUTCOMES, nameOf, outcomesText } from "./review.js";
@@ -21,7 +21,7 @@ const JOB_POLL_INTERVAL = 300;
 export async function chooseOther(file = null) {
   const { component } = store;
   if (!component) return;
-  const fault = el("p", { class: "fault", role: "alert" });
+  const fault = faultText();
   const attempt = async (work) => {
     fault.textContent = "";
     try {
@@ -152,18 +152,17 @@ export function drawBanner() {
   if (!other) return banner.replaceChildren();
   const names = [...other.values.keys()];
   const there = names.filter((name) => !table.rows.has(name)).length;
-  const differ = [...table.rows.values()].filter((row) => table.comparison(row) === "differs").length;
-  const here = [...table.rows.values()].filter((row) => table.comparison(row) === "here").length;
-  const counts = [`${differ} differ`, here && `${here} only here`, there && `${there} only there`]
-    .filter(Boolean)
-    .join(", ");
+  const numberOf = (kind) => table.sorted.filter((row) => table.comparison(row) === kind).length;
+  const differ = numberOf("differs");
+  const here = numberOf("here");
+  const counts = [`${differ} differ`, here && `${here} only here`, there && `${there} only there`];
   banner.replaceChildren(
     el(
       "span",
       {},
       "Compared with ",
       el("b", { text: other.label }),
-      `: ${counts}.`,
+      `: ${counts.filter(Boolean).join(", ")}.`,
       other.notes.map((note) => el("small", { text: ` ${typeof note === "string" ? note : (note.text ?? "")}` })),
     ),
     store.mayWrite && button("Take over …", takeOver, { kind: "strong", disabled: !differ && !there }),
@@ -175,7 +174,7 @@ export function drawBanner() {
 export async function takeOver() {
   const { component, table } = store;
   const { other } = table;
-  const fault = el("p", { class: "fault", role: "alert" });
+  const fault = faultText();
   const summary = el("p", { class: "summary", role: "status", text: "Planning the changes …" });
   const body = el("tbody");
   const apply = button("Apply", () => go(), { kind: "strong", disabled: true });
@@ -193,21 +192,7 @@ export async function takeOver() {
       },
     },
   });
-  const table_ = el(
-    "table",
-    { class: "changes" },
-    el(
-      "thead",
-      {},
-      el(
-        "tr",
-        {},
-        el("th", {}, all),
-        ...["Name", "Now", "New", "Remark"].map((text) => el("th", { scope: "col", text })),
-      ),
-    ),
-    body,
-  );
+  const table_ = changesTable([el("th", {}, all), "Name", "Now", "New", "Remark"], body);
   const renamesInput = el("input", { type: "file", id: "renames", accept: ".yaml,.yml,.json", on: { change: replan } });
   const renamesLabel = el(
     "label",

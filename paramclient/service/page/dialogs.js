@@ -1,7 +1,7 @@
 /** Dialogs: one at a time, with the browser's focus handling. */
 
 import { onToken, request } from "./api.js";
-import { button, byId, el } from "./dom.js";
+import { button, byId, el, faultText } from "./dom.js";
 
 let asking = null;
 let end = () => {};
@@ -52,7 +52,7 @@ function askForToken() {
 async function ask() {
   let isDone = false;
   const field = el("input", { type: "password", id: "token", autocomplete: "current-password", required: true });
-  const fault = el("p", { class: "fault", role: "alert" });
+  const fault = faultText();
   const form = el(
     "form",
     {

@@ -63,6 +63,15 @@ export function setAttribute(element, name, value) {
   } else if (element.getAttribute(name) !== String(value)) element.setAttribute(name, value);
 }
 
+/** Returns a paragraph for an error. */
+export const faultText = () => el("p", { class: "fault", role: "alert" });
+
+/** Returns a table of changes. Its columns are headings, or elements of their own. */
+export function changesTable(columns, body, kind = "") {
+  const heads = columns.map((each) => (each.nodeType ? each : el("th", { scope: "col", text: each })));
+  return el("table", { class: `changes ${kind}` }, el("thead", {}, el("tr", {}, heads)), body);
+}
+
 /** Announces a text to screen readers. */
 export function announce(text) {
   const region = byId("spoken");

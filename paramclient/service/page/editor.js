@@ -1,6 +1,6 @@
 /** Editors of a value: a number with its range, a list of named values, or check boxes for bits. */
 
-import { button, byId, el, isNarrow } from "./dom.js";
+import { button, byId, el, faultText, isNarrow } from "./dom.js";
 import { defaultOf, isFloat, maskOf, parse, rangeOf, sameText, textOf, textOfMask, warningOf } from "./values.js";
 
 const OTHER = "other";
@@ -14,7 +14,7 @@ export function editorOf(row, pending, { stage, leave, isCompact = true }) {
   const before = row.text;
   const value = pending?.text ?? before;
   const hint = el("p", { class: "hint", id: `hint-${isCompact ? "cell" : "sheet"}`, text: hints(row) });
-  const fault = el("p", { class: "fault", role: "alert" });
+  const fault = faultText();
   const doubts = el("p", { class: "doubt", role: "status" });
   const recent = el("p", { class: "doubt", role: "status" });
   const report = (read) => {

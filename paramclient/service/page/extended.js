@@ -2,7 +2,7 @@
 
 import { at, get, request } from "./api.js";
 import { closeDialog, openDialog } from "./dialogs.js";
-import { announce, button, byId, el, setText } from "./dom.js";
+import { announce, button, byId, changesTable, el, faultText, setText } from "./dom.js";
 import { Caution, OUTCOMES, nameOf } from "./review.js";
 import { authorOf, keyOf, store } from "./store.js";
 import { isFloat, isWhole, many, numberText, parse } from "./values.js";
@@ -100,11 +100,11 @@ export async function showExtended() {
   const lines = new Map();
   const body = el("tbody", {});
   const state = el("p", { class: "summary", role: "status" });
-  const fault = el("p", { class: "fault", role: "alert" });
+  const fault = faultText();
   const armed = new Caution(component, () => refresh());
-  const columns = ["Name", "Type", "Value", "Result"].map((text) => el("th", { scope: "col", text }));
+  const columns = ["Name", "Type", "Value", "Result"];
   if (store.mayWrite) columns.push(el("td"));
-  const table = el("table", { class: "changes extended" }, el("thead", {}, el("tr", {}, columns)), body);
+  const table = changesTable(columns, body, "extended");
   const fetch_ = button("Fetch", fetchAll, { label: "Fetch all extended parameters from the component" });
   let seq = -1;
   let early = null;

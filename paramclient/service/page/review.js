@@ -1,7 +1,7 @@
 /** Review of staged changes, their results, and undo. */
 
 import { at, request } from "./api.js";
-import { announce, button, el, setText } from "./dom.js";
+import { announce, button, changesTable, el, setText } from "./dom.js";
 import { closeDialog, openDialog } from "./dialogs.js";
 import { valueText } from "./details.js";
 import { keyOf, store } from "./store.js";
@@ -64,26 +64,9 @@ export async function review() {
   const lines = new Map(
     changes.map((change) => [change.name, lineOf(change, () => table.rows.get(change.name), () => drop(change.name))]),
   );
-  const body = el(
-    "tbody",
-    {},
-    [...lines.values()].map((line) => line.element),
-  );
-  const table_ = el(
-    "table",
-    { class: "changes" },
-    el(
-      "thead",
-      {},
-      el(
-        "tr",
-        {},
-        ...["Name", "Now", "New", "Remark"].map((text) => el("th", { scope: "col", text })),
-        el("th", {}, el("span", { class: "unseen", text: "Drop" })),
-      ),
-    ),
-    body,
-  );
+  const elements = [...lines.values()].map((line) => line.element);
+  const dropping = el("th", {}, el("span", { class: "unseen", text: "Drop" }));
+  const table_ = changesTable(["Name", "Now", "New", "Remark", dropping], el("tbody", {}, elements));
   const armed = new Caution(component, () => refresh());
   const summary = el("p", { class: "summary", role: "status" });
   const send = button("", () => go(), { kind: "strong" });
@@ -131,18 +114,8 @@ export async function review() {
     announce(said);
     const late = sent.outcomes.filter((each) => each.isTaken && each.isLate).map((each) => each.name);
     if (late.length) summary.append(el("br"), `Takes effect after a reboot of the vehicle: ${late.join(", ")}.`);
-    const way =
-      sent.outcomes.some((each) => each.isTaken) &&
-      button(
-        "Undo …",
-        () => {
-          closeDialog();
-          undo();
-        },
-        { kind: "quiet", drawing: "undo" },
-      );
     const done = button("Done", closeDialog, { kind: "strong" });
-    buttons.replaceChildren(...[way, done].filter(Boolean));
+    buttons.replaceChildren(undoButton(sent), done);
     done.focus();
   }
 
@@ -155,8 +128,13 @@ export async function review() {
   });
 }
 
+/** Returns a button that undoes what was sent; "" if the vehicle took nothing. */
+export const undoButton = (sent) =>
+  sent.outcomes.some((each) => each.isTaken) ? button("Undo …", undo, { kind: "quiet", drawing: "undo" }) : "";
+
 /** Stages the values from before the last write and shows the review. */
 export function undo() {
+  closeDialog();
   const { sent } = store.table;
   if (!sent) return;
   for (const each of sent.outcomes) if (each.isTaken) store.stage(each.name, each.before, each.restore);

@@ -83,19 +83,11 @@ class Table {
     this.seq = seq;
     this.isLoaded = true;
     this.forget();
-    this.catchUp();
   }
 
   /** Continues with the previously loaded table, if any. */
   keep() {
     this.isLoaded = this.rows.size > 0;
-    this.catchUp();
-  }
-
-  catchUp() {
-    const early = this.early ?? [];
-    this.early = null;
-    for (const event of early) this.change(event);
   }
 
   /** Applies a change; returns the row that was changed, added or removed, or null. */
@@ -104,13 +96,17 @@ class Table {
       this.early?.push(event); // without a load in progress, the next one includes the event
       return null;
     }
-    if (event.seq <= this.seq) return null;
+    const isIncluded = event.seq <= this.seq; // in the loaded table: only announced
     const row = this.rows.get(event.name);
+    const recent = { at: Date.now(), by: authorOf(event.by), kind: event.kind };
     if (event.new === null) {
-      this.rows.delete(event.name);
-      this.forget();
-      if (row) row.recent = { at: Date.now(), by: authorOf(event.by), kind: "removed" };
-      return row ?? null;
+      if (!isIncluded && this.rows.delete(event.name)) this.forget();
+      return row || isIncluded ? { ...row, name: event.name, recent } : null;
+    }
+    if (isIncluded) {
+      if (event.kind !== "added" || !row) return null;
+      row.recent = recent;
+      return row;
     }
     const document = { name: event.name, ...event.new };
     if (!row) {
@@ -118,14 +114,14 @@ class Table {
       this.rows.set(event.name, added);
       this.forget();
       if (event.kind !== "added") return null;
-      added.recent = { at: Date.now(), by: authorOf(event.by), kind: "added" };
+      added.recent = recent;
       return added;
     }
     const before = row.text;
     const isTrust = event.old && sameText(textOf(event.old), textOf(event.new), row.type);
     row.take(document);
     if (isTrust || sameText(before, row.text, row.type)) return null;
-    row.recent = { at: Date.now(), by: authorOf(event.by), kind: "changed", before };
+    row.recent = { ...recent, kind: "changed", before };
     return row;
   }
 
@@ -242,7 +238,7 @@ class Store {
     if (!component) return;
     const table = this.tableOf(key);
     table.isLoaded = false;
-    table.early = [];
+    table.early ??= [];
     const load = ++table.loads;
     table.isLoading = true;
     let found;
@@ -256,18 +252,27 @@ class Store {
     }
     if (load !== table.loads) return;
     table.load(found.params, found.seq ?? -1);
-    if (key === this.selected) this.emit("table");
+    this.catchUp(key);
   }
 
   /** After a failed load, the table stays, with later events applied, and is loaded again. */
   keepTable(key, mayWork) {
     const table = this.tableOf(key);
     table.keep();
+    this.catchUp(key);
     if (key !== this.selected) return;
-    this.emit("table");
     const load = table.loads;
     const again = () => load === table.loads && key === this.selected && this.loadTable(key).catch(() => {});
     if (mayWork) setTimeout(again, RELOAD_DELAY);
+  }
+
+  /** Takes the changes that arrived during a load. */
+  catchUp(key) {
+    const table = this.tableOf(key);
+    const early = table.early ?? [];
+    table.early = null;
+    for (const event of early) this.takeChange(key, event);
+    if (key === this.selected) this.emit("table");
   }
 
   tableOf(key) {
@@ -289,9 +294,8 @@ class Store {
     const key = keyOf(event);
     if (event.type === "component") this.takeComponent(key, event);
     else if (event.type === "change") this.takeChange(key, event);
-    else if (event.type === "params" || event.type === "resynced") {
-      if (this.tables.get(key)?.isLoaded && event.type === "params") this.reload(key);
-    } else if (event.type === "progress") {
+    else if (event.type === "params") this.reload(key);
+    else if (event.type === "progress") {
       const component = this.components.get(key);
       if (component) component.fetch = event.done ? null : event;
       this.emit("components");
@@ -335,10 +339,12 @@ class Store {
     if (key === this.selected) this.emit("table");
   }
 
-  /** Combines simultaneous loads of a table. */
+  /** Loads a loaded table again, once for simultaneous events. A load in progress may lack what they report. */
   reload(key) {
-    clearTimeout(this.reloading);
-    this.reloading = setTimeout(() => this.loadTable(key).catch(() => {}), 150);
+    const table = this.tables.get(key);
+    if (!table?.isLoaded && !table?.isLoading) return;
+    clearTimeout(table.reloading);
+    table.reloading = setTimeout(() => this.loadTable(key).catch(() => {}), 150);
   }
 
   /** Stages a value; one equal to the vehicle's is removed. */

@@ -1,7 +1,7 @@
 /** Vehicles and their states: the list, the status line, and the actions. */
 
 import { at, download, get, request } from "./api.js";
-import { announce, button, byId, el, setAttribute, setText } from "./dom.js";
+import { announce, button, byId, el, faultText, setAttribute, setText } from "./dom.js";
 import { chooseOther } from "./compare.js";
 import { closeDialog, openDialog } from "./dialogs.js";
 import { offerExtended, showExtended } from "./extended.js";
@@ -170,41 +170,36 @@ export function drawActions() {
   const isHeard = !store.component?.is_kept;
   const actions = [
     button("Compare", () => chooseOther(), { drawing: "compare" }),
-    button("Save", save, { drawing: "save" }),
-    button("Load descriptions", describe, {
-      drawing: "help",
-      id: "describe",
-      hidden: true,
-    }),
-    button("Extended", () => showExtended().catch(showError), {
+    button("Save", shown(save), { drawing: "save" }),
+    button("Load descriptions", describe, { drawing: "help", id: "describe", hidden: true }),
+    button("Extended", shown(showExtended), {
       drawing: "extended",
       label: "Extended parameters of the component: text and 64-bit numbers",
       id: "extended",
       hidden: true,
     }),
     store.mayWrite &&
-      button("Snapshot", keepState, { drawing: "keep", label: "Snapshot: record the current values for a later restore" }),
-    isHeard && button("Fetch", fetchAll, { drawing: "refresh", label: "Fetch all parameters from the vehicle" }),
+      button("Snapshot", shown(keepState), { drawing: "keep", label: "Snapshot: record the current values for a later restore" }),
+    isHeard && button("Fetch", shown(fetchAll), { drawing: "refresh", label: "Fetch all parameters from the vehicle" }),
   ];
   byId("actions").replaceChildren(...actions.filter(Boolean));
-  byId("meter-cancel").replaceChildren(button("Stop", stopFetch, { kind: "quiet" }));
+  byId("meter-cancel").replaceChildren(button("Stop", shown(stopFetch), { kind: "quiet" }));
   setText(byId("role"), store.mayWrite ? "" : "read-only");
   offerExtended();
 }
 
+/** Returns an action whose error is shown. */
+const shown = (action) => () => action().catch(showError);
+
 async function fetchAll() {
-  try {
-    await request("POST", at(store.component, "/fetch"), { refresh: true, wait: false });
-    announce("Fetching all parameters.");
-  } catch (error) {
-    showError(error);
-  }
+  await request("POST", at(store.component, "/fetch"), { refresh: true, wait: false });
+  announce("Fetching all parameters.");
 }
 
 /** Loads metadata from the vehicle, which is slow over a radio, or from a file. */
 async function describe() {
   const { component } = store;
-  const fault = el("p", { class: "fault", role: "alert" });
+  const fault = faultText();
   const state = el("p", { role: "status" });
   const attempt = async (method, body) => {
     fault.textContent = "";
@@ -219,11 +214,8 @@ async function describe() {
     }
     state.textContent = "";
   };
-  const input = el("input", {
-    type: "file",
-    id: "file",
-    on: { change: () => input.files[0] && attempt("PUT", input.files[0]) },
-  });
+  const change = () => input.files[0] && attempt("PUT", input.files[0]);
+  const input = el("input", { type: "file", id: "file", on: { change } });
   const ask = button("Load from the vehicle", () => attempt("POST", {}), { kind: "strong" });
   const content = el(
     "div",
@@ -259,56 +251,33 @@ export function offerDescriptions() {
 
 async function stopFetch() {
   const { component } = store;
-  try {
-    const { jobs } = await get("/jobs");
-    const running = jobs.filter(
-      (job) => job.kind === "fetch" && job.state === "running" && keyOf(job) === keyOf(component),
-    );
-    for (const job of running) await request("DELETE", `/jobs/${encodeURIComponent(job.id)}`);
-    if (!running.length) announce("The service started this fetch; it cannot be stopped here.");
-  } catch (error) {
-    showError(error);
-  }
+  const { jobs } = await get("/jobs");
+  const isOwn = (job) => job.kind === "fetch" && job.state === "running" && keyOf(job) === keyOf(component);
+  const running = jobs.filter(isOwn);
+  for (const job of running) await request("DELETE", `/jobs/${encodeURIComponent(job.id)}`);
+  if (!running.length) announce("The service started this fetch; it cannot be stopped here.");
 }
 
 async function keepState() {
-  try {
-    await request("POST", at(store.component, "/snapshots"), { reason: "kept by hand" });
-    announce("Snapshot created.");
-    showBriefly("Snapshot created. Compare shows it.");
-  } catch (error) {
-    showError(error);
-  }
+  await request("POST", at(store.component, "/snapshots"), { reason: "kept by hand" });
+  announce("Snapshot created.");
+  showBriefly("Snapshot created. Compare shows it.");
 }
 
-/** Asks for a file format and saves the table; shows an error. */
+/** Asks for a file format and saves the table. */
 async function save() {
   const { component } = store;
-  let formats;
-  try {
-    ({ formats } = await get("/formats"));
-  } catch (error) {
-    showError(error);
-    return;
-  }
-  const list = el(
-    "ul",
-    { class: "choices" },
-    formats
-      .filter((format) => format.writes)
-      .map((format) => {
-        const { name } = format;
-        const choose = el(
-          "button",
-          { type: "button", class: "choice", on: { click: () => take(name) } },
-          el("b", { text: format.title }),
-          el("small", { text: format.endings.join(", ") }),
-        );
-        return el("li", {}, choose);
-      }),
-  );
+  const { formats } = await get("/formats");
+  const choices = formats
+    .filter((format) => format.writes)
+    .map(({ name, title, endings }) => {
+      const choose = { type: "button", class: "choice", on: { click: () => take(name) } };
+      const texts = [el("b", { text: title }), el("small", { text: endings.join(", ") })];
+      return el("li", {}, el("button", choose, texts));
+    });
+  const list = el("ul", { class: "choices" }, choices);
   const state = el("p", { role: "status" });
-  const fault = el("p", { class: "fault", role: "alert" });
+  const fault = faultText();
 
   async function take(format) {
     fault.textContent = "";
