@@ -85,7 +85,7 @@ def test_a_kind_of_several_vehicles_lists_them(command: Command, put: Put, words
 def test_a_kind_that_is_not_there(command: Command, put: Put) -> None:
     done = command("get", put(copter()), "A", "--vehicle", "px4", "--timeout", 3)
     assert (done.code, done.out) == (3, "")
-    assert "a vehicle with px4" in done.err
+    assert "a vehicle with autopilot px4" in done.err
     assert "Heard on sim:custom so far: 4/1 ArduPilot quadrotor." in done.err
 
 
