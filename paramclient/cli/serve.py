@@ -77,7 +77,7 @@ async def serve(
     if missing := [name for name in SERVICE_LIBRARIES if find_spec(name) is None]:
         raise UsageError(f"serving needs {' and '.join(missing)}: pip install 'paramclient[service]'")
     from paramclient import service  # only here: needs the extra
-    from paramclient.service.garbage_collection import ComponentFreezer
+    from paramclient.service.garbage_collection import GarbageCollection
 
     if no_cache and cache is not None:
         raise UsageError("--cache and --no-cache exclude each other")
@@ -110,9 +110,9 @@ async def serve(
     sys.setswitchinterval(SWITCH_INTERVAL)
     stop = anyio.Event()
     with on_end_signal(lambda _: stop.set()):
-        freezing = asyncio.create_task(ComponentFreezer().run(lambda: hub.followed))
+        collecting = asyncio.create_task(GarbageCollection().run(lambda: hub.followed, lambda: hub.is_busy))
         try:
             await service.serve(hub, settings, listening=listening, stop=stop, listens=listens)
         finally:
-            freezing.cancel()
+            collecting.cancel()
     return ExitCode.DONE

@@ -342,7 +342,9 @@ async def wait_for_vehicle(
     Raises:
         ParamClientError: as from `ParamClient.component` and `ParamClient.only_component`.
     """
-    awaited = address_in_words(system, component, peer) if kind is None else f"a vehicle with autopilot {kind}"
+    awaited = (
+        address_in_words(system, component, peer) if kind is None else f"a vehicle with autopilot {kind}"
+    )
 
     async def look(_: Callable[[], None]) -> Component:
         if kind is None and not only:

@@ -12,7 +12,7 @@ Needs the extra `service`.
 - `acceptor`, `connection_slots`, `connections`: connections before TLS, their number, their limits.
 - `quota`, `body_limits`, `body_memory`, `log_limit`: limits of requests in progress, request bodies and log
   lines.
-- `garbage_collection`: components that full garbage collections of a serving process skip.
+- `garbage_collection`: when full garbage collections of a serving process run, and what they skip.
 - `request_body`, `param_sources`, `route_context`, `responses`, `problems`, `metrics`: request bodies,
   parameter sets named in requests, shared parts of routes, responses, errors, Prometheus.
 """

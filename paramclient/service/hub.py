@@ -145,6 +145,12 @@ class Hub:
         return [followed for each in self.links.values() for followed in each.followed.values()]
 
     @property
+    def is_busy(self) -> bool:
+        """Return whether a request waits or is worked on for long, or a job runs."""
+        quotas = (self.long_requests, *self.waiting_requests.values())
+        return any(map(len, quotas)) or any(job.state == "running" for job in self.jobs.all)
+
+    @property
     def uptime(self) -> float:
         """Return the seconds since its creation."""
         return time.monotonic() - self._began
