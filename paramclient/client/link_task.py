@@ -252,7 +252,7 @@ class LinkTask:
         station = self._station
         while self.ended is None:
             self._something_to_send = anyio.Event()
-            now = anyio.current_time()
+            began = now = anyio.current_time()
             self._detect_suspend(now)
             self._suspend.expect(math.inf)  # a slow link may block the sender
             self._due = math.inf
@@ -264,7 +264,6 @@ class LinkTask:
             to_send = station.data_to_send()
             if to_send:
                 self._sent.set()
-            sent_from = anyio.current_time()
             turn_ends = time.perf_counter() + TURN_MAX
             for data, peer in to_send:
                 await self._transmit(data, peer)
@@ -280,8 +279,9 @@ class LinkTask:
             is_behind = self._is_behind(now)
             if is_behind:
                 due = now + TURN_MAX
-            blocked = min(now - sent_from, SEND_BLOCK_MAX)
-            self._suspend.expect(due + blocked)  # it may have passed while the link blocked the sender
+            blocked = min(now - began, SEND_BLOCK_MAX)
+            # it may have passed while others were ticked before it, or while the link blocked the sender
+            self._suspend.expect(max(due, began) + blocked)
             self._due = due
             wait = due - now
             with anyio.move_on_after(None if wait == math.inf else max(wait, 0.0)):

@@ -15,8 +15,9 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import anyio
 import anyio.lowlevel
@@ -41,6 +42,11 @@ SHARED_BATCHES_MAX: Final = 32
 
 _encode: Final = json.JSONEncoder(allow_nan=False, separators=COMPACT_SEPARATORS).encode
 _POSITION: Final = re.compile(r"([0-9a-f]{16})-([0-9]{1,18})")
+
+
+EventLabel: TypeAlias = tuple[str, str | None, int | None, int | None]
+"""Type of an event, name of its link, its system id and component id. Garbage collections do not visit plain
+tuples of such values, nor strings."""
 
 
 class EventPosition(NamedTuple):
@@ -79,31 +85,15 @@ class EventFilter(NamedTuple):
     system: int | None = None
     component: int | None = None
 
-    def matches(self, event: FeedEvent) -> bool:
-        """Return whether an event matches."""
+    def matches(self, label: EventLabel) -> bool:
+        """Return whether an event with this label matches."""
+        kind, link, system, component = label
         return (
-            (self.types is None or event.kind in self.types)
-            and (self.link is None or event.link in (None, self.link))
-            and (self.system is None or event.system in (None, self.system))
-            and (self.component is None or event.component in (None, self.component))
+            (self.types is None or kind in self.types)
+            and (self.link is None or link in (None, self.link))
+            and (self.system is None or system in (None, self.system))
+            and (self.component is None or component in (None, self.component))
         )
-
-
-@dataclass(slots=True)
-class FeedEvent:
-    """One event.
-
-    Attributes:
-        text: the event as JSON; or, until it is first used, what its members are encoded from.
-    """
-
-    seq: int
-    kind: str
-    link: str | None
-    system: int | None
-    component: int | None
-    at: float
-    text: str | Callable[[], str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +138,8 @@ class EventFeed:
         self.is_ended = False
         self._clock = clock
         self._released_seq = 0  # number of the last event that listeners have been woken for
-        self._events: deque[FeedEvent] = deque(maxlen=kept)
+        self._labels: deque[EventLabel] = deque(maxlen=kept)
+        self._texts: deque[str | Callable[[], str]] = deque(maxlen=kept)  # JSON, or what encodes it
         self._woken = anyio.Event()
         self._has_new = anyio.Event()
         self._shared: dict[tuple[int, EventFilter], tuple[Batch, bytes]] = {}
@@ -179,16 +170,17 @@ class EventFeed:
             component: component id, or None.
         """
         self.seq += 1
-        event = FeedEvent(self.seq, kind, link, system, component, self._clock(), "")
-        event.text = members if callable(members) else self._event_text(event, _encode(members)[1:-1])
-        self._events.append(event)
+        label = (kind, link, system, component)
+        encode = partial(self._event_json, self.seq, self._clock(), label, members)
+        self._labels.append(label)
+        self._texts.append(encode if callable(members) else encode())
         self._has_new.set()
         return self.seq
 
     def listen(self, after: EventPosition | None = None, event_filter: EventFilter | None = None) -> Listener:
         """Return a listener at a position, or at the end if there is no position or its next event is
         lost."""
-        oldest = self.seq - len(self._events)
+        oldest = self.seq - len(self._labels)
         can_resume = after is not None and after.run == self.run and oldest <= after.seq <= self.seq
         seq = after.seq if can_resume and after is not None else self.seq
         return Listener(
@@ -209,25 +201,23 @@ class EventFeed:
             self._wake()
             await anyio.sleep(min(BATCH_INTERVAL_MAX, BATCH_INTERVAL_PER_LISTENER * self.listeners))
 
-    def event_json(self, event: FeedEvent) -> str:
+    def _event_json(
+        self, seq: int, at: float, label: EventLabel, members: dict[str, Any] | Callable[[], str]
+    ) -> str:
         """Return an event as JSON."""
-        if not isinstance(event.text, str):
-            event.text = self._event_text(event, event.text())
-        return event.text
+        kind, link, system, component = label
+        places = {"link": link, "system": system, "component": component}
+        known = {name: place for name, place in places.items() if place is not None}
+        head = _encode({"run": self.run, "seq": seq, "at": round(at, 3), "type": kind, **known})
+        more = members() if callable(members) else _encode(members)[1:-1]
+        return f"{head[:-1]},{more}}}" if more else head
 
-    def _event_text(self, event: FeedEvent, members: str) -> str:
-        """Return an event with its further members, which are JSON without the braces, as JSON."""
-        head: dict[str, Any] = {
-            "run": self.run,
-            "seq": event.seq,
-            "at": round(event.at, 3),
-            "type": event.kind,
-        }
-        for name in ("link", "system", "component"):
-            if (value := getattr(event, name)) is not None:
-                head[name] = value
-        text = _encode(head)
-        return f"{text[:-1]},{members}}}" if members else text
+    def _text_at(self, index: int) -> str:
+        """Return a kept event as JSON."""
+        text = self._texts[index]
+        if not isinstance(text, str):
+            text = self._texts[index] = text()
+        return text
 
     def _batch_after(self, seq: int, event_filter: EventFilter) -> tuple[Batch, bytes]:
         """Return the batch after a number for this filter, also as server-sent events."""
@@ -235,15 +225,16 @@ class EventFeed:
         found = self._shared.get(key)
         if found is not None:
             return found
-        oldest = self.seq - len(self._events)
+        oldest = self.seq - len(self._labels)
         if seq < oldest:  # the kept events are useless without the lost ones
             batch = Batch(EventPosition(self.run, self._released_seq), self._released_seq - seq, ())
         else:
             end = min(self._released_seq, seq + BATCH_EVENTS_MAX)
-            chosen = islice(self._events, seq - oldest, end - oldest)
-            texts = tuple(
-                (event.seq, self.event_json(event)) for event in chosen if event_filter.matches(event)
+            labels = islice(self._labels, seq - oldest, end - oldest)
+            chosen = (
+                index for index, label in enumerate(labels, seq - oldest) if event_filter.matches(label)
             )
+            texts = tuple((oldest + index + 1, self._text_at(index)) for index in chosen)
             batch = Batch(EventPosition(self.run, end), 0, texts)
         if len(self._shared) >= SHARED_BATCHES_MAX:
             del self._shared[next(iter(self._shared))]

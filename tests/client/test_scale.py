@@ -514,6 +514,33 @@ async def test_a_deadline_that_passed_while_the_sender_was_blocked_is_no_suspend
 
 
 @in_simulated_time
+async def test_deadlines_that_wait_for_those_of_other_components_are_no_suspend() -> None:
+    """A tick handles a few components: the last of 1,000 that are due together is late by seconds."""
+
+    class Behind(Watched):
+        def __init__(self) -> None:
+            super().__init__()
+            self.due = anyio.current_time() - SUSPEND_MIN - 1.0
+            self.resumed = 0
+
+        def tick(self, now: float) -> None:
+            super().tick(now)
+            if len(self.ticks) >= 20:
+                self.due = math.inf
+
+        def next_deadline(self) -> float:
+            return self.due
+
+        def handle_suspend(self, unseen: float, now: float) -> None:
+            self.resumed += 1
+
+    station = Behind()
+    await carry(Flood(), station, 5.0, lambda: None)
+    assert station.due == math.inf, "the deadlines were handled"
+    assert not station.resumed
+
+
+@in_simulated_time
 async def test_many_datagrams_at_once_give_way_to_other_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each datagram takes a millisecond; so do the tasks that process them."""
 
