@@ -323,6 +323,16 @@ async def test_two_set_ups_do_not_mix_and_one_can_be_ended(tmp_path: Path) -> No
         assert on_board.values["TUNE_00"] == 7.5
 
 
+@in_simulated_time
+async def test_a_fetch_of_extended_parameters_refuses_no_set_up(tmp_path: Path) -> None:
+    async with serving(tap := Tap(px4()), place=tmp_path) as service:
+        tap.is_mute = True
+        started = await service.client.post(f"{HERE}/extended/fetch", json={"wait": False})
+        assert (started.status_code, started.json()["state"]) == (202, "running")
+        body = {"wanted": {"values": dict.fromkeys(TUNE, 7.5)}, "wait": False}
+        assert (await service.client.post(f"{HERE}/apply", json=body)).status_code == 202
+
+
 class Quiet(Tap):
     """Says nothing any more after some writes."""
 

@@ -382,7 +382,7 @@ class ValueReads(Machine, Generic[Response]):
         if isinstance(read.key, int) and count is not None and read.key >= count:
             return self._unknown(read.key, f": it has {count}, counted from 0")
         if self._seems_unknown(read):
-            return self._unknown(read.key, ": it did not respond to reads of it, and responds to other reads")
+            return self._unknown(read.key, ": it does not respond to reads of this name, but to others")
         return NoReply(self._name(read.key), attempts=read.attempts, waited=now - read.begun_at)
 
     def _unknown(self, key: Key, reason: str = "") -> UnknownParameter:

@@ -29,7 +29,7 @@ begun."""
 
 
 class SetStatus(StrEnum):
-    """What became of one value of a `set_many`."""
+    """The outcome of one value of a `set_many`."""
 
     ACCEPTED = "accepted"
     """The vehicle holds the requested value, as far as the type can represent it."""

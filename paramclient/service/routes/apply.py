@@ -23,7 +23,7 @@ from paramclient.provision.apply_restore import restore_categories
 from paramclient.provision.vehicle_params import FetchedSet, collect_defaults, fetch_set
 from paramclient.service.followed_component import FollowedComponent
 from paramclient.service.hub import Hub
-from paramclient.service.jobs import Job, Kind
+from paramclient.service.jobs import FETCHES, Job, Kind
 from paramclient.service.param_sources import (
     EarlierState,
     Patterns,
@@ -386,7 +386,7 @@ def _begin(
         ServiceError: a set-up of the component is running, or too many jobs are running.
     """
     for other in hub.jobs.all:
-        if other.state == "running" and other.kind != "fetch" and other.followed is target:
+        if other.state == "running" and other.kind not in FETCHES and other.followed is target:
             what = f"{other.requested_by} is already setting up this component in job {other.id}."
             raise ServiceError(409, "busy", what, job=other.id)
     system, component = target.address
