@@ -682,7 +682,8 @@ class Fetch(Operation[FetchResult]):
         after = None if read is None else Announcement.answering(read)
         notes: tuple[str, ...] = ()
         if not download.missing:
-            self._remove_unlisted(download)
+            if read is not None or not download.is_settled:  # else `_is_proven` has just done it
+                self._remove_unlisted(download)
             if not download.is_settled:
                 notes = (UNSETTLED,)
             self._table.unconfirm()

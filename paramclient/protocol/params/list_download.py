@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from itertools import filterfalse
 from typing import Final
 
 from paramclient.errors import NoReply
@@ -167,7 +168,7 @@ class ListDownload(Operation[None]):
     @property
     def missing(self) -> tuple[int, ...]:
         """Indices below the count that were not received, rising."""
-        return tuple(index for index in range(self.count or 0) if index not in self.names)
+        return tuple(filterfalse(self.names.__contains__, range(self.count or 0)))
 
     @property
     def is_settled(self) -> bool:
@@ -532,9 +533,9 @@ class ListDownload(Operation[None]):
     def _read_missing_below(self, end: int, now: float) -> None:
         """Read what is missing below an index and was not requested."""
         while len(self._requested) < REQUESTED_INDICES_MAX and self._next < end:
-            index = self._next
-            self._next += 1
-            if not (index in self.names or index in self.given_up or index in self._requested):
+            index = next(filterfalse(self.names.__contains__, range(self._next, end)), end)
+            self._next = min(index + 1, end)
+            if not (index == end or index in self.given_up or index in self._requested):
                 self._ask(index, now)
 
     def _another_pass_is_faster(self, missing: int) -> bool:
