@@ -41,17 +41,21 @@ def nearest_names(name: str, names: Iterable[str]) -> tuple[str, ...]:
 
 def _candidates(upper_name: str, name: str, names: Iterable[str]) -> list[tuple[str, str]]:
     """Return the names to compare with `name`, each in upper case and as given."""
-    found = [(other.upper(), other) for other in names if other != name]
     length = AFFIX_LENGTH
-    while length == AFFIX_LENGTH or len(found) > COMPARED_NAMES_MAX:
+    others = [other for other in names if other != name]
+    head, tail = upper_name[:length], upper_name[-length:]
+    found = [
+        pair
+        for pair in zip(map(str.upper, others), others, strict=True)  # one pair at a time: names are many
+        if pair[0].startswith(head) or pair[0].endswith(tail)
+    ]
+    while len(found) > COMPARED_NAMES_MAX and length < len(upper_name):
+        length *= 2
         head, tail = upper_name[:length], upper_name[-length:]
         closer = [pair for pair in found if pair[0].startswith(head) or pair[0].endswith(tail)]
-        if length > AFFIX_LENGTH and not closer:
+        if not closer:
             break
         found = closer
-        if length >= len(upper_name):
-            break
-        length *= 2
     return sorted(found)[:COMPARED_NAMES_MAX]
 
 
