@@ -363,7 +363,7 @@ def test_few_modules_know_an_event_loop_by_name() -> None:
     uses = {module for module in MODULES for each in imports_of(module) if each.top in loops}
     assert {module for module in uses if not is_command(module)} == {
         "paramclient.client.client_task",
-        "paramclient.links.transport",
+        "paramclient.links.serial_transport",
         "paramclient.service.connections",
     }
 

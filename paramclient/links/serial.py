@@ -205,7 +205,7 @@ class _Port(Protocol):
 
 async def _open_port(device: str, baud: int) -> _Port:
     if sys.platform == "win32":
-        from paramclient.links.transport import Transport  # imported here because it imports asyncio
+        from paramclient.links.serial_transport import Transport  # imported here because it imports asyncio
 
         return await Transport.opened(device, baud)
     else:  # noqa: RET505 - with else, the type checker of each system skips the other branch

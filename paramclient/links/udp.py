@@ -1,4 +1,4 @@
-"""Links over UDP: `udpin` listens for vehicles, `udpout` sends to one address.
+"""Links over UDP: `udpin` listens for vehicles, `udpout` sends to one address; the peers of a link.
 
 Datagrams that arrive while the reader is late wait in the kernel's buffer, and only there. A datagram with
 one PARAM_VALUE takes 832 bytes of it (Linux 6.18, loopback), so a burst of 2,000 needs 1.7 MB. Linux' usual
@@ -127,7 +127,7 @@ class UdpLink(SocketLink):
         # Addresses that have sent heartbeats, the latest sender last.
         self._peers: dict[Address, _PeerState] = {}
         # Addresses that have sent only other frames.
-        self._strangers: dict[Address, _PeerState] = {}
+        self._unproven: dict[Address, _PeerState] = {}
         self._stranger_served_at = -math.inf
         self._framer = Framer((HEARTBEAT_ID,), stream=False)
 
@@ -215,18 +215,18 @@ class UdpLink(SocketLink):
         beats = self._framer.receive(data)
         if self._framer.frames == before:
             return
-        known = self._strangers.pop(address, None) or self._peers.get(address) or _PeerState()
+        known = self._unproven.pop(address, None) or self._peers.get(address) or _PeerState()
         known.proven_at = now
         if beats or address in self._peers:
             self._peers[address] = known
         else:
-            self._strangers[address] = known
-        if len(self._peers) + len(self._strangers) > PEERS_MAX:
-            least_useful = self._strangers or self._peers
+            self._unproven[address] = known
+        if len(self._peers) + len(self._unproven) > PEERS_MAX:
+            least_useful = self._unproven or self._peers
             del least_useful[next(iter(least_useful))]
 
     def _forget_silent(self, now: float) -> None:
-        for known in (self._peers, self._strangers):
+        for known in (self._peers, self._unproven):
             for address in [each for each, at in known.items() if now - at.proven_at >= PEER_TIMEOUT]:
                 del known[address]
 
@@ -234,16 +234,16 @@ class UdpLink(SocketLink):
         """Return the addresses for a broadcast. Addresses without heartbeats get heartbeats in turn."""
         now = anyio.current_time()
         self._forget_silent(now)
-        strangers = list(self._strangers)
-        if strangers and self._framer.receive(data):
+        unproven = list(self._unproven)
+        if unproven and self._framer.receive(data):
             is_due = now >= self._stranger_served_at + UNKNOWN_PEER_INTERVAL
-            strangers = [min(strangers, key=lambda each: self._strangers[each].served_at)] if is_due else []
-            for address in strangers:
-                self._stranger_served_at = self._strangers[address].served_at = now
-        return [*self._peers, *strangers]
+            unproven = [min(unproven, key=lambda each: self._unproven[each].served_at)] if is_due else []
+            for address in unproven:
+                self._stranger_served_at = self._unproven[address].served_at = now
+        return [*self._peers, *unproven]
 
     def _destinations(self, peer: Peer) -> list[Address]:
-        return [each for each in (peer,) if each in self._peers or each in self._strangers]
+        return [each for each in (peer,) if each in self._peers or each in self._unproven]
 
     def _transmit(self, sock: socket.socket, data: bytes, address: Address) -> None:
         sock.sendto(data, address)
@@ -258,7 +258,7 @@ class UdpLink(SocketLink):
                 sock.setsockopt(socket.SOL_SOCKET, option, RECEIVE_BUFFER)
         self.receive_buffer = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
         self._has_arrival_times = _note_arrivals(sock)
-        self._peers, self._strangers = {}, {}
+        self._peers, self._unproven = {}, {}
         self._no_route_since = None
         return sock
 

@@ -31,7 +31,7 @@ __all__ = [
     "Trust",
     "Value",
     "WireValue",
-    "as_sent",
+    "as_reported",
     "bits_of",
     "check_name",
     "check_value",
@@ -396,7 +396,7 @@ def encode_value(value: WireValue, number: int, encoding: Encoding) -> bytes:
     return raw
 
 
-def as_sent(bits: int, number: int, encoding: Encoding) -> bytes:
+def as_reported(bits: int, number: int, encoding: Encoding) -> bytes:
     """Return the four wire bytes with which a vehicle reports a value of these bits and this type.
 
     Not the inverse of `decode_value`: a C-casting vehicle rounds integers beyond 24 bits to the next float32,

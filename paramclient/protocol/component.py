@@ -18,7 +18,7 @@ from paramclient.model.values import (
     ParamType,
     Trust,
     WireValue,
-    as_sent,
+    as_reported,
     encode_value,
     is_portable_name,
 )
@@ -618,7 +618,7 @@ class ComponentMachine:
         old = change[1]
         if old is not None and self.identification.autopilot != MAV_AUTOPILOT_PX4:
             bits, number, *_ = unpack_fields(old)
-            raw = as_sent(bits, number, self.table.encoding)
+            raw = as_reported(bits, number, self.table.encoding)
             self._checks.replaced(change.name, number, raw, message, now, self.reads.sent_at)
 
     def _receive_ambiguous(self, message: ParamValue, until: float, now: float) -> None:

@@ -1,4 +1,5 @@
-"""The state before the last `apply` in the cache: its snapshot, and changes since then."""
+"""The state that a restore without a given state goes back to: the snapshot before the last `apply`, and the
+changes since then. A second restore to it is refused."""
 
 from __future__ import annotations
 

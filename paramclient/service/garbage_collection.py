@@ -16,10 +16,10 @@ CHECK_INTERVAL: Final = 1.0
 COLLECTED_COMPONENTS_MAX: Final = 32
 """Number of components that full garbage collections may examine: 5 ms. Also the number of forgotten
 components that may occupy memory."""
-IDLE_THRESHOLD: Final = 10
+COLLECTIONS_WHEN_IDLE: Final = 10
 """Collections of the middle generation, of about 7,000 new objects each, after which a full one runs at the
 next idle check: Python's default, after which it would run at any moment."""
-BUSY_THRESHOLD: Final = 60
+COLLECTIONS_WHEN_BUSY: Final = 60
 """Collections of the middle generation after which a full one runs also while requests are in progress: the
 garbage that it would have freed takes at most about 40 MB."""
 
@@ -46,7 +46,7 @@ class GarbageCollection:
             is_busy: returns whether requests are in progress.
         """
         before = gc.get_threshold()
-        gc.set_threshold(*before[:2], BUSY_THRESHOLD)
+        gc.set_threshold(*before[:2], COLLECTIONS_WHEN_BUSY)
         try:
             while True:
                 await anyio.sleep(CHECK_INTERVAL)
@@ -68,5 +68,5 @@ class GarbageCollection:
         if len(followed - self._frozen) >= COLLECTED_COMPONENTS_MAX:
             self._frozen = followed
             gc.freeze()
-        if not is_busy and gc.get_count()[2] >= IDLE_THRESHOLD:
+        if not is_busy and gc.get_count()[2] >= COLLECTIONS_WHEN_IDLE:
             gc.collect()

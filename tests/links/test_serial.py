@@ -29,7 +29,7 @@ from paramclient import ParamClient
 from paramclient.client import reconnect_delays
 from paramclient.errors import LinkError, UsageError
 from paramclient.links import Link, Peer, create_link, refusals, serial
-from paramclient.links.transport import UNREAD_BYTES_MAX, Transport
+from paramclient.links.serial_transport import UNREAD_BYTES_MAX, Transport
 from paramclient.protocol import wire
 from tests.cable import TIMEOUT, Cable
 from tests.shell import a_client, bits, generic, small_px4, until
@@ -528,7 +528,7 @@ async def test_closing_drops_unsent_bytes(cable: Cable, monkeypatch: pytest.Monk
 def test_a_transport_needs_asyncio() -> None:
     program = (
         "import asyncio\n"
-        "from paramclient.links.transport import Transport\n"
+        "from paramclient.links.serial_transport import Transport\n"
         "opening = Transport.opened('COM5', 57600)\n"
         "try:\n"
         "    opening.send(None)\n"

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 import pytest
 
 from paramclient.service.garbage_collection import (
-    BUSY_THRESHOLD,
     COLLECTED_COMPONENTS_MAX,
-    IDLE_THRESHOLD,
+    COLLECTIONS_WHEN_BUSY,
+    COLLECTIONS_WHEN_IDLE,
     GarbageCollection,
 )
 from tests.shell import in_simulated_time
@@ -45,7 +45,11 @@ def test_collections_go_through_no_components_that_stay(monkeypatch: pytest.Monk
 
 @pytest.mark.parametrize(
     ("collections", "is_busy", "collects"),
-    [(IDLE_THRESHOLD, False, True), (IDLE_THRESHOLD, True, False), (IDLE_THRESHOLD - 1, False, False)],
+    [
+        (COLLECTIONS_WHEN_IDLE, False, True),
+        (COLLECTIONS_WHEN_IDLE, True, False),
+        (COLLECTIONS_WHEN_IDLE - 1, False, False),
+    ],
 )
 def test_a_full_collection_waits_until_no_request_is_in_progress(
     monkeypatch: pytest.MonkeyPatch, collections: int, is_busy: bool, collects: bool
@@ -62,7 +66,7 @@ async def test_python_starts_full_collections_late_and_as_before_afterwards() ->
     before = gc.get_threshold()
     task = asyncio.create_task(GarbageCollection().run(lambda: (), lambda: True))
     await asyncio.sleep(0)
-    assert gc.get_threshold() == (*before[:2], BUSY_THRESHOLD)
+    assert gc.get_threshold() == (*before[:2], COLLECTIONS_WHEN_BUSY)
     task.cancel()
     await asyncio.wait([task])
     assert gc.get_threshold() == before

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
-from paramclient.model.values import Encoding, Param, as_sent
+from paramclient.model.values import Encoding, Param, as_reported
 from paramclient.protocol.params.reads import Read, Reads
 from paramclient.protocol.requests.operation import Operation
 
@@ -112,7 +112,7 @@ class Sampling(Operation[Sample]):
             words = f"the vehicle has {count} parameters, and not {self._count}"
         elif known is None or known.name != name:
             words = f"parameter {index} is {name}"
-        elif known.type_number != number or as_sent(known.bits, number, self._encoding) != raw:
+        elif known.type_number != number or as_reported(known.bits, number, self._encoding) != raw:
             words = f"{name} has another value"
         if words:
             self.cancel()

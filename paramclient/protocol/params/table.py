@@ -34,7 +34,7 @@ from paramclient.model.values import (
     ParamType,
     Trust,
     WireValue,
-    as_sent,
+    as_reported,
     bits_of_wire,
     from_bits,
     is_portable_name,
@@ -338,7 +338,7 @@ class Table:
             if not self._name_quota.has_capacity(len(self._compact)):
                 return None
             self._name_quota.taken += 1
-        raw = as_sent(bits, number, self._encoding)
+        raw = as_reported(bits, number, self._encoding)
         before = self._defaults.get(name)
         is_same_type = old is None or unpack_fields(old)[1] == number
         if is_older and old is not None and not (is_same_type and self._wire.get(name) == raw):
@@ -397,7 +397,7 @@ class Table:
             old = self._compact[name]
             bits, number, _, trust, place = unpack_fields(old)
             if name in self._filed:
-                self._wire[name] = as_sent(bits, number, encoding)
+                self._wire[name] = as_reported(bits, number, encoding)
                 continue
             bits, is_raw = bits_of_wire(raw, number, encoding)
             new = self._compact[name] = pack_fields(bits, number, is_raw, trust, place)
@@ -818,7 +818,11 @@ class Table:
             return False
         bits, number, is_raw, *_ = unpack_fields(known)
         value = from_bits(bits, number, is_raw=is_raw)
-        return isinstance(value, int) and abs(value) > _EXACT and as_sent(bits, number, self._encoding) == raw
+        return (
+            isinstance(value, int)
+            and abs(value) > _EXACT
+            and as_reported(bits, number, self._encoding) == raw
+        )
 
     def _with_outdated_index(self, name: str, compact: CompactParam) -> CompactParam:
         self.outdated_indices.add(name)

@@ -29,7 +29,7 @@ from typing import Final, NamedTuple
 
 from paramclient.errors import FileTransferError, PackError
 from paramclient.model.px4_hash import crc32_px4
-from paramclient.model.values import Encoding, Param, ParamType, Trust, as_sent
+from paramclient.model.values import Encoding, Param, ParamType, Trust, as_reported
 from paramclient.protocol.ftp import BUSY, CommittedWrite, FileChecksums, FileRead, FileTransfers
 from paramclient.protocol.ftp.file_write import BLOCKS_IN_FLIGHT_MAX
 from paramclient.protocol.ftp.packets import DATA_SIZE_MAX, FRAME_OVERHEAD
@@ -251,7 +251,7 @@ class ParamUpload(Operation[None]):
     def _prove(self, row: PackedParam, count: int, now: float) -> None:
         if row.name in self.unproven:
             self.unproven.discard(row.name)
-            raw = as_sent(row.bits, row.type, Encoding.C_CAST)
+            raw = as_reported(row.bits, row.type, Encoding.C_CAST)
             self._hooks.proven(ParamValue(row.name, raw, row.type, count, NO_INDEX), now)
 
 

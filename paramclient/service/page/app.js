@@ -260,7 +260,7 @@ store.on("armed", (component) =>
 store.on("lost", (component) => announce(`${nameOf(component)} ${component.is_lost ? "is lost" : "is heard again"}.`));
 
 /** Describes recent changes of one or several rows in one sentence for each kind. */
-function wordsOf(recent) {
+function changesText(recent) {
   const of = (kind) => recent.filter((each) => each.kind === kind);
   const said = ["changed", "added", "removed"].map((kind) => {
     const all = of(kind);
@@ -277,7 +277,7 @@ store.on("recent", ({ key, row }) => {
   if (key !== store.selected) return;
   if (!recent.length) {
     setTimeout(() => {
-      announce(wordsOf(recent));
+      announce(changesText(recent));
       recent.length = 0;
     }, 1000);
   }

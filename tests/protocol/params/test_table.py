@@ -8,7 +8,7 @@ import pytest
 
 from paramclient.cache import ObservedParams, StoredParam, UnixTimes
 from paramclient.model.px4_hash import hash_params
-from paramclient.model.values import Encoding, Param, ParamType, Trust, as_sent
+from paramclient.model.values import Encoding, Param, ParamType, Trust, as_reported
 from paramclient.protocol.params import table as room
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.table import Table
@@ -322,7 +322,7 @@ def test_file_entries_are_independent_of_the_encoding(first: Encoding) -> None:
     changes = table.use_encoding(second)
     assert {change.name for change in changes} == {"C"}
     assert [table.params[name].value for name in "ABC"] == [BIG, 5, 6]
-    received = ParamValue("A", as_sent(BIG, ParamType.INT32, second), ParamType.INT32, 3, 0)
+    received = ParamValue("A", as_reported(BIG, ParamType.INT32, second), ParamType.INT32, 3, 0)
     assert table.store_value(received, "vehicle") is None
     assert table.params["A"].value == BIG
 
@@ -335,7 +335,7 @@ def test_the_cache_adds_what_an_earlier_message_lacks() -> None:
     }
     table = Table(Encoding.C_CAST)
     for index, (name, value) in enumerate({"A": BIG, "B": 6, "C": 5}.items()):
-        raw = as_sent(value, ParamType.INT32, Encoding.C_CAST)
+        raw = as_reported(value, ParamType.INT32, Encoding.C_CAST)
         table.store_value(ParamValue(name, raw, ParamType.INT32, 3, index), "vehicle")
     changes = table.fill(cached)
     assert [change.name for change in changes] == ["A"]
