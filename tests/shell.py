@@ -7,6 +7,7 @@ import functools
 import math
 import selectors
 import time
+from collections import deque
 from collections.abc import Awaitable, Callable, Collection, Coroutine, Mapping
 from types import SimpleNamespace
 from typing import Any, ParamSpec, TypeVar
@@ -22,6 +23,7 @@ from paramclient.errors import LinkError
 from paramclient.links import Peer, SimLink
 from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
+from paramclient.service.event_feed import EventFeed
 from paramclient.sim import Endpoint, GenericVehicle, PX4Vehicle, SimParam
 
 P = ParamSpec("P")
@@ -415,3 +417,9 @@ client_of: Callable[..., ParamClient] = ParamClient
 
 def _nothing() -> None:
     return
+
+
+def shorten_feed(feed: EventFeed, kept: int) -> None:
+    """Keep fewer events from now on."""
+    feed._labels = deque(feed._labels, kept)
+    feed._texts = deque(feed._texts, kept)

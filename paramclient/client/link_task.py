@@ -264,6 +264,7 @@ class LinkTask:
             to_send = station.data_to_send()
             if to_send:
                 self._sent.set()
+            sent_from = anyio.current_time()
             turn_ends = time.perf_counter() + TURN_MAX
             for data, peer in to_send:
                 await self._transmit(data, peer)
@@ -279,7 +280,7 @@ class LinkTask:
             is_behind = self._is_behind(now)
             if is_behind:
                 due = now + TURN_MAX
-            blocked = min(now - began, SEND_BLOCK_MAX)
+            blocked = min(now - sent_from, SEND_BLOCK_MAX)
             # it may have passed while others were ticked before it, or while the link blocked the sender
             self._suspend.expect(max(due, began) + blocked)
             self._due = due

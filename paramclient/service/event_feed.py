@@ -169,11 +169,12 @@ class EventFeed:
             system: system id, or None.
             component: component id, or None.
         """
-        self.seq += 1
         label = (kind, link, system, component)
-        encode = partial(self._event_json, self.seq, self._clock(), label, members)
+        encode = partial(self._event_json, self.seq + 1, self._clock(), label, members)
+        text = encode if callable(members) else encode()
+        self.seq += 1
         self._labels.append(label)
-        self._texts.append(encode if callable(members) else encode())
+        self._texts.append(text)
         self._has_new.set()
         return self.seq
 

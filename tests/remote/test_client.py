@@ -7,7 +7,6 @@ import hashlib
 import math
 import os
 import random
-from collections import deque
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from typing import Any
@@ -55,6 +54,7 @@ from tests.shell import (
     in_simulated_time,
     outcome,
     settled,
+    shorten_feed,
     small_px4,
     until,
 )
@@ -565,7 +565,7 @@ async def test_a_write_whose_answer_is_lost_is_not_sent_again() -> None:
 async def test_a_slow_listener_that_has_missed_events_loads_anew() -> None:
     vehicle = generic()
     async with a_hub(vehicle) as hub:
-        hub.feed._events = deque(maxlen=8)
+        shorten_feed(hub.feed, 8)
         network = Network(create_app(hub))
         async with a_program(network) as client:
             component = await client.component()

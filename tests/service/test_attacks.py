@@ -12,7 +12,6 @@ import socket
 import ssl
 import struct
 import time
-from collections import deque
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,7 +36,7 @@ from paramclient.service import (
 )
 from paramclient.service.tokens import WRONG_TOKENS_MAX
 from paramclient.sim import GenericVehicle
-from tests.shell import until
+from tests.shell import shorten_feed, until
 
 ANNA = "anna-may-write-0123456789"
 BEN = "ben-may-read-0123456789ab"
@@ -511,13 +510,13 @@ def a_narrow_socket(port: int) -> socket.socket:
 async def test_a_slow_listener_is_informed_of_lost_events_and_continues() -> None:
     async with served() as service:
         feed = service.hub.feed
-        feed._events = deque(maxlen=64)
+        shorten_feed(feed, 64)
         reader, writer = await asyncio.open_connection(sock=a_narrow_socket(service.port), limit=4_096)
         try:
             writer.write(service.head("GET", "/api/v1/events"))
             await reader.readuntil(b'"hello"')
             await overwhelm(service)
-            assert len(feed._events) == 64, "what it has not read is not kept for it"
+            assert len(feed._texts) == 64, "what it has not read is not kept for it"
             assert feed.listeners == 1
             kinds: list[str] = []
             last = 0
@@ -546,7 +545,7 @@ async def test_a_slow_listener_is_informed_of_lost_events_and_continues() -> Non
 async def test_a_listener_who_never_reads_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connections, "CLIENT_STALL_TIMEOUT", 0.2)
     async with served() as service:
-        service.hub.feed._events = deque(maxlen=64)
+        shorten_feed(service.hub.feed, 64)
         with a_narrow_socket(service.port) as narrow:
             narrow.send(service.head("GET", "/api/v1/events"))
             await until(lambda: service.hub.feed.listeners == 1)
@@ -644,7 +643,7 @@ async def test_clients_that_read_nothing_do_not_delay_the_end(
     streams = [("/api/v1/events", ()), ("/api/v1/ws", UPGRADE), ("/openapi.json", ())]
     async with contextlib.AsyncExitStack() as stack:
         async with served(listening=listening) as service:
-            service.hub.feed._events = deque(maxlen=64)
+            shorten_feed(service.hub.feed, 64)
             held = []
             for path, more in streams:
                 narrow = stack.enter_context(a_narrow_socket(service.port))

@@ -133,6 +133,19 @@ async def test_a_listener_receives_every_event_once_and_in_order() -> None:
 
 
 @in_simulated_time
+async def test_an_event_that_cannot_be_encoded_is_none() -> None:
+    async with a_feed() as feed:
+        listener = feed.listen()
+        publish(feed, 1)
+        with pytest.raises(ValueError, match="not JSON compliant"):
+            feed.publish("note", {"number": float("nan")})
+        publish(feed, 1)
+        batch = await listener.next(0.01)
+        assert batch is not None
+        assert [(seq, json.loads(text)["seq"]) for seq, text in batch[0].texts] == [(1, 1), (2, 2)]
+
+
+@in_simulated_time
 async def test_kept_events_are_nothing_that_garbage_collections_visit() -> None:
     async with a_feed() as feed:
         listener = feed.listen()

@@ -20,8 +20,9 @@ from tests.shell import in_simulated_time
 
 def test_collections_go_through_no_components_that_stay(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[str] = []
-    for name in ("freeze", "unfreeze", "collect"):
+    for name in ("freeze", "unfreeze"):
         monkeypatch.setattr(gc, name, lambda name=name: calls.append(name))
+    monkeypatch.setattr(gc, "collect", lambda generation=2: calls.append(f"collect {generation}"))
 
     def after(followed: range) -> list[str]:
         calls.clear()
@@ -30,16 +31,16 @@ def test_collections_go_through_no_components_that_stay(monkeypatch: pytest.Monk
 
     garbage = GarbageCollection()
     assert after(range(COLLECTED_COMPONENTS_MAX - 1)) == []
-    assert after(range(COLLECTED_COMPONENTS_MAX)) == ["freeze"]
+    assert after(range(COLLECTED_COMPONENTS_MAX)) == ["collect 1", "freeze"]
     assert after(range(2 * COLLECTED_COMPONENTS_MAX - 1)) == []
-    assert after(range(2 * COLLECTED_COMPONENTS_MAX)) == ["freeze"]
+    assert after(range(2 * COLLECTED_COMPONENTS_MAX)) == ["collect 1", "freeze"]
     assert after(range(1, 2 * COLLECTED_COMPONENTS_MAX)) == []
     assert after(range(COLLECTED_COMPONENTS_MAX, 2 * COLLECTED_COMPONENTS_MAX)) == [
         "unfreeze",
-        "collect",
+        "collect 2",
         "freeze",
     ]
-    assert after(range(2 * COLLECTED_COMPONENTS_MAX)) == ["freeze"]
+    assert after(range(2 * COLLECTED_COMPONENTS_MAX)) == ["collect 1", "freeze"]
     assert after(range(2 * COLLECTED_COMPONENTS_MAX)) == []
 
 

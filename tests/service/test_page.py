@@ -501,9 +501,12 @@ def test_changes_that_a_load_overtakes_are_announced(sight: Sight) -> None:
             const { table, selected } = store;
             const said = [];
             store.on("recent", ({ row }) => said.push(`${row.name} ${row.recent.kind}`));
-            const change = (seq, name, kind) => {
+            const change = (seq, name, kind, value) => {
                 const param = { name, value: 1, type: "INT32" };
-                const [before, now] = kind === "removed" ? [param, null] : [null, param];
+                const [before, now] = { removed: [param, null], added: [null, param] }[kind] ?? [
+                    param,
+                    { ...param, value },
+                ];
                 store.takeChange(selected, { seq, name, kind, old: before, new: now, by: "vehicle" });
             };
             table.isLoaded = false;
@@ -514,31 +517,60 @@ def test_changes_that_a_load_overtakes_are_announced(sight: Sight) -> None:
             store.catchUp(selected);
             change(table.seq, "GONE_ONE", "removed");
             change(table.seq, "MC_PITCH_P", "added");
-            change(table.seq, "MC_YAW_P", "changed");
+            change(table.seq, "MC_YAW_P", "changed", 2);
+            change(table.seq, "MC_YAWRATE_P", "changed", 1);
             return [said, table.rows.has("MC_ROLL_P"), table.rows.has("NEW_ONE")];
         }"""
     )
-    said = ["MC_ROLL_P removed", "NEW_ONE added", "GONE_ONE removed", "MC_PITCH_P added"]
+    said = ["MC_ROLL_P removed", "NEW_ONE added", "GONE_ONE removed", "MC_PITCH_P added", "MC_YAW_P changed"]
     assert announced == [said, False, True]
 
 
 @needs_browser
 def test_each_table_is_loaded_again_by_its_own_events(sight: Sight) -> None:
-    """Also one that is being loaded: the response may lack what the event reports."""
+    """After a load in progress, and only if its response lacks what the event reports."""
     loaded = sight.page.evaluate(
         """async () => {
             const { store } = await import("/page/store.js");
             const loaded = [];
             store.loadTable = async (key) => loaded.push(key);
-            store.tableOf("one").isLoaded = true;
-            store.tableOf("two").isLoading = true;
-            store.tableOf("three");
-            for (const key of ["one", "two", "one", "three", "unknown"]) store.reload(key);
-            await new Promise((resolve) => setTimeout(resolve, 400));
-            return loaded.sort();
+            const pause = () => new Promise((resolve) => setTimeout(resolve, 400));
+            Object.assign(store.tableOf("older"), { isLoaded: true, seq: 6 });
+            Object.assign(store.tableOf("newer"), { isLoaded: true, seq: 7 });
+            const loading = Object.assign(store.tableOf("loading"), { isLoading: true });
+            for (const key of ["older", "newer", "loading", "older", "unknown"]) store.reload(key, 7);
+            await pause();
+            const before = [...loaded];
+            Object.assign(loading, { isLoaded: true, isLoading: false, seq: 6 });
+            store.reload("loading", -1);
+            await pause();
+            return [before, loaded];
         }"""
     )
-    assert loaded == ["one", "two"]
+    assert loaded == [["older"], ["older", "loading"]]
+
+
+@needs_browser
+def test_a_load_that_a_later_one_overtakes_changes_nothing(sight: Sight) -> None:
+    state = sight.page.evaluate(
+        """async () => {
+            const { store } = await import("/page/store.js");
+            const { table, selected } = store;
+            const request = window.fetch;
+            let count = 0;
+            window.fetch = async (...options) => {
+                const isFirst = count++ === 0;
+                const response = await request(...options);
+                if (isFirst) await new Promise((resolve) => setTimeout(resolve, 300));
+                if (isFirst) throw new TypeError("lost");
+                return response;
+            };
+            const loads = [store.loadTable(selected), store.loadTable(selected)];
+            await Promise.all(loads);
+            return [count, table.isLoaded, table.isLoading, table.rows.size];
+        }"""
+    )
+    assert state == [2, True, False, 903]
 
 
 @needs_browser

@@ -293,6 +293,7 @@ const stream = new Stream({
   begin: () =>
     store.begin().catch((error) => {
       showError(error);
+      stream.last = stream.run = null; // begin anew
       setTimeout(() => stream.open(), 2000);
     }),
   take: (event) => store.take(event),

@@ -1,7 +1,7 @@
 /** Comparison with a file, an earlier state or another vehicle, and applying values from it. */
 
 import { Problem, at, get, request } from "./api.js";
-import { announce, button, byId, changesTable, el, faultText, setText } from "./dom.js";
+import { announce, button, byId, changesTable, choice, el, faultText, fileChoice, nothing, setText } from "./dom.js";
 import { closeDialog, openDialog } from "./dialogs.js";
 import { valueText } from "./details.js";
 import { Caution, OUTCOMES, nameOf, outcomesText } from "./review.js";
@@ -31,24 +31,19 @@ export async function chooseOther(file = null) {
       fault.textContent = error.message;
     }
   };
-  const input = el("input", {
-    type: "file",
-    id: "file",
-    on: { change: () => input.files[0] && attempt(() => fromFile(input.files[0])) },
-  });
-  const snapshots = el("ul", { class: "choices" }, el("li", { class: "nothing", text: "Looking …" }));
+  const [input, label] = fileChoice(
+    "file",
+    "A parameter file of any ground station. You can also drop it onto the page.",
+    (chosen) => chosen && attempt(() => fromFile(chosen)),
+  );
+  const snapshots = el("ul", { class: "choices" }, nothing("Looking …"));
   const vehicles = el("ul", { class: "choices" });
   const content = el(
     "div",
     {},
     fault,
     el("h3", { text: "A file" }),
-    el(
-      "label",
-      { class: "drop", for: "file" },
-      el("span", { text: "A parameter file of any ground station. You can also drop it onto the page." }),
-      input,
-    ),
+    label,
     el("h3", { text: "An earlier state" }),
     snapshots,
     el("h3", { text: "Another vehicle" }),
@@ -91,7 +86,7 @@ async function fillSnapshots(component, list, attempt) {
         }),
     ]);
   } catch (error) {
-    list.replaceChildren(el("li", { class: "nothing", text: error.message }));
+    list.replaceChildren(nothing(error.message));
   }
 }
 
@@ -108,21 +103,9 @@ function fillVehicles(component, list, attempt) {
   });
 }
 
-function fill(list, items, nothing, parts) {
-  const made = items.map((item) => {
-    const [name, remark, choose] = parts(item);
-    return el(
-      "li",
-      {},
-      el(
-        "button",
-        { type: "button", class: "choice", on: { click: choose } },
-        el("b", { text: name }),
-        el("small", { text: remark }),
-      ),
-    );
-  });
-  list.replaceChildren(...(made.length ? made : [el("li", { class: "nothing", text: nothing })]));
+function fill(list, items, remark, parts) {
+  const made = items.map((item) => choice(...parts(item)));
+  list.replaceChildren(...(made.length ? made : [nothing(remark)]));
 }
 
 function otherOf(label, params, source, isPartial, notes = []) {
@@ -193,13 +176,8 @@ export async function takeOver() {
     },
   });
   const table_ = changesTable([el("th", {}, all), "Name", "Now", "New", "Remark"], body);
-  const renamesInput = el("input", { type: "file", id: "renames", accept: ".yaml,.yml,.json", on: { change: replan } });
-  const renamesLabel = el(
-    "label",
-    { class: "drop", for: "renames" },
-    el("span", { text: "Changed names: a YAML file with old and new names." }),
-    renamesInput,
-  );
+  const text = "Changed names: a YAML file with old and new names.";
+  const [renamesInput, renamesLabel] = fileChoice("renames", text, replan, { accept: ".yaml,.yml,.json" });
   let renames = null;
   let lines = [];
   let job = null;
@@ -280,8 +258,7 @@ export async function takeOver() {
     store.emit("table");
   }
 
-  async function replan() {
-    const file = renamesInput.files[0];
+  async function replan(file) {
     fault.textContent = "";
     renames = null;
     if (file && file.size > RENAMES_BYTES_MAX)

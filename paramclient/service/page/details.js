@@ -1,7 +1,7 @@
 /** Details of one parameter: description, trust, history, and the form to edit it. */
 
 import { at, get } from "./api.js";
-import { button, byId, el, isNarrow } from "./dom.js";
+import { button, byId, el, isNarrow, nothing } from "./dom.js";
 import { editorOf } from "./editor.js";
 import { authorOf, store } from "./store.js";
 import { defaultOf, defaultSourceOf, meaningOf, moment, recentText, numberText, parse, rangeOf, span, textOf } from "./values.js";
@@ -106,11 +106,7 @@ export class Details {
     this.value.replaceChildren(
       el("b", { text: row.text }),
       el("span", { text: row.meaning || info?.units || "" }),
-      !row.recent
-        ? ""
-        : el("em", {
-            text: recentText(row.recent, `${span((Date.now() - row.recent.at) / 1000)} ago`),
-          }),
+      row.recent ? el("em", { text: recentText(row.recent, `${span((Date.now() - row.recent.at) / 1000)} ago`) }) : "",
     );
     const standard = defaultOf(known);
     const facts = [
@@ -145,29 +141,25 @@ export class Details {
       if (this.name !== row.name) return;
       const entries = [...found.history].sort((a, b) => timeOf(b) - timeOf(a));
       this.past.replaceChildren(...entries.map((entry) => this.entry(entry, row)));
-      if (!entries.length) this.past.append(el("li", { class: "nothing", text: "No changes recorded." }));
+      if (!entries.length) this.past.append(nothing("No changes recorded."));
     } catch (error) {
-      this.past.replaceChildren(el("li", { class: "nothing", text: error.message }));
+      this.past.replaceChildren(nothing(error.message));
     }
   }
 
   entry(entry, row) {
     const old = valueText(entry.old, row.type);
     const now = entry.new === null ? "gone" : valueText(entry.new, row.type);
+    const take = () => {
+      const { error, text, send } = parse(old, row.type);
+      if (!error) store.stage(row.name, text, send);
+    };
     return el(
       "li",
       {},
       el("span", { class: "step", text: `${old} → ${now}` }),
       el("small", { text: `${moment(timeOf(entry))} · ${authorOf(entry.by)}` }),
-      store.mayWrite &&
-        button(
-          "Take",
-          () => {
-            const read = parse(old, row.type);
-            if (!read.error) store.stage(row.name, read.text, read.send);
-          },
-          { kind: "quiet", label: `Take ${old} again` },
-        ),
+      store.mayWrite && button("Take", take, { kind: "quiet", label: `Take ${old} again` }),
     );
   }
 }

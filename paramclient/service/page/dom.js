@@ -63,6 +63,21 @@ export function setAttribute(element, name, value) {
   } else if (element.getAttribute(name) !== String(value)) element.setAttribute(name, value);
 }
 
+/** Returns an input for a file, and its label. */
+export function fileChoice(id, text, take, more = {}) {
+  const input = el("input", { type: "file", id, ...more, on: { change: () => take(input.files[0]) } });
+  return [input, el("label", { class: "drop", for: id }, el("span", { text }), input)];
+}
+
+/** Returns an item of a list of choices. */
+export const choice = (name, remark, click) => {
+  const texts = [el("b", { text: name }), el("small", { text: remark })];
+  return el("li", {}, el("button", { type: "button", class: "choice", on: { click } }, texts));
+};
+
+/** Returns the item of an empty list. */
+export const nothing = (text) => el("li", { class: "nothing", text });
+
 /** Returns a paragraph for an error. */
 export const faultText = () => el("p", { class: "fault", role: "alert" });
 

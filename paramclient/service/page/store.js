@@ -45,6 +45,7 @@ class Table {
     this.sent = null;
     this.other = null;
     this.seq = -1;
+    this.wanted = -1;
     this.loads = 0;
     this.isLoaded = false;
     this.early = null;
@@ -97,6 +98,7 @@ class Table {
       return null;
     }
     const isIncluded = event.seq <= this.seq; // in the loaded table: only announced
+    const isTrust = event.old && event.new && sameText(textOf(event.old), textOf(event.new), event.new.type);
     const row = this.rows.get(event.name);
     const recent = { at: Date.now(), by: authorOf(event.by), kind: event.kind };
     if (event.new === null) {
@@ -104,8 +106,8 @@ class Table {
       return row || isIncluded ? { ...row, name: event.name, recent } : null;
     }
     if (isIncluded) {
-      if (event.kind !== "added" || !row) return null;
-      row.recent = recent;
+      if (!row || isTrust || (event.kind !== "added" && !event.old)) return null;
+      row.recent = { ...recent, before: event.old && textOf(event.old) };
       return row;
     }
     const document = { name: event.name, ...event.new };
@@ -118,7 +120,6 @@ class Table {
       return added;
     }
     const before = row.text;
-    const isTrust = event.old && sameText(textOf(event.old), textOf(event.new), row.type);
     row.take(document);
     if (isTrust || sameText(before, row.text, row.type)) return null;
     row.recent = { ...recent, kind: "changed", before };
@@ -193,8 +194,10 @@ class Store {
     const load = ++this.loads;
     this.early = [];
     for (const table of this.tables.values()) {
-      table.isLoaded = false;
+      table.isLoaded = table.isLoading = false;
       table.early = null;
+      table.seq = table.wanted = -1; // another run counts anew
+      table.loads++;
     }
     const [me, links, found] = await Promise.all([get("/me"), get("/links"), get("/components")]);
     if (load !== this.loads) return;
@@ -245,14 +248,16 @@ class Store {
     try {
       found = await get(at(component, "/params", { metadata: "true" }));
     } catch (error) {
-      if (load === table.loads) this.keepTable(key, !(error.status < 500));
+      if (load !== table.loads) return;
+      this.keepTable(key, !(error.status < 500));
       throw error;
     } finally {
-      table.isLoading = load !== table.loads;
+      if (load === table.loads) table.isLoading = false;
     }
     if (load !== table.loads) return;
     table.load(found.params, found.seq ?? -1);
     this.catchUp(key);
+    this.reload(key, -1);
   }
 
   /** After a failed load, the table stays, with later events applied, and is loaded again. */
@@ -294,7 +299,7 @@ class Store {
     const key = keyOf(event);
     if (event.type === "component") this.takeComponent(key, event);
     else if (event.type === "change") this.takeChange(key, event);
-    else if (event.type === "params") this.reload(key);
+    else if (event.type === "params") this.reload(key, event.seq);
     else if (event.type === "progress") {
       const component = this.components.get(key);
       if (component) component.fetch = event.done ? null : event;
@@ -339,12 +344,14 @@ class Store {
     if (key === this.selected) this.emit("table");
   }
 
-  /** Loads a loaded table again, once for simultaneous events. A load in progress may lack what they report. */
-  reload(key) {
+  /** Loads a table again, after a load in progress, if it lacks what an event reports. */
+  reload(key, seq) {
     const table = this.tables.get(key);
-    if (!table?.isLoaded && !table?.isLoading) return;
+    if (!table) return;
+    table.wanted = Math.max(table.wanted, seq);
     clearTimeout(table.reloading);
-    table.reloading = setTimeout(() => this.loadTable(key).catch(() => {}), 150);
+    const isDue = () => table.isLoaded && table.wanted > table.seq;
+    table.reloading = setTimeout(() => isDue() && this.loadTable(key).catch(() => {}), 150);
   }
 
   /** Stages a value; one equal to the vehicle's is removed. */

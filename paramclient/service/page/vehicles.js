@@ -1,7 +1,7 @@
 /** Vehicles and their states: the list, the status line, and the actions. */
 
 import { at, download, get, request } from "./api.js";
-import { announce, button, byId, el, faultText, setAttribute, setText } from "./dom.js";
+import { announce, button, byId, choice, el, faultText, fileChoice, nothing, setAttribute, setText } from "./dom.js";
 import { chooseOther } from "./compare.js";
 import { closeDialog, openDialog } from "./dialogs.js";
 import { offerExtended, showExtended } from "./extended.js";
@@ -67,7 +67,7 @@ export function drawVehicles() {
   const { unheard, component } = store;
   if (component?.is_kept && !unheard.includes(component)) unheard.unshift(component); // connected again
   drawList(byId("vehicles"), components);
-  if (!components.length) byId("vehicles").append(el("li", { class: "nothing", text: "None found yet." }));
+  if (!components.length) byId("vehicles").append(nothing("None found yet."));
   drawCached(unheard);
   drawChoice(components, unheard);
   drawVehicle(component);
@@ -214,8 +214,8 @@ async function describe() {
     }
     state.textContent = "";
   };
-  const change = () => input.files[0] && attempt("PUT", input.files[0]);
-  const input = el("input", { type: "file", id: "file", on: { change } });
+  const text = "apm.pdef.xml, parameters.json or the like";
+  const [, label] = fileChoice("file", text, (file) => file && attempt("PUT", file));
   const ask = button("Load from the vehicle", () => attempt("POST", {}), { kind: "strong" });
   const content = el(
     "div",
@@ -224,12 +224,7 @@ async function describe() {
       text: "Units, ranges and value names are not loaded yet. A vehicle with PX4 can send them; for others, use a file of their firmware.",
     }),
     el("h3", { text: "From a file" }),
-    el(
-      "label",
-      { class: "drop", for: "file" },
-      el("span", { text: "apm.pdef.xml, parameters.json or the like" }),
-      input,
-    ),
+    label,
     state,
     fault,
   );
@@ -270,11 +265,7 @@ async function save() {
   const { formats } = await get("/formats");
   const choices = formats
     .filter((format) => format.writes)
-    .map(({ name, title, endings }) => {
-      const choose = { type: "button", class: "choice", on: { click: () => take(name) } };
-      const texts = [el("b", { text: title }), el("small", { text: endings.join(", ") })];
-      return el("li", {}, el("button", choose, texts));
-    });
+    .map(({ name, title, endings }) => choice(title, endings.join(", "), () => take(name)));
   const list = el("ul", { class: "choices" }, choices);
   const state = el("p", { role: "status" });
   const fault = faultText();
