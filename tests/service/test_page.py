@@ -28,7 +28,7 @@ FILES = Path(__file__).parents[2] / "paramclient/service/page"
 LARGEST_PAGE = 150_000
 DESKTOP = {"width": 1280, "height": 800}
 PHONE = {"width": 390, "height": 844}
-TIMEOUT = 15_000.0
+TIMEOUT = 60_000.0
 EXPECTED = re.compile(
     r"the server responded with a status of (4\d\d|503)|ERR_(CONNECTION_(REFUSED|RESET)|INCOMPLETE)"
 )
