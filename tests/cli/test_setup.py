@@ -771,15 +771,18 @@ def test_ctrl_c_prints_the_outcomes_so_far(
     assert set(vehicle.values.values()) == {2}
 
 
+class Dying(GenericVehicle):
+    """Says nothing any more after 12 writes."""
+
+    def _on_set(self, request: Any, sender: Any) -> None:
+        super()._on_set(request, sender)
+        if self.requests["PARAM_SET"] == 12:
+            self._switch_on(float("inf"))
+
+
 def test_a_silent_vehicle_is_reported_with_the_outcomes_so_far(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
 ) -> None:
-    class Dying(GenericVehicle):
-        def _on_set(self, request: Any, sender: Any) -> None:
-            super()._on_set(request, sender)
-            if self.requests["PARAM_SET"] == 12:
-                self._switch_on(float("inf"))
-
     names = [f"P{number:02}" for number in range(40)]
     vehicle = Dying(dict.fromkeys(names, 1))
     wanted = file("".join(f"{name},2\n" for name in names))
@@ -810,12 +813,6 @@ def test_an_interrupted_restore_prints_the_command_that_continues(
 def test_a_restore_that_fails_prints_the_command_that_continues(
     command: Command, put: Put, file: Callable[..., Path], cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Dying(GenericVehicle):
-        def _on_set(self, request: Any, sender: Any) -> None:
-            super()._on_set(request, sender)
-            if self.requests["PARAM_SET"] == 12:
-                self._switch_on(float("inf"))
-
     names = [f"P{number:02}" for number in range(40)]
     wanted = file("".join(f"{name},2\n" for name in names))
     assert command("apply", put(GenericVehicle(dict.fromkeys(names, 1))), wanted).code == 0

@@ -477,6 +477,25 @@ async def test_many_frames_at_once_give_way_to_other_tasks(monkeypatch: pytest.M
     assert max(map(len, rounds)) == round(TURN_MAX / 0.001)
 
 
+class Due(Watched):
+    """Has one deadline, and counts suspends.
+
+    Args:
+        due: the deadline, in seconds from now.
+    """
+
+    def __init__(self, due: float) -> None:
+        super().__init__()
+        self.due = anyio.current_time() + due
+        self.resumed = 0
+
+    def next_deadline(self) -> float:
+        return self.due
+
+    def handle_suspend(self, unseen: float, now: float) -> None:
+        self.resumed += 1
+
+
 @in_simulated_time
 async def test_a_deadline_that_passed_while_the_sender_was_blocked_is_no_suspend() -> None:
     """A slow serial link takes seconds to send; every request was sent again then."""
@@ -485,12 +504,8 @@ async def test_a_deadline_that_passed_while_the_sender_was_blocked_is_no_suspend
         async def send(self, data: bytes, peer: Peer | None) -> None:
             await anyio.sleep(SUSPEND_MIN + 1.0)
 
-    class Resumed(Watched):
-        def __init__(self) -> None:
-            super().__init__()
-            self.frames: list[tuple[bytes, Peer | None]] = [(b"x", None)]
-            self.due = anyio.current_time() + 0.5
-            self.resumed = 0
+    class Resumed(Due):
+        frames: tuple[tuple[bytes, Peer | None], ...] = ((b"x", None),)
 
         def tick(self, now: float) -> None:
             super().tick(now)
@@ -498,16 +513,10 @@ async def test_a_deadline_that_passed_while_the_sender_was_blocked_is_no_suspend
                 self.due = math.inf
 
         def data_to_send(self) -> list[tuple[bytes, Peer | None]]:
-            frames, self.frames = self.frames, []
-            return frames
+            frames, self.frames = self.frames, ()
+            return list(frames)
 
-        def next_deadline(self) -> float:
-            return self.due
-
-        def handle_suspend(self, unseen: float, now: float) -> None:
-            self.resumed += 1
-
-    station = Resumed()
+    station = Resumed(0.5)
     await carry(Slow(), station, 10.0, lambda: None)
     assert station.due == math.inf, "the passed deadline was handled"
     assert not station.resumed
@@ -517,24 +526,13 @@ async def test_a_deadline_that_passed_while_the_sender_was_blocked_is_no_suspend
 async def test_deadlines_that_wait_for_those_of_other_components_are_no_suspend() -> None:
     """A tick handles a few components: the last of 1,000 that are due together is late by seconds."""
 
-    class Behind(Watched):
-        def __init__(self) -> None:
-            super().__init__()
-            self.due = anyio.current_time() - SUSPEND_MIN - 1.0
-            self.resumed = 0
-
+    class Behind(Due):
         def tick(self, now: float) -> None:
             super().tick(now)
             if len(self.ticks) >= 20:
                 self.due = math.inf
 
-        def next_deadline(self) -> float:
-            return self.due
-
-        def handle_suspend(self, unseen: float, now: float) -> None:
-            self.resumed += 1
-
-    station = Behind()
+    station = Behind(-SUSPEND_MIN - 1.0)
     await carry(Flood(), station, 5.0, lambda: None)
     assert station.due == math.inf, "the deadlines were handled"
     assert not station.resumed
