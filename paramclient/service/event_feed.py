@@ -22,7 +22,15 @@ from typing import Any, Final, NamedTuple, TypeAlias
 import anyio
 import anyio.lowlevel
 
-__all__ = ["COMPACT_SEPARATORS", "Batch", "EventFeed", "Listener", "EventPosition", "EventFilter"]
+__all__ = [
+    "COMPACT_SEPARATORS",
+    "Batch",
+    "EventFeed",
+    "EventFilter",
+    "EventPosition",
+    "Listener",
+    "change_members",
+]
 
 COMPACT_SEPARATORS: Final = (",", ":")
 """JSON separators without spaces."""
@@ -115,6 +123,19 @@ class Batch:
         """Return the batch as server-sent events (WHATWG HTML, "Server-sent events")."""
         run = self.position.run
         return "".join([f"id: {run}-{seq}\ndata: {text}\n\n" for seq, text in self.texts]).encode()
+
+
+def change_members(name: str, old: str | None, new: str | None, by: str, kind: str) -> str:
+    """Return the members of a change as JSON without the braces.
+
+    Args:
+        name: name of the parameter.
+        old, new: the values before and after as JSON, or None.
+        by: author of the change.
+        kind: added, changed or removed.
+    """
+    members = f'"name":{json.dumps(name)},"old":{old or "null"},"new":{new or "null"},"by":{json.dumps(by)}'
+    return f'{members},"kind":"{kind}"'
 
 
 class EventFeed:

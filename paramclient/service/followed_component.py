@@ -19,6 +19,7 @@ from paramclient.errors import NoReply, ParamClientError
 from paramclient.model.params import CACHED, as_params, compact_param, trust_of
 from paramclient.model.values import Param, Trust
 from paramclient.protocol.params.change import Added, Change
+from paramclient.service.event_feed import change_members
 from paramclient.service.followed_extended import FollowedExtended
 
 if TYPE_CHECKING:
@@ -291,10 +292,9 @@ class FollowedComponent:
         self, name: str, old: Param | None, new: Param | None, received_at: float | None, by: str, kind: str
     ) -> str:
         """Return the members of a change as JSON without the braces."""
-        before = "null" if old is None else self._encode(old, None)
-        after = "null" if new is None else self._encode(new, received_at)
-        members = f'"name":{json.dumps(name)},"old":{before},"new":{after},"by":{json.dumps(by)}'
-        return f'{members},"kind":"{kind}"'
+        before = None if old is None else self._encode(old, None)
+        after = None if new is None else self._encode(new, received_at)
+        return change_members(name, before, after, by, kind)
 
     def _state_key(self) -> tuple[object, ...]:
         """Return the state whose changes are published; the identity is the first item."""

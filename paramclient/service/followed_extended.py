@@ -16,6 +16,7 @@ from paramclient.documents.component import ProgressDoc
 from paramclient.documents.extended_param import ExtParamDoc
 from paramclient.model.ext_params import ExtParam
 from paramclient.protocol.ext.change import ExtChange
+from paramclient.service.event_feed import change_members
 
 __all__ = ["FollowedExtended", "ext_param_json"]
 
@@ -130,10 +131,9 @@ class FollowedExtended:
         received_at = None if new is None else self.received_at(name)
 
         def write() -> str:
-            before = "null" if old is None else ext_param_json(old, None)
-            after = "null" if new is None else ext_param_json(new, received_at)
-            members = f'"name":{json.dumps(name)},"old":{before},"new":{after},"by":{json.dumps(by)}'
-            return f'{members},"kind":"{kind}"'
+            before = None if old is None else ext_param_json(old, None)
+            after = None if new is None else ext_param_json(new, received_at)
+            return change_members(name, before, after, by, kind)
 
         self._publish("extended_change", write)
 
