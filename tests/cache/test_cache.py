@@ -512,7 +512,8 @@ def test_the_default_path_is_in_the_users_cache_folder(
 
 
 def test_to_import_it_takes_no_other_library() -> None:
-    loaded = start(f"{CACHE_ALONE}; print(*sys.modules)").communicate()[0].split()
+    with start(f"{CACHE_ALONE}; print(*sys.modules)") as program:
+        loaded = program.communicate()[0].split()
     assert "paramclient.cache.store" in loaded
     assert not {"pydantic", "pymavlink", "anyio", "asyncio"} & set(loaded)
 

@@ -460,12 +460,12 @@ cache = ParamCache(sys.argv[1])
 made = [cache.store_snapshot(Identity(1, "x"), 1, ParamSet({{}}), reason=sys.argv[2]) for _ in range(40)]
 print(*(each.id for each in made))
 """
-    programs = [start(program, path, name) for name in "ab"]
-    for each in programs:
-        assert each.stdin is not None
-        each.stdin.write("go\n")
-        each.stdin.flush()
-    ids = [number for each in programs for number in map(int, each.communicate()[0].split())]
+    with start(program, path, "a") as first, start(program, path, "b") as second:
+        for each in (first, second):
+            assert each.stdin is not None
+            each.stdin.write("go\n")
+            each.stdin.flush()
+        ids = [number for each in (first, second) for number in map(int, each.communicate()[0].split())]
     assert sorted(ids) == list(range(1, 81))
     with ParamCache(path) as cache:
         assert [each.id for each in cache.snapshots("system:1@x")] == list(range(31, 81))

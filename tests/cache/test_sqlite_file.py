@@ -255,15 +255,16 @@ def test_several_programs_write_at_once(path: Path, begin: bytes | None) -> None
     """They also race for making the file, and for setting a damaged one aside, which happens once."""
     if begin is not None:
         path.write_bytes(begin)
-    programs = [start(COUNTERS, path, component) for component in range(1, 5)]
-    for program in programs:
-        assert program.stdout is not None
-        assert program.stdout.readline() == "ready\n"
-    for program in programs:
-        assert program.stdin is not None
-        program.stdin.write("go\n")
-        program.stdin.flush()
-    said = [program.communicate()[0] for program in programs]
+    with ExitStack() as running:
+        programs = [running.enter_context(start(COUNTERS, path, component)) for component in range(1, 5)]
+        for program in programs:
+            assert program.stdout is not None
+            assert program.stdout.readline() == "ready\n"
+        for program in programs:
+            assert program.stdin is not None
+            program.stdin.write("go\n")
+            program.stdin.flush()
+        said = [program.communicate()[0] for program in programs]
     assert all(text.startswith("done") for text in said), said
     with ParamCache(path) as cache:
         for component in range(1, 5):
@@ -772,10 +773,10 @@ def test_to_open_a_cache_twice_drops_none_of_its_locks(path: Path) -> None:
         with ParamCache(path) as second:
             assert len(values(second)) == 3
         gc.collect()
-        output, _ = start(ask, path, "PRAGMA journal_mode = DELETE").communicate()
-        assert output.strip() != "delete", "only who is alone may do that"
-    output, _ = start(ask, path, "PRAGMA journal_mode = DELETE").communicate()
-    assert output.strip() == "delete"
+        with start(ask, path, "PRAGMA journal_mode = DELETE") as program:
+            assert program.communicate()[0].strip() != "delete", "only who is alone may do that"
+    with start(ask, path, "PRAGMA journal_mode = DELETE") as program:
+        assert program.communicate()[0].strip() == "delete"
 
 
 def test_a_file_of_ours_without_an_application_id_gets_one(path: Path) -> None:

@@ -41,8 +41,10 @@ def another_program(tmp_path: Path, kind: str, family: str = "AF_INET") -> Itera
         [sys.executable, script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as program:
         assert program.stdout is not None
-        yield program.pid, int(program.stdout.readline())
-        program.communicate("")
+        try:
+            yield program.pid, int(program.stdout.readline())
+        finally:
+            program.kill()
 
 
 @linux_only
