@@ -128,8 +128,7 @@ def test_the_version_stands_in_one_place(metadata: Message) -> None:
 
 def test_the_changelog_knows_the_version() -> None:
     text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
-    versions = re.findall(r"^## \[([^]]+)\](?: - \d{4}-\d\d-\d\d)?$", text, re.MULTILINE)
-    assert versions[:2] == ["Unreleased", paramclient.__version__]
+    assert re.findall(r"^## \[([^]]+)\]", text, re.MULTILINE)[0] == paramclient.__version__
 
 
 def test_the_dependencies_of_the_library_and_its_extras(metadata: Message) -> None:
