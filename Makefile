@@ -1,16 +1,18 @@
 # Everything is installed into .venv, which the first call creates if it does not exist.
 #
-#   make demo       the main job on a simulated vehicle
-#   make test       the tests                      make coverage   the tests with their coverage
-#   make lint       style and types                make docs       the documentation, into docs/_build/html
-#   make bench      parser and start-up time       make dist       wheel and sdist, into dist
-#   make cost       CPU and memory                 make peers      downloads, compared with other clients
-#   make scale      250 systems on one link        make fuzz       each target of fuzz/ for SECONDS
-#   make soak       10,000 random sessions         make kills      1,000 programs killed while they write
-#   make attack     hostile clients and services   make fuzz-http  random requests to the service
-#   make sync       generates the blocking client from the asynchronous one
-#   make clean      removes .venv and all other files that these commands create
-#   make pictures   the comparison with other clients as pictures, into docs/images
+#   make demo         the main job on a simulated vehicle
+#   make test         the tests                      make lint       style and types
+#   make test-slow    tests in real time, of many processes, and of every program and command in the documentation
+#   make test-all     all tests: test, test-slow, and soak, kills, attack and fuzz for some minutes each
+#   make coverage     the tests with their coverage  make docs       the documentation, into docs/_build/html
+#   make bench        parser and start-up time       make dist       wheel and sdist, into dist
+#   make cost         CPU and memory                 make peers      downloads, compared with other clients
+#   make scale        250 systems on one link        make fuzz       each target of fuzz/ for SECONDS
+#   make soak         random sessions                make kills      programs killed while they write
+#   make attack       hostile clients and services   make fuzz-http  random requests to the service
+#   make sync         generates the blocking client from the asynchronous one
+#   make clean        removes .venv and all other files that these commands create
+#   make pictures     the comparison with other clients as pictures, into docs/images
 #   make screenshots  screenshots of the web page, into docs/images
 #   make live LINK=udpin:127.0.0.1:14550   checks on a real vehicle, which must be disarmed
 
@@ -35,27 +37,34 @@ READ_ONLY ?=
 REBOOT ?=
 
 MEASURED = 'model/*' 'protocol/*' 'sim/*' 'cache/*' 'files/*' errors.py
-# excluded from the coverage: tests of other rooms, and tests that start processes, in which coverage is not measured
-UNMEASURED = $(addprefix --ignore=tests/,cli test_bench.py test_docs.py test_examples.py links/test_links.py \
-	protocol/test_state_machine.py test_packaging.py)
-
 # more workers than cores: many tests wait for a process, a socket or a timeout
 WORKERS ?= $(shell $(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 2)')
 
 # the tests start several hundred processes; without bytecode, each of them would compile paramclient again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test coverage soak kills live fuzz fuzz-http attack lint docs screenshots pictures sync bench cost scale peers dist clean
+.PHONY: demo test test-slow test-all coverage soak kills live fuzz fuzz-http attack lint docs screenshots pictures sync bench cost scale peers dist clean
 .NOTPARALLEL:
 
 demo: $(VENV)/with-cli
 	@$(BIN)/python examples/demo.py
 
 test: $(VENV)/with-test
-	$(BIN)/python -m pytest --numprocesses $(WORKERS) $(TESTS)
+	$(BIN)/python -m pytest -m 'not slow' --numprocesses $(WORKERS) $(TESTS)
+
+test-slow: $(VENV)/with-test
+	$(BIN)/python -m pytest -m slow --numprocesses $(WORKERS) $(TESTS)
+
+test-all:
+	$(MAKE) test
+	$(MAKE) test-slow
+	$(MAKE) soak SESSIONS=1000
+	$(MAKE) kills KILLS=100
+	$(MAKE) attack
+	$(MAKE) fuzz SECONDS=30
 
 coverage: $(VENV)/with-test
-	$(BIN)/python -m pytest --numprocesses $(WORKERS) --cov --cov-report= $(TESTS) $(UNMEASURED)
+	$(BIN)/python -m pytest -m 'not slow' --numprocesses $(WORKERS) --cov --cov-report= $(TESTS)
 	@failed=; for room in $(MEASURED); do \
 		echo "== paramclient/$$room"; \
 		$(BIN)/coverage report --include="paramclient/$$room" --fail-under=95 || failed=1; \

@@ -15,6 +15,8 @@ from paramclient.model.values import ParamType
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle
 from tests.simulated_on_udp import flying
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parent.parent
 
 

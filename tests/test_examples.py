@@ -14,6 +14,8 @@ import yaml
 
 from paramclient import read_file
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parent.parent
 EXAMPLES = ROOT / "examples"
 

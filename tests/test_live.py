@@ -26,6 +26,8 @@ from tests.live.relay import Conditions, RealVehicle
 from tests.live.session import Check, Measured, Session
 from tests.simulated_on_udp import flying
 
+pytestmark = pytest.mark.slow
+
 CHANNELS: dict[str, WireValue] = {
     f"RC{channel}_{what}": value
     for channel in range(1, 17)

@@ -20,6 +20,8 @@ from hatchling.builders.wheel import WheelBuilder
 
 import paramclient
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parent.parent
 SOURCES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "paramclient").rglob("*.py")}
 PLUGIN = "pytest_paramclient.py"
