@@ -10,7 +10,6 @@
 #   make scale        250 systems on one link        make fuzz       each target of fuzz/ for SECONDS
 #   make soak         random sessions                make kills      programs killed while they write
 #   make attack       hostile clients and services   make fuzz-http  random requests to the service
-#   make sync         generates the blocking client from the asynchronous one
 #   make clean        removes .venv and all other files that these commands create
 #   make pictures     the comparison with other clients as pictures, into docs/images
 #   make screenshots  screenshots of the web page, into docs/images
@@ -43,7 +42,7 @@ WORKERS ?= $(shell $(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 2)
 # the tests start several hundred processes; without bytecode, each of them would compile paramclient again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-slow test-all coverage soak kills live fuzz fuzz-http attack lint docs screenshots pictures sync bench cost scale peers dist clean
+.PHONY: demo test test-slow test-all coverage soak kills live fuzz fuzz-http attack lint docs screenshots pictures bench cost scale peers dist clean
 .NOTPARALLEL:
 
 demo: $(VENV)/with-cli
@@ -107,10 +106,6 @@ screenshots: $(VENV)/with-test
 pictures: $(VENV)/made
 	$(BIN)/python bench/pictures.py
 
-# needed after each change of the asynchronous interface; a test compares the result
-sync: $(VENV)/with-test
-	$(BIN)/python -m tests.sync_interface
-
 bench: $(VENV)/with-cli
 	$(BIN)/python bench/parse.py
 	$(BIN)/python bench/startup.py
@@ -153,7 +148,7 @@ $(VENV)/made:
 
 $(VENV)/with-cli: pyproject.toml $(VENV)/made
 	@echo "Installing paramclient into $(VENV)"
-	@$(PIP) --editable '.[cli,remote,serial,service]'
+	@$(PIP) --editable '.[cli,serial,service]'
 	@touch $@
 
 # dependency groups need pip 25.1; the pip of a new environment may be older

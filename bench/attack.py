@@ -18,7 +18,6 @@ import argparse
 import asyncio
 import contextlib
 import dataclasses
-import gzip
 import json
 import os
 import re
@@ -903,75 +902,6 @@ async def killed_apply(rows: list[Row], quick: bool) -> None:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-CLIENT: Final = """
-import asyncio, re, sys, time
-from pathlib import Path
-from paramclient import ParamClient
-def peak(): return int(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) / 1024
-async def main():
-    try:
-        async with ParamClient(sys.argv[1]):
-            return "no error"
-    except Exception as error:
-        return type(error).__name__
-began = time.monotonic()
-import httpx, paramclient.remote.client
-before = peak()
-print(asyncio.run(main()), peak() - before, time.monotonic() - began)
-"""
-"""A client program that opens a service; it prints the error, the megabytes used, and the seconds."""
-
-
-async def hostile_service(rows: list[Row], quick: bool) -> None:
-    """Clause 9."""
-    stream = b"HTTP/1.1 200 OK\r\nContent-Type: text/event-stream\r\n\r\n"
-    hello = b'data: {"run":"0123456789abcdef","seq":0,"at":0,"type":"hello","resumed":false}\n\n'
-    answer = b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\n"
-    bomb = gzip.compress(b" " * (64 << 20))
-    wide = b"[" + b"[]," * (4 << 20) + b"1]"
-    keys = b"{" + b",".join(b'"%07d":1.5' % number for number in range(999_000)) + b"}"
-    attacks: list[tuple[str, bytes, bytes, bytes]] = [
-        ("a line without an end", stream, b"x" * 65_536, b""),
-        ("an event without an end", stream, b"data: " + b"x" * 65_000 + b"\n", b""),
-        ("a packed answer of 64 MB", answer + b"Content-Encoding: gzip\r\n\r\n" + bomb, b"", hello),
-        ("an answer without an end", answer + b"\r\n", b" " * 65_536, hello),
-        ("4 million lists", answer + b"\r\n" + wide, b"", hello),
-        ("1 million members", answer + b"\r\n" + keys, b"", hello),
-        ("100,000 levels", answer + b"\r\n" + b"[" * 100_000, b"", hello),
-        ("headers without an end", b"HTTP/1.1 200 OK\r\n", b"X: y\r\n" * 1_000, b""),
-    ]
-    for name, begin, endless, greeting in attacks[: 4 if quick else None]:
-
-        async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            with contextlib.suppress(OSError, asyncio.IncompleteReadError):
-                request = await reader.readuntil(b"\r\n\r\n")
-                if greeting and b"/events" in request:  # noqa: B023 - called in this turn alone
-                    writer.write(stream + greeting)  # noqa: B023 - called in this turn alone
-                    await reader.read()
-                else:
-                    writer.write(begin)  # noqa: B023 - called in this turn alone
-                    while endless:  # noqa: B023 - called in this turn alone
-                        writer.write(endless)  # noqa: B023 - called in this turn alone
-                        await writer.drain()
-            with contextlib.suppress(OSError):
-                writer.close()
-
-        server = await asyncio.start_server(serve, HERE, 0)
-        url = f"http://{HERE}:{server.sockets[0].getsockname()[1]}"
-        client = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-c", CLIENT, url),
-            stdout=subprocess.PIPE,
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-        )
-        out, _ = await asyncio.wait_for(client.communicate(), 2 * TIMEOUT)
-        server.close()
-        kind, memory, seconds = out.decode().split()
-        attack = f"a service sends a client {name}"
-        rows.append(Row(attack, "memory grows", 256.0, round(float(memory), 1), "MB"))
-        rows.append(Row(attack, "it ends", 15.0, round(float(seconds), 1), "s"))
-        rows.append(Row(attack, "another error than LinkError", 0, kind != "LinkError", ""))
-
-
 async def udp(rows: list[Row], quick: bool) -> None:
     """Clause 10."""
     with socket.socket(type=socket.SOCK_DGRAM) as free:
@@ -1047,7 +977,6 @@ async def attack(quick: bool, only: str) -> list[Row]:
         "stuck readers": lambda: on_service(stuck_readers, *sim),
         "locked cache": lambda: locked_cache(rows, quick),
         "killed apply": lambda: killed_apply(rows, quick),
-        "hostile service": lambda: hostile_service(rows, quick),
         "udp": lambda: udp(rows, quick),
     }
     for name, run in groups.items():

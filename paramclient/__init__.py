@@ -1,6 +1,6 @@
 """Client for MAVLink's parameter protocol, for asyncio and trio programs, with a parameter cache.
 
-- `client`, `remote`: the client over a link, and over a service.
+- `client`: the client over a link.
 - `sync`: the same client for scripts and notebooks, without `await`.
 - `protocol`, `links`: the sans-I/O core, and the bytes in and out.
 - `cache`, `files`, `metadata`, `logs`, `provision`, `diagnosis`: cached tables, parameter files, units

@@ -275,17 +275,14 @@ class AmbiguousVehicle(UsageError):
 
     Attributes:
         vehicles: the matching vehicles, in words: `1/1 PX4 quadrotor` on a link.
-        choose_by: the argument that selects one of them, "system", "component" or "peer"; "link" if only
-            the link of a service distinguishes them; "" for vehicles in the cache, which have keys.
+        choose_by: the argument that selects one of them, "system", "component" or "peer"; "" for vehicles in
+            the cache, which have keys.
         summary: the text of the error without the advice.
     """
 
     def __init__(self, message: str, *, vehicles: Sequence[str], choose_by: str = "") -> None:
-        ways = {
-            "": "",
-            "link": " Name its link in the address of the service: http://HOST:PORT?link=NAME.",
-        }
-        super().__init__(message + ways.get(choose_by, f" Choose one with the argument {choose_by}."))
+        way = f" Choose one with the argument {choose_by}." if choose_by else ""
+        super().__init__(message + way)
         self.vehicles = tuple(vehicles)
         self.choose_by = choose_by
         self.summary = message

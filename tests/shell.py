@@ -408,11 +408,7 @@ async def settled() -> None:
 
 def a_client(link: Any, **options: Any) -> ParamClient:
     """A client without a cache, unless one is given."""
-    return client_of(link, **{"cache": False} | options)
-
-
-client_of: Callable[..., ParamClient] = ParamClient
-"""What makes clients; see `tests/client_kinds.py`."""
+    return ParamClient(link, **{"cache": False} | options)
 
 
 def _nothing() -> None:

@@ -38,8 +38,7 @@ MAY_IMPORT = {
     "cache": {"errors", "model"},
     "files": {"errors", "model", "protocol"},
     "metadata": SHELL,
-    "client": SHELL | {"sim", "remote"},
-    "remote": SHELL | {"documents"},
+    "client": SHELL | {"sim"},
     "diagnosis": SHELL | {"metadata"},
     "provision": SHELL | {"files"},
     "logs": SHELL | {"files"},
@@ -71,8 +70,7 @@ LIBRARIES = {
     "psycopg": ("cache",),
     "psycopg_pool": ("cache",),
     "pyulog": ("logs",),
-    "httpx": ("remote",),
-    "httpx_sse": ("remote",),
+    "httpx": (),
     **dict.fromkeys(["rich", "cyclopts"], ("cli", "__main__")),
     **dict.fromkeys(["fastapi", "starlette", "uvicorn", "websockets", "prometheus_client"], ("service",)),
 }
@@ -306,7 +304,7 @@ def test_names_in_all_exist_once() -> None:
 def test_importing_the_package_loads_nothing_that_only_some_need() -> None:
     """Start-up is part of the command's promise; mavutil, besides, changes the process that imports it."""
     unwanted = {"pymavlink.mavutil", "pydantic", "yaml", "filelock", *LIBRARIES} - {"pymavlink", "asyncio"}
-    rooms = ("sim", "testing", "cli", "provision", "documents", "service", "remote", "sync")
+    rooms = ("sim", "testing", "cli", "provision", "documents", "service", "sync")
     unwanted |= {f"paramclient.{room}" for room in rooms}
     program = f"import sys; from paramclient import *; print(sorted({unwanted!r} & sys.modules.keys()))"
     run = subprocess.run(

@@ -28,7 +28,6 @@ import paramclient.diagnosis
 import paramclient.links
 import paramclient.metadata
 import paramclient.provision
-import paramclient.remote
 import paramclient.sim
 import paramclient.sync
 import paramclient.testing
@@ -49,7 +48,7 @@ EVERY_PAGE = pytest.mark.parametrize("page", PAGES, ids=name_of)
 
 PUBLIC = [
     *(paramclient, paramclient.diagnosis, paramclient.links, paramclient.metadata, paramclient.provision),
-    *(paramclient.remote, paramclient.sim, paramclient.sync, paramclient.testing),
+    *(paramclient.sim, paramclient.sync, paramclient.testing),
 ]
 
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -490,8 +489,7 @@ def test_every_public_name_is_in_the_pages(module: ModuleType) -> None:
 
 
 MADE_BY_THE_LIBRARY = {
-    *("CachedComponent.of", "ClientStats.of", "RemoteComponent.__init__"),
-    "RemoteComponent.load_restore_point",
+    *("CachedComponent.of", "ClientStats.of"),
     *("Changes.push", "Events.push", "ExtChanges.push", "SimVehicle.__init__"),
     *("ParamCache.save", "ParamCache.merge", "ParamCache.save_ext"),
 }

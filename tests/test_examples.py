@@ -22,9 +22,7 @@ EXAMPLES = ROOT / "examples"
 PRINTED = {
     "companion": [
         r"serving /dev/\S+ on http://127\.0\.0\.1:\d+",
-        r"903 parameters, 0 missing",
         r"accepted: MC_ROLL_P = 6\.5",
-        r"all clients receive: MC_ROLL_P = 6\.5, by us",
         r"BAT1_N_CELLS = 6, was 4",
         r"the service has ended with 0",
     ],

@@ -1,33 +1,43 @@
-"""A program on the companion computer. It uses the vehicle over the service like over its own link.
+"""A program on the companion computer: sets a parameter over the HTTP API of the service.
 
     python examples/companion/tune.py http://127.0.0.1:8765 MC_ROLL_P 6.5
 
 If the service requires a token, it is in the environment variable PARAMCLIENT_TOKEN.
 """
 
-import asyncio
+import json
+import os
 import sys
+import time
+import urllib.error
+import urllib.request
+from typing import Any
 
-from paramclient import ParamClient
+VEHICLE = "/api/v1/components/1/1"
 
 
-async def main(service: str, name: str, value: float) -> None:
-    async with ParamClient(service) as client:
-        vehicle = await client.only_component(timeout=30)
-        result = await vehicle.fetch_all()
-        print(f"{result.received} parameters, {len(result.missing)} missing")
-        known = vehicle.params.get(name)
-        changes = vehicle.changes()
-        done = await vehicle.set(name, value)
-        print(f"{done.status}: {name} = {done.actual!r}")
-        if known is not None and known.value == done.actual:
-            return  # the vehicle had the value already: nothing has changed
-        async for change in changes:
-            if change.name == name and change.new is not None:
-                print(f"all clients receive: {name} = {change.new.value!r}, by {change.by}")
-                break
+def ask(address: str, body: dict[str, Any] | None = None, method: str | None = None) -> Any:
+    """Send a request, and return the JSON of the response."""
+    request = urllib.request.Request(
+        address, None if body is None else json.dumps(body).encode(), method=method
+    )
+    request.add_header("Content-Type", "application/json")
+    if token := os.environ.get("PARAMCLIENT_TOKEN"):
+        request.add_header("Authorization", f"Bearer {token}")
+    with urllib.request.urlopen(request, timeout=30) as response:
+        return json.load(response)
+
+
+def main(service: str, name: str, value: float) -> None:
+    while True:
+        try:
+            ask(service + VEHICLE)
+            break
+        except urllib.error.URLError:  # the service listens before it has heard the vehicle
+            time.sleep(0.2)
+    done = ask(f"{service}{VEHICLE}/params/{name}", {"value": value}, "PUT")
+    print(f"{done['status']}: {name} = {done['actual']!r}")
 
 
 if __name__ == "__main__":
-    service, name, value = sys.argv[1:]
-    asyncio.run(main(service, name, float(value)))
+    main(sys.argv[1], sys.argv[2], float(sys.argv[3]))

@@ -4,7 +4,6 @@
 - Subcommands: `read_commands` (fetch, get, watch), `set_command` (set), `reset_command` (reset), `offline`
   (show, cache), `logs` (import), `apply` (apply, verify, restore), `save`, `diff`, `history`, `search`
   (search, info), `fleet`, `link`, `check`, `ports`, `signing`, `serve`, `token` and `simulate` (sim).
-- `apply_over_service`: apply, verify and restore, if the link is a service.
 - `restore_states`: the states that restore writes, and what they undo.
 - `metadata_files`: metadata (add, list, remove).
 - `completion`, `completion_table`, `completion_install`: shell completion.

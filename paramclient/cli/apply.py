@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -59,10 +58,8 @@ from paramclient.cli.targets import (
     fill_pattern,
     targets,
 )
-from paramclient.cli.time_arguments import parse_when
 from paramclient.client.component import Component
 from paramclient.errors import NoReply, ParamClientError, UsageError
-from paramclient.links.names import names_service
 from paramclient.metadata import Metadata
 from paramclient.protocol.params.fetch_result import Progress
 from paramclient.provision import ApplyProgress, ApplyResult, ApplyRow, Plan, verify_all
@@ -159,20 +156,6 @@ async def apply(
     chosen = from_file(metadata)
     rules = read_rules(renames)
     values = Source(file, over, options, only=True)
-    if names_service(url):
-        from paramclient.cli.apply_over_service import ServiceSetUp, apply_over_service  # loads pydantic
-
-        if all_vehicles or expect is not None or backup is not None or chosen is not None:
-            raise UsageError(
-                "over a service, apply sets up one vehicle, with the metadata of the service, whose cache "
-                "has the state before: --all, --expect, --backup and --metadata FILE need the link itself"
-            )
-        choices = ServiceSetUp(
-            include, reboot, allow_armed, skip_invalid, force, durable, renames=renames, full=full
-        )
-        return await apply_over_service(
-            url, values, choices, options, metadata=metadata, dry_run=dry_run, yes=yes
-        )
     await values.open()
     async with targets(url, options, all_vehicles=all_vehicles, expect=expect, only=True) as found:
         wanted = await values.wanted(found.vehicles)
@@ -262,16 +245,6 @@ async def verify(
     chosen = from_file(metadata)
     rules = read_rules(renames)
     values = Source(file, over, options, only=False)
-    if names_service(url):
-        from paramclient.cli.apply_over_service import ServiceSetUp, verify_over_service  # loads pydantic
-
-        if all_vehicles or expect is not None or chosen is not None:
-            raise UsageError(
-                "over a service, verify compares one vehicle, with the metadata of the service: --all, "
-                "--expect and --metadata FILE need the link itself"
-            )
-        compared_with = ServiceSetUp(include, renames=renames, full=full)
-        return await verify_over_service(url, values, compared_with, options, metadata=metadata)
     await values.open()
     async with targets(url, options, all_vehicles=all_vehicles, expect=expect, only=False) as found:
         wanted = await values.wanted(found.vehicles)
@@ -342,21 +315,6 @@ async def restore(
                 "--include, --reboot, --allow-armed, --force, --all and --expect are for plain parameters"
             )
         return await restore_extended(url, when, options, dry_run=dry_run, yes=yes, backup=backup)
-    if names_service(url):
-        from paramclient.cli.apply_over_service import ServiceSetUp, restore_over_service  # loads pydantic
-
-        if backup is not None or is_plain_file:
-            raise UsageError(
-                "over a service, restore writes a state of the service's cache: a backup file and --backup "
-                "need the link itself. `paramclient apply` takes a file over a service"
-            )
-        if all_vehicles or expect is not None:
-            raise UsageError(
-                "over a service, restore is for one vehicle: --all and --expect need the link itself"
-            )
-        moment = None if when is None else parse_when(when, time.time())
-        choices = ServiceSetUp(include, reboot, allow_armed, skip_invalid=True, force=force, full=full)
-        return await restore_over_service(url, moment, choices, options, dry_run=dry_run, yes=yes)
     if all_vehicles:
         check_when_for_all(when)
         check_pattern("--backup", backup, all_vehicles=True)

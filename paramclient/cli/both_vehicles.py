@@ -11,7 +11,6 @@ from paramclient.cli.sources import check_link, is_file, names_vehicle, whole_ta
 from paramclient.cli.targets import find_vehicles
 from paramclient.errors import AmbiguousVehicle
 from paramclient.links import LinkKind, parse_link
-from paramclient.links.names import names_service
 from paramclient.model.paramset import ParamSet
 
 __all__ = ["may_have_several", "resolve_both"]
@@ -27,7 +26,7 @@ def may_have_several(text: str, options: LinkOptions) -> bool:
     if is_chosen or is_file(text) or names_vehicle(text, options.cache):
         return False
     check_link(text)
-    return names_service(text) or parse_link(text).kind is not LinkKind.SIM
+    return parse_link(text).kind is not LinkKind.SIM
 
 
 async def resolve_both(url: str, options: LinkOptions) -> tuple[ParamSet, ParamSet]:

@@ -79,7 +79,6 @@ _LINKS: Final = (
     ("sim:px4", "a simulated PX4"),
     ("sim:ardupilot", "a simulated ArduPilot"),
     ("replay:", "FILE, a telemetry log"),
-    ("http://127.0.0.1:8765", "a service"),
 )
 
 

@@ -8,7 +8,6 @@ from typing import Final
 from paramclient.cli.metadata import known_of_session
 from paramclient.cli.output import printable, report, say
 from paramclient.cli.session import CommandSession
-from paramclient.client.local import ServiceComponent
 from paramclient.metadata import Metadata, load_if_quick
 from paramclient.model.defaults import Default, DefaultSource
 from paramclient.model.values import Param
@@ -69,7 +68,7 @@ async def find_defaults(
     found = given
     if found is None:
         found = await known_of_session(session, choice)
-    if found is None and loads and not isinstance(session.component, ServiceComponent):
+    if found is None and loads:
         quick = await load_if_quick(session.component, timeout=session.deadline.left())
         found = quick.metadata
         if found is None:

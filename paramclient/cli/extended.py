@@ -115,8 +115,6 @@ async def is_extended_session(session: CommandSession, *, extended: bool, plain:
     """
     if extended or plain or session.client.listens_only:
         return extended
-    if not _has_extended_calls(session):
-        return False
     ext = session.component.ext
     if ext.is_spoken or not ext.is_expected:
         return ext.is_spoken
@@ -602,14 +600,6 @@ async def are_extended(sources: Sequence[str], options: LinkOptions) -> bool:
 
 _COLUMNS: Final = ("name", "value", "type", "index")
 """Columns of the table of extended parameters."""
-
-
-def _has_extended_calls(session: CommandSession) -> bool:
-    """Return whether extended parameters can be used: a service of an earlier version does not serve them."""
-    try:
-        return session.component.ext is not None
-    except UsageError:
-        return False
 
 
 def _cells(param: ExtParam) -> tuple[object, ...]:

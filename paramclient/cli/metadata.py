@@ -20,11 +20,9 @@ from paramclient.cli.session import (
     FIRMWARE_POLL_INTERVAL,
     FIRMWARE_TIMEOUT,
     CommandSession,
-    Deadline,
     wait_for_firmware,
 )
 from paramclient.cli.waiting import while_waiting
-from paramclient.client.local import ServiceComponent
 from paramclient.errors import UsageError
 from paramclient.links import LinkKind
 from paramclient.metadata import (
@@ -115,16 +113,12 @@ async def known_of_session(
         VehicleError, NoReply, LinkError: as `metadata_of`.
     """
     if choice == VEHICLE or needed_for:
-        found, refusal = None, None
-        try:
-            found = await request_from_vehicle(session)
-        except UsageError as error:  # over a service that refuses the request
-            refusal = error
+        found = await request_from_vehicle(session)
         if found is None and choice != VEHICLE:
             found = await _stored(session, added_only=True)
         if found is None:
             problem = f"{needed_for}. " if needed_for else ""
-            raise refusal or UsageError(
+            raise UsageError(
                 f"{problem}{session.label} does not describe its parameters; --metadata takes a file that "
                 "does, and `paramclient metadata add` remembers one."
                 f"{files_of([session.component.autopilot])}"
@@ -145,7 +139,7 @@ async def loaded_of_session(session: CommandSession, choice: str | None) -> Meta
     """
     found = await known_of_session(session, choice)
     component, store = session.component, _store_of(session)
-    if found is not None or session.options.json or store is None or isinstance(component, ServiceComponent):
+    if found is not None or session.options.json or store is None:
         return found
     if component.autopilot == PX4_NAME:
         await wait_for_firmware([component], session.deadline)
@@ -169,13 +163,11 @@ async def loaded_of_session(session: CommandSession, choice: str | None) -> Meta
 
 
 async def request_from_vehicle(session: CommandSession) -> Metadata | None:
-    """Return the metadata of the vehicle, requested by this program or the service; None if it has none.
+    """Return the metadata of the vehicle, or None if it has none.
 
     Raises:
         UsageError, VehicleError, NoReply, LinkError: as `metadata_of`.
     """
-    if isinstance(session.component, ServiceComponent):
-        return await _of_service(session.component, session.deadline, loads=True)
     progress = _DownloadNotice(session.label)
     return await metadata_of(session.component, timeout=session.deadline.left(), progress=progress)
 
@@ -183,17 +175,11 @@ async def request_from_vehicle(session: CommandSession) -> Metadata | None:
 async def _stored(session: CommandSession, *, added_only: bool = False) -> Metadata | None:
     """Return the stored or added metadata of the vehicle's firmware, without any request to it; or None.
 
-    Over a service, that which the service has, without `added_only`.
-
     With `added_only`, metadata that a vehicle has provided is left out: the firmware may have been built from
     other sources since, and only the vehicle can confirm it.
     """
-    component = session.component
     store = _store_of(session)
-    found = None if store is None else await _found_in(session, store, added_only=added_only)
-    if found is None and not added_only and isinstance(component, ServiceComponent):
-        found = await _of_service(component, session.deadline, loads=False)
-    return found
+    return None if store is None else await _found_in(session, store, added_only=added_only)
 
 
 async def _found_in(session: CommandSession, store: MetadataStore, *, added_only: bool) -> Metadata | None:
@@ -209,22 +195,11 @@ async def _found_in(session: CommandSession, store: MetadataStore, *, added_only
 
 
 def _store_of(session: CommandSession) -> MetadataStore | None:
-    """Return the metadata beside the user's cache, also for a service, whose client has no cache; or None."""
+    """Return the metadata beside the cache; or None."""
     if session.options.place is False:
         return None
     cache = session.client.cache or ParamCache(session.options.cache)
     return MetadataStore.beside(cache.path)
-
-
-async def _of_service(component: ServiceComponent, deadline: Deadline, *, loads: bool) -> Metadata | None:
-    """Return the metadata that a service has, or with `loads` requests from the vehicle."""
-    from paramclient.documents.param import InfosDoc  # only here: loads pydantic
-
-    found = await component.read_descriptions(loads=loads, timeout=deadline.left())
-    try:
-        return None if found is None else InfosDoc.model_validate(found).metadata()
-    except (ArithmeticError, TypeError, ValueError) as error:
-        raise UsageError(f"the descriptions that the service gives are not valid: {error}") from error
 
 
 class _DownloadNotice:

@@ -26,7 +26,6 @@ from paramclient.errors import (
     UnknownVehicle,
     UsageError,
 )
-from paramclient.links.names import names_service
 from paramclient.model.paramset import ParamSet, RestorePoint
 from paramclient.model.wording import age_in_words, first_of
 from paramclient.provision.inspection import wait_for_identity
@@ -152,9 +151,6 @@ def choices_error(
 
     system = vehicle.system
     listing = f"`paramclient history {system} {'--extended ' if extended else ''}--snapshots`"
-    if names_service(url):
-        place = f"{url.partition('?')[0].rstrip('/')}/api/v1/components/{system}/{vehicle.component}"
-        listing = f"GET {place}/{'extended/' if extended else ''}snapshots"
     seconds = max(1, int(time.time() - error.restored_at) + 1)
     return UsageError(
         f"{error.summary}; choose the state: {command(error.before_apply)} for the state before that apply, "

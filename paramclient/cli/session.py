@@ -19,12 +19,10 @@ from paramclient.cli.output import local_time, printable, report, say
 from paramclient.cli.vehicle_name import check_kind, check_uid, wait_for_kind
 from paramclient.cli.waiting import while_waiting
 from paramclient.client.arguments import address_in_words
-from paramclient.client.client import ParamClient, implementation_of
+from paramclient.client.client import ParamClient, local_client
 from paramclient.client.component import Component
-from paramclient.client.link_client import LinkClient
 from paramclient.errors import AmbiguousVehicle, CacheError, NoReply, UsageError
 from paramclient.links import LinkKind, ReplayLink, parse_link
-from paramclient.links.names import names_service
 from paramclient.model.identity import version_text
 from paramclient.model.wording import counted, first_of
 from paramclient.protocol.no_reply_hint import hint_of_link
@@ -171,9 +169,7 @@ class CommandSession:
         """
         options, component = self.options, self.component
         kind = options.named.kind
-        if kind is not None and (chosen := check_kind(self.client, kind)) in (None, component):
-            if chosen is component and component.address not in self.client.components:
-                return  # another link of the service has the same ids, and no vehicle of this kind
+        if kind is not None and check_kind(self.client, kind) in (None, component):
             await self.client.only_component(
                 component.system, component.component, timeout=self.deadline.left(RECHECK_TIMEOUT)
             )
@@ -202,8 +198,6 @@ def check_link_argument(text: str) -> None:
     Raises:
         UsageError: it is the name of a file or a parameter.
     """
-    if names_service(text):
-        return
     try:
         parse_link(text)
     except UsageError:
@@ -383,13 +377,8 @@ def listen(url: str, options: TrafficOptions, *, listen_only: bool = False) -> P
     """Return a client that counts all traffic, and neither reads nor writes a cache.
 
     Raises:
-        UsageError: no such link, or the URL of a service.
+        UsageError: no such link.
     """
-    if names_service(url):
-        raise UsageError(
-            f"{url} is a service, which does not report the traffic of its links; run the command with the "
-            "link itself"
-        )
     return ParamClient(
         url,
         cache=False,
@@ -402,13 +391,8 @@ def listen(url: str, options: TrafficOptions, *, listen_only: bool = False) -> P
 
 
 def received_in_words(client: ParamClient) -> str:
-    """Return what was received so far on the link, or the vehicles on the links of a service."""
-    implementation = implementation_of(client)
-    if isinstance(implementation, LinkClient):
-        return hint_of_link(implementation.station, client.link.name)
-    heard = implementation.autopilots_on_links
-    vehicles = ", ".join(f"{receiver_in_words(each)} on {each.identity.link}" for each in heard)
-    return f"The service has: {vehicles}." if vehicles else ""
+    """Return what was received so far on the link."""
+    return hint_of_link(local_client(client).station, client.link.name)
 
 
 def _difference(found: Component, chosen: Component) -> str:

@@ -32,7 +32,6 @@ from paramclient.files import ParamFile, read_file, read_renames
 from paramclient.files.formats import ENDINGS
 from paramclient.files.param_file import AUTOPILOT
 from paramclient.links import FORMS, parse_link
-from paramclient.links.names import names_service
 from paramclient.logs.onboard import is_onboard_log, read_onboard_log
 from paramclient.model.paramset import ParamSet
 from paramclient.model.renames import Renames
@@ -162,8 +161,7 @@ def check_link(text: str) -> None:
             file that does not exist.
     """
     try:
-        if not names_service(text):
-            parse_link(text)
+        parse_link(text)
     except UsageError as error:
         if PurePath(text).suffix.lower() in _ENDINGS:
             raise UsageError(f"no such file: {text}{_nearest_file(text)}") from None

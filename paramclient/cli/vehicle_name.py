@@ -10,7 +10,7 @@ import anyio
 
 from paramclient.cache import ParamCache
 from paramclient.cache.lookup import KINDS, address_of, find_vehicle
-from paramclient.client.client import ParamClient, implementation_of
+from paramclient.client.client import ParamClient, local_client
 from paramclient.client.component import Component
 from paramclient.errors import AmbiguousVehicle, AnotherVehicle, NoReply, UsageError
 from paramclient.protocol.vehicle_selection import LOOK_TIME
@@ -112,7 +112,7 @@ async def wait_for_kind(client: ParamClient, kind: str, timeout: float | None) -
     """
     with anyio.move_on_after(timeout):
         while not (found := _of_kind(client, kind)):
-            implementation_of(client).check_open()
+            local_client(client).check_open()
             await anyio.sleep(KIND_POLL_INTERVAL)
         await anyio.sleep(LOOK_TIME)
     return check_kind(client, kind) if found else None
@@ -126,18 +126,11 @@ def check_kind(client: ParamClient, kind: str) -> Component | None:
     """
     found = _of_kind(client, kind)
     if len(found) > 1:
-        spans_links = len({each.identity.link for each in found}) > 1
-        where = "on the links of this service" if spans_links else "on this link"
-        words = [
-            f"{each.system}/{each.component} {each.autopilot}"
-            + (f" on {each.identity.link}" if spans_links else "")
-            for each in found
-        ]
-        has_equal_systems = len({each.system for each in found}) < len(found)
+        words = [f"{each.system}/{each.component} {each.autopilot}" for each in found]
         raise AmbiguousVehicle(
-            f"{len(found)} vehicles {where} are {kind}: {', '.join(words)}.",
+            f"{len(found)} vehicles on this link are {kind}: {', '.join(words)}.",
             vehicles=words,
-            choose_by="link" if spans_links and has_equal_systems else "system",
+            choose_by="system",
         )
     return found[0] if found else None
 
@@ -184,5 +177,4 @@ def _reported_uids(client: ParamClient, component: Component) -> list[str | None
 
 
 def _of_kind(client: ParamClient, kind: str) -> list[Component]:
-    heard = implementation_of(client).autopilots_on_links
-    return [each for each in heard if each.autopilot == kind and each.state != "lost"]
+    return [each for each in client.autopilots if each.autopilot == kind and each.state != "lost"]

@@ -14,7 +14,7 @@
 - `forwarding`: frames to and from one other program.
 - `link_client`, `link_component`, `link_extended_params`: the implementation over a link of this process.
 - `link_task`: link reader and sender; reopens the link.
-- `local`: internal interfaces: of a client and a component on a link of this process, and over a service.
+- `local`: internal interfaces of a client and a component.
 - `recording`: telemetry log of a link.
 - `reconnect_delays`: delays between attempts to reopen a link, and the timeout of calls; `link_task` makes
   the attempts.

@@ -1,4 +1,4 @@
-"""Argument defaults and checks, shared by clients over a link and over a service."""
+"""Argument defaults and checks."""
 
 from __future__ import annotations
 

@@ -1,11 +1,6 @@
-"""ParamClient: the public client for the components on a link, or on the links of a service.
+"""ParamClient: the public client for the components on a link.
 
-`ParamClient` is a concrete class that forwards its calls to an implementation: `LinkClient` for a link of
-this process, `ServiceClient` (in `paramclient.remote`) for a service. `__init__` chooses it by the name of
-the link. `ParamClient(link)` and `isinstance(client, ParamClient)` therefore work for both, a subclass of
-`ParamClient` works over both, and type checkers see one signature with its docstring. The implementations
-have the same calls with the same arguments. They are not subclasses of `ParamClient`, and do not import this
-module. Their components are subclasses of the abstract class `Component`, which users do not construct.
+It forwards its calls to `LinkClient`.
 """
 
 from __future__ import annotations
@@ -13,7 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from types import TracebackType
-from typing import TYPE_CHECKING, Self, TypeAlias
+from typing import TYPE_CHECKING, Self
 
 from paramclient.cache import ParamCache
 from paramclient.client.arguments import COMPONENT_TIMEOUT
@@ -23,13 +18,12 @@ from paramclient.client.events import Events
 from paramclient.client.fetch_all import FetchedAll
 from paramclient.client.files import Ftp
 from paramclient.client.link_client import ClientOptions, LinkClient
-from paramclient.client.local import LocalClient, not_given
+from paramclient.client.local import LocalClient
 from paramclient.client.short_traceback import shortened
 from paramclient.client.signing import Signing
 from paramclient.client.stats import ClientStats
 from paramclient.errors import ParamClientError, UsageError
 from paramclient.links import Link
-from paramclient.links.names import names_service
 from paramclient.model.values import Encoding
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.params.fetch_result import Policy, Progress
@@ -37,13 +31,9 @@ from paramclient.protocol.stats.traffic import TrafficReport
 from paramclient.protocol.wire import SigningKey, SigningReport
 
 if TYPE_CHECKING:
-    from paramclient.remote.service_client import ServiceClient
     from paramclient.sim import Endpoint
 
-__all__ = ["ParamClient", "implementation_of", "local_client"]
-
-Implementation: TypeAlias = "LinkClient | ServiceClient"
-"""The class to which a `ParamClient` forwards its calls."""
+__all__ = ["ParamClient", "local_client"]
 
 
 class ParamClient:
@@ -64,8 +54,7 @@ class ParamClient:
 
     Args:
         link: name of a link, such as `udpin:0.0.0.0:14550` (all forms are in `paramclient.links.FORMS`), a
-            link object, or a simulated vehicle. `http://HOST:8765` connects to a service of `paramclient
-            serve` (see `paramclient.remote`); then `token` is the only other argument allowed.
+            link object, or a simulated vehicle.
         cache: cache of the tables: None for the user's cache, a path, a `ParamCache` (the client does not
             close it), or False for none. A replayed log neither reads nor writes a cache.
         system, component: MAVLink ids of this client, 1 to 255.
@@ -90,7 +79,6 @@ class ParamClient:
             overwritten. A full disk ends the log with a warning and has no other effect.
         signing: key to sign sent frames and to check received ones, or a `Signing` with more options. None:
             frames are not signed, and signatures are not checked.
-        token: access token of the service; None for PARAMCLIENT_TOKEN of the environment.
         split_peers: whether equal ids at different UDP addresses or TCP connections are different components,
             for vehicles that share a system id. A vehicle with two connections to this computer then appears
             twice, and so does a vehicle that was restarted with another port.
@@ -122,7 +110,6 @@ class ParamClient:
         forward: str | Link | None = None,
         tlog: str | os.PathLike[str] | None = None,
         signing: Signing | SigningKey | None = None,
-        token: str | None = None,
         split_peers: bool = False,
     ) -> None:
         options = ClientOptions(
@@ -139,16 +126,7 @@ class ParamClient:
             signing=signing,
             split_peers=split_peers,
         )
-        self._implementation: Implementation
-        if names_service(link):
-            from paramclient.remote.service_client import ServiceClient  # only here: it loads httpx
-
-            options.check_unset()
-            self._implementation = ServiceClient(str(link), token=token)
-        elif token is not None:
-            raise UsageError("a token is only for a service, named http://HOST:PORT; a link has none")
-        else:
-            self._implementation = LinkClient(link, options)
+        self._implementation = LinkClient(link, options)
         self.cache = self._implementation.cache
 
     def __repr__(self) -> str:
@@ -263,11 +241,7 @@ class ParamClient:
         return self._implementation.events()
 
     def ftp(self, component: Component) -> Ftp:
-        """Return the MAVFTP file calls of a component.
-
-        Raises:
-            UsageError: the component belongs to a client over a service.
-        """
+        """Return the MAVFTP file calls of a component."""
         return self._implementation.ftp(component)
 
     async def component(
@@ -319,7 +293,7 @@ class ParamClient:
 
         Raises:
             NoReply: no autopilot was heard in time, or fewer than expected; the message names those heard.
-            UsageError: `expect` is below 1. Over a service: its links have autopilots with equal ids.
+            UsageError: `expect` is below 1.
             LinkError: the link failed, or the client was closed.
         """
         return await self._implementation.find_autopilots(expect=expect, timeout=timeout)
@@ -435,18 +409,6 @@ class ParamClient:
         return self._implementation.signing_report()
 
 
-def implementation_of(client: ParamClient) -> Implementation:
-    """Return the implementation of a client. For the modules of this package only, as is `local_client`."""
-    return client._implementation
-
-
 def local_client(client: ParamClient) -> LocalClient:
-    """Return the internal interface of a client.
-
-    Raises:
-        UsageError: the client is connected to a service.
-    """
-    implementation = client._implementation
-    if not isinstance(implementation, LinkClient):
-        raise not_given("what this needs")
-    return implementation
+    """Return the internal interface of a client. For the modules of this package only."""
+    return client._implementation

@@ -1,4 +1,4 @@
-"""Component: parameters of one component of a vehicle, and its calls, over a link or a service."""
+"""Component: parameters of one component of a vehicle, and its calls."""
 
 from __future__ import annotations
 
@@ -72,12 +72,7 @@ class Component(ABC):
     @property
     @abstractmethod
     def ext(self) -> ExtParams:
-        """The extended parameters of the component (PARAM_EXT_*), with their own calls.
-
-        Raises:
-            UsageError: the client is connected to a service of an earlier version without extended
-                parameters.
-        """
+        """The extended parameters of the component (PARAM_EXT_*), with their own calls."""
 
     @property
     @abstractmethod
@@ -237,8 +232,7 @@ class Component(ABC):
         Args:
             values: values by name, or pairs of name and value; a name may occur in several pairs. Values are
                 as in `set`.
-            progress: called with each outcome in the order of their arrival, from this task. Over a service,
-                they arrive together.
+            progress: called with each outcome in the order of their arrival, from this task.
             timeout: seconds for the whole call; None: no limit besides the number of attempts.
             settle: seconds as in `set`, for which each value is watched; the other writes continue meanwhile.
             force, author: as in `set`.

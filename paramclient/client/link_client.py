@@ -7,7 +7,7 @@ import math
 import os
 import weakref
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
@@ -95,25 +95,12 @@ class ClientOptions:
     signing: Signing | SigningKey | None = None
     split_peers: bool = False
 
-    def check_unset(self) -> None:
-        """Check that every option has its default, as a client over a service needs.
-
-        Raises:
-            UsageError: an option has another value.
-        """
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if value is not field.default and value != field.default:
-                raise UsageError(
-                    f"{field.name} is only for a client with its own link; a service has its own setting"
-                )
-
 
 class LinkClient(LocalClient):
     """A client over a link of this process: the link, the protocol core, the cache and their tasks.
 
     Args:
-        link: as in `ParamClient`, but for the address of a service.
+        link: as in `ParamClient`.
         options: the other arguments of `ParamClient`.
 
     Raises:
@@ -185,11 +172,6 @@ class LinkClient(LocalClient):
         vehicles = sorted(machines, key=lambda vehicle: vehicle[0])
         found = [station.autopilot_of(*vehicle) for vehicle in vehicles]
         return [self._components[machine.address] for machine in found if machine is not None]
-
-    @property
-    def autopilots_on_links(self) -> list[Component]:
-        """The same: there is one link."""
-        return self.autopilots
 
     @property
     def link(self) -> Link:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, Literal, Protocol, TypeVar
+from typing import Final, Protocol, TypeVar
 
 import anyio
 
@@ -23,10 +23,8 @@ from paramclient.client.events import Events
 from paramclient.client.extended_params import ExtChanges, ExtParams
 from paramclient.client.link_task import LinkTask
 from paramclient.client.subscription import Changes
-from paramclient.errors import ParamClientError, UsageError
 from paramclient.links import Link
 from paramclient.model.identity import Identity
-from paramclient.model.paramset import ParamSet, RestorePoint
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.params.fetch import Fetch
@@ -38,12 +36,7 @@ __all__ = [
     "LocalClient",
     "LocalComponent",
     "LocalExtParams",
-    "ServiceComponent",
-    "api_address",
-    "check_has_link",
-    "link_needed",
     "local",
-    "not_given",
     "wait_until_identified",
 ]
 
@@ -217,167 +210,10 @@ class LocalComponent(Component):
         """Push no further changes to this stream."""
 
 
-class ServiceComponent(Component):
-    """A component of a client over a service."""
-
-    @abstractmethod
-    async def read_descriptions(
-        self, *, loads: bool = False, timeout: float | None = None
-    ) -> Mapping[str, Any] | None:
-        """Return the metadata that the service has of the parameters as JSON (`InfosDoc`), or None.
-
-        Args:
-            loads: whether the service requests the metadata from the vehicle first.
-            timeout: seconds for that request; None for the choice of the service.
-
-        Raises:
-            NoReply: the vehicle did not respond, or the service cannot be reached.
-            LinkError: the service cannot be reached.
-            ParamClientError: the error that the service reports.
-        """
-
-    @property
-    @abstractmethod
-    def service(self) -> str:
-        """The address of the service, as the name of a link."""
-
-    @abstractmethod
-    async def load_restore_point(self) -> RestorePoint:
-        """Return the state before the last apply from the cache of the service, and what its restore undoes.
-
-        Raises:
-            AlreadyRestored: a restore ran since that apply.
-            NotInCache: the cache has no such state.
-            ParamClientError: as from `read_descriptions`.
-        """
-
-    @abstractmethod
-    async def load_state(self, when: float) -> ParamSet:
-        """Return an earlier state of the component from the cache of the service.
-
-        Args:
-            when: a float is a time in unix seconds, an int the number of a snapshot.
-
-        Raises:
-            NotInCache: the cache has no such state.
-            ParamClientError: as from `read_descriptions`.
-        """
-
-    @abstractmethod
-    async def plan_set_up(
-        self, kind: Literal["apply", "restore"], body: Mapping[str, Any], *, timeout: float | None = None
-    ) -> Mapping[str, Any]:
-        """Return what a set-up would write as JSON (`PlanDoc`); writes nothing.
-
-        Args:
-            kind: the set-up.
-            body: the wanted parameters, or the state to restore, and options (`PlanRequest`,
-                `RestoreRequest`).
-            timeout: seconds; None for the choice of the service.
-
-        Raises:
-            ParamClientError: as from `read_descriptions`.
-        """
-
-    @abstractmethod
-    async def compare(self, body: Mapping[str, Any], *, timeout: float | None = None) -> Mapping[str, Any]:
-        """Return the comparison with wanted parameters as JSON (`VerifiedDoc`).
-
-        Args:
-            body: the wanted parameters and options (`PlanRequest`).
-            timeout: seconds; None for the choice of the service.
-
-        Raises:
-            ParamClientError: as from `read_descriptions`.
-        """
-
-    @abstractmethod
-    async def begin_set_up(
-        self, kind: Literal["apply", "restore"], body: Mapping[str, Any], *, timeout: float | None = None
-    ) -> Mapping[str, Any]:
-        """Start a set-up as a job of the service, and return the job as JSON (`JobDoc`).
-
-        The job continues if this program ends. A request whose response is lost is not sent again.
-
-        Args:
-            kind: the set-up.
-            body: as for `plan_set_up`, with the options of the set-up (`ApplyRequest`, `RestoreRequest`).
-            timeout: seconds for the job; None for no limit.
-
-        Raises:
-            ParamClientError: as from `read_descriptions`.
-        """
-
-    @abstractmethod
-    async def read_job(self, job: str) -> Mapping[str, Any]:
-        """Return a job as JSON (`JobDoc`).
-
-        Raises:
-            ParamClientError: the error with which the job failed, or as from `read_descriptions`.
-        """
-
-    @abstractmethod
-    def error_of_problem(self, problem: Mapping[str, Any]) -> ParamClientError:
-        """Return the exception of a problem document, as that of a result (`Problem`).
-
-        Raises:
-            LinkError: the document is not valid.
-        """
-
-    @abstractmethod
-    async def cancel_job(self, job: str) -> None:
-        """Cancel a job; without effect after its end.
-
-        Raises:
-            ParamClientError: as from `read_descriptions`.
-        """
-
-
 def local(component: Component) -> LocalComponent:
-    """Return a component with its internal interface.
-
-    Raises:
-        UsageError: the component belongs to a client over a service.
-    """
-    if not isinstance(component, LocalComponent):
-        raise not_given("what this needs")
+    """Return a component with its internal interface."""
+    assert isinstance(component, LocalComponent)
     return component
-
-
-def check_has_link(component: Component, call: str, command: str, path: str) -> None:
-    """Check that a component is on a link of this process, before a call that a service can do as well.
-
-    Args:
-        component: the component.
-        call: the name of the call.
-        command: the command that does the same over a service, with `{}` for its address.
-        path: the last part of the path at which the service does the same.
-
-    Raises:
-        UsageError: the component belongs to a client over a service; the message says how it does the same.
-    """
-    if isinstance(component, ServiceComponent):
-        raise link_needed(
-            call,
-            f"The service does the same: run `paramclient {command.format(component.service)}`, or send POST "
-            f"{api_address(component, path)}, for example with httpx",
-        )
-
-
-def link_needed(call: str, advice: str) -> UsageError:
-    """Return the UsageError for a call that needs the link itself.
-
-    Args:
-        call: the name of the call.
-        advice: what to do instead, in sentences.
-    """
-    return UsageError(f"a service does not give {call}() the link itself, which it needs. {advice}")
-
-
-def api_address(component: ServiceComponent, path: str) -> str:
-    """Return the address of a component in the HTTP API of its service, with `path` as its last part."""
-    base, mark, link = component.service.partition("?")
-    return f"{base}/api/v1/components/{component.system}/{component.component}/{path}{mark}{link}"
 
 
 async def wait_until_identified(component: LocalComponent, timeout: float) -> None:
@@ -385,8 +221,3 @@ async def wait_until_identified(component: LocalComponent, timeout: float) -> No
     with anyio.move_on_after(timeout):
         while component.settled_identity is None:  # noqa: ASYNC110 - no event
             await anyio.sleep(IDENTITY_POLL_INTERVAL)
-
-
-def not_given(what: str) -> UsageError:
-    """Return the UsageError for a feature that a client over a service does not have."""
-    return UsageError(f"a service does not give {what}: use a program that has the link itself")

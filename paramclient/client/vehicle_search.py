@@ -22,11 +22,11 @@ VEHICLES_POLL_INTERVAL: Final = 0.05
 
 
 class _VehicleSource(Protocol):
-    """What the search needs of a client, over a link or over a service."""
+    """What the search needs of a client."""
 
     @property
-    def autopilots_on_links(self) -> list[Component]:
-        """The autopilots of every link."""
+    def autopilots(self) -> list[Component]:
+        """See `ParamClient.autopilots`."""
 
     def check_open(self) -> None:
         """Raise the error of a client that is not open, or whose link failed."""
@@ -52,7 +52,7 @@ async def find_autopilots(
     else:
         listening = None if timeout is None else began + timeout - anyio.current_time()
     return await listen_for_vehicles(
-        lambda: client.autopilots_on_links,
+        lambda: client.autopilots,
         expect=expect,
         timeout=listening,
         began=began,

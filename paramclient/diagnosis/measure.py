@@ -11,7 +11,7 @@ import anyio
 
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
-from paramclient.client.local import LocalComponent, ServiceComponent, link_needed, local
+from paramclient.client.local import LocalComponent, local
 from paramclient.diagnosis.report import (
     FileService,
     HashService,
@@ -87,15 +87,9 @@ async def check_vehicle(
         progress: called with the name of the next measurement, in words.
 
     Raises:
-        UsageError: the client does not count traffic, sends nothing, or is one over a service.
+        UsageError: the client does not count traffic, or sends nothing.
         LinkError: the link failed, or the client was closed.
     """
-    if isinstance(component, ServiceComponent):
-        raise link_needed(
-            "check_vehicle",
-            "Run `paramclient check LINK`, or pass an open ParamClient(LINK, traffic=True, cache=False) and "
-            "its component, on another link to the vehicle, or on that of the service while it does not run",
-        )
     return await _Diagnosis(client, component, timeout, progress or _ignore).run()
 
 

@@ -17,7 +17,7 @@ from urllib.parse import parse_qsl
 
 from paramclient.errors import UsageError
 
-__all__ = ["FORMS", "LinkKind", "LinkSpec", "names_service", "parse_link"]
+__all__ = ["FORMS", "LinkKind", "LinkSpec", "parse_link"]
 
 FORMS: Final = """\
   udpin:HOST:PORT     listen for vehicles; also udp:HOST:PORT, udpin:PORT, HOST:PORT
@@ -28,8 +28,7 @@ FORMS: Final = """\
   sim:px4             a simulated vehicle in this process; also sim:ardupilot, sim:px4?loss=0.05&seed=1
   sim:camera          a simulated camera with extended parameters, component 100
   replay:FILE         a telemetry log (.tlog); also replay:FILE?speed=10, and speed=0 for full speed
-  udpin://HOST:PORT   // may follow the first colon of each; write an IPv6 address in brackets
-  http://HOST:PORT    not a link, but a service with links (paramclient serve); also https://HOST"""
+  udpin://HOST:PORT   // may follow the first colon of each; write an IPv6 address in brackets"""
 """The accepted forms of a link name, for messages."""
 
 SIMULATED: Final = ("px4", "ardupilot", "camera")
@@ -104,11 +103,6 @@ def parse_link(text: str) -> LinkSpec:
         raise UsageError(f"link name {shown!r}: {problem}\naccepted forms:\n{FORMS}") from None
 
 
-def names_service(link: object) -> bool:
-    """Return whether this is the address of a service, and not a link name."""
-    return isinstance(link, str) and _SERVICE.match(link) is not None
-
-
 class _BadName(Exception):
     """The problem of a link name, in words."""
 
@@ -120,7 +114,7 @@ _SCHEMES: dict[str, LinkKind] = {
 }
 _LISTENING = frozenset({LinkKind.UDPIN, LinkKind.TCPIN})
 
-_SERVICE = re.compile(r"\s*https?://", re.IGNORECASE)
+_SERVICE = re.compile(r"https?://", re.IGNORECASE)
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*):(.*)")
 _HOST_PORT = re.compile(r"(?:\[([^\[\]]*)\]|([^:\[\]]*)):([^:]*)")
 _HOST_LABEL = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?")
@@ -131,8 +125,11 @@ _BARE_DEVICE = re.compile(r"/dev/|COM[0-9]", re.IGNORECASE)
 def _parse(name: str) -> LinkSpec:
     if _BARE_DEVICE.match(name):
         return _serial(name)
-    if names_service(name):
-        _fail("this is the address of a service, not of a link; use it only where a vehicle is expected")
+    if _SERVICE.match(name):
+        _fail(
+            "this is an HTTP address, not a link. Connect to the vehicle's own link, or use the HTTP API of"
+            " the service with an HTTP client"
+        )
     scheme = _SCHEME.fullmatch(name)
     kind = _SCHEMES.get(scheme[1].lower()) if scheme else None
     if scheme is None or kind is None:

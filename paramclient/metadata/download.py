@@ -17,14 +17,14 @@ import anyio.to_thread
 
 from paramclient.client.component import Component
 from paramclient.client.files import Ftp
-from paramclient.client.local import LocalComponent, ServiceComponent, api_address, link_needed, local
+from paramclient.client.local import LocalComponent, local
 from paramclient.errors import MetadataError, UsageError
 from paramclient.metadata.formats import PACKED_SIZE_MAX, json_of, read_content, unpacked
 from paramclient.metadata.info import Metadata
 from paramclient.metadata.metadata_cache import MetadataStore, has_checksum
 from paramclient.protocol.wire import ComponentMetadata
 
-__all__ = ["announced_metadata", "check_link_for_metadata", "metadata_of"]
+__all__ = ["announced_metadata", "metadata_of"]
 
 P = ParamSpec("P")
 Result = TypeVar("Result")
@@ -53,14 +53,12 @@ async def metadata_of(
         progress: as in `Ftp.read`, for each of the two files.
 
     Raises:
-        UsageError: the component belongs to a client over a service.
         MetadataError: the metadata is only on the internet (`source` is the address), is on an unknown
             component, does not have the announced checksum, or is damaged.
         FileTransferError: the vehicle does not serve the file that it names.
         NoReply: no response in time.
         LinkError: the link failed, or the client was closed.
     """
-    check_link_for_metadata(component, "metadata_of")
     vehicle = local(component)
     if isinstance(store, bool):
         cache = vehicle.client.cache
@@ -158,23 +156,6 @@ class _Files:
                 source=uri,
             )
         return Ftp(other), path
-
-
-def check_link_for_metadata(component: Component, call: str) -> None:
-    """Check that a component is on a link of this process, before a call that requests its metadata.
-
-    Raises:
-        UsageError: the component belongs to a client over a service; the message says how the service
-            requests the metadata.
-    """
-    if isinstance(component, ServiceComponent):
-        address = api_address(component, "metadata")
-        raise link_needed(
-            call,
-            f"The service requests the metadata itself: run `paramclient get {component.service} NAME "
-            f"--metadata vehicle`, or send POST {address}, for example with httpx; a GET of this address "
-            "returns the metadata",
-        )
 
 
 async def announced_metadata(component: Component, timeout: float | None) -> ComponentMetadata | None:

@@ -8,7 +8,7 @@ from typing import Final
 from paramclient.client.component import Component
 from paramclient.client.local import local
 from paramclient.errors import NoReply, UsageError, VehicleError
-from paramclient.metadata.download import check_link_for_metadata, metadata_of
+from paramclient.metadata.download import metadata_of
 from paramclient.metadata.info import Metadata
 from paramclient.metadata.metadata_cache import MetadataStore
 from paramclient.protocol.quick_transfer import obstacle_to_quick_transfer
@@ -34,11 +34,7 @@ class QuickDownload:
 
 
 def obstacle_to_load(component: Component) -> str | None:
-    """Return why metadata is not requested from a vehicle now; None for no reason.
-
-    Raises:
-        UsageError: the component belongs to a client over a service.
-    """
+    """Return why metadata is not requested from a vehicle now; None for no reason."""
     vehicle = local(component)
     if vehicle.machine.context.is_ardupilot:
         return "ArduPilot does not serve its metadata"
@@ -59,10 +55,8 @@ async def load_if_quick(
         timeout: seconds, if less than 2 s remain for the complete operation; else None.
 
     Raises:
-        UsageError: the component belongs to a client over a service.
         LinkError: the link failed, or the client was closed.
     """
-    check_link_for_metadata(component, "load_if_quick")
     obstacle = obstacle_to_load(component)
     if obstacle is not None:
         return QuickDownload(None, obstacle)

@@ -9,7 +9,6 @@ from typing import Final
 import anyio
 
 from paramclient.client.component import Component
-from paramclient.client.local import check_has_link
 from paramclient.errors import UsageError
 from paramclient.model.paramset import ParamSet
 from paramclient.model.renames import Renames
@@ -86,7 +85,7 @@ async def apply(
 
     Raises:
         InvalidParameters: some values are invalid, and `skip_invalid` is false.
-        UsageError: the component belongs to a client over a service; as from `plan`; the plan is for another
+        UsageError: as from `plan`; the plan is for another
             vehicle; SYS_AUTOCONFIG, which resets other parameters at the next start, is included without
             `reboot`; or `durable` without a cache.
         VehicleArmed: the vehicle is armed, and `allow_armed` is false.
@@ -94,7 +93,6 @@ async def apply(
         NoReply: the vehicle did not answer before the first write.
         LinkError: the link failed, or the client was closed, before the first write.
     """
-    check_has_link(component, "apply", "apply {} FILE", "apply")
     options = ApplyOptions(
         include=(include,) if isinstance(include, str) else tuple(include),
         info=info,
@@ -142,10 +140,9 @@ async def restore(
             `apply`.
 
     Raises:
-        UsageError: the component belongs to a client over a service; the state is that of another vehicle.
+        UsageError: the state is that of another vehicle.
         ParamClientError: as from `apply`.
     """
-    check_has_link(component, "restore", "restore {}", "restore")
     given = (include,) if isinstance(include, str) else tuple(include)
     options = ApplyOptions(
         include=(*await restore_categories(component, state), *given),

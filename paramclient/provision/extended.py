@@ -1,7 +1,4 @@
-"""Extended parameters from a file or an earlier state: compare, write, verify, restore.
-
-All calls use the extended calls of a component, and therefore also work over a service.
-"""
+"""Extended parameters from a file or an earlier state: compare, write, verify, restore."""
 
 from __future__ import annotations
 

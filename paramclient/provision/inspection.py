@@ -11,7 +11,7 @@ from typing import Final, Self
 import anyio
 
 from paramclient.client.component import Component
-from paramclient.client.local import check_has_link, local, wait_until_identified
+from paramclient.client.local import local, wait_until_identified
 from paramclient.errors import LinkError, NoReply, UsageError, VehicleError
 from paramclient.model.params import copy_params
 from paramclient.model.paramset import ParamSet, WrittenParam
@@ -224,11 +224,10 @@ async def prepare(
         run: runs long computations: a plan of thousands of parameters takes a second.
 
     Raises:
-        UsageError: as from `plan`; or the component belongs to a client over a service.
+        UsageError: as from `plan`.
         NoReply: the vehicle did not answer.
         LinkError: the link failed, or the client was closed.
     """
-    check_has_link(component, "prepare", "apply --dry-run {} FILE", "plan")
     check_component(wanted, component.component)
     given = (include,) if isinstance(include, str) else tuple(include)
     autopilot = component.autopilot
@@ -257,7 +256,6 @@ async def verify(
 
     Arguments and errors as in `prepare`.
     """
-    check_has_link(component, "verify", "verify {} FILE", "verify")
     return await prepare(component, wanted, include=include, info=info, force=force, renames=renames)
 
 

@@ -94,8 +94,7 @@ class ParamClient(BlockingClient):
 
     Args:
         link: name of a link, such as `udpin:0.0.0.0:14550` (all forms are in `paramclient.links.FORMS`), a
-            link object, or a simulated vehicle. `http://HOST:8765` connects to a service of `paramclient
-            serve` (see `paramclient.remote`); then `token` is the only other argument allowed.
+            link object, or a simulated vehicle.
         cache: cache of the tables: None for the user's cache, a path, a `ParamCache` (the client does not
             close it), or False for none. A replayed log neither reads nor writes a cache.
         system, component: MAVLink ids of this client, 1 to 255.
@@ -120,7 +119,6 @@ class ParamClient(BlockingClient):
             overwritten. A full disk ends the log with a warning and has no other effect.
         signing: key to sign sent frames and to check received ones, or a `Signing` with more options. None:
             frames are not signed, and signatures are not checked.
-        token: access token of the service; None for PARAMCLIENT_TOKEN of the environment.
         split_peers: whether equal ids at different UDP addresses or TCP connections are different components,
             for vehicles that share a system id. A vehicle with two connections to this computer then appears
             twice, and so does a vehicle that was restarted with another port.
@@ -149,7 +147,6 @@ class ParamClient(BlockingClient):
         forward: str | Link | None = None,
         tlog: str | os.PathLike[str] | None = None,
         signing: Signing | SigningKey | None = None,
-        token: str | None = None,
         split_peers: bool = False,
     ) -> None:
         super().__init__(
@@ -167,7 +164,6 @@ class ParamClient(BlockingClient):
                 forward=forward,
                 tlog=tlog,
                 signing=signing,
-                token=token,
                 split_peers=split_peers,
             )
         )

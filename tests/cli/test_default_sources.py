@@ -8,13 +8,10 @@ from typing import Any
 
 import pytest
 
-from paramclient.cli import session as cli_session
 from paramclient.files import read_file
-from paramclient.links import SimLink
 from paramclient.model.values import ParamType
 from paramclient.protocol import wire
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam
-from tests.client_kinds import ServedClient
 from tests.commands import Command, Put, behind, in_process, leaping
 from tests.shell import Tap
 
@@ -213,35 +210,3 @@ def test_a_comparison_with_the_defaults_takes_those_of_the_metadata(
 
 
 # over a service, and reset
-
-
-@pytest.fixture
-def served(monkeypatch: pytest.MonkeyPatch, put: Put) -> Put:
-    """Connect every URL to a service with the vehicle."""
-
-    def place(far_end: Any) -> str:
-        url = put(far_end)
-        monkeypatch.setattr(
-            cli_session, "ParamClient", lambda url, **options: ServedClient(SimLink(far_end, "sim:custom"))
-        )
-        return url
-
-    return place
-
-
-def test_over_a_service_the_metadata_is_that_of_the_service(command: Command, served: Put) -> None:
-    url = served(quad())
-    unknown = command("fetch", url, "--changed")
-    assert (unknown.code, unknown.out) == (1, "")
-    done = command("fetch", url, "--changed", "--json", "--metadata", "vehicle")
-    assert done.code == 0, done.err
-    param = done.json["params"]["MC_ROLL_P"]
-    assert (param["default"], param["default_source"]) == (4, "metadata")
-
-
-def test_reset_over_a_service_takes_the_metadata_of_the_vehicle(command: Command, served: Put) -> None:
-    vehicle = quad()
-    done = command("reset", served(vehicle), "--changed")
-    assert done.code == 0, done.err
-    assert done.rows[1:] == [["MC_ROLL_P", "6.25", "4.0", "4.0", "accepted"]]
-    assert vehicle.values["MC_ROLL_P"] == 4.0

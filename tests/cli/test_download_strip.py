@@ -9,14 +9,11 @@ from itertools import cycle, islice
 
 import pytest
 
-from paramclient.cli import session as cli_session
 from paramclient.cli.block_characters import ASCII, BLOCKS, Marks, Piece, marks_for
 from paramclient.cli.download_strip import STRIP_WIDTH_MAX, strip_lines
-from paramclient.links import SimLink
 from paramclient.protocol.params.download_ranges import DownloadRange, DownloadRanges, split_indices
 from paramclient.protocol.params.fetch_result import Progress
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
-from tests.client_kinds import ServedClient
 from tests.commands import Command, Outcome, Put, behind, in_process, leaping
 
 
@@ -142,18 +139,6 @@ def test_fetch_draws_the_indices_as_they_are_received(
     assert missing[-1] == 0
     assert drawn[-1].count("█") > 60
     assert "requested again" in done.err
-
-
-def test_a_service_without_ranges_gets_a_progress_bar(
-    command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    link = SimLink(Air.symmetric([PX4Vehicle()], delay=0.05), "sim:custom")
-    monkeypatch.setattr(cli_session, "ParamClient", lambda url, **options: ServedClient(link))
-    done = command("fetch", "http://127.0.0.1:8765", "--refresh")
-    assert done.code == 0
-    assert strips(done.err) == []
-    assert "requested again" not in done.err
-    assert re.search(r"\d+/903", done.err)
 
 
 def test_the_parts_repeat_nothing_from_one_report_to_the_next() -> None:

@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from paramclient import CacheError, ParamCache, ParamClient
-from paramclient.cli import session as cli_session
-from paramclient.links import SimLink
-from paramclient.sim import Air, Camera, Endpoint, GenericVehicle, PX4Vehicle
-from tests.client_kinds import ServedClient
+from paramclient import CacheError, ParamCache
+from paramclient.sim import Air, Camera, GenericVehicle, PX4Vehicle
 from tests.commands import Command, Put, behind, in_process, leaping, strict
-from tests.shell import PeersLink
 
 URL = "udpin:0.0.0.0:14550"
-SERVICE = "http://127.0.0.1:8765"
 CAMERA = ("--component", 100)
 
 
@@ -33,31 +27,12 @@ def put(monkeypatch: pytest.MonkeyPatch) -> Put:
     return behind(monkeypatch, URL)
 
 
-@pytest.fixture(params=[URL, SERVICE])
-def reach(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Put:
-    """Connect to simulated vehicles over a link of this process, and over a service."""
-    url: str = request.param
-    if url == URL:
-        return behind(monkeypatch, url)
-
-    def place(far_end: Endpoint | SimLink | PeersLink) -> str:
-        def client(url: str, **options: Any) -> ParamClient:
-            assert url == SERVICE
-            link = far_end if isinstance(far_end, SimLink | PeersLink) else SimLink(far_end, URL)
-            return ServedClient(link, **options)
-
-        monkeypatch.setattr(cli_session, "ParamClient", client)
-        return url
-
-    return place
-
-
 def small() -> Camera:
     return Camera({"CAM_MODE": 1, "CAM_NAME": "Front", "CAM_KEY": b"\xff\0\xfe", "CAM_EV": 0.5})
 
 
-def test_fetch_finds_them(command: Command, reach: Put) -> None:
-    url = reach(small())
+def test_fetch_finds_them(command: Command, put: Put) -> None:
+    url = put(small())
     done = command("fetch", url, *CAMERA)
     assert done.code == 0
     assert done.rows == [
@@ -74,8 +49,8 @@ def test_fetch_finds_them(command: Command, reach: Put) -> None:
     assert document["extended"]["CAM_NAME"]["value"] == "Front"
 
 
-def test_fetch_prints_only_the_chosen_ones(command: Command, reach: Put) -> None:
-    url = reach(small())
+def test_fetch_prints_only_the_chosen_ones(command: Command, put: Put) -> None:
+    url = put(small())
     done = command("fetch", url, *CAMERA, "--only", "cam_n*")
     assert [row[0] for row in done.words] == ["name", "CAM_NAME"]
     assert "4 extended parameters of 1/100" in done.err
@@ -85,16 +60,16 @@ def test_fetch_prints_only_the_chosen_ones(command: Command, reach: Put) -> None
     assert "no extended parameter of 1/100 no autopilot is called NOPE" in none.err
 
 
-def test_a_component_with_plain_parameters_alone_is_found_too(command: Command, reach: Put) -> None:
-    url = reach(GenericVehicle({"A": 1, "B": 2.5}, component=100))
+def test_a_component_with_plain_parameters_alone_is_found_too(command: Command, put: Put) -> None:
+    url = put(GenericVehicle({"A": 1, "B": 2.5}, component=100))
     done = command("fetch", url, *CAMERA)
     assert (done.code, [row[0] for row in done.words[1:]]) == (0, ["A", "B"])
     assert command("set", url, *CAMERA, "A", 5).code == 0
     assert command("get", url, *CAMERA, "A").words[1][:2] == ["A", "5"]
 
 
-def test_plain_ones_of_a_component_that_has_both(command: Command, reach: Put) -> None:
-    url = reach(Camera({"A": "text"}, plain={"A": 7}))
+def test_plain_ones_of_a_component_that_has_both(command: Command, put: Put) -> None:
+    url = put(Camera({"A": "text"}, plain={"A": 7}))
     assert command("get", url, "A", *CAMERA).words[1][:2] == ["A", "text"]
     assert command("get", url, "A", *CAMERA, "--plain").words[1][:2] == ["A", "7"]
     assert command("fetch", url, *CAMERA, "--plain").words[1][:2] == ["A", "7"]
@@ -111,9 +86,9 @@ def test_a_vehicle_type_that_the_file_does_not_name_needs_the_option(command: Co
     assert command("get", url, "A", "--component", 191, "--extended").words[1][:2] == ["A", "text"]
 
 
-def test_get_and_set(command: Command, reach: Put) -> None:
+def test_get_and_set(command: Command, put: Put) -> None:
     camera = small()
-    url = reach(camera)
+    url = put(camera)
     done = command(
         "set", url, *CAMERA, "CAM_NAME", "-Rear-", "CAM_MODE=0x10", "CAM_KEY", "hex:00ff", "CAM_EV", 1
     )
@@ -133,8 +108,8 @@ def test_get_and_set(command: Command, reach: Put) -> None:
     )
 
 
-def test_refusals_have_a_status_and_an_exit_code(command: Command, reach: Put) -> None:
-    url = reach(Camera({"A": 1, "B": 2, "C": 3}, supported={"A": [1]}, failing=["B"], limits={"C": (0, 5)}))
+def test_refusals_have_a_status_and_an_exit_code(command: Command, put: Put) -> None:
+    url = put(Camera({"A": 1, "B": 2, "C": 3}, supported={"A": [1]}, failing=["B"], limits={"C": (0, 5)}))
     done = command("set", url, *CAMERA, "A", 2, "B", 5, "C", 9)
     assert done.code == 1
     assert done.rows[1:] == [["A", "2", "refused"], ["B", "5", "refused"], ["C", "9", "5", "adjusted"]]
@@ -148,15 +123,13 @@ def test_refusals_have_a_status_and_an_exit_code(command: Command, reach: Put) -
         (("A",), "A: there is no value"),
         (("A", 1, "--settle", 1), "--settle, --force and --metadata are for plain parameters"),
     ):
-        failed = command(
-            "set", reach(Camera({"A": 1})), *CAMERA, *words
-        )  # its clock begins with the command's
+        failed = command("set", put(Camera({"A": 1})), *CAMERA, *words)  # its clock begins with the command's
         assert (failed.code, why in failed.err) == (2, True), failed.err
 
 
-def test_files_and_comparisons(command: Command, reach: Put, tmp_path: Path) -> None:
+def test_files_and_comparisons(command: Command, put: Put, tmp_path: Path) -> None:
     camera = small()
-    url = reach(camera)
+    url = put(camera)
     for ending in ("json", "yaml"):
         file = tmp_path / f"camera.{ending}"
         saved = command("save", url, file, *CAMERA, "--extended")
@@ -179,9 +152,9 @@ def test_files_and_comparisons(command: Command, reach: Put, tmp_path: Path) -> 
     assert command("diff", file, url, *CAMERA, "--only", "CAM_*").code == 2
 
 
-def test_apply_writes_what_differs_and_reads_it_back(command: Command, reach: Put, tmp_path: Path) -> None:
+def test_apply_writes_what_differs_and_reads_it_back(command: Command, put: Put, tmp_path: Path) -> None:
     camera = small()
-    url = reach(camera)
+    url = put(camera)
     file = tmp_path / "camera.yaml"
     assert command("save", url, file, *CAMERA, "--extended").code == 0
     camera.set_ext_param("CAM_NAME", "Rear")
@@ -201,10 +174,10 @@ def test_apply_writes_what_differs_and_reads_it_back(command: Command, reach: Pu
     assert command("apply", url, file, *CAMERA, "--reboot").code == 2
 
 
-def test_apply_reports_what_it_cannot_do(command: Command, reach: Put, tmp_path: Path) -> None:
+def test_apply_reports_what_it_cannot_do(command: Command, put: Put, tmp_path: Path) -> None:
     file = tmp_path / "camera.yaml"
-    assert command("save", reach(small()), file, *CAMERA, "--extended").code == 0
-    url = reach(Camera({"CAM_MODE": 2, "CAM_NAME": 5}, supported={"CAM_MODE": [2]}))
+    assert command("save", put(small()), file, *CAMERA, "--extended").code == 0
+    url = put(Camera({"CAM_MODE": 2, "CAM_NAME": 5}, supported={"CAM_MODE": [2]}))
     done = command("apply", url, file, *CAMERA)
     assert done.code == 1
     for words in (
@@ -213,14 +186,14 @@ def test_apply_reports_what_it_cannot_do(command: Command, reach: Put, tmp_path:
         "CAM_MODE: 1/100 no autopilot has 2, and the file 1",
     ):
         assert words in done.err
-    wrong = command("apply", reach(Camera(component=101)), file, "--component", 101)
+    wrong = command("apply", put(Camera(component=101)), file, "--component", 101)
     assert (wrong.code, "it has the parameters of component 100" in wrong.err) == (2, True)
 
 
-def test_restore_undoes_the_last_apply(command: Command, reach: Put, tmp_path: Path) -> None:
+def test_restore_undoes_the_last_apply(command: Command, put: Put, tmp_path: Path) -> None:
     camera = small()
     before = camera.ext_values
-    url = reach(camera)
+    url = put(camera)
     file, backup = tmp_path / "camera.yaml", tmp_path / "before.yaml"
     file.write_text(
         "paramclient_extended: 1\ncomponent: 100\nparams:\n"
@@ -274,9 +247,9 @@ def test_a_cached_table_is_applied(command: Command, put: Put) -> None:
     assert command("verify", url, "cache:1", *CAMERA, "--extended").code == 0
 
 
-def test_an_unknown_name_does_not_stop_the_other_values(command: Command, reach: Put) -> None:
+def test_an_unknown_name_does_not_stop_the_other_values(command: Command, put: Put) -> None:
     camera = small()
-    done = command("set", reach(camera), *CAMERA, "CAM_NAM", "x", "CAM_MODE", 5, "CAM_NAME", "Rear")
+    done = command("set", put(camera), *CAMERA, "CAM_NAM", "x", "CAM_MODE", 5, "CAM_NAME", "Rear")
     assert done.code == 1
     assert done.rows[1:] == [
         ["CAM_NAM", "x", "not on this vehicle"],
@@ -287,8 +260,8 @@ def test_an_unknown_name_does_not_stop_the_other_values(command: Command, reach:
     assert (camera.ext_values["CAM_MODE"], camera.ext_values["CAM_NAME"]) == (5, "Rear")
 
 
-def test_names_may_be_patterns_and_in_lower_case(command: Command, reach: Put) -> None:
-    url = reach(small())
+def test_names_may_be_patterns_and_in_lower_case(command: Command, put: Put) -> None:
+    url = put(small())
     found = command("get", url, *CAMERA, "cam_n*", "CAM_EV", "NO_*")
     assert (found.code, [row[0] for row in found.rows[1:]]) == (1, ["CAM_NAME", "CAM_EV"])
     assert "1/100 has no extended parameter that matches NO_*" in found.err
@@ -297,8 +270,8 @@ def test_names_may_be_patterns_and_in_lower_case(command: Command, reach: Put) -
     assert "Did you mean CAM_NAME" in near.err
 
 
-def test_bytes_are_in_the_json_of_set(command: Command, reach: Put) -> None:
-    url = reach(small())
+def test_bytes_are_in_the_json_of_set(command: Command, put: Put) -> None:
+    url = put(small())
     [done] = command("set", url, *CAMERA, "CAM_KEY", "hex:00ff", "--json").json["results"]
     assert (done["requested"], done["requested_hex"], done["actual_hex"]) == (None, "00ff", "00ff")
 
@@ -337,15 +310,15 @@ def test_cached_extended_parameters_are_shown_offline(command: Command, put: Put
     assert command("diff", 1, url, "--extended", *CAMERA).code == 0
 
 
-def test_a_component_without_extended_parameters_is_reported(command: Command, reach: Put) -> None:
-    url = reach(PX4Vehicle(table={"A": 1}))
+def test_a_component_without_extended_parameters_is_reported(command: Command, put: Put) -> None:
+    url = put(PX4Vehicle(table={"A": 1}))
     done = command("fetch", url, "--extended")
     assert (done.code, "no reply: extended parameters of 1/1" in done.err) == (3, True)
 
 
-def test_verify_compares_with_a_file(command: Command, reach: Put, tmp_path: Path) -> None:
+def test_verify_compares_with_a_file(command: Command, put: Put, tmp_path: Path) -> None:
     camera = small()
-    url = reach(camera)
+    url = put(camera)
     file = tmp_path / "camera.json"
     assert command("save", url, file, *CAMERA).code == 0, "found without the option"
     same = command("verify", url, file, *CAMERA)
@@ -363,8 +336,8 @@ def test_verify_compares_with_a_file(command: Command, reach: Put, tmp_path: Pat
     assert not camera.requests["PARAM_EXT_SET"]
 
 
-def test_save_finds_plain_ones_of_such_a_component(command: Command, reach: Put, tmp_path: Path) -> None:
-    url = reach(GenericVehicle({"A": 1}, component=100))
+def test_save_finds_plain_ones_of_such_a_component(command: Command, put: Put, tmp_path: Path) -> None:
+    url = put(GenericVehicle({"A": 1}, component=100))
     file = tmp_path / "camera.yaml"
     assert command("save", url, file, *CAMERA).code == 0
     assert "paramclient: 1" in file.read_text()
@@ -404,8 +377,8 @@ def changing() -> Camera:
     return Changing({"CAM_MODE": 1, "CAM_NAME": "Front", "CAM_KEY": b"\xff\0\xfe"})
 
 
-def test_watch_prints_changes(command: Command, reach: Put) -> None:
-    watched = command("watch", reach(changing()), *CAMERA, "--timeout", 10)
+def test_watch_prints_changes(command: Command, put: Put) -> None:
+    watched = command("watch", put(changing()), *CAMERA, "--timeout", 10)
     assert (watched.code, watched.err) == (0, "watching 3 extended parameters of 1/100 no autopilot\n")
     assert [line.split("  ", 1)[1] for line in watched.out.splitlines()] == [
         "CAM_NAME  Front -> Rear  (vehicle)",
@@ -413,8 +386,8 @@ def test_watch_prints_changes(command: Command, reach: Put) -> None:
     ]
 
 
-def test_watch_prints_lines_of_json(command: Command, reach: Put) -> None:
-    watched = command("watch", reach(changing()), "CAM_K*", *CAMERA, "--timeout", 10, "--json")
+def test_watch_prints_lines_of_json(command: Command, put: Put) -> None:
+    watched = command("watch", put(changing()), "CAM_K*", *CAMERA, "--timeout", 10, "--json")
     (line,) = (strict(line) for line in watched.out.splitlines())
     assert line.pop("time")
     assert line == {
@@ -426,8 +399,8 @@ def test_watch_prints_lines_of_json(command: Command, reach: Put) -> None:
     }
 
 
-def test_watch_checks_its_names(command: Command, reach: Put) -> None:
-    url = reach(changing())
+def test_watch_checks_its_names(command: Command, put: Put) -> None:
+    url = put(changing())
     unknown = command("watch", url, "NO_SUCH", *CAMERA, "--extended", "--timeout", 10)
     assert (unknown.code, unknown.out, "NO_SUCH" in unknown.err) == (1, "", True)
     one = command("watch", url, "CAM_MODE", *CAMERA, "--timeout", 10)
@@ -435,8 +408,8 @@ def test_watch_checks_its_names(command: Command, reach: Put) -> None:
     assert command("watch", url, *CAMERA, "--extended", "--plain").code == 2
 
 
-def test_watch_of_the_plain_ones(command: Command, reach: Put) -> None:
-    url = reach(Camera({"A": "text"}, plain={"A": 7}))
+def test_watch_of_the_plain_ones(command: Command, put: Put) -> None:
+    url = put(Camera({"A": "text"}, plain={"A": 7}))
     watched = command("watch", url, *CAMERA, "--plain", "--timeout", 3)
     assert (watched.code, watched.err) == (0, "watching 1 parameters of 1/100 no autopilot\n")
 

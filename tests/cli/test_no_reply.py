@@ -7,11 +7,8 @@ from typing import Any
 
 import pytest
 
-from paramclient.cli import session as cli_session
-from paramclient.links import SimLink
-from paramclient.sim import Air, Endpoint, GenericVehicle, PX4Vehicle
+from paramclient.sim import Air, GenericVehicle, PX4Vehicle
 from paramclient.sim.other_station import OtherStation
-from tests.client_kinds import ServedClient
 from tests.commands import Command, Put, behind, in_process, leaping
 
 
@@ -40,21 +37,9 @@ SPEAKS = "1/1 sends heartbeats (the last one "
 CURE = "Check the link towards the vehicle, and whether the vehicle requires signed messages."
 
 
-def serve(monkeypatch: pytest.MonkeyPatch, far_end: Endpoint) -> None:
-    """Connect every URL to a service that has this vehicle."""
-    monkeypatch.setattr(
-        cli_session, "ParamClient", lambda url, **options: ServedClient(SimLink(far_end, "sim:custom"))
-    )
-
-
-@pytest.mark.parametrize("over_service", [False, True])
 @pytest.mark.parametrize("words", [["get", "A"], ["set", "A", 2], ["fetch"]])
-def test_a_vehicle_that_speaks_and_does_not_answer(
-    command: Command, put: Put, monkeypatch: pytest.MonkeyPatch, words: list[Any], over_service: bool
-) -> None:
+def test_a_vehicle_that_speaks_and_does_not_answer(command: Command, put: Put, words: list[Any]) -> None:
     url = put(Deaf(table={"A": 1}))
-    if over_service:
-        serve(monkeypatch, Deaf(table={"A": 1}))
     done = command(words[0], url, *words[1:])
     assert done.code == 3
     assert SPEAKS in done.err, done.err

@@ -11,11 +11,8 @@ from typing import Any
 import pytest
 
 from paramclient import ParamType
-from paramclient.cli import session as cli_session
-from paramclient.links import SimLink
 from paramclient.protocol import wire
-from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam, Vehicle
-from tests.client_kinds import ServedClient
+from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam, Vehicle
 from tests.commands import Command, Put, behind, in_process, leaping
 from tests.shell import Tap
 
@@ -238,21 +235,6 @@ def test_the_user_of_a_terminal_confirms(
         for words in (["COUNT", "--yes"], ["COUNT", "--json"], ["MC_PITCH_P"]):
             done = command("reset", put(again), *words)
             assert (done.code, "go on?" in done.err) == (0, False)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_over_a_service_and_a_lossy_link(
-    command: Command, put: Put, monkeypatch: pytest.MonkeyPatch, seed: int
-) -> None:
-    vehicle = copter()
-    far_end: Endpoint = Air.symmetric([vehicle], delay=0.05, loss=0.1, seed=seed)
-    url = put(vehicle)
-    monkeypatch.setattr(
-        cli_session, "ParamClient", lambda url, **options: ServedClient(SimLink(far_end, "sim:custom"))
-    )
-    done = command("reset", url, "COUNT", "MC_*", "--timeout", 60)
-    assert done.code == 0, done.err
-    assert values(vehicle, *CHANGED) == CHANGED
 
 
 def test_with_two_vehicles_nothing_is_written(command: Command, put: Put) -> None:

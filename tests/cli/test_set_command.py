@@ -9,10 +9,7 @@ from typing import Any
 import pytest
 
 from paramclient import ParamType
-from paramclient.cli import session as cli_session
-from paramclient.links import SimLink
-from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
-from tests.client_kinds import ServedClient
+from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle
 from tests.commands import Command, Outcome, Put, behind, in_process, leaping
 
 NAMES = [f"P_{number:02}" for number in range(60)]
@@ -99,14 +96,9 @@ def test_every_value_has_an_outcome_of_its_own(command: Command, put: Put) -> No
     assert vehicle.values["A"] == 6
 
 
-@pytest.mark.parametrize("over_service", [False, True])
-def test_a_vehicle_that_ends_in_the_middle_loses_no_outcome(
-    command: Command, put: Put, monkeypatch: pytest.MonkeyPatch, over_service: bool
-) -> None:
+def test_a_vehicle_that_ends_in_the_middle_loses_no_outcome(command: Command, put: Put) -> None:
     vehicle = Ending(TABLE)
     url = put(vehicle)
-    if over_service:
-        serve(monkeypatch, vehicle)
     done = command("set", url, *PAIRS, "--json")
     found = statuses(done)
     assert done.code == 3
@@ -135,33 +127,6 @@ def test_ctrl_c_prints_the_outcomes_so_far(command: Command, put: Put, as_json: 
     assert all(vehicle.values[name] == 7 for name in accepted)
     assert {found[name] for name in NAMES if name not in accepted} == {"unknown"}
     assert command("set", put(GenericVehicle(TABLE)), *PAIRS).code == 0
-
-
-def test_over_a_service_all_pairs_are_one_request(
-    command: Command, put: Put, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    vehicle = PX4Vehicle(table=TABLE)
-    url = put(vehicle)
-    client = serve(monkeypatch, Air.symmetric([vehicle], delay=0.1))
-    done = command("set", url, *PAIRS)
-    assert done.code == 0, done.err
-    assert set(vehicle.values.values()) == {7}
-    assert len(client) == 1
-    found = re.search(r"\n60 of 60 set on 1/1 PX4 quadrotor, firmware [\d.]+\S* in (\d+\.\d+) s, ", done.err)
-    assert found
-    assert float(found[1]) < 3.0
-
-
-def serve(monkeypatch: pytest.MonkeyPatch, far_end: Endpoint) -> list[ServedClient]:
-    """Connect every URL to a service that has this vehicle; return the clients that were made."""
-    made: list[ServedClient] = []
-
-    def client(url: str, **options: Any) -> ServedClient:
-        made.append(ServedClient(SimLink(far_end, "sim:custom")))
-        return made[-1]
-
-    monkeypatch.setattr(cli_session, "ParamClient", client)
-    return made
 
 
 def test_a_name_that_the_vehicle_lacks_and_an_invalid_value_are_not_called_refused(

@@ -9,10 +9,7 @@ import pytest
 
 from paramclient import CacheError, ParamCache, UnknownVehicle, UsageError
 from paramclient.cache.nicknames import Nicknames, check_nickname
-from paramclient.cli import session as cli_session
-from paramclient.links import SimLink
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
-from tests.client_kinds import ServedClient
 from tests.commands import Command, Put, behind, in_process, leaping
 
 TABLE: dict[str, Any] = {"A": 1.0, "B": 2.0}
@@ -44,18 +41,11 @@ def copter(system: int = 4, **options: Any) -> ArduPilotVehicle:
     return ArduPilotVehicle(system=system, live=(), **{"table": TABLE} | options)
 
 
-@pytest.mark.parametrize("over_service", [False, True])
 @pytest.mark.parametrize("name", ["4", "4/1", "ardupilot", "ArduPilot"])
-def test_one_of_two_vehicles_is_written_to(
-    command: Command, put: Put, monkeypatch: pytest.MonkeyPatch, name: str, over_service: bool
-) -> None:
+def test_one_of_two_vehicles_is_written_to(command: Command, put: Put, name: str) -> None:
     one, two = px4(), copter()
     far_end: Endpoint = Air([one, two])
     url = put(far_end)
-    if over_service:
-        monkeypatch.setattr(
-            cli_session, "ParamClient", lambda url, **options: ServedClient(SimLink(far_end, "sim:custom"))
-        )
     done = command("set", url, "A", 7, "--vehicle", name)
     assert done.code == 0, done.err
     assert (one.values["A"], two.values["A"]) == (1.0, 7.0)
@@ -87,45 +77,6 @@ def test_a_kind_that_is_not_there(command: Command, put: Put) -> None:
     assert (done.code, done.out) == (3, "")
     assert "a vehicle with autopilot px4" in done.err
     assert "Heard on sim:custom so far: 4/1 ArduPilot quadrotor." in done.err
-
-
-def over_two_links(monkeypatch: pytest.MonkeyPatch, one: Endpoint, other: Endpoint) -> None:
-    """Connect every URL to a service with these vehicles on two links."""
-    monkeypatch.setattr(
-        cli_session,
-        "ParamClient",
-        lambda url, **options: ServedClient(
-            SimLink(one, "sim:one"), others={"sim:two": SimLink(other, "sim:two")}
-        ),
-    )
-
-
-def test_a_kind_on_one_of_two_links_of_a_service_with_equal_ids(
-    command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    one, two = px4(), copter(1)
-    over_two_links(monkeypatch, one, two)
-    for value, kind in ((7, "px4"), (8, "ardupilot")):
-        done = command("set", "http://127.0.0.1:8765", "A", value, "--vehicle", kind)
-        assert done.code == 0, done.err
-    assert (one.values["A"], two.values["A"]) == (7.0, 8.0)
-
-
-def test_a_kind_on_both_links_of_a_service_lists_them(
-    command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    one, two = px4(), px4()
-    over_two_links(monkeypatch, one, two)
-    done = command("set", "http://127.0.0.1:8765", "A", 7, "--vehicle", "px4")
-    assert (done.code, done.out) == (2, "")
-    assert done.err == (
-        "paramclient: 2 vehicles on the links of this service are px4: 1/1 px4 on sim:one, "
-        "1/1 px4 on sim:two. Name its link in the address of the service: http://HOST:PORT?link=NAME.\n"
-    )
-    assert (one.requests["PARAM_SET"], two.requests["PARAM_SET"]) == (0, 0)
-    done = command("get", "http://127.0.0.1:8765", "A", "--vehicle", "ardupilot", "--timeout", 3)
-    assert done.code == 3
-    assert "The service has: 1/1 PX4 quadrotor, firmware 1.17.0-alpha on sim:one, 1/1 " in done.err
 
 
 def test_a_nickname_names_a_vehicle_everywhere(command: Command, put: Put, tmp_path: Path) -> None:

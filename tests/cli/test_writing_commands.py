@@ -20,7 +20,6 @@ from paramclient.protocol import wire
 from paramclient.protocol.vehicle_selection import LOOK_TIME
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, Vehicle
 from tests.caches import NOW, update
-from tests.client_kinds import ServedClient
 from tests.commands import Command, Put, behind, in_process, leaping
 from tests.shell import Late, PeersLink, Tap
 
@@ -369,38 +368,6 @@ def test_a_short_timeout_reports_the_remaining_wait(command: Command, put: Put) 
 
 
 # over a service
-
-
-@pytest.fixture
-def served(monkeypatch: pytest.MonkeyPatch) -> Callable[[Endpoint], None]:
-    """Connect simulated vehicles to a service."""
-
-    def place(far_end: Endpoint) -> None:
-        def client(url: str, **options: Any) -> ServedClient:
-            return ServedClient(SimLink(far_end, "sim:custom"), cache=False)
-
-        monkeypatch.setattr(cli_session, "ParamClient", client)
-
-    return place
-
-
-@pytest.mark.parametrize("phase", [0.0, 0.9])
-@pytest.mark.parametrize("name", WRITING)
-def test_over_a_service_nothing_is_written_to_two_vehicles(
-    command: Command,
-    served: Callable[[Endpoint], None],
-    words: Callable[[str], list[str]],
-    name: str,
-    phase: float,
-) -> None:
-    one, two = px4(), copter()
-    served(Air([Late(one, 0.0), Late(two, phase)]))
-    done = command(*words(name))
-    assert (done.code, done.out) == (2, "")
-    assert done.err == LISTED
-    assert untouched(one, two)
-    assert command(*words("set"), "--system", 2).code == 0
-    assert (untouched(one), untouched(two)) == (True, False)
 
 
 def test_a_generic_vehicle_counts_as_a_vehicle(command: Command, put: Put) -> None:

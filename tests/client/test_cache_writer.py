@@ -33,7 +33,7 @@ from paramclient import (
 from paramclient.cache import CachedComponent
 from paramclient.client import cache_writer
 from paramclient.client import link_component as component_module
-from paramclient.client.client import implementation_of, local_client
+from paramclient.client.client import local_client
 from paramclient.client.link_client import LinkClient
 from paramclient.client.link_component import LinkComponent
 from paramclient.client.local import local
@@ -417,7 +417,7 @@ async def test_another_vehicle_takes_the_place_while_the_cache_is_read(path: Pat
             return super().load(key, component)
 
     def hear_of_another() -> None:
-        implementation = implementation_of(client)
+        implementation = local_client(client)
         assert isinstance(implementation, LinkClient)
         implementation.station.receive(version, "sim", anyio.current_time())
         implementation._dispatch()

@@ -44,7 +44,6 @@ from paramclient.links import Peer, create_link, serve_endpoint
 from paramclient.protocol import wire
 from paramclient.protocol.station import Station
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
-from tests.client_kinds import DIRECT, direct_only, listeners, looks, pytest_generate_tests, way
 from tests.shell import (
     TIMEOUT,
     VALUES,
@@ -64,8 +63,6 @@ from tests.shell import (
     until,
 )
 from tests.simulation import is_so
-
-__all__ = ["pytest_generate_tests", "way"]
 
 Call = Callable[[ParamClient, Component], Coroutine[Any, Any, object]]
 
@@ -123,7 +120,6 @@ async def test_an_error_of_a_call_is_raised_unchanged() -> None:
 
 
 @in_simulated_time
-@direct_only("the wrapper of the tests around the blocking client adds frames")
 async def test_the_traceback_of_a_mistake_is_short() -> None:
     async with a_client(generic(param_error=True)) as client:
         component = await client.component()
@@ -284,7 +280,6 @@ async def test_closing_while_the_link_is_disconnected() -> None:
     assert not tasks_beside()
 
 
-@direct_only("it is about a link of its own")
 @pytest.mark.asyncio
 @pytest.mark.parametrize("cached", [False, True])
 async def test_nothing_is_left_behind(tmp_path: Path, cached: bool) -> None:
@@ -301,7 +296,6 @@ async def test_nothing_is_left_behind(tmp_path: Path, cached: bool) -> None:
         gc.collect()
 
 
-@direct_only("it is about a link of its own")
 @pytest.mark.asyncio
 async def test_the_port_is_free_again_at_once() -> None:
     async with a_client("udpin:127.0.0.1:0") as client:
@@ -312,7 +306,6 @@ async def test_the_port_is_free_again_at_once() -> None:
         pass
 
 
-@direct_only("it is about a link of its own")
 @pytest.mark.asyncio
 async def test_a_link_that_cannot_be_opened(tmp_path: Path) -> None:
     before = tasks_beside(), threading.enumerate(), open_files()
@@ -416,7 +409,6 @@ async def test_the_user_knows_better_how_values_are_laid_out() -> None:
         assert (await component.get("PARAM_01")).value == 0, "1 as the bits of a float32 is next to nothing"
 
 
-@direct_only("the numbers of a service are those of a moment ago")
 @in_simulated_time
 async def test_bytes_are_counted_both_ways() -> None:
     tap = Tap(generic())
@@ -474,7 +466,7 @@ async def test_a_component_that_is_heard_before_its_heartbeat(monkeypatch: pytes
         named = await client.component(1, 1, timeout=0.4)
         assert named.encoding_reason == "the vehicle's capability PARAM_ENCODE_BYTEWISE"
         await asyncio.sleep(0.5)
-        assert looks(client.components[1, 1]) == "<Component 1/1 unknown partial 1 of 25 params>"
+        assert repr(client.components[1, 1]) == "<Component 1/1 unknown partial 1 of 25 params>"
         assert not any(task.done() for task in waiting)
         await asyncio.sleep(0.51)
         assert [task.result().autopilot for task in waiting] == ["px4", "px4"]
@@ -532,7 +524,6 @@ async def test_a_component_that_is_not_there(wanted: dict[str, Any], words: str)
         assert round(anyio.current_time() - began, 3) == arguments.COMPONENT_TIMEOUT
 
 
-@direct_only("a service reports the states of its links")
 @in_simulated_time
 async def test_a_component_that_is_not_there_and_what_was_received_instead() -> None:
     async with a_client(generic(autopilot=wire.MAV_AUTOPILOT_INVALID)) as client:
@@ -1145,17 +1136,6 @@ async def test_changes_end_with_the_client_after_the_queued_ones() -> None:
 
 
 @in_simulated_time
-async def test_a_dropped_changes_object_is_no_listener_any_more() -> None:
-    async with a_client(small_px4()) as client:
-        component = await client.component()
-        changes = component.changes()
-        assert len(listeners(component)) == 1
-        del changes
-        await settled()
-        assert not listeners(component)
-
-
-@in_simulated_time
 async def test_changes_by_other_stations_are_distinguished_from_the_vehicles_own() -> None:
     vehicle = small_px4()
     radio = Radio(vehicle)
@@ -1176,7 +1156,7 @@ async def test_changes_by_other_stations_are_distinguished_from_the_vehicles_own
 
 
 @in_simulated_time
-async def test_calls_go_on_when_the_link_is_back(way: str) -> None:
+async def test_calls_go_on_when_the_link_is_back() -> None:
     vehicle = generic(burst=1, period=0.1)
     link = FlakyLink(vehicle)
     async with a_client(link) as client:
@@ -1188,8 +1168,7 @@ async def test_calls_go_on_when_the_link_is_back(way: str) -> None:
         write = asyncio.create_task(component.set("PARAM_22", 5))
         await link.drop(stays_offline=True)
         await asyncio.sleep(4.0)
-        if way == DIRECT:
-            assert repr(client) == "<ParamClient tcp:flaky:5760 reconnecting, 1 component>"
+        assert repr(client) == "<ParamClient tcp:flaky:5760 reconnecting, 1 component>"
         assert not any(task.done() for task in (fetch, read, write))
         link.is_offline = False
         assert (await read).value == 20
@@ -1217,7 +1196,6 @@ async def test_waiting_reads_are_sent_at_once_when_the_link_is_back() -> None:
         assert anyio.current_time() - reconnected_at < 1.1, "one round trip, and no time-out before it"
 
 
-@direct_only("a service waits for its links, so client.component() goes on")
 @in_simulated_time
 async def test_a_link_that_stays_disconnected_fails_the_calls_and_not_the_client(
     caplog: pytest.LogCaptureFixture,
@@ -1262,7 +1240,6 @@ async def test_a_link_that_stays_disconnected_fails_the_calls_and_not_the_client
     assert "reconnecting" in reported[0].getMessage()
 
 
-@direct_only("the errors are made anew from what the service says")
 @in_simulated_time
 async def test_the_errors_of_a_long_absence_do_not_grow() -> None:
     link = FlakyLink(generic())
@@ -1278,7 +1255,6 @@ async def test_the_errors_of_a_long_absence_do_not_grow() -> None:
         assert len(lengths) == 1
 
 
-@direct_only("a service opens it again")
 @in_simulated_time
 async def test_a_link_that_cannot_reconnect_ends_every_call() -> None:
     tap = Tap(generic())
@@ -1301,7 +1277,6 @@ async def test_a_link_that_cannot_reconnect_ends_every_call() -> None:
     assert isinstance(await outcome(component.get("PARAM_01")), ClientClosed)
 
 
-@direct_only("it is about a link of its own")
 @pytest.mark.asyncio
 @pytest.mark.parametrize("kind", ["udpin", "tcpin"])
 async def test_a_vehicle_over_real_sockets(kind: str) -> None:
@@ -1318,7 +1293,6 @@ async def test_a_vehicle_over_real_sockets(kind: str) -> None:
         assert vehicle.param("MC_ROLL_P").value == 7.25
 
 
-@direct_only("it is about a link of its own")
 @pytest.mark.asyncio
 @pytest.mark.parametrize("kind", ["udpin", "tcpin"])
 async def test_a_client_that_listens(kind: str) -> None:
@@ -1337,7 +1311,6 @@ async def test_a_client_that_listens(kind: str) -> None:
             tasks.cancel_scope.cancel()
 
 
-@direct_only("it is about a link of its own")
 @pytest.mark.asyncio
 async def test_a_tcp_connection_that_breaks_during_a_download() -> None:
     vehicle = generic(burst=1, period=0.03, stream=True)
@@ -1355,7 +1328,6 @@ async def test_a_tcp_connection_that_breaks_during_a_download() -> None:
         assert bits(result.params) == bits(vehicle.params)
 
 
-@direct_only("it is about a link of its own")
 @pytest.mark.asyncio
 async def test_a_tcp_server_that_stays_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reconnect_delays, "LINK_TIMEOUT", 0.3)
@@ -1423,7 +1395,6 @@ async def known_component(client: ParamClient) -> Component:
     return component
 
 
-@direct_only("it is about the reader of a link")
 @in_simulated_time
 async def test_telemetry_alone_lets_the_reader_rest() -> None:
     vehicle = Chatter(generic(), 1 / 2000)
@@ -1435,7 +1406,6 @@ async def test_telemetry_alone_lets_the_reader_rest() -> None:
         assert len(vehicle.portions) < 1.2 / link_task.READ_PAUSE
 
 
-@direct_only("it is about the reader of a link")
 @in_simulated_time
 async def test_nothing_rests_while_an_answer_is_awaited() -> None:
     vehicle = Chatter(generic(), 1 / 2000)
@@ -1451,7 +1421,6 @@ async def test_nothing_rests_while_an_answer_is_awaited() -> None:
         call.cancel()
 
 
-@direct_only("it is about the reader of a link")
 @in_simulated_time
 async def test_datagrams_that_arrive_during_a_pause_are_processed_in_order(
     monkeypatch: pytest.MonkeyPatch,
@@ -1479,7 +1448,6 @@ async def test_datagrams_that_arrive_during_a_pause_are_processed_in_order(
         assert taken == given
 
 
-@direct_only("it is about the reader of a link")
 @in_simulated_time
 async def test_a_change_waits_for_the_end_of_a_rest_at_the_most() -> None:
     vehicle = Chatter(generic(), 1 / 2000)
@@ -1496,7 +1464,6 @@ async def test_a_change_waits_for_the_end_of_a_rest_at_the_most() -> None:
             assert anyio.current_time() - began < link_task.READ_PAUSE + 0.001
 
 
-@direct_only("it is about the reader of a link")
 @in_simulated_time
 async def test_a_busy_link_shortens_the_rests() -> None:
     vehicle = Chatter(generic(), 1 / 20_000)
@@ -1509,7 +1476,6 @@ async def test_a_busy_link_shortens_the_rests() -> None:
     assert 0.9 * link_task.PAUSE_DATAGRAMS_MAX < largest < 1.1 * link_task.PAUSE_DATAGRAMS_MAX
 
 
-@direct_only("it is about the reader of a link")
 @pytest.mark.parametrize("call", ["get", "set", "fetch_all", "client.fetch_all"])
 @in_simulated_time
 async def test_a_call_ends_a_rest_at_once(call: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -1531,7 +1497,6 @@ async def test_a_call_ends_a_rest_at_once(call: str, monkeypatch: pytest.MonkeyP
     assert with_rests < without + 0.05
 
 
-@direct_only("it is about the reader of a link")
 @in_simulated_time
 async def test_closing_does_not_wait_for_the_end_of_a_rest(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(link_task, "READ_PAUSE", 60.0)
@@ -1547,7 +1512,6 @@ async def test_closing_does_not_wait_for_the_end_of_a_rest(monkeypatch: pytest.M
 # How they look
 
 
-@direct_only("the words name the link")
 @in_simulated_time
 async def test_their_style_shows_the_comparison() -> None:
     client = a_client(Air([small_px4(burst=1, period=0.05), generic(system=2)]))
@@ -1583,11 +1547,11 @@ async def test_a_blocked_program_processes_received_data_before_timeouts_count()
 
 
 @in_simulated_time
-async def test_the_autopilots_are_the_vehicles_without_what_they_carry(way: str) -> None:
+async def test_the_autopilots_are_the_vehicles_without_what_they_carry() -> None:
     camera = generic(system=1, component=100)
     vehicles = [generic(system=3), small_px4(), camera, generic(system=2, component=7)]
     async with a_client(Air(vehicles)) as client:
-        assert client.autopilots == [] or way != DIRECT, "a service may have found them before"
+        assert client.autopilots == []
         await client.fetch_all()
         addresses = [(each.system, each.component) for each in client.autopilots]
         assert addresses == [(1, 1), (2, 7), (3, 1)]

@@ -15,7 +15,6 @@ from paramclient import (
     AmbiguousVehicle,
     Contested,
     ContestedAddress,
-    Discovered,
     NoReply,
     ParamCache,
     ParamClient,
@@ -27,7 +26,6 @@ from paramclient.links.udp import UdpIn
 from paramclient.protocol import wire
 from paramclient.protocol.vehicle.presence import LOST_AFTER
 from paramclient.sim import ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
-from tests.client_kinds import ServedClient
 from tests.commands import Command, behind, in_process, leaping
 from tests.service_hub import C, met, problem, service
 from tests.shell import Late, PeersLink, in_simulated_time, outcome, until
@@ -393,21 +391,3 @@ def test_two_autopilots_on_one_udp_port(tmp_path: Path) -> None:
     for table in cached(path).values():
         assert set(table) in (set(TABLE), set(OTHER))
     assert lines(path) == []
-
-
-@in_simulated_time
-async def test_a_client_of_the_service_receives_the_report_too() -> None:
-    async with ServedClient(two(by=2.0, until=8.0), cache=False) as client:
-        events = client.events()
-        vehicle = await client.component()
-        await vehicle.get("SHARED_A")
-        await until(lambda: vehicle.contest is not None)
-        assert vehicle.state == "contested"
-        assert vehicle.contest is not None
-        assert "10.0.0.2:14550" in vehicle.contest.claimants[1]
-        with pytest.raises(ContestedAddress, match="is contested") as caught:
-            await vehicle.set("SHARED_A", 5)
-        assert caught.value.claimants == vehicle.contest.claimants
-        await until(lambda: vehicle.contest is None)
-        reported = [await anext(events) for _ in range(3)]
-        assert [type(each) for each in reported] == [Discovered, Contested, Uncontested]

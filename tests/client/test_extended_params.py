@@ -31,10 +31,7 @@ from paramclient import (
 )
 from paramclient.sim import Air, Camera, PX4Vehicle
 from tests import shell
-from tests.client_kinds import direct_only, pytest_generate_tests, way
 from tests.shell import a_client, in_simulated_time, settled
-
-__all__ = ["pytest_generate_tests", "way"]
 
 MANY = {f"PARAM_{number:03}": number for number in range(120)}
 
@@ -182,7 +179,6 @@ async def test_changes() -> None:
         await anext(changes)
 
 
-@direct_only("a service names the authors")
 @in_simulated_time
 async def test_a_change_on_behalf_of_another() -> None:
     async with a_client(Camera({"A": 1})) as client:

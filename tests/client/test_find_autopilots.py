@@ -7,10 +7,7 @@ import pytest
 from paramclient import NoReply, UsageError
 from paramclient.client.vehicle_search import VEHICLES_LISTENING_TIME
 from paramclient.sim import Air
-from tests.client_kinds import pytest_generate_tests, way
 from tests.shell import Late, a_client, generic, in_simulated_time, simulated_time_loop, small_px4
-
-__all__ = ["pytest_generate_tests", "way"]
 
 
 def fleet() -> Air:
@@ -20,7 +17,7 @@ def fleet() -> Air:
 
 
 @in_simulated_time
-async def test_the_expected_vehicles_are_returned_as_soon_as_they_are_heard(way: str) -> None:
+async def test_the_expected_vehicles_are_returned_as_soon_as_they_are_heard() -> None:
     began = simulated_time_loop().now
     async with a_client(fleet()) as client:
         found = await client.find_autopilots(expect=4)
@@ -30,7 +27,7 @@ async def test_the_expected_vehicles_are_returned_as_soon_as_they_are_heard(way:
 
 
 @in_simulated_time
-async def test_fewer_vehicles_than_expected_are_an_error_that_names_them(way: str) -> None:
+async def test_fewer_vehicles_than_expected_are_an_error_that_names_them() -> None:
     async with a_client(fleet()) as client:
         with pytest.raises(NoReply) as caught:
             await client.find_autopilots(expect=5, timeout=6.0)
@@ -40,7 +37,7 @@ async def test_fewer_vehicles_than_expected_are_an_error_that_names_them(way: st
 
 
 @in_simulated_time
-async def test_without_a_number_all_that_are_heard_in_3_s_are_returned(way: str) -> None:
+async def test_without_a_number_all_that_are_heard_in_3_s_are_returned() -> None:
     async with a_client(fleet()) as client:
         began = simulated_time_loop().now
         found = await client.find_autopilots()
@@ -49,7 +46,7 @@ async def test_without_a_number_all_that_are_heard_in_3_s_are_returned(way: str)
 
 
 @in_simulated_time
-async def test_no_vehicle_is_an_error(way: str) -> None:
+async def test_no_vehicle_is_an_error() -> None:
     async with a_client(Air([])) as client:
         for expect in (None, 2):
             with pytest.raises(NoReply):
@@ -57,7 +54,7 @@ async def test_no_vehicle_is_an_error(way: str) -> None:
 
 
 @in_simulated_time
-async def test_less_than_one_vehicle_cannot_be_expected(way: str) -> None:
+async def test_less_than_one_vehicle_cannot_be_expected() -> None:
     async with a_client(fleet()) as client:
         with pytest.raises(UsageError, match="from 1 up, not 0"):
             await client.find_autopilots(expect=0)

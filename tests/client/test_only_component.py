@@ -9,11 +9,7 @@ from paramclient import AmbiguousVehicle, Component, LinkError, NoReply, UsageEr
 from paramclient.client.client import local_client
 from paramclient.protocol import wire
 from paramclient.protocol.vehicle_selection import LOOK_TIME
-from paramclient.remote import RemoteClient, RemoteComponent
-from paramclient.service import Hub, create_app
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
-from tests.asgi import ASGITransport
-from tests.client_kinds import direct_only, pytest_generate_tests, way
 from tests.service_hub import met, problem, service
 from tests.shell import (
     FlakyLink,
@@ -26,8 +22,6 @@ from tests.shell import (
     small_px4,
     until,
 )
-
-__all__ = ["pytest_generate_tests", "way"]
 
 TEXT = "2 vehicles on this link: 1/1 PX4 quadrotor, 2/1 ArduPilot quadrotor."
 
@@ -153,7 +147,6 @@ async def test_a_vehicle_that_was_lost_is_waited_for() -> None:
             await client.only_component(2, timeout=3.0)
 
 
-@direct_only("the link is at hand")
 @in_simulated_time
 async def test_after_an_absence_of_the_link_a_second_one_is_looked_for_again() -> None:
     link = FlakyLink(Air([px4(), copter()]))
@@ -180,7 +173,6 @@ async def test_a_client_that_is_closed_says_so() -> None:
 # several links of a service
 
 
-@direct_only("it has services of its own")
 @in_simulated_time
 async def test_the_vehicles_on_all_links_of_a_service_count() -> None:
     other = FlakyLink(Air([copter()]))
@@ -201,23 +193,6 @@ async def test_the_vehicles_on_all_links_of_a_service_count() -> None:
         assert len(hub.links) == 2
 
 
-@direct_only("it has services of its own")
-@in_simulated_time
-async def test_one_address_on_two_links_of_a_service_is_chosen_by_the_link() -> None:
-    async with Hub([px4(), FlakyLink(Late(small_px4(uid=77), 0.9))], cache=False, fetches=False) as hub:
-        app = create_app(hub)
-        for arguments in ((), (1,), (1, 1)):
-            async with RemoteClient("http://127.0.0.1:8765", transport=ASGITransport(app)) as client:
-                with pytest.raises(AmbiguousVehicle, match=r"1/1 PX4 quadrotor on sim:custom, .*\?link=NAME"):
-                    await client.only_component(*arguments)
-        name = "http://127.0.0.1:8765?link=tcp:flaky:5760"
-        async with RemoteClient(name, transport=ASGITransport(app)) as client:
-            found = await client.only_component()
-            assert isinstance(found, RemoteComponent)
-            assert found.link_name == "tcp:flaky:5760"
-
-
-@direct_only("it has services of its own")
 @in_simulated_time
 async def test_a_link_that_cannot_be_opened_has_no_vehicle() -> None:
     offline = FlakyLink(Air([copter()]))

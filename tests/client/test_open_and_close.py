@@ -20,10 +20,7 @@ import pytest
 from paramclient import ClientClosed, LinkError, ParamCache, ParamClient, UsageError
 from paramclient.client import client_task
 from paramclient.links import Peer, SimLink
-from paramclient.remote import RemoteClient
-from paramclient.service import Hub, create_app
 from paramclient.sim import Endpoint
-from tests.asgi import ASGITransport
 from tests.cable import TIMEOUT
 from tests.shell import Tap, a_client, bits, generic, small_px4
 
@@ -275,18 +272,6 @@ async def test_an_error_in_a_task_of_the_client_reaches_its_callers(caplog: pyte
     assert [record.getMessage() for record in caplog.records] == [
         "tcp:faulty:5760: an unexpected error has ended the client"
     ]
-
-
-@pytest.mark.parametrize("anyio_backend", ["asyncio"])
-async def test_over_a_service() -> None:
-    async with beside() as tasks, Hub([("sim", lambda: a_client(generic()))], cache=False) as hub:
-        client = RemoteClient("http://127.0.0.1:8765", transport=ASGITransport(create_app(hub)))
-        await in_a_task(tasks, client.open)
-        component = await client.component()
-        assert (await component.get("PARAM_01")).value == 1
-        await in_a_task(tasks, client.aclose)
-        with pytest.raises(ClientClosed):
-            await component.get("PARAM_01")
 
 
 LEFT_OPEN = """

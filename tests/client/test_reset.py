@@ -8,10 +8,7 @@ from paramclient import ParamType, SetStatus, UnknownParameter, UsageError
 from paramclient.metadata import Metadata, ParamInfo
 from paramclient.protocol import wire
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, SimParam
-from tests.client_kinds import pytest_generate_tests, way
 from tests.shell import Tap, a_client, in_simulated_time
-
-__all__ = ["pytest_generate_tests", "way"]
 
 
 def with_defaults(**others: object) -> ArduPilotVehicle:

@@ -29,10 +29,7 @@ from paramclient.protocol import wire
 from paramclient.protocol.requests.write_window import WRITES_IN_FLIGHT_MAX
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam, Vehicle
 from tests import shell
-from tests.client_kinds import direct_only, pytest_generate_tests, way
 from tests.shell import VALUES, FlakyLink, Tap, a_client, generic, in_simulated_time, residue, small_px4
-
-__all__ = ["pytest_generate_tests", "way"]
 
 MANY: dict[str, int | float] = {f"MANY_{number:03}": float(number) for number in range(200)}
 NEW: dict[str, int | float] = {name: value + 0.5 for name, value in MANY.items()}
@@ -151,7 +148,6 @@ async def test_a_switch_of_a_group_is_a_barrier() -> None:
     assert min(times["GRP_A"], times["PARAM_3"]) - times["GRP_ENABLE"] > 0.1
 
 
-@direct_only("counts the writes in flight")
 @in_simulated_time
 async def test_as_many_writes_are_in_flight_as_the_vehicle_serves() -> None:
     tap = Tap(Air.symmetric([PX4Vehicle(table=MANY)], delay=0.2))
@@ -305,7 +301,6 @@ async def test_values_are_watched_while_others_are_written() -> None:
         assert not left_of(component)
 
 
-@direct_only("a service reports the outcomes together")
 @in_simulated_time
 async def test_an_error_of_progress_cancels_the_call() -> None:
     tap = Tap(Air.symmetric([PX4Vehicle(table=MANY)], delay=0.05))
@@ -325,7 +320,6 @@ async def test_an_error_of_progress_cancels_the_call() -> None:
         assert len(tap.messages(wire.ParamSetMessage)) == sent < 60
 
 
-@direct_only("the cache is that of the client")
 @in_simulated_time
 async def test_values_that_are_not_on_the_disk_are_reported_as_such(tmp_path: Path) -> None:
     async with a_client(small_px4(), cache=tmp_path / "cache") as client:
@@ -346,7 +340,6 @@ async def test_values_that_are_not_on_the_disk_are_reported_as_such(tmp_path: Pa
             await (await client.component()).set_many({"PARAM_01": 2}, durable=True)
 
 
-@direct_only("the outcome of a request that the client gave up is not reported")
 @in_simulated_time
 async def test_two_calls_at_once_both_end() -> None:
     vehicle = PX4Vehicle(table=MANY)

@@ -292,7 +292,7 @@ def test_a_spec_has_the_parts_of_the_name() -> None:
         ("vehicle.params", "kind of link is missing"),
         ("/home/me/vehicle.params", "kind of link is missing"),
         ("./px4:1", "kind of link is missing"),
-        ("http://127.0.0.1:80", "this is the address of a service"),
+        ("http://127.0.0.1:80", "this is an HTTP address, not a link"),
         ("mavlink:px4", "'mavlink' is not|is not a port"),
         ("udpin:", "port is missing"),
         ("udpin:0.0.0.0", "port is missing"),

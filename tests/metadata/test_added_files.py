@@ -8,13 +8,9 @@ from pathlib import Path
 import pytest
 
 from paramclient import MetadataError, UsageError
-from paramclient.cli import session as cli_session
-from paramclient.links import SimLink
 from paramclient.metadata import AddedFiles, Metadata, MetadataStore, metadata_cache, read_metadata
 from paramclient.model.identity import Identity
 from paramclient.model.px4_hash import crc32_px4
-from paramclient.sim import ArduPilotVehicle
-from tests.client_kinds import ServedClient
 from tests.commands import Command, Put, behind, in_process, leaping
 
 DATA = Path(__file__).parent.parent / "data"
@@ -150,39 +146,3 @@ def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
 @pytest.fixture
 def put(monkeypatch: pytest.MonkeyPatch) -> Put:
     return behind(monkeypatch, "udpin:0.0.0.0:14550")
-
-
-@pytest.mark.parametrize("over_service", [False, True])
-def test_every_command_uses_an_added_file(
-    command: Command, put: Put, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, over_service: bool
-) -> None:
-    vehicle = ArduPilotVehicle(table={"GAIN": 4.0, "MODE": 0}, live=())
-    url = put(vehicle)
-    if over_service:
-        monkeypatch.setattr(
-            cli_session, "ParamClient", lambda url, **options: ServedClient(SimLink(vehicle, "sim:custom"))
-        )
-    assert command("metadata", "list").err == "no metadata was added\n"
-    file = described(tmp_path, "ArduCopter")
-    added = command("metadata", "add", file, "--firmware", "4.6")
-    assert (added.code, added.err) == (0, f"2 descriptions from {file} for copter 4.6\n")
-    assert command("metadata", "list").rows[1] == ["copter", "4.6", "2"]
-    listed = command("metadata", "list", "--json").json
-    assert listed == {"metadata": [{"vehicle": "copter", "firmware": "4.6", "descriptions": 2}]}
-
-    assert command("set", url, "MODE=Loiter").code == 0
-    assert vehicle.values["MODE"] == 2
-    refused = command("set", url, "GAIN", 11)
-    assert refused.code == 2
-    assert "above the maximum of 10" in refused.err
-    assert vehicle.values["GAIN"] == 4.0
-    assert "Loiter" in command("get", url, "MODE").out
-    if not over_service:
-        command("fetch", url)
-        assert "Loiter" in command("show", 1, "MODE").out
-
-    removed = command("metadata", "remove", "copter", "--firmware", "4.6", "--json")
-    assert removed.json == {"vehicle": "copter", "firmware": "4.6"}
-    assert "Loiter" not in command("get", url, "MODE").out
-    assert command("set", url, "MODE=Loiter").code == 2
-    assert command("metadata", "remove", "copter").code == 2

@@ -28,10 +28,7 @@ from paramclient.provision import (
     verify_extended,
 )
 from paramclient.sim import Camera
-from tests.client_kinds import direct_only, pytest_generate_tests, way
 from tests.shell import a_client, in_simulated_time
-
-__all__ = ["pytest_generate_tests", "way"]
 
 
 @pytest.fixture
@@ -208,7 +205,6 @@ async def test_what_is_done_before_writing_may_end_the_call(path: Path) -> None:
 
 
 @in_simulated_time
-@direct_only("the link is cut during the call")
 async def test_a_lost_component_ends_the_run_with_the_outcomes_so_far(path: Path) -> None:
     camera = Camera({"A": 1, "B": 2}, slow={"B": 3.0})
     async with a_client(camera, cache=path) as client:

@@ -112,7 +112,7 @@ class Progress:
         rate: parameters per second since the first one was received.
         seconds_left: at that rate, or None while unknown.
         ranges: what of each part of the download was received, requested again, and is missing, counted only
-            when it is read. None without a download, and over a service. Not compared.
+            when it is read. None without a download. Not compared.
     """
 
     received: int
