@@ -47,8 +47,8 @@ MAY_IMPORT = {
     "documents": SHELL | {"files", "metadata", "provision", "logs", "diagnosis"},
     "": SHELL | {"files"},
 }
-"""The rooms that a room may import. A name covers the rooms inside; the empty name is the public face. Command
-and service, which are not named, may import all of these, and none of these imports them."""
+"""The rooms that a room may import. A name covers the rooms inside; the empty name is the public face. The
+command and the service, which are not named, may import all of these, and none of these imports them."""
 
 PURE = ("errors", "model", "protocol", "sim")
 """Rooms without input and output: time and bytes are arguments."""
